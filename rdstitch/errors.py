@@ -1,0 +1,59 @@
+"""What can go wrong, as a tree; each leaf knows the exit status that the command line gives it.
+
+::
+
+    RdstitchError                1  something unexpected
+    ├── ArgumentError            2  an argument has the wrong shape, type or range (also a ValueError)
+    ├── InputError               3  a file cannot be read, or is not what it should be
+    ├── RegistrationError        4  no overlap, or no result that can be relied on
+    ├── PartialResultError       5  pictures were left out, and --strict forbids that
+    ├── OutputError              6  a file cannot be written, or exists already
+    └── LimitError               7  refused: too large for memory, format or common sense
+
+A fit that fails is not an error but a value with a reason; see
+:class:`rdstitch.radial_homography.RadialHomography`.
+"""
+
+from typing import ClassVar
+
+
+class RdstitchError(Exception):
+    """Base of all errors that rdstitch raises on purpose; its text is one line for the user."""
+
+    exit_status: ClassVar[int] = 1
+
+
+class ArgumentError(RdstitchError, ValueError):
+    """An argument has the wrong shape, type or range."""
+
+    exit_status = 2
+
+
+class InputError(RdstitchError):
+    """A file cannot be read, or is not what it should be."""
+
+    exit_status = 3
+
+
+class RegistrationError(RdstitchError):
+    """The pictures do not overlap, or nothing reliable came out of them."""
+
+    exit_status = 4
+
+
+class PartialResultError(RdstitchError):
+    """Pictures were left out although the caller asked for all of them."""
+
+    exit_status = 5
+
+
+class OutputError(RdstitchError):
+    """A file cannot be written, or exists and may not be replaced."""
+
+    exit_status = 6
+
+
+class LimitError(RdstitchError):
+    """Refused: the result would be too large for memory, for the format, or for common sense."""
+
+    exit_status = 7

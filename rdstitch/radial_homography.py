@@ -1,0 +1,251 @@
+"""Homography and distortion together: ``p2(λ) ~ H p1(λ)`` with the lifted point ``p(λ) = (x, y, 1 + λ(x² + y²))``.
+
+:class:`RadialHomography` carries H, λ and their frame as one value. :func:`transfer` maps measured points to
+measured points; :func:`transfer_jacobian` adds the analytic derivatives that pairwise refinement and the global
+adjustment are both built on.
+"""
+
+from dataclasses import dataclass, field
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rdstitch.camera import Camera, FloatArray, distort
+from rdstitch.planar_motion import PlanarMotion
+
+LENS_PARAMETERS = ("distortion", "distortion2", "center_x", "center_y")
+
+
+def lift(points: ArrayLike, distortion: ArrayLike, distortion2: float = 0.0) -> FloatArray:
+    """``(x, y, 1 + λ r² + μ r⁴)`` of normalized points (..., 2); shape (..., 3). λ broadcasts."""
+    x = np.asarray(points, dtype=np.float64)
+    radius2 = np.einsum("...i,...i->...", x, x)
+    third = 1.0 + (np.asarray(distortion) + distortion2 * radius2) * radius2
+    return np.concatenate([np.broadcast_to(x, (*third.shape, 2)), third[..., None]], axis=-1)
+
+
+def project(homogeneous: FloatArray) -> FloatArray:
+    """(..., 3) to (..., 2); NaN at and behind the horizon (third coordinate not positive)."""
+    third = homogeneous[..., 2:]
+    return homogeneous[..., :2] / np.where(third > 0.0, third, np.nan)
+
+
+def transfer(
+    homography: ArrayLike, distortion: ArrayLike, points: ArrayLike, distortion2: float = 0.0
+) -> FloatArray:
+    """Where measured points of picture 1 are measured in picture 2: undistort, apply H, distort.
+
+    Parameters
+    ----------
+    homography : array_like of shape (..., 3, 3)
+        From picture 1 to picture 2, with positive third coordinates in front of the camera.
+    distortion : array_like of shape (...)
+        λ in the frame of the points.
+    points : array_like of shape (N, 2)
+        Normalized.
+    distortion2 : float
+        μ in the frame of the points.
+
+    Returns
+    -------
+    ndarray of shape (..., N, 2)
+        Normalized; NaN for a point that comes to lie behind the camera or beyond the lens model.
+    """
+    h = np.asarray(homography, dtype=np.float64)
+    lam = np.asarray(distortion, dtype=np.float64)[..., None]
+    lifted = lift(np.asarray(points, dtype=np.float64), lam, distortion2)
+    return distort(project(lifted @ np.swapaxes(h, -2, -1)), lam, distortion2)
+
+
+@dataclass(frozen=True)
+class TransferJacobian:
+    """Transferred points and their derivatives, for N points; all in normalized coordinates.
+
+    Attributes
+    ----------
+    points : ndarray of shape (N, 2)
+        Where the points of picture 1 are measured in picture 2.
+    by_homography : ndarray of shape (N, 2, 9)
+        By the entries of H, row by row.
+    by_lens : ndarray of shape (N, 2, 4)
+        By :data:`LENS_PARAMETERS`: λ, μ, and the distortion centre (a shift of both pictures' centre).
+    by_point : ndarray of shape (N, 2, 2)
+        By the point in picture 1.
+    """
+
+    points: FloatArray
+    by_homography: FloatArray
+    by_lens: FloatArray
+    by_point: FloatArray
+
+
+def transfer_jacobian(
+    homography: FloatArray, distortion: float, points: FloatArray, distortion2: float = 0.0
+) -> TransferJacobian:
+    """:func:`transfer` with its analytic derivatives.
+
+    With ``z = H p``, ``u = z_xy / z_w`` and d the distorted point, ``g = 1 + λ ρ² + μ ρ⁴``, ``ρ = |d|``: since
+    ``u = d / g``, ``du/dd = (I - α d d') / g`` with ``α = (2λ + 4μρ²)/g``, whose inverse is
+    ``dd/du = g (I + α d d' / (1 - αρ²))``; and at fixed u ``dd/dλ = d ρ² / (g (1 - αρ²))``.
+
+    Parameters
+    ----------
+    homography : ndarray of shape (3, 3) or (N, 3, 3)
+        One for all points, or one a point.
+    distortion, distortion2 : float
+        λ and μ in the frame of the points.
+    points : ndarray of shape (N, 2)
+        Points of picture 1, normalized. Points that cannot be transferred give NaN everywhere.
+    """
+    h = np.broadcast_to(homography, (len(points), 3, 3))
+    r2 = np.einsum("ni,ni->n", points, points)
+    lifted = lift(points, distortion, distortion2)
+    z = np.einsum("nij,nj->ni", h, lifted)
+    w = np.where(z[:, 2] > 0.0, z[:, 2], np.nan)
+    u = z[:, :2] / w[:, None]
+    d = distort(u, distortion, distortion2)
+
+    rho2 = np.einsum("ni,ni->n", d, d)
+    g = 1.0 + distortion * rho2 + distortion2 * rho2**2
+    alpha = (2.0 * distortion + 4.0 * distortion2 * rho2) / g
+    stretch = 1.0 - alpha * rho2
+    outer = d[:, :, None] * d[:, None, :]
+    d_by_u = g[:, None, None] * (np.eye(2) + (alpha / stretch)[:, None, None] * outer)
+
+    u_by_z = np.zeros((len(points), 2, 3))
+    u_by_z[:, 0, 0] = u_by_z[:, 1, 1] = 1.0 / w
+    u_by_z[:, :, 2] = -u / w[:, None]
+    d_by_z = d_by_u @ u_by_z
+
+    by_homography = (d_by_z[:, :, :, None] * lifted[:, None, None, :]).reshape(-1, 2, 9)
+
+    lifted_by_point = np.zeros((len(points), 3, 2))
+    lifted_by_point[:, 0, 0] = lifted_by_point[:, 1, 1] = 1.0
+    lifted_by_point[:, 2, :] = (2.0 * distortion + 4.0 * distortion2 * r2)[:, None] * points
+    by_point = d_by_z @ h @ lifted_by_point
+
+    along_third = np.einsum("nij,nj->ni", d_by_z, h[:, :, 2])
+    own = d * (rho2 / (g * stretch))[:, None]
+    by_lens = np.empty((len(points), 2, 4))
+    by_lens[:, :, 0] = along_third * r2[:, None] + own
+    by_lens[:, :, 1] = along_third * (r2**2)[:, None] + own * rho2[:, None]
+    by_lens[:, :, 2:] = np.eye(2) - by_point
+    return TransferJacobian(d, by_homography, by_lens, by_point)
+
+
+def measurement_whitening(by_point: FloatArray) -> FloatArray:
+    """Whitening of a transfer error whose noise comes from both pictures (Sampson's weighting).
+
+    A point measured with the same noise in both pictures is transferred with covariance ``I + J J'``,
+    ``J`` = ``by_point``. The returned upper triangular ``W`` has ``W'W = ((I + J J') / 2)⁻¹``, so that the whitened
+    error has the size of the error in one picture where the two have the same scale.
+
+    Parameters
+    ----------
+    by_point : ndarray of shape (N, 2, 2)
+        Derivative of the transferred by the original point, both in px.
+
+    Returns
+    -------
+    ndarray of shape (N, 2, 2)
+    """
+    a, b = by_point[:, 0, :], by_point[:, 1, :]
+    xx = (1.0 + np.einsum("ni,ni->n", a, a)) / 2.0
+    yy = (1.0 + np.einsum("ni,ni->n", b, b)) / 2.0
+    xy = np.einsum("ni,ni->n", a, b) / 2.0
+    whitening = np.zeros_like(by_point)
+    conditional = xx - xy**2 / yy
+    whitening[:, 0, 0] = 1.0 / np.sqrt(conditional)
+    whitening[:, 0, 1] = -xy / yy / np.sqrt(conditional)
+    whitening[:, 1, 1] = 1.0 / np.sqrt(yy)
+    return whitening
+
+
+@dataclass(frozen=True)
+class RadialHomography:
+    """The relation of two pictures of a plane: homography, λ, and how far both can be trusted.
+
+    A fit that failed is falsy and carries the reason.
+
+    Attributes
+    ----------
+    homography : ndarray of shape (3, 3)
+        ``p2(λ) ~ H p1(λ)`` for points normalized by half the diagonal of their picture; NaN after a failure.
+    camera : Camera
+        The camera of picture 1, with the estimated λ (0 after a failure) and the focal length that was used.
+    camera2 : Camera
+        The same lens on picture 2, which may have another size.
+    inliers : ndarray of shape (N,), bool
+        Correspondences that agree with this model.
+    covariance : ndarray of shape (P, P)
+        Of λ (first) and the free parameters of the homography's model; empty after a failure.
+    distortion_std : float
+        Standard deviation of λ in the half-diagonal frame; inf where λ is not observable, 0 where it was given.
+    model : str
+        "rigid", "similarity" or "homography": the least free model that explains the data.
+    motion : PlanarMotion or None
+        The motion where the model is one of planar motion.
+    rms : float
+        Root mean square error of the inliers, px of picture 2.
+    solver : str
+        Minimal solver that found the model.
+    iterations : int
+        Samples drawn.
+    reason : str
+        Why this model was chosen, or why the fit failed.
+    ok : bool
+    """
+
+    homography: FloatArray
+    camera: Camera
+    camera2: Camera
+    inliers: NDArray[np.bool_]
+    covariance: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    distortion_std: float = np.inf
+    model: str = ""
+    motion: PlanarMotion | None = None
+    rms: float = np.nan
+    solver: str = ""
+    iterations: int = 0
+    reason: str = ""
+    ok: bool = True
+
+    @classmethod
+    def failed(cls, reason: str, camera: Camera, camera2: Camera, count: int, iterations: int = 0) -> Self:
+        """A fit of ``count`` correspondences that failed, with the reason."""
+        none = np.zeros(count, dtype=np.bool_)
+        h = np.full((3, 3), np.nan)
+        return cls(h, camera, camera2, none, iterations=iterations, reason=reason, ok=False)
+
+    def __bool__(self) -> bool:
+        """Whether the fit succeeded."""
+        return self.ok
+
+    @property
+    def distortion(self) -> float:
+        """λ for half the image diagonal; NaN after a failure."""
+        return self.camera.distortion if self.ok else np.nan
+
+    @property
+    def distortion_observable(self) -> bool:
+        """Whether the pictures say anything about λ."""
+        return self.ok and bool(np.isfinite(self.distortion_std))
+
+    @property
+    def homography_px(self) -> FloatArray:
+        """H from undistorted pixels of picture 1 to undistorted pixels of picture 2, shape (3, 3)."""
+        to_px = _pixel_matrix(self.camera2)
+        return to_px @ self.homography @ np.linalg.inv(_pixel_matrix(self.camera))
+
+    def transfer(self, points1: ArrayLike) -> FloatArray:
+        """Measured px of picture 1 (N, 2) to measured px of picture 2; NaN where there is no such point."""
+        normalized = self.camera.normalize(points1)
+        moved = transfer(self.homography, self.camera.distortion, normalized, self.camera.distortion2)
+        return self.camera2.denormalize(moved)
+
+
+def _pixel_matrix(camera: Camera) -> FloatArray:
+    """Matrix (3, 3) from half-diagonal-normalized to pixel coordinates."""
+    s, (cx, cy) = camera.half_diagonal, camera.center
+    return np.array([[s, 0.0, cx], [0.0, s, cy], [0.0, 0.0, 1.0]])
