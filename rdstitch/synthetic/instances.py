@@ -1,0 +1,272 @@
+"""Problem instances with known truth, in batches: what the minimal solvers are tested and measured with."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.camera import FloatArray, distort
+from rdstitch.errors import ArgumentError
+from rdstitch.planar_motion import rotation_from_tilt
+from rdstitch.radial_homography import lift, project
+from rdstitch.solvers.solutions import Solutions
+
+Range = tuple[float, float]
+IndexArray = NDArray[np.intp]
+
+# Half width and half height of a 4:3 picture in focal lengths. Its half diagonal is one focal length, so that
+# λ has the same value in the focal-normalized and in the half-diagonal frame.
+HALF_SIZE = (0.8, 0.6)
+
+# Rays meet the plane within ten heights of the camera: what lies nearer to the horizon is no use to anybody.
+_MIN_STEEPNESS = 0.1
+_CANDIDATES_PER_POINT = 12
+_MAX_ROUNDS = 200
+
+
+@dataclass(frozen=True)
+class Instances:
+    """B instances of k correspondences between two pictures of a plane.
+
+    Attributes
+    ----------
+    x1, x2 : ndarray of shape (B, k, 2)
+        Measured (distorted, noisy) points of picture 1 and 2, focal-normalized.
+    homography : ndarray of shape (B, 3, 3)
+        ``p2(λ) ~ H p1(λ)`` with positive third coordinates.
+    distortion : ndarray of shape (B,)
+        λ, focal-normalized.
+    """
+
+    x1: FloatArray
+    x2: FloatArray
+    homography: FloatArray
+    distortion: FloatArray
+
+    def __len__(self) -> int:
+        """Number of instances."""
+        return len(self.distortion)
+
+    def best_errors(self, solutions: Solutions) -> tuple[FloatArray, FloatArray]:
+        """Errors of the solution nearest to the truth in λ, one a sample.
+
+        Returns
+        -------
+        distortion_error : ndarray of shape (B,)
+            ``|λ - λ_true|``; inf where a sample has no solution.
+        homography_error : ndarray of shape (B,)
+            Frobenius distance of the same solution's H from the truth, both of unit norm, for the better sign.
+        """
+        distortion_error = np.full(len(self), np.inf)
+        homography_error = np.full(len(self), np.inf)
+        sample = solutions.sample
+        error = np.abs(solutions.distortion - self.distortion[sample])
+        order = np.lexsort((error, sample))
+        first = order[np.r_[True, np.diff(sample[order]) > 0]] if len(order) else order
+        distortion_error[sample[first]] = error[first]
+        homography_error[sample[first]] = _distance(
+            solutions.homography[first], self.homography[sample[first]]
+        )
+        return distortion_error, homography_error
+
+
+@dataclass(frozen=True)
+class PlanarInstances(Instances):
+    """Instances of planar motion: ``H = R2 Rz(φ) diag(1, 1, height) T R1'``.
+
+    Attributes
+    ----------
+    tilt, tilt2 : ndarray of shape (B, 2)
+        (ψ, θ) of picture 1 and picture 2, radians; the same unless separate tilts were asked for.
+    yaw : ndarray of shape (B,)
+        φ, radians.
+    translation : ndarray of shape (B, 2)
+        (tx, ty), in units of the first camera's height above the plane.
+    height : ndarray of shape (B,)
+        Height of the second camera in units of the first's.
+    """
+
+    tilt: FloatArray
+    tilt2: FloatArray
+    yaw: FloatArray
+    translation: FloatArray
+    height: FloatArray
+
+
+def planar_instances(
+    count: int,
+    points: int,
+    *,
+    seed: int,
+    distortion: Range = (-0.7, 0.0),
+    max_tilt: float = 0.3,
+    separate_tilts: bool = False,
+    yaw: Range = (-np.pi, np.pi),
+    translation: Range = (0.1, 0.8),
+    height: Range = (1.0, 1.0),
+    half_size: Range = HALF_SIZE,
+    noise: float = 0.0,
+) -> PlanarInstances:
+    """Random planar motion over a plane, seen by a tilted camera with radial distortion.
+
+    Parameters
+    ----------
+    count, points : int
+        B and k: instances, and correspondences in each.
+    seed : int
+        Equal seeds give equal instances.
+    distortion : (float, float)
+        Range of λ, uniform.
+    max_tilt : float
+        ψ and θ are uniform in ± this many radians.
+    separate_tilts : bool
+        Whether picture 2 has a tilt of its own.
+    yaw, translation, height : (float, float)
+        Ranges of φ (radians), of the length of t (heights; its direction is uniform) and of the second camera's
+        height, all uniform, but thinned where the pictures have too little in common.
+    half_size : (float, float)
+        Half width and half height of the pictures, focal lengths.
+    noise : float
+        Standard deviation of the normal noise added to both pictures' points, focal lengths.
+
+    Returns
+    -------
+    PlanarInstances
+        Points uniform over the part of picture 1 that is visible in picture 2 and well below the horizon.
+    """
+    rng = np.random.default_rng(seed)
+    lam = rng.uniform(*distortion, count)
+    tilt = rng.uniform(-max_tilt, max_tilt, (count, 2))
+    tilt2 = rng.uniform(-max_tilt, max_tilt, (count, 2)) if separate_tilts else tilt
+    rotation, rotation2 = rotation_from_tilt(tilt), rotation_from_tilt(tilt2)
+    motion = np.empty((count, 4))  # φ, tx, ty, height
+
+    def draw(which: IndexArray) -> FloatArray:
+        direction, length = rng.uniform(-np.pi, np.pi, len(which)), rng.uniform(*translation, len(which))
+        motion[which, 0] = rng.uniform(*yaw, len(which))
+        motion[which, 1] = length * np.cos(direction)
+        motion[which, 2] = length * np.sin(direction)
+        motion[which, 3] = rng.uniform(*height, len(which))
+        middle = _rigid_in_plane(motion[which])
+        return rotation2[which] @ middle @ np.swapaxes(rotation[which], 1, 2)
+
+    x1, x2, h = _visible_points(rng, lam, rotation[:, :, 2], points, half_size, draw)
+    return PlanarInstances(
+        x1=x1 + noise * rng.standard_normal(x1.shape),
+        x2=x2 + noise * rng.standard_normal(x2.shape),
+        homography=h,
+        distortion=lam,
+        tilt=tilt,
+        tilt2=tilt2,
+        yaw=motion[:, 0],
+        translation=motion[:, 1:3],
+        height=motion[:, 3],
+    )
+
+
+def general_instances(
+    count: int,
+    points: int,
+    *,
+    seed: int,
+    distortion: Range = (-0.7, 0.0),
+    max_angle: float = 0.3,
+    translation: Range = (0.1, 0.8),
+    half_size: Range = HALF_SIZE,
+    noise: float = 0.0,
+) -> Instances:
+    """Random free motion before a plane: homographies with all eight degrees of freedom.
+
+    ``H = Rx(α) Ry(β) Rz(φ) (I - t n')`` with the plane normal n and the attitude (α, β) tilted by up to
+    ``max_angle`` about either axis, any yaw φ, and any direction of the translation t. Parameters as for :func:`planar_instances`.
+    """
+    rng = np.random.default_rng(seed)
+    lam = rng.uniform(*distortion, count)
+    normal = rotation_from_tilt(rng.uniform(-max_angle, max_angle, (count, 2)))[:, :, 2]
+
+    def draw(which: IndexArray) -> FloatArray:
+        attitude = rotation_from_tilt(rng.uniform(-max_angle, max_angle, (len(which), 2)))
+        yaw = rng.uniform(-np.pi, np.pi, len(which))
+        turn = _rigid_in_plane(np.column_stack([yaw, np.zeros((len(which), 2)), np.ones(len(which))]))
+        t = rng.standard_normal((len(which), 3))
+        t *= (rng.uniform(*translation, len(which)) / np.linalg.norm(t, axis=1))[:, None]
+        return attitude @ turn @ (np.eye(3) - t[:, :, None] * normal[which][:, None, :])
+
+    x1, x2, h = _visible_points(rng, lam, normal, points, half_size, draw)
+    return Instances(
+        x1=x1 + noise * rng.standard_normal(x1.shape),
+        x2=x2 + noise * rng.standard_normal(x2.shape),
+        homography=h,
+        distortion=lam,
+    )
+
+
+def _visible_points(
+    rng: np.random.Generator,
+    distortion: FloatArray,
+    normal: FloatArray,
+    points: int,
+    half_size: Range,
+    draw: Callable[[IndexArray], FloatArray],
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Points of picture 1 and where picture 2 sees them; motions without enough of them are drawn again."""
+    count = len(distortion)
+    half = np.asarray(half_size)
+    if np.min(1.0 + distortion * np.sum(half**2), initial=1.0) <= 0.0:
+        raise ArgumentError(
+            f"a distortion of {np.min(distortion):g} folds the corners of pictures this large"
+        )
+    x1, x2 = np.empty((count, points, 2)), np.empty((count, points, 2))
+    h = np.empty((count, 3, 3))
+    missing = np.arange(count)
+    for _ in range(_MAX_ROUNDS):
+        if not len(missing):
+            return x1, x2, h
+        motion = draw(missing)
+        candidates = half * rng.uniform(-1.0, 1.0, (len(missing), _CANDIDATES_PER_POINT * points, 2))
+        seen = _batch_transfer(motion, distortion[missing], candidates)
+        # NaN, a point that cannot be seen, compares as False.
+        visible = (np.abs(seen) <= half).all(axis=-1) & (
+            _steepness(candidates, distortion[missing], normal[missing]) > _MIN_STEEPNESS
+        )
+        first = np.argsort(~visible, axis=1, kind="stable")[:, :points, None]
+        enough = visible.sum(axis=1) >= points
+        x1[missing] = np.take_along_axis(candidates, first, axis=1)
+        x2[missing] = np.take_along_axis(seen, first, axis=1)
+        h[missing] = motion
+        missing = missing[~enough]
+    raise ArgumentError("these ranges give pictures that have too few points in common")
+
+
+def _steepness(points: FloatArray, distortion: FloatArray, normal: FloatArray) -> FloatArray:
+    """Cosine between the ray of each measured point (B, k, 2) and its plane's normal (B, 3)."""
+    rays = lift(points, distortion[:, None])
+    along: FloatArray = np.einsum("bki,bi->bk", rays, normal)
+    return along / np.linalg.norm(rays, axis=-1)
+
+
+def _batch_transfer(homography: FloatArray, distortion: FloatArray, points: FloatArray) -> FloatArray:
+    """Each instance's own points (B, k, 2) through its own H and λ."""
+    lifted = lift(points, distortion[:, None])
+    return distort(project(lifted @ np.swapaxes(homography, 1, 2)), distortion[:, None])
+
+
+def _rigid_in_plane(motion: FloatArray) -> FloatArray:
+    """``Rz(φ) diag(1, 1, height) T`` of rows (φ, tx, ty, height); shape (B, 3, 3)."""
+    yaw, translation, height = motion[:, 0], motion[:, 1:3], motion[:, 3]
+    matrix = np.zeros((len(motion), 3, 3))
+    matrix[:, 0, 0] = matrix[:, 1, 1] = np.cos(yaw)
+    matrix[:, 1, 0] = np.sin(yaw)
+    matrix[:, 0, 1] = -matrix[:, 1, 0]
+    matrix[:, :2, 2] = -np.einsum("bij,bj->bi", matrix[:, :2, :2], translation)
+    matrix[:, 2, 2] = height
+    return matrix
+
+
+def _distance(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Frobenius distance of batches of homographies, scaled to unit norm, for the better sign."""
+    a = a / np.linalg.norm(a, axis=(1, 2), keepdims=True)
+    b = b / np.linalg.norm(b, axis=(1, 2), keepdims=True)
+    distance: FloatArray = np.minimum(np.linalg.norm(a - b, axis=(1, 2)), np.linalg.norm(a + b, axis=(1, 2)))
+    return distance

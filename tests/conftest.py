@@ -1,0 +1,22 @@
+"""Fixtures that tests share."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+# The development pictures lie beside the checkout; they are not part of the project.
+_SHARED_DATA = Path(__file__).resolve().parents[1] / "../shared/data"
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Callable[[str], Path]:
+    """``shared_data(name)``: folder or file of the development pictures; the test is skipped where it is absent."""
+
+    def locate(name: str) -> Path:
+        path = (_SHARED_DATA / name).resolve()
+        if not path.exists():
+            pytest.skip(f"development pictures {name!r} are not here")
+        return path
+
+    return locate
