@@ -24,6 +24,13 @@ FloatArray = NDArray[np.float64]
 
 _NEWTON_STEPS = 12
 
+FOCAL_LOG_STD = {"option": 0.01, "file": 0.01, "estimate": 0.05, "exif": 0.05, "guess": 0.3}
+"""Standard deviation of the logarithm of a focal length, by where it comes from."""
+
+_GUESSED_FOCAL = (
+    1.2  # half diagonals: a 26 mm lens on 36 x 24 mm, in the middle of what phones and drones carry
+)
+
 
 def undistort(points: ArrayLike, distortion: ArrayLike, distortion2: float = 0.0) -> FloatArray:
     """Undistort normalized points.
@@ -106,7 +113,7 @@ class Camera:
     focal : float or None
         Focal length, px, or None where nothing is known of it.
     focal_source : str or None
-        Where the focal length comes from: "option", "exif", "guess", "estimate" or "file".
+        Where the focal length comes from, a key of :data:`FOCAL_LOG_STD`.
     distortion_std : float or None
         Standard deviation of λ; None where it was given and not estimated.
 
@@ -136,8 +143,12 @@ class Camera:
             raise ArgumentError(f"camera has a value that is not finite: {numbers}")
         if self.focal is not None and not (math.isfinite(self.focal) and self.focal > 0):
             raise ArgumentError(f"focal length must be positive, not {self.focal}")
+        if self.focal_source is not None and self.focal_source not in FOCAL_LOG_STD:
+            raise ArgumentError(f"unknown source of a focal length: {self.focal_source!r}")
         if np.isnan(undistort(self.normalize(self.outline(1)), self.distortion, self.distortion2)).any():
-            raise ArgumentError(f"distortion {self.distortion:g} folds the picture at a corner; it must be above -1")
+            raise ArgumentError(
+                f"distortion {self.distortion:g} folds the picture at a corner; it must be above -1"
+            )
 
     @property
     def half_diagonal(self) -> float:
@@ -153,6 +164,17 @@ class Camera:
     def distortion_focal(self) -> float | None:
         """λ for points in focal lengths from the centre, or None without a focal length."""
         return None if self.focal is None else self.distortion_px * self.focal**2
+
+    @property
+    def focal_log_std(self) -> float:
+        """Standard deviation of the logarithm of the focal length."""
+        return FOCAL_LOG_STD[self.focal_source or "guess"]
+
+    def with_focal(self) -> Self:
+        """This camera, with a guessed focal length where none is known."""
+        if self.focal is not None:
+            return self
+        return replace(self, focal=_GUESSED_FOCAL * self.half_diagonal, focal_source="guess")
 
     def normalize(self, points: ArrayLike) -> FloatArray:
         """Pixels (..., 2) to normalized points, in half diagonals from the centre."""

@@ -77,12 +77,14 @@ class PlanarMotion:
         h = np.array(homography, dtype=np.float64)
         h = h / np.linalg.norm(h)
         row_space = np.linalg.svd(h - np.eye(3) * np.trace(h) / 3)[2][0]
-        candidates = [cls._with_normal(h, n) for n in (*np.linalg.eig(h.T)[1].T.real, row_space)]
+        candidates = [
+            cls.from_homography_and_normal(h, n) for n in (*np.linalg.eig(h.T)[1].T.real, row_space)
+        ]
         return min(candidates, key=lambda motion: motion._distance(h))
 
     @classmethod
-    def _with_normal(cls, h: FloatArray, normal: FloatArray) -> Self:
-        """The motion nearest to ``h`` for a given plane normal of any length and sign."""
+    def from_homography_and_normal(cls, h: FloatArray, normal: FloatArray) -> Self:
+        """The motion nearest to a homography (3, 3) for a given plane normal (3,) of any length and sign."""
         if not normal.any():
             normal = np.array([0.0, 0.0, 1.0])
         psi, theta = tilt_from_normal(normal if normal[2] >= 0.0 else -normal)

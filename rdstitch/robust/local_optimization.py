@@ -1,0 +1,156 @@
+"""Refinement of homography and λ over all correspondences at once.
+
+Levenberg-Marquardt on the parameters of a pair model and λ, with the Geman-McClure loss
+``e² / (1 + e²/c²)`` of the whitened transfer error in measured pixels, so that correspondences that do not fit lose
+their influence without ever being decided upon.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rdstitch.camera import FloatArray
+from rdstitch.radial_homography import measurement_whitening, transfer_jacobian
+from rdstitch.robust.measurements import Measurements
+from rdstitch.robust.pair_models import PairModel
+
+_LARGEST_BEND = 0.98  # |λ| in the half-diagonal frame; beyond, the lens model folds at the corner
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A model fitted to the correspondences.
+
+    Attributes
+    ----------
+    model : PairModel
+    state : ndarray
+        The model's state.
+    distortion : float
+        λ in the half-diagonal frame.
+    errors : ndarray of shape (N,)
+        Whitened transfer errors, px; inf where the point cannot be transferred.
+    cost : float
+        Value of the loss, px².
+    information : ndarray of shape (P, P)
+        Weighted ``J'J``, 1/px²: by λ first (only where it was free), then by the model's parameters.
+    """
+
+    model: PairModel
+    state: FloatArray
+    distortion: float
+    errors: FloatArray
+    cost: float
+    information: FloatArray
+
+    @property
+    def homography(self) -> FloatArray:
+        """H (3, 3)."""
+        return self.model.homography(self.state)
+
+
+@dataclass(frozen=True)
+class _Linearized:
+    cost: float
+    errors: FloatArray
+    information: FloatArray
+    gradient: FloatArray
+
+
+def refine(
+    model: PairModel,
+    homography: FloatArray,
+    distortion: float,
+    data: Measurements,
+    scale: float,
+    *,
+    fixed_distortion: bool = False,
+    noise: float = 1.0,
+    iterations: int = 10,
+) -> Refined:
+    """Fit a model and λ, starting from a homography.
+
+    Parameters
+    ----------
+    model : PairModel
+    homography : ndarray of shape (3, 3)
+    distortion : float
+        Start of λ, or its value if ``fixed_distortion``.
+    data : Measurements
+    scale : float
+        ``c`` of the loss, px.
+    noise : float
+        Standard deviation of the measurements, px: the weight of the model's prior against the data.
+    iterations : int
+        At most so many steps.
+    """
+    state = model.initialize(homography)
+    current = _linearize(model, state, distortion, data, scale, fixed_distortion, noise)
+    damping = 1e-4
+    first = 0 if fixed_distortion else 1
+    for _ in range(iterations):
+        diagonal = np.diag(current.information)
+        damped = current.information + np.diag(damping * diagonal + 1e-12 * diagonal.max(initial=1e-300))
+        try:
+            step = -np.linalg.solve(damped, current.gradient)
+        except np.linalg.LinAlgError:
+            break
+        moved_distortion = distortion if fixed_distortion else float(distortion + step[0])
+        moved_state = model.retract(state, step[first:])
+        if abs(moved_distortion) < _LARGEST_BEND and np.isfinite(moved_state).all():
+            moved = _linearize(model, moved_state, moved_distortion, data, scale, fixed_distortion, noise)
+            if moved.cost < current.cost:
+                gain = (current.cost - moved.cost) / current.cost
+                state, distortion, current = moved_state, moved_distortion, moved
+                damping = max(damping / 10.0, 1e-9)
+                if gain < 1e-6:
+                    break
+                continue
+        damping *= 20.0
+        if damping > 1e4:
+            break
+    return Refined(model, state, distortion, current.errors, current.cost, current.information)
+
+
+def _linearize(
+    model: PairModel,
+    state: FloatArray,
+    distortion: float,
+    data: Measurements,
+    scale: float,
+    fixed_distortion: bool,
+    noise: float,
+) -> _Linearized:
+    """Loss, normal matrix and gradient at a state."""
+    transfer = transfer_jacobian(model.homography(state), distortion, data.x1)
+    residuals = (transfer.points - data.x2) * data.px
+    lost = ~np.isfinite(residuals).all(axis=1)
+    columns = transfer.by_homography @ model.jacobian(state)
+    if not fixed_distortion:
+        columns = np.concatenate([transfer.by_lens[:, :, :1], columns], axis=2)
+    columns *= data.px
+    whitening = measurement_whitening(transfer.by_point * data.px_ratio)
+    residuals = np.einsum("nij,nj->ni", whitening, residuals)
+    columns = whitening @ columns
+    residuals[lost] = 0.0
+    columns[lost] = 0.0
+
+    errors2 = np.einsum("ni,ni->n", residuals, residuals)
+    relative = 1.0 / (1.0 + errors2 / scale**2)
+    weights = np.where(lost, 0.0, relative**2)
+    flat = (columns * np.sqrt(weights)[:, None, None]).reshape(-1, columns.shape[2])
+    weighted = (residuals * np.sqrt(weights)[:, None]).reshape(-1)
+    information, gradient = flat.T @ flat, flat.T @ weighted
+    cost = float(np.sum(np.where(lost, scale**2, errors2 * relative)))
+
+    prior, by_prior = model.prior(state)
+    if len(prior):
+        by_prior = np.concatenate(
+            [np.zeros((len(prior), information.shape[0] - by_prior.shape[1])), by_prior], axis=1
+        )
+        information = information + noise**2 * by_prior.T @ by_prior
+        gradient = gradient + noise**2 * by_prior.T @ prior
+        cost += noise**2 * float(prior @ prior)
+    errors = np.sqrt(errors2)
+    errors[lost] = np.inf
+    return _Linearized(cost, errors, information, gradient)

@@ -1,0 +1,153 @@
+"""Which model of the family describes a pair: the least free one that explains the data."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rdstitch.camera import FloatArray
+from rdstitch.robust.local_optimization import Refined, refine
+from rdstitch.robust.measurements import Measurements
+from rdstitch.robust.pair_models import HomographyModel, PairModel
+
+_LEAST_NOISE = 0.02  # px; below, noise-free data would reject every model over rounding
+_RAYLEIGH_MEDIAN = 1.1774  # median length of a two-dimensional normal vector of standard deviation 1
+_LOSS_WIDTH = 4.0  # scale of the loss in standard deviations of the noise
+
+_LARGEST_STD = 0.1
+"""Standard deviation of λ above which the pictures say nothing useful about it: a tenth of the radius at the corner."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The chosen model, fitted.
+
+    Attributes
+    ----------
+    fit : Refined
+    noise : float
+        Standard deviation of the transfer errors, per axis, px.
+    covariance : ndarray of shape (P, P)
+        Of λ (first, where it was estimated) and the model's parameters.
+    distortion_std : float
+        Standard deviation of λ; 0 where it was given, inf where it is not observable (λ is then 0 in ``fit``).
+    reason : str
+    """
+
+    fit: Refined
+    noise: float
+    covariance: FloatArray
+    distortion_std: float
+    reason: str
+
+
+def select_model(
+    models: list[PairModel],
+    homography: FloatArray,
+    distortion: float,
+    data: Measurements,
+    threshold: float,
+    *,
+    fixed_distortion: bool,
+) -> Selection:
+    """Fit every model and choose by the Bayesian information criterion.
+
+    The noise is that of the freest model, so that a lesser model is held against what the pictures allow and not
+    against its own misfit.
+
+    Parameters
+    ----------
+    models : list of PairModel
+        From least to most free; the last one is a :class:`HomographyModel`.
+    homography, distortion
+        Where to start.
+    data : Measurements
+    threshold : float
+        Largest transfer error of an inlier, px.
+    fixed_distortion : bool
+        Whether λ is known.
+    """
+    free = refine(
+        HomographyModel(),
+        homography,
+        distortion,
+        data,
+        threshold,
+        fixed_distortion=fixed_distortion,
+        iterations=8,
+    )
+    noise = noise_of(free.errors, threshold)
+    scale = min(threshold, _LOSS_WIDTH * noise)
+    inliers = max(1, int(np.sum(free.errors < threshold)))
+
+    def fit(model: PairModel, start: Refined, fixed: bool) -> Refined:
+        return refine(
+            model,
+            start.homography,
+            start.distortion,
+            data,
+            scale,
+            fixed_distortion=fixed,
+            noise=noise,
+            iterations=15,
+        )
+
+    fits = [fit(model, free, fixed_distortion) for model in models]
+    penalties = [len(f.information) * np.log(2 * inliers) for f in fits]
+    criteria = [f.cost / noise**2 + penalty for f, penalty in zip(fits, penalties, strict=True)]
+    chosen = fits[int(np.argmin(criteria))]
+    reason = _explain(models, fits, chosen, threshold)
+    if fixed_distortion:
+        covariance = _covariance(chosen, noise_of(chosen.errors, threshold))
+        return Selection(chosen, noise_of(chosen.errors, threshold), covariance, 0.0, reason)
+
+    covariance = _covariance(chosen, noise_of(chosen.errors, threshold))
+    std = float(np.sqrt(covariance[0, 0]))
+    if std < _LARGEST_STD:
+        return Selection(chosen, noise_of(chosen.errors, threshold), covariance, std, reason)
+    straight = Refined(chosen.model, chosen.state, 0.0, chosen.errors, chosen.cost, chosen.information)
+    chosen = fit(chosen.model, straight, True)
+    reason += f"; λ is not observable (standard deviation {std:.2g}) and was set to 0"
+    return Selection(
+        chosen,
+        noise_of(chosen.errors, threshold),
+        _covariance(chosen, noise_of(chosen.errors, threshold)),
+        np.inf,
+        reason,
+    )
+
+
+def noise_of(errors: FloatArray, threshold: float) -> float:
+    """Standard deviation per axis, px, from the median error of those below the threshold."""
+    inside = errors[errors < threshold]
+    return _LEAST_NOISE if not len(inside) else max(float(np.median(inside)) / _RAYLEIGH_MEDIAN, _LEAST_NOISE)
+
+
+def _covariance(fit: Refined, noise: float) -> FloatArray:
+    """Inverse of the normal matrix times the noise variance; inf where a direction is not determined."""
+    scale = np.sqrt(np.diag(fit.information))
+    if not (scale > 0.0).all():
+        return np.full_like(fit.information, np.inf)
+    correlation = fit.information / np.outer(scale, scale)
+    values, vectors = np.linalg.eigh(correlation)
+    if values[0] < 1e-13:
+        return np.full_like(fit.information, np.inf)
+    inverse = (vectors / values) @ vectors.T
+    return np.asarray(noise**2 * inverse / np.outer(scale, scale))
+
+
+def _explain(models: list[PairModel], fits: list[Refined], chosen: Refined, threshold: float) -> str:
+    """One clause on why this model and not another."""
+    rms = {f.model.name: rms_of(f.errors, threshold) for f in fits}
+    listed = ", ".join(f"{m.name} {rms[m.name]:.2f} px" for m in models)
+    name = chosen.model.name
+    if len(models) == 1:
+        return f"{name}: the only model asked for (rms {listed})"
+    if isinstance(chosen.model, HomographyModel):
+        return f"{name}: no model with less freedom explains the data (rms {listed})"
+    return f"{name}: the least free model that explains the data (rms {listed})"
+
+
+def rms_of(errors: FloatArray, threshold: float) -> float:
+    """Root mean square of the errors below the threshold, px; NaN where there are none."""
+    inside = errors[errors < threshold]
+    return float(np.sqrt(np.mean(inside**2))) if len(inside) else np.nan

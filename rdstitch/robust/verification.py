@@ -1,0 +1,45 @@
+"""Whether agreement is more than chance."""
+
+import numpy as np
+from scipy.special import betainc
+
+from rdstitch.camera import FloatArray
+
+_CELLS_PER_DIAGONAL = 32
+_LEAST_CELLS = 8
+_LARGEST_CHANCE = 1e-4
+
+
+def doubts(
+    points1: FloatArray,
+    points2: FloatArray,
+    inliers: FloatArray,
+    image_size: tuple[int, int],
+    threshold: float,
+) -> str | None:
+    """Why the inliers could be chance, or None.
+
+    Two questions are asked. Are there more inliers than wrong matches would give by chance? A wrong match lies within
+    the threshold with a probability of a disc's share of the picture. And do they lie in enough different places?
+    Neighbouring matches go wrong together, on a moving object or on a repeated pattern, and count once.
+
+    Parameters
+    ----------
+    points1, points2 : ndarray of shape (N, 2)
+        Measured points, px.
+    inliers : ndarray of shape (N,), bool
+    image_size : (int, int)
+        Of picture 2, px.
+    threshold : float
+        px.
+    """
+    count = int(inliers.sum())
+    cell = float(np.hypot(*image_size)) / _CELLS_PER_DIAGONAL
+    cells = min(len(np.unique(np.floor(p[inliers] / cell), axis=0)) for p in (points1, points2))
+    if cells < _LEAST_CELLS:
+        return f"{count} of {len(inliers)} matches agree, in only {cells} places of the picture"
+    by_chance = min(0.5, np.pi * threshold**2 / (image_size[0] * image_size[1]) + 0.01)
+    trials = len(inliers) - 4
+    if trials > 0 and betainc(max(1, count - 4), trials - count + 5, by_chance) > _LARGEST_CHANCE:
+        return f"{count} of {len(inliers)} matches agree, no more than chance allows"
+    return None
