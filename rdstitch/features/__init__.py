@@ -1,1 +1,1 @@
-"""TODO."""
+"""Features of pictures, and their matches."""

@@ -1,0 +1,121 @@
+"""Feature detection: pictures in, keypoints with descriptors out."""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from rdstitch.errors import ArgumentError
+from rdstitch.features.keypoints import Features
+from rdstitch.features.opencv import create_detector, describe
+from rdstitch.features.options import KINDS, FeatureOptions
+from rdstitch.features.picture import Image, Mask, prepare
+from rdstitch.features.spread import spread, strongest
+
+__all__ = ["KINDS", "FeatureOptions", "Features", "Source", "detect", "detect_all"]
+
+Source = Callable[[], tuple[Image, Mask | None]]
+"""Loads one picture and its mask (True or non-zero: use it; None: use all) when it is called."""
+
+
+def detect(image: Image, options: FeatureOptions | None = None, mask: Mask | None = None) -> Features:
+    """Detect and describe the features of one picture.
+
+    Parameters
+    ----------
+    image : ndarray of shape (height, width) or (height, width, 1 to 4)
+        Grey, grey with alpha, RGB or RGB with alpha; uint8, or uint16 or float, which are stretched to 8
+        bits. Nothing is detected where alpha is zero or a float is not finite.
+    options : FeatureOptions, optional
+    mask : ndarray of shape (height, width), bool or uint8, optional
+        Where to look: True, or not zero. A keypoint whose extent reaches into the rest is dropped.
+
+    Returns
+    -------
+    Features
+        Points in px of ``image``, strongest first; none for a blank picture. The same for the same picture,
+        whatever the number of threads.
+
+    Raises
+    ------
+    ArgumentError
+        When the picture or the mask has the wrong shape or type, or when this OpenCV lacks the detector.
+    """
+    options = options or FeatureOptions()
+    picture = prepare(image, mask, options.work_megapixels)
+    detector = create_detector(options)
+    keypoints = detector.detect(picture.grey, None)
+    table = np.array([(*k.pt, k.size, k.angle, k.octave, k.response) for k in keypoints]).reshape(-1, 6)
+    # OpenCV's order is no promise: sort, so that the choice among equals is the same everywhere.
+    order = np.lexsort(table.T)[::-1]
+    order = order[picture.covers(table[order, :2], table[order, 2] / 2)]
+    points, response = table[order, :2], table[order, 5]
+    if options.spread:
+        cell = options.spread_cell * float(np.hypot(*picture.grey.shape))
+        chosen = order[spread(points, response, options.max_features, cell)]
+    else:
+        chosen = order[strongest(response, options.max_features)]
+    features = describe(detector, picture.grey, [keypoints[i] for i in chosen], options.kind)
+    scale = features.scale * float(np.sqrt(picture.factor.prod()))
+    return replace(features, points=picture.to_full_size(features.points), scale=scale)
+
+
+def detect_all(
+    sources: Sequence[Source],
+    options: FeatureOptions | None = None,
+    workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Features]:
+    """Detect the features of many pictures, several at a time; at most ``workers`` pictures are in memory.
+
+    Parameters
+    ----------
+    sources : sequence of callable
+        Each loads one picture and its mask.
+    options : FeatureOptions, optional
+    workers : int
+        Pictures to work on at the same time, each in one thread.
+    progress : callable, optional
+        Called in this thread with the number of pictures done and their total.
+
+    Returns
+    -------
+    list of Features
+        In the order of ``sources``.
+
+    Raises
+    ------
+    ArgumentError
+        As :func:`detect`.
+    Exception
+        What a source raises; of several, that of the first source.
+    """
+    options = options or FeatureOptions()
+    if workers < 1:
+        raise ArgumentError(f"workers must be at least 1, not {workers}")
+
+    def work(source: Source) -> Features:
+        image, mask = source()
+        return detect(image, options, mask)
+
+    results: list[Features] = []
+    with _one_opencv_thread(), ThreadPoolExecutor(workers) as pool:
+        for features in pool.map(work, sources):
+            results.append(features)
+            if progress is not None:
+                progress(len(results), len(sources))
+    return results
+
+
+@contextmanager
+def _one_opencv_thread() -> Iterator[None]:
+    """Keep OpenCV from starting threads of its own while we run several pictures at a time."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)

@@ -1,0 +1,39 @@
+"""Options of feature detection."""
+
+from dataclasses import dataclass
+
+from rdstitch.errors import ArgumentError
+
+KINDS = ("rootsift", "sift", "orb", "akaze", "kaze", "brisk")
+
+
+@dataclass(frozen=True)
+class FeatureOptions:
+    """Which features to detect, and how many.
+
+    Raises
+    ------
+    ArgumentError
+        When a value is out of range, or the kind unknown.
+    """
+
+    kind: str = "rootsift"  # one of KINDS
+    max_features: int = 4000  # keypoints kept per picture
+    work_megapixels: float | None = 2.0  # size at most that detection works at, 10⁶ px; None: full size
+    spread: bool = (
+        True  # the strongest of each cell of a grid in turn, rather than the strongest of the picture
+    )
+    spread_cell: float = 0.05  # side of a cell of that grid, fraction of the picture's diagonal
+    sift_contrast: float = 0.02  # SIFT's contrast threshold; 0.04 is OpenCV's, too high for hazy pictures
+    orb_fast_threshold: int = 7  # grey levels by which a corner must differ from its surroundings
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        if self.kind not in KINDS:
+            raise ArgumentError(f"unknown kind of features {self.kind!r}; known are {', '.join(KINDS)}")
+        if self.max_features < 1:
+            raise ArgumentError(f"max_features must be at least 1, not {self.max_features}")
+        if self.work_megapixels is not None and not self.work_megapixels > 0:
+            raise ArgumentError(f"work_megapixels must be positive, not {self.work_megapixels}")
+        if not 0 < self.spread_cell <= 1:
+            raise ArgumentError(f"spread_cell must be in (0, 1], not {self.spread_cell}")

@@ -1,0 +1,117 @@
+"""A picture as detectors want it: grey, 8 bits, of working size, with the distance to what is masked."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.camera import FloatArray
+from rdstitch.errors import ArgumentError
+
+Image = NDArray[Any]
+"""Of uint8, uint16 or float."""
+
+Mask = NDArray[Any]
+"""Of bool or uint8."""
+
+_STRETCH_PERCENTILES = (0.1, 99.9)
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A grey picture of working size.
+
+    Attributes
+    ----------
+    grey : ndarray of shape (height, width), uint8
+    clearance : ndarray of shape (height, width), float32, or None
+        Distance to the nearest masked pixel, px of ``grey``, zero if masked; None without mask.
+    factor : ndarray of shape (2,)
+        Full size divided by working size, horizontally and vertically.
+    """
+
+    grey: NDArray[np.uint8]
+    clearance: NDArray[np.float32] | None
+    factor: FloatArray
+
+    def covers(self, points: FloatArray, radius: FloatArray) -> NDArray[np.bool_]:
+        """Whether discs (N, 2), (N,) keep clear of the mask; px of ``grey``."""
+        if self.clearance is None:
+            return np.ones(len(points), dtype=bool)
+        height, width = self.clearance.shape
+        u, v = np.clip(np.rint(points), 0, (width - 1, height - 1)).astype(np.intp).T
+        clearance: NDArray[np.float32] = self.clearance[v, u]
+        return clearance > radius
+
+    def to_full_size(self, points: FloatArray) -> FloatArray:
+        """Px of ``grey`` to px of the full-size picture; (0, 0) is the centre of the first pixel in both."""
+        return (points + 0.5) * self.factor - 0.5
+
+
+def prepare(image: Image, mask: Mask | None, work_megapixels: float | None) -> Picture:
+    """Make a picture ready for detection; see :func:`rdstitch.features.detect.detect` for the arguments."""
+    if image.ndim not in (2, 3) or image.size == 0 or (image.ndim == 3 and image.shape[2] > 4):
+        raise ArgumentError(f"expected a picture of shape (height, width[, 1 to 4]), not {image.shape}")
+    usable = _usable(image, mask)
+    height, width = image.shape[:2]
+    shrink = 1.0 if work_megapixels is None else math.sqrt(work_megapixels * 1e6 / (width * height))
+    if shrink < 1.0:
+        size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        if usable is not None:
+            # A pixel is usable if all that it was made of is.
+            usable = cv2.resize(usable.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+    grey = _eight_bits(_grey(image), usable)
+    factor = np.array([width / grey.shape[1], height / grey.shape[0]])
+    return Picture(grey, None if usable is None else _clearance(usable), factor)
+
+
+def _usable(image: Image, mask: Mask | None) -> NDArray[np.bool_] | None:
+    """Where all of mask, alpha and finiteness allow features, or None for everywhere."""
+    parts: list[NDArray[np.bool_]] = []
+    if mask is not None:
+        if mask.shape != image.shape[:2]:
+            raise ArgumentError(f"mask of shape {mask.shape} for a picture of shape {image.shape[:2]}")
+        parts.append(mask != 0)
+    if image.ndim == 3 and image.shape[2] in (2, 4):
+        parts.append(image[..., -1] > 0)
+    if image.dtype.kind == "f":
+        parts.append(np.isfinite(image.reshape(*image.shape[:2], -1)).all(axis=2))
+    parts = [part for part in parts if not part.all()]
+    return np.logical_and.reduce(parts) if parts else None
+
+
+def _grey(image: Image) -> Image:
+    """Luminance of grey, grey with alpha, RGB and RGB with alpha; float64 counts as float32."""
+    if image.dtype.kind == "f":
+        image = image.astype(np.float32)
+    elif image.dtype not in (np.uint8, np.uint16):
+        raise ArgumentError(f"expected a picture of uint8, uint16 or float, not {image.dtype}")
+    if image.ndim == 2:
+        return image
+    if image.shape[2] < 3:
+        return np.ascontiguousarray(image[..., 0])
+    return cv2.cvtColor(image[..., :3], cv2.COLOR_RGB2GRAY)
+
+
+def _eight_bits(grey: Image, usable: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
+    """Stretch deeper pictures to 8 bits by percentiles of the part that is used, not by single hot pixels."""
+    if grey.dtype == np.uint8:
+        return np.ascontiguousarray(grey, dtype=np.uint8)
+    inside = grey if usable is None else grey[usable]
+    if inside.size == 0:
+        return np.zeros(grey.shape, dtype=np.uint8)
+    low, high = (float(value) for value in np.percentile(inside, _STRETCH_PERCENTILES))
+    finite = np.nan_to_num(grey.astype(np.float32), nan=low, posinf=high, neginf=low)
+    scaled = (finite - low) * (255.0 / max(high - low, 1e-12))
+    eight: NDArray[np.uint8] = np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
+    return eight
+
+
+def _clearance(usable: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Distance of each pixel to the nearest one that is not usable, px."""
+    distance: NDArray[np.float32] = cv2.distanceTransform(usable.astype(np.uint8), cv2.DIST_L2, 5)
+    return distance
