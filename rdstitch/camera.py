@@ -27,9 +27,7 @@ _NEWTON_STEPS = 12
 FOCAL_LOG_STD = {"option": 0.01, "file": 0.01, "estimate": 0.05, "exif": 0.05, "guess": 0.3}
 """Standard deviation of the logarithm of a focal length, by where it comes from."""
 
-_GUESSED_FOCAL = (
-    1.2  # half diagonals: a 26 mm lens on 36 x 24 mm, in the middle of what phones and drones carry
-)
+_GUESSED_FOCAL = 1.2  # half diagonals: a 26 mm lens on 36 x 24 mm, in the middle of what phones and drones carry
 
 
 def undistort(points: ArrayLike, distortion: ArrayLike, distortion2: float = 0.0) -> FloatArray:
@@ -146,9 +144,7 @@ class Camera:
         if self.focal_source is not None and self.focal_source not in FOCAL_LOG_STD:
             raise ArgumentError(f"unknown source of a focal length: {self.focal_source!r}")
         if np.isnan(undistort(self.normalize(self.outline(1)), self.distortion, self.distortion2)).any():
-            raise ArgumentError(
-                f"distortion {self.distortion:g} folds the picture at a corner; it must be above -1"
-            )
+            raise ArgumentError(f"distortion {self.distortion:g} folds the picture at a corner; it must be above -1")
 
     @property
     def half_diagonal(self) -> float:
@@ -171,7 +167,7 @@ class Camera:
         return FOCAL_LOG_STD[self.focal_source or "guess"]
 
     def with_focal(self) -> Self:
-        """This camera, with a guessed focal length where none is known."""
+        """The camera with a guessed focal length where none is known."""
         if self.focal is not None:
             return self
         return replace(self, focal=_GUESSED_FOCAL * self.half_diagonal, focal_source="guess")

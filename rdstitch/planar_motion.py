@@ -77,9 +77,7 @@ class PlanarMotion:
         h = np.array(homography, dtype=np.float64)
         h = h / np.linalg.norm(h)
         row_space = np.linalg.svd(h - np.eye(3) * np.trace(h) / 3)[2][0]
-        candidates = [
-            cls.from_homography_and_normal(h, n) for n in (*np.linalg.eig(h.T)[1].T.real, row_space)
-        ]
+        candidates = [cls.from_homography_and_normal(h, n) for n in (*np.linalg.eig(h.T)[1].T.real, row_space)]
         return min(candidates, key=lambda motion: motion._distance(h))
 
     @classmethod

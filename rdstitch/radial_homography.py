@@ -31,9 +31,7 @@ def project(homogeneous: FloatArray) -> FloatArray:
     return homogeneous[..., :2] / np.where(third > 0.0, third, np.nan)
 
 
-def transfer(
-    homography: ArrayLike, distortion: ArrayLike, points: ArrayLike, distortion2: float = 0.0
-) -> FloatArray:
+def transfer(homography: ArrayLike, distortion: ArrayLike, points: ArrayLike, distortion2: float = 0.0) -> FloatArray:
     """Where measured points of picture 1 are measured in picture 2: undistort, apply H, distort.
 
     Parameters

@@ -145,9 +145,7 @@ def _linearize(
 
     prior, by_prior = model.prior(state)
     if len(prior):
-        by_prior = np.concatenate(
-            [np.zeros((len(prior), information.shape[0] - by_prior.shape[1])), by_prior], axis=1
-        )
+        by_prior = np.concatenate([np.zeros((len(prior), information.shape[0] - by_prior.shape[1])), by_prior], axis=1)
         information = information + noise**2 * by_prior.T @ by_prior
         gradient = gradient + noise**2 * by_prior.T @ prior
         cost += noise**2 * float(prior @ prior)

@@ -135,9 +135,7 @@ class PlanarModel:
     def motion(self, state: FloatArray) -> PlanarMotion:
         """The motion that a state stands for (with the tilt of picture 1 where the two are known)."""
         tilt = (float(state[0]), float(state[1])) if self.tilts is None else self.tilts[0]
-        return PlanarMotion(
-            tilt, float(state[2]), (float(state[3]), float(state[4])), float(np.exp(state[_HEIGHT]))
-        )
+        return PlanarMotion(tilt, float(state[2]), (float(state[3]), float(state[4])), float(np.exp(state[_HEIGHT])))
 
     def focal_correction(self, state: FloatArray) -> float:
         """Factor by which the focal length was corrected."""

@@ -87,9 +87,7 @@ def ransac(solvers: list[MinimalSolver], data: Measurements, options: RansacOpti
     options : RansacOptions
     """
     lanes = [
-        _Lane(solver, data, options, index)
-        for index, solver in enumerate(solvers)
-        if solver.sample_size <= len(data)
+        _Lane(solver, data, options, index) for index, solver in enumerate(solvers) if solver.sample_size <= len(data)
     ]
     best: Hypothesis | None = None
     iterations, batch = 0, _FIRST_BATCH

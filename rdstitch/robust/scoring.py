@@ -32,9 +32,7 @@ def transfer_errors2(homography: FloatArray, distortion: FloatArray, data: Measu
     Written out for speed: with ``z = H p(λ)`` the distorted point is
     ``2 z_xy / (z_w + sqrt(z_w² - 4 λ |z_xy|²))``.
     """
-    basis = np.stack(
-        [data.x1[:, 0], data.x1[:, 1], np.ones(len(data)), np.einsum("ni,ni->n", data.x1, data.x1)]
-    )
+    basis = np.stack([data.x1[:, 0], data.x1[:, 1], np.ones(len(data)), np.einsum("ni,ni->n", data.x1, data.x1)])
     coefficients = np.concatenate([homography, homography[:, :, 2:] * distortion[:, None, None]], axis=2)
     z = np.matmul(coefficients, basis)
     squares = z[:, 0] ** 2
