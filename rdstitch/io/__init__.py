@@ -1,1 +1,20 @@
-"""TODO."""
+"""Files in and out: pictures with their metadata, sidecars, and nothing half-written."""
+
+from rdstitch.io.atomic import atomic_output, check_output, write_json_atomic, write_text_atomic
+from rdstitch.io.metadata import Attitude, GpsPosition, Metadata, read_metadata
+from rdstitch.io.read import Picture, read_image
+from rdstitch.io.write import write_image
+
+__all__ = [
+    "Attitude",
+    "GpsPosition",
+    "Metadata",
+    "Picture",
+    "atomic_output",
+    "check_output",
+    "read_image",
+    "read_metadata",
+    "write_image",
+    "write_json_atomic",
+    "write_text_atomic",
+]

@@ -1,0 +1,82 @@
+"""Guards around the decoders: files that are no pictures end as one InputError, and no warning leaks."""
+
+import logging
+import os
+import stat
+import struct
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+from PIL import Image
+
+from rdstitch.errors import InputError
+
+# What Pillow, tifffile and OpenCV have been seen to raise on damaged files.
+_DAMAGE = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    TypeError,
+    LookupError,
+    ArithmeticError,
+    AttributeError,
+    RuntimeError,
+    AssertionError,
+    EOFError,
+    struct.error,
+    zlib.error,
+    Image.DecompressionBombError,
+    cv2.error,
+)
+
+
+def check_readable(path: Path) -> None:
+    """Refuse what cannot be a picture file, before a decoder blocks or stumbles on it.
+
+    Raises
+    ------
+    InputError
+        When the path is missing, no regular file, empty, or not readable.
+    """
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        hint = "a link to nothing" if path.is_symlink() else "no such file"
+        raise InputError(f"{path}: {hint}; check the name") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}; check the name") from error
+    if stat.S_ISDIR(status.st_mode):
+        raise InputError(f"{path}: is a folder, not a picture; name the pictures in it")
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path}: is not a regular file; copy it to one first")
+    if status.st_size == 0:
+        raise InputError(f"{path}: is empty (0 bytes); copy it again from its source")
+    if not os.access(path, os.R_OK):
+        raise InputError(f"{path}: permission denied; make it readable")
+
+
+@contextmanager
+def decoding(path: Path) -> Iterator[None]:
+    """Run a decoder: its warnings are swallowed, its failures become an InputError that names the file."""
+    logger = logging.getLogger("tifffile")
+    was_disabled, logger.disabled = logger.disabled, True
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except MemoryError as error:
+        raise InputError(f"{path}: too large to read into memory; make it smaller first") from error
+    except Image.DecompressionBombError as error:
+        raise InputError(f"{path}: more than 178 megapixels; cut it up or make it smaller first") from error
+    except PermissionError as error:
+        raise InputError(f"{path}: permission denied; make it readable") from error
+    except _DAMAGE as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = reason.replace(f"'{path}'", "the file")
+        raise InputError(f"{path}: not a picture that can be read, or damaged ({reason[:160]})") from error
+    finally:
+        logger.disabled = was_disabled

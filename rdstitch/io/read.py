@@ -1,0 +1,203 @@
+"""Reading a picture: any common file to an array in RGB order, upright, with its alpha and metadata."""
+
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image
+
+from rdstitch.errors import InputError
+from rdstitch.io.decoding import check_readable, decoding
+from rdstitch.io.metadata import Metadata, metadata_of, read_metadata
+
+Pixels = NDArray[Any]
+
+_OPAQUE = 255
+_TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+_PNG_PIXEL_CHUNKS = (b"IHDR", b"tRNS", b"IDAT", b"IEND")
+_GREY_16 = ("I;16", "I;16B", "I;16L", "I;16N", "I")
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture in memory.
+
+    Attributes
+    ----------
+    pixels : ndarray of shape (height, width) or (height, width, channels)
+        uint8, uint16 or float32. Colour is in RGB order, never BGR. The EXIF orientation has been applied.
+    alpha : ndarray of shape (height, width), uint8, or None
+        255 where the picture is opaque, 0 where it says nothing; None when it is opaque everywhere.
+    metadata : Metadata
+    """
+
+    pixels: Pixels
+    alpha: NDArray[np.uint8] | None
+    metadata: Metadata
+
+
+def read_image(path: str | Path) -> Picture:
+    """Read a picture file.
+
+    JPEG, PNG, TIFF, WebP and whatever else Pillow reads, with 8 or 16 bit or floating-point samples. Of an animated
+    or multi-page file the first picture counts. CMYK and palette colours become RGB. NaN or infinite samples of a
+    floating-point file become transparent zeros.
+
+    Raises
+    ------
+    InputError
+        When the file is missing, unreadable, no picture, or damaged; the text names the file.
+    """
+    file = Path(path)
+    check_readable(file)
+    with decoding(file):
+        with file.open("rb") as stream:
+            magic = stream.read(8)
+        if magic[:4] in _TIFF_MAGIC:
+            return _finish(file, *_read_tiff(file), read_metadata(file))
+        with Image.open(file) as image:
+            metadata = metadata_of(image)
+            if magic == _PNG_MAGIC and metadata.bit_depth == 16 and image.mode not in _GREY_16:
+                samples, alpha = _split(_read_16_bit_png(file))
+            else:
+                samples, alpha = _from_pillow(image)
+        return _finish(file, samples, alpha, metadata)
+
+
+def _from_pillow(image: Image.Image) -> tuple[Pixels, Pixels | None]:
+    """Samples and alpha of any mode of Pillow's."""
+    if image.mode in _GREY_16:
+        image.load()
+        return np.asarray(image).astype(np.uint16), None
+    if image.mode == "F":
+        return np.asarray(image, dtype=np.float32), None
+    transparent = "A" in image.getbands() or "transparency" in image.info or image.mode in ("La", "RGBa")
+    grey = image.mode in ("1", "L", "LA", "La") or (image.mode == "P" and _is_grey(image))
+    image = image.convert("RGBA" if transparent else "L" if grey else "RGB")
+    samples = np.asarray(image)
+    if not transparent:
+        return samples, None
+    return (samples[..., 0] if grey else samples[..., :3]), samples[..., 3]
+
+
+def _is_grey(image: Image.Image) -> bool:
+    """Whether a palette holds shades of grey only."""
+    palette = np.array(image.getpalette("RGB") or [], dtype=np.uint8).reshape(-1, 3)
+    return bool((palette == palette[:, :1]).all())
+
+
+def _read_16_bit_png(file: Path) -> Pixels:
+    """16-bit colour, which Pillow would cut to 8 bit; damage is found by the checksums, which OpenCV tolerates."""
+    data = file.read_bytes()
+    position, kind = len(_PNG_MAGIC), b""
+    kept = [data[:position]]
+    while kind != b"IEND":
+        length, kind = struct.unpack_from(">I4s", data, position)
+        end = position + length + 12
+        (checksum,) = struct.unpack_from(">I", data, end - 4)
+        if zlib.crc32(data[position + 4 : end - 4]) != checksum:
+            raise ValueError("checksum error")
+        # libpng prints complaints about odd colour profiles and the like; it need not see them.
+        if kind in _PNG_PIXEL_CHUNKS:
+            kept.append(data[position:end])
+        position = end
+    return _decode_with_opencv(b"".join(kept))
+
+
+def _decode_with_opencv(data: bytes) -> Pixels:
+    """Samples in RGB(A) order as stored."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+        samples = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    if samples is None:
+        raise ValueError("the decoder gives up")
+    if samples.ndim == 3 and samples.shape[2] in (3, 4):
+        code = cv2.COLOR_BGR2RGB if samples.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
+        return cv2.cvtColor(samples, code)
+    return samples
+
+
+def _split(samples: Pixels) -> tuple[Pixels, Pixels | None]:
+    """Colour and alpha of an RGBA array."""
+    if samples.ndim == 3 and samples.shape[2] == 4:
+        return samples[..., :3], samples[..., 3]
+    return samples, None
+
+
+def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
+    """Samples and alpha of the first page, with any number of bands."""
+    with tifffile.TiffFile(file) as tiff:
+        page = tiff.pages.first
+        plain = page.photometric in (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB)
+        has_alpha = any(extra in (1, 2) for extra in page.extrasamples)
+        try:
+            samples = page.asarray() if plain else None
+        except ValueError as error:
+            if "imagecodecs" not in str(error):
+                raise
+            samples = None
+        axes = page.axes
+    if samples is None:
+        return _split(_decode_with_opencv(file.read_bytes()))
+    if axes.startswith("S"):
+        samples, axes = np.moveaxis(samples, 0, -1), axes[1:] + "S"
+    if axes not in ("YX", "YXS"):
+        raise ValueError(f"unexpected axes {axes}")
+    if samples.dtype == np.bool_:
+        samples = samples.astype(np.uint8) * _OPAQUE
+    if axes == "YXS" and has_alpha:
+        samples, alpha = samples[..., :-1], samples[..., -1]
+        return (samples[..., 0] if samples.shape[2] == 1 else samples), alpha
+    return samples, None
+
+
+def _finish(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Metadata) -> Picture:
+    """Upright, in one of the three sample types, contiguous, and without NaN."""
+    if samples.size == 0:
+        raise InputError(f"{file}: has no pixels")
+    opaque = None if alpha is None else _as_uint8(alpha)
+    if samples.dtype not in (np.uint8, np.uint16):
+        samples = samples.astype(np.float32)
+        finite = np.isfinite(samples)
+        valid = finite if samples.ndim == 2 else finite.all(axis=2)
+        if not valid.all():
+            samples = np.where(finite, samples, np.float32(0.0))
+            whole = np.full(valid.shape, _OPAQUE, np.uint8) if opaque is None else opaque
+            opaque = np.where(valid, whole, np.uint8(0))
+    if opaque is not None and bool((opaque == _OPAQUE).all()):
+        opaque = None
+    upright = np.ascontiguousarray(_turn(samples, metadata.orientation))
+    turned = None if opaque is None else np.ascontiguousarray(_turn(opaque, metadata.orientation))
+    return Picture(upright, turned, metadata)
+
+
+def _as_uint8(alpha: Pixels) -> NDArray[np.uint8]:
+    """Alpha of any sample type as 0..255."""
+    if alpha.dtype == np.uint8:
+        return np.asarray(alpha, dtype=np.uint8)
+    full = np.iinfo(alpha.dtype).max if np.issubdtype(alpha.dtype, np.integer) else 1.0
+    share = np.clip(np.nan_to_num(alpha.astype(np.float32) / full), 0.0, 1.0)
+    return np.rint(share * _OPAQUE).astype(np.uint8)
+
+
+def _turn(samples: Pixels, orientation: int) -> Pixels:
+    """Apply an EXIF orientation (1 to 8)."""
+    if orientation >= 5:
+        samples = np.swapaxes(samples, 0, 1)
+    # After the transposition of 5..8: which axes run backwards.
+    if orientation in (3, 4, 7, 8):
+        samples = samples[::-1]
+    if orientation in (2, 3, 6, 7):
+        samples = samples[:, ::-1]
+    return samples
