@@ -76,7 +76,9 @@ def distort(points: ArrayLike, distortion: ArrayLike, distortion2: float = 0.0) 
     discriminant = 1.0 - 4.0 * np.asarray(distortion) * radius2
     if distortion2 == 0.0:
         return x * (2.0 / (1.0 + np.sqrt(np.where(discriminant >= 0.0, discriminant, np.nan))))[..., None]
-    return x * _two_coefficient_ratio(radius2, np.asarray(distortion), distortion2, discriminant)[..., None]
+    with np.errstate(over="ignore", invalid="ignore"):
+        ratio = _two_coefficient_ratio(radius2, np.asarray(distortion), distortion2, discriminant)
+    return x * ratio[..., None]
 
 
 def _two_coefficient_ratio(

@@ -1,1 +1,1 @@
-"""TODO."""
+"""The command line of rdstitch: options in, one library call, a line out."""

@@ -1,0 +1,76 @@
+"""What the user sees while a command runs: bars on a terminal, lines of log, all on standard error."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import TracebackType
+from typing import Self
+
+from tqdm import tqdm
+
+
+class Reporter:
+    """Receives what the library has to say while it works.
+
+    It is the ``progress`` callable of the library: called with a stage's name, how much is done and how much there is
+    to do.
+
+    Parameters
+    ----------
+    verbosity : int
+        -1 says nothing but errors, 0 warnings and, on a terminal, bars; 1 and above also the log.
+    """
+
+    def __init__(self, verbosity: int) -> None:
+        self._verbosity = verbosity
+        self._bars = verbosity >= 0 and sys.stderr.isatty()
+        self._bar: tqdm[None] | None = None
+        self._stage = ""
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Show that ``done`` of ``total`` steps of a stage are done."""
+        if stage != self._stage:
+            self._close()
+            self._stage = stage
+            self.log(f"{stage} ({total})")
+            if self._bars:
+                self._bar = tqdm(total=total, desc=stage, leave=False, file=sys.stderr, dynamic_ncols=True)
+        if self._bar is not None:
+            self._bar.update(done - self._bar.n)
+
+    def warn(self, text: str) -> None:
+        """Say what the user should know even though the command succeeds."""
+        if self._verbosity >= 0:
+            self._line(f"rdstitch: warning: {text}")
+
+    def log(self, text: str) -> None:
+        """Say what is going on, for those who asked."""
+        if self._verbosity >= 1:
+            self._line(f"rdstitch: {text}")
+
+    def __enter__(self) -> Self:
+        """Begin reporting."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Take the bar away, whatever happened."""
+        self._close()
+
+    def _line(self, text: str) -> None:
+        with self._paused():
+            print(text.encode("utf-8", "backslashreplace").decode("utf-8"), file=sys.stderr)
+
+    @contextmanager
+    def _paused(self) -> Iterator[None]:
+        if self._bar is not None:
+            self._bar.clear()
+        yield
+        if self._bar is not None:
+            self._bar.refresh()
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None

@@ -1,0 +1,146 @@
+"""Registration of pairs: match the features of two pictures, estimate homography and λ together."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from rdstitch.camera import Camera
+from rdstitch.errors import ArgumentError
+from rdstitch.features import Correspondences, Features, match
+from rdstitch.radial_homography import RadialHomography
+from rdstitch.registration.links import Link
+from rdstitch.robust import SOLVERS, estimate_radial_homography
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class PairOptions:
+    """How pairs are matched and estimated."""
+
+    ratio: float | None = None  # largest ratio of distances of a match; None: what suits the features
+    solver: str = "auto"  # one of rdstitch.robust.SOLVERS
+    distortion: float | None = None  # known λ, half-diagonal frame
+    threshold: float = 3.0  # px, largest transfer error of an inlier
+    confidence: float = 0.999  # probability that no better model was missed
+    max_iterations: int = 10000  # samples per pair
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the solver's name before long work begins."""
+        if self.solver not in SOLVERS:
+            raise ArgumentError(f"unknown solver {self.solver!r}; choose one of {', '.join(SOLVERS)}")
+
+
+@dataclass(frozen=True)
+class PairRegistration:
+    """What became of one pair.
+
+    Attributes
+    ----------
+    image1, image2 : int
+        Indices of the pictures.
+    correspondences : Correspondences
+        The matches, of full-size px, right and wrong.
+    relation : RadialHomography
+        The estimate from ``image1`` to ``image2``; falsy with the reason where there is none.
+    """
+
+    image1: int
+    image2: int
+    correspondences: Correspondences
+    relation: RadialHomography
+
+    def link(self) -> Link:
+        """The inliers, as global adjustment takes them."""
+        inliers = self.relation.inliers
+        matched = self.correspondences
+        return Link(self.image1, self.image2, matched.points1[inliers], matched.points2[inliers], self.relation)
+
+
+def match_pairs(
+    features: Sequence[Features],
+    pairs: Sequence[tuple[int, int]],
+    ratio: float | None,
+    progress: Progress | None = None,
+) -> list[Correspondences]:
+    """Match the features of pairs of pictures; the matrix products keep all cores busy.
+
+    Parameters
+    ----------
+    features : sequence of Features
+        One a picture.
+    pairs : sequence of (int, int)
+        Indices of the pictures of each pair.
+    ratio : float or None
+    progress : callable, optional
+        Called with the number of pairs done and their total.
+    """
+    matched = []
+    for image1, image2 in pairs:
+        matched.append(match(features[image1], features[image2], ratio))
+        if progress is not None:
+            progress(len(matched), len(pairs))
+    return matched
+
+
+def estimate_pairs(
+    cameras: Sequence[Camera],
+    pairs: Sequence[tuple[int, int]],
+    matched: Sequence[Correspondences],
+    options: PairOptions,
+    *,
+    tilts: Sequence[tuple[float, float] | None] | None = None,
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> list[PairRegistration]:
+    """Estimate the relation of every pair, several at a time.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        One a picture; of its lens only the centre and the focal length are used, unless ``options.distortion``.
+    pairs : sequence of (int, int)
+    matched : sequence of Correspondences
+        One a pair.
+    options : PairOptions
+    tilts : sequence of (float, float) or None, optional
+        Known tilt (ψ, θ), radians, of each picture, None where unknown.
+    workers : int
+        Threads.
+    progress : callable, optional
+        Called with the number of pairs done and their total.
+    """
+
+    def work(index: int) -> PairRegistration:
+        image1, image2 = pairs[index]
+        camera1, camera2, found = cameras[image1], cameras[image2], matched[index]
+        tilt1, tilt2 = (None, None) if tilts is None else (tilts[image1], tilts[image2])
+        relation = estimate_radial_homography(
+            found.points1,
+            found.points2,
+            camera1.image_size,
+            image_size2=camera2.image_size,
+            focal=camera1.focal,
+            focal_source=camera1.focal_source,
+            center=camera1.center,
+            solver=options.solver,
+            tilt=None if tilt1 is None or tilt2 is None else np.array([tilt1, tilt2]),
+            distortion=options.distortion,
+            quality=-found.ratio,
+            threshold=options.threshold,
+            confidence=options.confidence,
+            max_iterations=options.max_iterations,
+            seed=options.seed,
+        )
+        return PairRegistration(image1, image2, found, relation)
+
+    registered = []
+    with ThreadPoolExecutor(workers) as pool:
+        for registration in pool.map(work, range(len(pairs))):
+            registered.append(registration)
+            if progress is not None:
+                progress(len(registered), len(pairs))
+    return registered

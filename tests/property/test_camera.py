@@ -1,0 +1,81 @@
+"""The division model both ways, its units and its domain."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from rdstitch.camera import Camera, distort, undistort
+from rdstitch.errors import ArgumentError, InputError
+
+coordinates = st.floats(-1.0, 1.0, allow_subnormal=False)
+distortions = st.floats(-0.95, 0.45)
+
+
+@given(x=coordinates, y=coordinates, distortion=distortions, second=st.sampled_from([0.0, -0.02, 0.03]))
+def test_distort_inverts_undistort(x: float, y: float, distortion: float, second: float) -> None:
+    point = np.array([x, y])
+    radius2 = float(point @ point)
+    assume(radius2 <= 1.0)
+    factor = 1.0 + distortion * radius2 + second * radius2**2
+    slope = factor - 2.0 * distortion * radius2 - 4.0 * second * radius2**2
+    assume(factor > 0.05 and slope > 0.2)
+    back = distort(undistort(point, distortion, second), distortion, second)
+    np.testing.assert_allclose(back, point, atol=1e-10)
+
+
+@given(distortion=st.floats(-1e-9, 1e-9), radius=st.floats(0.0, 1e-150))
+def test_no_cancellation_at_the_centre_or_without_distortion(distortion: float, radius: float) -> None:
+    point = np.array([radius, 0.0])
+    np.testing.assert_array_equal(distort(point, distortion), point)
+    np.testing.assert_allclose(distort([0.5, 0.5], distortion), [0.5, 0.5], atol=1e-9)
+
+
+def test_outside_the_domain_is_nan_and_never_a_plausible_point() -> None:
+    assert np.isnan(undistort([1.5, 0.0], -0.5)).all()
+    assert np.isnan(distort([10.0, 0.0], 0.1)).all()
+    assert np.isfinite(distort([1e6, 0.0], -0.5)).all()
+    assert np.isnan(distort([5.0, 0.0], 0.1, 0.1)).all()
+
+
+@given(distortion=distortions, width=st.integers(2, 5000), height=st.integers(2, 5000))
+def test_units_of_distortion_agree(distortion: float, width: int, height: int) -> None:
+    camera = Camera((width, height), distortion, focal=0.8 * width, focal_source="exif")
+    corner = np.array([width - 0.5, height - 0.5])
+    undistorted = camera.undistort(corner) - camera.center
+    np.testing.assert_allclose(undistorted, (corner - camera.center) / (1.0 + distortion), rtol=1e-9)
+    in_px = np.hypot(*(corner - camera.center))
+    assert camera.distortion_focal is not None
+    np.testing.assert_allclose(camera.distortion_px * in_px**2, distortion, atol=1e-12)
+    np.testing.assert_allclose(camera.distortion_focal * (in_px / (0.8 * width)) ** 2, distortion, atol=1e-12)
+
+
+def test_a_resized_picture_shows_the_same_rays() -> None:
+    camera = Camera((800, 600), -0.3, center=(410.0, 290.0), focal=700.0, focal_source="option")
+    small = camera.resized((400, 300))
+    corner = camera.undistort([-0.5, -0.5])
+    np.testing.assert_allclose((corner + 0.5) / 2 - 0.5, small.undistort([-0.5, -0.5]))
+    assert small.focal == 350.0
+    assert small.distortion == camera.distortion
+
+
+@pytest.mark.parametrize("bad", [{"distortion": -1.0}, {"distortion": np.nan}, {"focal": 0.0}, {"focal_source": "x"}])
+def test_impossible_cameras_are_refused(bad: dict[str, float]) -> None:
+    with pytest.raises(ArgumentError):
+        Camera((640, 480), **bad)  # type: ignore[arg-type]
+
+
+def test_a_camera_file_brings_the_camera_back(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    camera = Camera((640, 480), -0.25, 0.01, (321.0, 239.5), 520.0, "exif", 0.003)
+    camera.save(tmp_path / "camera.json")
+    loaded = Camera.load(tmp_path / "camera.json")
+    assert (loaded.distortion, loaded.distortion2, loaded.center) == (-0.25, 0.01, (321.0, 239.5))
+    assert (loaded.focal, loaded.focal_source, loaded.distortion_std) == (520.0, "file", 0.003)
+
+
+@given(text=st.text())
+def test_anything_else_is_no_camera_file(text: str, tmp_path_factory: pytest.TempPathFactory) -> None:
+    path = tmp_path_factory.mktemp("camera") / "camera.json"
+    path.write_text(text, encoding="utf-8", errors="surrogatepass")
+    with pytest.raises(InputError, match=r"camera\.json"):
+        Camera.load(path)
