@@ -11,7 +11,7 @@ _SHARED_DATA = Path(__file__).resolve().parents[1] / "../shared/data"
 
 @pytest.fixture(scope="session")
 def shared_data() -> Callable[[str], Path]:
-    """``shared_data(name)``: folder or file of the development pictures; the test is skipped where it is absent."""
+    """``shared_data(name)``: path of development pictures; the test is skipped where they are absent."""
 
     def locate(name: str) -> Path:
         path = (_SHARED_DATA / name).resolve()

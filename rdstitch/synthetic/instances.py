@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rdstitch.camera import FloatArray, distort
 from rdstitch.errors import ArgumentError
-from rdstitch.planar_motion import rotation_from_tilt
+from rdstitch.planar_motion import PlanarMotion, rotation_from_tilt
 from rdstitch.radial_homography import lift, project
 from rdstitch.solvers.solutions import Solutions
 
@@ -21,7 +21,6 @@ HALF_SIZE = (0.8, 0.6)
 
 # Rays meet the plane within ten heights of the camera: what lies nearer to the horizon is no use to anybody.
 _MIN_STEEPNESS = 0.1
-_CANDIDATES_PER_POINT = 12
 _MAX_ROUNDS = 200
 
 
@@ -56,7 +55,7 @@ class Instances:
         distortion_error : ndarray of shape (B,)
             ``|λ - λ_true|``; inf where a sample has no solution.
         homography_error : ndarray of shape (B,)
-            Frobenius distance of the same solution's H from the truth, both of unit norm, for the better sign.
+            Frobenius distance of the same solution's H from the truth, both of unit norm, up to sign.
         """
         distortion_error = np.full(len(self), np.inf)
         homography_error = np.full(len(self), np.inf)
@@ -65,9 +64,7 @@ class Instances:
         order = np.lexsort((error, sample))
         first = order[np.r_[True, np.diff(sample[order]) > 0]] if len(order) else order
         distortion_error[sample[first]] = error[first]
-        homography_error[sample[first]] = _distance(
-            solutions.homography[first], self.homography[sample[first]]
-        )
+        homography_error[sample[first]] = _distance(solutions.homography[first], self.homography[sample[first]])
         return distortion_error, homography_error
 
 
@@ -93,6 +90,13 @@ class PlanarInstances(Instances):
     translation: FloatArray
     height: FloatArray
 
+    def motion(self, index: int) -> PlanarMotion:
+        """The motion of one instance whose two tilts are the same."""
+        psi, theta = self.tilt[index]
+        tx, ty = self.translation[index]
+        yaw, height = self.yaw[index], self.height[index]
+        return PlanarMotion((float(psi), float(theta)), float(yaw), (float(tx), float(ty)), float(height))
+
 
 def planar_instances(
     count: int,
@@ -106,6 +110,7 @@ def planar_instances(
     translation: Range = (0.1, 0.8),
     height: Range = (1.0, 1.0),
     half_size: Range = HALF_SIZE,
+    overlap: float = 0.1,
     noise: float = 0.0,
 ) -> PlanarInstances:
     """Random planar motion over a plane, seen by a tilted camera with radial distortion.
@@ -123,10 +128,12 @@ def planar_instances(
     separate_tilts : bool
         Whether picture 2 has a tilt of its own.
     yaw, translation, height : (float, float)
-        Ranges of φ (radians), of the length of t (heights; its direction is uniform) and of the second camera's
-        height, all uniform, but thinned where the pictures have too little in common.
+        Ranges of φ (radians), of the length of t (its direction is uniform) and of the second camera's height,
+        all uniform, but thinned where the pictures have too little in common.
     half_size : (float, float)
         Half width and half height of the pictures, focal lengths.
+    overlap : float
+        Least share of picture 1 that picture 2 sees, roughly; motions with less are drawn again.
     noise : float
         Standard deviation of the normal noise added to both pictures' points, focal lengths.
 
@@ -151,7 +158,7 @@ def planar_instances(
         middle = _rigid_in_plane(motion[which])
         return rotation2[which] @ middle @ np.swapaxes(rotation[which], 1, 2)
 
-    x1, x2, h = _visible_points(rng, lam, rotation[:, :, 2], points, half_size, draw)
+    x1, x2, h = _visible_points(rng, lam, rotation[:, :, 2], points, half_size, overlap, draw)
     return PlanarInstances(
         x1=x1 + noise * rng.standard_normal(x1.shape),
         x2=x2 + noise * rng.standard_normal(x2.shape),
@@ -174,12 +181,14 @@ def general_instances(
     max_angle: float = 0.3,
     translation: Range = (0.1, 0.8),
     half_size: Range = HALF_SIZE,
+    overlap: float = 0.1,
     noise: float = 0.0,
 ) -> Instances:
     """Random free motion before a plane: homographies with all eight degrees of freedom.
 
     ``H = Rx(α) Ry(β) Rz(φ) (I - t n')`` with the plane normal n and the attitude (α, β) tilted by up to
-    ``max_angle`` about either axis, any yaw φ, and any direction of the translation t. Parameters as for :func:`planar_instances`.
+    ``max_angle`` about either axis, any yaw φ, and any direction of the translation t. Other parameters as for
+    :func:`planar_instances`.
     """
     rng = np.random.default_rng(seed)
     lam = rng.uniform(*distortion, count)
@@ -193,7 +202,7 @@ def general_instances(
         t *= (rng.uniform(*translation, len(which)) / np.linalg.norm(t, axis=1))[:, None]
         return attitude @ turn @ (np.eye(3) - t[:, :, None] * normal[which][:, None, :])
 
-    x1, x2, h = _visible_points(rng, lam, normal, points, half_size, draw)
+    x1, x2, h = _visible_points(rng, lam, normal, points, half_size, overlap, draw)
     return Instances(
         x1=x1 + noise * rng.standard_normal(x1.shape),
         x2=x2 + noise * rng.standard_normal(x2.shape),
@@ -208,15 +217,14 @@ def _visible_points(
     normal: FloatArray,
     points: int,
     half_size: Range,
+    overlap: float,
     draw: Callable[[IndexArray], FloatArray],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Points of picture 1 and where picture 2 sees them; motions without enough of them are drawn again."""
-    count = len(distortion)
+    count, drawn = len(distortion), int(np.ceil(points / overlap))
     half = np.asarray(half_size)
     if np.min(1.0 + distortion * np.sum(half**2), initial=1.0) <= 0.0:
-        raise ArgumentError(
-            f"a distortion of {np.min(distortion):g} folds the corners of pictures this large"
-        )
+        raise ArgumentError(f"a distortion of {np.min(distortion):g} folds the corners of pictures this large")
     x1, x2 = np.empty((count, points, 2)), np.empty((count, points, 2))
     h = np.empty((count, 3, 3))
     missing = np.arange(count)
@@ -224,7 +232,7 @@ def _visible_points(
         if not len(missing):
             return x1, x2, h
         motion = draw(missing)
-        candidates = half * rng.uniform(-1.0, 1.0, (len(missing), _CANDIDATES_PER_POINT * points, 2))
+        candidates = half * rng.uniform(-1.0, 1.0, (len(missing), drawn, 2))
         seen = _batch_transfer(motion, distortion[missing], candidates)
         # NaN, a point that cannot be seen, compares as False.
         visible = (np.abs(seen) <= half).all(axis=-1) & (
@@ -242,8 +250,8 @@ def _visible_points(
 def _steepness(points: FloatArray, distortion: FloatArray, normal: FloatArray) -> FloatArray:
     """Cosine between the ray of each measured point (B, k, 2) and its plane's normal (B, 3)."""
     rays = lift(points, distortion[:, None])
-    along: FloatArray = np.einsum("bki,bi->bk", rays, normal)
-    return along / np.linalg.norm(rays, axis=-1)
+    cosine: FloatArray = np.einsum("bki,bi->bk", rays, normal) / np.linalg.norm(rays, axis=-1)
+    return cosine
 
 
 def _batch_transfer(homography: FloatArray, distortion: FloatArray, points: FloatArray) -> FloatArray:

@@ -1,0 +1,145 @@
+"""Matches of one pair of pictures, with noise and outliers and their truth: for tests of robust estimation."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.errors import ArgumentError
+from rdstitch.planar_motion import PlanarMotion
+from rdstitch.radial_homography import RadialHomography
+from rdstitch.synthetic.instances import general_instances, planar_instances
+
+
+@dataclass(frozen=True)
+class SyntheticMatches:
+    """N matches between two pictures of a plane, some of them wrong.
+
+    Attributes
+    ----------
+    points1, points2 : ndarray of shape (N, 2)
+        Measured px.
+    quality : ndarray of shape (N,)
+        What a matcher would say of each match, higher is better: right matches tend to score above wrong ones.
+    truth : RadialHomography
+        The true camera, homography, motion (None where it is free), and which matches are right.
+    """
+
+    points1: FloatArray
+    points2: FloatArray
+    quality: FloatArray
+    truth: RadialHomography
+
+    @property
+    def inliers(self) -> NDArray[np.bool_]:
+        """Which matches are right, shape (N,)."""
+        return self.truth.inliers
+
+
+def correspondences(
+    count: int = 400,
+    *,
+    seed: int,
+    image_size: tuple[int, int] = (1000, 800),
+    focal: float | None = None,
+    distortion: float = -0.25,
+    motion: str = "rigid",
+    max_tilt: float = 0.1,
+    max_height_change: float = 0.25,
+    overlap: float = 0.3,
+    noise: float = 0.7,
+    outliers: float = 0.3,
+) -> SyntheticMatches:
+    """Random matches of two pictures of a plane.
+
+    Parameters
+    ----------
+    count : int
+        N.
+    seed : int
+        Equal seeds give equal matches.
+    image_size : (int, int)
+        Width and height, px.
+    focal : float, optional
+        Focal length, px; 1.2 times half the diagonal if not given.
+    distortion : float
+        λ in the half-diagonal frame.
+    motion : str
+        "rigid" (planar motion), "similarity" (and the height changes by up to ``max_height_change``), or "homography"
+        (free motion before a tilted plane).
+    max_tilt : float
+        Radians. ψ and θ are uniform in ± this; free motion tilts plane and camera by as much.
+    overlap : float
+        Least share of picture 1 that picture 2 sees, roughly.
+    noise : float
+        Standard deviation in px of the normal noise on both pictures' points.
+    outliers : float
+        Share of wrong matches: points that lie anywhere in both pictures.
+
+    Returns
+    -------
+    SyntheticMatches
+        In random order.
+    """
+    half_diagonal = float(np.hypot(*image_size)) / 2
+    f = 1.2 * half_diagonal if focal is None else focal
+    camera = Camera(image_size, distortion, focal=f, focal_source="option")
+    lam = camera.distortion_px * f**2
+    half = (np.array(image_size) - 1.0) / 2.0
+    right = count - round(count * outliers)
+    field = (half[0] / f, half[1] / f)
+    # The longest motion is that which still leaves pictures of this field of view something in common.
+    length = (0.1 * half_diagonal / f, 1.5 * half_diagonal / f)
+    planar: PlanarMotion | None = None
+    if motion == "homography":
+        drawn = general_instances(
+            1,
+            right,
+            seed=seed,
+            distortion=(lam, lam),
+            max_angle=max_tilt,
+            translation=length,
+            half_size=field,
+            overlap=overlap,
+        )
+    elif motion in ("rigid", "similarity"):
+        change = max_height_change if motion == "similarity" else 0.0
+        drawn = planar_instances(
+            1,
+            right,
+            seed=seed,
+            distortion=(lam, lam),
+            max_tilt=max_tilt,
+            translation=length,
+            height=(1.0 - change, 1.0 + change),
+            half_size=field,
+            overlap=overlap,
+        )
+        planar = drawn.motion(0)
+    else:
+        raise ArgumentError(f"motion must be rigid, similarity or homography, not {motion!r}")
+
+    rng = np.random.default_rng((seed, 1))
+    points1, points2 = (half * rng.uniform(-1.0, 1.0, (count, 2)) for _ in range(2))
+    inliers = np.zeros(count, dtype=np.bool_)
+    inliers[rng.permutation(count)[:right]] = True
+    points1[inliers], points2[inliers] = f * drawn.x1[0], f * drawn.x2[0]
+    points1[inliers] += noise * rng.standard_normal((right, 2))
+    points2[inliers] += noise * rng.standard_normal((right, 2))
+    quality = np.where(inliers, rng.beta(4.0, 2.0, count), rng.beta(2.0, 4.0, count))
+
+    zoom = np.diag([f, f, half_diagonal])
+    h = zoom @ drawn.homography[0] @ np.linalg.inv(zoom)
+    truth = RadialHomography(
+        homography=h,
+        camera=camera,
+        camera2=camera,
+        inliers=inliers,
+        distortion_std=0.0,
+        model=motion,
+        motion=planar,
+        rms=noise,
+        solver="truth",
+    )
+    return SyntheticMatches(points1 + camera.center, points2 + camera.center, quality, truth)
