@@ -1,7 +1,7 @@
 """What feature detection hands on: keypoints and descriptors of one picture."""
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +71,18 @@ class Features:
     def __len__(self) -> int:
         """Number of keypoints."""
         return len(self.points)
+
+    def take(self, index: NDArray[np.intp]) -> Self:
+        """The keypoints of the given indices, in their order."""
+        return replace(
+            self,
+            points=self.points[index],
+            descriptors=self.descriptors[index],
+            scale=self.scale[index],
+            angle=self.angle[index],
+            response=self.response[index],
+            laplacian_sign=None if self.laplacian_sign is None else self.laplacian_sign[index],
+        )
 
     @property
     def binary(self) -> bool:

@@ -73,9 +73,7 @@ def describe(detector: Any, grey: Grey, keypoints: Sequence[cv2.KeyPoint], kind:
         values = cast(Descriptors, np.zeros((0, detector.descriptorSize()), dtype))
     else:
         values = descriptors
-    columns = np.array([(*k.pt, k.size, k.angle, k.response) for k in described], dtype=np.float64).reshape(
-        -1, 5
-    )
+    columns = np.array([(*k.pt, k.size, k.angle, k.response) for k in described], dtype=np.float64).reshape(-1, 5)
     return Features(
         points=np.ascontiguousarray(columns[:, :2]),
         descriptors=root(values) if kind == "rootsift" else values,

@@ -79,7 +79,7 @@ def _usable(image: Image, mask: Mask | None) -> NDArray[np.bool_] | None:
     if image.ndim == 3 and image.shape[2] in (2, 4):
         parts.append(image[..., -1] > 0)
     if image.dtype.kind == "f":
-        parts.append(np.isfinite(image.reshape(*image.shape[:2], -1)).all(axis=2))
+        parts.append(np.asarray(np.isfinite(image.reshape(*image.shape[:2], -1)).all(axis=2)))
     parts = [part for part in parts if not part.all()]
     return np.logical_and.reduce(parts) if parts else None
 
@@ -105,7 +105,7 @@ def _eight_bits(grey: Image, usable: NDArray[np.bool_] | None) -> NDArray[np.uin
     if inside.size == 0:
         return np.zeros(grey.shape, dtype=np.uint8)
     low, high = (float(value) for value in np.percentile(inside, _STRETCH_PERCENTILES))
-    finite = np.nan_to_num(grey.astype(np.float32), nan=low, posinf=high, neginf=low)
+    finite = np.nan_to_num(grey.astype(np.float64), nan=low, posinf=high, neginf=low)
     scaled = (finite - low) * (255.0 / max(high - low, 1e-12))
     eight: NDArray[np.uint8] = np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
     return eight

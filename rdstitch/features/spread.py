@@ -14,9 +14,9 @@ def strongest(response: FloatArray, count: int) -> NDArray[np.intp]:
 def spread(points: FloatArray, response: FloatArray, count: int, cell: float) -> NDArray[np.intp]:
     """Indices of ``count`` keypoints that are spread over the picture, strongest first.
 
-    The cells of a grid take turns, each giving its strongest keypoint that is left, until ``count`` are taken:
-    no cell gets more than another that still has some. The corners, where the distortion is seen, thus keep what
-    they have however strong the middle of the picture is.
+    The cells of a grid take turns, each giving its strongest keypoint that is left, until ``count`` are
+    taken: no cell gets more than another that still has some. The corners, where the distortion is seen, thus
+    keep what they have however strong the middle of the picture is.
 
     Parameters
     ----------

@@ -1,0 +1,147 @@
+"""Mutual nearest neighbours with the ratio of the nearest to the second nearest, in bounded memory."""
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.camera import FloatArray
+from rdstitch.features.keypoints import Features
+from rdstitch.features.similarity import Similarity, compare
+
+
+@dataclass(frozen=True, eq=False)
+class Locations:
+    """Keypoints grouped by location: SIFT gives a point with several orientations as many descriptors.
+
+    They compete with each other in the ratio test, which then loses the point, and would give several matches of
+    one point. So what is matched is locations, as alike as the most alike of their descriptors.
+
+    Attributes
+    ----------
+    layers : tuple of ndarray, intp
+        Layer k holds the index of the (k+1)-th keypoint of each location that has one; the locations with the most
+        keypoints come first, so that every layer is a beginning of the one before.
+    """
+
+    layers: tuple[NDArray[np.intp], ...]
+
+    @classmethod
+    def group(cls, points: FloatArray) -> Self:
+        """Group points (N, 2) that are equal; keypoints of one location keep their order."""
+        _, location, count = np.unique(points, axis=0, return_inverse=True, return_counts=True)
+        location = location.reshape(-1)
+        by_location = np.argsort(location, kind="stable")
+        starts = np.concatenate([[0], np.cumsum(count)[:-1]]).astype(np.intp)
+        # Among equally many keypoints the first keypoint decides: the order of the input, not that of coordinates.
+        order = np.lexsort((by_location[starts], -count)) if len(points) else np.zeros(0, np.intp)
+        starts, count = starts[order], count[order]
+        layers = [by_location[starts[count > k] + k] for k in range(int(count.max(initial=1)))]
+        return cls(tuple(layers))
+
+    def __len__(self) -> int:
+        """Number of locations."""
+        return len(self.layers[0])
+
+    def rows(self, start: int, stop: int) -> list[NDArray[np.intp]]:
+        """The layers of locations ``start`` to ``stop``."""
+        return [layer[start:stop] for layer in self.layers if len(layer) > start]
+
+
+def mutual_nearest(features1: Features, features2: Features, block_bytes: int) -> tuple[NDArray[np.intp], FloatArray]:
+    """Pairs of keypoints that are each other's nearest in descriptor space, and how distinct they are.
+
+    Parameters
+    ----------
+    features1, features2 : Features
+        Of one kind.
+    block_bytes : int
+        Size of the blocks in which the matrix of similarities is made, bytes; at least one row of it.
+
+    Returns
+    -------
+    pairs : ndarray of shape (M, 2), intp
+        Indices into features 1 and 2. Where several are equally near there is no pair.
+    ratio : ndarray of shape (M,)
+        Distance to the nearest over distance to the second nearest location, the worse of both directions.
+    """
+    if len(features1) == 0 or len(features2) == 0:
+        return np.zeros((0, 2), dtype=np.intp), np.zeros(0)
+    one, two = Locations.group(features1.points), Locations.group(features2.points)
+    columns = np.concatenate(two.layers)
+    similarity = compare(features1.descriptors, features2.descriptors[columns])
+
+    nearest = np.empty(len(one), dtype=np.intp)
+    best, second = np.empty((2, len(one)), similarity.dtype)
+    best_of_column, second_of_column = np.full((2, len(two)), similarity.lowest, similarity.dtype)
+    step = max(1, block_bytes // (similarity.dtype.itemsize * len(columns)) // len(one.layers))
+    for start in range(0, len(one), step):
+        layers = one.rows(start, start + step)
+        block = _merge(similarity.block(np.concatenate(layers)), layers, two)
+        here = slice(start, start + len(block))
+        _update_two_best(best_of_column, second_of_column, block)
+        index = np.arange(len(block))
+        nearest[here] = block.argmax(axis=1)
+        best[here] = block[index, nearest[here]]
+        block[index, nearest[here]] = similarity.lowest
+        second[here] = block.max(axis=1)
+
+    # Where several are nearest, the second best equals the best in one direction or in the other.
+    mutual = (best == best_of_column[nearest]) & (best > second) & (best > second_of_column[nearest])
+    location1 = np.flatnonzero(mutual)
+    location2 = nearest[location1]
+    runner_up = np.maximum(second[location1], second_of_column[location2])
+    ratio = similarity.distance(best[location1]) / similarity.distance(runner_up)
+    return _nearest_keypoints(similarity, one, two, location1, location2), ratio
+
+
+def _merge(block: NDArray[Any], layers: list[NDArray[np.intp]], two: Locations) -> NDArray[Any]:
+    """From keypoints x keypoints to locations x locations, in place; returns the part that is the result."""
+    top = block[: len(layers[0])]
+    offset = len(top)
+    for layer in layers[1:]:
+        np.maximum(top[: len(layer)], block[offset : offset + len(layer)], out=top[: len(layer)])
+        offset += len(layer)
+    left = top[:, : len(two)]
+    offset = len(two)
+    for layer in two.layers[1:]:
+        np.maximum(left[:, : len(layer)], top[:, offset : offset + len(layer)], out=left[:, : len(layer)])
+        offset += len(layer)
+    return left
+
+
+def _update_two_best(best: NDArray[Any], second: NDArray[Any], block: NDArray[Any]) -> None:
+    """Let the rows of a block compete for the largest and second largest of each column, in place.
+
+    Row by row, because a row stays in the cache, where NumPy's minimum and maximum are fastest.
+    """
+    loser = np.empty_like(best)
+    for row in block:
+        np.minimum(best, row, out=loser)
+        np.maximum(second, loser, out=second)
+        np.maximum(best, row, out=best)
+
+
+def _nearest_keypoints(
+    similarity: Similarity,
+    one: Locations,
+    two: Locations,
+    location1: NDArray[np.intp],
+    location2: NDArray[np.intp],
+) -> NDArray[np.intp]:
+    """Of each pair of locations the most alike pair of keypoints, as indices into the features, shape (M, 2)."""
+    pairs = np.column_stack([one.layers[0][location1], two.layers[0][location2]])
+    best = np.full(len(pairs), similarity.lowest, similarity.dtype)
+    for layer1 in one.layers:
+        offset = 0
+        for layer2 in two.layers:
+            both = np.flatnonzero((location1 < len(layer1)) & (location2 < len(layer2)))
+            keypoint1, location = layer1[location1[both]], location2[both]
+            value = similarity.pairs(keypoint1, offset + location)
+            better = value > best[both]
+            chosen = both[better]
+            best[chosen] = value[better]
+            pairs[chosen] = np.column_stack([keypoint1[better], layer2[location[better]]])
+            offset += len(layer2)
+    return pairs
