@@ -8,12 +8,14 @@ their influence without ever being decided upon.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from rdstitch.camera import FloatArray
 from rdstitch.radial_homography import measurement_whitening, transfer_jacobian
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import PairModel
 
+_LEAST_GAIN = 1e-6  # relative fall of the loss that is worth another step
 _LARGEST_BEND = 0.98  # |λ| in the half-diagonal frame; beyond, the lens model folds at the corner
 
 
@@ -103,7 +105,7 @@ def refine(
                 gain = (current.cost - moved.cost) / current.cost
                 state, distortion, current = moved_state, moved_distortion, moved
                 damping = max(damping / 10.0, 1e-9)
-                if gain < 1e-6:
+                if gain < _LEAST_GAIN:
                     break
                 continue
         damping *= 20.0
@@ -125,27 +127,27 @@ def _linearize(
     transfer = transfer_jacobian(model.homography(state), distortion, data.x1)
     residuals = (transfer.points - data.x2) * data.px
     lost = ~np.isfinite(residuals).all(axis=1)
-    columns = transfer.by_homography @ model.jacobian(state)
-    if not fixed_distortion:
-        columns = np.concatenate([transfer.by_lens[:, :, :1], columns], axis=2)
-    columns *= data.px
+    lens = transfer.by_lens[:, :, :0] if fixed_distortion else transfer.by_lens[:, :, :1]
     whitening = measurement_whitening(transfer.by_point * data.px_ratio)
     residuals = np.einsum("nij,nj->ni", whitening, residuals)
-    columns = whitening @ columns
     residuals[lost] = 0.0
-    columns[lost] = 0.0
-
     errors2 = np.einsum("ni,ni->n", residuals, residuals)
     relative = 1.0 / (1.0 + errors2 / scale**2)
-    weights = np.where(lost, 0.0, relative**2)
-    flat = (columns * np.sqrt(weights)[:, None, None]).reshape(-1, columns.shape[2])
-    weighted = (residuals * np.sqrt(weights)[:, None]).reshape(-1)
-    information, gradient = flat.T @ flat, flat.T @ weighted
-    cost = float(np.sum(np.where(lost, scale**2, errors2 * relative)))
+    relative[lost] = 0.0
+
+    # The normal matrix is formed by the entries of H, whatever the model, and only then by the model's parameters.
+    columns = np.concatenate([lens, transfer.by_homography], axis=2)
+    columns = (whitening * (data.px * relative)[:, None, None]) @ columns
+    columns[lost] = 0.0
+    flat, weighted = columns.reshape(-1, columns.shape[2]), (residuals * relative[:, None]).ravel()
+    chain = block_diag(np.eye(lens.shape[2]), model.jacobian(state))
+    information = chain.T @ (flat.T @ flat) @ chain
+    gradient = chain.T @ (flat.T @ weighted)
+    cost = float(errors2 @ relative) + scale**2 * int(lost.sum())
 
     prior, by_prior = model.prior(state)
     if len(prior):
-        by_prior = np.concatenate([np.zeros((len(prior), information.shape[0] - by_prior.shape[1])), by_prior], axis=1)
+        by_prior = np.pad(by_prior, ((0, 0), (lens.shape[2], 0)))
         information = information + noise**2 * by_prior.T @ by_prior
         gradient = gradient + noise**2 * by_prior.T @ prior
         cost += noise**2 * float(prior @ prior)

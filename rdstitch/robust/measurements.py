@@ -1,8 +1,10 @@
 """The data of one pair of pictures, as robust estimation sees it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.errors import ArgumentError
@@ -48,6 +50,11 @@ class Measurements:
         if quality is not None and quality.shape != (len(points1),):
             raise ArgumentError(f"quality must have shape ({len(points1)},), not {quality.shape}")
         return cls(camera1.normalize(points1), camera2.normalize(points2), camera1, camera2, quality)
+
+    def subset(self, chosen: NDArray[Any]) -> "Measurements":
+        """The chosen correspondences, given by index or as a mask."""
+        quality = None if self.quality is None else self.quality[chosen]
+        return replace(self, x1=self.x1[chosen], x2=self.x2[chosen], quality=quality)
 
     def __len__(self) -> int:
         """Number of correspondences."""

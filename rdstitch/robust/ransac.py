@@ -179,4 +179,4 @@ def _subset(data: Measurements, seed: int) -> Measurements:
     if len(data) <= _QUICK_SCORE:
         return data
     chosen = np.sort(np.random.default_rng([seed, 1 << 20]).choice(len(data), _QUICK_SCORE, replace=False))
-    return Measurements(data.x1[chosen], data.x2[chosen], data.camera1, data.camera2)
+    return data.subset(chosen)

@@ -13,6 +13,8 @@ _LEAST_NOISE = 0.02  # px; below, noise-free data would reject every model over 
 _RAYLEIGH_MEDIAN = 1.1774  # median length of a two-dimensional normal vector of standard deviation 1
 _LOSS_WIDTH = 4.0  # scale of the loss in standard deviations of the noise
 
+_NEAR = 3.0  # errors, in thresholds, beyond which a correspondence has no say in the choice
+
 _LARGEST_STD = 0.1
 """Standard deviation of λ above which the pictures say nothing useful about it: a tenth of the radius at the corner."""
 
@@ -76,44 +78,30 @@ def select_model(
         iterations=8,
     )
     noise = noise_of(free.errors, threshold)
-    scale = min(threshold, _LOSS_WIDTH * noise)
     inliers = max(1, int(np.sum(free.errors < threshold)))
+    near = data.subset(free.errors < _NEAR * threshold)
 
-    def fit(model: PairModel, start: Refined, fixed: bool) -> Refined:
+    def fit(model: PairModel, start: Refined, distortion: float, fixed: bool, iterations: int = 15) -> Refined:
+        points = near if iterations else data
+        scale = min(threshold, _LOSS_WIDTH * noise)
         return refine(
-            model,
-            start.homography,
-            start.distortion,
-            data,
-            scale,
-            fixed_distortion=fixed,
-            noise=noise,
-            iterations=15,
-        )
+            model, start.homography, distortion, points, scale, fixed_distortion=fixed, noise=noise, iterations=iterations
+        )  # fmt: skip
 
-    fits = [fit(model, free, fixed_distortion) for model in models]
-    penalties = [len(f.information) * np.log(2 * inliers) for f in fits]
-    criteria = [f.cost / noise**2 + penalty for f, penalty in zip(fits, penalties, strict=True)]
+    fits = [fit(model, free, free.distortion, fixed_distortion) for model in models]
+    criteria = [f.cost / noise**2 + len(f.information) * np.log(2 * inliers) for f in fits]
     chosen = fits[int(np.argmin(criteria))]
-    reason = _explain(models, fits, chosen, threshold)
-    if fixed_distortion:
-        covariance = _covariance(chosen, noise_of(chosen.errors, threshold))
-        return Selection(chosen, noise_of(chosen.errors, threshold), covariance, 0.0, reason)
-
-    covariance = _covariance(chosen, noise_of(chosen.errors, threshold))
-    std = float(np.sqrt(covariance[0, 0]))
-    if std < _LARGEST_STD:
-        return Selection(chosen, noise_of(chosen.errors, threshold), covariance, std, reason)
-    straight = Refined(chosen.model, chosen.state, 0.0, chosen.errors, chosen.cost, chosen.information)
-    chosen = fit(chosen.model, straight, True)
-    reason += f"; λ is not observable (standard deviation {std:.2g}) and was set to 0"
-    return Selection(
-        chosen,
-        noise_of(chosen.errors, threshold),
-        _covariance(chosen, noise_of(chosen.errors, threshold)),
-        np.inf,
-        reason,
-    )
+    reason = _explain(fits, chosen, threshold)
+    noise = noise_of(chosen.errors, threshold)
+    covariance = _covariance(chosen, noise)
+    std = 0.0 if fixed_distortion else float(np.sqrt(covariance[0, 0]))
+    if std >= _LARGEST_STD:
+        chosen = fit(chosen.model, chosen, 0.0, True)
+        covariance = _covariance(chosen, noise)
+        reason += f"; λ is not observable (standard deviation {std:.2g}) and was set to 0"
+        std = np.inf
+    final = fit(chosen.model, chosen, chosen.distortion, fixed_distortion or np.isinf(std), iterations=0)
+    return Selection(final, noise, covariance, std, reason)
 
 
 def noise_of(errors: FloatArray, threshold: float) -> float:
@@ -135,16 +123,11 @@ def _covariance(fit: Refined, noise: float) -> FloatArray:
     return np.asarray(noise**2 * inverse / np.outer(scale, scale))
 
 
-def _explain(models: list[PairModel], fits: list[Refined], chosen: Refined, threshold: float) -> str:
+def _explain(fits: list[Refined], chosen: Refined, threshold: float) -> str:
     """One clause on why this model and not another."""
-    rms = {f.model.name: rms_of(f.errors, threshold) for f in fits}
-    listed = ", ".join(f"{m.name} {rms[m.name]:.2f} px" for m in models)
-    name = chosen.model.name
-    if len(models) == 1:
-        return f"{name}: the only model asked for (rms {listed})"
-    if isinstance(chosen.model, HomographyModel):
-        return f"{name}: no model with less freedom explains the data (rms {listed})"
-    return f"{name}: the least free model that explains the data (rms {listed})"
+    listed = ", ".join(f"{f.model.name} {rms_of(f.errors, threshold):.2f} px" for f in fits)
+    why = "no model with less freedom" if chosen is fits[-1] else "the least free model that"
+    return f"{chosen.model.name}: {why} explains the data (rms {listed})"
 
 
 def rms_of(errors: FloatArray, threshold: float) -> float:

@@ -1,0 +1,109 @@
+"""The input pictures: which files, what their headers say, and the camera each was taken with."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rdstitch.camera import Camera
+from rdstitch.errors import ArgumentError, InputError
+from rdstitch.io.metadata import Metadata, read_metadata
+
+
+@dataclass(frozen=True)
+class Source:
+    """One input picture; its pixels are read when they are needed.
+
+    Attributes
+    ----------
+    path : Path
+    metadata : Metadata
+    camera : Camera
+        What is known of the camera before registration: size, centre, focal length, and λ where it was given.
+    """
+
+    path: Path
+    metadata: Metadata
+    camera: Camera
+
+    @property
+    def name(self) -> str:
+        """File name, for messages and reports."""
+        return self.path.name
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A file that could not be used.
+
+    Attributes
+    ----------
+    path : Path
+    reason : str
+    """
+
+    path: Path
+    reason: str
+
+
+def read_sources(
+    paths: Iterable[str | Path], *, camera: Camera | None, focal: float | None, distortion: float | None, skip_bad: bool
+) -> tuple[list[Source], list[LeftOut]]:
+    """Read the headers of the pictures; a file named twice counts once.
+
+    Parameters
+    ----------
+    paths : iterable of path
+    camera : Camera or None
+        Known camera; adapted to the size of each picture.
+    focal : float or None
+        Known focal length, px.
+    distortion : float or None
+        Known λ, half-diagonal frame.
+    skip_bad : bool
+        Leave out files that cannot be read, with the reason, instead of raising.
+
+    Raises
+    ------
+    InputError
+        When a file cannot be read.
+    """
+    sources: list[Source] = []
+    left_out: list[LeftOut] = []
+    seen: set[Path] = set()
+    for path in map(Path, paths):
+        try:
+            key = path.resolve()
+            metadata = read_metadata(path)
+        except (InputError, OSError, RuntimeError) as error:
+            reason = error if isinstance(error, InputError) else InputError(f"{path}: cannot be read: {error}")
+            if not skip_bad:
+                raise reason from error
+            left_out.append(LeftOut(path, str(reason)))
+            continue
+        if key not in seen:
+            seen.add(key)
+            sources.append(Source(path, metadata, _camera(metadata, camera, focal, distortion)))
+    return sources, left_out
+
+
+def _camera(metadata: Metadata, camera: Camera | None, focal: float | None, distortion: float | None) -> Camera:
+    """The best that is known of one picture's camera: what the user says, then EXIF; the guess comes later."""
+    found = Camera(metadata.size) if camera is None else _fitted(camera, metadata.size)
+    if focal is not None:
+        found = replace(found, focal=focal, focal_source="option")
+    elif found.focal is None and metadata.focal_px is not None:
+        found = replace(found, focal=metadata.focal_px, focal_source="exif")
+    return found if distortion is None else replace(found, distortion=distortion, distortion2=0.0, distortion_std=None)
+
+
+def _fitted(camera: Camera, size: tuple[int, int]) -> Camera:
+    """A known camera for a picture of another size or turned by a quarter."""
+    if size == camera.image_size:
+        return camera
+    ratio, own = size[0] / size[1], camera.image_size[0] / camera.image_size[1]
+    if not any(abs(ratio / shape - 1.0) < 0.02 for shape in (own, 1.0 / own)):
+        raise ArgumentError(
+            f"the camera file is for {camera.image_size[0]} x {camera.image_size[1]} px; "
+            f"a picture of {size[0]} x {size[1]} px was cropped or comes from another camera"
+        )
+    return camera.resized(size)
