@@ -1,0 +1,220 @@
+"""Planes to look at: procedural textures of any size, hopeless ones, and any given picture.
+
+A texture answers for any rectangle of itself, so that a plane of a gigapixel need not be in memory. Values are grey
+levels or RGB in [0, 1].
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.errors import ArgumentError
+
+Picture = NDArray[np.float32]
+
+# Periods of the two layers of an endless texture: without a common divisor, so that together they repeat only after
+# more than three million texels along each axis.
+_PERIODS = (2039, 1787)
+_SUBPIXEL_BITS = 4
+
+
+class Texture(Protocol):
+    """A picture of the plane."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, texels."""
+
+    @property
+    def channels(self) -> int:
+        """1 for grey, 3 for RGB."""
+
+    def region(self, left: int, top: int, right: int, bottom: int) -> Picture:
+        """Texels of a rectangle inside the texture, shape (bottom - top, right - left, channels), in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class PictureTexture:
+    """A picture as texture.
+
+    Attributes
+    ----------
+    pixels : ndarray of shape (h, w) or (h, w, 3)
+        uint8 or uint16 of full range, or float32 in [0, 1].
+    """
+
+    pixels: NDArray[Any]
+
+    def __post_init__(self) -> None:
+        """Check the shape and the type."""
+        if self.pixels.ndim not in (2, 3) or self.pixels.size == 0:
+            raise ArgumentError(f"a texture has shape (h, w) or (h, w, 3), not {self.pixels.shape}")
+        if self.pixels.dtype not in (np.uint8, np.uint16, np.float32):
+            raise ArgumentError(f"a texture is uint8, uint16 or float32, not {self.pixels.dtype}")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, texels."""
+        return self.pixels.shape[1], self.pixels.shape[0]
+
+    @property
+    def channels(self) -> int:
+        """1 for grey, 3 for RGB."""
+        return 1 if self.pixels.ndim == 2 else self.pixels.shape[2]
+
+    def region(self, left: int, top: int, right: int, bottom: int) -> Picture:
+        """See :class:`Texture`."""
+        part = self.pixels[top:bottom, left:right]
+        full = 1.0 if part.dtype == np.float32 else float(np.iinfo(part.dtype).max)
+        scaled: Picture = part.astype(np.float32) / np.float32(full)
+        return scaled[:, :, None] if scaled.ndim == 2 else scaled
+
+
+@dataclass(frozen=True)
+class EndlessTexture:
+    """Ground of any size that never repeats: the mean of two periodic layers with coprime periods.
+
+    Attributes
+    ----------
+    size : (int, int)
+        Width and height, texels.
+    seed : int
+        Equal seeds give equal ground.
+    channels : int
+        1 for grey, 3 for RGB.
+    """
+
+    size: tuple[int, int]
+    seed: int
+    channels: int = 3
+
+    def region(self, left: int, top: int, right: int, bottom: int) -> Picture:
+        """See :class:`Texture`."""
+        x, y = np.arange(left, right), np.arange(top, bottom)
+        layers = [_periodic_ground(period, (self.seed, period), self.channels) for period in _PERIODS]
+        first, second = (
+            layer.take(y % period, axis=0).take(x % period, axis=1)
+            for layer, period in zip(layers, _PERIODS, strict=True)
+        )
+        # The mean of two layers has 1/sqrt(2) of their contrast: give it back.
+        mean = np.float32(0.5) + np.float32(np.sqrt(0.5)) * ((first - np.float32(0.5)) + (second - np.float32(0.5)))
+        return np.clip(mean, 0.0, 1.0, out=mean)
+
+
+def ground(size: tuple[int, int], seed: int, channels: int = 3) -> Texture:
+    """Ground as an aerial photograph or a floor shows it: patches that hide one another, at all scales, and grain.
+
+    Dead leaves (polygons, ellipses and streaks with sizes distributed as r⁻³, later ones on top), the usual model for
+    the statistics of natural images, under a 1/f grain.
+
+    Parameters
+    ----------
+    size : (int, int)
+        Width and height, texels. Up to 16 megapixels are held as one picture, larger ground is an
+        :class:`EndlessTexture`.
+    seed : int
+        Equal seeds give equal ground.
+    channels : int
+        1 for grey, 3 for RGB.
+    """
+    if size[0] * size[1] > 16_000_000:
+        return EndlessTexture(size, seed, channels)
+    rng = np.random.default_rng(seed)
+    return PictureTexture(_grained(_dead_leaves(rng, size, channels, wrap=False), rng))
+
+
+def blank(size: tuple[int, int], level: float = 0.5, channels: int = 1) -> Texture:
+    """No texture at all."""
+    return PictureTexture(np.full((size[1], size[0], channels), level, dtype=np.float32))
+
+
+def gradient(size: tuple[int, int], channels: int = 1) -> Texture:
+    """Smooth shading without a single corner: a sky, or a white wall."""
+    x = np.linspace(0.2, 0.6, size[0], dtype=np.float32)
+    y = np.linspace(0.0, 0.3, size[1], dtype=np.float32)
+    return PictureTexture(np.repeat((y[:, None] + x)[:, :, None], channels, axis=2))
+
+
+def repeated(size: tuple[int, int], seed: int, period: int = 96, channels: int = 3) -> Texture:
+    """One tile over and over: rich in corners, yet every match is ambiguous."""
+    tile = _periodic_ground(period, (seed, period), channels)
+    rows, columns = -(-size[1] // period), -(-size[0] // period)
+    return PictureTexture(np.tile(tile, (rows, columns, 1))[: size[1], : size[0]].copy())
+
+
+@lru_cache(maxsize=8)
+def _periodic_ground(period: int, seed: tuple[int, int], channels: int) -> Picture:
+    """Ground of ``period`` x ``period`` texels that continues across its borders."""
+    rng = np.random.default_rng(seed)
+    ground = _grained(_dead_leaves(rng, (period, period), channels, wrap=True), rng)
+    ground.setflags(write=False)
+    return ground
+
+
+def _dead_leaves(
+    rng: np.random.Generator, size: tuple[int, int], channels: int, *, wrap: bool, cover: float = 3.0
+) -> NDArray[np.uint8]:
+    """Overlapping patches that cover the picture ``cover`` times; with ``wrap``, also across its borders."""
+    width, height = size
+    smallest, largest = 2.5, max(6.0, min(160.0, min(size) / 6.0))
+    mean_area = np.pi * 2.0 * np.log(largest / smallest) / (smallest**-2 - largest**-2)
+    count = int(np.ceil(cover * width * height / mean_area))
+    # Inverse of the cumulative distribution of r⁻³.
+    radius = 1.0 / np.sqrt(smallest**-2 - rng.random(count) * (smallest**-2 - largest**-2))
+    center = rng.random((count, 2)) * size
+    colour = _palette(rng, count, channels)
+    leaves = _leaf_outlines(rng, radius)
+
+    canvas = np.empty((height, width, channels), dtype=np.uint8)
+    canvas[:] = np.median(colour, axis=0)
+    for outline, middle, reach, value in zip(leaves, center, radius, colour.tolist(), strict=True):
+        for shift in _wrapped(middle, 2.0 * reach, size) if wrap else [middle]:
+            corners = np.rint((outline + shift) * 2**_SUBPIXEL_BITS).astype(np.int32)
+            cv2.fillPoly(canvas, [corners], value, cv2.LINE_AA, _SUBPIXEL_BITS)
+    return canvas
+
+
+def _palette(rng: np.random.Generator, count: int, channels: int) -> NDArray[np.float64]:
+    """Colours of patches, grey levels 20-235: a few materials, each with its own spread of brightness."""
+    materials = rng.uniform(60.0, 190.0, (9, 1)) + rng.normal(0.0, 18.0, (9, channels))
+    colour = materials[rng.integers(len(materials), size=count)] + rng.normal(0.0, 28.0, (count, 1))
+    return np.clip(colour, 20.0, 235.0)
+
+
+def _leaf_outlines(rng: np.random.Generator, radius: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Outlines around the origin: polygons of 3-7 corners, ellipses, and streaks like roads and joints."""
+    outlines = []
+    kinds = rng.choice(3, size=len(radius), p=(0.7, 0.2, 0.1))
+    for r, kind in zip(radius, kinds, strict=True):
+        corners = int(rng.integers(3, 8)) if kind == 0 else (16 if kind == 1 else 4)
+        around = 2.0 * np.pi * (np.arange(corners) + (rng.uniform(-0.35, 0.35, corners) if kind == 0 else 0.5))
+        points = np.column_stack([np.cos(around / corners), np.sin(around / corners)])
+        points *= (r, r * rng.uniform(0.4, 1.0)) if kind < 2 else (2.5 * r, 0.25 * r)
+        turn = rng.uniform(0.0, np.pi)
+        c, s = np.cos(turn), np.sin(turn)
+        outlines.append(points @ np.array([[c, s], [-s, c]]))
+    return outlines
+
+
+def _wrapped(middle: NDArray[np.float64], reach: float, size: tuple[int, int]) -> list[NDArray[np.float64]]:
+    """All places at which a leaf is drawn so that it continues across the borders."""
+    shifts = []
+    for x, width in zip(middle, size, strict=True):
+        shifts.append([0.0, *([width] if x < reach else []), *([-width] if x > width - reach else [])])
+    return [middle + np.array([dx, dy]) for dx in shifts[0] for dy in shifts[1]]
+
+
+def _grained(patches: NDArray[np.uint8], rng: np.random.Generator, strength: float = 0.05) -> Picture:
+    """Patches with periodic 1/f texture over them, in [0, 1]."""
+    height, width = patches.shape[:2]
+    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :])
+    frequency[0, 0] = np.inf
+    white = rng.standard_normal((height, width), dtype=np.float32)
+    grain = np.fft.irfft2(np.fft.rfft2(white) / frequency, s=(height, width))
+    grain = (strength * grain / grain.std()).astype(np.float32)
+    picture: Picture = patches.astype(np.float32) / np.float32(255.0) + grain[:, :, None]
+    return np.clip(picture, 0.0, 1.0, out=picture)
