@@ -133,7 +133,8 @@ def metadata_of(image: Image.Image) -> Metadata:
 
 def _bit_depth(image: Image.Image) -> int:
     """Bits per sample as stored; Pillow shows 16-bit colour PNG as 8-bit."""
-    if image.format == "PNG" and "16" in str(getattr(image, "tile", "")).partition("zip")[2]:
+    pieces = getattr(image, "tile", None)
+    if image.format == "PNG" and pieces and "16" in str(pieces[0][3]):
         return 16
     tags = getattr(image, "tag_v2", None)
     if tags is not None:

@@ -188,7 +188,7 @@ def _as_uint8(alpha: Pixels) -> NDArray[np.uint8]:
         return np.asarray(alpha, dtype=np.uint8)
     full = np.iinfo(alpha.dtype).max if np.issubdtype(alpha.dtype, np.integer) else 1.0
     share = np.clip(np.nan_to_num(alpha.astype(np.float32) / full), 0.0, 1.0)
-    return np.rint(share * _OPAQUE).astype(np.uint8)
+    return np.asarray(np.rint(share * _OPAQUE), dtype=np.uint8)
 
 
 def _turn(samples: Pixels, orientation: int) -> Pixels:

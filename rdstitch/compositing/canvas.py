@@ -1,0 +1,183 @@
+"""The canvas: where every picture lies in the output, and how large that is.
+
+A homography ``G`` maps the half-diagonal-normalized undistorted coordinates of its picture to *plane* coordinates,
+which have no unit; the canvas is the plane scaled, turned and shifted to pixels.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.errors import ArgumentError, LimitError
+
+# Straight sides are curved after undistortion: 64 points a side put the extremes within 0.02 px on 4000 px.
+_POINTS_PER_SIDE = 64
+_LARGEST_GROWTH = 100.0
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """The output picture's geometry.
+
+    Attributes
+    ----------
+    size : (int, int)
+        Width and height, px.
+    matrix : ndarray of shape (3, 3)
+        Affine, from plane coordinates to canvas px (centre of the top-left pixel at (0, 0)).
+    footprints : tuple of ndarray of shape (K, 2)
+        Outline of each picture, canvas px, clockwise from the picture's top-left corner.
+    """
+
+    size: tuple[int, int]
+    matrix: FloatArray
+    footprints: tuple[FloatArray, ...]
+
+    def boxes(self) -> list[tuple[int, int, int, int]]:
+        """Bounds (x0, y0, x1, y1) of every picture, whole px inside the canvas, end exclusive."""
+        width, height = self.size
+        boxes = []
+        for outline in self.footprints:
+            low, high = np.floor(outline.min(axis=0)), np.ceil(outline.max(axis=0)) + 1
+            x0, y0 = (max(0, int(v)) for v in low)
+            boxes.append((x0, y0, min(width, int(high[0])), min(height, int(high[1]))))
+        return boxes
+
+    def cropped(self, box: tuple[int, int, int, int]) -> "Canvas":
+        """The part (x0, y0, x1, y1) of this canvas as a canvas of its own."""
+        x0, y0, x1, y1 = box
+        shift = np.array([[1.0, 0.0, -x0], [0.0, 1.0, -y0], [0.0, 0.0, 1.0]])
+        footprints = tuple(outline - (x0, y0) for outline in self.footprints)
+        return Canvas((x1 - x0, y1 - y0), shift @ self.matrix, footprints)
+
+
+def plan_canvas(
+    cameras: Sequence[Camera],
+    homographies: ArrayLike,
+    *,
+    scale: float = 1.0,
+    rotate: float = 0.0,
+    reference: int | None = None,
+    names: Sequence[str] | None = None,
+) -> Canvas:
+    """Plan the smallest upright canvas that holds every picture.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+    homographies : array_like of shape (N, 3, 3)
+        ``G`` of each picture: normalized undistorted to plane coordinates.
+    scale : float
+        1 keeps, at its centre, the resolution of the reference picture, or of the median picture without one.
+    rotate : float
+        Degrees that the plane is turned clockwise in the output.
+    reference : int, optional
+        Picture whose resolution counts.
+    names : sequence of str, optional
+        What to call the pictures in messages.
+
+    Returns
+    -------
+    Canvas
+
+    Raises
+    ------
+    ArgumentError
+        When shapes differ, a homography is not finite or singular, or ``scale`` is not positive.
+    LimitError
+        When the canvas would be absurd; the text names the picture that makes it so.
+    """
+    matrices = np.asarray(homographies, dtype=np.float64)
+    called = [f"picture {k + 1}" for k in range(len(cameras))] if names is None else list(names)
+    _check(cameras, matrices, scale, rotate, called)
+    to_plane = [_oriented(g) for g in matrices]
+    outlines = [_outline_on_plane(c, g, name) for c, g, name in zip(cameras, to_plane, called, strict=True)]
+    px_per_unit = np.array([_resolution(c, g) for c, g in zip(cameras, to_plane, strict=True)])
+    _refuse_mirrored(px_per_unit, called)
+    resolution = scale * abs(px_per_unit[reference] if reference is not None else np.median(np.abs(px_per_unit)))
+
+    angle = math.radians(rotate)
+    cos, sin = resolution * math.cos(angle), resolution * math.sin(angle)
+    linear = np.array([[cos, -sin], [sin, cos]])
+    placed = [outline @ linear.T for outline in outlines]
+    low = np.min([outline.min(axis=0) for outline in placed], axis=0)
+    high = np.max([outline.max(axis=0) for outline in placed], axis=0)
+    _refuse_absurd(cameras, placed, high - low, scale, called)
+    # The outermost edge is the canvas' edge, half a pixel before the centre of the first pixel.
+    size = np.maximum(np.ceil(high - low - 1e-6), 1).astype(int)
+    matrix = np.eye(3)
+    matrix[:2, :2], matrix[:2, 2] = linear, -low - 0.5
+    return Canvas((int(size[0]), int(size[1])), matrix, tuple(p - low - 0.5 for p in placed))
+
+
+def _check(cameras: Sequence[Camera], matrices: FloatArray, scale: float, rotate: float, names: Sequence[str]) -> None:
+    """Refuse arguments that do not fit together."""
+    if not cameras or matrices.shape != (len(cameras), 3, 3) or len(names) != len(cameras):
+        raise ArgumentError(f"expected one homography (3, 3) per camera, not {matrices.shape} for {len(cameras)}")
+    if not (math.isfinite(scale) and scale > 0):
+        raise ArgumentError(f"scale must be positive, not {scale}")
+    if not math.isfinite(rotate):
+        raise ArgumentError(f"rotate must be an angle in degrees, not {rotate}")
+    for matrix, name in zip(matrices, names, strict=True):
+        if not np.isfinite(matrix).all() or np.linalg.cond(matrix) > 1e12:
+            raise ArgumentError(f"{name}: the homography is singular or not finite")
+
+
+def _oriented(matrix: FloatArray) -> FloatArray:
+    """The homography with the sign that puts the picture's centre in front of the camera."""
+    return matrix if matrix[2, 2] > 0 else -matrix
+
+
+def _outline_on_plane(camera: Camera, matrix: FloatArray, name: str) -> FloatArray:
+    """Densely sampled outline in plane coordinates."""
+    flat = camera.normalize(camera.undistort(camera.outline(_POINTS_PER_SIDE)))
+    z = np.column_stack([flat, np.ones(len(flat))]) @ matrix.T
+    # The third coordinate is linear, so it has one sign inside when it has one on the outline.
+    if not (z[:, 2] > 0).all():
+        raise LimitError(f"{name}: the horizon crosses the picture; leave it out, or choose another reference picture")
+    return z[:, :2] / z[:, 2:]
+
+
+def _resolution(camera: Camera, matrix: FloatArray) -> float:
+    """Picture px per plane unit at the picture's centre, negative where the picture is mirrored."""
+    width, height = camera.image_size
+    middle = np.array([(width - 1) / 2, (height - 1) / 2])
+    flat = camera.normalize(camera.undistort(middle + np.array([(-0.5, 0), (0.5, 0), (0, -0.5), (0, 0.5)])))
+    z = np.column_stack([flat, np.ones(4)]) @ matrix.T
+    left, right, top, bottom = z[:, :2] / z[:, 2:]
+    (ax, ay), (bx, by) = right - left, bottom - top
+    area = ax * by - ay * bx
+    return float(math.copysign(1.0 / math.sqrt(max(abs(area), 1e-300)), area))
+
+
+def _refuse_mirrored(px_per_unit: FloatArray, names: Sequence[str]) -> None:
+    """Refuse a picture that lies mirrored among the others."""
+    usual = 1.0 if (px_per_unit > 0).sum() * 2 >= len(px_per_unit) else -1.0
+    for value, name in zip(px_per_unit, names, strict=True):
+        if value * usual < 0:
+            raise LimitError(f"{name}: would be mirrored (folded) in the output; leave it out")
+
+
+def _refuse_absurd(
+    cameras: Sequence[Camera], outlines: Sequence[FloatArray], extent: FloatArray, scale: float, names: Sequence[str]
+) -> None:
+    """Refuse a canvas, or a picture in it, that is out of all proportion to the input."""
+    pixels = [c.image_size[0] * c.image_size[1] * scale**2 for c in cameras]
+    for outline, own, name in zip(outlines, pixels, names, strict=True):
+        growth = float(np.prod(np.ptp(outline, axis=0))) / own
+        if growth > _LARGEST_GROWTH:
+            raise LimitError(
+                f"{name}: would be stretched to {growth:.0f} times its size (near the horizon, or wrongly placed); "
+                "leave it out, or choose another reference picture"
+            )
+    if float(np.prod(extent)) > _LARGEST_GROWTH * sum(pixels):
+        middle = np.median([outline.mean(axis=0) for outline in outlines], axis=0)
+        farthest = int(np.argmax([np.linalg.norm(outline.mean(axis=0) - middle) for outline in outlines]))
+        raise LimitError(
+            f"the canvas would have {extent[0]:.0f} x {extent[1]:.0f} px, over {_LARGEST_GROWTH:.0f} times all "
+            f"pictures; {names[farthest]} lies farthest off: leave it out"
+        )

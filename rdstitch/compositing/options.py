@@ -1,0 +1,71 @@
+"""How pictures are put together."""
+
+import math
+from dataclasses import dataclass, fields
+from typing import Literal, get_args, get_type_hints
+
+from rdstitch.errors import ArgumentError
+
+Exposure = Literal["none", "gain", "blocks"]
+Seam = Literal["none", "voronoi", "graphcut"]
+Blend = Literal["none", "feather", "multiband"]
+Crop = Literal["none", "auto"]
+Interpolation = Literal["linear", "cubic", "lanczos"]
+
+
+@dataclass(frozen=True)
+class CompositeOptions:
+    """Options of the compositor; the command line has the same names and defaults.
+
+    Raises
+    ------
+    ArgumentError
+        When a value is not one of those listed.
+    """
+
+    # Brightness made equal, in linear light: "gain" one factor per picture and channel and one vignetting for all;
+    # "blocks" also a smooth field per picture; "none" for people who measure.
+    exposure: Exposure = "gain"
+    # Where one picture ends and the next begins: "graphcut" goes round what differs between them (parallax, people),
+    # "voronoi" where their borders are equally far, "none" leaves it to the blending.
+    seam: Seam = "graphcut"
+    # "multiband" hides the seam over a width that suits each size of detail, "feather" averages over the whole
+    # overlap, "none" cuts.
+    blend: Blend = "multiband"
+    # "auto" cuts to the largest upright rectangle without holes, where that keeps a fair part of the picture.
+    crop: Crop = "none"
+    # Size of the output; 1 keeps the resolution of the reference picture (or the median one) at its centre.
+    scale: float = 1.0
+    # Degrees that the output is turned clockwise.
+    rotate: float = 0.0
+    # Bytes that the compositor may hold in pictures and tiles; None: half of the memory that is free.
+    max_memory: int | None = None
+    # Kernel of the one resampling.
+    interpolation: Interpolation = "cubic"
+    # Grey of what no picture covers, in formats without transparency: 0 black, 255 white.
+    background: int = 0
+    # Bands of "multiband"; the widest transition is about 2**bands px. None: by the size of the pictures.
+    bands: int | None = None
+    # Side of the square tiles that the canvas is worked on in, px; a multiple of 256. It does not change the result.
+    tile_size: int = 1024
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        hints = get_type_hints(type(self))
+        for option in fields(self):
+            allowed = get_args(hints[option.name])
+            value = getattr(self, option.name)
+            if isinstance(value, str) and value not in allowed:
+                raise ArgumentError(f"{option.name} must be one of {', '.join(allowed)}, not '{value}'")
+        if not (math.isfinite(self.scale) and self.scale > 0):
+            raise ArgumentError(f"scale must be positive, not {self.scale}")
+        if not math.isfinite(self.rotate):
+            raise ArgumentError(f"rotate must be an angle in degrees, not {self.rotate}")
+        if self.max_memory is not None and self.max_memory <= 0:
+            raise ArgumentError(f"max_memory must be positive, not {self.max_memory}")
+        if not 0 <= self.background <= 255:
+            raise ArgumentError(f"background must be a grey from 0 to 255, not {self.background}")
+        if self.bands is not None and not 1 <= self.bands <= 8:
+            raise ArgumentError(f"bands must be from 1 to 8, not {self.bands}")
+        if self.tile_size < 256 or self.tile_size % 256:
+            raise ArgumentError(f"tile_size must be a multiple of 256, not {self.tile_size}")

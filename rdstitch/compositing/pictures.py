@@ -1,0 +1,156 @@
+"""Pictures read when their tiles come, smoothed for the output's resolution, in a cache of bounded size."""
+
+import math
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.errors import InputError
+from rdstitch.io.read import Picture
+
+Source = Callable[[], Picture]
+
+_OPAQUE_FROM = 128
+# A picture that gets smaller by less than this keeps its pixels as they are.
+_NEGLIGIBLE_SHRINK = 1.05
+# Share of the shorter side over which the weight rises from the border of a mask.
+_MASK_FEATHER = 0.125
+
+
+@dataclass(frozen=True)
+class LoadedPicture:
+    """A picture ready to be resampled.
+
+    Attributes
+    ----------
+    pixels : ndarray of shape (h, w) or (h, w, C)
+        uint8, uint16 or float32; transparent pixels are filled from their nearest neighbours.
+    opacity : ndarray of shape (h, w), float32, or None
+        0 where the picture is masked out, else rising to 1 with the distance from the mask.
+    opacity_step : float
+        Opacity of the last opaque pixel beside a transparent one.
+    reduction : int
+        The picture is smaller than the original by this factor.
+    """
+
+    pixels: NDArray[Any]
+    opacity: NDArray[np.float32] | None = None
+    opacity_step: float = 1.0
+    reduction: int = 1
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it takes, bytes."""
+        return self.pixels.nbytes + (0 if self.opacity is None else self.opacity.nbytes)
+
+
+def prepare_picture(picture: Picture, shrink: float) -> LoadedPicture:
+    """Fill what is transparent, and smooth the picture to what an output that shrinks it can show.
+
+    Parameters
+    ----------
+    picture : Picture
+    shrink : float
+        Picture px per output px. From 2 on, the picture is averaged over whole blocks; the rest is a Gaussian.
+    """
+    pixels, opaque = picture.pixels, None
+    if picture.alpha is not None:
+        opaque = picture.alpha >= _OPAQUE_FROM
+        pixels = _filled(pixels, opaque)
+    reduction = max(1, int(shrink))
+    if reduction > 1:
+        pixels = _block_mean(pixels, reduction)
+        opaque = None if opaque is None else _block_mean(opaque.astype(np.float32), reduction) > 0.999
+    rest = shrink / reduction
+    if rest > _NEGLIGIBLE_SHRINK:
+        sigma = 0.5 * math.sqrt(rest**2 - 1.0)
+        pixels = cv2.GaussianBlur(pixels, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
+    if opaque is None:
+        return LoadedPicture(pixels, reduction=reduction)
+    opacity, step = _opacity(opaque)
+    return LoadedPicture(pixels, opacity, step, reduction)
+
+
+def _filled(pixels: NDArray[Any], opaque: NDArray[np.bool_]) -> NDArray[Any]:
+    """Every transparent pixel gets the value of the nearest opaque one, so that no kernel mixes in its colour."""
+    if not opaque.any():
+        return pixels
+    _, labels = cv2.distanceTransformWithLabels(
+        (~opaque).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    position = np.zeros(int(labels.max()) + 1, dtype=np.intp)
+    position[labels[opaque]] = np.flatnonzero(opaque)
+    flat = pixels.reshape(-1, *pixels.shape[2:])
+    return np.ascontiguousarray(flat[position[labels]])
+
+
+def _block_mean(pixels: NDArray[Any], factor: int) -> NDArray[Any]:
+    """Mean over blocks of ``factor`` x ``factor`` px; the last block is completed by repetition."""
+    height, width = pixels.shape[:2]
+    down, right = -height % factor, -width % factor
+    whole = cv2.copyMakeBorder(pixels, 0, down, 0, right, cv2.BORDER_REPLICATE) if down or right else pixels
+    size = ((width + right) // factor, (height + down) // factor)
+    done = cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(done).reshape(size[1], size[0], *pixels.shape[2:])
+
+
+def _opacity(opaque: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float]:
+    """Weight that rises from a mask's border, and its value at the first opaque pixel."""
+    reach = max(2.0, _MASK_FEATHER * min(opaque.shape))
+    distance = cv2.distanceTransform(opaque.astype(np.uint8), cv2.DIST_L2, 5)
+    return np.minimum(np.asarray(distance, dtype=np.float32) / np.float32(reach), np.float32(1.0)), 1.0 / reach
+
+
+class PictureCache:
+    """The pictures used last, in at most ``limit`` bytes (though always one).
+
+    Parameters
+    ----------
+    sources : sequence of callables
+        Each reads one picture.
+    sizes : sequence of (int, int)
+        Width and height that each picture must have.
+    shrinks : sequence of float
+        Picture px per output px.
+    limit : int
+        Bytes.
+    """
+
+    def __init__(
+        self, sources: Sequence[Source], sizes: Sequence[tuple[int, int]], shrinks: Sequence[float], limit: int
+    ) -> None:
+        self._sources, self._sizes, self._shrinks, self._limit = sources, sizes, shrinks, limit
+        self._held: OrderedDict[int, LoadedPicture] = OrderedDict()
+        self._bytes = 0
+
+    def __getitem__(self, index: int) -> LoadedPicture:
+        """Picture ``index``, read unless it is held.
+
+        Raises
+        ------
+        InputError
+            When it cannot be read, or has another size than its camera.
+        """
+        if index in self._held:
+            self._held.move_to_end(index)
+            return self._held[index]
+        picture = self._sources[index]()
+        height, width = picture.pixels.shape[:2]
+        if (width, height) != self._sizes[index]:
+            expected = "{} x {}".format(*self._sizes[index])
+            raise InputError(
+                f"picture {index + 1} has {width} x {height} px now, but {expected} when it was registered"
+            )
+        loaded = prepare_picture(picture, self._shrinks[index])
+        del picture
+        self._bytes += loaded.nbytes
+        while self._held and self._bytes > self._limit:
+            _, dropped = self._held.popitem(last=False)
+            self._bytes -= dropped.nbytes
+        self._held[index] = loaded
+        return loaded

@@ -1,0 +1,233 @@
+"""One resampling from the original: canvas px → plane → undistorted → measured px of one picture."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.compositing.canvas import Canvas
+from rdstitch.compositing.pictures import LoadedPicture
+
+Box = tuple[int, int, int, int]
+Float32Array = NDArray[np.float32]
+
+INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos": cv2.INTER_LANCZOS4}
+
+# Coordinates are computed on a lattice of the canvas and interpolated linearly, to this many px of the picture.
+# OpenCV rounds them to 1/32 px afterwards.
+_LATTICE_ERROR = 0.01
+_LATTICE_STEPS = (32, 16, 8, 4, 2)
+_NOWHERE = np.float32(-1e6)
+# Room around a piece of a picture for the kernel of the resampling, px.
+_KERNEL_MARGIN = 8
+_PROBES = 16
+
+
+@dataclass(frozen=True)
+class Warp:
+    """How the canvas is filled from one picture.
+
+    Attributes
+    ----------
+    camera : Camera
+    from_canvas : ndarray of shape (3, 3)
+        Canvas px to normalized undistorted coordinates; third coordinate positive in front of the camera.
+    box : (int, int, int, int)
+        Where the picture can lie on the canvas: x0, y0, x1, y1, px, end exclusive.
+    step : int
+        Spacing of the coordinate lattice, canvas px.
+    shrink : float
+        Picture px per canvas px (median over the picture); above 1 the picture gets smaller.
+    """
+
+    camera: Camera
+    from_canvas: FloatArray
+    box: Box
+    step: int
+    shrink: float
+
+    def source_points(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Measured px (..., 2) of the picture at canvas px ``x``, ``y``; NaN where there are none."""
+        m = self.from_canvas
+        z = m[2, 0] * x + m[2, 1] * y + m[2, 2]
+        z = np.where(z > 0.0, z, np.nan)
+        u = (m[0, 0] * x + m[0, 1] * y + m[0, 2]) / z
+        v = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) / z
+        return self.camera.distort(self.camera.denormalize(np.stack([u, v], axis=-1)))
+
+    def maps(self, box: Box) -> tuple[Float32Array, Float32Array]:
+        """Measured px of every canvas px of ``box``: two arrays (h, w), far outside where there are none.
+
+        The lattice is anchored to the canvas, so that every box gives the same coordinates, bit for bit.
+        """
+        x0, y0, x1, y1 = box
+        xs, ys = (_lattice(a, b, self.step) for a, b in ((x0, x1), (y0, y1)))
+        nodes = self.source_points(xs[None, :], ys[:, None]).astype(np.float32)
+        nodes[~np.isfinite(nodes).all(axis=-1)] = _NOWHERE
+        window = np.s_[y0 - int(ys[0]) : y1 - int(ys[0]), x0 - int(xs[0]) : x1 - int(xs[0])]
+        return (
+            np.ascontiguousarray(interpolate_lattice(nodes[..., 0], self.step)[window]),
+            np.ascontiguousarray(interpolate_lattice(nodes[..., 1], self.step)[window]),
+        )
+
+
+@dataclass(frozen=True)
+class WarpedTile:
+    """One picture on one box of the canvas.
+
+    Attributes
+    ----------
+    pixels : ndarray of shape (h, w) or (h, w, C)
+        In the picture's sample type; mirrored content outside the picture, so that filters find no edge there.
+    inside : ndarray of shape (h, w), bool
+        Where the picture says something.
+    weight : ndarray of shape (h, w), float32
+        1 at the picture's centre, falling to 0 at its border (measured in the picture); 0 outside.
+    """
+
+    pixels: NDArray[Any]
+    inside: NDArray[np.bool_]
+    weight: Float32Array
+
+
+def plan_warp(camera: Camera, homography: FloatArray, canvas: Canvas, index: int) -> Warp:
+    """Everything about the resampling of picture ``index`` that does not depend on the tile."""
+    from_canvas = np.asarray(np.linalg.inv(canvas.matrix @ homography), dtype=np.float64)
+    outline = canvas.footprints[index]
+    # The sign of a homography is free; its inverse must put the footprint in front of the camera.
+    if from_canvas[2] @ np.array([*outline.mean(axis=0), 1.0]) < 0:
+        from_canvas = -from_canvas
+    box = canvas.boxes()[index]
+    draft = Warp(camera, from_canvas, box, 1, 1.0)
+    probes = _probes(camera, canvas.matrix @ homography, outline)
+    return Warp(camera, from_canvas, box, _lattice_step(draft, probes), _shrink(draft, probes))
+
+
+def warp_tile(warp: Warp, picture: LoadedPicture, box: Box, interpolation: str = "cubic") -> WarpedTile | None:
+    """Resample one picture onto one box of the canvas; None where they do not meet.
+
+    Parameters
+    ----------
+    warp : Warp
+    picture : LoadedPicture
+        Prepared for ``warp.shrink``.
+    box : (int, int, int, int)
+        x0, y0, x1, y1 on the canvas, px, end exclusive.
+    interpolation : str
+        "linear", "cubic" or "lanczos".
+    """
+    map_x, map_y = warp.maps(box)
+    width, height = warp.camera.image_size
+    inside = (map_x >= -0.5) & (map_x < width - 0.5) & (map_y >= -0.5) & (map_y < height - 0.5)
+    if not inside.any():
+        return None
+    weight = (np.float32(1.0) - np.abs((map_x + np.float32(0.5)) * np.float32(2.0 / width) - np.float32(1.0))) * (
+        np.float32(1.0) - np.abs((map_y + np.float32(0.5)) * np.float32(2.0 / height) - np.float32(1.0))
+    )
+    weight[~inside] = 0.0
+    if not inside.all():
+        map_x, map_y = _mirror(map_x, width), _mirror(map_y, height)
+    if picture.reduction > 1:
+        map_x, map_y = (_reduce(m, picture.reduction) for m in (map_x, map_y))
+    pixels, opacity = _sample(picture, map_x, map_y, INTERPOLATION[interpolation])
+    if opacity is not None:
+        inside &= opacity > 0
+        weight *= opacity
+    return WarpedTile(pixels, inside, weight)
+
+
+def _sample(
+    picture: LoadedPicture, map_x: Float32Array, map_y: Float32Array, interpolation: int
+) -> tuple[NDArray[Any], Float32Array | None]:
+    """Pixels and opacity at the given px of the picture, read from the smallest piece that holds them."""
+    height, width = picture.pixels.shape[:2]
+    left, top = (max(0, int(m.min()) - _KERNEL_MARGIN) for m in (map_x, map_y))
+    right = min(width, int(map_x.max()) + 2 + _KERNEL_MARGIN)
+    bottom = min(height, int(map_y.max()) + 2 + _KERNEL_MARGIN)
+    # Whole px are subtracted exactly, so the piece does not change the result.
+    map_x, map_y = map_x - np.float32(left), map_y - np.float32(top)
+    piece = picture.pixels[top:bottom, left:right]
+    pixels = _remap(piece, map_x, map_y, interpolation)
+    if picture.opacity is None:
+        return pixels, None
+    opacity = cv2.remap(
+        picture.opacity[top:bottom, left:right], map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    # The outer half of the last opaque pixel is outside.
+    return pixels, np.where(opacity >= 0.5 * picture.opacity_step, opacity, 0.0).astype(np.float32)
+
+
+def _remap(piece: NDArray[Any], map_x: Float32Array, map_y: Float32Array, interpolation: int) -> NDArray[Any]:
+    """``cv2.remap`` for any number of channels."""
+    channels = 1 if piece.ndim == 2 else piece.shape[2]
+    if channels <= 4:
+        done = cv2.remap(piece, map_x, map_y, interpolation, borderMode=cv2.BORDER_REFLECT)
+        return np.asarray(done).reshape(*map_x.shape, *piece.shape[2:])
+    bands = [_remap(np.ascontiguousarray(piece[..., k]), map_x, map_y, interpolation) for k in range(channels)]
+    return np.stack(bands, axis=-1)
+
+
+def _mirror(values: Float32Array, length: int) -> Float32Array:
+    """Coordinates mirrored at the picture's borders until they lie inside."""
+    t = np.mod(values + np.float32(0.5), np.float32(2 * length))
+    mirrored: Float32Array = np.minimum(t, np.float32(2 * length) - t) - np.float32(0.5)
+    return mirrored
+
+
+def _reduce(values: Float32Array, reduction: int) -> Float32Array:
+    """Px of the original to px of the picture reduced by a whole factor."""
+    return (values + np.float32(0.5)) / np.float32(reduction) - np.float32(0.5)
+
+
+def _lattice(start: int, stop: int, step: int) -> FloatArray:
+    """Nodes of the canvas' lattice that enclose [start, stop - 1]."""
+    return np.arange(start // step, -(-(stop - 1) // step) + 2, dtype=np.float64) * step
+
+
+def interpolate_lattice(nodes: Float32Array, step: int) -> Float32Array:
+    """Linear interpolation of (m, n) nodes to ((m-1) step, (n-1) step) values, equal for equal nodes."""
+    if step == 1:
+        return nodes[:-1, :-1]
+    t = (np.arange(step, dtype=np.float32) / np.float32(step))[:, None]
+    rows, columns = nodes.shape
+    down = (nodes[:-1, None, :] + (nodes[1:] - nodes[:-1])[:, None, :] * t).reshape(-1, columns)
+    across = down[:, :-1, None] + (down[:, 1:] - down[:, :-1])[:, :, None] * t[:, 0]
+    return across.reshape((rows - 1) * step, -1)
+
+
+def _probes(camera: Camera, to_canvas: FloatArray, outline: FloatArray) -> FloatArray:
+    """Canvas px (K, 2) spread over the picture, its outline included."""
+    width, height = camera.image_size
+    grid = np.stack(np.meshgrid(np.linspace(0, width - 1, _PROBES), np.linspace(0, height - 1, _PROBES)), axis=-1)
+    flat = camera.normalize(camera.undistort(grid.reshape(-1, 2)))
+    z = np.column_stack([flat, np.ones(len(flat))]) @ to_canvas.T
+    return np.concatenate([z[:, :2] / z[:, 2:], outline])
+
+
+def _lattice_step(warp: Warp, probes: FloatArray) -> int:
+    """Widest spacing of the lattice whose interpolation error stays below the limit."""
+    corners = np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
+    truth = warp.source_points(probes[:, 0], probes[:, 1])
+    known = np.isfinite(truth).all(axis=1)
+    for step in _LATTICE_STEPS:
+        around = probes[:, None] + corners * step
+        reach = warp.source_points(around[..., 0], around[..., 1])
+        around = probes[:, None] + corners * (step / 2)
+        near = warp.source_points(around[..., 0], around[..., 1])
+        error = np.linalg.norm(near.mean(axis=1) - truth, axis=1)[known]
+        if np.isfinite(reach[known]).all() and (error < _LATTICE_ERROR).all():
+            return step
+    return 1
+
+
+def _shrink(warp: Warp, probes: FloatArray) -> float:
+    """Median over the picture of picture px per canvas px."""
+    offsets = np.array([(-0.5, 0.0), (0.5, 0.0), (0.0, -0.5), (0.0, 0.5)])
+    around = probes[:, None] + offsets
+    left, right, top, bottom = np.moveaxis(warp.source_points(around[..., 0], around[..., 1]), 1, 0)
+    (ax, ay), (bx, by) = (right - left).T, (bottom - top).T
+    return math.sqrt(float(np.nanmedian(np.abs(ax * by - ay * bx))))
