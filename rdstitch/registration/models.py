@@ -1,0 +1,239 @@
+"""How a picture's pose and the camera's shared parameters make a homography: the family of motion models.
+
+Every model gives, for each picture i, the homography ``P_i`` from the plane to the picture's undistorted coordinates
+(half diagonals from the distortion centre), and its derivatives; the adjustment knows nothing else of a model. Two
+pictures are related by ``H_ij = P_j P_i⁻¹``.
+
+From the least to the most free:
+
+========== =============================================== ===================================================
+model      per picture                                     picture
+========== =============================================== ===================================================
+rigid      φ, tx, ty                                       robot: tilt and height stay (Valtonen Örnhag et al.)
+similarity φ, tx, ty, log h                                drone that climbs and sinks
+tilting    φ, tx, ty, log h, δψ, δθ                        drone in wind: small tilts of its own
+homography 8                                               any motion, any camera
+========== =============================================== ===================================================
+
+The first three share the tilt (ψ, θ) and the focal length:
+``P_i = diag(f, f, 1) Rx(ψ + δψ_i) Ry(θ + δθ_i) Rz(φ_i) diag(1, 1, h_i) T(t_i)``, ``T = I - t e3'``.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.camera import FloatArray
+from rdstitch.planar_motion import rotation_from_tilt
+
+BoolArray = NDArray[np.bool_]
+
+YAW, X, Y, LOG_HEIGHT, PSI, THETA = range(6)
+"""Columns of a planar model's poses."""
+
+_AROUND_X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+_AROUND_Y = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+
+
+@dataclass(frozen=True)
+class ModelMatrices:
+    """Plane-to-picture homographies of N pictures with their derivatives.
+
+    Attributes
+    ----------
+    matrices : ndarray of shape (N, 3, 3)
+    by_pose : ndarray of shape (N, D, 3, 3)
+        By a step of the D pose parameters, as :meth:`Model.moved` takes it.
+    by_shared : ndarray of shape (N, S, 3, 3)
+        By the S shared parameters.
+    """
+
+    matrices: FloatArray
+    by_pose: FloatArray
+    by_shared: FloatArray
+
+
+class Model(Protocol):
+    """What the adjustment needs to know of a motion model."""
+
+    @property
+    def name(self) -> str:
+        """One word for it."""
+
+    @property
+    def pose_size(self) -> int:
+        """Free parameters per picture, D."""
+
+    @property
+    def shared_names(self) -> tuple[str, ...]:
+        """Parameters that all pictures share, S of them, without those of the lens."""
+
+    @property
+    def gauge(self) -> BoolArray:
+        """Which of the D parameters the choice of the plane's frame takes from the reference picture, shape (D,)."""
+
+    def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
+        """Homographies from the plane to the pictures, with derivatives."""
+
+    def moved(self, poses: FloatArray, step: FloatArray) -> FloatArray:
+        """Poses after a step of shape (N, D)."""
+
+    def offsets(self, poses: FloatArray) -> FloatArray:
+        """The D parameters of each picture (N, D) that a prior speaks of; zeros where none can."""
+
+    def origin(self, shared: FloatArray) -> FloatArray:
+        """The homography (3, 3) of a picture whose pose is the plane's own frame."""
+
+    def poses_from(self, homographies: FloatArray, shared: FloatArray) -> FloatArray:
+        """The poses nearest to the given plane-to-picture homographies (N, 3, 3)."""
+
+
+@dataclass(frozen=True)
+class PlanarModel:
+    """Camera that moves over a plane with a tilt that it keeps, or nearly keeps.
+
+    Poses have six columns, :data:`YAW` to :data:`THETA`, of which only the free ones move.
+
+    Attributes
+    ----------
+    name : str
+    free : tuple of int
+        The free columns.
+    """
+
+    name: str
+    free: tuple[int, ...]
+    shared_names: tuple[str, ...] = ("psi", "theta", "log_focal")
+
+    @property
+    def pose_size(self) -> int:
+        """Free parameters per picture."""
+        return len(self.free)
+
+    @property
+    def gauge(self) -> BoolArray:
+        """A rigid motion of the plane, and its scale where heights are free; tilts are no matter of frame."""
+        return np.array([column not in (PSI, THETA) for column in self.free])
+
+    def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
+        """Homographies from the plane to the pictures, with derivatives."""
+        count = len(poses)
+        focal = np.exp(shared[2])
+        calibration = np.diag([focal, focal, 1.0])
+        rotation = rotation_from_tilt(poses[:, [PSI, THETA]] + shared[:2])
+        motion, by_motion = _motion_in_plane(poses)
+        left = calibration @ rotation
+        matrices = left @ motion
+
+        by_tilt = np.stack([calibration @ _AROUND_X @ rotation @ motion, left @ _AROUND_Y @ motion], axis=1)
+        by_columns = np.concatenate([left[:, None] @ by_motion, by_tilt], axis=1)
+        by_focal = matrices * np.array([1.0, 1.0, 0.0])[:, None]
+        by_shared = np.concatenate([by_tilt, by_focal[:, None]], axis=1)
+        return ModelMatrices(matrices, by_columns[:, list(self.free)].reshape(count, -1, 3, 3), by_shared)
+
+    def moved(self, poses: FloatArray, step: FloatArray) -> FloatArray:
+        """Poses after a step of shape (N, D)."""
+        result = poses.copy()
+        result[:, list(self.free)] += step
+        return result
+
+    def offsets(self, poses: FloatArray) -> FloatArray:
+        """The free parameters themselves."""
+        return poses[:, list(self.free)]
+
+    def origin(self, shared: FloatArray) -> FloatArray:
+        """``diag(f, f, 1) R``."""
+        matrix: FloatArray = self.matrices(np.zeros((1, 6)), shared).matrices[0]
+        return matrix
+
+    def poses_from(self, homographies: FloatArray, shared: FloatArray) -> FloatArray:
+        """The nearest poses without tilts of their own."""
+        focal = np.exp(shared[2])
+        motion = rotation_from_tilt(shared[:2]).T @ np.diag([1.0 / focal, 1.0 / focal, 1.0]) @ homographies
+        area = motion[:, 0, 0] * motion[:, 1, 1] - motion[:, 0, 1] * motion[:, 1, 0]
+        scale = np.copysign(np.sqrt(np.maximum(np.abs(area), 1e-12)), motion[:, 2, 2])
+        motion = motion / scale[:, None, None]
+        yaw = np.arctan2(motion[:, 1, 0] - motion[:, 0, 1], motion[:, 0, 0] + motion[:, 1, 1])
+        c, s = np.cos(yaw), np.sin(yaw)
+        poses = np.zeros((len(homographies), 6))
+        poses[:, YAW] = yaw
+        poses[:, X] = -(c * motion[:, 0, 2] + s * motion[:, 1, 2])
+        poses[:, Y] = -(-s * motion[:, 0, 2] + c * motion[:, 1, 2])
+        if LOG_HEIGHT in self.free:
+            poses[:, LOG_HEIGHT] = np.log(np.clip(np.abs(motion[:, 2, 2]), 1e-3, 1e3))
+        return poses
+
+
+def _motion_in_plane(poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """``Rz(φ) diag(1, 1, h) T`` (N, 3, 3) and its derivatives by φ, tx, ty, log h (N, 4, 3, 3)."""
+    c, s = np.cos(poses[:, YAW]), np.sin(poses[:, YAW])
+    x, y, height = poses[:, X], poses[:, Y], np.exp(poses[:, LOG_HEIGHT])
+    motion = np.zeros((len(poses), 3, 3))
+    motion[:, 0, 0] = motion[:, 1, 1] = c
+    motion[:, 0, 1], motion[:, 1, 0] = -s, s
+    motion[:, 0, 2], motion[:, 1, 2] = -(c * x - s * y), -(s * x + c * y)
+    motion[:, 2, 2] = height
+    derivatives = np.zeros((len(poses), 4, 3, 3))
+    derivatives[:, 0, 0], derivatives[:, 0, 1] = -motion[:, 1], motion[:, 0]
+    derivatives[:, 1, 0, 2], derivatives[:, 1, 1, 2] = -c, -s
+    derivatives[:, 2, 0, 2], derivatives[:, 2, 1, 2] = s, -c
+    derivatives[:, 3, 2, 2] = height
+    return motion, derivatives
+
+
+@dataclass(frozen=True)
+class HomographyModel:
+    """One homography per picture: eight parameters, a step being ``P ← (I + Σ δ_k E_k) P``.
+
+    The step acts in the picture's frame, where coordinates are of order one however far away the picture lies.
+    ``E_k`` are the unit matrices without the last, which the scale of P leaves free. Poses are P, row by row.
+    """
+
+    name: str = "homography"
+    pose_size: int = 8
+    shared_names: tuple[str, ...] = ()
+
+    @property
+    def gauge(self) -> BoolArray:
+        """All of the reference picture: the plane may be mapped by any homography."""
+        return np.ones(8, dtype=np.bool_)
+
+    def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
+        """Homographies from the plane to the pictures, with derivatives."""
+        matrices = poses.reshape(-1, 3, 3)
+        generators = np.eye(9)[:8].reshape(8, 3, 3)
+        return ModelMatrices(matrices, generators @ matrices[:, None], np.zeros((len(poses), 0, 3, 3)))
+
+    def moved(self, poses: FloatArray, step: FloatArray) -> FloatArray:
+        """Poses after a step of shape (N, 8)."""
+        change = np.concatenate([step, np.zeros((len(step), 1))], axis=1).reshape(-1, 3, 3)
+        return _unit_determinant(poses.reshape(-1, 3, 3) + change @ poses.reshape(-1, 3, 3))
+
+    def offsets(self, poses: FloatArray) -> FloatArray:
+        """Zeros: no prior speaks of a homography."""
+        return np.zeros((len(poses), 8))
+
+    def origin(self, shared: FloatArray) -> FloatArray:
+        """The identity."""
+        return np.eye(3)
+
+    def poses_from(self, homographies: FloatArray, shared: FloatArray) -> FloatArray:
+        """The homographies themselves."""
+        return _unit_determinant(homographies)
+
+
+def _unit_determinant(matrices: FloatArray) -> FloatArray:
+    """Scaled to determinant ±1 without changing sign, flattened to (N, 9)."""
+    size = np.cbrt(np.maximum(np.abs(np.linalg.det(matrices)), 1e-300))
+    scaled: FloatArray = matrices / size[:, None, None]
+    return scaled.reshape(-1, 9)
+
+
+RIGID = PlanarModel("rigid", (YAW, X, Y))
+SIMILARITY = PlanarModel("similarity", (YAW, X, Y, LOG_HEIGHT))
+TILTING = PlanarModel("tilting", (YAW, X, Y, LOG_HEIGHT, PSI, THETA))
+HOMOGRAPHY = HomographyModel()
+MODELS: dict[str, Model] = {model.name: model for model in (RIGID, SIMILARITY, TILTING, HOMOGRAPHY)}
+"""The family by name, from the least to the most free."""

@@ -1,0 +1,109 @@
+"""The correspondences of all links as flat arrays, thinned so that each link costs the same."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.registration.links import Link
+
+IntArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Correspondences of L links, one after the other.
+
+    Attributes
+    ----------
+    image1, image2 : ndarray of shape (L,), intp
+        Indices of the pictures of each link.
+    start : ndarray of shape (L + 1,), intp
+        Link l has the correspondences ``start[l]:start[l + 1]``.
+    points1, points2 : ndarray of shape (M, 2)
+        Measured, in half diagonals from the camera's distortion centre.
+    scale1, scale2 : ndarray of shape (L,)
+        Half the diagonal of each link's pictures, px.
+    """
+
+    image1: IntArray
+    image2: IntArray
+    start: IntArray
+    points1: FloatArray
+    points2: FloatArray
+    scale1: FloatArray
+    scale2: FloatArray
+
+    @classmethod
+    def from_links(cls, links: Sequence[Link], cameras: Sequence[Camera], most: int | None = None) -> Self:
+        """Of each link at most about ``most`` correspondences, well spread over its overlap."""
+        kept = [spread_choice(link.points1, most) for link in links]
+        sizes = [camera.half_diagonal for camera in cameras]
+        pairs = [(link.image1, link.image2) for link in links]
+        index1, index2 = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
+        empty = [np.empty((0, 2))]
+        return cls(
+            index1,
+            index2,
+            np.concatenate([[0], np.cumsum([len(k) for k in kept])]).astype(np.intp),
+            np.concatenate(
+                empty
+                + [cameras[i].normalize(link.points1[k]) for (i, _), link, k in zip(pairs, links, kept, strict=True)]
+            ),
+            np.concatenate(
+                empty
+                + [cameras[j].normalize(link.points2[k]) for (_, j), link, k in zip(pairs, links, kept, strict=True)]
+            ),
+            np.array([sizes[i] for i in index1]),
+            np.array([sizes[j] for j in index2]),
+        )
+
+    def __len__(self) -> int:
+        """Number of links."""
+        return len(self.image1)
+
+    @property
+    def link(self) -> IntArray:
+        """The link of each correspondence, shape (M,)."""
+        return np.repeat(np.arange(len(self)), np.diff(self.start))
+
+    def subset(self, links: IntArray | NDArray[np.bool_], image_index: IntArray | None = None) -> Self:
+        """Only some links; with ``image_index`` (N,) pictures get new numbers."""
+        chosen = np.flatnonzero(links) if np.asarray(links).dtype == np.bool_ else np.asarray(links)
+        counts = np.diff(self.start)[chosen]
+        start = np.concatenate([[0], np.cumsum(counts)]).astype(np.intp)
+        rows = np.arange(start[-1]) + np.repeat(self.start[chosen] - start[:-1], counts)
+        image1, image2 = self.image1[chosen], self.image2[chosen]
+        if image_index is not None:
+            image1, image2 = image_index[image1], image_index[image2]
+        return type(self)(
+            image1, image2, start, self.points1[rows], self.points2[rows], self.scale1[chosen], self.scale2[chosen]
+        )
+
+    def taken_apart(self) -> Self:
+        """Every link on its own: link l is between the pictures 2l and 2l + 1."""
+        first = 2 * np.arange(len(self))
+        return type(self)(first, first + 1, self.start, self.points1, self.points2, self.scale1, self.scale2)
+
+
+def spread_choice(points: FloatArray, most: int | None) -> IntArray:
+    """Indices of about ``most`` of the points (M, 2), ascending, evenly spread over their bounding box.
+
+    The points are dealt out by the cells of a grid: first one of each cell, then the second of each, until there
+    are enough.
+    """
+    count = len(points)
+    if most is None or count <= most:
+        return np.arange(count)
+    low, high = points.min(axis=0), points.max(axis=0)
+    side = max(int(np.sqrt(most)), 1)
+    cell = np.minimum(((points - low) / np.maximum(high - low, 1e-12) * side).astype(np.intp), side - 1)
+    number = cell[:, 0] * side + cell[:, 1]
+    order = np.argsort(number, kind="stable")
+    _, first, sizes = np.unique(number[order], return_index=True, return_counts=True)
+    turn = np.empty(count, dtype=np.intp)
+    turn[order] = np.arange(count) - np.repeat(first, sizes)
+    return np.sort(np.argsort(turn, kind="stable")[:most])
