@@ -4,7 +4,7 @@ from rdstitch.synthetic.correspondences import SyntheticMatches, correspondences
 from rdstitch.synthetic.instances import Instances, PlanarInstances, general_instances, planar_instances
 from rdstitch.synthetic.lenses import BrownLens, FisheyeLens, Lens, best_division_model
 from rdstitch.synthetic.poses import Poses, fit_to_plane
-from rdstitch.synthetic.rendering import Photometry, Relief, Sequence
+from rdstitch.synthetic.rendering import Photometry, Relief, Sequence, boxes
 from rdstitch.synthetic.textures import (
     EndlessTexture,
     PictureTexture,
@@ -31,6 +31,7 @@ __all__ = [
     "Texture",
     "best_division_model",
     "blank",
+    "boxes",
     "correspondences",
     "fit_to_plane",
     "general_instances",

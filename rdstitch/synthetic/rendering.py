@@ -19,8 +19,10 @@ from rdstitch.synthetic.lenses import Lens
 from rdstitch.synthetic.poses import Poses, plane_outline, to_picture, to_plane
 from rdstitch.synthetic.textures import Picture, Texture
 
-_SAMPLES_PER_STRIP = 1_000_000
-_MAX_SUPERSAMPLE = 6
+_PIXELS_PER_STRIP = 400_000
+_MAX_SAMPLES_PER_SIDE = 6
+# A place that is in no picture, for rays that meet nothing.
+_NOWHERE = -1e6
 # What cubic interpolation needs around a sample, texels.
 _APRON = 3
 
@@ -72,6 +74,47 @@ class Relief:
 
     height: NDArray[np.float32]
     steps: int = 16
+
+    def seen_from(self, position: FloatArray, height: float, foot: FloatArray) -> FloatArray:
+        """Texels (..., 2) over which rays meet the ground: at the first level, from the top, that is in it.
+
+        Parameters
+        ----------
+        position, height
+            Of the camera, texels.
+        foot : ndarray of shape (h, w, 2)
+            Where the rays would meet the plane.
+        """
+        place = foot.copy()
+        found = np.zeros(foot.shape[:-1], dtype=np.bool_)
+        for level in np.linspace(float(self.height.max()), 0.0, self.steps, endpoint=False):
+            at_level = position + (foot - position) * (1.0 - level / height)
+            x, y = (np.nan_to_num(at_level[..., k], nan=_NOWHERE).astype(np.float32) for k in (0, 1))
+            ground = cv2.remap(self.height, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+            hit = ~found & (ground >= level) & (ground > 0.0)
+            place[hit] = at_level[hit]
+            found |= hit
+        return place
+
+
+def boxes(size: tuple[int, int], seed: int, *, count: int, height: float, width: int = 60) -> Relief:
+    """Flat ground with ``count`` boxes up to ``height`` texels high and up to ``width`` texels wide: a town.
+
+    Parameters
+    ----------
+    size : (int, int)
+        Of the texture, texels.
+    seed : int
+        Equal seeds give equal towns.
+    """
+    rng = np.random.default_rng(seed)
+    steps = 16
+    ground = np.zeros((size[1], size[0]), dtype=np.float32)
+    for _ in range(count):
+        x, y = (int(rng.integers(0, max(1, n - width))) for n in size)
+        w, h = (int(n) for n in rng.integers(width // 3, width + 1, 2))
+        ground[y : y + h, x : x + w] = height * rng.integers(steps // 4, steps + 1) / steps
+    return Relief(ground, steps)
 
 
 @dataclass(frozen=True)
@@ -128,12 +171,9 @@ class Sequence:
             uint8 or uint16; RGB. Black where the texture ends.
         """
         width, height = self.lens.image_size
-        supersample = self._supersample(index)
-        rows = max(1, _SAMPLES_PER_STRIP // (width * supersample**2))
-        picture = np.concatenate(
-            [self._strip(index, top, min(top + rows, height), supersample) for top in range(0, height, rows)]
-        )
-        return self._expose(index, picture)
+        rows = max(1, _PIXELS_PER_STRIP // width)
+        strips = [self._strip(index, top, min(top + rows, height)) for top in range(0, height, rows)]
+        return self._expose(index, np.concatenate(strips))
 
     def frames(self) -> list[NDArray[Any]]:
         """Render all pictures."""
@@ -188,45 +228,24 @@ class Sequence:
             cv2.fillPoly(mask, [np.rint(points * 16.0).astype(np.int32)], 1, cv2.LINE_8, 4)
         return mask.astype(np.bool_)
 
-    def _supersample(self, index: int) -> int:
-        """Samples along each side of a pixel, so that they are no further apart than texels nearly everywhere."""
-        width, height = self.lens.image_size
-        u, v = np.meshgrid(np.linspace(0.0, width - 2.0, 9), np.linspace(0.0, height - 2.0, 7))
-        points = np.stack([u, v], axis=-1).reshape(-1, 2)
-        here = self.to_plane(index, points)
-        step = np.stack([self.to_plane(index, points + d) - here for d in ((1.0, 0.0), (0.0, 1.0))])
-        length = np.linalg.norm(step, axis=-1)
-        length = length[np.isfinite(length)]
-        if not len(length):
-            raise ArgumentError(f"picture {index} sees nothing of the plane")
-        return int(np.clip(np.ceil(np.quantile(length, 0.9)), 2, _MAX_SUPERSAMPLE))
-
-    def _strip(self, index: int, top: int, bottom: int, supersample: int) -> Picture:
+    def _strip(self, index: int, top: int, bottom: int) -> Picture:
         """Rows ``top`` to ``bottom`` of a picture before exposure, in [0, 1]."""
-        width = self.lens.image_size[0]
-        inside = (np.arange(supersample) + 0.5) / supersample - 0.5
-        u = (np.arange(width)[:, None] + inside).ravel()
-        v = (np.arange(top, bottom)[:, None] + inside).ravel()
-        points = np.stack(np.meshgrid(u, v), axis=-1)
-        place = self.to_plane(index, points) if self.relief is None else self._on_relief(index, points, self.relief)
-        samples = _sample(self.texture, place)
-        return _area_mean(samples, supersample)
-
-    def _on_relief(self, index: int, points: FloatArray, relief: Relief) -> FloatArray:
-        """Where rays meet the ground: the first level, from the top, that is below it."""
-        foot = self.to_plane(index, points)
-        position, height = self.poses.position[index], self.poses.height[index]
-        ground_height = np.ascontiguousarray(relief.height, dtype=np.float32)
-        place = foot.copy()
-        found = np.zeros(foot.shape[:-1], dtype=np.bool_)
-        for level in np.linspace(float(relief.height.max()), 0.0, relief.steps, endpoint=False):
-            at_level = position + (foot - position) * (1.0 - level / height)
-            x, y = (np.nan_to_num(at_level[..., k], nan=-1e6).astype(np.float32) for k in (0, 1))
-            under = cv2.remap(ground_height, x, y, cv2.INTER_NEAREST, borderValue=(0.0,))
-            hit = ~found & (under >= level)
-            place[hit] = at_level[hit]
-            found |= hit
-        return place
+        u, v = np.arange(-1, self.lens.image_size[0] + 1), np.arange(top - 1, bottom + 1)
+        wide = self.to_plane(index, np.stack(np.meshgrid(u, v), axis=-1))
+        foot = wide[1:-1, 1:-1]
+        # Within a pixel the lens and the perspective are linear to a few 1e-4 px.
+        along = (wide[1:-1, 2:] - wide[1:-1, :-2]) / 2.0
+        down = (wide[2:, 1:-1] - wide[:-2, 1:-1]) / 2.0
+        count = _samples_per_side(along, down)
+        offsets = (np.arange(count) + 0.5) / count - 0.5
+        total = np.zeros((*foot.shape[:2], self.texture.channels), dtype=np.float32)
+        for dv in offsets:
+            for du in offsets:
+                place = foot + du * along + dv * down
+                if self.relief is not None:
+                    place = self.relief.seen_from(self.poses.position[index], self.poses.height[index], place)
+                total += _sample(self.texture, place)
+        return np.divide(total, np.float32(count**2), out=total)
 
     def _expose(self, index: int, picture: Picture) -> NDArray[Any]:
         """Gain, vignetting, blur, noise and rounding."""
@@ -249,26 +268,29 @@ class Sequence:
         return exposed[:, :, 0] if channels == 1 else exposed
 
 
+def _samples_per_side(along: FloatArray, down: FloatArray) -> int:
+    """Samples along each side of a pixel, so that they are no further apart than texels nearly everywhere."""
+    longest = np.maximum(np.hypot(*np.moveaxis(along, -1, 0)), np.hypot(*np.moveaxis(down, -1, 0)))
+    longest = longest[np.isfinite(longest)]
+    if not len(longest):
+        return 1
+    return int(np.clip(np.ceil(np.quantile(longest, 0.9)), 2, _MAX_SAMPLES_PER_SIDE))
+
+
 def _sample(texture: Texture, place: FloatArray) -> Picture:
     """Texture interpolated at texels (h, w, 2), shape (h, w, channels); 0 outside and at NaN."""
-    width, height = texture.size
-    finite = np.isfinite(place).all(axis=-1)
-    inside = finite & ((place >= -0.5) & (place <= np.array([width, height]) - 0.5)).all(axis=-1)
-    if not inside.any():
-        return np.zeros((*place.shape[:2], texture.channels), dtype=np.float32)
-    within = place[inside]
-    low = np.maximum(np.floor(within.min(axis=0)).astype(int) - _APRON, 0)
-    high = np.minimum(np.ceil(within.max(axis=0)).astype(int) + _APRON + 1, (width, height))
-    part = texture.region(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
-    x, y = (np.where(inside, place[..., k] - low[k], 0.0).astype(np.float32) for k in (0, 1))
-    samples = cv2.remap(part, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    samples = samples.reshape(*place.shape[:2], texture.channels)
-    samples[~inside] = 0.0
-    return samples.astype(np.float32, copy=False)
-
-
-def _area_mean(samples: Picture, factor: int) -> Picture:
-    """Mean over ``factor`` x ``factor`` blocks."""
-    height, width, channels = samples.shape
-    mean = cv2.resize(samples, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
-    return np.asarray(mean, dtype=np.float32).reshape(height // factor, width // factor, channels)
+    # NaN, a ray that meets nothing, is sent where nothing is, and does not count for the region that is needed.
+    axes = [np.ascontiguousarray(place[..., k]) for k in (0, 1)]
+    low, high = [], []
+    for coordinate, size in zip(axes, texture.size, strict=True):
+        least, most = np.fmin.reduce(coordinate, axis=None), np.fmax.reduce(coordinate, axis=None)
+        if not (least < size and most > -1.0):
+            return np.zeros((*place.shape[:2], texture.channels), dtype=np.float32)
+        low.append(max(int(least) - _APRON, 0))
+        high.append(min(int(most) + _APRON + 2, size))
+    part = texture.region(low[0], low[1], high[0], high[1])
+    x, y = (np.nan_to_num(axis - start, nan=_NOWHERE) for axis, start in zip(axes, low, strict=True))
+    samples = cv2.remap(
+        part, x.astype(np.float32), y.astype(np.float32), cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT
+    )
+    return np.asarray(samples, dtype=np.float32).reshape(*place.shape[:2], texture.channels)

@@ -167,14 +167,15 @@ def _dead_leaves(
     radius = 1.0 / np.sqrt(smallest**-2 - rng.random(count) * (smallest**-2 - largest**-2))
     center = rng.random((count, 2)) * size
     colour = _palette(rng, count, channels)
+    places, owner = _wrapped(center, 2.5 * radius, size) if wrap else (center, np.arange(count))
     leaves = _leaf_outlines(rng, radius)
 
     canvas = np.empty((height, width, channels), dtype=np.uint8)
     canvas[:] = np.median(colour, axis=0)
-    for outline, middle, reach, value in zip(leaves, center, radius, colour.tolist(), strict=True):
-        for shift in _wrapped(middle, 2.0 * reach, size) if wrap else [middle]:
-            corners = np.rint((outline + shift) * 2**_SUBPIXEL_BITS).astype(np.int32)
-            cv2.fillPoly(canvas, [corners], value, cv2.LINE_AA, _SUBPIXEL_BITS)
+    shifts = np.rint(places * 2**_SUBPIXEL_BITS).astype(np.int32)
+    values = colour.tolist()
+    for leaf, shift in zip(owner.tolist(), shifts, strict=True):
+        cv2.fillPoly(canvas, [leaves[leaf] + shift], values[leaf], cv2.LINE_AA, _SUBPIXEL_BITS)
     return canvas
 
 
@@ -185,27 +186,43 @@ def _palette(rng: np.random.Generator, count: int, channels: int) -> NDArray[np.
     return np.clip(colour, 20.0, 235.0)
 
 
-def _leaf_outlines(rng: np.random.Generator, radius: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Outlines around the origin: polygons of 3-7 corners, ellipses, and streaks like roads and joints."""
-    outlines = []
-    kinds = rng.choice(3, size=len(radius), p=(0.7, 0.2, 0.1))
-    for r, kind in zip(radius, kinds, strict=True):
-        corners = int(rng.integers(3, 8)) if kind == 0 else (16 if kind == 1 else 4)
-        around = 2.0 * np.pi * (np.arange(corners) + (rng.uniform(-0.35, 0.35, corners) if kind == 0 else 0.5))
-        points = np.column_stack([np.cos(around / corners), np.sin(around / corners)])
-        points *= (r, r * rng.uniform(0.4, 1.0)) if kind < 2 else (2.5 * r, 0.25 * r)
-        turn = rng.uniform(0.0, np.pi)
-        c, s = np.cos(turn), np.sin(turn)
-        outlines.append(points @ np.array([[c, s], [-s, c]]))
+def _leaf_outlines(rng: np.random.Generator, radius: NDArray[np.float64]) -> list[NDArray[np.int32]]:
+    """Outlines around the origin: polygons of 3-7 corners, ellipses, and streaks like roads and joints.
+
+    In units of ``2 ** -_SUBPIXEL_BITS`` texels, as OpenCV draws them.
+    """
+    count = len(radius)
+    polygon, ellipse, streak = range(3)
+    kind = rng.choice(3, size=count, p=(0.7, 0.2, 0.1))
+    corners = np.where(kind == polygon, rng.integers(3, 8, count), np.where(kind == ellipse, 16, 4))
+    irregular = np.where(kind == polygon, 0.35, 0.0)
+    flat = np.where(kind == streak, 0.1, rng.uniform(0.4, 1.0, count))
+    long = np.where(kind == streak, 2.5, 1.0) * radius
+    turn = rng.uniform(0.0, np.pi, count)
+    c, s = np.cos(turn), np.sin(turn)
+    axes = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1) * flat[:, None]], axis=-2)
+    axes *= (long * 2**_SUBPIXEL_BITS)[:, None, None]
+
+    outlines: list[NDArray[np.int32]] = [np.empty((0, 2), dtype=np.int32)] * count
+    for n in np.unique(corners):
+        which = np.flatnonzero(corners == n)
+        jitter = irregular[which, None] * rng.uniform(-1.0, 1.0, (len(which), n))
+        around = 2.0 * np.pi * (np.arange(n) + 0.5 + jitter) / n
+        points = np.stack([np.cos(around), np.sin(around)], axis=-1) @ axes[which]
+        for leaf, outline in zip(which.tolist(), np.rint(points).astype(np.int32), strict=True):
+            outlines[leaf] = outline
     return outlines
 
 
-def _wrapped(middle: NDArray[np.float64], reach: float, size: tuple[int, int]) -> list[NDArray[np.float64]]:
-    """All places at which a leaf is drawn so that it continues across the borders."""
-    shifts = []
-    for x, width in zip(middle, size, strict=True):
-        shifts.append([0.0, *([width] if x < reach else []), *([-width] if x > width - reach else [])])
-    return [middle + np.array([dx, dy]) for dx in shifts[0] for dy in shifts[1]]
+def _wrapped(
+    center: NDArray[np.float64], reach: NDArray[np.float64], size: tuple[int, int]
+) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """All places at which leaves are drawn so that they continue across the borders, and the leaf of each."""
+    shifts = np.array([(dx, dy) for dx in (-1.0, 0.0, 1.0) for dy in (-1.0, 0.0, 1.0)]) * size
+    places = center[:, None, :] + shifts
+    touching = ((places > -reach[:, None, None]) & (places < np.array(size) + reach[:, None, None])).all(axis=-1)
+    owner, shift = np.nonzero(touching)
+    return places[owner, shift], owner
 
 
 def _grained(patches: NDArray[np.uint8], rng: np.random.Generator, strength: float = 0.05) -> Picture:
