@@ -2,9 +2,20 @@
 
 from rdstitch.synthetic.correspondences import SyntheticMatches, correspondences
 from rdstitch.synthetic.instances import Instances, PlanarInstances, general_instances, planar_instances
+from rdstitch.synthetic.layouts import (
+    drive_poses,
+    grid_poses,
+    joined,
+    line_poses,
+    pair_poses,
+    parking_poses,
+    rotation_poses,
+    survey_poses,
+    turn_poses,
+)
 from rdstitch.synthetic.lenses import BrownLens, FisheyeLens, Lens, best_division_model
 from rdstitch.synthetic.poses import Poses, fit_to_plane
-from rdstitch.synthetic.rendering import Photometry, Relief, Sequence, boxes
+from rdstitch.synthetic.rendering import Photometry, Relief, Sequence, boxes, sequence_over
 from rdstitch.synthetic.textures import (
     EndlessTexture,
     PictureTexture,
@@ -33,10 +44,20 @@ __all__ = [
     "blank",
     "boxes",
     "correspondences",
+    "drive_poses",
     "fit_to_plane",
     "general_instances",
     "gradient",
+    "grid_poses",
     "ground",
+    "joined",
+    "line_poses",
+    "pair_poses",
+    "parking_poses",
     "planar_instances",
     "repeated",
+    "rotation_poses",
+    "sequence_over",
+    "survey_poses",
+    "turn_poses",
 ]

@@ -4,6 +4,7 @@ Every output pixel is the mean of a grid of samples over its area, each traced t
 interpolated in the texture: as an ideal sensor does it, and without aliasing.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from rdstitch.camera import FloatArray
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.synthetic.lenses import Lens
-from rdstitch.synthetic.poses import Poses, plane_outline, to_picture, to_plane
+from rdstitch.synthetic.poses import Poses, fit_to_plane, plane_outline, to_picture, to_plane
 from rdstitch.synthetic.textures import Picture, Texture
 
 _PIXELS_PER_STRIP = 400_000
@@ -294,3 +295,39 @@ def _sample(texture: Texture, place: FloatArray) -> Picture:
         part, x.astype(np.float32), y.astype(np.float32), cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT
     )
     return np.asarray(samples, dtype=np.float32).reshape(*place.shape[:2], texture.channels)
+
+
+def sequence_over(
+    plane: Texture | Callable[[tuple[int, int]], Texture],
+    lens: Lens,
+    poses: Poses,
+    *,
+    photometry: Photometry | None = None,
+    seed: int = 0,
+    margin: int = 16,
+) -> Sequence:
+    """Pictures of a plane that is made as large as they need it.
+
+    Parameters
+    ----------
+    plane : Texture or callable
+        What makes the plane for a given size, such as ``lambda size: ground(size, seed=1)``; or a texture, on which
+        the poses are centred.
+    lens, poses, photometry, seed
+        As in :class:`Sequence`; the poses may lie anywhere and are moved.
+    margin : int
+        Texels that are left around what the pictures show.
+
+    Raises
+    ------
+    ArgumentError
+        When a picture sees the horizon, or when a given texture is too small.
+    """
+    moved, size = fit_to_plane(lens, poses, margin)
+    settings = Photometry() if photometry is None else photometry
+    if callable(plane):
+        return Sequence(plane(size), lens, moved, settings, seed=seed)
+    spare = np.array(plane.size) - size
+    if (spare < 0).any():
+        raise ArgumentError(f"the texture has {plane.size} texels, the pictures need {size}")
+    return Sequence(plane, lens, moved.moved(spare // 2), settings, seed=seed)
