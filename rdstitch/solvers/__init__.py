@@ -1,1 +1,34 @@
-"""TODO."""
+"""Minimal solvers: all homographies and λ that a few point matches allow.
+
+Which one when, with the number of matches that it needs:
+
+==============================  =  ==============================================================
+:func:`two_point`               2  planar motion, tilt known (a levelled camera, an IMU, a gimbal)
+:func:`three_point`             3  planar motion, tilt unknown: the minimal case
+:func:`three_point_similarity`  3  planar motion whose height changes (a drone), tilt known
+:func:`four_point`              4  planar motion, tilt unknown, by a constraint on the homography
+:func:`five_point`              5  any motion and any plane; the only one without a focal length
+:func:`five_point_qep`          5  the same by Fitzgibbon's eigenvalue problem, the baseline
+:func:`two_point_rigid`         2  λ known: planar motion, tilt known
+:func:`two_point_similarity`    2  λ known: planar motion whose height changes, tilt known
+:func:`four_point_dlt`          4  λ known: any motion and any plane
+==============================  =  ==============================================================
+
+All take batches of samples, (B, k, 2), and return every real solution; see :class:`Solutions`.
+"""
+
+from rdstitch.solvers.five_point import five_point
+from rdstitch.solvers.known_distortion import four_point_dlt, two_point_rigid, two_point_similarity
+from rdstitch.solvers.solutions import Solutions
+from rdstitch.solvers.three_point_similarity import three_point_similarity
+from rdstitch.solvers.two_point import two_point
+
+__all__ = [
+    "Solutions",
+    "five_point",
+    "four_point_dlt",
+    "three_point_similarity",
+    "two_point",
+    "two_point_rigid",
+    "two_point_similarity",
+]

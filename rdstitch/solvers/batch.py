@@ -1,0 +1,69 @@
+"""Batches of samples: blocks that stay in cache, with the batch axis last."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rdstitch.camera import FloatArray
+from rdstitch.solvers.solutions import Solutions, as_samples
+
+BlockSolver = Callable[[FloatArray, FloatArray, NDArray[np.intp]], Solutions]
+
+
+@dataclass(frozen=True)
+class SampleArrays:
+    """Numbers per sample, shape (..., B): what an equation is evaluated from."""
+
+    rows: FloatArray
+
+    def take(self, samples: NDArray[np.intp]) -> Self:
+        """Those of some samples; indices may repeat."""
+        return type(self)(np.take(self.rows, samples, axis=-1))
+
+
+def solve_in_blocks(solve: BlockSolver, x1: ArrayLike, x2: ArrayLike, count: int, block_size: int = 1024) -> Solutions:
+    """Check a batch of samples, and solve it block by block.
+
+    Samples with a coordinate that is not finite have no solution.
+
+    Parameters
+    ----------
+    solve : callable
+        Takes the two point arrays of a block, each of shape (count, 2, b) with the batch axis last, and the place of
+        the block's samples in the batch, (b,).
+    x1, x2 : array_like of shape (B, count, 2) or (count, 2)
+        Normalized points of picture 1 and picture 2.
+    count : int
+        Points in a sample.
+    block_size : int
+        Samples in a block.
+
+    Raises
+    ------
+    ArgumentError
+        When a shape is wrong.
+    """
+    a, b = as_samples(x1, x2, count)
+    finite = np.isfinite(a).all(axis=(1, 2)) & np.isfinite(b).all(axis=(1, 2))
+    index = np.flatnonzero(finite)
+    if len(index) < len(a):
+        a, b = a[index], b[index]
+    parts = []
+    # A degenerate sample divides by zero on its way to being rejected.
+    with np.errstate(all="ignore"):
+        for start in range(0, len(a), block_size):
+            block = slice(start, start + block_size)
+            first = np.ascontiguousarray(np.moveaxis(a[block], 0, -1))
+            second = np.ascontiguousarray(np.moveaxis(b[block], 0, -1))
+            part = solve(first, second, index[block])
+            parts.append(Solutions(index[part.sample + start], part.homography, part.distortion))
+    if not parts:
+        return Solutions.empty()
+    return Solutions(
+        np.concatenate([part.sample for part in parts]),
+        np.concatenate([part.homography for part in parts]),
+        np.concatenate([part.distortion for part in parts]),
+    )

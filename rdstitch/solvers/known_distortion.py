@@ -1,0 +1,100 @@
+"""Minimal solvers for a lens that is known already: λ comes from a camera file."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rdstitch.camera import FloatArray
+from rdstitch.errors import ArgumentError
+from rdstitch.solvers.batch import solve_in_blocks
+from rdstitch.solvers.homography import homography_through
+from rdstitch.solvers.plane import TiltRotations, lens_range, motion_homography, visible_range
+from rdstitch.solvers.solutions import Solutions
+
+
+def two_point_rigid(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike, tilt: ArrayLike = (0.0, 0.0)) -> Solutions:
+    """Planar motion from two points, for known λ and tilt: the least-squares rigid motion of the plane points.
+
+    Parameters
+    ----------
+    x1, x2 : array_like of shape (B, 2, 2) or (2, 2)
+        Focal-normalized points of picture 1 and picture 2.
+    distortion : array_like of shape () or (B,)
+        λ, focal-normalized.
+    tilt : array_like of shape (2,), (2, 2) or (B, 2, 2)
+        (ψ, θ) of the camera, radians; or one such pair a picture; or one a sample and picture.
+
+    Returns
+    -------
+    Solutions
+        One a sample, or none where a point is behind the camera or outside the lens model, or points coincide.
+
+    Raises
+    ------
+    ArgumentError
+        When a shape is wrong.
+    """
+    return _motion(x1, x2, distortion, tilt, height_free=False)
+
+
+def two_point_similarity(
+    x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike, tilt: ArrayLike = (0.0, 0.0)
+) -> Solutions:
+    """Planar motion with a change of height from two points, for known λ and tilt; as :func:`two_point_rigid`."""
+    return _motion(x1, x2, distortion, tilt, height_free=True)
+
+
+def four_point_dlt(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike) -> Solutions:
+    """Any homography from four points, for known λ, in closed form (:mod:`rdstitch.solvers.homography`).
+
+    Parameters
+    ----------
+    x1, x2 : array_like of shape (B, 4, 2) or (4, 2)
+        Normalized points of picture 1 and picture 2.
+    distortion : array_like of shape () or (B,)
+        λ in the frame of the points.
+
+    Returns
+    -------
+    Solutions
+        One a sample, or none where three points are collinear, change sides or are mirrored, or a point is outside the
+        lens model.
+
+    Raises
+    ------
+    ArgumentError
+        When a shape is wrong.
+    """
+    lam = _distortions(distortion, x1)
+
+    def solve(a: FloatArray, b: FloatArray, samples: NDArray[np.intp]) -> Solutions:
+        own = lam[samples]
+        low, _ = lens_range(a, b, (-np.inf, np.inf))
+        h, possible = homography_through(a, b, own)
+        index = np.flatnonzero(possible & (own > low))
+        return Solutions(index, h[index], own[index])
+
+    return solve_in_blocks(solve, x1, x2, 4)
+
+
+def _motion(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike, tilt: ArrayLike, *, height_free: bool) -> Solutions:
+    """Motion in the plane from two points."""
+    rotations = TiltRotations.from_tilt(tilt, np.shape(x1)[0] if np.ndim(x1) else 0)
+    lam = _distortions(distortion, x1)
+
+    def solve(a: FloatArray, b: FloatArray, samples: NDArray[np.intp]) -> Solutions:
+        own, rotation = lam[samples], rotations.take(samples)
+        low, high = visible_range(a, b, rotation, (-np.inf, np.inf))
+        index = np.flatnonzero((own > low) & (own < high))
+        h = motion_homography(a[..., index], b[..., index], rotation.take(index), own[index], height_free)
+        return Solutions(index, h, own[index])
+
+    return solve_in_blocks(solve, x1, x2, 2)
+
+
+def _distortions(distortion: ArrayLike, x1: ArrayLike) -> FloatArray:
+    """λ of every sample."""
+    lam = np.asarray(distortion, dtype=np.float64)
+    count = np.shape(x1)[0] if np.ndim(x1) == 3 else 1
+    if lam.shape not in ((), (count,)) or not np.isfinite(lam).all():
+        raise ArgumentError(f"distortion must be a finite number or one a sample, not {distortion!r}")
+    return np.broadcast_to(lam, (count,))
