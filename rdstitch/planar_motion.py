@@ -18,14 +18,18 @@ from rdstitch.camera import FloatArray
 def rotation_from_tilt(tilt: ArrayLike) -> FloatArray:
     """``R = Rx(ψ) Ry(θ)`` for tilts (ψ, θ) of shape (..., 2), radians; shape (..., 3, 3)."""
     angles = np.asarray(tilt, dtype=np.float64)
-    (sin_x, cos_x), (sin_y, cos_y) = ((np.sin(a), np.cos(a)) for a in (angles[..., 0], angles[..., 1]))
-    zero = np.zeros_like(sin_x)
-    rows = [
-        [cos_y, zero, sin_y],
-        [sin_x * sin_y, cos_x, -sin_x * cos_y],
-        [-cos_x * sin_y, sin_x, cos_x * cos_y],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    sin_x, sin_y = np.moveaxis(np.sin(angles), -1, 0)
+    cos_x, cos_y = np.moveaxis(np.cos(angles), -1, 0)
+    rotation = np.zeros((*angles.shape[:-1], 3, 3))
+    rotation[..., 0, 0] = cos_y
+    rotation[..., 0, 2] = sin_y
+    rotation[..., 1, 0] = sin_x * sin_y
+    rotation[..., 1, 1] = cos_x
+    rotation[..., 1, 2] = -sin_x * cos_y
+    rotation[..., 2, 0] = -cos_x * sin_y
+    rotation[..., 2, 1] = sin_x
+    rotation[..., 2, 2] = cos_x * cos_y
+    return rotation
 
 
 def tilt_from_normal(normal: ArrayLike) -> FloatArray:

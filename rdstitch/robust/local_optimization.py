@@ -8,7 +8,6 @@ their influence without ever being decided upon.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from rdstitch.camera import FloatArray
 from rdstitch.radial_homography import measurement_whitening, transfer_jacobian
@@ -140,7 +139,10 @@ def _linearize(
     columns = (whitening * (data.px * relative)[:, None, None]) @ columns
     columns[lost] = 0.0
     flat, weighted = columns.reshape(-1, columns.shape[2]), (residuals * relative[:, None]).ravel()
-    chain = block_diag(np.eye(lens.shape[2]), model.jacobian(state))
+    by_state = model.jacobian(state)
+    chain = np.zeros((columns.shape[2], lens.shape[2] + by_state.shape[1]))
+    chain[: lens.shape[2], : lens.shape[2]] = np.eye(lens.shape[2])
+    chain[lens.shape[2] :, lens.shape[2] :] = by_state
     information = chain.T @ (flat.T @ flat) @ chain
     gradient = chain.T @ (flat.T @ weighted)
     cost = float(errors2 @ relative) + scale**2 * int(lost.sum())

@@ -142,29 +142,25 @@ class _Lane:
         return candidate if best is None or candidate.cost < best.cost else best
 
     def _optimize(self, homography: FloatArray, distortion: float) -> Hypothesis:
-        """The best of a hypothesis, its refinement in its own model, and from there as a free homography."""
+        """The best of a hypothesis, its refinement in the model it assumes, and from there as a free homography."""
         best = self._judge(homography, distortion)
-        models: list[PairModel] = [self._solver.model]
-        if not isinstance(self._solver.model, HomographyModel):
-            models.append(HomographyModel())
-        for model in models:
-            if isinstance(model, HomographyModel) and best.inlier_share * len(self._data) < _FREE_REFINEMENT:
-                break
-            homography, distortion = best.homography, best.distortion
-            for scale in (3.0, 1.0):
-                fit = refine(
-                    model,
-                    homography,
-                    distortion,
-                    self._data,
-                    scale * self._options.threshold,
-                    fixed_distortion=self._solver.fixed_distortion,
-                    iterations=4,
-                )
-                homography, distortion = fit.homography, fit.distortion
-            refined = self._judge(homography, distortion)
-            best = refined if refined.cost < best.cost else best
-        return best
+        best = self._refined(best, self._solver.model, 3.0 * self._options.threshold)
+        enough = best.inlier_share * len(self._data) >= _FREE_REFINEMENT
+        return self._refined(best, HomographyModel() if enough else self._solver.model, self._options.threshold)
+
+    def _refined(self, start: Hypothesis, model: PairModel, scale: float) -> Hypothesis:
+        """The start or its refinement, whichever is better."""
+        fit = refine(
+            model,
+            start.homography,
+            start.distortion,
+            self._data,
+            scale,
+            fixed_distortion=self._solver.fixed_distortion,
+            iterations=4,
+        )
+        refined = self._judge(fit.homography, fit.distortion)
+        return refined if refined.cost < start.cost else start
 
     def _judge(self, homography: FloatArray, distortion: float) -> Hypothesis:
         errors2 = transfer_errors2(homography[None], np.array([distortion]), self._data)[0]
