@@ -1,1 +1,52 @@
-"""TODO."""
+"""Stitch pictures of a flat scene taken through a lens that bends straight lines, without knowing the lens.
+
+Homography and division-model distortion λ are estimated together from the pictures themselves. The names below are
+loaded when they are first used, so that importing the package costs nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rdstitch import solvers
+    from rdstitch.camera import Camera
+    from rdstitch.compositing import CompositeOptions
+    from rdstitch.features import FeatureOptions
+    from rdstitch.pipeline import StitchOptions, StitchResult, pano, undistort
+    from rdstitch.radial_homography import RadialHomography
+    from rdstitch.robust import estimate_radial_homography
+
+_HOMES = {
+    "Camera": "rdstitch.camera",
+    "CompositeOptions": "rdstitch.compositing",
+    "FeatureOptions": "rdstitch.features",
+    "RadialHomography": "rdstitch.radial_homography",
+    "StitchOptions": "rdstitch.pipeline",
+    "StitchResult": "rdstitch.pipeline",
+    "estimate_radial_homography": "rdstitch.robust",
+    "pano": "rdstitch.pipeline",
+    "solvers": "rdstitch",
+    "undistort": "rdstitch.pipeline",
+}
+
+__all__ = [
+    "Camera",
+    "CompositeOptions",
+    "FeatureOptions",
+    "RadialHomography",
+    "StitchOptions",
+    "StitchResult",
+    "estimate_radial_homography",
+    "pano",
+    "solvers",
+    "undistort",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name from its home."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if _HOMES[name] == __name__:
+        return import_module(f"{__name__}.{name}")
+    return getattr(import_module(_HOMES[name]), name)

@@ -1,1 +1,8 @@
 """Features of pictures, and their matches."""
+
+from rdstitch.features.detect import detect, detect_all
+from rdstitch.features.keypoints import Features
+from rdstitch.features.match import Correspondences, match
+from rdstitch.features.options import KINDS, FeatureOptions
+
+__all__ = ["KINDS", "Correspondences", "FeatureOptions", "Features", "detect", "detect_all", "match"]

@@ -1,0 +1,41 @@
+"""``rdstitch pano``: a few overlapping pictures become one."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rdstitch_cli import options
+from rdstitch_cli.progress import Reporter
+from rdstitch_cli.stitching import stitch_options, summarize
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  rdstitch pano left.jpg right.jpg -o pano.jpg
+  rdstitch pano *.png -o wall.png --reference middle.png
+  rdstitch pano a.jpg b.jpg -o ab.tif --camera camera.json
+"""
+)
+@click.argument("pictures", nargs=-1, required=True, type=options.PICTURE, metavar="IMG IMG...")
+@options.output
+@options.overwrite
+@click.option("--reference", metavar="NAME", help="Picture whose frame is kept; otherwise the best connected one.")
+@options.known
+@options.estimation
+@options.compositing
+@click.option("--save-camera", type=options.PICTURE, metavar="FILE", help="Write the estimated camera to FILE (JSON).")
+@options.trust
+@options.verbosity
+def pano(pictures: tuple[Path, ...], output: Path, quiet: bool, verbose: bool, **given: Any) -> None:
+    """Stitch two or more pictures that overlap, in any order.
+
+    Writes the picture to the output, everything estimated to the output's name with .json added, and λ to standard
+    output.
+    """
+    from rdstitch.pipeline import pano as recipe
+
+    with Reporter(-quiet + verbose) as reporter:
+        result = recipe(pictures, output, stitch_options(**given), progress=reporter)
+        summarize(result, reporter)

@@ -1,0 +1,54 @@
+"""``rdstitch undistort``: straight lines become straight."""
+
+from pathlib import Path
+
+import click
+
+from rdstitch_cli import options
+from rdstitch_cli.progress import Reporter
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  rdstitch undistort frames/*.jpg --camera camera.json -o straight/
+  rdstitch undistort wall.jpg --lambda -0.25 -o straight/
+"""
+)
+@click.argument("pictures", nargs=-1, required=True, type=options.PICTURE, metavar="IMG...")
+@options.lens
+@click.option(
+    "-o", "--output", type=options.PICTURE, required=True, metavar="DIR", help="Folder to write to; made if missing."
+)
+@options.overwrite
+@click.option(
+    "--view",
+    type=click.Choice(["same", "all", "valid"]),
+    default="same",
+    show_default=True,
+    help="What to show: the same scale and size as the picture, all of it, or only where it has no empty border.",
+)
+@options.verbosity
+def undistort(
+    pictures: tuple[Path, ...],
+    camera: Path | None,
+    distortion: float | None,
+    output: Path,
+    overwrite: bool,
+    view: str,
+    quiet: bool,
+    verbose: bool,
+) -> None:
+    """Undistort pictures with a known lens, each into a file of the same name in a folder.
+
+    The lens comes from a camera file, as 'rdstitch pano --save-camera' and 'rdstitch calibrate' write it, or is given
+    as λ for half the image diagonal.
+    """
+    from rdstitch.camera import Camera
+    from rdstitch.pipeline import undistort as recipe
+
+    if (camera is None) == (distortion is None):
+        raise click.UsageError("give either --camera FILE or --lambda L")
+    with Reporter(-quiet + verbose) as reporter:
+        lens = None if camera is None else Camera.load(camera)
+        recipe(pictures, output, camera=lens, distortion=distortion, view=view, overwrite=overwrite, progress=reporter)

@@ -1,0 +1,118 @@
+"""Options that several commands share, each defined once."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+Decorator = Callable[[Command], Command]
+
+FEATURES = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk")
+SOLVERS = ("auto", "two-point", "three-point", "three-point-similarity", "four-point", "five-point")
+MODELS = ("auto", "rigid", "similarity", "tilting", "homography")
+
+PICTURE = click.Path(path_type=Path)
+
+
+def together(*options: Callable[[Any], Any]) -> Decorator[Any]:
+    """Several options as one decorator, shown in this order."""
+
+    def decorate(command: Any) -> Any:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+class Angles(click.ParamType):
+    """Two angles in degrees, ``PSI,THETA``; the value is in radians."""
+
+    name = "PSI,THETA"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
+        """Parse the text."""
+        if isinstance(value, tuple):
+            return value[0], value[1]
+        try:
+            psi, theta = (math.radians(float(part)) for part in str(value).split(","))
+        except ValueError:
+            self.fail(f"{value!r} is not two angles in degrees like 2.5,-1", param, ctx)
+        if not (abs(psi) < math.pi / 2 and abs(theta) < math.pi / 2):
+            self.fail(f"{value!r}: a tilt lies between -90 and 90 degrees", param, ctx)
+        return psi, theta
+
+
+output = click.option(
+    "-o", "--output", type=PICTURE, required=True, help="Picture to write: .jpg, .png, .tif or .webp."
+)
+
+overwrite = click.option("--overwrite", is_flag=True, help="Replace existing output files.")
+
+verbosity = together(
+    click.option("-q", "--quiet", is_flag=True, help="Say nothing on standard error but errors."),
+    click.option("-v", "--verbose", is_flag=True, help="Say what is going on."),
+)
+
+lens = together(
+    click.option(
+        "--camera", type=PICTURE, metavar="FILE", help="Camera file with a known lens; λ is then not estimated."
+    ),
+    click.option(
+        "--lambda", "distortion", type=float, metavar="L", help="Known λ for half the image diagonal; not estimated."
+    ),
+)
+
+known = together(
+    lens,
+    click.option("--focal", type=float, metavar="PX", help="Focal length, px; otherwise from EXIF, else guessed."),
+    click.option("--tilt", type=Angles(), help="Known tilt of the camera to the plane, degrees."),
+)
+
+estimation = together(
+    click.option(
+        "--features", type=click.Choice(FEATURES), default="rootsift", show_default=True, help="Features to match."
+    ),
+    click.option("--max-features", type=click.IntRange(1), metavar="N", help="At most so many features a picture."),
+    click.option(
+        "--work-megapixels",
+        type=float,
+        metavar="MP",
+        help="Size at most that features are detected at; 0 is full size.",
+    ),
+    click.option(
+        "--solver", type=click.Choice(SOLVERS), default="auto", show_default=True, help="Minimal solver of the pairs."
+    ),
+    click.option(
+        "--model", type=click.Choice(MODELS), default="auto", show_default=True, help="How freely the camera moved."
+    ),
+    click.option(
+        "--threshold", type=float, default=3.0, show_default=True, metavar="PX", help="Largest error of an inlier, px."
+    ),
+    click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of random sampling."),
+    click.option(
+        "-j", "--workers", type=click.IntRange(0), default=0, help="Threads; 0, the default, is one for each core."
+    ),
+)
+
+trust = together(
+    click.option("--strict", is_flag=True, help="Fail with status 5 when a picture is left out."),
+    click.option("--force", is_flag=True, help="Write the result even when it fails its own checks."),
+)
+
+compositing = together(
+    click.option(
+        "--blend",
+        type=click.Choice(["none", "feather", "multiband"]),
+        default="multiband",
+        show_default=True,
+        help="How pictures pass into one another.",
+    ),
+    click.option("--scale", type=float, default=1.0, show_default=True, help="Size of the output; 1 keeps resolution."),
+    click.option(
+        "--rotate", type=float, default=0.0, show_default=True, metavar="DEG", help="Turn the output clockwise."
+    ),
+)
