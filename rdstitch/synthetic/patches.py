@@ -1,0 +1,134 @@
+"""Where patches of one picture are found in another, to a few hundredths of a pixel."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.camera import FloatArray
+from rdstitch.synthetic.textures import Picture
+
+_ITERATIONS = 8
+_PATCHES = 5000
+# Patches that are refined together, as one tall picture: OpenCV wants it lower than 32,768 px.
+_BATCH = 256
+# A patch whose refinement leaves the peak it started from has lost its way.
+_FARTHEST_FROM_PEAK = 1.5
+
+
+@dataclass(frozen=True)
+class Displacements:
+    """Patches with texture, and where they were found.
+
+    Attributes
+    ----------
+    center : ndarray of shape (P, 2)
+        Centre of each patch, px.
+    displacement : ndarray of shape (P, 2)
+        From there to where the other picture shows the same, px; NaN where it was not found.
+    correlation : ndarray of shape (P,)
+        Normalized cross-correlation there; that of the best place, if too low, for patches that were not found.
+    """
+
+    center: FloatArray
+    displacement: FloatArray
+    correlation: FloatArray
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """Which patches were found, shape (P,)."""
+        found: NDArray[np.bool_] = np.all(np.isfinite(self.displacement), axis=1)
+        return found
+
+
+def patch_displacements(
+    picture: Picture,
+    other: Picture,
+    valid: NDArray[np.bool_],
+    *,
+    patch: int = 33,
+    search: int = 16,
+    spacing: int | None = None,
+    least_contrast: float = 0.02,
+    least_correlation: float = 0.7,
+) -> Displacements:
+    """Look for patches of a picture in another one that shows nearly the same.
+
+    Each patch of a regular grid is looked for by normalized cross-correlation, and from the best whole pixel on by
+    least squares over shift, gain and offset (Lucas and Kanade).
+
+    Parameters
+    ----------
+    picture, other : ndarray of shape (h, w), float32
+        In [0, 1].
+    valid : ndarray of shape (h, w), bool
+        Where ``picture`` and ``other`` mean something; a patch must lie inside with all its px.
+    patch : int
+        Side of a patch, px; odd.
+    spacing : int, optional
+        Distance between patches, px; if not given, 24 or what makes some 5,000 patches.
+    search : int
+        Largest displacement along each axis, px.
+    least_contrast : float
+        Patches with a smaller standard deviation have no texture and are left out.
+    least_correlation : float
+        What is less alike counts as not found.
+    """
+    half = patch // 2
+    step = max(24, int(np.sqrt(picture.size / _PATCHES))) if spacing is None else spacing
+    inside = cv2.erode(valid.astype(np.uint8), np.ones((patch, patch), np.uint8), borderValue=(0.0,)) > 0
+    height, width = picture.shape
+    y, x = (g.ravel() for g in np.mgrid[half : height - half : step, half : width - half : step])
+    keep = inside[y, x]
+    y, x = y[keep], x[keep]
+    windows = np.lib.stride_tricks.sliding_window_view(picture, (patch, patch))
+    templates = windows[y - half, x - half].copy() if len(x) else np.empty((0, patch, patch), np.float32)
+    textured = templates.std(axis=(1, 2)) >= least_contrast
+    templates, y, x = templates[textured], y[textured], x[textured]
+    center = np.column_stack([x, y]).astype(np.float64)
+
+    padded = cv2.copyMakeBorder(other, search, search, search, search, cv2.BORDER_REPLICATE)
+    peak = np.empty((len(center), 2))
+    for k, template in enumerate(templates):
+        top, left = y[k] - half, x[k] - half
+        area = padded[top : top + patch + 2 * search, left : left + patch + 2 * search]
+        best = cv2.minMaxLoc(cv2.matchTemplate(area, template, cv2.TM_CCOEFF_NORMED))[3]
+        peak[k] = best[0] - search, best[1] - search
+    displacement, correlation = np.empty_like(center), np.empty(len(center))
+    for first in range(0, len(center), _BATCH):
+        part = np.s_[first : first + _BATCH]
+        displacement[part], correlation[part] = _refine(templates[part], other, center[part], peak[part])
+    lost = (np.abs(displacement - peak) > _FARTHEST_FROM_PEAK).any(axis=1) | ~(correlation >= least_correlation)
+    displacement[lost] = np.nan
+    return Displacements(center, displacement, correlation)
+
+
+def _refine(templates: Picture, other: Picture, center: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Displacement (P, 2) that minimises the squared difference up to gain and offset, and the correlation there."""
+    count, patch = len(templates), templates.shape[1]
+    offset = np.arange(patch) - patch // 2
+    gy, gx = cv2.Sobel(other, cv2.CV_32F, 0, 1, scale=1 / 8), cv2.Sobel(other, cv2.CV_32F, 1, 0, scale=1 / 8)
+    target = templates.reshape(count, -1).astype(np.float64)
+    target = target - target.mean(axis=1, keepdims=True)
+    displacement, correlation = start.copy(), np.full(count, np.nan)
+    for _ in range(_ITERATIONS):
+        x = np.repeat(center[:, :1] + displacement[:, :1] + offset, patch, axis=0)
+        y = (center[:, 1:] + displacement[:, 1:] + offset).reshape(-1, 1) + np.zeros(patch)
+        maps = x.astype(np.float32), y.astype(np.float32)
+        value, along, down = (
+            np.asarray(
+                cv2.remap(source, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), dtype=np.float64
+            ).reshape(count, -1)
+            for source in (other, gx, gy)
+        )
+        value, along, down = (a - a.mean(axis=1, keepdims=True) for a in (value, along, down))
+        energy = np.maximum(np.sum(value**2, axis=1), 1e-12)
+        correlation = np.sum(value * target, axis=1) / np.sqrt(energy * np.sum(target**2, axis=1))
+        # target ~ gain (value + dx along + dy down): linear in gain, gain dx and gain dy.
+        basis = np.stack([value, along, down], axis=1)
+        normal = basis @ basis.transpose(0, 2, 1) + 1e-9 * np.eye(3)
+        gain, dx, dy = np.linalg.solve(normal, basis @ target[:, :, None])[:, :, 0].T
+        step = np.column_stack([dx, dy]) / np.where(gain > 0.1, gain, np.inf)[:, None]
+        displacement = displacement + np.clip(step, -1.0, 1.0)
+    return displacement, correlation

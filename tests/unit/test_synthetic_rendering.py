@@ -1,0 +1,144 @@
+"""Rendered pictures show what projection says they show."""
+
+import numpy as np
+import pytest
+
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.synthetic import (
+    BrownLens,
+    FisheyeLens,
+    Lens,
+    Photometry,
+    PictureTexture,
+    Poses,
+    Relief,
+    Sequence,
+    fit_to_plane,
+    ground,
+    pair_poses,
+    sequence_over,
+)
+
+SIZE = (320, 240)
+LENSES: list[Lens] = [
+    Camera(SIZE, -0.4, focal=260.0),
+    Camera(SIZE, -0.2, -0.08, focal=260.0),
+    FisheyeLens(SIZE, 220.0),
+    BrownLens(SIZE, 260.0, k1=-0.25, k2=0.06, p1=2e-3, p2=-1e-3),
+]
+
+
+def blobs(size: tuple[int, int], places: FloatArray, sigma: float) -> PictureTexture:
+    """Gaussian blobs at given texels on black ground."""
+    x, y = np.arange(size[0]), np.arange(size[1])
+    rows = np.exp(-((y[:, None] - places[:, 1]) ** 2) / (2.0 * sigma**2))
+    columns = np.exp(-((x[:, None] - places[:, 0]) ** 2) / (2.0 * sigma**2))
+    return PictureTexture((rows @ columns.T).astype(np.float32))
+
+
+def centroid(picture: FloatArray, around: FloatArray, radius: int = 9) -> FloatArray:
+    """Centre of gravity of the light near a px, weighted by its square: far pixels count little."""
+    u, v = np.rint(around).astype(int)
+    window = picture[v - radius : v + radius + 1, u - radius : u + radius + 1] ** 2
+    grid = np.arange(-radius, radius + 1)
+    return np.array([u + (window.sum(axis=0) @ grid) / window.sum(), v + (window.sum(axis=1) @ grid) / window.sum()])
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=["division", "division2", "fisheye", "brown"])
+@pytest.mark.parametrize("texels_per_pixel", [0.8, 1.0, 2.6])
+def test_a_blob_is_seen_where_projection_puts_it(lens: Lens, texels_per_pixel: float) -> None:
+    assert lens.focal is not None
+    poses, size = fit_to_plane(lens, Poses.of([(0.0, 0.0)], texels_per_pixel * lens.focal, 0.4, (0.06, -0.05)))
+    wanted = np.stack(np.meshgrid(np.linspace(25, 295, 7), np.linspace(25, 215, 5)), axis=-1).reshape(-1, 2)
+    wanted += np.random.default_rng(1).uniform(-0.5, 0.5, wanted.shape)
+    sequence = Sequence(PictureTexture(np.zeros((1, 1), np.float32)), lens, poses)
+    places = sequence.to_plane(0, wanted)
+    sequence = Sequence(blobs(size, places, 2.0 * texels_per_pixel), lens, poses, Photometry(bits=16))
+    picture = sequence.frame(0).astype(np.float64)
+    found = np.array([centroid(picture, place) for place in wanted])
+    # A round blob on the plane is seen by a lens that bends it: its centroid is off by up to 0.03 px at the corners.
+    error = np.linalg.norm(found - wanted, axis=1)
+    assert np.median(error) < 0.02
+    assert error.max() < 0.06
+    np.testing.assert_allclose(sequence.to_picture(0, places), wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=["division", "division2", "fisheye", "brown"])
+def test_lenses_go_both_ways(lens: Lens) -> None:
+    points = np.random.default_rng(2).uniform((0, 0), SIZE, (500, 2))
+    pinhole = lens.undistort(points)
+    assert np.isfinite(pinhole).all()
+    assert np.abs(pinhole - points).max() > 5.0
+    np.testing.assert_allclose(lens.distort(pinhole), points, atol=1e-7)
+    np.testing.assert_allclose(lens.undistort(np.asarray(lens.center)), lens.center, atol=1e-12)
+
+
+def test_two_pictures_are_related_by_their_planar_motion() -> None:
+    lens = Camera(SIZE, -0.3, focal=260.0)
+    sequence = sequence_over(
+        lambda size: ground(size, 1), lens, pair_poses(lens, 0.4, yaw=0.5, direction=1.0, scale=1.2, tilt=(0.1, 0.07))
+    )
+    h = sequence.poses.motion(0, 1).homography()
+    points = np.random.default_rng(3).uniform((0, 0), SIZE, (50, 2))
+    rays = (lens.undistort(points) - lens.center) / 260.0
+    moved = np.column_stack([rays, np.ones(50)]) @ h.T
+    expected = lens.distort(moved[:, :2] / moved[:, 2:] * 260.0 + lens.center)
+    np.testing.assert_allclose(sequence.to_picture(1, sequence.to_plane(0, points)), expected, atol=1e-8)
+
+
+def test_rendering_does_not_alias() -> None:
+    """A checkerboard too fine to be resolved turns grey, not into moiré."""
+    lens = Camera(SIZE, 0.0, focal=260.0)
+    x, y = np.meshgrid(np.arange(2400), np.arange(1800))
+    board = PictureTexture((((x + y) % 2) * 255).astype(np.uint8))
+    sequence = sequence_over(board, lens, Poses.of([(0.0, 0.0)], 5.0 * 260.0, 0.3))
+    picture = sequence.frame(0)[4:-4, 4:-4].astype(np.float64)
+    assert abs(picture.mean() - 127.5) < 2.0
+    assert picture.std() < 8.0
+
+
+def test_exposure_is_what_was_asked_for() -> None:
+    lens = Camera(SIZE, 0.0, focal=260.0)
+    grey = PictureTexture(np.full((400, 500), 100, np.uint8))
+    poses = Poses.of([(0.0, 0.0), (5.0, 3.0)], 260.0)
+    settings = Photometry(gain=np.array([1.0, 1.5]), vignetting=0.4, noise=0.01, bits=16)
+    sequence = sequence_over(grey, lens, poses, photometry=settings, seed=4)
+    first, second = (frame.astype(np.float64) for frame in sequence.frames())
+    assert first.shape == (240, 320)
+    centre = np.s_[110:130, 150:170]
+    assert first[centre].mean() / 65535 == pytest.approx(100 / 255, abs=0.002)
+    assert second[centre].mean() / first[centre].mean() == pytest.approx(1.5, abs=0.01)
+    assert first[:3, :3].mean() / first[centre].mean() == pytest.approx(0.6, abs=0.02)
+    assert first[centre].std() / 65535 == pytest.approx(0.01, abs=0.002)
+    np.testing.assert_array_equal(sequence.frame(1), second)
+    assert (sequence.frame(0) != sequence_over(grey, lens, poses, photometry=settings, seed=5).frame(0)).any()
+
+
+def test_a_raised_box_is_seen_in_parallax() -> None:
+    """The top of a box of height z is seen where the plane point under its ray lies, ``z / (h - z)`` further out."""
+    lens = Camera(SIZE, 0.0, focal=260.0)
+    poses, (width, height) = fit_to_plane(lens, Poses.of([(0.0, 0.0)], 260.0))
+    place = poses.position[0] + (80.0, 40.0)
+    x, y = int(place[0]), int(place[1])
+    relief = np.zeros((height, width), np.float32)
+    relief[y - 20 : y + 21, x - 20 : x + 21] = 26.0
+    sequence = Sequence(blobs((width, height), place[None], 2.0), lens, poses, relief=Relief(relief))
+    expected = sequence.to_picture(0, poses.position[0] + (place - poses.position[0]) * 260.0 / (260.0 - 26.0))
+    found = centroid(sequence.frame(0).astype(np.float64), expected)
+    np.testing.assert_allclose(found, expected, atol=0.05)
+
+
+def test_reachable_is_where_pictures_look() -> None:
+    lens = Camera(SIZE, -0.3, focal=260.0)
+    sequence = sequence_over(lambda size: ground(size, 1, 1), lens, pair_poses(lens, 0.3, yaw=0.2))
+    mask = sequence.reachable()
+    places = np.random.default_rng(5).uniform((0, 0), np.array(mask.shape[::-1]) - 1, (2000, 2))
+    seen = np.zeros(len(places), dtype=np.bool_)
+    near = np.zeros(len(places), dtype=np.bool_)
+    for index in range(2):
+        u = sequence.to_picture(index, places)
+        border = np.minimum(u, np.array(SIZE) - 1 - u).min(axis=1)
+        seen |= border > -0.5
+        near |= np.abs(border) < 2.0
+    column, row = np.rint(places).astype(int).T
+    np.testing.assert_array_equal(mask[row, column][~near], seen[~near])
