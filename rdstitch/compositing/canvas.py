@@ -54,6 +54,14 @@ class Canvas:
         footprints = tuple(outline - (x0, y0) for outline in self.footprints)
         return Canvas((x1 - x0, y1 - y0), shift @ self.matrix, footprints)
 
+    def reduced(self, factor: int) -> "Canvas":
+        """The same canvas with px ``factor`` times as large."""
+        width, height = (-(-n // factor) for n in self.size)
+        shift = 0.5 / factor - 0.5
+        to_reduced = np.array([[1.0 / factor, 0.0, shift], [0.0, 1.0 / factor, shift], [0.0, 0.0, 1.0]])
+        footprints = tuple(outline / factor + shift for outline in self.footprints)
+        return Canvas((width, height), to_reduced @ self.matrix, footprints)
+
 
 def plan_canvas(
     cameras: Sequence[Camera],

@@ -1,5 +1,6 @@
 """The compositor: pictures, cameras and homographies in, one picture out."""
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,15 +10,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.camera import Camera
 from rdstitch.compositing.canvas import Canvas
+from rdstitch.compositing.exposure import Exposure, estimate_exposure, no_exposure
 from rdstitch.compositing.options import CompositeOptions
-from rdstitch.compositing.pictures import PictureCache, Source
-from rdstitch.compositing.warp import Box, Warp, plan_warp, warp_tile
+from rdstitch.compositing.pictures import PictureCache, PictureReader, Source
+from rdstitch.compositing.render import Renderer
+from rdstitch.compositing.seams import find_seams
+from rdstitch.compositing.survey import survey_pictures
+from rdstitch.compositing.warp import plan_warp
 from rdstitch.errors import ArgumentError
 
 # Called with the share of the work done, 0 to 1.
 Progress = Callable[[float], None]
 
 _DEFAULT_MEMORY = 2**30
+_MOST_BANDS = 5
 
 
 @dataclass(frozen=True)
@@ -32,11 +38,14 @@ class Composite:
         255 where a picture lies, else 0.
     canvas : Canvas
         Geometry of ``pixels``, after cropping.
+    exposure : Exposure
+        What the pictures were corrected by.
     """
 
     pixels: NDArray[Any]
     alpha: NDArray[np.uint8]
     canvas: Canvas
+    exposure: Exposure
 
 
 def compose(
@@ -74,67 +83,80 @@ def compose(
         When a picture cannot be read.
     """
     options = options or CompositeOptions()
+    renderer = prepare(sources, cameras, homographies, canvas, options, _part_of(progress, 0.0, 0.3))
+    width, height = canvas.size
+    # Held in BGR order, so that encoders that want it need no copy; seen in RGB order.
+    pixels = np.zeros((height, width, renderer.channels), dtype=renderer.dtype)[..., ::-1]
+    alpha = np.zeros((height, width), dtype=np.uint8)
+    for top, samples, covered in strips(renderer, canvas, _part_of(progress, 0.3, 1.0)):
+        pixels[top : top + len(samples)] = samples
+        alpha[top : top + len(samples)] = covered
+    return Composite(pixels if renderer.channels > 1 else pixels[..., 0], alpha, canvas, renderer.exposure)
+
+
+def prepare(
+    sources: Sequence[Source],
+    cameras: Sequence[Camera],
+    homographies: ArrayLike,
+    canvas: Canvas,
+    options: CompositeOptions,
+    progress: Progress | None = None,
+) -> Renderer:
+    """Decide on exposure and seams, from one small look at each picture; parameters as for :func:`compose`."""
     matrices = np.asarray(homographies, dtype=np.float64)
     if not len(sources) == len(cameras) == len(matrices) == len(canvas.footprints):
         raise ArgumentError("sources, cameras, homographies and footprints must be equally many")
     warps = [plan_warp(c, g, canvas, k) for k, (c, g) in enumerate(zip(cameras, matrices, strict=True))]
-    cache = PictureCache(
-        sources,
-        [c.image_size for c in cameras],
-        [w.shrink for w in warps],
-        options.max_memory or _DEFAULT_MEMORY,
+    reader = PictureReader(sources, [c.image_size for c in cameras])
+    exposure, seams = None, None
+    if options.exposure != "none" or options.seam != "none":
+        survey = survey_pictures(reader, cameras, matrices, canvas, _part_of(progress, 0.0, 0.7))
+        if options.exposure != "none":
+            exposure = estimate_exposure(survey, cameras, blocks=options.exposure == "blocks")
+        if options.seam != "none":
+            decided = exposure or no_exposure(len(cameras), reader.samples[0])
+            graphcut = options.seam == "graphcut"
+            seams = find_seams(survey, decided, graphcut, _part_of(progress, 0.7, 1.0))
+    channels, dtype = reader.samples
+    return Renderer(
+        warps,
+        PictureCache(reader, [w.shrink for w in warps], options.max_memory or _DEFAULT_MEMORY),
+        exposure or no_exposure(len(cameras), channels),
+        seams,
+        options,
+        options.bands or _bands(cameras),
+        channels,
+        dtype,
     )
-    first = cache[0].pixels
+
+
+def strips(
+    renderer: Renderer, canvas: Canvas, progress: Progress | None = None
+) -> Iterator[tuple[int, NDArray[Any], NDArray[np.uint8]]]:
+    """The output from top to bottom: first row, samples (h, W, C) and alpha (h, W) of each strip of tiles."""
     width, height = canvas.size
-    pixels = np.zeros((height, width, *first.shape[2:]), dtype=first.dtype)
-    alpha = np.zeros((height, width), dtype=np.uint8)
-    tiles = list(_tiles(canvas.size, options.tile_size))
-    for done, box in enumerate(tiles, start=1):
-        x0, y0, x1, y1 = box
-        samples, covered = _feather(warps, cache, box, options)
-        if samples is not None:
-            pixels[y0:y1, x0:x1] = samples
-            alpha[y0:y1, x0:x1] = np.where(covered, np.uint8(255), np.uint8(0))
-        if progress is not None:
-            progress(done / len(tiles))
-    return Composite(pixels, alpha, canvas)
+    side = renderer.options.tile_size
+    for top in range(0, height, side):
+        bottom = min(top + side, height)
+        samples = np.zeros((bottom - top, width, renderer.channels), dtype=renderer.dtype)
+        alpha = np.zeros((bottom - top, width), dtype=np.uint8)
+        for left in range(0, width, side):
+            right = min(left + side, width)
+            samples[:, left:right], covered = renderer.tile((left, top, right, bottom))
+            alpha[:, left:right][covered] = 255
+            if progress is not None:
+                progress((top * width + (bottom - top) * right) / (width * height))
+        yield top, samples, alpha
 
 
-def _tiles(size: tuple[int, int], side: int) -> Iterator[Box]:
-    """Boxes that cover the canvas, row by row."""
-    width, height = size
-    for y in range(0, height, side):
-        for x in range(0, width, side):
-            yield x, y, min(x + side, width), min(y + side, height)
+def _bands(cameras: Sequence[Camera]) -> int:
+    """Bands that suit the smallest picture: the widest transition is a few per cent of its side."""
+    side = min(min(c.image_size) for c in cameras)
+    return int(np.clip(math.log2(max(side, 1)) - 4.5, 1, _MOST_BANDS))
 
 
-def _feather(
-    warps: Sequence[Warp], cache: PictureCache, box: Box, options: CompositeOptions
-) -> tuple[NDArray[Any] | None, NDArray[np.bool_]]:
-    """Mean of the pictures on one box, weighted by the distance to their borders."""
-    x0, y0, x1, y1 = box
-    total, weights = None, np.zeros((y1 - y0, x1 - x0), dtype=np.float32)
-    dtype: np.dtype[Any] = np.dtype(np.uint8)
-    for k, warp in enumerate(warps):
-        bx0, by0, bx1, by1 = warp.box
-        if bx0 >= x1 or bx1 <= x0 or by0 >= y1 or by1 <= y0:
-            continue
-        tile = warp_tile(warp, cache[k], box, options.interpolation)
-        if tile is None:
-            continue
-        dtype = tile.pixels.dtype
-        values = tile.pixels.astype(np.float32)
-        if total is None:
-            total = np.zeros_like(values)
-        # Never 0 inside: a border pixel that one picture alone covers must not get lost.
-        weight = np.where(tile.inside, np.maximum(tile.weight, np.float32(1e-6)), np.float32(0.0))
-        total += values * (weight[..., None] if values.ndim == 3 else weight)
-        weights += weight
-    covered = weights > 0
-    if total is None:
-        return None, covered
-    safe = np.where(covered, weights, np.float32(1.0))
-    mean = total / (safe[..., None] if total.ndim == 3 else safe)
-    if np.issubdtype(dtype, np.integer):
-        mean = np.clip(np.rint(mean), 0, np.iinfo(dtype).max)
-    return mean.astype(dtype), covered
+def _part_of(progress: Progress | None, start: float, stop: float) -> Progress | None:
+    """A progress that fills a part of another."""
+    if progress is None:
+        return None
+    return lambda share: progress(start + (stop - start) * share)

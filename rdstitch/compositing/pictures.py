@@ -3,7 +3,7 @@
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -106,48 +106,99 @@ def _opacity(opaque: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float]:
     return np.minimum(np.asarray(distance, dtype=np.float32) / np.float32(reach), np.float32(1.0)), 1.0 / reach
 
 
-class PictureCache:
-    """The pictures used last, in at most ``limit`` bytes (though always one).
+class PictureReader:
+    """Reads pictures, and sees to it that they are what was registered.
 
     Parameters
     ----------
     sources : sequence of callables
         Each reads one picture.
     sizes : sequence of (int, int)
-        Width and height that each picture must have.
+        Width and height, px, that each picture must have.
+    """
+
+    def __init__(self, sources: Sequence[Source], sizes: Sequence[tuple[int, int]]) -> None:
+        self._sources, self._sizes = sources, sizes
+        self._samples: tuple[tuple[int, ...], np.dtype[Any]] | None = None
+        self._masked: dict[int, bool] = {}
+
+    def __call__(self, index: int) -> Picture:
+        """Read picture ``index``; a grey picture among coloured ones becomes coloured.
+
+        Raises
+        ------
+        InputError
+            When it cannot be read, has another size than its camera, or samples unlike the first picture's.
+        """
+        picture = self._sources[index]()
+        height, width = picture.pixels.shape[:2]
+        if (width, height) != self._sizes[index]:
+            expected = "{} x {}".format(*self._sizes[index])
+            raise InputError(f"picture {index + 1} has {width} x {height} px, but its camera has {expected}")
+        if self._samples is None:
+            self._samples = picture.pixels.shape[2:], picture.pixels.dtype
+        channels, dtype = self._samples
+        pixels = picture.pixels
+        if pixels.ndim == 2 and channels == (3,):
+            pixels = np.repeat(pixels[..., None], 3, axis=2)
+        elif pixels.shape[2:] == (3,) and channels == ():
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+        if (pixels.shape[2:], pixels.dtype) != (channels, dtype):
+            raise InputError(
+                f"picture {index + 1} has {_kind(pixels.shape[2:], pixels.dtype)}, but the first that was read has "
+                f"{_kind(channels, dtype)}; convert them to one kind"
+            )
+        self._masked[index] = picture.alpha is not None
+        return replace(picture, pixels=pixels)
+
+    def masked(self, index: int) -> bool:
+        """Whether a picture has transparent parts; reads it when that is not known yet."""
+        if index not in self._masked:
+            self(index)
+        return self._masked[index]
+
+    @property
+    def samples(self) -> tuple[int, np.dtype[Any]]:
+        """Number of channels and type of all pictures' samples; reads the first one when none has been read."""
+        if self._samples is None:
+            self(0)
+        assert self._samples is not None
+        channels, dtype = self._samples
+        return (channels[0] if channels else 1), dtype
+
+
+def _kind(channels: tuple[int, ...], dtype: np.dtype[Any]) -> str:
+    """Samples in words."""
+    return f"{channels[0] if channels else 1} channel(s) of {dtype}"
+
+
+class PictureCache:
+    """The pictures used last, prepared for resampling, in at most ``limit`` bytes (though always one).
+
+    Parameters
+    ----------
+    reader : PictureReader
     shrinks : sequence of float
         Picture px per output px.
     limit : int
         Bytes.
     """
 
-    def __init__(
-        self, sources: Sequence[Source], sizes: Sequence[tuple[int, int]], shrinks: Sequence[float], limit: int
-    ) -> None:
-        self._sources, self._sizes, self._shrinks, self._limit = sources, sizes, shrinks, limit
+    def __init__(self, reader: PictureReader, shrinks: Sequence[float], limit: int) -> None:
+        self._reader, self._shrinks, self._limit = reader, shrinks, limit
         self._held: OrderedDict[int, LoadedPicture] = OrderedDict()
         self._bytes = 0
 
-    def __getitem__(self, index: int) -> LoadedPicture:
-        """Picture ``index``, read unless it is held.
+    def masked(self, index: int) -> bool:
+        """Whether a picture has transparent parts."""
+        return self._reader.masked(index)
 
-        Raises
-        ------
-        InputError
-            When it cannot be read, or has another size than its camera.
-        """
+    def __getitem__(self, index: int) -> LoadedPicture:
+        """Picture ``index``, read unless it is held."""
         if index in self._held:
             self._held.move_to_end(index)
             return self._held[index]
-        picture = self._sources[index]()
-        height, width = picture.pixels.shape[:2]
-        if (width, height) != self._sizes[index]:
-            expected = "{} x {}".format(*self._sizes[index])
-            raise InputError(
-                f"picture {index + 1} has {width} x {height} px now, but {expected} when it was registered"
-            )
-        loaded = prepare_picture(picture, self._shrinks[index])
-        del picture
+        loaded = prepare_picture(self._reader(index), self._shrinks[index])
         self._bytes += loaded.nbytes
         while self._held and self._bytes > self._limit:
             _, dropped = self._held.popitem(last=False)

@@ -25,6 +25,7 @@ _NOWHERE = np.float32(-1e6)
 # Room around a piece of a picture for the kernel of the resampling, px.
 _KERNEL_MARGIN = 8
 _PROBES = 16
+_LEAST_WEIGHT = np.float32(1e-6)
 
 
 @dataclass(frozen=True)
@@ -64,101 +65,138 @@ class Warp:
 
         The lattice is anchored to the canvas, so that every box gives the same coordinates, bit for bit.
         """
-        x0, y0, x1, y1 = box
-        xs, ys = (_lattice(a, b, self.step) for a, b in ((x0, x1), (y0, y1)))
-        nodes = self.source_points(xs[None, :], ys[:, None]).astype(np.float32)
+        nodes = self.source_points(*lattice_nodes(box, self.step)).astype(np.float32)
         nodes[~np.isfinite(nodes).all(axis=-1)] = _NOWHERE
-        window = np.s_[y0 - int(ys[0]) : y1 - int(ys[0]), x0 - int(xs[0]) : x1 - int(xs[0])]
         return (
-            np.ascontiguousarray(interpolate_lattice(nodes[..., 0], self.step)[window]),
-            np.ascontiguousarray(interpolate_lattice(nodes[..., 1], self.step)[window]),
+            interpolate_lattice(nodes[..., 0], box, self.step),
+            interpolate_lattice(nodes[..., 1], box, self.step),
         )
 
 
 @dataclass(frozen=True)
-class WarpedTile:
-    """One picture on one box of the canvas.
+class Geometry:
+    """Where the px of one box of the canvas come from in one picture.
 
     Attributes
     ----------
-    pixels : ndarray of shape (h, w) or (h, w, C)
-        In the picture's sample type; mirrored content outside the picture, so that filters find no edge there.
+    box : (int, int, int, int)
+        x0, y0, x1, y1 on the canvas, px, end exclusive; it may reach beyond the canvas.
+    map_x, map_y : ndarray of shape (h, w), float32
+        Px of the picture as measured.
     inside : ndarray of shape (h, w), bool
-        Where the picture says something.
-    weight : ndarray of shape (h, w), float32
-        1 at the picture's centre, falling to 0 at its border (measured in the picture); 0 outside.
+        Where they lie in the picture.
     """
 
-    pixels: NDArray[Any]
+    box: Box
+    map_x: Float32Array
+    map_y: Float32Array
     inside: NDArray[np.bool_]
-    weight: Float32Array
+
+    def part(self, box: Box) -> "Geometry":
+        """The same for a box within this one."""
+        x0, y0, x1, y1 = box
+        cut = np.s_[y0 - self.box[1] : y1 - self.box[1], x0 - self.box[0] : x1 - self.box[0]]
+        return Geometry(box, self.map_x[cut], self.map_y[cut], self.inside[cut])
 
 
 def plan_warp(camera: Camera, homography: FloatArray, canvas: Canvas, index: int) -> Warp:
     """Everything about the resampling of picture ``index`` that does not depend on the tile."""
-    from_canvas = np.asarray(np.linalg.inv(canvas.matrix @ homography), dtype=np.float64)
+    to_canvas = canvas.matrix @ homography
+    from_canvas = np.asarray(np.linalg.inv(to_canvas), dtype=np.float64)
     outline = canvas.footprints[index]
     # The sign of a homography is free; its inverse must put the footprint in front of the camera.
     if from_canvas[2] @ np.array([*outline.mean(axis=0), 1.0]) < 0:
         from_canvas = -from_canvas
     box = canvas.boxes()[index]
     draft = Warp(camera, from_canvas, box, 1, 1.0)
-    probes = _probes(camera, canvas.matrix @ homography, outline)
+    probes = _probes(camera, to_canvas, outline)
     return Warp(camera, from_canvas, box, _lattice_step(draft, probes), _shrink(draft, probes))
 
 
-def warp_tile(warp: Warp, picture: LoadedPicture, box: Box, interpolation: str = "cubic") -> WarpedTile | None:
-    """Resample one picture onto one box of the canvas; None where they do not meet.
+def locate(warp: Warp, box: Box) -> Geometry | None:
+    """Where the px of a box come from; None where the picture does not reach it."""
+    if intersection(warp.box, box) is None:
+        return None
+    map_x, map_y = warp.maps(box)
+    width, height = warp.camera.image_size
+    inside = (map_x >= -0.5) & (map_x < width - 0.5) & (map_y >= -0.5) & (map_y < height - 0.5)
+    return Geometry(box, map_x, map_y, inside) if inside.any() else None
+
+
+def border_weight(warp: Warp, geometry: Geometry) -> Float32Array:
+    """1 at the picture's centre, falling to 0 at its border (measured in the picture) and outside."""
+    width, height = warp.camera.image_size
+    one, half = np.float32(1.0), np.float32(0.5)
+    weight = (one - np.abs((geometry.map_x + half) * np.float32(2.0 / width) - one)) * (
+        one - np.abs((geometry.map_y + half) * np.float32(2.0 / height) - one)
+    )
+    # Never 0 inside: a border px that one picture alone covers must not get lost.
+    return np.where(geometry.inside, np.maximum(weight, _LEAST_WEIGHT), np.float32(0.0))
+
+
+def sample(warp: Warp, picture: LoadedPicture, geometry: Geometry, interpolation: str = "cubic") -> NDArray[Any]:
+    """Resample a picture; content is mirrored outside of it, so that filters find no edge there.
 
     Parameters
     ----------
     warp : Warp
     picture : LoadedPicture
         Prepared for ``warp.shrink``.
-    box : (int, int, int, int)
-        x0, y0, x1, y1 on the canvas, px, end exclusive.
+    geometry : Geometry
+        From :func:`locate`.
     interpolation : str
         "linear", "cubic" or "lanczos".
+
+    Returns
+    -------
+    ndarray of shape (h, w) or (h, w, C)
+        In the picture's sample type.
     """
-    map_x, map_y = warp.maps(box)
-    width, height = warp.camera.image_size
-    inside = (map_x >= -0.5) & (map_x < width - 0.5) & (map_y >= -0.5) & (map_y < height - 0.5)
-    if not inside.any():
+    map_x, map_y = _mirrored(warp, picture, geometry)
+    return _remap_piece(picture.pixels, map_x, map_y, INTERPOLATION[interpolation])
+
+
+def sample_opacity(warp: Warp, picture: LoadedPicture, geometry: Geometry) -> Float32Array | None:
+    """Opacity (h, w), 0 where the picture is masked out; None for a picture without a mask."""
+    if picture.opacity is None:
         return None
-    weight = (np.float32(1.0) - np.abs((map_x + np.float32(0.5)) * np.float32(2.0 / width) - np.float32(1.0))) * (
-        np.float32(1.0) - np.abs((map_y + np.float32(0.5)) * np.float32(2.0 / height) - np.float32(1.0))
+    map_x, map_y = _mirrored(warp, picture, geometry)
+    opacity = _remap_piece(picture.opacity, map_x, map_y, cv2.INTER_LINEAR)
+    # The outer half of the last opaque px is outside.
+    return np.where(opacity >= 0.5 * picture.opacity_step, opacity, 0.0).astype(np.float32)
+
+
+def intersection(first: Box, second: Box) -> Box | None:
+    """The common part of two boxes; None where there is none."""
+    x0, y0, x1, y1 = (
+        max(first[0], second[0]),
+        max(first[1], second[1]),
+        min(first[2], second[2]),
+        min(first[3], second[3]),
     )
-    weight[~inside] = 0.0
-    if not inside.all():
+    return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
+
+
+def _mirrored(warp: Warp, picture: LoadedPicture, geometry: Geometry) -> tuple[Float32Array, Float32Array]:
+    """Px of the (reduced) picture, all inside it."""
+    map_x, map_y = geometry.map_x, geometry.map_y
+    if not geometry.inside.all():
+        width, height = warp.camera.image_size
         map_x, map_y = _mirror(map_x, width), _mirror(map_y, height)
     if picture.reduction > 1:
         map_x, map_y = (_reduce(m, picture.reduction) for m in (map_x, map_y))
-    pixels, opacity = _sample(picture, map_x, map_y, INTERPOLATION[interpolation])
-    if opacity is not None:
-        inside &= opacity > 0
-        weight *= opacity
-    return WarpedTile(pixels, inside, weight)
+    return map_x, map_y
 
 
-def _sample(
-    picture: LoadedPicture, map_x: Float32Array, map_y: Float32Array, interpolation: int
-) -> tuple[NDArray[Any], Float32Array | None]:
-    """Pixels and opacity at the given px of the picture, read from the smallest piece that holds them."""
-    height, width = picture.pixels.shape[:2]
+def _remap_piece(pixels: NDArray[Any], map_x: Float32Array, map_y: Float32Array, interpolation: int) -> NDArray[Any]:
+    """``cv2.remap`` from the smallest piece of a picture that is needed; it takes no side above 32767 px."""
+    height, width = pixels.shape[:2]
     left, top = (max(0, int(m.min()) - _KERNEL_MARGIN) for m in (map_x, map_y))
     right = min(width, int(map_x.max()) + 2 + _KERNEL_MARGIN)
     bottom = min(height, int(map_y.max()) + 2 + _KERNEL_MARGIN)
     # Whole px are subtracted exactly, so the piece does not change the result.
     map_x, map_y = map_x - np.float32(left), map_y - np.float32(top)
-    piece = picture.pixels[top:bottom, left:right]
-    pixels = _remap(piece, map_x, map_y, interpolation)
-    if picture.opacity is None:
-        return pixels, None
-    opacity = cv2.remap(
-        picture.opacity[top:bottom, left:right], map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
-    # The outer half of the last opaque pixel is outside.
-    return pixels, np.where(opacity >= 0.5 * picture.opacity_step, opacity, 0.0).astype(np.float32)
+    return _remap(pixels[top:bottom, left:right], map_x, map_y, interpolation)
 
 
 def _remap(piece: NDArray[Any], map_x: Float32Array, map_y: Float32Array, interpolation: int) -> NDArray[Any]:
@@ -183,20 +221,31 @@ def _reduce(values: Float32Array, reduction: int) -> Float32Array:
     return (values + np.float32(0.5)) / np.float32(reduction) - np.float32(0.5)
 
 
-def _lattice(start: int, stop: int, step: int) -> FloatArray:
-    """Nodes of the canvas' lattice that enclose [start, stop - 1]."""
-    return np.arange(start // step, -(-(stop - 1) // step) + 2, dtype=np.float64) * step
+def lattice_nodes(box: Box, step: int) -> tuple[FloatArray, FloatArray]:
+    """Canvas px x (1, n) and y (m, 1) of the lattice nodes that enclose a box."""
+    x, y = (
+        np.arange(start // step, -(-(stop - 1) // step) + 2, dtype=np.float64) * step
+        for start, stop in ((box[0], box[2]), (box[1], box[3]))
+    )
+    return x[None, :], y[:, None]
 
 
-def interpolate_lattice(nodes: Float32Array, step: int) -> Float32Array:
-    """Linear interpolation of (m, n) nodes to ((m-1) step, (n-1) step) values, equal for equal nodes."""
-    if step == 1:
-        return nodes[:-1, :-1]
-    t = (np.arange(step, dtype=np.float32) / np.float32(step))[:, None]
-    rows, columns = nodes.shape
-    down = (nodes[:-1, None, :] + (nodes[1:] - nodes[:-1])[:, None, :] * t).reshape(-1, columns)
-    across = down[:, :-1, None] + (down[:, 1:] - down[:, :-1])[:, :, None] * t[:, 0]
-    return across.reshape((rows - 1) * step, -1)
+def interpolate_lattice(nodes: Float32Array, box: Box, step: int) -> Float32Array:
+    """Linear interpolation of node values (m, n) to the px (h, w) of the box that they enclose.
+
+    Every value depends on its four nodes alone, bit for bit, whatever the box.
+    """
+    x0, y0, x1, y1 = box
+    top, left = y0 % step, x0 % step
+    rows = nodes[:-1]
+    if step > 1:
+        t = (np.arange(step, dtype=np.float32) / np.float32(step))[:, None]
+        rows = rows[:, None, :] + (nodes[1:] - rows)[:, None, :] * t
+    rows = rows.reshape(-1, nodes.shape[1])[top : top + y1 - y0]
+    values = rows[:, :-1]
+    if step > 1:
+        values = values[:, :, None] + (rows[:, 1:] - values)[:, :, None] * t[:, 0]
+    return np.ascontiguousarray(values.reshape(len(rows), -1)[:, left : left + x1 - x0])
 
 
 def _probes(camera: Camera, to_canvas: FloatArray, outline: FloatArray) -> FloatArray:

@@ -1,0 +1,318 @@
+"""Equal brightness: gain per picture and channel, one vignetting for all, and a smooth field per picture.
+
+Light ``L`` gives the sample ``v = full ((1 + b) L^(1/p) - b)``: sRGB above its toe for ``b`` = 0.055, any power law,
+and so also raw light, for ``b`` = 0. A factor on the light is then a factor ``q`` on ``v + b``, whatever the power, and
+
+    log(v + b) = log q_i + a1 r² + a2 r⁴ + a3 r⁶ + f_i(u, v) + log(light of that point of the plane)
+
+is linear in all unknowns: ``q_i`` per picture and channel, the vignetting ``a`` of the lens over the distance r from
+the distortion centre, and the block field ``f_i``. Two pictures of one point differ by the first terms alone. Which
+``b`` the pictures follow is decided by the residuals.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.compositing.survey import Survey, SurveyTile
+from rdstitch.compositing.warp import Box, Float32Array, Warp, interpolate_lattice, intersection, lattice_nodes
+
+_SRGB_OFFSET = 0.055
+# Samples outside this part of the range are clipped or mostly noise.
+_DARKEST, _BRIGHTEST = 0.02, 0.97
+_SAMPLES_PER_PAIR, _LARGEST_SAMPLES = 1500, 600_000
+_FEWEST_SAMPLES = 30
+# How well two pictures' brightness can agree, and how far gains stray (log units): keeps long chains from drifting.
+_PAIR_SIGMA, _GAIN_SIGMA = 0.02, 0.5
+_VIGNETTING_SIGMA, _VIGNETTING_RANGE = 1.0, (0.15, 1.25)
+_BLOCKS = 5
+_BLOCK_SIGMA, _BLOCK_BEND_SIGMA = 0.3, 0.1
+_HUBER = 1.345
+_ROUNDS = 6
+# A model with more freedom must explain the data better by this share to be taken.
+_WORTHWHILE = 0.02
+# The correction is smooth: it is computed at this spacing, canvas px, and interpolated.
+_LATTICE = 32
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """What every picture's samples are multiplied by: ``v' = q (v + b) - b``.
+
+    Attributes
+    ----------
+    offset : float
+        ``b``, share of the full range.
+    log_gain : ndarray of shape (N, C)
+        log of what picture i is brighter by than the average.
+    vignetting : ndarray of shape (3,)
+        Coefficients of r², r⁴, r⁶ in log(v + b); r in half diagonals from the distortion centre.
+    blocks : ndarray of shape (N, B, B), or (N, 0, 0)
+        Smooth remainder on a grid over each picture (rows, columns).
+    rms_before, rms_after : float
+        Robust difference between overlapping pictures, share of the full range.
+    """
+
+    offset: float
+    log_gain: FloatArray
+    vignetting: FloatArray = field(default_factory=lambda: np.zeros(3))
+    blocks: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    rms_before: float = 0.0
+    rms_after: float = 0.0
+
+    def smooth_part(self, index: int, camera: Camera, points: FloatArray) -> FloatArray:
+        """Vignetting and block field at measured px (..., 2), log units."""
+        r2 = _radius2(camera, points)
+        log = r2 * (self.vignetting[0] + r2 * (self.vignetting[1] + r2 * self.vignetting[2]))
+        if self.blocks.size:
+            nodes, shares = _block_weights(camera, points)
+            log = log + (self.blocks[index].ravel()[nodes] * shares).sum(axis=-1)
+        return np.asarray(log, dtype=np.float64)
+
+    def correct(self, index: int, warp: Warp, box: Box, pixels: NDArray[Any]) -> Float32Array:
+        """Resampled pixels (h, w, C) of picture ``index`` on ``box``, as if all were exposed alike.
+
+        Depends, px by px, on nothing but the px: every box gives the same, bit for bit.
+        """
+        full = full_scale(pixels.dtype)
+        values = pixels.astype(np.float32)
+        level = np.exp(-self.log_gain[index]).astype(np.float32)
+        offset = np.float32(self.offset * full)
+        if self.vignetting.any() or self.blocks.size:
+            x, y = np.broadcast_arrays(*lattice_nodes(box, _LATTICE))
+            points = warp.source_points(x, y)
+            width, height = warp.camera.image_size
+            # Outside the picture only mirrored content is corrected; the model must not run away there.
+            points = np.clip(np.nan_to_num(points), -0.5, (width - 0.5, height - 0.5))
+            nodes = np.exp(-self.smooth_part(index, warp.camera, points)).astype(np.float32)
+            factor = interpolate_lattice(nodes, box, _LATTICE)
+            values += offset
+            values *= factor[..., None] * level
+            values -= offset
+        elif self.log_gain[index].any():
+            values += offset
+            values *= level
+            values -= offset
+        return np.clip(values, 0, np.float32(full), out=values) if pixels.dtype.kind == "u" else values
+
+
+def full_scale(dtype: np.dtype[Any]) -> float:
+    """Largest sample; 1 for floating point."""
+    return float(np.iinfo(dtype).max) if dtype.kind == "u" else 1.0
+
+
+def no_exposure(count: int, channels: int) -> Exposure:
+    """Leaves every sample as it is."""
+    return Exposure(0.0, np.zeros((count, channels)))
+
+
+def estimate_exposure(survey: Survey, cameras: Sequence[Camera], blocks: bool = False) -> Exposure:
+    """Least squares over all overlaps, robust against what differs for other reasons (parallax, people).
+
+    Parameters
+    ----------
+    survey : Survey
+    cameras : sequence of Camera
+        Their distortion centre is the centre of the vignetting.
+    blocks : bool
+        Whether each picture also gets a smooth field of its own.
+
+    Returns
+    -------
+    Exposure
+        Without any correction where no pictures overlap.
+    """
+    present = [tile for tile in survey.tiles if tile is not None]
+    channels = present[0].pixels.shape[2] if present else 1
+    samples = _collect(survey, cameras)
+    if samples is None:
+        return no_exposure(len(cameras), channels)
+    offsets = (_SRGB_OFFSET, 0.0) if present[0].pixels.dtype.kind == "u" else (0.0,)
+    fits = [_fit(samples, b, len(cameras), vignetting) for b in offsets for vignetting in (False, True)]
+    best = fits[0]
+    for fit in fits[1:]:
+        if fit.rms_after < (1.0 - _WORTHWHILE) * best.rms_after:
+            best = fit
+    return _with_blocks(best, samples, cameras) if blocks else best
+
+
+@dataclass(frozen=True)
+class _Samples:
+    """Points that two pictures see: picture, weight, value (share of full), px and r² of either; S of each."""
+
+    first: NDArray[np.intp]
+    second: NDArray[np.intp]
+    share: FloatArray
+    value1: FloatArray
+    value2: FloatArray
+    point1: FloatArray
+    point2: FloatArray
+    radius1: FloatArray
+    radius2: FloatArray
+
+
+def _collect(survey: Survey, cameras: Sequence[Camera]) -> _Samples | None:
+    """Samples from every pair of overlapping pictures, evenly spread."""
+    pairs = [
+        (i, j, box)
+        for i, a in enumerate(survey.tiles)
+        if a is not None
+        for j, b in enumerate(survey.tiles[:i])
+        if b is not None and (box := intersection(a.box, b.box)) is not None
+    ]
+    limit = max(_FEWEST_SAMPLES, min(_SAMPLES_PER_PAIR, _LARGEST_SAMPLES // max(1, len(pairs))))
+    found: list[tuple[Any, ...]] = []
+    for i, j, box in pairs:
+        a, b = survey.tiles[i], survey.tiles[j]
+        assert a is not None
+        assert b is not None
+        inside = _cut(a, box, a.inside) & _cut(b, box, b.inside)
+        where = np.flatnonzero(inside)
+        if len(where) < _FEWEST_SAMPLES:
+            continue
+        where = where[:: max(1, len(where) // limit)]
+        va, vb = (_values(tile, box, where) for tile in (a, b))
+        usable = ((np.minimum(va, vb) > _DARKEST) & (np.maximum(va, vb) < _BRIGHTEST)).all(axis=1)
+        if a.pixels.dtype.kind != "u":
+            usable = ((va > 0) & (vb > 0)).all(axis=1)
+        where, va, vb = where[usable], va[usable], vb[usable]
+        if len(where) < _FEWEST_SAMPLES:
+            continue
+        y, x = (index.astype(np.float64) for index in np.unravel_index(where, inside.shape))
+        pa, pb = (survey.warps[k].source_points(x + box[0], y + box[1]) for k in (i, j))
+        found.append((i, j, va, vb, pa, pb, _radius2(cameras[i], pa), _radius2(cameras[j], pb)))
+    if not found:
+        return None
+    counts = [len(f[2]) for f in found]
+    first, second = (np.repeat([f[k] for f in found], counts) for k in (0, 1))
+    # A pair counts as one measurement however many samples it has.
+    share = np.repeat([1.0 / n for n in counts], counts)
+    return _Samples(first, second, share, *(np.concatenate([f[k] for f in found]) for k in range(2, 8)))
+
+
+def _cut(tile: SurveyTile, box: Box, values: NDArray[Any]) -> NDArray[Any]:
+    """The part of a tile's array that lies on ``box``."""
+    x, y = box[0] - tile.box[0], box[1] - tile.box[1]
+    return values[y : y + box[3] - box[1], x : x + box[2] - box[0]]
+
+
+def _values(tile: SurveyTile, box: Box, where: NDArray[np.intp]) -> FloatArray:
+    """Samples as share of the full range, (S, C)."""
+    cut = _cut(tile, box, tile.pixels).reshape(-1, tile.pixels.shape[2])
+    return cut[where].astype(np.float64) / full_scale(tile.pixels.dtype)
+
+
+def _radius2(camera: Camera, points: FloatArray) -> FloatArray:
+    """Squared distance from the distortion centre, half diagonals."""
+    return np.asarray((camera.normalize(points) ** 2).sum(axis=-1), dtype=np.float64)
+
+
+def _fit(samples: _Samples, offset: float, count: int, vignetting: bool) -> Exposure:
+    """Gains and vignetting for one response of the camera, by iteratively reweighted least squares."""
+    difference = np.log(samples.value1 + offset) - np.log(samples.value2 + offset)
+    grey = difference.mean(axis=1)
+    level = np.sqrt((samples.value1.mean(axis=1) + offset) * (samples.value2.mean(axis=1) + offset))
+    powers = [samples.radius1**k - samples.radius2**k for k in (1, 2, 3)]
+    radial = np.stack(powers, axis=1) if vignetting else np.zeros((len(grey), 0))
+    robust = np.ones(len(grey))
+    before = _robust_rms(grey * level, samples.share)
+    for _ in range(_ROUNDS):
+        weight = robust * samples.share / _PAIR_SIGMA**2
+        solution = _solve(samples, weight, grey[:, None], radial, count)
+        residual = grey - (solution[samples.first] - solution[samples.second])[:, 0] - radial @ solution[count:, 0]
+        scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-4)
+        robust = 1.0 / np.maximum(1.0, np.abs(residual) / (_HUBER * scale))
+    coefficients = np.zeros(3)
+    if vignetting:
+        coefficients = solution[count:, 0]
+        profile = np.exp(np.stack([np.linspace(0, 1, 20) ** k for k in (1, 2, 3)], axis=1) @ coefficients)
+        if not ((profile > _VIGNETTING_RANGE[0]) & (profile < _VIGNETTING_RANGE[1])).all():
+            return Exposure(offset, np.zeros((count, difference.shape[1])), rms_before=before, rms_after=np.inf)
+    flat = difference - (radial @ solution[count:])
+    gains = _solve(samples, robust * samples.share / _PAIR_SIGMA**2, flat, np.zeros((len(grey), 0)), count)
+    after = _robust_rms((flat - gains[samples.first] + gains[samples.second]).mean(axis=1) * level, samples.share)
+    return Exposure(offset, gains, coefficients, rms_before=before, rms_after=after)
+
+
+def _robust_rms(errors: FloatArray, share: FloatArray) -> float:
+    """Mean absolute error over pairs."""
+    return float((np.abs(errors) * share).sum() / share.sum())
+
+
+def _solve(samples: _Samples, weight: FloatArray, values: FloatArray, radial: FloatArray, count: int) -> FloatArray:
+    """Weighted least squares of ``g_first - g_second + radial a = values``; shape (count + K, C)."""
+    rows = np.arange(len(weight))
+    extra = radial.shape[1]
+    design = sparse.csr_array(
+        (
+            np.concatenate([np.ones(len(rows)), -np.ones(len(rows)), radial.ravel()]),
+            (
+                np.concatenate([rows, rows, np.repeat(rows, extra)]),
+                np.concatenate([samples.first, samples.second, np.tile(np.arange(count, count + extra), len(rows))]),
+            ),
+        ),
+        shape=(len(rows), count + extra),
+    )
+    weighted = design.T.multiply(weight).tocsr()
+    prior = np.concatenate([np.full(count, _GAIN_SIGMA**-2), np.full(extra, _VIGNETTING_SIGMA**-2)])
+    normal = (weighted @ design + sparse.diags_array(prior)).tocsc()
+    solution = spsolve(normal, weighted @ values)
+    return np.asarray(solution, dtype=np.float64).reshape(count + extra, -1)
+
+
+def _block_weights(camera: Camera, points: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+    """Bilinear interpolation on the picture's block grid: four nodes (..., 4) and their shares (..., 4)."""
+    width, height = camera.image_size
+    place = (np.asarray(points) + 0.5) / (width, height) * (_BLOCKS - 1)
+    place = np.clip(place, 0.0, _BLOCKS - 1.0)
+    cell = np.minimum(place.astype(np.intp), _BLOCKS - 2)
+    x, y = np.moveaxis(place - cell, -1, 0)
+    node = cell[..., 1] * _BLOCKS + cell[..., 0]
+    nodes = np.stack([node, node + 1, node + _BLOCKS, node + _BLOCKS + 1], axis=-1)
+    return nodes, np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=-1)
+
+
+def _with_blocks(base: Exposure, samples: _Samples, cameras: Sequence[Camera]) -> Exposure:
+    """Add a smooth field per picture that explains what gain and vignetting leave over."""
+    b, count, size = base.offset, len(cameras), _BLOCKS**2
+    residual = (np.log(samples.value1 + b) - np.log(samples.value2 + b)).mean(axis=1)
+    residual -= (base.log_gain[samples.first] - base.log_gain[samples.second]).mean(axis=1)
+    powers = np.stack([samples.radius1**k - samples.radius2**k for k in (1, 2, 3)], axis=1)
+    residual -= powers @ base.vignetting
+    level = np.sqrt((samples.value1.mean(axis=1) + b) * (samples.value2.mean(axis=1) + b))
+    parts = []
+    for sign, picture, points in ((1.0, samples.first, samples.point1), (-1.0, samples.second, samples.point2)):
+        nodes, shares = np.empty((len(points), 4), dtype=np.intp), np.empty((len(points), 4))
+        for k in np.unique(picture):
+            chosen = picture == k
+            nodes[chosen], shares[chosen] = _block_weights(cameras[k], points[chosen])
+        parts.append((picture[:, None] * size + nodes, sign * shares))
+    columns, entries = (np.concatenate([p[k] for p in parts], axis=1) for k in (0, 1))
+    rows = np.repeat(np.arange(len(residual)), 8)
+    design = sparse.csr_array((entries.ravel(), (rows, columns.ravel())), shape=(len(residual), count * size))
+    prior = sparse.kron(sparse.eye_array(count), _block_prior()).tocsr()
+    robust = np.ones(len(residual))
+    solution = np.zeros(count * size)
+    for _ in range(_ROUNDS):
+        weighted = design.T.multiply(robust * samples.share * size / _PAIR_SIGMA**2).tocsr()
+        solution = np.asarray(spsolve((weighted @ design + prior).tocsc(), weighted @ residual))
+        left = residual - design @ solution
+        scale = max(1.4826 * float(np.median(np.abs(left))), 1e-4)
+        robust = 1.0 / np.maximum(1.0, np.abs(left) / (_HUBER * scale))
+    fields = solution.reshape(count, _BLOCKS, _BLOCKS)
+    after = _robust_rms(left * level, samples.share)
+    return Exposure(b, base.log_gain, base.vignetting, fields, base.rms_before, after)
+
+
+def _block_prior() -> sparse.csr_array:
+    """Fields are small, and bend little: precision matrix of one picture's nodes."""
+    bend = sparse.diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(_BLOCKS - 2, _BLOCKS))
+    one = sparse.eye_array(_BLOCKS)
+    both = sparse.vstack([sparse.kron(bend, one), sparse.kron(one, bend)])
+    return sparse.csr_array(both.T @ both / _BLOCK_BEND_SIGMA**2 + sparse.eye_array(_BLOCKS**2) / _BLOCK_SIGMA**2)

@@ -1,0 +1,134 @@
+"""Multi-band blending (Burt and Adelson 1983), such that tiles give bit for bit what one piece gives.
+
+Every band is blended with the weights smoothed to its own scale, so that a seam is as wide as the detail it crosses.
+The arithmetic is exact: samples and weights are multiples of a power of two that leave float32 room for the sums of the
+pyramid's kernels (1, 4, 6, 4, 1) / 16, and are rounded to such multiples after every step. Sums then do not depend on
+their order, nor on where a tile begins.
+"""
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from rdstitch.compositing.warp import Box, Float32Array
+
+_WEIGHT_STEPS = np.float32(4096.0)
+
+
+def margin(bands: int) -> int:
+    """How far, px, a result can depend on the px around it.
+
+    A px of band l reaches, up and down the pyramid, 2 (2^l - 1) px; the Laplacian adds as much of the next band.
+    """
+    return 4 << bands
+
+
+def aligned(box: Box, bands: int) -> Box:
+    """The smallest box of whole px of the coarsest band that holds ``box``."""
+    unit = 1 << bands
+    x0, y0, x1, y1 = box
+    return x0 // unit * unit, y0 // unit * unit, -(-x1 // unit) * unit, -(-y1 // unit) * unit
+
+
+def grown(box: Box, by: int) -> Box:
+    """``box`` with ``by`` px more on each side."""
+    return box[0] - by, box[1] - by, box[2] + by, box[3] + by
+
+
+def rounding_constant(full: float, integer: bool) -> np.float32:
+    """Adding and subtracting it rounds float32 to multiples that leave 8 bits for a kernel's sum; 0 for no rounding.
+
+    8-bit samples are rounded to 1/16, 16-bit samples to 1. Floating-point samples have no such bound; tiles of them
+    agree to float32's precision only.
+    """
+    if not integer:
+        return np.float32(0.0)
+    return np.float32(1.5 * 2.0**23 * (1.0 / 16.0 if full < 256 else 1.0))
+
+
+def rounded(values: Float32Array, constant: np.float32) -> Float32Array:
+    """Round in place to the multiples that the constant stands for."""
+    if constant:
+        values += constant
+        values -= constant
+    return values
+
+
+@dataclass
+class MultibandBlender:
+    """Sums of weighted Laplacian bands on one box.
+
+    Parameters
+    ----------
+    box : (int, int, int, int)
+        On the canvas, aligned to the coarsest band.
+    bands : int
+    channels : int
+    constant : float32
+        From :func:`rounding_constant`.
+    """
+
+    box: Box
+    bands: int
+    channels: int
+    constant: np.float32
+    _sums: list[Float32Array] = field(default_factory=list)
+    _weights: list[Float32Array] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Make room for the sums."""
+        width, height = self.box[2] - self.box[0], self.box[3] - self.box[1]
+        for band in range(self.bands + 1):
+            shape = (height >> band, width >> band)
+            self._sums.append(np.zeros((*shape, self.channels), dtype=np.float32))
+            self._weights.append(np.zeros(shape, dtype=np.float32))
+
+    def add(self, box: Box, pixels: Float32Array, weight: Float32Array) -> None:
+        """Add a picture's (h, w, C) samples and (h, w) weights on an aligned box within the blender's.
+
+        ``pixels`` is used up.
+        """
+        level = rounded(pixels, self.constant)
+        share = np.ceil(weight * _WEIGHT_STEPS) / _WEIGHT_STEPS
+        x, y = box[0] - self.box[0], box[1] - self.box[1]
+        for band in range(self.bands + 1):
+            band_pixels = level
+            if band < self.bands:
+                coarser = rounded(_down(level), self.constant)
+                band_pixels = level - rounded(_up(coarser), self.constant)
+                level = coarser
+            height, width = share.shape
+            cut = np.s_[y >> band : (y >> band) + height, x >> band : (x >> band) + width]
+            band_pixels *= share[..., None]
+            self._sums[band][cut] += band_pixels
+            self._weights[band][cut] += share
+            if band < self.bands:
+                # Rounded up: where a weight is felt at all, it must not become 0.
+                share = np.ceil(_down(share[..., None])[..., 0] * _WEIGHT_STEPS) / _WEIGHT_STEPS
+
+    def result(self) -> Float32Array:
+        """The blended samples (h, w, C); meaningless near the box' border and where no weight was."""
+        result = np.zeros(0, dtype=np.float32)
+        for band in range(self.bands, -1, -1):
+            weights = self._weights[band]
+            np.maximum(weights, 1.0 / _WEIGHT_STEPS, out=weights)
+            blended = self._sums[band]
+            blended /= weights[..., None]
+            rounded(blended, self.constant)
+            if band < self.bands:
+                blended += rounded(_up(result), self.constant)
+            result = blended
+        return result
+
+
+def _down(values: Float32Array) -> Float32Array:
+    """Half the resolution."""
+    done = cv2.pyrDown(values)
+    return np.asarray(done, dtype=np.float32).reshape(*done.shape[:2], values.shape[2])
+
+
+def _up(values: Float32Array) -> Float32Array:
+    """Twice the resolution."""
+    done = cv2.pyrUp(values)
+    return np.asarray(done, dtype=np.float32).reshape(*done.shape[:2], values.shape[2])

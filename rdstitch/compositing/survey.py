@@ -1,0 +1,112 @@
+"""A first look at all pictures, small, on the canvas: what exposure and seams are decided on."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.compositing.canvas import Canvas
+from rdstitch.compositing.pictures import PictureReader, prepare_picture
+from rdstitch.compositing.warp import (
+    Box,
+    Float32Array,
+    Warp,
+    border_weight,
+    locate,
+    plan_warp,
+    sample,
+    sample_opacity,
+)
+
+_LARGEST_PICTURE = 250_000
+_LARGEST_TOTAL = 16_000_000
+
+
+@dataclass(frozen=True)
+class SurveyTile:
+    """One picture on the reduced canvas.
+
+    Attributes
+    ----------
+    box : (int, int, int, int)
+        On the reduced canvas.
+    pixels : ndarray of shape (h, w, C)
+        In the picture's sample type.
+    inside : ndarray of shape (h, w), bool
+    weight : ndarray of shape (h, w), float32
+        Falls from 1 at the picture's centre to 0 at its border.
+    """
+
+    box: Box
+    pixels: NDArray[Any]
+    inside: NDArray[np.bool_]
+    weight: Float32Array
+
+
+@dataclass(frozen=True)
+class Survey:
+    """All pictures, small.
+
+    Attributes
+    ----------
+    factor : int
+        Canvas px per reduced px, a power of two.
+    canvas : Canvas
+        The reduced canvas.
+    warps : tuple of Warp
+        Onto the reduced canvas.
+    tiles : tuple of SurveyTile or None
+        None for a picture that is nowhere opaque.
+    """
+
+    factor: int
+    canvas: Canvas
+    warps: tuple[Warp, ...]
+    tiles: tuple[SurveyTile | None, ...]
+
+
+def survey_factor(canvas: Canvas) -> int:
+    """Reduction at which all pictures together fit easily into memory, a power of two."""
+    areas = [(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in canvas.boxes()]
+    factor = 1
+    while max(areas) > _LARGEST_PICTURE * factor**2 or sum(areas) > _LARGEST_TOTAL * factor**2:
+        factor *= 2
+    return factor
+
+
+def survey_pictures(
+    reader: PictureReader,
+    cameras: Sequence[Camera],
+    homographies: FloatArray,
+    canvas: Canvas,
+    progress: Callable[[float], None] | None = None,
+) -> Survey:
+    """Read every picture once and lay it, small, on the reduced canvas."""
+    factor = survey_factor(canvas)
+    small = canvas.reduced(factor)
+    warps = tuple(plan_warp(c, g, small, k) for k, (c, g) in enumerate(zip(cameras, homographies, strict=True)))
+    tiles = []
+    for k, warp in enumerate(warps):
+        tiles.append(_survey_tile(reader, k, warp))
+        if progress is not None:
+            progress((k + 1) / len(warps))
+    return Survey(factor, small, warps, tuple(tiles))
+
+
+def _survey_tile(reader: PictureReader, index: int, warp: Warp) -> SurveyTile | None:
+    """One picture, small."""
+    geometry = locate(warp, warp.box)
+    if geometry is None:
+        return None
+    picture = prepare_picture(reader(index), warp.shrink)
+    inside, weight = geometry.inside, border_weight(warp, geometry)
+    opacity = sample_opacity(warp, picture, geometry)
+    if opacity is not None:
+        inside, weight = inside & (opacity > 0), weight * opacity
+    if not inside.any():
+        return None
+    pixels = sample(warp, picture, geometry, "linear")
+    return SurveyTile(warp.box, pixels.reshape(*inside.shape, -1), inside, weight)
