@@ -34,7 +34,9 @@ class Refined:
     cost : float
         Value of the loss, px².
     information : ndarray of shape (P, P)
-        Weighted ``J'J``, 1/px²: by λ first (only where it was free), then by the model's parameters.
+        Weighted ``J'J``: by λ first (only where it was free), then by the model's parameters.
+    influence : ndarray of shape (N, P)
+        Each correspondence's share of the gradient, in the same order.
     """
 
     model: PairModel
@@ -43,6 +45,7 @@ class Refined:
     errors: FloatArray
     cost: float
     information: FloatArray
+    influence: FloatArray
 
     @property
     def homography(self) -> FloatArray:
@@ -56,6 +59,7 @@ class _Linearized:
     errors: FloatArray
     information: FloatArray
     gradient: FloatArray
+    influence: FloatArray
 
 
 def refine(
@@ -110,7 +114,7 @@ def refine(
         damping *= 20.0
         if damping > 1e4:
             break
-    return Refined(model, state, distortion, current.errors, current.cost, current.information)
+    return Refined(model, state, distortion, current.errors, current.cost, current.information, current.influence)
 
 
 def _linearize(
@@ -138,13 +142,14 @@ def _linearize(
     columns = np.concatenate([lens, transfer.by_homography], axis=2)
     columns = (whitening * (data.px * relative)[:, None, None]) @ columns
     columns[lost] = 0.0
-    flat, weighted = columns.reshape(-1, columns.shape[2]), (residuals * relative[:, None]).ravel()
+    flat = columns.reshape(-1, columns.shape[2])
     by_state = model.jacobian(state)
     chain = np.zeros((columns.shape[2], lens.shape[2] + by_state.shape[1]))
     chain[: lens.shape[2], : lens.shape[2]] = np.eye(lens.shape[2])
     chain[lens.shape[2] :, lens.shape[2] :] = by_state
     information = chain.T @ (flat.T @ flat) @ chain
-    gradient = chain.T @ (flat.T @ weighted)
+    influence = np.einsum("nip,ni->np", columns, residuals * relative[:, None]) @ chain
+    gradient = influence.sum(axis=0)
     cost = float(errors2 @ relative) + scale**2 * int(lost.sum())
 
     prior, by_prior = model.prior(state)
@@ -155,4 +160,4 @@ def _linearize(
         cost += noise**2 * float(prior @ prior)
     errors = np.sqrt(errors2)
     errors[lost] = np.inf
-    return _Linearized(cost, errors, information, gradient)
+    return _Linearized(cost, errors, information, gradient, influence)

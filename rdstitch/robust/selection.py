@@ -13,6 +13,8 @@ _LEAST_NOISE = 0.02  # px; below, noise-free data would reject every model over 
 _RAYLEIGH_MEDIAN = 1.1774  # median length of a two-dimensional normal vector of standard deviation 1
 _LOSS_WIDTH = 4.0  # scale of the loss in standard deviations of the noise
 
+_SINGULAR = 1e-13  # eigenvalue of the correlation matrix of the parameters
+_CELLS_PER_HALF_DIAGONAL = 5.0
 _NEAR = 3.0  # errors, in thresholds, beyond which a correspondence has no say in the choice
 
 _LARGEST_STD = 0.1
@@ -93,15 +95,15 @@ def select_model(
     chosen = fits[int(np.argmin(criteria))]
     reason = _explain(fits, chosen, threshold)
     noise = noise_of(chosen.errors, threshold)
-    covariance = _covariance(chosen, noise)
+    chosen = fit(chosen.model, chosen, chosen.distortion, fixed_distortion, iterations=0)
+    covariance = _covariance(chosen, noise, data)
     std = 0.0 if fixed_distortion else float(np.sqrt(covariance[0, 0]))
-    if std >= _LARGEST_STD:
-        chosen = fit(chosen.model, chosen, 0.0, True)
-        covariance = _covariance(chosen, noise)
-        reason += f"; λ is not observable (standard deviation {std:.2g}) and was set to 0"
-        std = np.inf
-    final = fit(chosen.model, chosen, chosen.distortion, fixed_distortion or np.isinf(std), iterations=0)
-    return Selection(final, noise, covariance, std, reason)
+    if std < _LARGEST_STD:
+        return Selection(chosen, noise, covariance, std, reason)
+    straight = fit(chosen.model, chosen, 0.0, True)
+    straight = fit(chosen.model, straight, 0.0, True, iterations=0)
+    reason += f"; λ is not observable (standard deviation {std:.2g}) and was set to 0"
+    return Selection(straight, noise, _covariance(straight, noise, data), np.inf, reason)
 
 
 def noise_of(errors: FloatArray, threshold: float) -> float:
@@ -110,17 +112,28 @@ def noise_of(errors: FloatArray, threshold: float) -> float:
     return _LEAST_NOISE if not len(inside) else max(float(np.median(inside)) / _RAYLEIGH_MEDIAN, _LEAST_NOISE)
 
 
-def _covariance(fit: Refined, noise: float) -> FloatArray:
-    """Inverse of the normal matrix times the noise variance; inf where a direction is not determined."""
+def _covariance(fit: Refined, noise: float, data: Measurements) -> FloatArray:
+    """Covariance that holds also where neighbouring errors are alike, as parallax and lens misfit make them.
+
+    ``A⁻¹ (Σ_c g_c g_c') A⁻¹`` over the cells c of a grid, ``A`` the normal matrix and ``g_c`` the gradient of the
+    correspondences in a cell (White's estimator with clusters), but in no direction less than ``noise² A⁻¹``, what
+    independent errors give. Infinite where a parameter is not determined.
+    """
     scale = np.sqrt(np.diag(fit.information))
+    size = len(scale)
     if not (scale > 0.0).all():
-        return np.full_like(fit.information, np.inf)
-    correlation = fit.information / np.outer(scale, scale)
-    values, vectors = np.linalg.eigh(correlation)
-    if values[0] < 1e-13:
-        return np.full_like(fit.information, np.inf)
-    inverse = (vectors / values) @ vectors.T
-    return np.asarray(noise**2 * inverse / np.outer(scale, scale))
+        return np.full((size, size), np.inf)
+    values, vectors = np.linalg.eigh(fit.information / np.outer(scale, scale))
+    if values[0] < _SINGULAR:
+        return np.full((size, size), np.inf)
+    # In the basis where noise² A⁻¹ is the identity, the larger of the two is a matter of eigenvalues.
+    root = (vectors / np.sqrt(values)) / scale[:, None]
+    cells = np.unique(np.floor(data.x1 * _CELLS_PER_HALF_DIAGONAL), axis=0, return_inverse=True)[1].ravel()
+    influence = np.zeros((int(cells.max()) + 1, size))
+    np.add.at(influence, cells, fit.influence @ root)
+    spread, directions = np.linalg.eigh(influence.T @ influence / noise**2)
+    root = root @ directions * np.sqrt(np.maximum(spread, 1.0))
+    return np.asarray(noise**2 * root @ root.T)
 
 
 def _explain(fits: list[Refined], chosen: Refined, threshold: float) -> str:
