@@ -1,184 +1,257 @@
 """The recipe of the global adjustment: consensus, match graph, choice of the model, adjustment."""
 
-import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rdstitch.camera import Camera, FloatArray
-from rdstitch.errors import ArgumentError
-from rdstitch.registration.alignment import Alignment, LinkFit, Poses, Relief
-from rdstitch.registration.bundle_adjustment import Adjusted, Adjuster, Freedom, Parameters, Priors
+from rdstitch.errors import ArgumentError, RegistrationError
+from rdstitch.registration.alignment import Alignment
+from rdstitch.registration.consistency import contradicting_links, misfitting_links
 from rdstitch.registration.graph import connected_components, spanning_tree
-from rdstitch.registration.initialization import adjust_apart, relations_at
+from rdstitch.registration.initialization import relations_at
 from rdstitch.registration.links import Link
-from rdstitch.registration.models import LOG_HEIGHT, MODELS, PSI, THETA, YAW, Model, X, Y
-from rdstitch.registration.observations import Observations
+from rdstitch.registration.model_selection import Choice, choose_model
+from rdstitch.registration.models import MODELS, BoolArray
+from rdstitch.registration.observations import IntArray, Observations
+from rdstitch.registration.outcome import Outcome, describe
+from rdstitch.registration.problem import (
+    Fit,
+    Knowledge,
+    Problem,
+    focal_knowledge,
+    homography_apart,
+    thin_for_selection,
+)
+from rdstitch.registration.voting import Consensus, vote
 
-_FOCAL_STD = {"option": 0.01, "file": 0.01, "estimate": 0.05, "exif": 0.05, "guess": 0.3, None: 0.4}
-"""Relative standard deviation of a focal length by its source."""
+_LENS_STD = np.array([0.5, 0.05, 0.03, 0.03])
+"""How far λ, μ and the distortion centre can be expected from 0 before anything is known."""
 
-_USUAL_FOCAL = 1.9
-"""Half diagonals: the focal length where nothing is known of it (a field of view of about 55 degrees)."""
+_OBSERVABLE = 0.1
+"""Standard deviation of λ from which on it counts as not observable."""
 
-
-def focal_prior(cameras: Sequence[Camera]) -> tuple[float, float]:
-    """Mean and standard deviation of the logarithm of the focal length in half diagonals."""
-    known = [camera for camera in cameras if camera.focal is not None]
-    if not known:
-        return math.log(_USUAL_FOCAL), _FOCAL_STD[None]
-    ratios = [camera.focal / camera.half_diagonal for camera in known if camera.focal is not None]
-    return float(np.log(np.median(ratios))), max(_FOCAL_STD.get(camera.focal_source, 0.3) for camera in known)
+_ROUNDS = 3
+"""Times that wrong pairs are looked for."""
 
 
 @dataclass(frozen=True)
-class _Task:
-    """One connected set of pictures to align."""
+class AlignmentOptions:
+    """What the caller decides or knows.
 
-    observations: Observations
-    homographies: FloatArray
-    count: int
-    reference: int
-    lens: FloatArray
-    free_lens: np.ndarray
-    focal: tuple[float, float]
+    Attributes
+    ----------
+    reference : int, optional
+        The picture that defines the plane's frame; the centre of the match graph if not given.
+    model : str
+        "rigid", "similarity", "tilting", "homography", or "auto": the least free one that the data allow.
+    distortion : float, optional
+        λ in the half-diagonal frame, where it is known; estimated otherwise.
+    tilt : (float, float), optional
+        (ψ, θ), radians, where it is known.
+    tilt_std : float
+        Its standard deviation, radians; 0 for an exact one.
+    attitudes : ndarray of shape (N, 2), optional
+        (ψ, θ) of each picture, radians, where an IMU or a gimbal has measured them; ``tilt`` is then how the camera
+        is mounted on that.
+    attitudes_std : float
+        Their standard deviation, radians; 0 for exact ones.
+    most : int
+        Correspondences used of each link.
+    """
 
-    def priors(self, model: Model) -> Priors:
-        none = Priors.none(model, self.count)
-        if not model.shared_names:
-            return none
-        shared = np.array([0.0, 0.0, self.focal[0]])
-        return replace(none, shared=shared, shared_precision=np.array([0.0, 0.0, self.focal[1] ** -2.0]))
+    reference: int | None = None
+    model: str = "auto"
+    distortion: float | None = None
+    tilt: tuple[float, float] | None = None
+    tilt_std: float = 0.0
+    attitudes: ArrayLike | None = None
+    attitudes_std: float = 0.0
+    most: int = 250
 
-    def fit(self, model: Model) -> Adjusted:
-        priors = self.priors(model)
-        apart = adjust_apart(
-            model, self.observations, self.homographies, priors.shared, self.lens, self.free_lens, priors
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.model != "auto" and self.model not in MODELS:
+            raise ArgumentError(f"model must be auto, {', '.join(MODELS)}, not {self.model}")
+        if self.tilt_std < 0 or self.attitudes_std < 0:
+            raise ArgumentError("a standard deviation cannot be negative")
+
+    def knowledge(self, cameras: Sequence[Camera]) -> Knowledge:
+        """As the adjustment needs it."""
+        count = len(cameras)
+        attitudes = np.zeros((count, 2)) if self.attitudes is None else np.asarray(self.attitudes, dtype=np.float64)
+        if attitudes.shape != (count, 2) or not np.isfinite(attitudes).all():
+            raise ArgumentError(f"expected one attitude (psi, theta) for each of the {count} pictures")
+        return Knowledge(
+            *focal_knowledge(cameras),
+            tilt=self.tilt or (0.0, 0.0),
+            tilt_std=np.inf if self.tilt is None else self.tilt_std,
+            attitudes=attitudes,
+            attitudes_std=None if self.attitudes is None else self.attitudes_std,
+            lens=np.zeros(4),
+            lens_std=_LENS_STD,
         )
-        o = self.observations
-        counts = np.diff(o.start).astype(np.float64)
-        tree = spanning_tree(self.count, o.image1, o.image2, counts, self.reference)
-        origin = model.origin(apart.parameters.shared)
-        chained = tree.chained(apart.homographies, o.image1, origin)
-        shared = apart.parameters.shared
-        start = Parameters(model.poses_from(chained, shared), shared, apart.parameters.lens)
-        freedom = Freedom.fixing(model, self.count, [self.reference], self.free_lens)
-        return Adjuster(model, o, freedom, priors).run(start)
+
+    @property
+    def models(self) -> list[str]:
+        """Models to be tried, from the least to the most free."""
+        if self.model != "auto":
+            return [self.model]
+        exact = self.attitudes is not None and self.attitudes_std == 0.0
+        return [name for name in MODELS if not (exact and name == "tilting")]
 
 
 def align(
     cameras: Sequence[Camera],
     links: Sequence[Link],
+    options: AlignmentOptions = AlignmentOptions(),
     *,
-    reference: int | None = None,
-    model: str = "auto",
-    distortion: float | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> Alignment:
     """Align all pictures over one plane.
 
     Parameters
     ----------
     cameras : sequence of Camera
-        One per picture, of one lens.
+        One per picture, of one lens; sizes may differ.
     links : sequence of Link
-        The pairs that overlap.
-    reference : int, optional
-        The picture that defines the plane's frame; the centre of the match graph if not given.
-    model : str
-        "rigid", "similarity", "tilting", "homography", or "auto": the least free one that the data allow.
-    distortion : float, optional
-        λ where it is known; estimated otherwise.
+        The pairs that overlap, each once.
+    options : AlignmentOptions
+    progress : callable, optional
+        Called with the name of each stage as it begins.
 
     Raises
     ------
     ArgumentError
-        When there are no links, or an argument is out of range.
+        When an argument is out of range, or two links are between the same pictures.
+    RegistrationError
+        When no two pictures are linked.
     """
-    if not links:
-        raise ArgumentError("nothing to align: no two pictures overlap")
-    count = len(cameras)
-    index1, index2 = (np.array([getattr(link, n) for link in links], dtype=np.intp) for n in ("image1", "image2"))
-    components = connected_components(count, index1, index2)
-    group = np.array(components[0])
-    used = np.zeros(count, dtype=np.bool_)
-    used[group] = True
-    number = np.full(count, -1, dtype=np.intp)
-    number[group] = np.arange(len(group))
-    chosen = np.flatnonzero(used[index1])
-    observations = Observations.from_links([links[k] for k in chosen], cameras, 250).subset(
-        np.arange(len(chosen)), number
-    )
-    votes = [links[k].relation.distortion for k in chosen if links[k].relation.distortion_observable]
-    lens = np.zeros(4)
-    lens[0] = distortion if distortion is not None else (float(np.median(votes)) if votes else 0.0)
-    free_lens = np.array([distortion is None, False, False, False])
-    relations = relations_at(observations, [links[k].relation for k in chosen], lens)
-    weights = np.diff(observations.start).astype(np.float64)
-    root = spanning_tree(len(group), observations.image1, observations.image2, weights).root
-    root = root if reference is None else int(number[reference])
-    task = _Task(observations, relations, len(group), root, lens, free_lens, focal_prior(cameras))
-    names = ("rigid", "homography") if model == "auto" else (model,)
-    fits = {name: task.fit(MODELS[name]) for name in names}
-    best = min(fits, key=lambda name: fits[name].sigma * (1.1 if name == "homography" else 1.0))
-    fit, family = fits[best], MODELS[best]
+    say = progress or (lambda stage: None)
+    _check(cameras, links, options)
+    known = options.knowledge(cameras)
+    everything = Observations.from_links(links, cameras, options.most)
 
-    homographies = np.full((count, 3, 3), np.nan)
-    homographies[group] = np.linalg.inv(fit.matrices.matrices)
-    planar = bool(family.shared_names)
-    std = np.sqrt(np.diag(fit.covariance))
-    parameters = (*family.shared_names, *(("distortion",) if distortion is None else ()))
-    lam = float(fit.parameters.lens[0])
-    lam_std = float(std[-1]) if distortion is None else 0.0
-    focal = float(np.exp(fit.parameters.shared[2])) if planar else None
-    new = tuple(
-        replace(
-            camera,
-            distortion=lam,
-            distortion_std=lam_std,
-            focal=camera.focal if focal is None else focal * camera.half_diagonal,
-            focal_source=camera.focal_source if focal is None else "estimate",
+    say("consensus of the pairs")
+    votes = vote([k.relation.distortion for k in links], [k.relation.distortion_std for k in links])
+    lens, free_lens = _lens_start(cameras, options, votes)
+    few = everything.thinned(thin_for_selection(len(links)))
+    relations = relations_at(few, [link.relation for link in links], lens)
+    apart = homography_apart(few, relations, lens, free_lens, known)
+    observable = options.distortion is not None or float(np.sqrt(apart.covariance[0, 0])) < _OBSERVABLE
+    if observable:
+        lens, relations = apart.parameters.lens, apart.homographies
+    else:
+        lens, free_lens = np.array([cameras[0].distortion, 0.0, 0.0, 0.0]), np.zeros(4, dtype=np.bool_)
+        apart = homography_apart(few, relations_at(few, [k.relation for k in links], lens), lens, free_lens, known)
+        relations = apart.homographies
+
+    say("choice of the model")
+    wrong = contradicting_links(apart, few, len(cameras))
+    graph = _Graph(len(cameras), few, relations, lens, free_lens, known, options)
+    problem, pictures = graph.problem(~wrong)
+    choice = _choose(problem, options)
+    choice, pictures, wrong = _drop_wrong_pairs(graph, problem, pictures, choice, wrong)
+
+    say("adjustment")
+    full = replace(graph, observations=everything)
+    problem, _ = full.problem(~wrong, pictures, choice.overdispersion)
+    fit = problem.refine(choice.fit.model, choice.fit.adjusted.parameters, choice.fit.tilt_spread)
+    outcome = Outcome(cameras, links, pictures, ~wrong, problem, replace(choice, fit=fit), votes, observable)
+    return describe(outcome)
+
+
+def _check(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions) -> None:
+    if not links:
+        raise RegistrationError("nothing to align: no two pictures overlap")
+    pairs = [(min(k.image1, k.image2), max(k.image1, k.image2)) for k in links]
+    if min(pairs)[0] < 0 or max(high for _, high in pairs) >= len(cameras):
+        raise ArgumentError(f"a link names a picture that is none of the {len(cameras)}")
+    if len(set(pairs)) != len(pairs):
+        raise ArgumentError("two links are between the same pictures")
+    if options.reference is not None and not 0 <= options.reference < len(cameras):
+        raise ArgumentError(f"the reference picture {options.reference} is none of the {len(cameras)}")
+
+
+def _lens_start(cameras: Sequence[Camera], options: AlignmentOptions, votes: Consensus) -> tuple[FloatArray, BoolArray]:
+    """Where the lens starts, and which of its parameters are free."""
+    lens = np.array([votes.distortion if votes.votes else 0.0, cameras[0].distortion2, 0.0, 0.0])
+    if options.distortion is not None:
+        lens[0] = options.distortion
+    return lens, np.array([options.distortion is None, False, False, False])
+
+
+@dataclass(frozen=True)
+class _Graph:
+    """All links; makes the problem of the largest connected part of some of them."""
+
+    count: int
+    observations: Observations
+    homographies: FloatArray
+    lens: FloatArray
+    free_lens: BoolArray
+    known: Knowledge
+    options: AlignmentOptions
+
+    def problem(
+        self, kept: BoolArray, pictures: IntArray | None = None, overdispersion: float = 1.0
+    ) -> tuple[Problem, IntArray]:
+        """The problem, and its pictures (those given, if given)."""
+        o = self.observations
+        if pictures is None:
+            groups = connected_components(self.count, o.image1[kept], o.image2[kept])
+            pictures = np.array(groups[0], dtype=np.intp)
+        number = np.full(self.count, -1, dtype=np.intp)
+        number[pictures] = np.arange(len(pictures))
+        links = np.flatnonzero(kept & (number[o.image1] >= 0) & (number[o.image2] >= 0))
+        own = o.subset(links, number)
+        wanted = self.options.reference
+        if wanted is not None and number[wanted] >= 0:
+            reference = int(number[wanted])
+        else:
+            matches = np.diff(own.start).astype(np.float64)
+            reference = spanning_tree(len(pictures), own.image1, own.image2, matches).root
+        problem = Problem(
+            own,
+            self.homographies[links],
+            len(pictures),
+            reference,
+            self.lens,
+            self.free_lens,
+            self.known.of(pictures),
+            overdispersion,
         )
-        for camera in cameras
-    )
-    poses = None
-    if planar:
-        full = np.full((count, 6), np.nan)
-        full[group] = fit.parameters.poses
-        poses = Poses(
-            full[:, YAW],
-            full[:, [X, Y]],
-            np.exp(full[:, LOG_HEIGHT]),
-            full[:, [PSI, THETA]] + fit.parameters.shared[:2],
-        )
-    fits_of_links = [
-        LinkFit(link.image1, link.image2, len(link), len(link), float("nan"), False, "other group") for link in links
-    ]
-    inlier = fit.squared < (3.5 * fit.sigma) ** 2
-    for row, k in enumerate(chosen):
-        own = slice(observations.start[row], observations.start[row + 1])
-        squared = fit.squared[own][inlier[own]]
-        rms = float(np.sqrt(squared.mean())) if len(squared) else float("nan")
-        fits_of_links[k] = replace(fits_of_links[k], inliers=int(inlier[own].sum()), rms=rms, used=True, reason="")
-    return Alignment(
-        cameras=new,
-        homographies=homographies,
-        used=used,
-        reasons=tuple("" if u else "overlaps with no other picture of the largest group" for u in used),
-        components=tuple(tuple(c) for c in components),
-        reference=int(group[root]),
-        model=best,
-        model_reason="",
-        poses=poses,
-        tilt=(float(fit.parameters.shared[0]), float(fit.parameters.shared[1])) if planar else None,
-        tilt_spread=0.0,
-        focal=focal,
-        focal_std=float(std[2]) * focal if focal is not None else None,
-        distortion=lam,
-        distortion_std=lam_std,
-        parameters=parameters,
-        covariance=fit.covariance,
-        rms=float(np.sqrt(fit.squared[inlier].mean())),
-        links=tuple(fits_of_links),
-        relief=Relief(False, 0.0, 0.0, ""),
-    )
+        return problem, pictures
+
+
+def _choose(problem: Problem, options: AlignmentOptions) -> Choice:
+    """Adjust the models from the least to the most free, each from the best start so far; the best of them."""
+    fits: list[Fit] = []
+    for name in options.models:
+        fits.append(problem.fit(MODELS[name], fits[-1:]))
+    return choose_model(problem, fits)
+
+
+def _drop_wrong_pairs(
+    graph: _Graph, problem: Problem, pictures: IntArray, choice: Choice, wrong: BoolArray
+) -> tuple[Choice, IntArray, BoolArray]:
+    """Judge all links by the adjusted poses, and adjust again without those that do not fit."""
+    for _ in range(_ROUNDS):
+        adjusted, model = choice.fit.adjusted, choice.fit.model
+        everything, _ = graph.problem(np.ones_like(wrong), pictures)
+        inside = np.isin(graph.observations.image1, pictures) & np.isin(graph.observations.image2, pictures)
+        judged = wrong.copy()
+        judged[inside] = misfitting_links(everything.squared(model, adjusted.parameters), everything.observations)
+        if (judged == wrong).all():
+            break
+        wrong = judged
+        problem, kept = graph.problem(~wrong)
+        if np.isin(kept, pictures).all():
+            poses = adjusted.parameters.poses[np.searchsorted(pictures, kept)]
+            fit = problem.refine(model, replace(adjusted.parameters, poses=poses), choice.fit.tilt_spread)
+        else:
+            fit = problem.fit(model)
+        choice, pictures = replace(choice, fit=fit), kept
+    return choice, pictures, wrong

@@ -202,6 +202,11 @@ class Adjuster:
             converged = False
         return self._finished(parameters, sigma, used, converged)
 
+    def squared(self, parameters: Parameters) -> FloatArray:
+        """``|r|²`` of each correspondence (M,), px², whitened; inf where it cannot be transferred."""
+        squared: FloatArray = self._evaluate(parameters, 1.0, 1.0).equations.squared
+        return squared
+
     def _descend(self, parameters: Parameters, sigma: float, width: float, most: int) -> tuple[_State, int, bool]:
         """Levenberg-Marquardt at one width of the loss; the state reached, linearizations, whether converged."""
         state = self._evaluate(parameters, sigma, width)

@@ -41,8 +41,8 @@ def _direct_linear(x1: FloatArray, x2: FloatArray) -> FloatArray:
     zero = np.zeros_like(lifted)
     first = np.concatenate([lifted, zero, -x2[:, :1] * lifted], axis=1)
     second = np.concatenate([zero, lifted, -x2[:, 1:] * lifted], axis=1)
-    h = np.linalg.svd(np.concatenate([first, second]), full_matrices=False)[2][-1].reshape(3, 3)
-    return h * np.copysign(1.0 / np.linalg.norm(h), np.median(lifted @ h[2]))
+    h: FloatArray = np.linalg.svd(np.concatenate([first, second]), full_matrices=False)[2][-1].reshape(3, 3)
+    return h * float(np.copysign(1.0 / np.linalg.norm(h), np.median(lifted @ h[2])))
 
 
 def adjust_apart(
@@ -53,6 +53,7 @@ def adjust_apart(
     lens: FloatArray,
     free_lens: BoolArray,
     priors: Priors,
+    attitudes: FloatArray,
 ) -> Adjusted:
     """Adjust every link on its own, with the shared parameters in common.
 
@@ -64,13 +65,16 @@ def adjust_apart(
         Where to start.
     priors : Priors
         On the shared parameters and the lens; those on the poses are not used.
+    attitudes : ndarray of shape (N, 2)
+        How the tilt of each picture is known to differ from the shared one, radians.
     """
     apart = observations.taken_apart()
     count = 2 * len(apart)
     matrices = np.empty((count, 3, 3))
-    matrices[0::2] = model.origin(shared)
+    tilts = np.stack([attitudes[observations.image1], attitudes[observations.image2]], axis=1).reshape(-1, 2)
+    matrices[0::2] = model.origins(shared, tilts[0::2])
     matrices[1::2] = homographies @ matrices[0::2]
-    start = Parameters(model.poses_from(matrices, shared), shared, lens)
+    start = Parameters(model.poses_from(matrices, shared, tilts), shared, lens)
     none = Priors.none(model, count)
     known = Priors(
         priors.shared,

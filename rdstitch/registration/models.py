@@ -83,11 +83,11 @@ class Model(Protocol):
     def offsets(self, poses: FloatArray) -> FloatArray:
         """The D parameters of each picture (N, D) that a prior speaks of; zeros where none can."""
 
-    def origin(self, shared: FloatArray) -> FloatArray:
-        """The homography (3, 3) of a picture whose pose is the plane's own frame."""
+    def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+        """Homographies (N, 3, 3) of pictures at the origin of the plane, with the tilts (N, 2) given."""
 
-    def poses_from(self, homographies: FloatArray, shared: FloatArray) -> FloatArray:
-        """The poses nearest to the given plane-to-picture homographies (N, 3, 3)."""
+    def poses_from(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+        """The poses with these tilts (N, 2) that come nearest to plane-to-picture homographies (N, 3, 3)."""
 
 
 @dataclass(frozen=True)
@@ -143,21 +143,23 @@ class PlanarModel:
         """The free parameters themselves."""
         return poses[:, list(self.free)]
 
-    def origin(self, shared: FloatArray) -> FloatArray:
-        """``diag(f, f, 1) R``."""
-        matrix: FloatArray = self.matrices(np.zeros((1, 6)), shared).matrices[0]
-        return matrix
+    def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+        """``diag(f, f, 1) R_i``."""
+        poses = np.zeros((len(attitudes), 6))
+        poses[:, [PSI, THETA]] = attitudes
+        matrices: FloatArray = self.matrices(poses, shared).matrices
+        return matrices
 
-    def poses_from(self, homographies: FloatArray, shared: FloatArray) -> FloatArray:
-        """The nearest poses without tilts of their own."""
-        focal = np.exp(shared[2])
-        motion = rotation_from_tilt(shared[:2]).T @ np.diag([1.0 / focal, 1.0 / focal, 1.0]) @ homographies
+    def poses_from(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+        """The nearest poses, given how the tilts of the pictures differ from the shared one."""
+        motion = np.linalg.inv(self.origins(shared, attitudes)) @ homographies
         area = motion[:, 0, 0] * motion[:, 1, 1] - motion[:, 0, 1] * motion[:, 1, 0]
         scale = np.copysign(np.sqrt(np.maximum(np.abs(area), 1e-12)), motion[:, 2, 2])
         motion = motion / scale[:, None, None]
         yaw = np.arctan2(motion[:, 1, 0] - motion[:, 0, 1], motion[:, 0, 0] + motion[:, 1, 1])
         c, s = np.cos(yaw), np.sin(yaw)
         poses = np.zeros((len(homographies), 6))
+        poses[:, [PSI, THETA]] = attitudes
         poses[:, YAW] = yaw
         poses[:, X] = -(c * motion[:, 0, 2] + s * motion[:, 1, 2])
         poses[:, Y] = -(-s * motion[:, 0, 2] + c * motion[:, 1, 2])
@@ -215,11 +217,11 @@ class HomographyModel:
         """Zeros: no prior speaks of a homography."""
         return np.zeros((len(poses), 8))
 
-    def origin(self, shared: FloatArray) -> FloatArray:
+    def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """The identity."""
-        return np.eye(3)
+        return np.tile(np.eye(3), (len(attitudes), 1, 1))
 
-    def poses_from(self, homographies: FloatArray, shared: FloatArray) -> FloatArray:
+    def poses_from(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """The homographies themselves."""
         return _unit_determinant(homographies)
 

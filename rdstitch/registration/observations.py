@@ -1,7 +1,8 @@
 """The correspondences of all links as flat arrays, thinned so that each link costs the same."""
 
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -82,6 +83,13 @@ class Observations:
         return type(self)(
             image1, image2, start, self.points1[rows], self.points2[rows], self.scale1[chosen], self.scale2[chosen]
         )
+
+    def thinned(self, most: int) -> Self:
+        """Of each link at most about ``most`` correspondences, well spread over its overlap."""
+        kept = [spread_choice(self.points1[a:b], most) + a for a, b in itertools.pairwise(self.start)]
+        rows = np.concatenate([np.empty(0, dtype=np.intp), *kept])
+        start = np.concatenate([[0], np.cumsum([len(k) for k in kept])]).astype(np.intp)
+        return replace(self, start=start, points1=self.points1[rows], points2=self.points2[rows])
 
     def taken_apart(self) -> Self:
         """Every link on its own: link l is between the pictures 2l and 2l + 1."""
