@@ -153,7 +153,7 @@ def isolate(values: FloatArray, largest: FloatArray) -> tuple[IndexArray, FloatA
     cell, sample = np.nonzero(changes == 1)
     found = [(sample, width * cell - 1.0, width * (cell + 1) - 1.0)]
     cell, sample = np.nonzero(changes > 1)
-    left: FloatArray = width * cell - 1.0
+    left = np.asarray(width * cell - 1.0, dtype=np.float64)
     current = coefficients[cell, :, sample]
     split = bernstein_subdivision(degree, _PARTS).reshape(-1, count).T
     for _ in range(_DEPTH):

@@ -9,6 +9,7 @@ from rdstitch.solvers.plane import (
     TiltRotations,
     depths,
     differences,
+    mirrored,
     motion_homography,
     plane_points,
     visible_range,
@@ -17,8 +18,6 @@ from rdstitch.solvers.roots import real_roots
 from rdstitch.solvers.solutions import Solutions
 
 _DEGREE = 8
-# Areas of triangles below this, relative to the product of their sides' squares, have no orientation.
-_NO_AREA = 1e-12
 
 
 def three_point_similarity(
@@ -71,16 +70,6 @@ def three_point_similarity(
         return Solutions(index, motion_homography(a, b, own, distortion, height_free=True), distortion)
 
     return solve_in_blocks(solve, x1, x2, 3)
-
-
-def mirrored(first: FloatArray, second: FloatArray) -> NDArray[np.bool_]:
-    """Whether triangles (3, 2, M) have opposite orientations; False for those that have none."""
-    areas, sizes = [], []
-    for triangle in (first, second):
-        (ux, uy), (vx, vy) = triangle[1] - triangle[0], triangle[2] - triangle[0]
-        areas.append(ux * vy - uy * vx)
-        sizes.append(ux**2 + uy**2 + vx**2 + vy**2)
-    return np.asarray(areas[0] * areas[1] < -_NO_AREA * sizes[0] * sizes[1])
 
 
 class DistanceRatioEquation(SampleArrays):

@@ -1,0 +1,204 @@
+"""Three points, tilt unknown: the minimal case, by Newton's method from several starts."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rdstitch.camera import FloatArray
+from rdstitch.errors import ArgumentError
+from rdstitch.planar_motion import rotation_from_tilt, tilt_from_normal
+from rdstitch.solvers.batch import SampleArrays, solve_in_blocks
+from rdstitch.solvers.plane import TiltRotations, lens_range, mirrored, motion_homography, plane_points
+from rdstitch.solvers.solutions import Solutions
+
+BoolArray = NDArray[np.bool_]
+IndexArray = NDArray[np.intp]
+
+DEFAULT_STARTS: FloatArray = np.array(
+    [
+        (0.0, 0.0, -0.35),
+        (-0.2, -0.2, -0.35),
+        (0.2, 0.2, -0.45),
+        (0.0, -0.2, -0.05),
+        (-0.2, 0.2, -0.2),
+        (0.2, -0.2, -0.35),
+        (0.0, 0.2, -0.45),
+    ]
+)
+"""Starts (a, b, λ) that together reach 99 % of the solutions for tilts up to 0.3 radians."""
+
+_STEPS = 16
+_LONGEST_STEP = 0.3
+# Newton's method squares the error: after a step this short there is only rounding error left.
+_CONVERGED = 1e-8
+_SAME = 1e-6
+# A plane seen at more than 63 degrees from the vertical is given up.
+_STEEPEST = 2.0
+_STATES_IN_BLOCK = 768
+
+
+def three_point(
+    x1: ArrayLike,
+    x2: ArrayLike,
+    distortion_range: tuple[float, float] = (-1.5, 0.5),
+    starts: ArrayLike = DEFAULT_STARTS,
+) -> Solutions:
+    """Planar motion with unknown tilt, and λ, from three points: as many equations as unknowns.
+
+    A rigid motion keeps all three distances. With the plane normal ``n ~ (a, b, 1)``, depths ``w_i = n · p_i(λ)`` and
+    ``p_i w_j - p_j w_i = n × (p_i × p_j)``, these are three equations in (a, b, λ):
+
+    ``log |n × (p_i × p_j)| - log w_i w_j`` is the same in both pictures.
+
+    Newton's method on the logarithms, with steps limited in length, runs from all starts of all samples at once. It
+    finds the solutions that the starts lead to, not provably all.
+
+    Parameters
+    ----------
+    x1, x2 : array_like of shape (B, 3, 2) or (3, 2)
+        Focal-normalized points of picture 1 and picture 2.
+    distortion_range : (float, float)
+        Range of λ (focal-normalized) to search.
+    starts : array_like of shape (S, 3)
+        Rows (a, b, λ), ``a = n_x / n_z``, ``b = n_y / n_z``. A good guess of tilt and λ is a better start than the
+        default ones.
+
+    Returns
+    -------
+    Solutions
+        Those for which all points are in front of the camera and within the lens model, λ is in the range and the
+        triangle is not mirrored.
+
+    Raises
+    ------
+    ArgumentError
+        When a shape is wrong or the range is empty.
+    """
+    first = np.asarray(starts, dtype=np.float64)
+    if first.ndim != 2 or first.shape[1] != 3 or not len(first) or not np.isfinite(first).all():
+        raise ArgumentError(f"starts must be rows (a, b, lambda) of finite numbers, not shape {first.shape}")
+
+    def solve(a: FloatArray, b: FloatArray, _: IndexArray) -> Solutions:
+        low, high = lens_range(a, b, distortion_range)
+        usable = np.flatnonzero(low < high)
+        a, b = a[..., usable], b[..., usable]
+        index, state = newton(DistanceSystem.from_points(a, b), first)
+        inside = (state[2] > low[usable[index]]) & (state[2] < high[usable[index]])
+        index, state = index[inside], state[:, inside]
+        index, h, distortion = _motions(a, b, index, state)
+        return Solutions(usable[index], h, distortion)
+
+    return solve_in_blocks(solve, x1, x2, 3, block_size=max(1, _STATES_IN_BLOCK // len(first)))
+
+
+def _motions(
+    x1: FloatArray, x2: FloatArray, index: IndexArray, state: FloatArray
+) -> tuple[IndexArray, FloatArray, FloatArray]:
+    """Sample, homography and λ of the states (a, b, λ) that are physically possible."""
+    a, b, distortion = state
+    x1, x2 = x1[..., index], x2[..., index]
+    tilt = tilt_from_normal(np.stack([a, b, np.ones_like(a)], axis=-1))
+    rotation = np.moveaxis(rotation_from_tilt(tilt), 0, -1)
+    possible = ~mirrored(plane_points(x1, rotation, distortion), plane_points(x2, rotation, distortion))
+    for x in (x1, x2):
+        depth = 1.0 + a * x[:, 0] + b * x[:, 1] + distortion * (x[:, 0] ** 2 + x[:, 1] ** 2)
+        possible &= (depth > 0.0).all(axis=0)
+    rotations = TiltRotations(rotation, rotation).take(np.flatnonzero(possible))
+    distortion = distortion[possible]
+    h = motion_homography(x1[..., possible], x2[..., possible], rotations, distortion)
+    return index[possible], h, distortion
+
+
+class DistanceSystem(SampleArrays):
+    """The three equations of :func:`three_point`.
+
+    Rows: x, y, r² of each point, then constants of the three coordinates of ``p_i × p_j`` and slopes of the first two,
+    for the pair opposite to each point; shape (8, 2, 3, B), picture before point.
+    """
+
+    @classmethod
+    def from_points(cls, x1: FloatArray, x2: FloatArray) -> "DistanceSystem":
+        """From points of shape (3, 2, B)."""
+        x, y = np.stack([x1, x2]).transpose(2, 0, 1, 3)
+        r2 = x**2 + y**2
+        (xi, yi, ri), (xj, yj, rj) = ([v[:, order] for v in (x, y, r2)] for order in ([1, 2, 0], [2, 0, 1]))
+        dx, dy = xi - xj, yi - yj
+        return cls(np.stack([x, y, r2, dy, -dx, yj * dx - xj * dy, yi * rj - yj * ri, ri * xj - rj * xi]))
+
+    def step(self, state: FloatArray) -> FloatArray:
+        """Newton's step from the states (a, b, λ), shape (3, B)."""
+        a, b, lam = state
+        x, y, r2, c1, c2, c3, s1, s2 = self.rows
+        w = 1.0 + a * x + b * y + lam * r2
+        c1, c2 = c1 + lam * s1, c2 + lam * s2
+        m1, m2, m3 = b * c3 - c2, c1 - a * c3, a * c2 - b * c1
+        size = m1**2 + m2**2 + m3**2
+        # log w_i w_j is the sum over all three points less the opposite one.
+        opposite = np.log(np.abs(w))
+        value = _between(0.5 * np.log(size), opposite)
+        by_a = _between((m3 * c2 - m2 * c3) / size, x / w)
+        by_b = _between((m1 * c3 - m3 * c1) / size, y / w)
+        by_lam = _between((m2 * s1 - m1 * s2 + m3 * (a * s2 - b * s1)) / size, r2 / w)
+        return _solve_3x3(by_a, by_b, by_lam, -value)
+
+
+def _between(length: FloatArray, depth: FloatArray) -> FloatArray:
+    """Difference between the pictures of ``length - (sum of depth over the pair)``, from (2, 3, B) to (3, B)."""
+    both = length + depth
+    both -= depth.sum(axis=1, keepdims=True)
+    difference: FloatArray = both[0] - both[1]
+    return difference
+
+
+def _solve_3x3(a: FloatArray, b: FloatArray, c: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve ``[a b c] s = right`` for columns of shape (3, B), by Cramer's rule."""
+    normal = _cross(b, c)
+    determinant = (a * normal).sum(axis=0)
+    across = _cross(right, a)
+    solved = np.stack([(right * normal).sum(axis=0), -(c * across).sum(axis=0), (b * across).sum(axis=0)])
+    return np.asarray(solved / determinant)
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross product of vectors of shape (3, B)."""
+    product: FloatArray = a[[1, 2, 0]] * b[[2, 0, 1]]
+    product -= a[[2, 0, 1]] * b[[1, 2, 0]]
+    return product
+
+
+def newton(system: DistanceSystem, starts: FloatArray) -> tuple[IndexArray, FloatArray]:
+    """Different solutions that Newton's method reaches from every start of every sample.
+
+    Returns
+    -------
+    sample : ndarray of shape (M,), intp
+        Ascending.
+    state : ndarray of shape (3, M)
+        (a, b, λ).
+    """
+    count = system.rows.shape[-1]
+    origin = np.repeat(np.arange(count), len(starts))
+    state = np.tile(starts.T, count)
+    system = system.take(origin)
+    samples, states = [origin[:0]], [state[:, :0]]
+    for _ in range(_STEPS):
+        step = system.step(state)
+        length = np.abs(step).max(axis=0)
+        state = state + step * np.minimum(1.0, _LONGEST_STEP / length)
+        done = length < _CONVERGED
+        going = (length >= _CONVERGED) & (np.abs(state).max(axis=0) < _STEEPEST)
+        samples.append(origin[done])
+        states.append(state[:, done])
+        if not going.any():
+            break
+        index = np.flatnonzero(going)
+        origin, state, system = origin[index], state[:, index], system.take(index)
+    return _different(np.concatenate(samples), np.concatenate(states, axis=1))
+
+
+def _different(sample: IndexArray, state: FloatArray) -> tuple[IndexArray, FloatArray]:
+    """One of each group of equal states of the same sample."""
+    order = np.lexsort((state[0], state[2], sample))
+    sample, state = sample[order], state[:, order]
+    new = np.ones(len(sample), dtype=np.bool_)
+    new[1:] = (np.diff(sample) > 0) | (np.abs(np.diff(state, axis=1)).max(axis=0) > _SAME)
+    return sample[new], state[:, new]
