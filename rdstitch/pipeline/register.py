@@ -11,7 +11,7 @@ from rdstitch.features import Features, detect_all
 from rdstitch.io.read import Pixels, read_image
 from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.sources import LeftOut, Source
-from rdstitch.registration import Alignment, align
+from rdstitch.registration import Alignment, AlignmentOptions, align
 from rdstitch.registration.pairs import PairOptions, PairRegistration, estimate_pairs, match_pairs
 
 Progress = Callable[[str, int, int], None]
@@ -78,7 +78,15 @@ def register(
         [source.camera for source in sources],
         pairs,
         matched,
-        PairOptions(options.solver, known, options.threshold, options.confidence, options.max_iterations, options.seed),
+        PairOptions(
+            options.ratio,
+            options.solver,
+            known,
+            options.threshold,
+            options.confidence,
+            options.max_iterations,
+            options.seed,
+        ),
         tilts=None if options.tilt is None else [options.tilt] * len(sources),
         workers=options.threads,
         progress=partial(progress, "registering pairs"),
@@ -87,7 +95,9 @@ def register(
     if not links:
         raise RegistrationError(_no_overlap(sources, registered))
     alignment = align(
-        [source.camera.with_focal() for source in sources], links, reference=reference, model=options.model
+        [source.camera.with_focal() for source in sources],
+        links,
+        AlignmentOptions(reference=reference, model=options.model, distortion=known, tilt=options.tilt),
     )
     left_out = [
         LeftOut(source.path, damaged.get(index, alignment.reasons[index]))
