@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from rdstitch.errors import ArgumentError
+from rdstitch.features.detection import find
 from rdstitch.features.keypoints import Features
-from rdstitch.features.opencv import create_detector, describe
 from rdstitch.features.options import KINDS, FeatureOptions
 from rdstitch.features.picture import Image, Mask, prepare
 from rdstitch.features.spread import spread, strongest
@@ -46,19 +46,15 @@ def detect(image: Image, options: FeatureOptions | None = None, mask: Mask | Non
     """
     options = options or FeatureOptions()
     picture = prepare(image, mask, options.work_megapixels)
-    detector = create_detector(options)
-    keypoints = detector.detect(picture.grey, None)
-    table = np.array([(*k.pt, k.size, k.angle, k.octave, k.response) for k in keypoints]).reshape(-1, 6)
-    # OpenCV's order is no promise: sort, so that the choice among equals is the same everywhere.
-    order = np.lexsort(table.T)[::-1]
-    order = order[picture.covers(table[order, :2], table[order, 2] / 2)]
-    points, response = table[order, :2], table[order, 5]
+    detection = find(picture.grey, options)
+    usable = np.flatnonzero(picture.covers(detection.points, detection.scale / 2))
+    points, response = detection.points[usable], detection.response[usable]
     if options.spread:
         cell = options.spread_cell * float(np.hypot(*picture.grey.shape))
-        chosen = order[spread(points, response, options.max_features, cell)]
+        chosen = spread(points, response, options.max_features, cell)
     else:
-        chosen = order[strongest(response, options.max_features)]
-    features = describe(detector, picture.grey, [keypoints[i] for i in chosen], options.kind)
+        chosen = strongest(response, options.max_features)
+    features = detection.describe(usable[chosen])
     scale = features.scale * float(np.sqrt(picture.factor.prod()))
     return replace(features, points=picture.to_full_size(features.points), scale=scale)
 

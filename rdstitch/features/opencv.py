@@ -1,36 +1,101 @@
-"""The detectors that OpenCV brings, behind one interface: detect, choose, describe."""
+"""The detectors that OpenCV brings, in the steps that all detectors take: find, choose, describe."""
 
-from collections.abc import Callable, Sequence
-from typing import Any, cast
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Self, cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rdstitch.camera import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.features.keypoints import Descriptors, Features
 from rdstitch.features.options import FeatureOptions
 
 Grey = NDArray[np.uint8]
 
-_ROOTSIFT_SCALE = 512.0
+_ROOTSIFT_NORM = 512.0
+
+
+@dataclass(frozen=True, eq=False)
+class OpenCVDetection:
+    """Keypoints that an OpenCV detector found in a picture."""
+
+    detector: Any
+    grey: Grey
+    keypoints: list[cv2.KeyPoint]
+    points: FloatArray
+    scale: FloatArray
+    response: FloatArray
+    kind: str
+
+    @classmethod
+    def find(cls, grey: Grey, options: FeatureOptions) -> Self:
+        """Find keypoints; see :func:`create_detector` for errors."""
+        detector = create_detector(options)
+        keypoints = detector.detect(grey, None)
+        rows = [(*k.pt, k.size, k.angle, k.octave, k.response) for k in keypoints]
+        table = np.array(rows, dtype=np.float64).reshape(-1, 6)
+        # OpenCV promises no order: sort, so that the choice among equals is the same everywhere.
+        order = np.lexsort(table.T)
+        table = table[order]
+        return cls(
+            detector,
+            grey,
+            [keypoints[i] for i in order],
+            points=table[:, :2],
+            scale=table[:, 2],
+            response=table[:, 5],
+            kind=options.kind,
+        )
+
+    def describe(self, chosen: NDArray[np.intp]) -> Features:
+        """Describe the chosen keypoints; those too near the border for OpenCV drop out."""
+        wanted = [self.keypoints[i] for i in chosen]
+        described, descriptors = self.detector.compute(self.grey, wanted) if wanted else ((), None)
+        if descriptors is None:
+            dtype = np.float32 if self.detector.descriptorType() == cv2.CV_32F else np.uint8
+            descriptors = np.zeros((0, self.detector.descriptorSize()), dtype)
+        rows = [(*k.pt, k.size, k.angle, k.response) for k in described]
+        u, v, size, degrees, response = np.array(rows, dtype=np.float64).reshape(-1, 5).T
+        return Features(
+            points=np.column_stack([u, v]),
+            descriptors=root(descriptors) if self.kind == "rootsift" else cast(Descriptors, descriptors),
+            scale=size,
+            # OpenCV marks "no orientation" by -1.
+            angle=np.where(degrees < 0, 0.0, np.radians(degrees) % (2 * np.pi)),
+            response=response,
+            laplacian_sign=None,
+            kind=self.kind,
+        )
 
 
 def create_detector(options: FeatureOptions) -> Any:
-    """Make the OpenCV detector for ``options.kind``.
+    """Make the OpenCV detector of a kind of features.
 
     Raises
     ------
     ArgumentError
         When this OpenCV lacks it. Builds differ, and a name may be there that only raises: so it is called.
     """
-    kind = "sift" if options.kind == "rootsift" else options.kind
     try:
-        return _FACTORIES[kind](options)
+        return _FACTORIES[options.kind](options)
     except (AttributeError, cv2.error) as error:
         raise ArgumentError(
             f"features {options.kind!r} are not in this OpenCV ({cv2.__version__}); choose others"
         ) from error
+
+
+def root(descriptors: Descriptors) -> NDArray[np.float32]:
+    """RootSIFT (Arandjelović and Zisserman, CVPR 2012): square roots of the L1-normalized descriptor, norm 512.
+
+    Rounded to integers like SIFT's own, which loses nothing measurable and keeps distances exact.
+    """
+    values = descriptors.astype(np.float32)
+    total = np.maximum(values.sum(axis=1, keepdims=True), np.float32(1.0))
+    rooted: NDArray[np.float32] = np.rint(np.sqrt(values / total) * np.float32(_ROOTSIFT_NORM))
+    return rooted
 
 
 def _sift(options: FeatureOptions) -> Any:
@@ -54,44 +119,10 @@ def _moved(name: str) -> Callable[[FeatureOptions], Any]:
 
 
 _FACTORIES: dict[str, Callable[[FeatureOptions], Any]] = {
+    "rootsift": _sift,
     "sift": _sift,
     "orb": _orb,
     "akaze": _moved("AKAZE_create"),
     "kaze": _moved("KAZE_create"),
     "brisk": _moved("BRISK_create"),
 }
-
-
-def describe(detector: Any, grey: Grey, keypoints: Sequence[cv2.KeyPoint], kind: str) -> Features:
-    """Describe chosen keypoints; those that OpenCV cannot describe, at the border, drop out.
-
-    Points and scales are in px of ``grey``.
-    """
-    described, descriptors = detector.compute(grey, list(keypoints)) if keypoints else ((), None)
-    if descriptors is None:
-        dtype = np.float32 if detector.descriptorType() == cv2.CV_32F else np.uint8
-        values = cast(Descriptors, np.zeros((0, detector.descriptorSize()), dtype))
-    else:
-        values = descriptors
-    columns = np.array([(*k.pt, k.size, k.angle, k.response) for k in described], dtype=np.float64).reshape(-1, 5)
-    return Features(
-        points=np.ascontiguousarray(columns[:, :2]),
-        descriptors=root(values) if kind == "rootsift" else values,
-        scale=columns[:, 2].copy(),
-        # OpenCV marks "no orientation" by -1.
-        angle=np.where(columns[:, 3] < 0, 0.0, np.radians(columns[:, 3]) % (2 * np.pi)),
-        response=columns[:, 4].copy(),
-        laplacian_sign=None,
-        kind=kind,
-    )
-
-
-def root(descriptors: Descriptors) -> NDArray[np.float32]:
-    """RootSIFT (Arandjelović and Zisserman 2012): square roots of the L1-normalized descriptor, norm 512.
-
-    Rounded to integers like SIFT's own, which loses nothing measurable and makes distances exact in float32.
-    """
-    values = descriptors.astype(np.float32)
-    total = np.maximum(values.sum(axis=1, keepdims=True), np.float32(1.0))
-    rooted: NDArray[np.float32] = np.rint(np.sqrt(values / total) * np.float32(_ROOTSIFT_SCALE))
-    return rooted

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from rdstitch.errors import ArgumentError
 
-KINDS = ("rootsift", "sift", "orb", "akaze", "kaze", "brisk")
+KINDS = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk")
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,12 @@ class FeatureOptions:
     spread: bool = True  # the strongest of each cell of a grid in turn, rather than the strongest of the picture
     spread_cell: float = 0.05  # side of a cell of that grid, fraction of the picture's diagonal
     sift_contrast: float = 0.02  # SIFT's contrast threshold; 0.04 is OpenCV's, too high for hazy pictures
+    surf_threshold: float = 100.0  # determinant of the Hessian, grey levels², from which on a blob counts
+    surf_octaves: int = 4  # octaves of scale
+    surf_layers: int = 3  # scales per octave
+    surf_extended: bool = False  # 128 numbers a descriptor instead of 64
+    surf_upright: bool = False  # no orientation: for pictures that are turned by less than about 15°
+    surf_refine: bool = True  # place blobs by Gaussian derivatives; False: by box filters alone, as the paper does
     orb_fast_threshold: int = 7  # grey levels by which a corner must differ from its surroundings
 
     def __post_init__(self) -> None:
@@ -33,5 +39,7 @@ class FeatureOptions:
             raise ArgumentError(f"max_features must be at least 1, not {self.max_features}")
         if self.work_megapixels is not None and not self.work_megapixels > 0:
             raise ArgumentError(f"work_megapixels must be positive, not {self.work_megapixels}")
+        if self.surf_octaves < 1 or self.surf_layers < 1:
+            raise ArgumentError("surf_octaves and surf_layers must be at least 1")
         if not 0 < self.spread_cell <= 1:
             raise ArgumentError(f"spread_cell must be in (0, 1], not {self.spread_cell}")

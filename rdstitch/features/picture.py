@@ -105,7 +105,7 @@ def _eight_bits(grey: Image, usable: NDArray[np.bool_] | None) -> NDArray[np.uin
     if inside.size == 0:
         return np.zeros(grey.shape, dtype=np.uint8)
     low, high = (float(value) for value in np.percentile(inside, _STRETCH_PERCENTILES))
-    finite = np.nan_to_num(grey.astype(np.float64), nan=low, posinf=high, neginf=low)
+    finite = np.where(np.isfinite(grey), grey, low)
     scaled = (finite - low) * (255.0 / max(high - low, 1e-12))
     eight: NDArray[np.uint8] = np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
     return eight

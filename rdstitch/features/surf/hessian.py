@@ -1,0 +1,187 @@
+"""Blobs: maxima of the determinant of the Hessian over place and scale, by box filters (Bay et al., §3)."""
+
+from dataclasses import dataclass, fields
+from typing import Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.camera import FloatArray
+from rdstitch.features.surf.pyramid import Grey, from_level, pyramid
+from rdstitch.features.surf.quadric import vertex
+
+# The box filter of 9 px stands for a Gaussian of σ = 1.2 px; larger ones in proportion (§3.3).
+SIGMA_PER_SIZE = 1.2 / 9
+_SMALLEST_LOBE = 3
+# Weight of the mixed derivative, which the box filters get relatively wrong (§3.2).
+_MIXED_WEIGHT = 0.9
+# Rows worked on at a time, few enough that the intermediate results stay in the cache.
+_STRIP_ROWS = 48
+
+
+@dataclass(frozen=True, eq=False)
+class Blobs:
+    """Blobs of one picture.
+
+    Attributes
+    ----------
+    points : ndarray of shape (N, 2)
+        Centres, px.
+    size : ndarray of shape (N,)
+        Side of the box filter that answers most, px.
+    response : ndarray of shape (N,)
+        Determinant of the Hessian, grey levels².
+    laplacian_sign : ndarray of shape (N,), int8
+        Sign of the trace of the Hessian: +1 for dark blobs, -1 for light ones.
+    """
+
+    points: FloatArray
+    size: FloatArray
+    response: FloatArray
+    laplacian_sign: NDArray[np.int8]
+
+    def __len__(self) -> int:
+        """Number of blobs."""
+        return len(self.points)
+
+    @property
+    def scale(self) -> FloatArray:
+        """The s of the paper, px, shape (N,)."""
+        return self.size * SIGMA_PER_SIZE
+
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Self:
+        """The blobs of the given indices, or of a mask."""
+        return type(self)(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    @classmethod
+    def concatenate(cls, parts: list[Self]) -> Self:
+        """All blobs of at least one part."""
+        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+
+
+def find_blobs(grey: Grey, threshold: float, octaves: int, layers: int) -> Blobs:
+    """Find blobs.
+
+    Parameters
+    ----------
+    grey : ndarray of shape (height, width), uint8
+    threshold : float
+        Least determinant of the Hessian, grey levels².
+    octaves : int
+        Octaves of scale, each on the picture of half the size of the one before.
+    layers : int
+        Scales per octave at which there can be blobs; filters grow by 6 px from one to the next.
+    """
+    parts = []
+    for octave, level in enumerate(pyramid(grey, octaves)):
+        height = len(level)
+        for start in range(0, height, _STRIP_ROWS):
+            blobs = _blobs_of_rows(level, start, min(start + _STRIP_ROWS, height), threshold, layers)
+            parts.append(
+                Blobs(
+                    from_level(blobs.points, octave),
+                    blobs.size * 2**octave,
+                    blobs.response,
+                    blobs.laplacian_sign,
+                )
+            )
+    return Blobs.concatenate(parts)
+
+
+def _blobs_of_rows(level: Grey, start: int, stop: int, threshold: float, layers: int) -> Blobs:
+    """Blobs centred in rows ``start`` to ``stop`` of a level, px of the level."""
+    height, width = level.shape
+    lobes = [_SMALLEST_LOBE + 2 * k for k in range(layers + 2)]
+    # One row more on either side, to compare with.
+    first, last = max(start - 1, 0), min(stop + 1, height)
+    reach = (3 * lobes[-1]) // 2
+    top = max(first - reach, 0)
+    integral = np.asarray(cv2.integral(level[top : min(last + reach, height)]), np.int32)
+    determinant = np.zeros((layers + 2, last - first, width), np.float32)
+    trace = np.zeros_like(determinant)
+    for k, lobe in enumerate(lobes):
+        half = (3 * lobe) // 2
+        rows = range(max(first, half), min(last, height - half))
+        if len(rows) and width >= 3 * lobe:
+            inside = np.s_[k, rows.start - first : rows.stop - first, half : width - half]
+            determinant[inside], trace[inside] = _hessian(integral, rows.start - top, len(rows), lobe)
+    layer, row, column = _maxima(determinant, threshold)
+    centred = (row + first >= start) & (row + first < stop)
+    layer, row, column = layer[centred], row[centred], column[centred]
+    offset, is_maximum = vertex(_neighbourhoods(determinant, layer, row, column))
+    kept = is_maximum & (np.abs(offset) <= 1).all(axis=1)
+    layer, row, column, offset = layer[kept], row[kept], column[kept], offset[kept]
+    return Blobs(
+        points=np.column_stack([column, row + first]) + offset[:, :2],
+        size=3.0 * (_SMALLEST_LOBE + 2.0 * (layer + offset[:, 2])),
+        response=determinant[layer, row, column].astype(np.float64),
+        laplacian_sign=np.where(trace[layer, row, column] >= 0, 1, -1).astype(np.int8),
+    )
+
+
+def _hessian(
+    integral: NDArray[np.int32], row: int, count: int, lobe: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Determinant and trace of the Hessian at ``count`` rows from ``row`` on, where a filter of 3 lobes fits.
+
+    Sums over boxes are differences of the integral image; those along v are taken first and shared.
+    """
+    half = (3 * lobe) // 2
+    width = integral.shape[1] - 3 * lobe
+
+    def rows(offset: int) -> NDArray[np.int32]:
+        return integral[row + offset : row + offset + count]
+
+    def columns(values: NDArray[np.int32], offset: int) -> NDArray[np.int32]:
+        return values[:, half + offset : half + offset + width]
+
+    # D_uu and D_vv: three lobes of weights 1, -2, 1, each 2 lobe - 1 across.
+    across = rows(lobe) - rows(1 - lobe)
+    middle = columns(across, half + 1 - lobe) - columns(across, lobe - half)
+    duu = columns(across, half + 1) - columns(across, -half) - 3 * middle
+    along = rows(half + 1) - rows(-half) - 3 * (rows(half + 1 - lobe) - rows(lobe - half))
+    dvv = columns(along, lobe) - columns(along, 1 - lobe)
+    # D_uv: four square lobes around the centre's row and column.
+    above_below = rows(0) - rows(-lobe) - rows(lobe + 1) + rows(1)
+    duv = (
+        columns(above_below, 0) - columns(above_below, -lobe) - columns(above_below, lobe + 1) + columns(above_below, 1)
+    )
+    pure = np.float32(1 / (lobe * (2 * lobe - 1)))
+    mixed = np.float32(_MIXED_WEIGHT / lobe**2)
+    uu, vv, uv = duu.astype(np.float32), dvv.astype(np.float32), duv.astype(np.float32)
+    uu *= pure
+    vv *= pure
+    uv *= mixed
+    return uu * vv - uv * uv, uu + vv
+
+
+def _maxima(
+    determinant: NDArray[np.float32], threshold: float
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Layer, row and column of the values above the threshold that exceed all 26 neighbours."""
+    found = []
+    kernel = np.ones((3, 3), np.uint8)
+    for layer in range(1, len(determinant) - 1):
+        values = determinant[layer]
+        row, column = np.nonzero((values > threshold) & (values == cv2.dilate(values, kernel)))
+        inside = (row > 0) & (row < values.shape[0] - 1) & (column > 0) & (column < values.shape[1] - 1)
+        row, column = row[inside], column[inside]
+        around = _neighbourhoods(determinant, np.full(len(row), layer), row, column).reshape(-1, 27)
+        unique = (around >= around[:, 13:14]).sum(axis=1) == 1
+        found.append((np.full(int(unique.sum()), layer), row[unique], column[unique]))
+    layers, rows, columns = (np.concatenate(part) for part in zip(*found, strict=True))
+    return layers, rows, columns
+
+
+def _neighbourhoods(
+    determinant: NDArray[np.float32], layer: NDArray[np.intp], row: NDArray[np.intp], column: NDArray[np.intp]
+) -> NDArray[np.float32]:
+    """Values around places, shape (N, 3, 3, 3), axes layer, row, column."""
+    step = np.arange(-1, 2)
+    values: NDArray[np.float32] = determinant[
+        layer[:, None, None, None] + step[:, None, None],
+        row[:, None, None, None] + step[:, None],
+        column[:, None, None, None] + step,
+    ]
+    return values
