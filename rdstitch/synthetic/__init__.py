@@ -1,7 +1,10 @@
 """Ground truth: problem instances, matches and rendered image sequences, for tests, examples and benchmarks."""
 
+from rdstitch.synthetic.alignment import AlignmentError, alignment_error
+from rdstitch.synthetic.comparison import PlaneComparison, compare_with_plane, coverage, plane_under, sharpness
 from rdstitch.synthetic.correspondences import SyntheticMatches, correspondences
-from rdstitch.synthetic.instances import Instances, PlanarInstances, general_instances, planar_instances
+from rdstitch.synthetic.fitting import fit_homography, fit_similarity
+from rdstitch.synthetic.instances import HALF_SIZE, Instances, PlanarInstances, general_instances, planar_instances
 from rdstitch.synthetic.layouts import (
     drive_poses,
     grid_poses,
@@ -27,6 +30,8 @@ from rdstitch.synthetic.textures import (
 )
 
 __all__ = [
+    "HALF_SIZE",
+    "AlignmentError",
     "BrownLens",
     "EndlessTexture",
     "FisheyeLens",
@@ -35,16 +40,22 @@ __all__ = [
     "Photometry",
     "PictureTexture",
     "PlanarInstances",
+    "PlaneComparison",
     "Poses",
     "Relief",
     "Sequence",
     "SyntheticMatches",
     "Texture",
+    "alignment_error",
     "best_division_model",
     "blank",
     "boxes",
+    "compare_with_plane",
     "correspondences",
+    "coverage",
     "drive_poses",
+    "fit_homography",
+    "fit_similarity",
     "fit_to_plane",
     "general_instances",
     "gradient",
@@ -55,9 +66,11 @@ __all__ = [
     "pair_poses",
     "parking_poses",
     "planar_instances",
+    "plane_under",
     "repeated",
     "rotation_poses",
     "sequence_over",
+    "sharpness",
     "survey_poses",
     "turn_poses",
 ]

@@ -13,8 +13,10 @@ from rdstitch.synthetic.fitting import FITS, apply, fit_similarity, quantile
 from rdstitch.synthetic.patches import patch_displacements
 from rdstitch.synthetic.textures import Picture, PictureTexture, Texture
 
-_ROUNDS = 3
-_FEATURES = 6000
+_ROUNDS = 5
+# A transform that moves no patch by more than this, px, will not change any more.
+_SETTLED = 0.02
+_FEATURES = 4000
 _FEATURE_PIXELS = 1_500_000
 # Matches that agree with the first rough homography to this share of the mosaic's size are used to place it.
 _ROUGH_AGREEMENT = 0.04
@@ -88,8 +90,8 @@ def compare_with_plane(
 ) -> PlaneComparison:
     """Lay a mosaic on the true plane and measure how far each part of it is from where it belongs.
 
-    The mosaic is placed roughly by feature matches, or by ``start``. Then, three times: the plane is drawn in the
-    mosaic's place, patches of the mosaic are looked for in it
+    The mosaic is placed roughly by feature matches, or by ``start``. Then, until it
+    settles: the plane is drawn in the mosaic's place, patches of the mosaic are looked for in it
     (:func:`rdstitch.synthetic.patches.patch_displacements`), and the transform that minimises the sum of their squared
     distances is found anew. In the first round patches more than three times the median away do not take part in the
     fit, afterwards all do that were found.
@@ -125,9 +127,8 @@ def compare_with_plane(
     placed = _place_by_features(grey, filled, truth) if start is None else np.asarray(start, dtype=np.float64)
     if placed is None:
         return _nothing(0.0 if reachable is not None else np.nan)
-    transform: FloatArray = placed
     for turn in range(_ROUNDS):
-        drawn, inside = _drawn_over(truth, transform, grey.shape)
+        drawn, inside = _drawn_over(truth, placed, grey.shape)
         moves = patch_displacements(grey, drawn, filled & inside, patch=patch, spacing=spacing, search=search)
         used = moves.found
         if turn == 0 and used.any():
@@ -136,8 +137,12 @@ def compare_with_plane(
         if used.sum() < 4:
             return _nothing(0.0 if reachable is not None else np.nan)
         # The mosaic shows at ``center`` what the drawn plane shows at ``center + displacement``.
-        on_plane = apply(transform, moves.center + np.nan_to_num(moves.displacement))
+        on_plane = apply(placed, moves.center + np.nan_to_num(moves.displacement))
         transform = FITS[model](moves.center[used], on_plane[used])
+        moved = apply(np.linalg.inv(transform), apply(placed, moves.center)) - moves.center
+        placed = transform
+        if turn > 0 and np.abs(moved).max() < _SETTLED:
+            break
     residual = moves.center - apply(np.linalg.inv(transform), on_plane)
     residual[~moves.found] = np.nan
     drawn, inside = _drawn_over(truth, transform, grey.shape)
@@ -209,11 +214,9 @@ def _drawn_over(truth: Picture, transform: FloatArray, shape: tuple[int, ...]) -
     size = (shape[1], shape[0])
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     drawn = cv2.warpPerspective(truth, transform, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    v, u = np.mgrid[: shape[0], : shape[1]]
-    place = apply(transform, np.stack([u, v], axis=-1))
-    limits = np.array([truth.shape[1] - 1, truth.shape[0] - 1])
-    inside: NDArray[np.bool_] = np.all((place >= 0.0) & (place <= limits), axis=-1)
-    return np.asarray(drawn, dtype=np.float32), inside
+    whole = np.full(truth.shape, 255, dtype=np.uint8)
+    inside = cv2.warpPerspective(whole, transform, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP) == 255
+    return np.asarray(drawn, dtype=np.float32), np.asarray(inside, dtype=np.bool_)
 
 
 def _texels_per_pixel(transform: FloatArray, shape: tuple[int, ...]) -> float:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rdstitch.camera import FloatArray
 from rdstitch.synthetic.textures import Picture
 
-_ITERATIONS = 8
+_ITERATIONS = 5
 _PATCHES = 5000
 # Patches that are refined together, as one tall picture: OpenCV wants it lower than 32,768 px.
 _BATCH = 256
@@ -96,39 +96,43 @@ def patch_displacements(
         best = cv2.minMaxLoc(cv2.matchTemplate(area, template, cv2.TM_CCOEFF_NORMED))[3]
         peak[k] = best[0] - search, best[1] - search
     displacement, correlation = np.empty_like(center), np.empty(len(center))
+    slopes = [cv2.Sobel(other, cv2.CV_32F, dx, 1 - dx, scale=1 / 8) for dx in (1, 0)]
+    layers = [other, *(np.asarray(slope, dtype=np.float32) for slope in slopes)]
     for first in range(0, len(center), _BATCH):
         part = np.s_[first : first + _BATCH]
-        displacement[part], correlation[part] = _refine(templates[part], other, center[part], peak[part])
+        displacement[part], correlation[part] = _refine(templates[part], layers, center[part], peak[part])
     lost = (np.abs(displacement - peak) > _FARTHEST_FROM_PEAK).any(axis=1) | ~(correlation >= least_correlation)
     displacement[lost] = np.nan
     return Displacements(center, displacement, correlation)
 
 
-def _refine(templates: Picture, other: Picture, center: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Displacement (P, 2) that minimises the squared difference up to gain and offset, and the correlation there."""
+def _refine(
+    templates: Picture, layers: list[Picture], center: FloatArray, start: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Displacement (P, 2) that minimises the squared difference up to gain and offset, and the correlation there.
+
+    ``layers`` are the other picture and its derivatives along x and y.
+    """
     count, patch = len(templates), templates.shape[1]
     offset = np.arange(patch) - patch // 2
-    gy, gx = cv2.Sobel(other, cv2.CV_32F, 0, 1, scale=1 / 8), cv2.Sobel(other, cv2.CV_32F, 1, 0, scale=1 / 8)
-    target = templates.reshape(count, -1).astype(np.float64)
+    target = templates.reshape(count, -1)
     target = target - target.mean(axis=1, keepdims=True)
     displacement, correlation = start.copy(), np.full(count, np.nan)
     for _ in range(_ITERATIONS):
-        x = np.repeat(center[:, :1] + displacement[:, :1] + offset, patch, axis=0)
-        y = (center[:, 1:] + displacement[:, 1:] + offset).reshape(-1, 1) + np.zeros(patch)
-        maps = x.astype(np.float32), y.astype(np.float32)
-        value, along, down = (
-            np.asarray(
-                cv2.remap(source, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), dtype=np.float64
-            ).reshape(count, -1)
-            for source in (other, gx, gy)
+        x, y = (center[:, k, None] + displacement[:, k, None] + offset for k in (0, 1))
+        maps = (
+            np.broadcast_to(x[:, None, :], (count, patch, patch)).reshape(-1, patch).astype(np.float32),
+            np.broadcast_to(y[:, :, None], (count, patch, patch)).reshape(-1, patch).astype(np.float32),
         )
-        value, along, down = (a - a.mean(axis=1, keepdims=True) for a in (value, along, down))
-        energy = np.maximum(np.sum(value**2, axis=1), 1e-12)
-        correlation = np.sum(value * target, axis=1) / np.sqrt(energy * np.sum(target**2, axis=1))
+        sampled = [cv2.remap(layer, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE) for layer in layers]
         # target ~ gain (value + dx along + dy down): linear in gain, gain dx and gain dy.
-        basis = np.stack([value, along, down], axis=1)
-        normal = basis @ basis.transpose(0, 2, 1) + 1e-9 * np.eye(3)
-        gain, dx, dy = np.linalg.solve(normal, basis @ target[:, :, None])[:, :, 0].T
+        basis = np.stack([layer.reshape(count, -1) for layer in sampled], axis=1)
+        basis -= basis.mean(axis=2, keepdims=True)
+        products = np.concatenate([basis, target[:, None]], axis=1) @ basis.transpose(0, 2, 1)
+        normal, right = products[:, :3].astype(np.float64), products[:, 3].astype(np.float64)
+        energy = np.maximum(normal[:, 0, 0], 1e-12)
+        correlation = right[:, 0] / np.sqrt(energy * np.einsum("pi,pi->p", target, target))
+        gain, dx, dy = np.linalg.solve(normal + 1e-9 * np.eye(3), right[:, :, None])[:, :, 0].T
         step = np.column_stack([dx, dy]) / np.where(gain > 0.1, gain, np.inf)[:, None]
         displacement = displacement + np.clip(step, -1.0, 1.0)
     return displacement, correlation

@@ -1,9 +1,13 @@
 """Rendered pictures show what projection says they show."""
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 
 from rdstitch.camera import Camera, FloatArray
+from rdstitch.errors import OutputError
 from rdstitch.synthetic import (
     BrownLens,
     FisheyeLens,
@@ -142,3 +146,26 @@ def test_reachable_is_where_pictures_look() -> None:
         near |= np.abs(border) < 2.0
     column, row = np.rint(places).astype(int).T
     np.testing.assert_array_equal(mask[row, column][~near], seen[~near])
+
+
+def test_written_pictures_are_the_frames(tmp_path: Path) -> None:
+    lens = Camera((64, 48), -0.3, focal=60.0)
+    sequence = sequence_over(lambda size: ground(size, 1), lens, pair_poses(lens), photometry=Photometry(bits=16))
+    paths = sequence.write(tmp_path)
+    assert [path.name for path in paths] == ["frame_0000.png", "frame_0001.png"]
+    for path, frame in zip(paths, sequence.frames(), strict=True):
+        np.testing.assert_array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:, :, ::-1], frame)
+    with pytest.raises(OutputError, match="cannot be written"):
+        sequence.write(tmp_path / "missing")
+
+
+def test_large_pictures_are_rendered_in_strips_without_a_trace() -> None:
+    """The strips' borders show no line: neighbouring rows differ there as they do elsewhere."""
+    lens = Camera((2000, 900), -0.2, focal=1500.0)
+    sequence = sequence_over(lambda size: ground(size, 2, 1), lens, Poses.of([(0.0, 0.0)], 1500.0, 0.2))
+    picture = sequence.frame(0).astype(np.float64)
+    difference = np.abs(np.diff(picture, axis=0)).mean(axis=1)
+    rows = 400_000 // 2000
+    borders = np.arange(rows, 900, rows) - 1
+    assert (difference[borders] < 1.2 * np.median(difference)).all()
+    assert (difference[borders] > 0.8 * np.median(difference)).all()

@@ -1,0 +1,88 @@
+"""Instances satisfy the equations that they are to be solved by."""
+
+import numpy as np
+import pytest
+
+from rdstitch.errors import ArgumentError
+from rdstitch.planar_motion import constraint_residuals
+from rdstitch.radial_homography import transfer
+from rdstitch.solvers.solutions import Solutions
+from rdstitch.synthetic import HALF_SIZE, correspondences, general_instances, planar_instances
+
+
+def test_points_of_planar_instances_obey_homography_and_motion() -> None:
+    instances = planar_instances(200, 4, seed=1, height=(0.75, 1.3))
+    for k in range(0, 200, 7):
+        h, lam = instances.homography[k], instances.distortion[k]
+        np.testing.assert_allclose(transfer(h, lam, instances.x1[k]), instances.x2[k], atol=1e-12)
+        np.testing.assert_allclose(instances.motion(k).homography(), h, atol=1e-12)
+    for x in (instances.x1, instances.x2):
+        assert (np.abs(x) <= HALF_SIZE).all()
+    assert (np.abs(instances.tilt) <= 0.3).all()
+    assert np.ptp(instances.yaw) > 5.0
+    assert (instances.distortion.min() < -0.65) & (instances.distortion.max() > -0.05)
+
+
+def test_rigid_motion_satisfies_the_constraints_and_free_motion_does_not() -> None:
+    rigid, free = planar_instances(500, 4, seed=2), general_instances(500, 5, seed=2)
+    assert max(np.abs(r).max() for r in constraint_residuals(rigid.homography)) < 1e-12
+    assert min(np.median(np.abs(r)) for r in constraint_residuals(free.homography)) > 1e-4
+    k = 3
+    np.testing.assert_allclose(transfer(free.homography[k], free.distortion[k], free.x1[k]), free.x2[k], atol=1e-12)
+
+
+def test_separate_tilts_are_in_the_homography() -> None:
+    instances = planar_instances(300, 2, seed=3, separate_tilts=True)
+    assert np.abs(instances.tilt - instances.tilt2).max() > 0.3
+    normal2 = np.linalg.solve(instances.homography.transpose(0, 2, 1), _normals(instances.tilt)[:, :, None])[:, :, 0]
+    np.testing.assert_allclose(normal2, _normals(instances.tilt2), atol=1e-12)
+
+
+def _normals(tilt: np.ndarray) -> np.ndarray:
+    psi, theta = tilt.T
+    return np.column_stack([np.sin(theta), -np.sin(psi) * np.cos(theta), np.cos(psi) * np.cos(theta)])
+
+
+def test_seed_decides_and_noise_has_the_size_asked_for() -> None:
+    clean, again = planar_instances(2000, 3, seed=4), planar_instances(2000, 3, seed=4)
+    np.testing.assert_array_equal(clean.x2, again.x2)
+    noisy = planar_instances(2000, 3, seed=4, noise=1e-3)
+    np.testing.assert_array_equal(clean.homography, noisy.homography)
+    assert (noisy.x1 - clean.x1).std() == pytest.approx(1e-3, rel=0.05)
+    assert (noisy.x2 - clean.x2).std() == pytest.approx(1e-3, rel=0.05)
+    assert (planar_instances(2000, 3, seed=5).x1 != clean.x1).any()
+
+
+def test_best_errors_picks_the_nearest_solution_of_each_sample() -> None:
+    instances = planar_instances(3, 2, seed=6)
+    solutions = Solutions(
+        sample=np.array([0, 0, 2]),
+        homography=np.stack([np.eye(3), -2.0 * instances.homography[0], instances.homography[2]]),
+        distortion=instances.distortion[[0, 0, 2]] + (0.2, -0.1, 1e-9),
+    )
+    distortion, homography = instances.best_errors(solutions)
+    np.testing.assert_allclose(distortion, [0.1, np.inf, 1e-9], atol=1e-15)
+    np.testing.assert_allclose(homography, [0.0, np.inf, 0.0], atol=1e-14)
+    assert np.isinf(instances.best_errors(Solutions.empty())[0]).all()
+
+
+def test_impossible_ranges_are_refused() -> None:
+    with pytest.raises(ArgumentError, match="folds"):
+        planar_instances(10, 2, seed=1, distortion=(-1.2, -1.1))
+    with pytest.raises(ArgumentError, match="in common"):
+        planar_instances(10, 2, seed=1, translation=(50.0, 60.0))
+
+
+@pytest.mark.parametrize("motion", ["rigid", "similarity", "homography"])
+def test_correspondences_are_as_asked_for(motion: str) -> None:
+    clean = correspondences(300, seed=7, motion=motion, noise=0.0, outliers=0.4)
+    error = np.linalg.norm(clean.truth.transfer(clean.points1) - clean.points2, axis=1)
+    assert clean.inliers.sum() == 180
+    assert error[clean.inliers].max() < 1e-9
+    assert np.nanmedian(error[~clean.inliers]) > 50.0
+    for points in (clean.points1, clean.points2):
+        assert ((points >= 0.0) & (points <= (999, 799))).all()
+    assert np.median(clean.quality[clean.inliers]) > np.median(clean.quality[~clean.inliers])
+    assert (clean.truth.motion is None) == (motion == "homography")
+    noisy = correspondences(300, seed=7, motion=motion, noise=0.7, outliers=0.4)
+    assert (noisy.points1 - clean.points1)[clean.inliers].std() == pytest.approx(0.7, rel=0.15)

@@ -1,0 +1,154 @@
+"""Paths, surveys and the ground below them."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from rdstitch.camera import Camera
+from rdstitch.errors import ArgumentError
+from rdstitch.synthetic import (
+    EndlessTexture,
+    FisheyeLens,
+    PictureTexture,
+    Poses,
+    best_division_model,
+    blank,
+    fit_to_plane,
+    gradient,
+    grid_poses,
+    ground,
+    joined,
+    line_poses,
+    pair_poses,
+    parking_poses,
+    repeated,
+    rotation_poses,
+    sequence_over,
+    survey_poses,
+    turn_poses,
+)
+
+LENS = Camera((320, 240), -0.25, focal=260.0)
+
+
+@pytest.mark.parametrize("direction", [0.0, 0.5 * np.pi])
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.1, -0.08)])
+def test_pairs_overlap_as_asked_for(direction: float, tilt: tuple[float, float]) -> None:
+    """Along the middle row (or column), 70 % of the first picture is not in the second."""
+    poses, _ = fit_to_plane(LENS, pair_poses(LENS, 0.3, direction=direction, tilt=tilt))
+    sequence = sequence_over(blank, LENS, poses)
+    ends = [(-0.5, 119.5), (319.5, 119.5)] if direction == 0.0 else [(159.5, -0.5), (159.5, 239.5)]
+    axis = 0 if direction == 0.0 else 1
+    first, second = (sequence.to_plane(index, ends)[:, axis] for index in range(2))
+    assert (first[1] - second[0]) / (first[1] - first[0]) == pytest.approx(0.3, abs=0.01)
+
+
+def test_all_that_pictures_see_lies_on_the_plane() -> None:
+    poses, (width, height) = fit_to_plane(LENS, grid_poses(LENS, 4, 3, yaw=0.3, shift=0.1, tilt=(0.05, 0.1)), margin=5)
+    sequence = sequence_over(PictureTexture(np.zeros((height, width), np.uint8)), LENS, poses, margin=5)
+    corners = np.array([(-0.5, -0.5), (319.5, -0.5), (319.5, 239.5), (-0.5, 239.5)])
+    seen = np.concatenate([sequence.to_plane(index, corners) for index in range(12)])
+    assert seen.min() > 4.0
+    assert (seen < (width - 5, height - 5)).all()
+    with pytest.raises(ArgumentError, match="texels"):
+        sequence_over(blank((width - 1, height)), LENS, poses, margin=5)
+
+
+def test_a_picture_of_the_horizon_is_refused() -> None:
+    with pytest.raises(ArgumentError, match="horizon"):
+        fit_to_plane(LENS, Poses.of([(0.0, 0.0)], 260.0, 0.0, (1.3, 0.0)))
+
+
+def test_motion_between_poses_is_the_homography_between_pictures() -> None:
+    poses = grid_poses(LENS, 3, 2, yaw=3.0, tilt=(0.1, -0.2)).shaken(seed=1, height=0.2)
+    from_plane = poses.from_plane()
+    for i, j in ((0, 1), (4, 2), (5, 0)):
+        h = from_plane[j] @ np.linalg.inv(from_plane[i])
+        expected = poses.motion(i, j).homography()
+        np.testing.assert_allclose(h / np.cbrt(np.linalg.det(h) / np.linalg.det(expected)), expected, atol=1e-12)
+    with pytest.raises(ArgumentError, match="tilt"):
+        poses.shaken(seed=1, tilt=0.1).motion(0, 1)
+
+
+def test_a_turn_ends_at_its_angle_and_a_line_is_straight() -> None:
+    line, turn = line_poses(LENS, 40, heading=0.3), turn_poses(LENS, 41, angle=1.2, heading=0.3)
+    steps = np.diff(line.position, axis=0)
+    np.testing.assert_allclose(np.arctan2(steps[:, 1], steps[:, 0]), 0.3, atol=1e-12)
+    assert turn.yaw[0] - turn.yaw[-1] == pytest.approx(1.2)
+    end = np.diff(turn.position[-2:], axis=0)[0]
+    assert np.arctan2(end[1], end[0]) == pytest.approx(1.5)
+
+
+def test_parking_ends_parallel_and_aside() -> None:
+    poses = parking_poses(LENS, 101)
+    assert poses.yaw[-1] == pytest.approx(poses.yaw[0])
+    assert np.ptp(poses.yaw) == pytest.approx(0.7)
+    step = np.linalg.norm(np.diff(poses.position[:2], axis=0))
+    assert abs(poses.position[-1, 1]) > 5.0 * step
+    assert (np.diff(poses.position[:, 0]) < 0.0).sum() == 50
+
+
+def test_joined_paths_go_on_where_the_last_ended() -> None:
+    path = joined(line_poses(LENS, 10), turn_poses(LENS, 21), parking_poses(LENS, 31))
+    assert len(path) == 10 + 20 + 30
+    step = np.linalg.norm(np.diff(path.position, axis=0), axis=1)
+    np.testing.assert_allclose(step, step[0], rtol=1e-9)
+    assert path.yaw[29] == pytest.approx(-np.pi / 2)
+
+
+@pytest.mark.parametrize("count", [117, 158])
+def test_a_survey_covers_a_field_with_neighbours(count: int) -> None:
+    poses = survey_poses(LENS, count, attitude_jitter=0.02, seed=3)
+    assert len(poses) == count
+    extent = np.ptp(poses.position, axis=0)
+    assert 0.5 < extent[0] / extent[1] < 2.0
+    assert (np.abs(poses.height / poses.height.mean() - 1.0) < 0.07).all()
+    assert np.ptp(poses.tilt, axis=0).max() <= 0.04
+
+
+def test_a_camera_that_turns_about_its_axis_does_not_move() -> None:
+    poses = rotation_poses(LENS, 5, yaw_step=0.3)
+    assert np.ptp(poses.position) == 0.0
+    assert poses.motion(0, 1).translation == (0.0, 0.0)
+    assert poses.motion(0, 1).yaw == pytest.approx(0.3)
+
+
+def test_endless_ground_is_the_same_wherever_it_is_cut() -> None:
+    texture = EndlessTexture((100_000, 50_000), seed=5, channels=1)
+    whole = texture.region(70_000, 30_000, 70_300, 30_200)
+    np.testing.assert_array_equal(texture.region(70_100, 30_050, 70_200, 30_150), whole[50:150, 100:200])
+    assert 0.05 < whole.std() < 0.4
+    period = texture.region(70_000 + 2039, 30_000, 70_300 + 2039, 30_200)
+    assert abs(np.corrcoef(whole.ravel(), period.ravel())[0, 1]) < 0.75
+    seam = texture.region(2039 - 8, 0, 2039 + 8, 2000).mean(axis=2)
+    steps = np.abs(np.diff(seam, axis=1)).mean(axis=0)
+    assert steps[7] < 2.0 * np.median(steps)
+
+
+def test_ground_has_the_spectrum_of_natural_pictures() -> None:
+    """Power falls as frequency to the power -1.5 … -3, and seeds differ."""
+    grey = ground((512, 512), 6, 1).region(0, 0, 512, 512)[:, :, 0].astype(np.float64)
+    assert np.abs(grey - ground((512, 512), 7, 1).region(0, 0, 512, 512)[:, :, 0]).mean() > 0.05
+    power = np.abs(np.fft.fft2((grey - grey.mean()) * np.outer(np.hanning(512), np.hanning(512)))) ** 2
+    radius = np.hypot(np.fft.fftfreq(512)[:, None], np.fft.fftfreq(512))
+    bands = np.geomspace(0.01, 0.3, 12)
+    mean = [power[(radius >= a) & (radius < b)].mean() for a, b in pairwise(bands)]
+    slope = np.polyfit(np.log(bands[:-1]), np.log(mean), 1)[0]
+    assert -3.0 < slope < -1.3
+
+
+def test_hopeless_textures_are_hopeless() -> None:
+    assert np.ptp(blank((50, 40)).region(0, 0, 50, 40)) == 0.0
+    assert np.abs(np.diff(gradient((500, 400)).region(0, 0, 500, 400), n=2, axis=0)).max() < 1e-6
+    tiles = repeated((500, 400), 1, period=96).region(0, 0, 500, 400)
+    np.testing.assert_array_equal(tiles[:, 96:192], tiles[:, :96])
+
+
+def test_a_fisheye_is_no_division_model() -> None:
+    camera, rms = best_division_model(FisheyeLens((640, 480), 400.0))
+    assert camera.distortion < -0.2
+    assert 0.1 < rms < 1.0
+    own, exact = best_division_model(LENS)
+    assert own.distortion == pytest.approx(-0.25, abs=1e-4)
+    assert exact < 1e-3
