@@ -78,8 +78,9 @@ def scene(
     in heights above the plane.
     """
     lens = Camera(size, distortion=distortion)
-    shared = np.array([*tilt, np.log(focal / lens.half_diagonal)])
-    truth = TILTING.matrices(poses, shared).matrices
+    ratio = focal / lens.half_diagonal
+    shared = TILTING.shared_from(np.array([*tilt, np.log(ratio)]))
+    truth = TILTING.matrices(poses * [1, ratio, ratio, 1, 1, 1], shared).matrices
     cameras = [Camera(size, focal=guess or focal, focal_source=focal_source) for _ in poses]
     inverse = np.linalg.inv(truth)
     links = []

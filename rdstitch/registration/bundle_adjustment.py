@@ -17,6 +17,7 @@ from rdstitch.registration.normal_equations import (
     chain,
     link_equations,
     robust_cost,
+    squared_errors,
 )
 from rdstitch.registration.observations import Observations
 
@@ -68,6 +69,7 @@ class Priors:
     Attributes
     ----------
     shared, shared_precision : ndarray of shape (S,)
+        Of what the model names, see :meth:`Model.natural`.
     lens, lens_precision : ndarray of shape (4,)
     poses, poses_precision : ndarray of shape (N, D)
     """
@@ -123,10 +125,8 @@ class Adjusted:
         ``|r|²`` of each correspondence, px², whitened; inf where it cannot be transferred.
     equations : LinkEquations
         At the solution.
-    information : ndarray of shape (S', S')
-        On the shared parameters and the free ones of the lens, for errors of ``sigma``, without priors.
     covariance : ndarray of shape (S', S')
-        Of the same, with priors; inf on the diagonal where nothing is known.
+        Of what the model names and of the free parameters of the lens, priors included.
     converged : bool
     iterations : int
     """
@@ -137,7 +137,6 @@ class Adjusted:
     sigma: float
     squared: FloatArray
     equations: LinkEquations
-    information: FloatArray
     covariance: FloatArray
     converged: bool
     iterations: int
@@ -222,11 +221,12 @@ class Adjuster:
             if not np.isfinite(predicted) or predicted <= self.tolerance * max(state.cost, 1e-12):
                 return state, used, True
             moved = state.parameters.moved(self.model, step_poses, step_shared, self.freedom.lens)
-            trial = self._evaluate(moved, sigma, width)
+            cost = self._cost_at(moved, state.equations.whitening, sigma, width)
             used += 1
-            if trial.cost < state.cost:
-                gain = (state.cost - trial.cost) / predicted
-                state, damping = trial, max(damping * (0.1 if gain > 0.5 else 1.0), 1e-9)
+            if cost < state.cost:
+                gain = (state.cost - cost) / predicted
+                damping = max(damping * (0.1 if gain > 0.5 else 1.0), 1e-9)
+                state = self._evaluate(moved, sigma, width)
             elif damping > 1e6:
                 return state, used, True
             else:
@@ -236,11 +236,22 @@ class Adjuster:
     def _evaluate(self, parameters: Parameters, sigma: float, width: float) -> _State:
         """Errors, cost and linearization at some parameters."""
         matrices = self.model.matrices(parameters.poses, parameters.shared)
-        i, j = self.observations.image1, self.observations.image2
-        homographies = matrices.matrices[j] @ np.linalg.inv(matrices.matrices)[i]
+        homographies = self._of_links(matrices)
         equations = link_equations(self.observations, homographies, parameters.lens, width)
         cost = float(robust_cost(equations.squared, width).sum()) * self._weight(sigma)
         return _State(parameters, matrices, homographies, equations, cost + self._prior_cost(parameters))
+
+    def _cost_at(self, parameters: Parameters, whitening: FloatArray, sigma: float, width: float) -> float:
+        """The cost at other parameters, with the whitening held."""
+        homographies = self._of_links(self.model.matrices(parameters.poses, parameters.shared))
+        squared = squared_errors(self.observations, homographies, parameters.lens, whitening)
+        return float(robust_cost(squared, width).sum()) * self._weight(sigma) + self._prior_cost(parameters)
+
+    def _of_links(self, matrices: ModelMatrices) -> FloatArray:
+        """``H_ij = P_j P_i⁻¹`` of each link, shape (L, 3, 3)."""
+        i, j = self.observations.image1, self.observations.image2
+        product: FloatArray = matrices.matrices[j] @ np.linalg.inv(matrices.matrices)[i]
+        return product
 
     def _weight(self, sigma: float) -> float:
         return 1.0 / (sigma**2 * self.overdispersion)
@@ -249,13 +260,13 @@ class Adjuster:
         p = self.priors
         offsets = self.model.offsets(parameters.poses)
         parts = (
-            p.shared_precision * (parameters.shared - p.shared) ** 2,
+            p.shared_precision * (self.model.natural(parameters.shared)[0] - p.shared) ** 2,
             p.lens_precision * (parameters.lens - p.lens) ** 2,
             p.poses_precision * (offsets - p.poses) ** 2,
         )
         return float(sum(part.sum() for part in parts))
 
-    def _normal_equations(self, state: _State, sigma: float, priors: bool = True) -> NormalEquations:
+    def _normal_equations(self, state: _State, sigma: float) -> NormalEquations:
         """Of the data at ``state``, and of the priors."""
         normal = chain(
             state.equations,
@@ -266,17 +277,31 @@ class Adjuster:
             self.freedom.lens,
             self._weight(sigma),
         )
-        if not priors:
-            return normal
         p, free, lens = self.priors, self.freedom.poses, self.freedom.lens
         precision = np.concatenate([p.shared_precision, p.lens_precision[lens]])
-        shared = np.concatenate([state.parameters.shared - p.shared, (state.parameters.lens - p.lens)[lens]])
+        natural, derivative = self._natural(state.parameters.shared)
+        error = np.concatenate([natural - p.shared, (state.parameters.lens - p.lens)[lens]])
         poses = self.model.offsets(state.parameters.poses) - p.poses
-        return normal.with_priors(p.poses_precision[free], poses[free], precision, shared)
+        return normal.with_priors(
+            p.poses_precision[free],
+            poses[free],
+            derivative.T @ (precision[:, None] * derivative),
+            derivative.T @ (precision * error),
+        )
+
+    def _natural(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What the shared parameters mean (S,), and its derivatives by them and by the lens (S', S')."""
+        natural, derivative = self.model.natural(shared)
+        size, lens = len(natural), int(self.freedom.lens.sum())
+        whole = np.eye(size + lens)
+        whole[:size, :size] = derivative
+        return natural, whole
 
     def _finished(self, parameters: Parameters, sigma: float, used: int, converged: bool) -> Adjusted:
         """The result with its covariance."""
         state = self._evaluate(parameters, sigma, WIDTH_PER_SIGMA * sigma)
+        derivative = self._natural(parameters.shared)[1]
+        covariance = _covariance(self._normal_equations(state, sigma).shared_information())
         return Adjusted(
             parameters,
             state.matrices,
@@ -284,8 +309,7 @@ class Adjuster:
             sigma,
             state.equations.squared,
             state.equations,
-            self._normal_equations(state, sigma, priors=False).shared_information(),
-            _covariance(self._normal_equations(state, sigma).shared_information()),
+            derivative @ covariance @ derivative.T,
             converged,
             used,
         )
@@ -300,13 +324,8 @@ class Adjuster:
 
 
 def _covariance(information: FloatArray) -> FloatArray:
-    """Inverse of an information matrix; inf on the diagonal for parameters that it says nothing of."""
-    scale = np.sqrt(np.maximum(np.diag(information), 0.0))
-    known = scale > 0.0
-    covariance = np.diag(np.where(known, 0.0, np.inf))
-    if known.any():
-        unit = information[np.ix_(known, known)] / np.outer(scale[known], scale[known])
-        values, vectors = np.linalg.eigh(unit)
-        inverse = (vectors / np.maximum(values, 1e-14)) @ vectors.T
-        covariance[np.ix_(known, known)] = inverse / np.outer(scale[known], scale[known])
-    return covariance
+    """Inverse of an information matrix; large, not infinite, for what it says nothing of."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12))
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    inverse: FloatArray = (vectors / np.maximum(values, 1e-14)) @ vectors.T * np.outer(scale, scale)
+    return inverse

@@ -17,6 +17,9 @@ homography 8                                               any motion, any camer
 
 The first three share the tilt (ψ, θ) and the focal length:
 ``P_i = diag(f, f, 1) Rx(ψ + δψ_i) Ry(θ + δθ_i) Rz(φ_i) diag(1, 1, h_i) T(t_i)``, ``T = I - t e3'``.
+
+The pictures see ψ/f, θ/f and f t far better than f itself. The adjustment therefore moves those; otherwise it would
+have to follow a curved valley.
 """
 
 from dataclasses import dataclass
@@ -77,6 +80,12 @@ class Model(Protocol):
     def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
         """Homographies from the plane to the pictures, with derivatives."""
 
+    def natural(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What :attr:`shared_names` names (S,), and its derivatives by the shared parameters (S, S)."""
+
+    def shared_from(self, natural: FloatArray) -> FloatArray:
+        """The inverse of :meth:`natural`."""
+
     def moved(self, poses: FloatArray, step: FloatArray) -> FloatArray:
         """Poses after a step of shape (N, D)."""
 
@@ -94,7 +103,8 @@ class Model(Protocol):
 class PlanarModel:
     """Camera that moves over a plane with a tilt that it keeps, or nearly keeps.
 
-    Poses have six columns, :data:`YAW` to :data:`THETA`, of which only the free ones move.
+    Poses have six columns, :data:`YAW` to :data:`THETA`, of which only the free ones move; positions are multiplied by
+    the focal length. The shared parameters are ψ/f, θ/f and log f.
 
     Attributes
     ----------
@@ -122,16 +132,32 @@ class PlanarModel:
         count = len(poses)
         focal = np.exp(shared[2])
         calibration = np.diag([focal, focal, 1.0])
-        rotation = rotation_from_tilt(poses[:, [PSI, THETA]] + shared[:2])
-        motion, by_motion = _motion_in_plane(poses)
+        rotation = rotation_from_tilt(poses[:, [PSI, THETA]] + shared[:2] * focal)
+        motion, by_motion = _motion_in_plane(poses, focal)
         left = calibration @ rotation
         matrices = left @ motion
 
         by_tilt = np.stack([calibration @ _AROUND_X @ rotation @ motion, left @ _AROUND_Y @ motion], axis=1)
         by_columns = np.concatenate([left[:, None] @ by_motion, by_tilt], axis=1)
-        by_focal = matrices * np.array([1.0, 1.0, 0.0])[:, None]
-        by_shared = np.concatenate([by_tilt, by_focal[:, None]], axis=1)
+        by_focal = (
+            matrices * np.array([1.0, 1.0, 0.0])[:, None]
+            + np.einsum("nkij,k->nij", by_tilt, shared[:2] * focal)
+            - np.einsum("nkij,nk->nij", by_columns[:, [X, Y]], poses[:, [X, Y]])
+        )
+        by_shared = np.concatenate([by_tilt * focal, by_focal[:, None]], axis=1)
         return ModelMatrices(matrices, by_columns[:, list(self.free)].reshape(count, -1, 3, 3), by_shared)
+
+    def natural(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """ψ, θ and log f, with derivatives."""
+        focal = float(np.exp(shared[2]))
+        natural = np.array([shared[0] * focal, shared[1] * focal, shared[2]])
+        derivative = np.diag([focal, focal, 1.0])
+        derivative[:2, 2] = natural[:2]
+        return natural, derivative
+
+    def shared_from(self, natural: FloatArray) -> FloatArray:
+        """ψ/f, θ/f and log f."""
+        return np.append(natural[:2] / np.exp(natural[2]), natural[2])
 
     def moved(self, poses: FloatArray, step: FloatArray) -> FloatArray:
         """Poses after a step of shape (N, D)."""
@@ -161,17 +187,27 @@ class PlanarModel:
         poses = np.zeros((len(homographies), 6))
         poses[:, [PSI, THETA]] = attitudes
         poses[:, YAW] = yaw
-        poses[:, X] = -(c * motion[:, 0, 2] + s * motion[:, 1, 2])
-        poses[:, Y] = -(-s * motion[:, 0, 2] + c * motion[:, 1, 2])
+        focal = np.exp(shared[2])
+        poses[:, X] = -(c * motion[:, 0, 2] + s * motion[:, 1, 2]) * focal
+        poses[:, Y] = -(-s * motion[:, 0, 2] + c * motion[:, 1, 2]) * focal
         if LOG_HEIGHT in self.free:
             poses[:, LOG_HEIGHT] = np.log(np.clip(np.abs(motion[:, 2, 2]), 1e-3, 1e3))
         return poses
 
 
-def _motion_in_plane(poses: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """``Rz(φ) diag(1, 1, h) T`` (N, 3, 3) and its derivatives by φ, tx, ty, log h (N, 4, 3, 3)."""
+def metric_poses(poses: FloatArray, shared: FloatArray) -> FloatArray:
+    """Poses (N, 6) of a planar model with positions in units of the height, and with the whole tilt."""
+    focal = np.exp(shared[2])
+    result = poses.copy()
+    result[:, [X, Y]] /= focal
+    result[:, [PSI, THETA]] += shared[:2] * focal
+    return result
+
+
+def _motion_in_plane(poses: FloatArray, focal: float) -> tuple[FloatArray, FloatArray]:
+    """``Rz(φ) diag(1, 1, h) T`` (N, 3, 3) and its derivatives by φ, f tx, f ty, log h (N, 4, 3, 3)."""
     c, s = np.cos(poses[:, YAW]), np.sin(poses[:, YAW])
-    x, y, height = poses[:, X], poses[:, Y], np.exp(poses[:, LOG_HEIGHT])
+    x, y, height = poses[:, X] / focal, poses[:, Y] / focal, np.exp(poses[:, LOG_HEIGHT])
     motion = np.zeros((len(poses), 3, 3))
     motion[:, 0, 0] = motion[:, 1, 1] = c
     motion[:, 0, 1], motion[:, 1, 0] = -s, s
@@ -179,8 +215,8 @@ def _motion_in_plane(poses: FloatArray) -> tuple[FloatArray, FloatArray]:
     motion[:, 2, 2] = height
     derivatives = np.zeros((len(poses), 4, 3, 3))
     derivatives[:, 0, 0], derivatives[:, 0, 1] = -motion[:, 1], motion[:, 0]
-    derivatives[:, 1, 0, 2], derivatives[:, 1, 1, 2] = -c, -s
-    derivatives[:, 2, 0, 2], derivatives[:, 2, 1, 2] = s, -c
+    derivatives[:, 1, 0, 2], derivatives[:, 1, 1, 2] = -c / focal, -s / focal
+    derivatives[:, 2, 0, 2], derivatives[:, 2, 1, 2] = s / focal, -c / focal
     derivatives[:, 3, 2, 2] = height
     return motion, derivatives
 
@@ -207,6 +243,14 @@ class HomographyModel:
         matrices = poses.reshape(-1, 3, 3)
         generators = np.eye(9)[:8].reshape(8, 3, 3)
         return ModelMatrices(matrices, generators @ matrices[:, None], np.zeros((len(poses), 0, 3, 3)))
+
+    def natural(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Nothing."""
+        return np.zeros(0), np.zeros((0, 0))
+
+    def shared_from(self, natural: FloatArray) -> FloatArray:
+        """Nothing."""
+        return np.zeros(0)
 
     def moved(self, poses: FloatArray, step: FloatArray) -> FloatArray:
         """Poses after a step of shape (N, 8)."""

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from rdstitch.camera import FloatArray
-from rdstitch.radial_homography import measurement_whitening, transfer_jacobian
+from rdstitch.camera import FloatArray, distort
+from rdstitch.radial_homography import lift, measurement_whitening, project, transfer_jacobian
 from rdstitch.registration.models import BoolArray, ModelMatrices
 from rdstitch.registration.observations import Observations
 
@@ -35,11 +35,14 @@ class LinkEquations:
         ``Σ w J'r``.
     squared : ndarray of shape (M,)
         ``|r|²`` of each correspondence, px², whitened; inf where it cannot be transferred.
+    whitening : ndarray of shape (M, 2, 2)
+        What makes r of an error in normalized coordinates.
     """
 
     gram: FloatArray
     gradient: FloatArray
     squared: FloatArray
+    whitening: FloatArray
 
 
 def robust_weight(squared: FloatArray, width: float) -> FloatArray:
@@ -71,9 +74,10 @@ def link_equations(
     count = len(observations)
     gram, gradient = np.zeros((count, 13, 13)), np.zeros((count, 13))
     squared = np.empty(len(observations.points1))
+    whitening = np.empty((len(observations.points1), 2, 2))
     for first, last in _chunks(observations.start):
         rows = slice(observations.start[first], observations.start[last])
-        jacobian, error = _whitened(observations, homographies, lens, first, last)
+        jacobian, error, whitening[rows] = _whitened(observations, homographies, lens, first, last)
         squared[rows] = np.einsum("mi,mi->m", error, error)
         lost = ~np.isfinite(squared[rows])
         squared[rows][lost] = np.inf
@@ -86,7 +90,27 @@ def link_equations(
             own = jacobian[a:b].reshape(-1, 13)
             gram[link] = own.T @ own
             gradient[link] = own.T @ error[a:b].reshape(-1)
-    return LinkEquations(gram, gradient, squared)
+    return LinkEquations(gram, gradient, squared, whitening)
+
+
+def squared_errors(
+    observations: Observations, homographies: FloatArray, lens: FloatArray, whitening: FloatArray
+) -> FloatArray:
+    """``|r|²`` (M,) with a whitening that was computed before, px²; inf where there is no transfer.
+
+    Between one linearization and the next the whitening must stay what it is: otherwise the errors could be made
+    smaller by a larger derivative, against the gradient, which takes the whitening for constant.
+    """
+    squared = np.empty(len(observations.points1))
+    lam, mu, center = float(lens[0]), float(lens[1]), lens[2:]
+    for first, last in _chunks(observations.start):
+        rows = slice(observations.start[first], observations.start[last])
+        counts = np.diff(observations.start[first : last + 1])
+        lifted = lift(observations.points1[rows] - center, lam, mu)
+        moved = np.einsum("mij,mj->mi", np.repeat(homographies[first:last], counts, axis=0), lifted)
+        error = distort(project(moved), lam, mu) - (observations.points2[rows] - center)
+        squared[rows] = (np.einsum("mij,mj->mi", whitening[rows], error) ** 2).sum(axis=1)
+    return np.where(np.isfinite(squared), squared, np.inf)
 
 
 def whitened_errors(observations: Observations, homographies: FloatArray, lens: FloatArray) -> FloatArray:
@@ -103,8 +127,8 @@ def _chunks(start: NDArray[np.intp]) -> list[tuple[int, int]]:
 
 def _whitened(
     observations: Observations, homographies: FloatArray, lens: FloatArray, first: int, last: int
-) -> tuple[FloatArray, FloatArray]:
-    """Jacobian (m, 2, 13) and error (m, 2) of the correspondences of some links, whitened, px."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Jacobian (m, 2, 13) and error (m, 2) of the correspondences of some links, whitened, px; the whitening."""
     rows = slice(observations.start[first], observations.start[last])
     counts = np.diff(observations.start[first : last + 1])
     scale1 = np.repeat(observations.scale1[first:last], counts)[:, None, None]
@@ -114,7 +138,7 @@ def _whitened(
     whitening = measurement_whitening(result.by_point * (scale2 / scale1)) * scale2
     jacobian = whitening @ np.concatenate([result.by_homography, result.by_lens], axis=2)
     error = whitening @ (result.points - (observations.points2[rows] - lens[2:]))[:, :, None]
-    return jacobian, error[:, :, 0]
+    return jacobian, error[:, :, 0], whitening
 
 
 @dataclass(frozen=True)
@@ -150,16 +174,16 @@ class NormalEquations:
         self,
         precision_poses: FloatArray,
         error_poses: FloatArray,
-        precision_shared: FloatArray,
-        error_shared: FloatArray,
+        information_shared: FloatArray,
+        gradient_shared: FloatArray,
     ) -> Self:
-        """With priors added: inverse variances, and how far the parameters are from the means."""
+        """With priors added: on the poses as inverse variances and distances from the means, both (F,)."""
         return replace(
             self,
             poses=(self.poses + sparse.diags_array(precision_poses)).tocsc(),
-            shared=self.shared + np.diag(precision_shared),
+            shared=self.shared + information_shared,
             gradient_poses=self.gradient_poses + precision_poses * error_poses,
-            gradient_shared=self.gradient_shared + precision_shared * error_shared,
+            gradient_shared=self.gradient_shared + gradient_shared,
         )
 
     def shared_information(self) -> FloatArray:

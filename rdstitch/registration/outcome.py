@@ -14,7 +14,7 @@ from rdstitch.registration.consistency import link_medians
 from rdstitch.registration.graph import connected_components
 from rdstitch.registration.links import Link
 from rdstitch.registration.model_selection import Choice
-from rdstitch.registration.models import LOG_HEIGHT, PSI, THETA, YAW, BoolArray, X, Y
+from rdstitch.registration.models import LOG_HEIGHT, PSI, THETA, YAW, BoolArray, X, Y, metric_poses
 from rdstitch.registration.normal_equations import whitened_errors
 from rdstitch.registration.observations import IntArray
 from rdstitch.registration.problem import Problem
@@ -56,7 +56,7 @@ def describe(outcome: Outcome) -> Alignment:
     """The alignment, in the frame of the reference picture."""
     problem, fit = outcome.problem, outcome.choice.fit
     adjusted, planar = fit.adjusted, bool(fit.model.shared_names)
-    shared, lens = adjusted.parameters.shared, adjusted.parameters.lens
+    shared, lens = fit.model.natural(adjusted.parameters.shared)[0], adjusted.parameters.lens
     covariance = adjusted.covariance
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     names = (*fit.model.shared_names, *(n for n, free in zip(LENS_PARAMETERS, problem.free_lens, strict=True) if free))
@@ -121,19 +121,17 @@ def _in_frame_of_reference(outcome: Outcome) -> tuple[FloatArray, Poses | None]:
     if not fit.model.shared_names:
         homographies[outcome.pictures] = matrices[reference] @ np.linalg.inv(matrices)
         return homographies, None
-    poses = fit.adjusted.parameters.poses.copy()
+    shared, poses = fit.adjusted.parameters.shared, fit.adjusted.parameters.poses.copy()
     yaw, height = poses[reference, YAW], np.exp(poses[reference, LOG_HEIGHT])
     c, s = np.cos(yaw), np.sin(yaw)
     rotation = np.array([[c, -s], [s, c]])
     poses[:, [X, Y]] = (poses[:, [X, Y]] - poses[reference, [X, Y]]) @ rotation.T / height
     poses[:, YAW] = np.remainder(poses[:, YAW] - yaw + np.pi, 2 * np.pi) - np.pi
     poses[:, LOG_HEIGHT] -= np.log(height)
-    moved = fit.model.matrices(poses, fit.adjusted.parameters.shared).matrices
-    homographies[outcome.pictures] = np.linalg.inv(moved)
+    homographies[outcome.pictures] = np.linalg.inv(fit.model.matrices(poses, shared).matrices)
     every = np.full((count, 6), np.nan)
-    every[outcome.pictures] = poses
-    tilt = every[:, [PSI, THETA]] + fit.adjusted.parameters.shared[:2]
-    return homographies, Poses(every[:, YAW], every[:, [X, Y]], np.exp(every[:, LOG_HEIGHT]), tilt)
+    every[outcome.pictures] = metric_poses(poses, shared)
+    return homographies, Poses(every[:, YAW], every[:, [X, Y]], np.exp(every[:, LOG_HEIGHT]), every[:, [PSI, THETA]])
 
 
 def _groups(outcome: Outcome) -> tuple[tuple[int, ...], ...]:

@@ -208,22 +208,22 @@ class Problem:
             return adjust_apart(model, observations, homographies, shared, lens, self.free_lens, priors, known)
 
         if not model.shared_names:
-            return run(self.observations, self.homographies, priors.shared)
+            return run(self.observations, self.homographies, np.zeros(0))
         few = np.linspace(0, len(self.observations) - 1, min(len(self.observations), 60)).astype(np.intp)
         trials = [
             run(self.observations.subset(few).thinned(60), self.homographies[few], shared)
-            for shared in self._tilts_to_try(priors.shared)
+            for shared in self._tilts_to_try(model, priors.shared)
         ]
         width = WIDTH_PER_SIGMA * min(trial.sigma for trial in trials)
         best = min(trials, key=lambda trial: float(robust_cost(trial.squared, width).sum()))
         return run(self.observations, self.homographies, best.parameters.shared)
 
-    def _tilts_to_try(self, shared: FloatArray) -> list[FloatArray]:
-        """The known or zero tilt, and four around it, 0.2 radians away."""
-        if np.isfinite(self.knowledge.tilt_std):
-            return [shared]
+    def _tilts_to_try(self, model: Model, natural: FloatArray) -> list[FloatArray]:
+        """Shared parameters for the known or zero tilt, and for four around that, 0.2 radians away."""
         steps = np.array([(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2)])
-        return [shared + np.array([*step, 0.0]) for step in steps]
+        if np.isfinite(self.knowledge.tilt_std):
+            steps = steps[:1]
+        return [model.shared_from(natural + np.array([*step, 0.0])) for step in steps]
 
     def _taken_over(self, model: Model, other: Fit) -> Parameters:
         """Another model's solution as this model's start."""
