@@ -113,5 +113,4 @@ def _eight_bits(grey: Image, usable: NDArray[np.bool_] | None) -> NDArray[np.uin
 
 def _clearance(usable: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Distance of each pixel to the nearest one that is not usable, px."""
-    distance: NDArray[np.float32] = cv2.distanceTransform(usable.astype(np.uint8), cv2.DIST_L2, 5)
-    return distance
+    return np.asarray(cv2.distanceTransform(usable.astype(np.uint8), cv2.DIST_L2, 5), np.float32)
