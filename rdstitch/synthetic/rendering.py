@@ -134,6 +134,9 @@ class Sequence:
         Height of the ground; a plane if not given.
     seed : int
         Of the noise.
+    samples : int, optional
+        Samples along each side of a pixel; if not given, as many as the texture needs, at least 2. With 1, large
+        pictures are rendered faster, and alias a little.
     """
 
     texture: Texture
@@ -142,6 +145,7 @@ class Sequence:
     photometry: Photometry = field(default_factory=Photometry)
     relief: Relief | None = None
     seed: int = 0
+    samples: int | None = None
 
     def __len__(self) -> int:
         """Number of pictures."""
@@ -172,9 +176,18 @@ class Sequence:
             uint8 or uint16; RGB. Black where the texture ends.
         """
         width, height = self.lens.image_size
+        settings = self.photometry
+        rng = np.random.default_rng((self.seed, index))
+        full = 2**settings.bits - 1
+        picture = np.empty((height, width, self.texture.channels), dtype=np.uint8 if settings.bits == 8 else np.uint16)
         rows = max(1, _PIXELS_PER_STRIP // width)
-        strips = [self._strip(index, top, min(top + rows, height)) for top in range(0, height, rows)]
-        return self._expose(index, np.concatenate(strips))
+        for top in range(0, height, rows):
+            bottom = min(top + rows, height)
+            light = self._light(index, top, bottom)
+            if settings.noise > 0.0:
+                light += settings.noise * rng.standard_normal(light.shape, dtype=np.float32)
+            np.rint(np.clip(light, 0.0, 1.0, out=light) * np.float32(full), out=picture[top:bottom], casting="unsafe")
+        return picture[:, :, 0] if picture.shape[2] == 1 else picture
 
     def frames(self) -> list[NDArray[Any]]:
         """Render all pictures."""
@@ -229,44 +242,41 @@ class Sequence:
             cv2.fillPoly(mask, [np.rint(points * 16.0).astype(np.int32)], 1, cv2.LINE_8, 4)
         return mask.astype(np.bool_)
 
-    def _strip(self, index: int, top: int, bottom: int) -> Picture:
-        """Rows ``top`` to ``bottom`` of a picture before exposure, in [0, 1]."""
+    def _light(self, index: int, top: int, bottom: int) -> Picture:
+        """Rows ``top`` to ``bottom`` of a picture without noise: what falls on the sensor."""
+        settings = self.photometry
+        width, height = self.lens.image_size
+        # Blur needs the rows beyond the strip.
+        apron = int(np.ceil(4.0 * settings.blur))
+        light = self._sharp(index, top - apron, bottom + apron)
+        gain = np.broadcast_to(np.asarray(settings.gain, dtype=np.float64), (len(self),))[index]
+        u, v = np.arange(width) - self.lens.center[0], np.arange(top - apron, bottom + apron) - self.lens.center[1]
+        radius2 = 4.0 * (u**2 + v[:, None] ** 2) / (width**2 + height**2)
+        factor = (gain * np.maximum(1.0 - settings.vignetting * radius2, 0.0)) ** (1.0 / settings.gamma)
+        light *= factor[:, :, None].astype(np.float32)
+        if apron == 0:
+            return light
+        blurred = cv2.GaussianBlur(light, (0, 0), settings.blur, borderType=cv2.BORDER_REPLICATE)
+        return np.asarray(blurred, dtype=np.float32).reshape(light.shape)[apron:-apron]
+
+    def _sharp(self, index: int, top: int, bottom: int) -> Picture:
+        """Rows ``top`` to ``bottom`` of the plane as a perfect lens and sensor see it, in [0, 1]."""
         u, v = np.arange(-1, self.lens.image_size[0] + 1), np.arange(top - 1, bottom + 1)
         wide = self.to_plane(index, np.stack(np.meshgrid(u, v), axis=-1))
         foot = wide[1:-1, 1:-1]
         # Within a pixel the lens and the perspective are linear to a few 1e-4 px.
         along = (wide[1:-1, 2:] - wide[1:-1, :-2]) / 2.0
         down = (wide[2:, 1:-1] - wide[:-2, 1:-1]) / 2.0
-        count = _samples_per_side(along, down)
+        count = self.samples or _samples_per_side(along, down)
         offsets = (np.arange(count) + 0.5) / count - 0.5
         total = np.zeros((*foot.shape[:2], self.texture.channels), dtype=np.float32)
         for dv in offsets:
             for du in offsets:
-                place = foot + du * along + dv * down
+                place = foot if count == 1 else foot + du * along + dv * down
                 if self.relief is not None:
                     place = self.relief.seen_from(self.poses.position[index], self.poses.height[index], place)
                 total += _sample(self.texture, place)
         return np.divide(total, np.float32(count**2), out=total)
-
-    def _expose(self, index: int, picture: Picture) -> NDArray[Any]:
-        """Gain, vignetting, blur, noise and rounding."""
-        settings = self.photometry
-        height, width, channels = picture.shape
-        gain = np.broadcast_to(np.asarray(settings.gain, dtype=np.float64), (len(self),))[index]
-        u, v = np.arange(width) - self.lens.center[0], np.arange(height) - self.lens.center[1]
-        radius2 = 4.0 * (u**2 + v[:, None] ** 2) / (width**2 + height**2)
-        light = (gain * (1.0 - settings.vignetting * radius2)) ** (1.0 / settings.gamma)
-        picture = picture * light[:, :, None].astype(np.float32)
-        if settings.blur > 0.0:
-            blurred = cv2.GaussianBlur(picture, (0, 0), settings.blur, borderType=cv2.BORDER_REFLECT)
-            picture = np.asarray(blurred, dtype=np.float32).reshape(picture.shape)
-        if settings.noise > 0.0:
-            rng = np.random.default_rng((self.seed, index))
-            picture = picture + settings.noise * rng.standard_normal(picture.shape, dtype=np.float32)
-        full = 2**settings.bits - 1
-        rounded = np.rint(np.clip(picture, 0.0, 1.0) * np.float32(full))
-        exposed: NDArray[Any] = rounded.astype(np.uint8 if settings.bits == 8 else np.uint16)
-        return exposed[:, :, 0] if channels == 1 else exposed
 
 
 def _samples_per_side(along: FloatArray, down: FloatArray) -> int:

@@ -92,13 +92,13 @@ def test_alignment_error_of_truth_and_of_a_shifted_picture() -> None:
     def true_place(index: int, points: FloatArray) -> FloatArray:
         return apply(back, sequence.to_plane(index, points))
 
-    truth = {k: partial(true_place, k) for k in range(4)}
+    truth: dict[int, Transfer] = {k: partial(true_place, k) for k in range(4)}
     exact = alignment_error(sequence, truth)
     np.testing.assert_allclose(exact.transform, SIMILARITY, atol=1e-7)
     assert exact.max < 1e-6
 
     # One of four pictures 4 mosaic px off: a quarter of that goes into the fit.
-    wrong = {**truth, 2: lambda p: truth[2](p) + np.array([4.0, 0.0])}
+    wrong: dict[int, Transfer] = {**truth, 2: lambda p: truth[2](p) + np.array([4.0, 0.0])}
     moved = alignment_error(sequence, wrong)
     assert moved.error_mosaic[moved.image == 2].mean() == pytest.approx(3.0, abs=0.5)
     assert moved.error_mosaic[moved.image != 2].mean() == pytest.approx(1.0, abs=0.5)

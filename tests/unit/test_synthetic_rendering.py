@@ -154,7 +154,8 @@ def test_written_pictures_are_the_frames(tmp_path: Path) -> None:
     paths = sequence.write(tmp_path)
     assert [path.name for path in paths] == ["frame_0000.png", "frame_0001.png"]
     for path, frame in zip(paths, sequence.frames(), strict=True):
-        np.testing.assert_array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:, :, ::-1], frame)
+        bgr = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+        np.testing.assert_array_equal(bgr[:, :, ::-1], frame)
     with pytest.raises(OutputError, match="cannot be written"):
         sequence.write(tmp_path / "missing")
 
