@@ -1,5 +1,7 @@
 """Three points, tilt unknown: the minimal case, by Newton's method from several starts."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -12,28 +14,34 @@ from rdstitch.solvers.solutions import Solutions
 
 BoolArray = NDArray[np.bool_]
 IndexArray = NDArray[np.intp]
+RealArray = NDArray[np.floating[Any]]
 
 DEFAULT_STARTS: FloatArray = np.array(
     [
         (0.0, 0.0, -0.35),
-        (-0.2, -0.2, -0.35),
-        (0.2, 0.2, -0.45),
-        (0.0, -0.2, -0.05),
-        (-0.2, 0.2, -0.2),
-        (0.2, -0.2, -0.35),
-        (0.0, 0.2, -0.45),
+        (-0.15, 0.15, -0.1),
+        (0.3, -0.3, -0.35),
+        (-0.3, -0.15, -0.35),
+        (0.3, 0.45, -0.1),
+        (0.15, 0.0, -0.35),
+        (-0.45, -0.45, -0.1),
+        (0.0, 0.45, -0.1),
+        (0.3, -0.45, -0.1),
     ]
 )
-"""Starts (a, b, λ) that together reach 99 % of the solutions for tilts up to 0.3 radians."""
+"""Starts (a, b, λ) that complement each other: chosen one by one for the solutions that the earlier ones miss."""
 
-_STEPS = 16
-_LONGEST_STEP = 0.3
+_ROUGH_STEPS = 5
+_STEPS = 10
+_LONGEST_STEP = 0.4
 # Newton's method squares the error: after a step this short there is only rounding error left.
 _CONVERGED = 1e-8
+_MET = 1e-2
 _SAME = 1e-6
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 # A plane seen at more than 63 degrees from the vertical is given up.
 _STEEPEST = 2.0
-_STATES_IN_BLOCK = 768
+_STATES_IN_BLOCK = 9216
 
 
 def three_point(
@@ -50,7 +58,8 @@ def three_point(
     ``log |n × (p_i × p_j)| - log w_i w_j`` is the same in both pictures.
 
     Newton's method on the logarithms, with steps limited in length, runs from all starts of all samples at once. It
-    finds the solutions that the starts lead to, not provably all.
+    finds the solutions that the starts lead to, not provably all: from the default starts the true one in about 99 %
+    of noise-free samples with tilts up to 0.3 radians, and in 96 % up to 0.6.
 
     Parameters
     ----------
@@ -120,11 +129,11 @@ class DistanceSystem(SampleArrays):
         """From points of shape (3, 2, B)."""
         x, y = np.stack([x1, x2]).transpose(2, 0, 1, 3)
         r2 = x**2 + y**2
-        (xi, yi, ri), (xj, yj, rj) = ([v[:, order] for v in (x, y, r2)] for order in ([1, 2, 0], [2, 0, 1]))
+        (xi, yi, ri), (xj, yj, rj) = ([v[:, order] for v in (x, y, r2)] for order in (_NEXT, _LAST))
         dx, dy = xi - xj, yi - yj
         return cls(np.stack([x, y, r2, dy, -dx, yj * dx - xj * dy, yi * rj - yj * ri, ri * xj - rj * xi]))
 
-    def step(self, state: FloatArray) -> FloatArray:
+    def step(self, state: RealArray) -> RealArray:
         """Newton's step from the states (a, b, λ), shape (3, B)."""
         a, b, lam = state
         x, y, r2, c1, c2, c3, s1, s2 = self.rows
@@ -132,24 +141,26 @@ class DistanceSystem(SampleArrays):
         c1, c2 = c1 + lam * s1, c2 + lam * s2
         m1, m2, m3 = b * c3 - c2, c1 - a * c3, a * c2 - b * c1
         size = m1**2 + m2**2 + m3**2
-        # log w_i w_j is the sum over all three points less the opposite one.
-        opposite = np.log(np.abs(w))
-        value = _between(0.5 * np.log(size), opposite)
-        by_a = _between((m3 * c2 - m2 * c3) / size, x / w)
-        by_b = _between((m1 * c3 - m3 * c1) / size, y / w)
-        by_lam = _between((m2 * s1 - m1 * s2 + m3 * (a * s2 - b * s1)) / size, r2 / w)
+        pair = w[:, _NEXT] * w[:, _LAST]
+        first, second = size[0] * pair[1] ** 2, size[1] * pair[0] ** 2
+        # Up to third order half the difference of the logarithms of the squared distances; unlike that it is bounded,
+        # which keeps early steps short, and needs no logarithm.
+        value = (first - second) / (first + second)
+        per_size, per_depth = 1.0 / size, 1.0 / w
+        by_a = _between((m3 * c2 - m2 * c3) * per_size, x * per_depth)
+        by_b = _between((m1 * c3 - m3 * c1) * per_size, y * per_depth)
+        by_lam = _between((m2 * s1 - m1 * s2 + m3 * (a * s2 - b * s1)) * per_size, r2 * per_depth)
         return _solve_3x3(by_a, by_b, by_lam, -value)
 
 
-def _between(length: FloatArray, depth: FloatArray) -> FloatArray:
+def _between(length: RealArray, depth: RealArray) -> RealArray:
     """Difference between the pictures of ``length - (sum of depth over the pair)``, from (2, 3, B) to (3, B)."""
-    both = length + depth
-    both -= depth.sum(axis=1, keepdims=True)
-    difference: FloatArray = both[0] - both[1]
-    return difference
+    difference: RealArray = depth[0] - depth[1]
+    # The sum over a pair is the sum over all three points less the opposite one.
+    return (length[0] - length[1]) + (difference - difference.sum(axis=0))
 
 
-def _solve_3x3(a: FloatArray, b: FloatArray, c: FloatArray, right: FloatArray) -> FloatArray:
+def _solve_3x3(a: RealArray, b: RealArray, c: RealArray, right: RealArray) -> RealArray:
     """Solve ``[a b c] s = right`` for columns of shape (3, B), by Cramer's rule."""
     normal = _cross(b, c)
     determinant = (a * normal).sum(axis=0)
@@ -158,15 +169,17 @@ def _solve_3x3(a: FloatArray, b: FloatArray, c: FloatArray, right: FloatArray) -
     return np.asarray(solved / determinant)
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+def _cross(a: RealArray, b: RealArray) -> RealArray:
     """Cross product of vectors of shape (3, B)."""
-    product: FloatArray = a[[1, 2, 0]] * b[[2, 0, 1]]
-    product -= a[[2, 0, 1]] * b[[1, 2, 0]]
-    return product
+    (a0, a1, a2), (b0, b1, b2) = a, b
+    return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
 
 
 def newton(system: DistanceSystem, starts: FloatArray) -> tuple[IndexArray, FloatArray]:
     """Different solutions that Newton's method reaches from every start of every sample.
+
+    The first steps need no accuracy and run in single precision. By then most starts of a sample have met; those that
+    have go on as one.
 
     Returns
     -------
@@ -176,9 +189,16 @@ def newton(system: DistanceSystem, starts: FloatArray) -> tuple[IndexArray, Floa
         (a, b, λ).
     """
     count = system.rows.shape[-1]
-    origin = np.repeat(np.arange(count), len(starts))
-    state = np.tile(starts.T, count)
+    single = DistanceSystem(np.tile(system.rows.astype(np.float32), len(starts)))
+    rough = np.repeat(starts.T.astype(np.float32), count, axis=1)
+    for _ in range(_ROUGH_STEPS):
+        step = single.step(rough)
+        rough += step * np.minimum(np.float32(1.0), np.float32(_LONGEST_STEP) / np.abs(step).max(axis=0))
+    origin = np.flatnonzero(_leaders(rough.reshape(3, len(starts), count)))
+    state = rough[:, origin].astype(np.float64)
+    origin %= count
     system = system.take(origin)
+
     samples, states = [origin[:0]], [state[:, :0]]
     for _ in range(_STEPS):
         step = system.step(state)
@@ -195,9 +215,18 @@ def newton(system: DistanceSystem, starts: FloatArray) -> tuple[IndexArray, Floa
     return _different(np.concatenate(samples), np.concatenate(states, axis=1))
 
 
+def _leaders(state: RealArray) -> BoolArray:
+    """Of the states (3, S, B) of each sample the first of every group that has met, unless it makes no sense; (S B,)."""
+    leads: BoolArray = np.abs(state).max(axis=0) < _STEEPEST
+    for later in range(1, state.shape[1]):
+        distance = np.abs(state[:, :later] - state[:, later, None]).max(axis=0)
+        leads[later] &= ~(distance < _MET).any(axis=0)
+    return leads.ravel()
+
+
 def _different(sample: IndexArray, state: FloatArray) -> tuple[IndexArray, FloatArray]:
     """One of each group of equal states of the same sample."""
-    order = np.lexsort((state[0], state[2], sample))
+    order = np.lexsort((state[2], sample))
     sample, state = sample[order], state[:, order]
     new = np.ones(len(sample), dtype=np.bool_)
     new[1:] = (np.diff(sample) > 0) | (np.abs(np.diff(state, axis=1)).max(axis=0) > _SAME)
