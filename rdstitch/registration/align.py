@@ -18,7 +18,6 @@ from rdstitch.registration.models import MODELS, BoolArray
 from rdstitch.registration.observations import IntArray, Observations
 from rdstitch.registration.outcome import Outcome, describe
 from rdstitch.registration.problem import (
-    Fit,
     Knowledge,
     Problem,
     focal_knowledge,
@@ -152,7 +151,7 @@ def align(
     wrong = contradicting_links(apart, few, len(cameras))
     graph = _Graph(len(cameras), few, relations, lens, free_lens, known, options)
     problem, pictures = graph.problem(~wrong)
-    choice = _choose(problem, options)
+    choice = choose_model(problem, options.models)
     choice, pictures, wrong = _drop_wrong_pairs(graph, problem, pictures, choice, wrong)
 
     say("adjustment")
@@ -224,14 +223,6 @@ class _Graph:
             overdispersion,
         )
         return problem, pictures
-
-
-def _choose(problem: Problem, options: AlignmentOptions) -> Choice:
-    """Adjust the models from the least to the most free, each from the best start so far; the best of them."""
-    fits: list[Fit] = []
-    for name in options.models:
-        fits.append(problem.fit(MODELS[name], fits[-1:]))
-    return choose_model(problem, fits)
 
 
 def _drop_wrong_pairs(

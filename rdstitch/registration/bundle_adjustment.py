@@ -187,14 +187,14 @@ class Adjuster:
             Of the robust loss at the start, px; the scatter of the first errors decides if not given. It narrows to
             what the scatter of the errors asks for.
         """
-        sigma = self._sigma(self._evaluate(start, 1.0, 1.0).equations.squared)
+        sigma = sigma_of(self._evaluate(start, 1.0, 1.0).equations.squared)
         wide = max(width or 0.0, WIDTH_PER_SIGMA * sigma)
         parameters, used, converged = start, 0, False
         while used < self.max_iterations:
             last = wide <= WIDTH_PER_SIGMA * sigma * 1.05
             state, iterations, converged = self._descend(parameters, sigma, wide, 12 if last else 4)
             parameters, used = state.parameters, used + iterations
-            sigma, previous = self._sigma(state.equations.squared), sigma
+            sigma, previous = sigma_of(state.equations.squared), sigma
             wide = max(wide / 3.0, WIDTH_PER_SIGMA * sigma)
             if last and converged and abs(sigma - previous) <= 0.02 * previous:
                 break
@@ -314,13 +314,13 @@ class Adjuster:
             used,
         )
 
-    @staticmethod
-    def _sigma(squared: FloatArray) -> float:
-        """Standard deviation of an error's coordinate from the median of their lengths."""
-        if not len(squared):
-            return _SMALLEST_SIGMA
-        median = float(np.sqrt(np.median(squared)))
-        return max(median / _MEDIAN_RADIUS, _SMALLEST_SIGMA) if np.isfinite(median) else 1e3
+
+def sigma_of(squared: FloatArray) -> float:
+    """Standard deviation of an error's coordinate, px, from the median of the squared lengths (M,)."""
+    if not len(squared):
+        return _SMALLEST_SIGMA
+    median = float(np.sqrt(np.median(squared)))
+    return max(median / _MEDIAN_RADIUS, _SMALLEST_SIGMA) if np.isfinite(median) else 1e3
 
 
 def _covariance(information: FloatArray) -> FloatArray:

@@ -9,12 +9,14 @@ than about a tenth of a pixel, which therefore counts as noise.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
-from rdstitch.registration.bundle_adjustment import WIDTH_PER_SIGMA
+from rdstitch.camera import FloatArray
+from rdstitch.registration.bundle_adjustment import WIDTH_PER_SIGMA, sigma_of
 from rdstitch.registration.consistency import misfitting_links
-from rdstitch.registration.models import LOG_HEIGHT
+from rdstitch.registration.models import LOG_HEIGHT, MODELS, BoolArray, Model
 from rdstitch.registration.normal_equations import whitened_errors
 from rdstitch.registration.problem import Fit, Problem
 from rdstitch.registration.relief import coherence
@@ -40,33 +42,93 @@ class Choice:
     overdispersion: float
 
 
-def choose_model(problem: Problem, fits: Sequence[Fit]) -> Choice:
-    """The best of the models, given from the least to the most free."""
-    freest = fits[-1].adjusted
-    observations = problem.observations
-    errors = whitened_errors(observations, freest.homographies, freest.parameters.lens)
-    inliers = freest.squared <= (WIDTH_PER_SIGMA * freest.sigma) ** 2
-    overdispersion = coherence(observations, errors, inliers).overdispersion
-    right = ~misfitting_links(freest.squared, observations)[observations.link]
-    noise = math.hypot(freest.sigma, _EXACTNESS)
-    effective = 2.0 * float((right & inliers).sum()) / overdispersion
-    costs = []
-    for fit in fits:
-        ratio = np.minimum(fit.adjusted.squared[right], 1e12) / noise**2
-        width = WIDTH_PER_SIGMA**2
-        misfit = float((width * np.log1p(ratio / width)).sum()) / overdispersion
-        costs.append(misfit + _parameters(problem, fit) * math.log(max(effective, 2.0)))
-    best = int(np.argmin(costs))
-    return Choice(fits[best], _reason(fits, best), overdispersion)
+def choose_model(problem: Problem, names: Sequence[str]) -> Choice:
+    """Adjust models from the least to the most free, and take the best.
+
+    A homography for every link on its own leaves errors that no model of the family can undercut. Once freer models
+    could not pay for their freedom even with those, they are not tried.
+    """
+    bound = _Yardstick.of_links_apart(problem)
+    least = bound.misfit(_errors(problem, problem.homographies, problem.lens))
+    fits: list[Fit] = []
+    for name in names:
+        model = MODELS[name]
+        if fits and min(bound.cost(problem, fit) for fit in fits) <= least + bound.price(problem, model):
+            break
+        fits.append(problem.fit(model, fits[-1:]))
+    yardstick = bound if len(fits) < len(names) else _Yardstick.of_fit(problem, fits[-1])
+    best = int(np.argmin([yardstick.cost(problem, fit) for fit in fits]))
+    return Choice(fits[best], _reason(fits, best, list(names)), yardstick.overdispersion)
 
 
-def _parameters(problem: Problem, fit: Fit) -> int:
-    """Free parameters of a fit."""
-    poses = problem.count * fit.model.pose_size - int(fit.model.gauge.sum())
-    return poses + len(fit.model.shared_names) + int(problem.free_lens.sum())
+@dataclass(frozen=True)
+class _Yardstick:
+    """What the errors of a model are measured by.
+
+    Attributes
+    ----------
+    noise : float
+        Standard deviation of an error's coordinate when the model is right, px.
+    overdispersion : float
+    counted : ndarray of shape (M,), bool
+        Correspondences of links that fit.
+    effective : float
+        Independent observations.
+    """
+
+    noise: float
+    overdispersion: float
+    counted: BoolArray
+    effective: float
+
+    @classmethod
+    def of_links_apart(cls, problem: Problem) -> Self:
+        """From the errors of every link on its own."""
+        errors = whitened_errors(problem.observations, problem.homographies, problem.lens)
+        matches = len(errors)
+        freedom = max(1.0 - 4.0 * len(problem.observations) / max(matches, 1), 0.1)
+        return cls._from(problem, errors, freedom**-0.5)
+
+    @classmethod
+    def of_fit(cls, problem: Problem, fit: Fit) -> Self:
+        """From the errors of the freest model."""
+        adjusted = fit.adjusted
+        errors = whitened_errors(problem.observations, adjusted.homographies, adjusted.parameters.lens)
+        return cls._from(problem, errors, 1.0)
+
+    @classmethod
+    def _from(cls, problem: Problem, errors: FloatArray, enlarged: float) -> Self:
+        squared = np.nan_to_num(np.einsum("mi,mi->m", errors, errors), nan=np.inf)
+        sigma = sigma_of(squared)
+        inliers = squared <= (WIDTH_PER_SIGMA * sigma) ** 2
+        overdispersion = coherence(problem.observations, errors, inliers).overdispersion
+        counted = ~misfitting_links(squared, problem.observations)[problem.observations.link]
+        effective = max(2.0 * float((counted & inliers).sum()) / overdispersion, 2.0)
+        return cls(math.hypot(sigma * enlarged, _EXACTNESS), overdispersion, counted, effective)
+
+    def misfit(self, squared: FloatArray) -> float:
+        """Robust sum of squared errors in units of the noise."""
+        ratio = np.minimum(squared[self.counted], 1e12) / self.noise**2
+        return float((WIDTH_PER_SIGMA**2 * np.log1p(ratio / WIDTH_PER_SIGMA**2)).sum()) / self.overdispersion
+
+    def price(self, problem: Problem, model: Model) -> float:
+        """What the parameters of a model cost."""
+        poses = problem.count * model.pose_size - int(model.gauge.sum())
+        return (poses + len(model.shared_names) + int(problem.free_lens.sum())) * math.log(self.effective)
+
+    def cost(self, problem: Problem, fit: Fit) -> float:
+        """Misfit and price of a fit."""
+        return self.misfit(fit.adjusted.squared) + self.price(problem, fit.model)
 
 
-def _reason(fits: Sequence[Fit], best: int) -> str:
+def _errors(problem: Problem, homographies: FloatArray, lens: FloatArray) -> FloatArray:
+    """``|r|²`` (M,) of the correspondences; inf where there is no transfer."""
+    errors = whitened_errors(problem.observations, homographies, lens)
+    squared: FloatArray = np.nan_to_num(np.einsum("mi,mi->m", errors, errors), nan=np.inf)
+    return squared
+
+
+def _reason(fits: Sequence[Fit], best: int, names: Sequence[str]) -> str:
     """Why the model was taken, one sentence."""
     name, own = fits[best].model.name, fits[best].adjusted.sigma
     what = {
@@ -76,14 +138,15 @@ def _reason(fits: Sequence[Fit], best: int) -> str:
         f"tilts by {math.degrees(fits[best].tilt_spread):.1f} degrees",
         "homography": "no planar motion of one camera describes the pictures",
     }[name]
-    if len(fits) == 1:
+    if len(names) == 1:
         return f"{name}: as asked for; it leaves an error of {own:.2f} px"
-    less = "; ".join(f"{fit.model.name} {fit.adjusted.sigma:.2f} px" for fit in fits[:best])
-    more = "; ".join(f"{fit.model.name} {fit.adjusted.sigma:.2f} px" for fit in fits[best + 1 :])
+    less = ", ".join(f"{fit.model.name} {fit.adjusted.sigma:.2f} px" for fit in fits[:best])
+    more = ", ".join(f"{fit.model.name} {fit.adjusted.sigma:.2f} px" for fit in fits[best + 1 :])
     return (
         f"{name}: {what}; it leaves an error of {own:.2f} px"
         + (f", less free models more ({less})" if less else "")
         + (f", more freedom gains too little ({more})" if more else "")
+        + (", and nothing is left for more freedom to gain" if len(fits) < len(names) else "")
     )
 
 

@@ -18,7 +18,7 @@ from rdstitch.registration.bundle_adjustment import (
 from rdstitch.registration.consistency import link_medians
 from rdstitch.registration.graph import spanning_tree
 from rdstitch.registration.initialization import adjust_apart
-from rdstitch.registration.models import HOMOGRAPHY, PSI, THETA, BoolArray, Model
+from rdstitch.registration.models import HOMOGRAPHY, PSI, SIMILARITY, THETA, BoolArray, Model
 from rdstitch.registration.normal_equations import robust_cost
 from rdstitch.registration.observations import IntArray, Observations
 
@@ -30,6 +30,9 @@ _USUAL_FOCAL, _USUAL_FOCAL_STD = 1.9, 0.4
 
 _WIDEST_START = 0.05
 """Half diagonals: errors that a chain may have gathered before the adjustment, beyond which a link is doubted."""
+
+_TRIAL_LINKS, _TRIAL_MATCHES = 30, 40
+"""What the tilts to start from are tried on."""
 
 _TILT_SPREAD_START = math.radians(3.0)
 _TILT_SPREAD_LEAST = math.radians(0.05)
@@ -149,10 +152,11 @@ class Problem:
     overdispersion: float = 1.0
 
     def fit(self, model: Model, others: Sequence[Fit] = ()) -> Fit:
-        """Adjust a model from the chained links or another model's solution, whichever is nearer."""
-        starts = [self._chained(model), *(self._taken_over(model, other) for other in others)]
-        start = self._nearest(model, starts)
-        return self.refine(model, start)
+        """Adjust a model from the chained links or from the solution of a less free model, whichever is nearer."""
+        starts = [self._taken_over(model, other) for other in others]
+        if not (others and self._tilts_are_free(model)):
+            starts.append(self._chained(model, others))
+        return self.refine(model, self._nearest(model, starts))
 
     def squared(self, model: Model, parameters: Parameters) -> FloatArray:
         """``|r|²`` of each correspondence (M,) at some parameters, px², whitened."""
@@ -189,34 +193,38 @@ class Problem:
         priors = self.knowledge.priors(model, self.count, tilt_spread)
         return Adjuster(model, self.observations, freedom, priors, self.overdispersion)
 
-    def _chained(self, model: Model) -> Parameters:
+    def _chained(self, model: Model, others: Sequence[Fit]) -> Parameters:
         """Every link on its own, chained along the tree of the links with the most correspondences."""
-        apart = self._apart(model)
-        o, attitudes, shared = self.observations, self.knowledge.attitudes, apart.parameters.shared
+        o, attitudes = self.observations, self.knowledge.attitudes
+        shared, lens, homographies = np.zeros(0), self.lens, self.homographies
+        if model.shared_names:
+            apart = self._planar_apart(SIMILARITY if self._tilts_are_free(model) else model, others)
+            shared, lens, homographies = apart.parameters.shared, apart.parameters.lens, apart.homographies
         matches = np.diff(o.start).astype(np.float64)
         tree = spanning_tree(self.count, o.image1, o.image2, matches, self.reference)
         origin = model.origins(shared, attitudes[[tree.root]])[0]
-        chained = tree.chained(apart.homographies, o.image1, origin)
-        return Parameters(model.poses_from(chained, shared, attitudes), shared, apart.parameters.lens)
+        chained = tree.chained(homographies, o.image1, origin)
+        return Parameters(model.poses_from(chained, shared, attitudes), shared, lens)
 
-    def _apart(self, model: Model) -> Adjusted:
-        """Every link on its own; planar models from the best of several tilts."""
+    def _planar_apart(self, model: Model, others: Sequence[Fit]) -> Adjusted:
+        """Every link on its own, from the tilt of another planar model or the best of several."""
         priors = self.knowledge.priors(model, self.count, _TILT_SPREAD_START)
-
-        def run(observations: Observations, homographies: FloatArray, shared: FloatArray) -> Adjusted:
-            lens, known = self.lens, self.knowledge.attitudes
-            return adjust_apart(model, observations, homographies, shared, lens, self.free_lens, priors, known)
-
-        if not model.shared_names:
-            return run(self.observations, self.homographies, np.zeros(0))
-        few = np.linspace(0, len(self.observations) - 1, min(len(self.observations), 60)).astype(np.intp)
-        trials = [
-            run(self.observations.subset(few).thinned(60), self.homographies[few], shared)
-            for shared in self._tilts_to_try(model, priors.shared)
-        ]
-        width = WIDTH_PER_SIGMA * min(trial.sigma for trial in trials)
-        best = min(trials, key=lambda trial: float(robust_cost(trial.squared, width).sum()))
-        return run(self.observations, self.homographies, best.parameters.shared)
+        free, known = self.free_lens, self.knowledge.attitudes
+        planar = [other for other in others if other.model.shared_names]
+        if planar:
+            best = planar[-1].adjusted.parameters.shared
+        else:
+            links = len(self.observations)
+            few = np.linspace(0, links - 1, min(links, _TRIAL_LINKS)).astype(np.intp)
+            sample, own = self.observations.subset(few).thinned(_TRIAL_MATCHES), self.homographies[few]
+            trials = [
+                adjust_apart(model, sample, own, shared, self.lens, free, priors, known)
+                for shared in self._tilts_to_try(model, priors.shared)
+            ]
+            width = WIDTH_PER_SIGMA * min(trial.sigma for trial in trials)
+            cost = [float(robust_cost(trial.squared, width).sum()) for trial in trials]
+            best = trials[int(np.argmin(cost))].parameters.shared
+        return adjust_apart(model, self.observations, self.homographies, best, self.lens, free, priors, known)
 
     def _tilts_to_try(self, model: Model, natural: FloatArray) -> list[FloatArray]:
         """Shared parameters for the known or zero tilt, and for four around that, 0.2 radians away."""
