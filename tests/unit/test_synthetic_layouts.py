@@ -90,11 +90,15 @@ def test_parking_ends_parallel_and_aside() -> None:
 
 
 def test_joined_paths_go_on_where_the_last_ended() -> None:
-    path = joined(line_poses(LENS, 10), turn_poses(LENS, 21), parking_poses(LENS, 31))
+    path = joined(line_poses(LENS, 10), turn_poses(LENS, 21, heading=0.9), parking_poses(LENS, 31, heading=-2.0))
     assert len(path) == 10 + 20 + 30
     step = np.linalg.norm(np.diff(path.position, axis=0), axis=1)
     np.testing.assert_allclose(step, step[0], rtol=1e-9)
     assert path.yaw[29] == pytest.approx(-np.pi / 2)
+    move = np.diff(path.position, axis=0)
+    # At the joints (9, 29) the robot drives where it looks.
+    for joint, heading in ((9, 0.0), (29, np.pi / 2)):
+        np.testing.assert_allclose(move[joint] / step[joint], (np.cos(heading), np.sin(heading)), atol=1e-9)
 
 
 @pytest.mark.parametrize("count", [117, 158])
