@@ -19,14 +19,14 @@ RealArray = NDArray[np.floating[Any]]
 DEFAULT_STARTS: FloatArray = np.array(
     [
         (0.0, 0.0, -0.35),
-        (-0.15, 0.15, -0.1),
-        (0.3, -0.3, -0.35),
-        (-0.3, -0.15, -0.35),
-        (0.3, 0.45, -0.1),
-        (0.15, 0.0, -0.35),
-        (-0.45, -0.45, -0.1),
-        (0.0, 0.45, -0.1),
-        (0.3, -0.45, -0.1),
+        (-0.2, 0.1, -0.1),
+        (0.2, -0.1, -0.35),
+        (0.2, 0.45, -0.35),
+        (-0.3, -0.45, -0.35),
+        (0.45, -0.45, -0.1),
+        (-0.3, 0.45, -0.35),
+        (0.3, 0.1, -0.35),
+        (0.0, -0.2, -0.35),
     ]
 )
 """Starts (a, b, λ) that complement each other: chosen one by one for the solutions that the earlier ones miss."""
@@ -157,7 +157,9 @@ def _between(length: RealArray, depth: RealArray) -> RealArray:
     """Difference between the pictures of ``length - (sum of depth over the pair)``, from (2, 3, B) to (3, B)."""
     difference: RealArray = depth[0] - depth[1]
     # The sum over a pair is the sum over all three points less the opposite one.
-    return (length[0] - length[1]) + (difference - difference.sum(axis=0))
+    difference -= difference.sum(axis=0)
+    difference += length[0] - length[1]
+    return difference
 
 
 def _solve_3x3(a: RealArray, b: RealArray, c: RealArray, right: RealArray) -> RealArray:
@@ -216,7 +218,7 @@ def newton(system: DistanceSystem, starts: FloatArray) -> tuple[IndexArray, Floa
 
 
 def _leaders(state: RealArray) -> BoolArray:
-    """Of the states (3, S, B) of each sample the first of every group that has met, unless it makes no sense; (S B,)."""
+    """Of the states (3, S, B) of each sample the first of all that have met, unless it makes no sense; (S B,)."""
     leads: BoolArray = np.abs(state).max(axis=0) < _STEEPEST
     for later in range(1, state.shape[1]):
         distance = np.abs(state[:, :later] - state[:, later, None]).max(axis=0)
