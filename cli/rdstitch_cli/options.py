@@ -28,7 +28,7 @@ def together(*options: Callable[[Any], Any]) -> Decorator[Any]:
     return decorate
 
 
-class Angles(click.ParamType):
+class Angles(click.ParamType[tuple[float, float]]):
     """Two angles in degrees, ``PSI,THETA``; the value is in radians."""
 
     name = "PSI,THETA"

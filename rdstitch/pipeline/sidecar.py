@@ -23,47 +23,46 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
     """
     registration, alignment = result.registration, result.registration.alignment
     camera = alignment.cameras[alignment.reference]
-    return _plain(
-        {
-            "format": "rdstitch sidecar",
-            "version": VERSION,
-            "lambda": alignment.distortion,
-            "lambda_std": alignment.distortion_std,
-            "lambda_px": camera.distortion_px,
-            "lambda_focal": camera.distortion_focal,
-            "lambda_known": alignment.distortion_std == 0.0,
-            "camera": camera.as_dict(),
-            "tilt_deg": None if alignment.tilt is None else np.degrees(alignment.tilt),
-            "focal_px": camera.focal,
-            "focal_source": camera.focal_source,
-            "model": alignment.model,
-            "model_reason": alignment.model_reason,
-            "rms_px": alignment.rms,
-            "reference": registration.sources[alignment.reference].name,
-            "output": {
-                "file": None if result.output is None else result.output.name,
-                "size": result.canvas.size,
-                "plane_to_output": result.canvas.matrix,
-            },
-            "images": _images(result),
-            "pairs": _pairs(result),
-            "verdict": {
-                "ok": result.verdict.ok,
-                "failures": result.verdict.failures,
-                "warnings": result.warnings,
-                "relief": alignment.relief,
-            },
-            "options": result.options,
-            "seed": result.options.seed,
-            "versions": {
-                "rdstitch": version("rdstitch"),
-                "numpy": version("numpy"),
-                "scipy": version("scipy"),
-                "opencv": version("opencv-contrib-python-headless"),
-                "python": platform.python_version(),
-            },
-        }
-    )
+    content = {
+        "format": "rdstitch sidecar",
+        "version": VERSION,
+        "lambda": alignment.distortion,
+        "lambda_std": alignment.distortion_std,
+        "lambda_px": camera.distortion_px,
+        "lambda_focal": camera.distortion_focal,
+        "lambda_known": alignment.distortion_std == 0.0,
+        "camera": camera.as_dict(),
+        "tilt_deg": None if alignment.tilt is None else np.degrees(alignment.tilt),
+        "focal_px": camera.focal,
+        "focal_source": camera.focal_source,
+        "model": alignment.model,
+        "model_reason": alignment.model_reason,
+        "rms_px": alignment.rms,
+        "reference": registration.sources[alignment.reference].name,
+        "output": {
+            "file": None if result.output is None else result.output.name,
+            "size": result.canvas.size,
+            "plane_to_output": result.canvas.matrix,
+        },
+        "images": _images(result),
+        "pairs": _pairs(result),
+        "verdict": {
+            "ok": result.verdict.ok,
+            "failures": result.verdict.failures,
+            "warnings": result.warnings,
+            "relief": alignment.relief,
+        },
+        "options": result.options,
+        "seed": result.options.seed,
+        "versions": {
+            "rdstitch": version("rdstitch"),
+            "numpy": version("numpy"),
+            "scipy": version("scipy"),
+            "opencv": version("opencv-contrib-python-headless"),
+            "python": platform.python_version(),
+        },
+    }
+    return {key: _plain(value) for key, value in content.items()}
 
 
 def _images(result: StitchResult) -> list[dict[str, Any]]:

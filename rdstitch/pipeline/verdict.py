@@ -37,7 +37,9 @@ def judge(registration: Registration, threshold: float) -> Verdict:
     threshold : float
         Largest transfer error of an inlier of a pair, px.
     """
-    alignment, failures, doubts = registration.alignment, [], []
+    alignment = registration.alignment
+    failures: list[str] = []
+    doubts: list[str] = []
     used = [fit for fit in alignment.links if fit.used]
     names = [source.name for source in registration.sources]
     if not np.isfinite(alignment.rms) or alignment.rms > _LARGEST_RMS * threshold:

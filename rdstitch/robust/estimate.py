@@ -13,7 +13,7 @@ from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.pair_models import HomographyModel, PairModel, PlanarModel, Tilts
 from rdstitch.robust.ransac import Hypothesis, RansacOptions, Search, ransac
 from rdstitch.robust.selection import Selection, rms_of, select_model
-from rdstitch.robust.verification import doubts
+from rdstitch.robust.verification import LEAST_PLACES, doubts, places
 
 SOLVERS = ("auto", "two_point", "three_point", "three_point_similarity", "four_point", "five_point")
 
@@ -98,8 +98,9 @@ def estimate_radial_homography(
     data = Measurements.from_pixels(p1, p2, camera1, camera2, weights)
 
     solvers = _solvers(solver, camera1, tilts, distortion)
-    if len(data) < min(s.sample_size for s in solvers):
-        return RadialHomography.failed(f"only {len(data)} matches", camera1, camera2, len(data))
+    if (found := places(p1, p2, camera2.image_size)) < LEAST_PLACES:
+        reason = f"only {len(data)} matches, in {found} places of the picture"
+        return RadialHomography.failed(reason, camera1, camera2, len(data))
     search = ransac(solvers, data, RansacOptions(threshold, confidence, max_iterations, seed))
     if search.best is None:
         reason = f"no plausible model in {search.iterations} samples of {len(data)} matches"
@@ -177,7 +178,6 @@ def _result(
     chosen: Selection, search: Search, found: Hypothesis, camera1: Camera, camera2: Camera, threshold: float
 ) -> RadialHomography:
     fit, model = chosen.fit, chosen.fit.model
-    planar = isinstance(model, PlanarModel)
     camera1 = replace(camera1, distortion=fit.distortion, distortion_std=chosen.distortion_std)
     if not search.confident:
         reason = f"{chosen.reason}; the search stopped at its limit of samples before it was confident"
@@ -191,7 +191,7 @@ def _result(
         covariance=chosen.covariance,
         distortion_std=chosen.distortion_std,
         model=model.name,
-        motion=model.motion(fit.state) if planar else None,
+        motion=model.motion(fit.state) if isinstance(model, PlanarModel) else None,
         rms=rms_of(fit.errors, threshold),
         solver=found.solver,
         iterations=search.iterations,

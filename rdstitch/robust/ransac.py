@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rdstitch.camera import FloatArray
 from rdstitch.robust.local_optimization import refine
@@ -18,6 +19,7 @@ _LARGEST_BATCH = 512
 _LEAST_EXPLORATION = 96  # samples that every solver draws unless its own confidence is reached before
 _QUICK_SCORE = 384  # correspondences on which hypotheses are compared before the best are scored on all
 _SOLVER_SUCCESS = 0.8  # share of all-inlier samples that lead to the model, in the face of noise
+_NOVELTY = 0.1  # share of a hypothesis's inliers that must be new for it to be worth optimising
 _FREE_REFINEMENT = 12  # inliers from which on refinement may leave the model that the minimal solver assumes
 
 
@@ -42,7 +44,7 @@ class Hypothesis:
     distortion : float
     cost : float
         Mean truncated loss: 1 where nothing fits, 0 where all fits exactly.
-    inlier_share : float
+    inliers : ndarray of shape (N,), bool
     solver : str
         Name of the minimal solver that found it.
     """
@@ -50,8 +52,17 @@ class Hypothesis:
     homography: FloatArray
     distortion: float
     cost: float
-    inlier_share: float
+    inliers: NDArray[np.bool_]
     solver: str
+
+    @property
+    def inlier_share(self) -> float:
+        """Share of the correspondences that agree."""
+        return float(self.inliers.mean())
+
+    def repeats(self, other: "Hypothesis") -> bool:
+        """Whether it explains hardly anything that the other does not explain."""
+        return int((self.inliers & ~other.inliers).sum()) <= _NOVELTY * int(self.inliers.sum())
 
 
 @dataclass(frozen=True)
@@ -138,13 +149,15 @@ class _Lane:
         if costs[first] >= min(self._least_raw_cost, 1.0):
             return best
         self._least_raw_cost = float(costs[first])
-        candidate = self._optimize(found.homography[first], float(found.distortion[first]))
+        candidate = self._judge(found.homography[first], float(found.distortion[first]))
+        if best is not None and candidate.cost > best.cost and candidate.repeats(best):
+            return best
+        candidate = self._optimize(candidate)
         return candidate if best is None or candidate.cost < best.cost else best
 
-    def _optimize(self, homography: FloatArray, distortion: float) -> Hypothesis:
+    def _optimize(self, start: Hypothesis) -> Hypothesis:
         """The best of a hypothesis, its refinement in the model it assumes, and from there as a free homography."""
-        best = self._judge(homography, distortion)
-        best = self._refined(best, self._solver.model, 3.0 * self._options.threshold)
+        best = self._refined(start, self._solver.model, 3.0 * self._options.threshold)
         enough = best.inlier_share * len(self._data) >= _FREE_REFINEMENT
         return self._refined(best, HomographyModel() if enough else self._solver.model, self._options.threshold)
 
@@ -165,9 +178,7 @@ class _Lane:
     def _judge(self, homography: FloatArray, distortion: float) -> Hypothesis:
         errors2 = transfer_errors2(homography[None], np.array([distortion]), self._data)[0]
         relative = np.minimum(errors2 / self._options.threshold**2, 1.0)
-        return Hypothesis(
-            homography, distortion, float(relative.mean()), float((relative < 1.0).mean()), self._solver.name
-        )
+        return Hypothesis(homography, distortion, float(relative.mean()), relative < 1.0, self._solver.name)
 
 
 def _subset(data: Measurements, seed: int) -> Measurements:

@@ -23,7 +23,7 @@ def plausible(solutions: Solutions, corner_radius: float) -> NDArray[np.bool_]:
         size = np.linalg.norm(h, axis=(1, 2))
         determinant = np.linalg.det(h) / size**3
         bend = solutions.distortion * corner_radius**2
-        return np.isfinite(size) & (determinant > _LEAST_DETERMINANT) & (np.abs(bend) < 1.0)
+        return np.asarray(np.isfinite(size) & (determinant > _LEAST_DETERMINANT) & (np.abs(bend) < 1.0))
 
 
 def transfer_errors2(homography: FloatArray, distortion: FloatArray, data: Measurements) -> FloatArray:

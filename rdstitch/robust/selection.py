@@ -87,8 +87,15 @@ def select_model(
         points = near if iterations else data
         scale = min(threshold, _LOSS_WIDTH * noise)
         return refine(
-            model, start.homography, distortion, points, scale, fixed_distortion=fixed, noise=noise, iterations=iterations
-        )  # fmt: skip
+            model,
+            start.homography,
+            distortion,
+            points,
+            scale,
+            fixed_distortion=fixed,
+            noise=noise,
+            iterations=iterations,
+        )
 
     fits = [fit(model, free, free.distortion, fixed_distortion) for model in models]
     criteria = [f.cost / noise**2 + len(f.information) * np.log(2 * inliers) for f in fits]

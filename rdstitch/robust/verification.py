@@ -1,21 +1,24 @@
 """Whether agreement is more than chance."""
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import betainc
 
 from rdstitch.camera import FloatArray
 
 _CELLS_PER_DIAGONAL = 32
-_LEAST_CELLS = 8
+LEAST_PLACES = 8
 _LARGEST_CHANCE = 1e-4
 
 
+def places(points1: FloatArray, points2: FloatArray, image_size: tuple[int, int]) -> int:
+    """In how many different places of the pictures correspondences (N, 2), px, lie: cells of a grid, in the lesser."""
+    cell = float(np.hypot(*image_size)) / _CELLS_PER_DIAGONAL
+    return min(len(np.unique(np.floor(points / cell), axis=0)) for points in (points1, points2))
+
+
 def doubts(
-    points1: FloatArray,
-    points2: FloatArray,
-    inliers: FloatArray,
-    image_size: tuple[int, int],
-    threshold: float,
+    points1: FloatArray, points2: FloatArray, inliers: NDArray[np.bool_], image_size: tuple[int, int], threshold: float
 ) -> str | None:
     """Why the inliers could be chance, or None.
 
@@ -34,9 +37,8 @@ def doubts(
         px.
     """
     count = int(inliers.sum())
-    cell = float(np.hypot(*image_size)) / _CELLS_PER_DIAGONAL
-    cells = min(len(np.unique(np.floor(p[inliers] / cell), axis=0)) for p in (points1, points2))
-    if cells < _LEAST_CELLS:
+    cells = places(points1[inliers], points2[inliers], image_size)
+    if cells < LEAST_PLACES:
         return f"{count} of {len(inliers)} matches agree, in only {cells} places of the picture"
     by_chance = min(0.5, np.pi * threshold**2 / (image_size[0] * image_size[1]) + 0.01)
     trials = len(inliers) - 4

@@ -1,6 +1,7 @@
 """``rdstitch undistort``: straight lines become straight."""
 
 from pathlib import Path
+from typing import Literal
 
 import click
 
@@ -35,7 +36,7 @@ def undistort(
     distortion: float | None,
     output: Path,
     overwrite: bool,
-    view: str,
+    view: Literal["same", "all", "valid"],
     quiet: bool,
     verbose: bool,
 ) -> None:
