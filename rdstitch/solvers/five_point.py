@@ -73,5 +73,3 @@ class DirectionEquation(SampleArrays):
         a1, a2, a3, b1, b2, b3, g1, g2, g3 = constant + slope * distortion
         value: FloatArray = b1 * a2 * a3 * g1 + b2 * a3 * a1 * g2 + b3 * a1 * a2 * g3
         return value
-
-    residual = polynomial

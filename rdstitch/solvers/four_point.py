@@ -109,8 +109,6 @@ class QuarticEquation(SampleArrays):
         )
         return value
 
-    residual = polynomial
-
 
 class SexticEquation(SampleArrays):
     """``tr(adj H)³ = det(H) tr(H)³`` without its common factor ``(α_0 α_1 α_2 α_3)²``: of degree 16 in λ.
@@ -141,8 +139,3 @@ class SexticEquation(SampleArrays):
         """The equation itself."""
         a, b, f, g = self._sides(distortion)
         return a * g**3 - b * f**3
-
-    def residual(self, distortion: FloatArray) -> FloatArray:
-        """The same of cube roots."""
-        a, b, f, g = self._sides(distortion)
-        return np.asarray(np.cbrt(a) * g - np.cbrt(b) * f)

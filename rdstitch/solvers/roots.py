@@ -4,10 +4,12 @@ Every minimal problem of this package is one polynomial equation in λ per sampl
 at Chebyshev nodes of the sample's interval; one matrix product turns them into Bernstein coefficients on a few cells.
 By Descartes' rule a cell whose coefficients never change sign has no root, and one with a single change has exactly
 one. Cells with more changes are halved until they are isolated or as good as double; none is missed, as on a grid of
-samples. Each root is then polished on the equation itself, which is better conditioned than the polynomial
-through its values.
+samples. Newton's method on the Chebyshev series finds each root, and its last steps use the equation itself, which
+is better conditioned than the polynomial through its values.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from itertools import pairwise
 from typing import Protocol, Self
@@ -25,17 +27,19 @@ _DEPTH = 6
 # Relative to the largest value of the polynomial: what counts as a double root. Values of the polynomial are rounded
 # to about 1e-15 of it.
 _TOUCHING = 1e-13
-_POLISHING_STEPS = 12
+_NEWTON_STEPS = 40
+# In units of half the interval. Newton's method squares the error: the next step would be below rounding error.
+_NEWTON_CONVERGED = 1e-7
+_POLISHING_STEPS = 2
+# A longer step belongs to a double root, whose slope says nothing.
+_LONGEST_POLISHING_STEP = 1e-2
 
 
 class Equation(Protocol):
-    """One scalar equation in λ for each sample of a batch."""
+    """One polynomial equation in λ for each sample of a batch."""
 
     def polynomial(self, distortion: FloatArray) -> FloatArray:
-        """Value of the polynomial for λ of shape (..., B)."""
-
-    def residual(self, distortion: FloatArray) -> FloatArray:
-        """A value with the same sign as the polynomial inside the interval, as well conditioned as possible."""
+        """Value of the polynomial, as accurate as possible, for λ of shape (..., B)."""
 
     def take(self, samples: IndexArray) -> Self:
         """The equations of some samples; indices may repeat."""
@@ -61,16 +65,19 @@ def real_roots(equation: Equation, degree: int, low: FloatArray, high: FloatArra
     """
     half = 0.5 * (high - low)
     middle = low + half
-    nodes = chebyshev_nodes(degree)
-    values = equation.polynomial(middle + nodes[:, None] * half)
-    largest = np.abs(values).max(axis=0)
-    values[:, ~((half > 0.0) & np.isfinite(largest))] = 1.0
-    sample, left, right, known = isolate(values, largest)
-    left = middle[sample] + left * half[sample]
-    right = middle[sample] + right * half[sample]
-    root = polish(equation.take(sample), left, right)
-    root[known] = left[known]
-    return sample, root
+    values = equation.polynomial(middle + chebyshev_nodes(degree)[:, None] * half)
+    values[:, ~((half > 0.0) & np.isfinite(values).all(axis=0))] = 1.0
+    brackets = isolate(values)
+    sample = brackets.sample
+    series = (chebyshev_from_values(degree) @ values)[:, sample]
+    t = bracketed_newton(series, brackets)
+    _, slope = chebyshev_value_and_slope(series, t)
+    middle, half, own = middle[sample], half[sample], equation.take(sample)
+    slope = np.where(slope != 0.0, slope, np.inf)
+    for _ in range(_POLISHING_STEPS):
+        step = own.polynomial(middle + t * half) / slope
+        t = t - np.where(np.abs(step) < _LONGEST_POLISHING_STEP, step, 0.0)
+    return sample, middle + t * half
 
 
 @lru_cache
@@ -78,6 +85,16 @@ def chebyshev_nodes(degree: int) -> FloatArray:
     """Chebyshev nodes of the first kind in [-1, 1], enough for a polynomial of this degree; shape (degree + 1,)."""
     count = degree + 1
     return np.cos((2 * np.arange(count) + 1) * np.pi / (2 * count))
+
+
+@lru_cache
+def chebyshev_from_values(degree: int) -> FloatArray:
+    """Matrix from values at the Chebyshev nodes to coefficients of the Chebyshev series."""
+    count = degree + 1
+    angles = (2 * np.arange(count) + 1) * np.pi / (2 * count)
+    matrix = 2.0 / count * np.cos(np.arange(count)[:, None] * angles)
+    matrix[0] /= 2.0
+    return np.asarray(matrix)
 
 
 @lru_cache
@@ -124,24 +141,41 @@ def bernstein_subdivision(degree: int, parts: int) -> FloatArray:
     return matrix
 
 
-def isolate(values: FloatArray, largest: FloatArray) -> tuple[IndexArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Brackets of all roots in [-1, 1] of polynomials given by their values at Chebyshev nodes.
+@dataclass(frozen=True)
+class Brackets:
+    """Intervals in [-1, 1] that hold one root each, by polynomial.
 
-    Parameters
+    Attributes
     ----------
-    values : ndarray of shape (degree + 1, B)
-    largest : ndarray of shape (B,)
-        Size of the values, the yardstick of what counts as zero.
-
-    Returns
-    -------
     sample : ndarray of shape (M,), intp
         Polynomial of each root, ascending.
     left, right : ndarray of shape (M,)
-        Interval that holds exactly one root.
-    known : ndarray of shape (M,), bool
-        Double roots, which have no sign change: found already, at ``left``.
+        Ends; equal for a double root, which has no sign change.
+    value_left, value_right : ndarray of shape (M,)
+        Values of the polynomial there, of opposite signs.
     """
+
+    sample: IndexArray
+    left: FloatArray
+    right: FloatArray
+    value_left: FloatArray
+    value_right: FloatArray
+
+    @classmethod
+    def of_cells(cls, sample: IndexArray, left: FloatArray, width: float, coefficients: FloatArray) -> Self:
+        """Whole cells with their Bernstein coefficients (M, degree + 1)."""
+        return cls(sample, left, left + width, coefficients[:, 0], coefficients[:, -1])
+
+    @classmethod
+    def joined(cls, parts: Sequence["Brackets"]) -> Self:
+        """All of them, ascending by sample and then by root."""
+        columns = [np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)]
+        order = np.lexsort((columns[1], columns[0]))
+        return cls(*(column[order] for column in columns))
+
+
+def isolate(values: FloatArray) -> Brackets:
+    """Brackets of all roots in [-1, 1] of polynomials given by their values (degree + 1, B) at Chebyshev nodes."""
     degree = len(values) - 1
     count = degree + 1
     matrix = bernstein_from_values(degree, _CELLS)
@@ -151,9 +185,11 @@ def isolate(values: FloatArray, largest: FloatArray) -> tuple[IndexArray, FloatA
 
     width = 2.0 / _CELLS
     cell, sample = np.nonzero(changes == 1)
-    found = [(sample, width * cell - 1.0, width * (cell + 1) - 1.0)]
+    left = width * cell - 1.0
+    ends = coefficients[:, [0, -1]][cell, :, sample]
+    found = [Brackets.of_cells(sample, left, width, ends)]
     cell, sample = np.nonzero(changes > 1)
-    left = np.asarray(width * cell - 1.0, dtype=np.float64)
+    left = width * cell - 1.0
     current = coefficients[cell, :, sample]
     split = bernstein_subdivision(degree, _PARTS).reshape(-1, count).T
     for _ in range(_DEPTH):
@@ -166,42 +202,39 @@ def isolate(values: FloatArray, largest: FloatArray) -> tuple[IndexArray, FloatA
         positive = current > 0.0
         changes = (positive[:, 1:] != positive[:, :-1]).sum(axis=1, dtype=np.uint8)
         one, more = changes == 1, changes > 1
-        found.append((sample[one], left[one], left[one] + width))
+        found.append(Brackets.of_cells(sample[one], left[one], width, current[one]))
         sample, left, current = sample[more], left[more], current[more]
-
-    samples, lefts, rights = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    known = np.zeros(len(samples), dtype=np.bool_)
     if len(sample):
-        close = _close_pairs(current, sample, left, width, largest)
-        samples, lefts, rights, known = (
-            np.concatenate(pair) for pair in zip((samples, lefts, rights, known), close, strict=True)
-        )
-    order = np.lexsort((lefts, samples))
-    return samples[order], lefts[order], rights[order], known[order]
+        found.append(_close_pairs(current, sample, left, width, np.abs(values).max(axis=0)))
+    return Brackets.joined(found)
 
 
 def _close_pairs(
     coefficients: FloatArray, sample: IndexArray, left: FloatArray, width: float, largest: FloatArray
-) -> tuple[IndexArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Roots of cells so narrow that the polynomial is a parabola there; same values as :func:`isolate`."""
+) -> Brackets:
+    """Roots in cells so narrow that the polynomial is a parabola there.
+
+    ``largest`` (B,) is the size of the values of each polynomial: the yardstick of what counts as zero.
+    """
     first, last = coefficients[:, 0], coefficients[:, -1]
     right = left + width
     crosses = (first > 0.0) != (last > 0.0)
-    # The parabola with the end slopes of the cell, c0 (1-s)² + 2 m s (1-s) + c2 s², has its vertex at s.
+    # The middle control point of the parabola with the same end values and mean end slope, and its vertex in [0, 1].
     degree = coefficients.shape[1] - 1
-    control = 0.5 * (first + last) + 0.25 * degree * ((coefficients[:, 1] - first) - (last - coefficients[:, -2]))
-    bend = first - 2.0 * control + last
+    bend = 0.5 * degree * ((last - coefficients[:, -2]) - (coefficients[:, 1] - first))
+    control = 0.5 * (first + last - bend)
     s = np.clip((first - control) / np.where(bend != 0.0, bend, np.inf), 0.0, 1.0)
     vertex = left + s * width
     lowest = bernstein_value(coefficients, s)
     dips = ~crosses & ((lowest > 0.0) != (first > 0.0))
     touches = ~crosses & ~dips & (np.abs(lowest) <= _TOUCHING * largest[sample])
-    return (
-        np.concatenate([sample[crosses], sample[dips], sample[dips], sample[touches]]),
-        np.concatenate([left[crosses], left[dips], vertex[dips], vertex[touches]]),
-        np.concatenate([right[crosses], vertex[dips], right[dips], vertex[touches]]),
-        np.repeat([False, True], [crosses.sum() + 2 * dips.sum(), touches.sum()]),
+    parts = (
+        (crosses, left, right, first, last),
+        (dips, left, vertex, first, lowest),
+        (dips, vertex, right, lowest, last),
+        (touches, vertex, vertex, lowest, lowest),
     )
+    return Brackets.joined([Brackets(sample[mask], *(column[mask] for column in columns)) for mask, *columns in parts])
 
 
 @lru_cache
@@ -221,34 +254,41 @@ def bernstein_value(coefficients: FloatArray, s: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("nj,nj->n", coefficients, weights))
 
 
-def polish(equation: Equation, left: FloatArray, right: FloatArray) -> FloatArray:
-    """Roots of the residuals in brackets, to rounding error: regula falsi with the weights of Anderson and Björck.
+def chebyshev_value_and_slope(coefficients: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Value and derivative of Chebyshev series (degree + 1, N) at t (N,), by Clenshaw's recurrence."""
+    twice = 2.0 * t
+    value, before = coefficients[-1], np.zeros_like(t)
+    slope, slope_before = np.zeros_like(t), np.zeros_like(t)
+    for c in coefficients[-2:0:-1]:
+        slope, slope_before = 2.0 * value + twice * slope - slope_before, slope
+        value, before = c + twice * value - before, value
+    return coefficients[0] + t * value - before, value + t * slope - slope_before
 
-    Parameters
-    ----------
-    equation : Equation
-        M equations.
-    left, right : ndarray of shape (M,)
-        Interval of each that holds one root.
 
-    Returns
-    -------
-    ndarray of shape (M,)
+def bracketed_newton(coefficients: FloatArray, brackets: Brackets) -> FloatArray:
+    """The root of each Chebyshev series (degree + 1, M) in its bracket; shape (M,).
+
+    Newton's method from where the chord crosses zero; a step that leaves the bracket is replaced by its middle.
     """
-    a, b = left.copy(), right.copy()
-    fa, fb = equation.residual(a), equation.residual(b)
-    root = np.where(np.abs(fa) < np.abs(fb), a, b)
-    for _ in range(_POLISHING_STEPS):
-        slope = fb - fa
-        step = np.where(slope != 0.0, fb * (b - a) / np.where(slope != 0.0, slope, 1.0), 0.0)
-        previous = root
-        root = b - step
-        value = equation.residual(root)
-        if not np.any(np.abs(root - previous) > 1e-15 * np.abs(root)):
+    left, right = brackets.left, brackets.right
+    change = brackets.value_right - brackets.value_left
+    rising = change > 0.0
+    t = left - brackets.value_left * (right - left) / np.where(change != 0.0, change, np.inf)
+    roots = t.copy()
+    active = np.arange(len(t))
+    for _ in range(_NEWTON_STEPS):
+        value, slope = chebyshev_value_and_slope(coefficients, t)
+        above = (value > 0.0) == rising
+        right = np.where(above, t, right)
+        left = np.where(above, left, t)
+        following = t - value / np.where(slope != 0.0, slope, np.inf)
+        following = np.where((following >= left) & (following <= right), following, 0.5 * (left + right))
+        roots[active] = following
+        going = np.flatnonzero(np.abs(following - t) > _NEWTON_CONVERGED)
+        if not len(going):
             break
-        switch = (value > 0.0) != (fb > 0.0)
-        weight = 1.0 - value / np.where(fb != 0.0, fb, 1.0)
-        fa = np.where(switch, fb, fa * np.where(weight > 0.0, weight, 0.5))
-        a = np.where(switch, b, a)
-        b, fb = root, value
-    return np.clip(root, left, right)
+        if len(going) < 0.7 * len(t):
+            active, coefficients = active[going], coefficients[:, going]
+            left, right, rising, following = left[going], right[going], rising[going], following[going]
+        t = following
+    return roots

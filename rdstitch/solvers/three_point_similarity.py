@@ -102,8 +102,3 @@ class DistanceRatioEquation(SampleArrays):
         """The equation itself."""
         m2, w, o2, v = self._sides(distortion)
         return m2 * w**2 - o2 * v**2
-
-    def residual(self, distortion: FloatArray) -> FloatArray:
-        """The same without squares, since depths are positive."""
-        m2, w, o2, v = self._sides(distortion)
-        return np.sqrt(m2) * w - np.sqrt(o2) * v

@@ -77,8 +77,3 @@ class DistanceEquation(SampleArrays):
         """The equation itself."""
         m2, w, o2, v = self._factors(distortion)
         return m2 * v**2 - o2 * w**2
-
-    def residual(self, distortion: FloatArray) -> FloatArray:
-        """The same without squares, since depths are positive."""
-        m2, w, o2, v = self._factors(distortion)
-        return np.sqrt(m2) * v - np.sqrt(o2) * w
