@@ -80,10 +80,8 @@ class Exposure:
 
         Depends, px by px, on nothing but the px: every box gives the same, bit for bit.
         """
-        full = full_scale(pixels.dtype)
-        values = pixels.astype(np.float32)
+        full = np.float32(full_scale(pixels.dtype))
         level = np.exp(-self.log_gain[index]).astype(np.float32)
-        offset = np.float32(self.offset * full)
         if self.vignetting.any() or self.blocks.size:
             x, y = np.broadcast_arrays(*lattice_nodes(box, _LATTICE))
             points = warp.source_points(x, y)
@@ -91,15 +89,15 @@ class Exposure:
             # Outside the picture only mirrored content is corrected; the model must not run away there.
             points = np.clip(np.nan_to_num(points), -0.5, (width - 0.5, height - 0.5))
             nodes = np.exp(-self.smooth_part(index, warp.camera, points)).astype(np.float32)
-            factor = interpolate_lattice(nodes, box, _LATTICE)
-            values += offset
-            values *= factor[..., None] * level
-            values -= offset
-        elif self.log_gain[index].any():
-            values += offset
-            values *= level
-            values -= offset
-        return np.clip(values, 0, np.float32(full), out=values) if pixels.dtype.kind == "u" else values
+            level = interpolate_lattice(nodes, box, _LATTICE)[..., None] * level
+        elif not self.log_gain[index].any():
+            return pixels.astype(np.float32)
+        values: Float32Array = pixels * level
+        if self.offset:
+            level -= np.float32(1.0)
+            level *= np.float32(self.offset) * full
+            values += level
+        return np.clip(values, 0, full, out=values) if pixels.dtype.kind == "u" else values
 
 
 def full_scale(dtype: np.dtype[Any]) -> float:
@@ -134,11 +132,7 @@ def estimate_exposure(survey: Survey, cameras: Sequence[Camera], blocks: bool = 
     if samples is None:
         return no_exposure(len(cameras), channels)
     offsets = (_SRGB_OFFSET, 0.0) if present[0].pixels.dtype.kind == "u" else (0.0,)
-    fits = [_fit(samples, b, len(cameras), vignetting) for b in offsets for vignetting in (False, True)]
-    best = fits[0]
-    for fit in fits[1:]:
-        if fit.rms_after < (1.0 - _WORTHWHILE) * best.rms_after:
-            best = fit
+    best = min((_fit_light(samples, b, len(cameras)) for b in offsets), key=lambda fit: fit.rms_after)
     return _with_blocks(best, samples, cameras) if blocks else best
 
 
@@ -211,6 +205,12 @@ def _values(tile: SurveyTile, box: Box, where: NDArray[np.intp]) -> FloatArray:
 def _radius2(camera: Camera, points: FloatArray) -> FloatArray:
     """Squared distance from the distortion centre, half diagonals."""
     return np.asarray((camera.normalize(points) ** 2).sum(axis=-1), dtype=np.float64)
+
+
+def _fit_light(samples: _Samples, offset: float, count: int) -> Exposure:
+    """Gains, and vignetting where it explains the data better."""
+    gains, vignetted = (_fit(samples, offset, count, vignetting) for vignetting in (False, True))
+    return vignetted if vignetted.rms_after < (1.0 - _WORTHWHILE) * gains.rms_after else gains
 
 
 def _fit(samples: _Samples, offset: float, count: int, vignetting: bool) -> Exposure:

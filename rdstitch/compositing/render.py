@@ -1,6 +1,6 @@
 """One tile of the output: which pictures have a say where, and their samples put together."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,11 +29,30 @@ _NOBODY = -1
 
 @dataclass(frozen=True)
 class Layer:
-    """One picture's weight on a box of the canvas: (h, w), float32, 0 where it has no say."""
+    """One picture's weight on a part of the canvas.
+
+    Attributes
+    ----------
+    index : int
+        Of the picture.
+    geometry : Geometry
+        Of the part of the canvas.
+    weight : ndarray of shape (h, w), float32
+        0 where the picture has no say.
+    """
 
     index: int
-    box: Box
+    geometry: Geometry
     weight: Float32Array
+
+    @property
+    def box(self) -> Box:
+        """Part of the canvas: x0, y0, x1, y1, px, end exclusive."""
+        return self.geometry.box
+
+    def bounds(self) -> Box:
+        """Smallest box that holds all of the weight."""
+        return _bounds(self.weight, self.box)
 
 
 @dataclass(frozen=True)
@@ -98,9 +117,9 @@ class Renderer:
                 continue
             if self.options.blend != "feather":
                 # One owner per px: a product and a quotient would cost the last bit.
-                np.copyto(_part(total, box, common), self._samples(layer.index, common), where=weight[..., None] > 0)
+                np.copyto(_part(total, box, common), self._samples(layer, common), where=weight[..., None] > 0)
                 continue
-            _part(total, box, common)[...] += self._samples(layer.index, common) * weight[..., None]
+            _part(total, box, common)[...] += self._samples(layer, common) * weight[..., None]
             _part(weights, box, common)[...] += weight
         if self.options.blend == "feather":
             total /= np.where(weights > 0, weights, np.float32(1.0))[..., None]
@@ -110,14 +129,14 @@ class Renderer:
         """Blend in bands on the outer box; the inner one is right."""
         blender = MultibandBlender(outer, self.bands, self.channels, self._rounding)
         for layer in layers:
-            felt = aligned(grown(_bounds(layer), margin(self.bands)), self.bands)
+            felt = aligned(grown(layer.bounds(), margin(self.bands)), self.bands)
             part = intersection(felt, outer)
             assert part is not None
             weight = np.zeros((part[3] - part[1], part[2] - part[0]), dtype=np.float32)
             common = intersection(part, layer.box)
             assert common is not None
             _part(weight, part, common)[...] = _part(layer.weight, layer.box, common)
-            blender.add(part, self._samples(layer.index, part), weight)
+            blender.add(part, self._samples(layer, part), weight)
         return np.ascontiguousarray(_part(blender.result(), outer, box))
 
     @property
@@ -125,38 +144,39 @@ class Renderer:
         """See :func:`rdstitch.compositing.multiband.rounding_constant`."""
         return rounding_constant(full_scale(self.dtype), self.dtype.kind == "u")
 
-    def _samples(self, index: int, box: Box) -> Float32Array:
+    def _samples(self, layer: Layer, box: Box) -> Float32Array:
         """Resampled and exposure-corrected samples (h, w, C) of one picture; mirrored content outside of it."""
-        warp = self.warps[index]
-        map_x, map_y = warp.maps(box)
-        width, height = warp.camera.image_size
-        inside = (map_x >= -0.5) & (map_x < width - 0.5) & (map_y >= -0.5) & (map_y < height - 0.5)
-        geometry = Geometry(box, map_x, map_y, inside)
+        index, warp = layer.index, self.warps[layer.index]
+        known = intersection(layer.box, box) == box
+        geometry = layer.geometry.part(box) if known else locate(warp, box)
         pixels = sample(warp, self.pictures[index], geometry, self.options.interpolation)
-        values = self.exposure.correct(index, warp, box, pixels.reshape(*inside.shape, self.channels))
+        values = self.exposure.correct(index, warp, box, pixels.reshape(*geometry.inside.shape, self.channels))
         return rounded(values, self._rounding) if self.options.blend == "multiband" else values
 
     def _layers(self, box: Box) -> list[Layer]:
         """Weights of all pictures that have a say in a box."""
         if self.seams is None and self.options.blend != "none":
-            located = [(k, self._located(k, box)) for k in range(len(self.warps))]
-            return [Layer(k, found[0].box, found[1]) for k, found in located if found is not None]
-        return self._owned_layers(box)
+            return list(self._bordered(box))
+        return self._owned(box)
 
-    def _located(self, index: int, box: Box) -> tuple[Geometry, Float32Array] | None:
-        """Geometry and border weight of a picture on the part of a box that it can reach."""
-        warp = self.warps[index]
-        part = intersection(warp.box, box)
-        geometry = None if part is None else locate(warp, part)
-        if geometry is None:
+    def _bordered(self, box: Box) -> Iterator[Layer]:
+        """Every picture that covers part of a box, with weights that fall to its border."""
+        for index, warp in enumerate(self.warps):
+            if (part := intersection(warp.box, box)) is None:
+                continue
+            geometry = locate(warp, part)
+            if geometry.inside.any():
+                weight = border_weight(warp, geometry)
+                opacity = self._opacity(index, geometry)
+                yield Layer(index, geometry, weight if opacity is None else weight * opacity)
+
+    def _opacity(self, index: int, geometry: Geometry) -> Float32Array | None:
+        """Opacity of a picture that has a mask."""
+        if not self.pictures.masked(index):
             return None
-        weight = border_weight(warp, geometry)
-        if self.pictures.masked(index):
-            opacity = sample_opacity(warp, self.pictures[index], geometry)
-            weight = weight if opacity is None else weight * opacity
-        return geometry, weight
+        return sample_opacity(self.warps[index], self.pictures[index], geometry)
 
-    def _owned_layers(self, box: Box) -> list[Layer]:
+    def _owned(self, box: Box) -> list[Layer]:
         """Layers where each px has one owner, or, for feathering along a seam, shares of its owners.
 
         The owner is the picture with the largest share in the seam map among those that cover the px; where the map,
@@ -164,56 +184,58 @@ class Renderer:
         """
         shape = (box[3] - box[1], box[2] - box[0])
         owner, best = np.full(shape, _NOBODY, dtype=np.int32), np.zeros(shape, dtype=np.float32)
-        soft: list[Layer] = []
-        for k in self.seams.owners(box) if self.seams is not None else ():
-            found = self._located(k, box)
-            if found is not None and self.seams is not None:
-                part = found[0].box
-                share = np.where(found[1] > 0, self.seams.share(k, part), np.float32(0.0))
-                _claim(owner, best, box, part, share, k)
-                soft.append(Layer(k, part, share))
+        layers = list(self._shared(box))
+        for layer in layers:
+            _claim(owner, best, box, layer)
+        soft = layers if self.options.blend == "feather" else []
         missing = owner == _NOBODY
         if missing.any():
             best[...] = 0.0
-            left = _bounds(Layer(_NOBODY, box, missing.astype(np.float32)))
-            for k in range(len(self.warps)):
-                found = self._located(k, left)
-                if found is not None:
-                    part = found[0].box
-                    free = np.where(_part(missing, box, part), found[1], np.float32(0.0))
-                    _claim(owner, best, box, part, free, k)
+            for layer in self._bordered(_bounds(missing, box)):
+                layer.weight[~_part(missing, box, layer.box)] = 0.0
+                _claim(owner, best, box, layer)
+                layers.append(layer)
         if self.options.blend == "feather":
-            return _with_leftovers(soft, owner, missing, box)
-        return [_owned(owner, box, int(k)) for k in np.unique(owner) if k != _NOBODY]
+            owner[~missing] = _NOBODY
+        return soft + [piece for layer in layers if (piece := _won(owner, box, layer)) is not None]
+
+    def _shared(self, box: Box) -> Iterator[Layer]:
+        """Pictures that own part of a box in the seam map, with their shares where they cover it."""
+        if self.seams is None:
+            return
+        for index in self.seams.owners(box):
+            part = intersection(self.warps[index].box, box)
+            if part is None:
+                continue
+            geometry = locate(self.warps[index], part)
+            share = self.seams.share(index, part)
+            share[~geometry.inside] = 0.0
+            if (opacity := self._opacity(index, geometry)) is not None:
+                share[opacity == 0] = 0.0
+            if share.any():
+                yield Layer(index, geometry, share)
 
 
-def _claim(owner: NDArray[np.int32], best: Float32Array, box: Box, part: Box, share: Float32Array, index: int) -> None:
-    """Give ``index`` the px of ``part`` where its share is the largest so far."""
-    previous = _part(best, box, part)
-    better = share > previous
-    previous[better] = share[better]
-    _part(owner, box, part)[better] = index
+def _claim(owner: NDArray[np.int32], best: Float32Array, box: Box, layer: Layer) -> None:
+    """Give a layer's picture the px where its weight is the largest so far."""
+    previous = _part(best, box, layer.box)
+    better = layer.weight > previous
+    np.copyto(previous, layer.weight, where=better)
+    np.copyto(_part(owner, box, layer.box), layer.index, where=better)
 
 
-def _owned(owner: NDArray[np.int32], box: Box, index: int) -> Layer:
-    """The px of one owner, on their bounding box."""
-    whole = Layer(index, box, (owner == index).astype(np.float32))
-    bounds = _bounds(whole)
-    return Layer(index, bounds, np.ascontiguousarray(_part(whole.weight, box, bounds)))
+def _won(owner: NDArray[np.int32], box: Box, layer: Layer) -> Layer | None:
+    """The layer with weight 1 where its picture owns the px, and 0 elsewhere; None where it owns nothing."""
+    owned = _part(owner, box, layer.box) == layer.index
+    # A picture may have a layer from the seam map and one for what the map left over: each gets its own px.
+    owned &= layer.weight > 0
+    return Layer(layer.index, layer.geometry, owned.astype(np.float32)) if owned.any() else None
 
 
-def _with_leftovers(soft: list[Layer], owner: NDArray[np.int32], missing: NDArray[np.bool_], box: Box) -> list[Layer]:
-    """Shares along the seams, and whole px where the seam map knows no owner."""
-    alone = np.where(missing, owner, _NOBODY)
-    return [layer for layer in soft if layer.weight.any()] + [
-        _owned(alone, box, int(k)) for k in np.unique(alone) if k != _NOBODY
-    ]
-
-
-def _bounds(layer: Layer) -> Box:
-    """Bounding box, on the canvas, of where a layer has weight."""
-    rows, columns = (np.flatnonzero(layer.weight.any(axis=axis)) for axis in (1, 0))
-    x, y = layer.box[:2]
+def _bounds(values: NDArray[Any], box: Box) -> Box:
+    """Smallest box that holds all values on ``box`` that are not 0."""
+    rows, columns = (np.flatnonzero(values.any(axis=axis)) for axis in (1, 0))
+    x, y = box[:2]
     return int(x + columns[0]), int(y + rows[0]), int(x + columns[-1] + 1), int(y + rows[-1] + 1)
 
 

@@ -99,8 +99,6 @@ def survey_pictures(
 def _survey_tile(reader: PictureReader, index: int, warp: Warp) -> SurveyTile | None:
     """One picture, small."""
     geometry = locate(warp, warp.box)
-    if geometry is None:
-        return None
     picture = prepare_picture(reader(index), warp.shrink)
     inside, weight = geometry.inside, border_weight(warp, geometry)
     opacity = sample_opacity(warp, picture, geometry)

@@ -113,25 +113,26 @@ def plan_warp(camera: Camera, homography: FloatArray, canvas: Canvas, index: int
     return Warp(camera, from_canvas, box, _lattice_step(draft, probes), _shrink(draft, probes))
 
 
-def locate(warp: Warp, box: Box) -> Geometry | None:
-    """Where the px of a box come from; None where the picture does not reach it."""
-    if intersection(warp.box, box) is None:
-        return None
+def locate(warp: Warp, box: Box) -> Geometry:
+    """Where the px of a box come from, and which of them lie in the picture."""
     map_x, map_y = warp.maps(box)
     width, height = warp.camera.image_size
     inside = (map_x >= -0.5) & (map_x < width - 0.5) & (map_y >= -0.5) & (map_y < height - 0.5)
-    return Geometry(box, map_x, map_y, inside) if inside.any() else None
+    return Geometry(box, map_x, map_y, inside)
 
 
 def border_weight(warp: Warp, geometry: Geometry) -> Float32Array:
     """1 at the picture's centre, falling to 0 at its border (measured in the picture) and outside."""
     width, height = warp.camera.image_size
     one, half = np.float32(1.0), np.float32(0.5)
-    weight = (one - np.abs((geometry.map_x + half) * np.float32(2.0 / width) - one)) * (
-        one - np.abs((geometry.map_y + half) * np.float32(2.0 / height) - one)
-    )
+    weight: Float32Array = (geometry.map_x + half) * np.float32(2.0 / width) - one
+    weight = one - np.abs(weight, out=weight)
+    down = (geometry.map_y + half) * np.float32(2.0 / height) - one
+    weight *= one - np.abs(down, out=down)
     # Never 0 inside: a border px that one picture alone covers must not get lost.
-    return np.where(geometry.inside, np.maximum(weight, _LEAST_WEIGHT), np.float32(0.0))
+    np.maximum(weight, _LEAST_WEIGHT, out=weight)
+    weight[~geometry.inside] = 0.0
+    return weight
 
 
 def sample(warp: Warp, picture: LoadedPicture, geometry: Geometry, interpolation: str = "cubic") -> NDArray[Any]:
@@ -210,9 +211,13 @@ def _remap(piece: NDArray[Any], map_x: Float32Array, map_y: Float32Array, interp
 
 
 def _mirror(values: Float32Array, length: int) -> Float32Array:
-    """Coordinates mirrored at the picture's borders until they lie inside."""
-    t = np.mod(values + np.float32(0.5), np.float32(2 * length))
-    mirrored: Float32Array = np.minimum(t, np.float32(2 * length) - t) - np.float32(0.5)
+    """Coordinates mirrored at the picture's borders; far outside, those of the border."""
+    half, turn = np.float32(0.5), np.float32(2 * length)
+    mirrored = values + half
+    np.abs(mirrored, out=mirrored)
+    np.minimum(mirrored, turn - mirrored, out=mirrored)
+    np.maximum(mirrored, np.float32(0.0), out=mirrored)
+    mirrored -= half
     return mirrored
 
 
@@ -236,16 +241,16 @@ def interpolate_lattice(nodes: Float32Array, box: Box, step: int) -> Float32Arra
     Every value depends on its four nodes alone, bit for bit, whatever the box.
     """
     x0, y0, x1, y1 = box
-    top, left = y0 % step, x0 % step
-    rows = nodes[:-1]
-    if step > 1:
-        t = (np.arange(step, dtype=np.float32) / np.float32(step))[:, None]
-        rows = rows[:, None, :] + (nodes[1:] - rows)[:, None, :] * t
-    rows = rows.reshape(-1, nodes.shape[1])[top : top + y1 - y0]
-    values = rows[:, :-1]
-    if step > 1:
-        values = values[:, :, None] + (rows[:, 1:] - values)[:, :, None] * t[:, 0]
-    return np.ascontiguousarray(values.reshape(len(rows), -1)[:, left : left + x1 - x0])
+    left, top = x0 % step, y0 % step
+    share = np.arange(step, dtype=np.float32) / np.float32(step)
+    columns = np.empty((len(nodes), (nodes.shape[1] - 1) * step), dtype=np.float32)
+    rise = nodes[:, 1:] - nodes[:, :-1]
+    for k in range(step):
+        columns[:, k::step] = nodes[:, :-1] + rise * share[k]
+    columns = columns[:, left : left + x1 - x0]
+    values: Float32Array = (columns[1:] - columns[:-1])[:, None, :] * share[:, None]
+    values += columns[:-1, None, :]
+    return np.asarray(values.reshape(-1, x1 - x0)[top : top + y1 - y0])
 
 
 def _probes(camera: Camera, to_canvas: FloatArray, outline: FloatArray) -> FloatArray:

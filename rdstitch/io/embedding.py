@@ -1,54 +1,51 @@
-"""Colour profile, EXIF and resolution put into encoded JPEG and PNG files, which OpenCV writes without them."""
+"""Colour profile, EXIF and resolution as JPEG segments and PNG chunks."""
 
 import struct
 import zlib
 from collections.abc import Iterator
-
-import numpy as np
-from numpy.typing import NDArray
 
 from rdstitch.io.metadata import Metadata
 
 _EXIF_HEADER = b"Exif\0\0"
 _ICC_HEADER = b"ICC_PROFILE\0"
 _LARGEST_SEGMENT = 65533
+_JFIF = 0xE0
 _METRES_PER_INCH = 0.0254
 
 
-def embed_in_jpeg(data: NDArray[np.uint8], metadata: Metadata) -> list[bytes | memoryview]:
-    """The pieces of a JPEG file with EXIF (APP1) and ICC profile (APP2) after the JFIF header (APP0).
+def embed_in_jpeg(head: bytes, metadata: Metadata) -> list[bytes]:
+    """A JPEG file's beginning with EXIF (APP1) and ICC profile (APP2) after the JFIF header (APP0).
 
     EXIF of more than 64 kB does not fit into a JPEG segment and is left out.
     """
-    raw = data.data
     after_header = 2
     jfif = b""
-    if bytes(raw[2:4]) == b"\xff\xe0":
-        (length,) = struct.unpack(">H", raw[4:6])
-        after_header = 4 + length
-        jfif = bytes(raw[2:after_header])
+    if head[3] == _JFIF:
+        after_header = 4 + struct.unpack_from(">H", head, 4)[0]
+        jfif = head[2:after_header]
         if metadata.dpi is not None and all(0 < d < 65535 for d in metadata.dpi):
             jfif = jfif[:11] + struct.pack(">BHH", 1, *(round(d) for d in metadata.dpi)) + jfif[16:]
-    segments = [_segment(0xE1, _EXIF_HEADER + exif) for exif in [_bare_exif(metadata)] if exif]
-    return [bytes(raw[:2]), jfif, *segments, *_icc_segments(metadata.icc_profile), raw[after_header:]]
+    exif = bare_exif(metadata)
+    segments = [_segment(0xE1, _EXIF_HEADER + exif)] if exif else []
+    return [head[:2], jfif, *segments, *_icc_segments(metadata.icc_profile), head[after_header:]]
 
 
-def embed_in_png(data: NDArray[np.uint8], metadata: Metadata) -> list[bytes | memoryview]:
-    """The pieces of a PNG file with iCCP, pHYs and eXIf after the header."""
-    raw = data.data
-    after_header = 33  # signature (8) and IHDR (25)
-    chunks = []
+def png_metadata_chunks(metadata: Metadata) -> Iterator[bytes]:
+    """ICCP, pHYs and eXIf chunks, which stand between header and pixels."""
     if metadata.icc_profile:
-        chunks.append(_chunk(b"iCCP", b"ICC profile\0\0" + zlib.compress(metadata.icc_profile, 9)))
+        yield png_chunk(b"iCCP", b"ICC profile\0\0" + zlib.compress(metadata.icc_profile, 9))
     if metadata.dpi is not None and all(0 < d < 1e6 for d in metadata.dpi):
-        per_metre = [round(d / _METRES_PER_INCH) for d in metadata.dpi]
-        chunks.append(_chunk(b"pHYs", struct.pack(">IIB", *per_metre, 1)))
-    if exif := _bare_exif(metadata):
-        chunks.append(_chunk(b"eXIf", exif))
-    return [raw[:after_header], *chunks, raw[after_header:]]
+        yield png_chunk(b"pHYs", struct.pack(">IIB", *(round(d / _METRES_PER_INCH) for d in metadata.dpi), 1))
+    if exif := bare_exif(metadata):
+        yield png_chunk(b"eXIf", exif)
 
 
-def _bare_exif(metadata: Metadata) -> bytes:
+def png_chunk(kind: bytes, body: bytes) -> bytes:
+    """One PNG chunk."""
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(body, zlib.crc32(kind)))
+
+
+def bare_exif(metadata: Metadata) -> bytes:
     """EXIF as a TIFF structure, without the header that JPEG puts before it; empty when too large."""
     exif = metadata.exif.removeprefix(_EXIF_HEADER)
     return exif if len(exif) + len(_EXIF_HEADER) + 2 <= _LARGEST_SEGMENT else b""
@@ -66,8 +63,3 @@ def _icc_segments(profile: bytes) -> Iterator[bytes]:
     if len(pieces) <= 255:
         for number, piece in enumerate(pieces, start=1):
             yield _segment(0xE2, _ICC_HEADER + bytes([number, len(pieces)]) + piece)
-
-
-def _chunk(kind: bytes, body: bytes) -> bytes:
-    """One PNG chunk."""
-    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))

@@ -1,49 +1,154 @@
-"""TIFF: tiled, compressed, BigTIFF where needed."""
+"""TIFF from strips: tiled, compressed, BigTIFF where needed, with overviews of half the size again and again.
 
+Overviews are made while the strips pass, and wait in temporary files beside the output until their turn; memory is that
+of one strip, whatever the size of the picture.
+"""
+
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
+from PIL import ExifTags, Image
 
-from rdstitch.io.atomic import atomic_output
+from rdstitch.io.layout import STRIP_ROWS, Layout, Strip, with_alpha
 from rdstitch.io.metadata import Metadata
 
 _TILE = 256
-_BIGTIFF_FROM = 2**32 - 2**25
-_ICC_PROFILE_TAG = 34675
+# Smaller pictures need no overview.
+_SMALLEST_OVERVIEW = 256
+_BIGTIFF_FROM = 2**32 - 2**27
+_COPIED_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.Artist, ExifTags.Base.Copyright)
+# (code, type, count, value, only on the first page), as tifffile takes them.
+ExtraTag = tuple[int, int, int, Any, bool]
 
 
-def write_tiff(path: Path, pixels: NDArray[Any], alpha: NDArray[np.uint8] | None, metadata: Metadata) -> None:
-    """Write an array as TIFF; see :func:`rdstitch.io.write.write_image`."""
-    channels = 1 if pixels.ndim == 2 else pixels.shape[2]
-    samples = pixels
-    if alpha is not None:
-        opaque = np.iinfo(pixels.dtype).max if np.issubdtype(pixels.dtype, np.integer) else 1
-        full = (alpha.astype(np.float32) / 255 * opaque).astype(pixels.dtype)
-        samples = np.dstack([pixels, full])
-    with atomic_output(path) as temporary:
-        tifffile.imwrite(
-            temporary,
-            samples,
-            bigtiff=samples.nbytes > _BIGTIFF_FROM,
-            photometric="rgb" if channels == 3 else "minisblack",
-            planarconfig="contig" if samples.ndim == 3 else None,
-            extrasamples=_extra_samples(channels, alpha is not None),
-            tile=(_TILE, _TILE) if min(pixels.shape[:2]) > _TILE else None,
-            compression="zlib",
-            compressionargs={"level": 1},
-            predictor=True,
-            metadata=None,
-            software="rdstitch",
-            resolution=metadata.dpi,
-            resolutionunit="inch" if metadata.dpi else None,
-            iccprofile=metadata.icc_profile or None,
-        )
+def write_tiff(path: Path, layout: Layout, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag] = ()) -> None:
+    """Write a TIFF file whose first page is the picture and whose other pages are its overviews.
+
+    Parameters
+    ----------
+    path : Path
+        Temporary files for the overviews are made, and removed, in the same folder.
+    layout : Layout
+    strips : iterable of (samples, alpha)
+    extra_tags
+        Further tags of the first page, for example of a GeoTIFF.
+    """
+    sizes = [layout.size, *_overview_sizes(layout.size)]
+    total = sum(w * h for w, h in sizes) * layout.samples_per_pixel * layout.dtype.itemsize
+    joined: Iterable[NDArray[Any]] = (with_alpha(*strip) if layout.transparent else strip[0] for strip in strips)
+    with ExitStack() as stack:
+        tiff = stack.enter_context(tifffile.TiffWriter(path, bigtiff=total > _BIGTIFF_FROM))
+        for level, size in enumerate(sizes):
+            is_last = level + 1 == len(sizes)
+            spill = None if is_last else stack.enter_context(tempfile.TemporaryFile(dir=path.parent))
+            tags = [] if level else [*_copied_tags(layout.metadata), *extra_tags]
+            _write_page(tiff, layout, size, _spilling(joined, spill, layout.transparent), tags, bool(level))
+            if spill is not None:
+                joined = _reread(spill, sizes[level + 1], layout)
 
 
-def _extra_samples(channels: int, transparent: bool) -> list[str] | None:
-    """Meaning of the samples beyond grey or RGB."""
-    extra = ["unspecified"] * (channels - (3 if channels == 3 else 1)) + ["unassalpha"] * transparent
-    return extra or None
+def _write_page(
+    tiff: tifffile.TiffWriter,
+    layout: Layout,
+    size: tuple[int, int],
+    strips: Iterable[NDArray[Any]],
+    tags: list[ExtraTag],
+    reduced: bool,
+) -> None:
+    """Write one page from strips that hold all samples."""
+    width, height = size
+    samples = layout.samples_per_pixel
+    colour = 3 if layout.channels == 3 else 1
+    extra = ["unspecified"] * (layout.channels - colour) + ["unassalpha"] * layout.transparent
+    dpi = None if reduced else layout.metadata.dpi
+    tiff.write(
+        _tiles(strips),
+        shape=(height, width, samples) if samples > 1 else (height, width),
+        dtype=layout.dtype,
+        photometric="rgb" if colour == 3 else "minisblack",
+        planarconfig="contig" if samples > 1 else None,
+        extrasamples=extra or None,
+        tile=(_TILE, _TILE),
+        compression="zlib",
+        compressionargs={"level": 1},
+        predictor=True,
+        metadata=None,
+        software="rdstitch",
+        subfiletype=int(reduced),
+        resolution=dpi,
+        resolutionunit="inch" if dpi else None,
+        iccprofile=None if reduced else layout.metadata.icc_profile or None,
+        extratags=tags,
+    )
+
+
+def _tiles(strips: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
+    """Tiles in the order of the file; tifffile completes those at the right and lower border."""
+    for strip in strips:
+        for y in range(0, strip.shape[0], _TILE):
+            for x in range(0, strip.shape[1], _TILE):
+                tile = strip[y : y + _TILE, x : x + _TILE]
+                missing = [(0, _TILE - n) for n in tile.shape[:2]] + [(0, 0)]
+                tile = np.pad(tile, missing) if any(b for _, b in missing) else np.ascontiguousarray(tile)
+                yield tile if tile.shape[2] > 1 else tile[..., 0]
+
+
+def _spilling(strips: Iterable[NDArray[Any]], spill: IO[bytes] | None, transparent: bool) -> Iterator[NDArray[Any]]:
+    """The strips; what passes is also written, half as large, to a file."""
+    for strip in strips:
+        # Before it is passed on: the writer does not come back after the last tile.
+        if spill is not None:
+            spill.write(_halved(strip, transparent).data)
+        yield strip
+
+
+def _reread(spill: IO[bytes], size: tuple[int, int], layout: Layout) -> Iterator[NDArray[Any]]:
+    """Strips from a file of plain samples, which is closed afterwards."""
+    width, height = size
+    row = width * layout.samples_per_pixel * layout.dtype.itemsize
+    spill.seek(0)
+    for top in range(0, height, STRIP_ROWS):
+        rows = min(STRIP_ROWS, height - top)
+        samples = np.frombuffer(spill.read(rows * row), dtype=layout.dtype)
+        yield samples.reshape(rows, width, layout.samples_per_pixel)
+    spill.close()
+
+
+def _halved(strip: NDArray[Any], transparent: bool) -> NDArray[Any]:
+    """Mean of 2 x 2 px, weighted by the alpha that the last channel is; an odd border repeats itself."""
+    even = np.pad(strip, [(0, strip.shape[0] % 2), (0, strip.shape[1] % 2), (0, 0)], mode="edge")
+    corners = np.stack([even[y::2, x::2] for y in (0, 1) for x in (0, 1)]).astype(np.float32)
+    mean = corners.mean(axis=0)
+    if transparent:
+        opacity = np.maximum(corners[..., -1:].sum(axis=0), np.float32(1e-6))
+        mean[..., :-1] = (corners[..., :-1] * corners[..., -1:]).sum(axis=0) / opacity
+    if strip.dtype.kind == "u":
+        np.rint(mean, out=mean)
+    return np.ascontiguousarray(mean.astype(strip.dtype))
+
+
+def _copied_tags(metadata: Metadata) -> Iterator[ExtraTag]:
+    """Tags of the first picture's EXIF that stay true of a mosaic."""
+    if metadata.exif:
+        exif = Image.Exif()
+        exif.load(metadata.exif)
+        for tag in _COPIED_TAGS:
+            text = exif.get(tag)
+            if isinstance(text, str) and text.isascii() and text:
+                yield int(tag), 2, 0, text, True
+
+
+def _overview_sizes(size: tuple[int, int]) -> list[tuple[int, int]]:
+    """Sizes of the overviews, each half of the one before, rounded up."""
+    sizes = []
+    width, height = size
+    while max(width, height) > _SMALLEST_OVERVIEW:
+        width, height = -(-width // 2), -(-height // 2)
+        sizes.append((width, height))
+    return sizes
