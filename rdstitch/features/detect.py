@@ -55,8 +55,11 @@ def detect(image: Image, options: FeatureOptions | None = None, mask: Mask | Non
     else:
         chosen = strongest(response, options.max_features)
     features = detection.describe(usable[chosen])
+    # Some detectors return them in an order of their own.
+    features = features.take(strongest(features.response, len(features)))
     scale = features.scale * float(np.sqrt(picture.factor.prod()))
-    return replace(features, points=picture.to_full_size(features.points), scale=scale)
+    size = (image.shape[1], image.shape[0])
+    return replace(features, points=picture.to_full_size(features.points), scale=scale, image_size=size)
 
 
 def detect_all(

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from rdstitch.camera import FloatArray
 from rdstitch.features.keypoints import Features
+from rdstitch.features.learned import AlikedDetection
 from rdstitch.features.opencv import OpenCVDetection
 from rdstitch.features.options import FeatureOptions
 from rdstitch.features.surf.detection import SurfDetection
@@ -39,4 +40,6 @@ def find(grey: NDArray[np.uint8], options: FeatureOptions) -> Detection:
     """Find the keypoints of a picture by the detector that the options name."""
     if options.kind == "surf":
         return SurfDetection.find(grey, options)
+    if options.kind == "aliked":
+        return AlikedDetection.find(grey, options)
     return OpenCVDetection.find(grey, options)

@@ -34,6 +34,8 @@ class Features:
         kind has no such sign.
     kind : str
         What detected and described them; features of different kinds cannot be compared.
+    image_size : (int, int), optional
+        Width and height of the picture, px.
 
     Raises
     ------
@@ -48,6 +50,7 @@ class Features:
     response: FloatArray
     laplacian_sign: NDArray[np.int8] | None
     kind: str
+    image_size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and types."""

@@ -1,55 +1,18 @@
 """Matching: mutual nearest neighbours that pass the ratio test, exactly, by blocked matrix products."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.camera import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.features.correspondences import Correspondences
 from rdstitch.features.keypoints import Features
 from rdstitch.features.nearest import mutual_nearest
 
+__all__ = ["Correspondences", "match"]
+
 _DEFAULT_RATIO = 0.85
 _BLOCK_BYTES = 2**24
-_NORM = 1024.0  # largest norm of scaled descriptors: all sums of products of integers then fit float32's 24 bits
-
-
-@dataclass(frozen=True, eq=False)
-class Correspondences:
-    """Points of two pictures that show the same, the most distinctive match first (PROSAC's order).
-
-    Attributes
-    ----------
-    indices : ndarray of shape (M, 2), intp
-        Indices into the features of picture 1 and picture 2.
-    points1, points2 : ndarray of shape (M, 2), float64
-        px of the full-size pictures.
-    ratio : ndarray of shape (M,), float64
-        Distance to the match over distance to the second-best, the worse of both directions; in [0, 1],
-        ascending.
-
-    Raises
-    ------
-    ArgumentError
-        When the shapes do not fit together.
-    """
-
-    indices: NDArray[np.intp]
-    points1: FloatArray
-    points2: FloatArray
-    ratio: FloatArray
-
-    def __post_init__(self) -> None:
-        """Check shapes."""
-        count = len(self.ratio)
-        shapes = (self.indices.shape, self.points1.shape, self.points2.shape, self.ratio.shape)
-        if shapes != ((count, 2), (count, 2), (count, 2), (count,)):
-            raise ArgumentError(f"correspondences of different lengths: {shapes}")
-
-    def __len__(self) -> int:
-        """Number of correspondences."""
-        return len(self.ratio)
 
 
 def match(
@@ -83,8 +46,7 @@ def match(
     pairs, ratios = _match_signs(features1, features2, block_bytes)
     passed = np.flatnonzero(ratios < limit)
     order = passed[np.lexsort((pairs[passed, 1], pairs[passed, 0], ratios[passed]))]
-    pairs = pairs[order]
-    return Correspondences(pairs, features1.points[pairs[:, 0]], features2.points[pairs[:, 1]], ratios[order])
+    return Correspondences.of(features1, features2, pairs[order], ratios[order])
 
 
 def _match_signs(features1: Features, features2: Features, block_bytes: int) -> tuple[NDArray[np.intp], FloatArray]:

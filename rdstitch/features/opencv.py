@@ -16,6 +16,8 @@ from rdstitch.features.options import FeatureOptions
 Grey = NDArray[np.uint8]
 
 _ROOTSIFT_NORM = 512.0
+# Side in px below which some detectors raise, and none finds a thing.
+_SMALLEST_PICTURE = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,7 @@ class OpenCVDetection:
     def find(cls, grey: Grey, options: FeatureOptions) -> Self:
         """Find keypoints; see :func:`create_detector` for errors."""
         detector = create_detector(options)
-        keypoints = detector.detect(grey, None)
+        keypoints = detector.detect(grey, None) if min(grey.shape) >= _SMALLEST_PICTURE else ()
         rows = [(*k.pt, k.size, k.angle, k.octave, k.response) for k in keypoints]
         table = np.array(rows, dtype=np.float64).reshape(-1, 6)
         # OpenCV promises no order: sort, so that the choice among equals is the same everywhere.

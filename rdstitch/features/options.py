@@ -1,10 +1,11 @@
 """Options of feature detection."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from rdstitch.errors import ArgumentError
 
-KINDS = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk")
+KINDS = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk", "aliked")
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class FeatureOptions:
     surf_upright: bool = False  # no orientation: for pictures that are turned by less than about 15°
     surf_refine: bool = True  # place blobs by Gaussian derivatives; False: by box filters alone, as the paper does
     orb_fast_threshold: int = 7  # grey levels by which a corner must differ from its surroundings
+    aliked_model: str | Path | None = None  # ONNX file of the network
+    aliked_size: int = 640  # side of the square picture that the network takes, px
 
     def __post_init__(self) -> None:
         """Check ranges."""

@@ -1,0 +1,149 @@
+"""Learned features and their matcher, from ONNX files that the user supplies: ALIKED and LightGlue by OpenCV 5.
+
+ALIKED: Zhao et al., IEEE TIM 2023. LightGlue: Lindenberger et al., ICCV 2023. The files are exports such as
+OpenCV's own tests use: ALIKED takes ``image`` and gives ``keypoints``, ``descriptors``, ``scores``; LightGlue takes
+``kpts0``, ``kpts1``, ``desc0``, ``desc1`` and gives ``matches0``, ``mscores0``.
+"""
+
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.camera import FloatArray
+from rdstitch.errors import ArgumentError, InputError
+from rdstitch.features.correspondences import Correspondences
+from rdstitch.features.keypoints import Features
+from rdstitch.features.options import FeatureOptions
+
+
+@dataclass(frozen=True, eq=False)
+class AlikedDetection:
+    """Keypoints of a picture by ALIKED, which describes all of them at once."""
+
+    points: FloatArray
+    response: FloatArray
+    descriptors: NDArray[np.float32]
+
+    @classmethod
+    def find(cls, grey: NDArray[np.uint8], options: FeatureOptions) -> Self:
+        """Run the network on a picture.
+
+        Raises
+        ------
+        ArgumentError
+            When no file is named, or this OpenCV has no ALIKED.
+        InputError
+            When the file cannot be read, or holds another network.
+        """
+        if options.aliked_model is None:
+            raise ArgumentError("features 'aliked' need the ONNX file of the network")
+        network = _load("ALIKED", options.aliked_model, _aliked_parameters(options.aliked_size))
+        try:
+            keypoints, descriptors = network.detectAndCompute(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), None)
+        except cv2.error as error:
+            raise InputError(f"{options.aliked_model}: not an ALIKED network that OpenCV can run") from error
+        rows = np.array([(*k.pt, k.response) for k in keypoints], dtype=np.float64).reshape(-1, 3)
+        if descriptors is None:
+            descriptors = np.zeros((0, network.descriptorSize()))
+        return cls(rows[:, :2], rows[:, 2], np.asarray(descriptors, np.float32))
+
+    @property
+    def scale(self) -> FloatArray:
+        """Diameters, px: the network has but one scale."""
+        return np.ones(len(self.points))
+
+    def describe(self, chosen: NDArray[np.intp]) -> Features:
+        """Features of the chosen keypoints."""
+        return Features(
+            points=self.points[chosen],
+            descriptors=self.descriptors[chosen],
+            scale=self.scale[chosen],
+            angle=np.zeros(len(chosen)),
+            response=self.response[chosen],
+            laplacian_sign=None,
+            kind="aliked",
+        )
+
+
+class LightGlue:
+    """Matches learned features by a network that sees all keypoints of both pictures at once.
+
+    Parameters
+    ----------
+    model : path
+        ONNX file, trained for the kind of features to match.
+    min_score : float
+        Least confidence of a match, in [0, 1).
+
+    Raises
+    ------
+    ArgumentError
+        When this OpenCV has no LightGlue.
+    InputError
+        When the file cannot be read.
+    """
+
+    def __init__(self, model: str | Path, min_score: float = 0.1) -> None:
+        self._model = Path(model)
+        self._matcher = _load("LightGlueMatcher", self._model, min_score)
+        # The pair to match is the matcher's state: one thread at a time.
+        self._lock = threading.Lock()
+
+    def match(self, features1: Features, features2: Features) -> Correspondences:
+        """Match the features of two pictures, the most certain first.
+
+        Where the matcher by distances gives the ratio of distances, this one gives one minus its confidence.
+
+        Raises
+        ------
+        ArgumentError
+            When the features do not know the size of their pictures.
+        InputError
+            When the network is not LightGlue for these features.
+        """
+        if features1.image_size is None or features2.image_size is None:
+            raise ArgumentError("LightGlue needs to know the sizes of the pictures")
+        if len(features1) == 0 or len(features2) == 0:
+            return Correspondences.of(features1, features2, np.zeros((0, 2), np.intp), np.zeros(0))
+        try:
+            with self._lock:
+                self._matcher.setPairInfo(
+                    features1.points.astype(np.float32),
+                    features2.points.astype(np.float32),
+                    features1.image_size,
+                    features2.image_size,
+                )
+                found = self._matcher.match(features1.descriptors, features2.descriptors)
+        except cv2.error as error:
+            raise InputError(f"{self._model}: not a LightGlue network for {features1.kind} features") from error
+        rows = np.array([(m.queryIdx, m.trainIdx) for m in found], dtype=np.intp).reshape(-1, 2)
+        doubt = np.clip(np.array([m.distance for m in found], dtype=np.float64), 0.0, 1.0)
+        order = np.lexsort((rows[:, 1], rows[:, 0], doubt))
+        return Correspondences.of(features1, features2, rows[order], doubt[order])
+
+
+def _load(name: str, model: str | Path, *arguments: Any) -> Any:
+    """``cv2.<name>.create(model, …)`` with errors that say what is wrong."""
+    path = Path(model)
+    if not hasattr(cv2, name):
+        raise ArgumentError(f"this OpenCV ({cv2.__version__}) has no {name}; OpenCV 5 has")
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        return getattr(cv2, name).create(str(path), *arguments)
+    except cv2.error as error:
+        raise InputError(f"{path}: not an ONNX file that OpenCV can read") from error
+
+
+def _aliked_parameters(size: int) -> Any:
+    """``cv2.ALIKED.Params`` for a network with square input."""
+    if not hasattr(cv2, "ALIKED"):
+        return None
+    parameters = cv2.ALIKED.Params()
+    parameters.inputSize = (size, size)
+    return parameters

@@ -1,0 +1,135 @@
+"""Networks from the user's ONNX files: stand-ins with the inputs and outputs of ALIKED and LightGlue."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rdstitch.errors import ArgumentError, InputError
+from rdstitch.features import FeatureOptions, Features, detect
+from rdstitch.features.learned import LightGlue
+
+onnx = pytest.importorskip("onnx")
+if not hasattr(cv2, "ALIKED"):
+    pytest.skip("this OpenCV has no ALIKED", allow_module_level=True)
+
+SIDE = 64
+CELL = 8
+
+
+@pytest.fixture
+def aliked(tmp_path: Path) -> Path:
+    """A network that sees a keypoint in every cell of a grid, described by its pixels, brighter ones stronger."""
+    helper, numpy_helper, kind = onnx.helper, onnx.numpy_helper, onnx.TensorProto
+    cells = SIDE // CELL
+    place = (np.arange(cells) + 0.5) / cells * 2 - 1
+    v, u = np.meshgrid(place, place, indexing="ij")
+    keypoints = np.column_stack([u.ravel(), v.ravel()]).astype(np.float32)
+    pick = np.zeros((CELL * CELL, 3, CELL, CELL), np.float32)
+    pick[np.arange(64), 0, np.arange(64) // CELL, np.arange(64) % CELL] = 1
+    weights = {"keypoints0": keypoints, "pick": pick, "shape": np.array([64, cells**2]), "one": np.array([1])}
+    nodes = [
+        helper.make_node("Identity", ["keypoints0"], ["keypoints"]),
+        helper.make_node("Conv", ["image", "pick"], ["cells"], strides=[CELL, CELL]),
+        helper.make_node("Reshape", ["cells", "shape"], ["columns"]),
+        helper.make_node("Transpose", ["columns"], ["descriptors"], perm=[1, 0]),
+        helper.make_node("ReduceMean", ["descriptors", "one"], ["scores"], keepdims=1),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "aliked",
+        [helper.make_tensor_value_info("image", kind.FLOAT, [1, 3, SIDE, SIDE])],
+        [
+            helper.make_tensor_value_info(name, kind.FLOAT, [cells**2, width])
+            for name, width in (("keypoints", 2), ("descriptors", 64), ("scores", 1))
+        ],
+        [numpy_helper.from_array(values, name) for name, values in weights.items()],
+    )
+    return save(graph, tmp_path / "aliked.onnx")
+
+
+@pytest.fixture
+def lightglue(tmp_path: Path) -> Path:
+    """A network that matches keypoint i with keypoint i, the more certain the farther to the right it is."""
+    helper, numpy_helper, kind = onnx.helper, onnx.numpy_helper, onnx.TensorProto
+    pairs = np.repeat(np.arange(5)[:, None], 2, axis=1).astype(np.int64)
+    weights = {"pairs": pairs, "zero": np.array(0), "half": np.array(0.5, np.float32), "axes": np.array([0, 2])}
+    nodes = [
+        helper.make_node("Identity", ["pairs"], ["matches0"]),
+        helper.make_node("Gather", ["kpts0", "zero"], ["u"], axis=2),
+        helper.make_node("Mul", ["u", "half"], ["halved"]),
+        helper.make_node("Add", ["halved", "half"], ["certain"]),
+        helper.make_node("Squeeze", ["certain", "squeezed"], ["mscores0"]),
+    ]
+    weights["squeezed"] = np.array([0])
+    graph = helper.make_graph(
+        nodes,
+        "lightglue",
+        [
+            helper.make_tensor_value_info(name, kind.FLOAT, [1, 5, width])
+            for name, width in (("kpts0", 2), ("kpts1", 2), ("desc0", 64), ("desc1", 64))
+        ],
+        [
+            helper.make_tensor_value_info("matches0", kind.INT64, [5, 2]),
+            helper.make_tensor_value_info("mscores0", kind.FLOAT, [5]),
+        ],
+        [numpy_helper.from_array(values, name) for name, values in weights.items() if name != "axes"],
+    )
+    return save(graph, tmp_path / "lightglue.onnx")
+
+
+def save(graph: object, path: Path) -> Path:
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=9)
+    onnx.checker.check_model(model)
+    onnx.save(model, str(path))
+    return path
+
+
+def five(points: np.ndarray) -> Features:
+    zeros = np.zeros(5)
+    return Features(points, np.eye(5, 64, dtype=np.float32), zeros + 1, zeros, zeros, None, "aliked", (200, 100))
+
+
+def test_keypoints_of_a_network_are_features(aliked: Path) -> None:
+    picture = np.random.default_rng(0).integers(0, 256, (2 * SIDE, 2 * SIDE), dtype=np.uint8)
+    picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 3.0))
+    options = FeatureOptions(kind="aliked", aliked_model=aliked, aliked_size=SIDE, max_features=20, spread=False)
+    found = detect(picture, options)
+    assert found.descriptors.shape == (20, 64)
+    assert found.image_size == (128, 128)
+    np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), 1.0, rtol=1e-5)
+    assert (np.diff(found.response) <= 0).all()
+    # Each keypoint tells the brightness of the cell that it lies in.
+    for point, response in zip(found.points, found.response, strict=True):
+        u, v = (point // (2 * CELL) * 2 * CELL).astype(int)
+        cell = picture[v : v + 2 * CELL, u : u + 2 * CELL]
+        assert response * 255 == pytest.approx(cell.mean(), abs=2.0)
+
+
+def test_lightglue_orders_by_confidence(lightglue: Path) -> None:
+    points = np.array([[150.0, 10], [20, 20], [199, 30], [90, 40], [60, 50]])
+    found = LightGlue(lightglue, min_score=0.2).match(five(points), five(points + 1))
+    np.testing.assert_array_equal(found.indices, [[2, 2], [0, 0], [3, 3], [4, 4]])
+    np.testing.assert_allclose(found.ratio, 1 - points[[2, 0, 3, 4], 0] / 200, atol=1e-5)
+    np.testing.assert_array_equal(found.points2, points[[2, 0, 3, 4]] + 1)
+
+
+def test_what_is_no_network_is_refused(tmp_path: Path, aliked: Path, lightglue: Path) -> None:
+    picture = np.zeros((SIDE, SIDE), np.uint8)
+    text = tmp_path / "text.onnx"
+    text.write_text("not a network")
+    for model, said in (
+        (tmp_path / "none.onnx", "no such file"),
+        (text, "not an ONNX file"),
+        (lightglue, "not an ALIKED"),
+    ):
+        with pytest.raises(InputError, match=said):
+            detect(picture, FeatureOptions(kind="aliked", aliked_model=model))
+    with pytest.raises(ArgumentError, match="ONNX file"):
+        detect(picture, FeatureOptions(kind="aliked"))
+    with pytest.raises(InputError, match="not an ONNX file"):
+        LightGlue(text)
+    points = np.zeros((5, 2))
+    with pytest.raises(InputError, match="not a LightGlue"):
+        LightGlue(aliked).match(five(points), five(points))

@@ -1,0 +1,176 @@
+"""Matching gives what the definition says, whatever the blocks."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rdstitch.errors import ArgumentError
+from rdstitch.features import Features, match
+from rdstitch.features.keypoints import Descriptors
+
+
+def features(descriptors: Descriptors, points: NDArray[np.float64] | None = None, kind: str = "sift") -> Features:
+    """Features with given descriptors, by default each at a place of its own."""
+    count = len(descriptors)
+    if points is None:
+        points = np.column_stack([np.arange(count), np.zeros(count)]).astype(np.float64)
+    zeros = np.zeros(count)
+    return Features(points, descriptors, zeros + 1, zeros, zeros, None, kind)
+
+
+def sift_like(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
+    """Integers of norm about 512 in 128 dimensions."""
+    values = rng.gamma(0.6, size=(count, 128))
+    unit: NDArray[np.float64] = values / np.linalg.norm(values, axis=1, keepdims=True)
+    return np.rint(512 * unit).astype(np.float32)
+
+
+def pair_of(kind: str, seed: int) -> tuple[Features, Features]:
+    """Two pictures of which half the features show the same."""
+    rng = np.random.default_rng(seed)
+    if kind == "binary":
+        bits = rng.integers(0, 256, (150, 61), dtype=np.uint8)
+        noise = rng.integers(0, 256, bits.shape) * (rng.random(bits.shape) < 0.15)
+        other = np.where(np.arange(150)[:, None] < 75, bits ^ noise.astype(np.uint8), rng.permuted(bits, axis=1))
+        return features(bits, kind="akaze"), features(other[rng.permutation(150)][:140], kind="akaze")
+    values = sift_like(rng, 150)
+    other = sift_like(rng, 150)
+    other[:75] = np.rint(values[:75] * rng.uniform(0.7, 1.3, (75, 128)))
+    other = other[rng.permutation(150)][:140]
+    if kind == "signed":
+        values, other = values / np.float32(512), other / np.float32(512)
+        signs = [np.where(rng.random(n) < 0.5, 1, -1).astype(np.int8) for n in (150, 140)]
+        one, two = features(values, kind="surf"), features(other, kind="surf")
+        return replace(one, laplacian_sign=signs[0]), replace(two, laplacian_sign=signs[1])
+    return features(values), features(other)
+
+
+def distances(one: Features, two: Features) -> NDArray[np.float64]:
+    """All distances, by the definition."""
+    if one.binary:
+        bits = [np.unpackbits(np.asarray(f.descriptors, np.uint8), axis=1).astype(np.int64) for f in (one, two)]
+        return np.asarray(np.abs(bits[0][:, None] - bits[1]).sum(axis=2), np.float64)
+    difference = one.descriptors.astype(np.float64)[:, None] - two.descriptors.astype(np.float64)
+    table: NDArray[np.float64] = np.linalg.norm(difference, axis=2)
+    if one.laplacian_sign is not None and two.laplacian_sign is not None:
+        table[one.laplacian_sign[:, None] != two.laplacian_sign] = np.inf
+    return table
+
+
+def by_definition(one: Features, two: Features, ratio: float) -> set[tuple[int, int]]:
+    """Mutual nearest neighbours that pass the ratio test in both directions."""
+    table = distances(one, two)
+    found = set()
+    for i, row in enumerate(table):
+        j = int(row.argmin())
+        column = table[:, j]
+        rivals = min(np.delete(row, j).min(), np.delete(column, i).min())
+        if column.argmin() == i and row[j] < ratio * rivals:
+            found.add((i, j))
+    return found
+
+
+def as_set(indices: NDArray[np.intp]) -> set[tuple[int, int]]:
+    return {(int(i), int(j)) for i, j in indices}
+
+
+@pytest.mark.parametrize("kind", ["float", "binary", "signed"])
+@pytest.mark.parametrize("ratio", [0.6, 0.8, 1.0])
+@pytest.mark.parametrize("block_bytes", [1, 5000, 2**23])
+def test_matches_are_those_of_the_definition(kind: str, ratio: float, block_bytes: int) -> None:
+    one, two = pair_of(kind, seed=3)
+    found = match(one, two, ratio, block_bytes)
+    assert len(found) > 15
+    assert as_set(found.indices) == by_definition(one, two, ratio)
+
+
+@pytest.mark.parametrize("kind", ["float", "binary", "signed"])
+def test_blocks_and_exchange_change_nothing(kind: str) -> None:
+    one, two = pair_of(kind, seed=4)
+    reference = match(one, two, 0.9)
+    small, exchanged = match(one, two, 0.9, block_bytes=3000), match(two, one, 0.9)
+    np.testing.assert_array_equal(small.indices, reference.indices)
+    np.testing.assert_array_equal(small.ratio, reference.ratio)
+    assert as_set(exchanged.indices[:, ::-1]) == as_set(reference.indices)
+    np.testing.assert_array_equal(exchanged.ratio, reference.ratio)
+
+
+@pytest.mark.parametrize("kind", ["float", "binary"])
+def test_the_ratio_is_that_of_the_distances_and_orders_the_matches(kind: str) -> None:
+    one, two = pair_of(kind, seed=5)
+    found, table = match(one, two, 0.95), distances(one, two)
+    assert (np.diff(found.ratio) >= 0).all()
+    for (i, j), ratio in zip(found.indices, found.ratio, strict=True):
+        rivals = min(np.delete(table[i], j).min(), np.delete(table[:, j], i).min())
+        assert ratio == pytest.approx(table[i, j] / rivals, rel=1e-12)
+    np.testing.assert_array_equal(found.points1, one.points[found.indices[:, 0]])
+    np.testing.assert_array_equal(found.points2, two.points[found.indices[:, 1]])
+
+
+def test_opencv_finds_the_same_matches_of_sift_descriptors() -> None:
+    one, two = pair_of("float", seed=6)
+    knn = [cv2.BFMatcher().knnMatch(a.descriptors, b.descriptors, k=2) for a, b in ((one, two), (two, one))]
+    passed = [{(m.queryIdx, m.trainIdx) for m, n in pairs if m.distance < 0.8 * n.distance} for pairs in knn]
+    expected = passed[0] & {(i, j) for j, i in passed[1]}
+    assert as_set(match(one, two, 0.8).indices) == expected
+
+
+def test_a_tie_is_no_match() -> None:
+    rng = np.random.default_rng(7)
+    values = sift_like(rng, 20)
+    twice = np.vstack([values, values[:5]])
+    for one, two in ((values, twice), (twice, values)):
+        found = as_set(match(features(one), features(two), 1.0).indices)
+        assert found == {(i, i) for i in range(5, 20)}
+
+
+def test_orientations_of_one_point_do_not_compete_and_give_one_match() -> None:
+    rng = np.random.default_rng(8)
+    values = sift_like(rng, 30)
+    # Ten points have a second descriptor, nearly that of the first: alone, neither would pass the ratio test.
+    similar = values[:10] + rng.integers(-1, 2, (10, 128)).astype(np.float32)
+    points = rng.uniform(0, 100, (30, 2))
+    order = rng.permutation(40)
+    one = features(np.vstack([values, similar])[order], np.vstack([points, points[:10]])[order])
+    two = features(values + rng.integers(-2, 3, values.shape).astype(np.float32), points)
+    for a, b in ((one, two), (two, one), (one, one)):
+        found = match(a, b, 0.8)
+        assert len(found) == 30
+        np.testing.assert_array_equal(found.points1, found.points2)
+    apart = features(one.descriptors)
+    assert len(match(apart, two, 0.8)) == 20
+
+
+def test_of_several_orientations_the_most_alike_pair_is_named() -> None:
+    rng = np.random.default_rng(9)
+    values = sift_like(rng, 12)
+    points = np.repeat(rng.uniform(0, 100, (4, 2)), 3, axis=0)
+    exact = [2, 4, 6, 9]  # one descriptor of each point is unchanged
+    other = sift_like(rng, 12)
+    other[exact] = values[exact]
+    found = match(features(values, points), features(other, points), 0.99)
+    assert as_set(found.indices) == {(i, i) for i in exact}
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.uint8])
+def test_nothing_matches_nothing(dtype: type) -> None:
+    none, some = features(np.zeros((0, 32), dtype)), features(np.ones((1, 32), dtype))
+    for one, two in ((none, some), (some, none), (none, none)):
+        found = match(one, two)
+        assert (found.indices.shape, found.points1.shape, found.ratio.shape) == ((0, 2), (0, 2), (0,))
+    assert as_set(match(some, some).indices) == {(0, 0)}
+
+
+def test_bad_arguments_are_refused() -> None:
+    one, two = pair_of("float", seed=1)
+    with pytest.raises(ArgumentError, match="ratio"):
+        match(one, two, 0.0)
+    with pytest.raises(ArgumentError, match="kinds"):
+        match(one, replace(two, kind="rootsift"))
+    with pytest.raises(ArgumentError, match="descriptors of shape"):
+        replace(one, descriptors=one.descriptors[1:])
+    with pytest.raises(ArgumentError, match="finite"):
+        replace(one, points=one.points * np.nan)

@@ -1,0 +1,241 @@
+"""SURF finds blobs where and as large as they are, and describes them the same however the picture is turned."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rdstitch.features import FeatureOptions, detect, match
+from rdstitch.features.surf.descriptor import describe_patches
+from rdstitch.features.surf.hessian import find_blobs
+from rdstitch.features.surf.integer_kernels import apply, integer_kernels
+from rdstitch.features.surf.orientation import orientations
+from rdstitch.features.surf.pyramid import from_level, pyramid, to_level
+from rdstitch.features.surf.quadric import vertex
+from rdstitch.features.surf.refinement import refine
+from rdstitch.synthetic import ground
+
+Grey = NDArray[np.uint8]
+
+
+def texture(width: int = 480, height: int = 400, seed: int = 5) -> Grey:
+    """Ground, smoothed as a lens does."""
+    picture = ground((width, height), seed, 1).region(0, 0, width, height).reshape(height, width)
+    return np.asarray(cv2.convertScaleAbs(cv2.GaussianBlur(picture, (0, 0), 1.0), alpha=255.0), np.uint8)
+
+
+def blob(center: tuple[float, float], sigma: float, sign: int = 1, size: int = 160) -> Grey:
+    """One Gaussian blob."""
+    v, u = np.mgrid[:size, :size]
+    squared = (u - center[0]) ** 2 + (v - center[1]) ** 2
+    return np.asarray(np.rint(128 + sign * 90 * np.exp(-squared / (2 * sigma**2))), np.uint8)
+
+
+def turned(grey: Grey, degrees: float) -> tuple[Grey, NDArray[np.float64]]:
+    """The picture turned about its centre, and the motion (2, 3)."""
+    height, width = grey.shape
+    motion = np.asarray(cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), degrees, 1.0), np.float64)
+    return np.asarray(cv2.warpAffine(grey, motion, (width, height), flags=cv2.INTER_CUBIC), np.uint8), motion
+
+
+def box_hessian(grey: Grey, size: int, u: int, v: int) -> float:
+    """Determinant of the Hessian by the filters as the paper draws them."""
+    lobe, values = size // 3, grey.astype(np.float64)
+
+    def mean(left: int, top: int, right: int, bottom: int) -> float:
+        return float(values[v + top : v + bottom + 1, u + left : u + right + 1].sum())
+
+    half, side = size // 2, lobe - 1
+    mid = lobe // 2
+    duu = mean(-half, -side, half, side) - 3 * mean(-mid, -side, mid, side)
+    dvv = mean(-side, -half, side, half) - 3 * mean(-side, -mid, side, mid)
+    duv = mean(1, 1, lobe, lobe) + mean(-lobe, -lobe, -1, -1) - mean(1, -lobe, lobe, -1) - mean(-lobe, 1, -1, lobe)
+    return duu * dvv / (lobe * (2 * lobe - 1)) ** 2 - (0.9 * duv / lobe**2) ** 2
+
+
+def test_the_response_is_the_determinant_of_the_papers_box_filters() -> None:
+    grey = texture()
+    blobs = find_blobs(grey, 50.0, octaves=1, layers=3)
+    assert len(blobs) > 200
+    for index in range(0, len(blobs), 10):
+        u, v = np.rint(blobs.points[index]).astype(int)
+        # Refined places are within one sample of the maximum.
+        around = [
+            box_hessian(grey, size, u + du, v + dv) for size in (15, 21, 27) for du in (-1, 0, 1) for dv in (-1, 0, 1)
+        ]
+        assert min(abs(np.array(around) - blobs.response[index])) < 1e-3 * blobs.response[index]
+
+
+def test_strips_leave_no_seam(monkeypatch: pytest.MonkeyPatch) -> None:
+    grey = texture()
+    reference = find_blobs(grey, 50.0, 3, 3)
+    monkeypatch.setattr("rdstitch.features.surf.hessian._STRIP_ROWS", 7)
+    strips = find_blobs(grey, 50.0, 3, 3)
+    assert len(reference) == len(strips) > 200
+    a, b = (found.take(np.lexsort((*found.points.T, found.size))) for found in (reference, strips))
+    np.testing.assert_array_equal(a.points, b.points)
+    np.testing.assert_array_equal(a.response, b.response)
+
+
+def test_no_neighbour_in_place_or_scale_answers_more() -> None:
+    blobs = find_blobs(texture(), 50.0, 1, 3)
+    near = np.abs(blobs.points[:, None] - blobs.points).max(axis=2) < 1
+    close_in_size = np.abs(blobs.size[:, None] - blobs.size) < 3
+    assert (near & close_in_size).sum() == len(blobs)
+
+
+@pytest.mark.parametrize("sigma", [3.0, 4.4, 7.0, 13.0])
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_blob_is_found_where_it_is_and_as_large(sigma: float, sign: int) -> None:
+    center = (80.3, 78.6)
+    grey = blob(center, sigma, sign)
+    boxes = find_blobs(grey, 100.0, 4, 3)
+    strongest = boxes.take(np.array([int(boxes.response.argmax())]))
+    np.testing.assert_allclose(strongest.points[0], center, atol=0.04 * sigma)
+    assert strongest.laplacian_sign[0] == -sign
+    refined = refine(pyramid(grey, 7), strongest)
+    np.testing.assert_allclose(refined.points[0], center, atol=0.01 * sigma)
+    # s is the σ of the Gaussian that a box filter stands for, 1.43 times too small for its maximum over scale.
+    assert refined.scale[0] * 1.43 == pytest.approx(sigma, rel=0.06)
+
+
+def test_refinement_brings_back_a_displaced_blob() -> None:
+    grey = blob((80.3, 78.6), 5.0)
+    boxes = find_blobs(grey, 100.0, 4, 3)
+    found = boxes.take(np.array([int(boxes.response.argmax())]))
+    displaced = replace(found, points=found.points + np.array([0.9, -0.7]), size=found.size * 1.1)
+    levels = pyramid(grey, 7)
+    np.testing.assert_allclose(refine(levels, displaced).points, refine(levels, found).points, atol=0.3)
+
+
+def test_the_threshold_takes_the_strongest_blobs() -> None:
+    grey = texture()
+    many, few = find_blobs(grey, 50.0, 3, 3), find_blobs(grey, 400.0, 3, 3)
+    assert 0 < len(few) < len(many)
+    np.testing.assert_array_equal(few.points, many.take(many.response > 400.0).points)
+
+
+@pytest.mark.parametrize("degrees", [10.0, 37.0, 90.0, 160.0])
+def test_orientation_turns_with_the_picture(degrees: float) -> None:
+    grey = texture()
+    other, motion = turned(grey, degrees)
+    rng = np.random.default_rng(0)
+    points = rng.uniform((150, 110), (330, 290), (200, 2))
+    scale = rng.uniform(1.6, 4.0, 200)
+    before = orientations(pyramid(grey, 7), points, scale)
+    after = orientations(pyramid(other, 7), points @ motion[:, :2].T + motion[:, 2], scale)
+    # getRotationMatrix2D counts anticlockwise, v points down.
+    difference = np.angle(np.exp(1j * (after - before + np.radians(degrees))))
+    assert np.median(np.abs(difference)) < np.radians(3)
+    assert np.mean(np.abs(difference) < np.radians(10)) > 0.9
+
+
+def test_orientation_is_that_of_the_gradient() -> None:
+    v, u = np.mgrid[:120, :120]
+    for degrees in (0, 33, 118, 250, 340):
+        along = u * np.cos(np.radians(degrees)) + v * np.sin(np.radians(degrees))
+        ramp = np.rint(np.clip(128 + along - along.mean(), 0, 255)).astype(np.uint8)
+        found = np.degrees(orientations(pyramid(ramp, 4), np.array([[60.0, 58.0]]), np.array([2.5])))
+        assert (found[0] - degrees + 180) % 360 - 180 == pytest.approx(0.0, abs=1.0)
+
+
+@pytest.mark.parametrize("extended", [False, True])
+def test_descriptors_follow_rotation_scale_and_contrast(extended: bool) -> None:
+    grey = texture()
+    rng = np.random.default_rng(1)
+    points, scale, angle = rng.uniform((150, 110), (330, 290), (60, 2)), rng.uniform(1.6, 4, 60), rng.uniform(0, 6, 60)
+    reference = describe_patches(pyramid(grey, 7), points, scale, angle, extended)
+    assert reference.shape == (60, 128 if extended else 64)
+    np.testing.assert_allclose(np.linalg.norm(reference, axis=1), 1.0, rtol=1e-5)
+    between_different = np.linalg.norm(reference - np.roll(reference, 1, axis=0), axis=1)
+
+    other, motion = turned(grey, 25.0)
+    moved = points @ motion[:, :2].T + motion[:, 2]
+    rotated = describe_patches(pyramid(other, 7), moved, scale, angle - np.radians(25.0), extended)
+    doubled = np.asarray(cv2.resize(grey, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC), np.uint8)
+    scaled = describe_patches(pyramid(doubled, 8), to_level(points, -1), scale * 2, angle, extended)
+    dimmed = describe_patches(pyramid(np.rint(grey * 0.5 + 40).astype(np.uint8), 7), points, scale, angle, extended)
+    for descriptors in (rotated, scaled, dimmed):
+        difference = np.linalg.norm(descriptors - reference, axis=1)
+        assert np.median(difference) < 0.15 * np.median(between_different)
+
+
+def test_a_patch_without_contrast_has_a_descriptor_of_zeros() -> None:
+    flat = np.full((90, 90), 77, np.uint8)
+    found = describe_patches(pyramid(flat, 4), np.array([[45.0, 45.0]]), np.array([2.0]), np.zeros(1), False)
+    np.testing.assert_array_equal(found, np.zeros((1, 64), np.float32))
+
+
+def test_levels_share_places() -> None:
+    levels = pyramid(blob((80.3, 78.6), 9.0), 4)
+    assert [level.shape for level in levels] == [(160, 160), (80, 80), (40, 40), (20, 20)]
+    for index, level in enumerate(levels):
+        light = np.maximum(level.astype(np.float64) - 130, 0)
+        v, u = np.mgrid[: level.shape[0], : level.shape[1]]
+        centre = np.array([(u * light).sum(), (v * light).sum()]) / light.sum()
+        np.testing.assert_allclose(from_level(centre, index), (80.3, 78.6), atol=0.06)
+        np.testing.assert_allclose(to_level(from_level(centre, index), index), centre)
+
+
+def test_integer_kernels_are_exact_in_any_order() -> None:
+    rng = np.random.default_rng(2)
+    kernels, factor = integer_kernels(rng.normal(size=(576, 20)) - 0.5)
+    patches = rng.integers(0, 256, (50, 24, 24), dtype=np.uint8)
+    exact = patches.reshape(50, -1).astype(np.int64) @ kernels.astype(np.int64)
+    np.testing.assert_array_equal(apply(patches, kernels), exact)
+    assert np.abs(exact).max() < 2**24
+    np.testing.assert_array_equal(kernels.sum(axis=0), 0)
+    assert factor > 0
+
+
+def test_the_vertex_of_a_quadric_is_found() -> None:
+    rng = np.random.default_rng(3)
+    step = np.arange(-1.0, 2.0)
+    s, v, u = np.meshgrid(step, step, step, indexing="ij")
+    x = np.stack([u, v, s], axis=-1)
+    for _ in range(20):
+        root = rng.normal(size=(3, 3))
+        second, middle = root @ root.T + 0.1 * np.eye(3), rng.uniform(-1, 1, 3)
+        values = 5.0 - np.einsum("...i,ij,...j->...", x - middle, second, x - middle)
+        offset, is_maximum = vertex(np.stack([values, -values]))
+        np.testing.assert_allclose(offset, [middle, np.zeros(3)], atol=1e-9)
+        assert is_maximum.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("degrees", [15.0, 30.0, 45.0, 60.0, 90.0])
+def test_matches_survive_any_rotation(degrees: float) -> None:
+    grey = texture(seed=8)
+    other, motion = turned(grey, degrees)
+    options = FeatureOptions(kind="surf", max_features=800)
+    found = match(detect(grey, options), detect(other, options), 0.8)
+    error = np.linalg.norm(found.points1 @ motion[:, :2].T + motion[:, 2] - found.points2, axis=1)
+    assert (error < 1.0).sum() > 180
+    assert np.mean(error < 3.0) > 0.95
+    assert np.median(error) < 0.35
+
+
+def test_options_take_effect() -> None:
+    grey = texture()
+    features = {
+        name: detect(grey, FeatureOptions(kind="surf", **{name: value}))  # type: ignore[arg-type]
+        for name, value in {
+            "surf_upright": True,
+            "surf_extended": True,
+            "surf_refine": False,
+            "surf_threshold": 1000.0,
+            "surf_octaves": 1,
+            "surf_layers": 1,
+        }.items()
+    }
+    plain = detect(grey, FeatureOptions(kind="surf"))
+    assert plain.angle.any()
+    assert not features["surf_upright"].angle.any()
+    assert features["surf_extended"].descriptors.shape[1] == 128
+    assert len(features["surf_refine"]) > len(plain)
+    assert 0 < len(features["surf_threshold"]) < len(plain)
+    assert 0 < len(features["surf_layers"]) < len(plain)
+    assert features["surf_octaves"].scale.max() < 40 < plain.scale.max()
+    assert plain.laplacian_sign is not None
+    assert set(plain.laplacian_sign) == {-1, 1}
