@@ -88,6 +88,8 @@ def scene(
         for j in range(i + 1, len(poses)):
             if reach is not None and j - i > reach:
                 break
+            if np.linalg.norm(poses[i, [X, Y]] - poses[j, [X, Y]]) > 3.0 * np.hypot(*size) / focal:
+                continue
             h = truth[j] @ inverse[i]
             pixels = rng.uniform((0, 0), (size[0] - 1, size[1] - 1), (3 * per_link, 2))
             plane = _seen(inverse[i], lens, pixels)
