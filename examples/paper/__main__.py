@@ -1,0 +1,49 @@
+"""``python -m examples.paper [FIGURE …] [--full] [--output DIR]``."""
+
+import argparse
+import sys
+import time
+from importlib import import_module
+from pathlib import Path
+
+from examples.paper.report import save
+from examples.paper.settings import Effort, Settings
+
+FIGURES = {
+    "figure2": "numerical stability",
+}
+"""Modules in the order in which they run, with what they measure."""
+
+_REAL_PICTURES = Path(__file__).resolve().parents[2] / "../shared/data"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the figures asked for; print their tables, write plots where there is an output folder."""
+    parser = argparse.ArgumentParser(
+        prog="python -m examples.paper",
+        description="Reproduce the paper's figures and measure the peers.",
+        epilog="Figures: " + ", ".join(f"{name} ({what})" for name, what in FIGURES.items()) + ".",
+    )
+    parser.add_argument("figures", nargs="*", metavar="FIGURE", help="which ones; all if not given")
+    parser.add_argument("--full", action="store_true", help="the paper's counts: minutes to hours")
+    parser.add_argument("--output", type=Path, metavar="DIR", help="write tables, plots and pictures there")
+    parser.add_argument(
+        "--pictures", type=Path, metavar="DIR", default=_REAL_PICTURES, help="folder of the real sequences"
+    )
+    options = parser.parse_args(arguments)
+    unknown = set(options.figures) - set(FIGURES)
+    if unknown:
+        parser.error(f"unknown figure {', '.join(sorted(unknown))}; there are {', '.join(FIGURES)}")
+    settings = Settings(Effort.FULL if options.full else Effort.SMALL, options.pictures)
+    for name in options.figures or FIGURES:
+        begun = time.perf_counter()
+        report = import_module(f"examples.paper.{name}").run(settings)
+        print(report)
+        if options.output is not None:
+            print("\n".join(save(report, name, options.output)))
+        print(f"({name}: {time.perf_counter() - begun:.1f} s)\n", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,77 @@
+"""The minimal solvers that the figures compare, each applied to the first points of the same instances."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from examples.paper.peers import homlib_solver
+from rdstitch import solvers
+from rdstitch.camera import FloatArray
+from rdstitch.solvers import Solutions
+from rdstitch.synthetic import PlanarInstances
+
+FITZGIBBON = "estimate_fitzgibbon_cvpr_2001_two_sided_equal"
+WADENBACK = "estimate_wadenback_3dv_2026_two_sided_equal"
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A minimal solver.
+
+    Attributes
+    ----------
+    name : str
+    points : int
+        Correspondences that it needs.
+    solve : callable
+        Takes the points of the instances (B, points, 2), both pictures, and their true tilts (B, 2), which only
+        solvers for a known tilt look at.
+    """
+
+    name: str
+    points: int
+    solve: Callable[[FloatArray, FloatArray, FloatArray], Solutions]
+
+    def __call__(self, instances: PlanarInstances) -> Solutions:
+        """Solve all instances."""
+        k = self.points
+        return self.solve(instances.x1[:, :k], instances.x2[:, :k], instances.tilt)
+
+
+def known_tilt() -> list[Contender]:
+    """Solvers that are told the tilt."""
+    return [
+        Contender("2 points", 2, lambda a, b, tilt: solvers.two_point(a, b, _per_picture(tilt))),
+        Contender(
+            "3 points, height free", 3, lambda a, b, tilt: solvers.three_point_similarity(a, b, _per_picture(tilt))
+        ),
+    ]
+
+
+def unknown_tilt() -> list[Contender]:
+    """Solvers that are not told the tilt, ours and, where it is installed, homlib's."""
+    own = [
+        Contender("3 points", 3, lambda a, b, _: solvers.three_point(a, b)),
+        Contender("4 points", 4, lambda a, b, _: solvers.four_point(a, b)),
+        Contender("5 points", 5, lambda a, b, _: solvers.five_point(a, b)),
+    ]
+    return own + homlib_contenders()
+
+
+def homlib_contenders() -> list[Contender]:
+    """Solvers of homlib for one λ in both pictures; none where it is not installed."""
+    found = []
+    for name, function, arguments in (
+        ("5 points, Fitzgibbon (homlib)", FITZGIBBON, ()),
+        ("5 points, Wadenbäck (homlib)", WADENBACK, (False,)),
+    ):
+        solve = homlib_solver(function, *arguments)
+        if solve is not None:
+            found.append(Contender(name, 5, lambda a, b, _, solve=solve: solve(a, b)))  # type: ignore[misc]
+    return found
+
+
+def _per_picture(tilt: FloatArray) -> FloatArray:
+    """The same tilt (B, 2) for both pictures of a sample; shape (B, 2, 2)."""
+    return np.repeat(tilt[:, None, :], 2, axis=1)
