@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from rdstitch.camera import Camera
     from rdstitch.compositing import CompositeOptions
     from rdstitch.features import FeatureOptions
-    from rdstitch.pipeline import StitchOptions, StitchResult, pano, undistort
+    from rdstitch.pipeline import StitchOptions, StitchResult, calibrate, mosaic, pano, trajectory, undistort
     from rdstitch.radial_homography import RadialHomography
     from rdstitch.robust import estimate_radial_homography
 
@@ -24,7 +24,10 @@ _HOMES = {
     "StitchOptions": "rdstitch.pipeline",
     "StitchResult": "rdstitch.pipeline",
     "estimate_radial_homography": "rdstitch.robust",
+    "calibrate": "rdstitch.pipeline",
+    "mosaic": "rdstitch.pipeline",
     "pano": "rdstitch.pipeline",
+    "trajectory": "rdstitch.pipeline",
     "solvers": "rdstitch",
     "undistort": "rdstitch.pipeline",
 }
@@ -36,9 +39,12 @@ __all__ = [
     "RadialHomography",
     "StitchOptions",
     "StitchResult",
+    "calibrate",
     "estimate_radial_homography",
+    "mosaic",
     "pano",
     "solvers",
+    "trajectory",
     "undistort",
 ]
 

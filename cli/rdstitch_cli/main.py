@@ -8,7 +8,10 @@ from importlib.metadata import version
 import click
 
 from rdstitch.errors import RdstitchError
+from rdstitch_cli.commands.calibrate import calibrate
+from rdstitch_cli.commands.mosaic import mosaic
 from rdstitch_cli.commands.pano import pano
+from rdstitch_cli.commands.trajectory import trajectory
 from rdstitch_cli.commands.undistort import undistort
 
 EXIT_STATUSES = """\b
@@ -36,7 +39,7 @@ def cli(context: click.Context, debug: bool) -> None:
     context.obj = debug
 
 
-for command in (pano, undistort):
+for command in (pano, mosaic, calibrate, trajectory, undistort):
     command.epilog = f"{command.epilog or ''}\n\n{EXIT_STATUSES}"
     cli.add_command(command)
 

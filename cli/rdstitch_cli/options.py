@@ -1,6 +1,8 @@
 """Options that several commands share, each defined once."""
 
 import math
+import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -45,6 +47,27 @@ class Angles(click.ParamType[tuple[float, float]]):
             self.fail(f"{value!r}: a tilt lies between -90 and 90 degrees", param, ctx)
         return psi, theta
 
+
+def resolve(inputs: tuple[Path, ...]) -> list[Path]:
+    """The inputs, with - replaced by the names on standard input, one a line or separated by NUL."""
+    named: list[Path] = []
+    for item in inputs:
+        if str(item) != "-":
+            named.append(item)
+            continue
+        data = sys.stdin.buffer.read()
+        names = data.split(b"\0") if b"\0" in data else data.splitlines()
+        named.extend(Path(os.fsdecode(name)) for name in names if name)
+    return named
+
+
+inputs = click.argument(
+    "inputs", nargs=-1, required=True, type=click.Path(path_type=Path, allow_dash=True), metavar="INPUT..."
+)
+
+every = click.option(
+    "--every", type=click.IntRange(1), default=1, show_default=True, metavar="N", help="Of a video, every N-th frame."
+)
 
 output = click.option(
     "-o", "--output", type=PICTURE, required=True, help="Picture to write: .jpg, .png, .tif or .webp."

@@ -1,5 +1,6 @@
 """What the stitching commands share: from flags to options, from a result to lines."""
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -8,7 +9,7 @@ import click
 from rdstitch_cli.progress import Reporter
 
 if TYPE_CHECKING:
-    from rdstitch.pipeline import StitchOptions, StitchResult
+    from rdstitch.pipeline import Registration, StitchOptions, StitchResult
 
 
 def stitch_options(
@@ -43,13 +44,19 @@ def stitch_options(
 
 def summarize(result: "StitchResult", reporter: Reporter) -> None:
     """λ to standard output; what the user must know to standard error."""
-    for warning in result.warnings:
+    for doubt in result.verdict.doubts:
+        reporter.warn(doubt)
+    report_registration(result.registration, reporter)
+
+
+def report_registration(registration: "Registration", reporter: Reporter) -> None:
+    """λ to standard output, nan where it is not observable; pictures left out to standard error."""
+    alignment = registration.alignment
+    for warning in alignment.warnings:
         reporter.warn(warning)
-    for missing in result.registration.left_out:
+    for missing in registration.left_out:
         reporter.warn(f"left out {missing.path}: {missing.reason}")
-    alignment = result.registration.alignment
     used = int(alignment.used.sum())
     reporter.log(f"{used} of {len(alignment.used)} pictures, rms {alignment.rms:.2f} px; {alignment.model_reason}")
-    if alignment.distortion_std == float("inf"):
-        reporter.warn("λ is not observable in these pictures; 0 was assumed")
-    click.echo("nan" if alignment.distortion_std == float("inf") else f"{result.distortion:.6f}")
+    observable = math.isfinite(alignment.distortion_std)
+    click.echo(f"{alignment.distortion:.6f}" if observable else "nan")

@@ -1,8 +1,9 @@
 """The recipes that make a picture, a camera or a trajectory out of pictures."""
 
 from rdstitch.pipeline.options import StitchOptions
-from rdstitch.pipeline.recipes import pano
+from rdstitch.pipeline.recipes import calibrate, mosaic, pano, trajectory
+from rdstitch.pipeline.register import Registration
 from rdstitch.pipeline.result import StitchResult
 from rdstitch.pipeline.undistortion import undistort
 
-__all__ = ["StitchOptions", "StitchResult", "pano", "undistort"]
+__all__ = ["Registration", "StitchOptions", "StitchResult", "calibrate", "mosaic", "pano", "trajectory", "undistort"]

@@ -1,29 +1,37 @@
 """The recipes: each reads as the sequence of its stages."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Literal
 
 import numpy as np
 
-from rdstitch.camera import FloatArray
 from rdstitch.compositing import Composite, compose, plan_canvas
-from rdstitch.errors import ArgumentError, PartialResultError, RegistrationError
-from rdstitch.io.atomic import check_output, write_json_atomic
+from rdstitch.errors import ArgumentError, InputError, PartialResultError, RegistrationError
+from rdstitch.io.atomic import check_output, write_json_atomic, write_text_atomic
 from rdstitch.io.read import read_image
 from rdstitch.io.write import check_size, write_image
+from rdstitch.pipeline.inputs import find_pictures
 from rdstitch.pipeline.options import StitchOptions
-from rdstitch.pipeline.register import Progress, Registration, register, silent
+from rdstitch.pipeline.path_plot import path_as_svg
+from rdstitch.pipeline.progress import Progress, silent
+from rdstitch.pipeline.register import Registration, in_frame_of_reference, register
 from rdstitch.pipeline.result import StitchResult
 from rdstitch.pipeline.sidecar import sidecar
-from rdstitch.pipeline.sources import Source, read_sources
-from rdstitch.pipeline.verdict import judge
-from rdstitch.registration.selection import all_pairs
+from rdstitch.pipeline.sources import LeftOut, Source, read_sources
+from rdstitch.pipeline.verdict import Verdict, judge
+from rdstitch.registration.trajectory import Trajectory
+
+Inputs = Iterable[str | Path]
+Layout = Literal["csv", "tum"]
 
 
 def pano(
-    paths: Iterable[str | Path],
+    paths: Inputs,
     output: str | Path | None = None,
     options: StitchOptions | None = None,
     *,
@@ -34,7 +42,7 @@ def pano(
     Parameters
     ----------
     paths : iterable of path
-        Two or more pictures.
+        Two or more pictures; every one must be readable.
     output : path, optional
         Picture to write, with the sidecar beside it; without it the picture is in the result.
     options : StitchOptions, optional
@@ -49,9 +57,121 @@ def pano(
     options = options or StitchOptions()
     paths = list(paths)
     _check_outputs(output, options, paths)
-    sources = _read(paths, options)
-    registration = register(sources, all_pairs(len(sources)), options, skip_bad=False, progress=progress)
-    return _finish(registration, _in_frame_of_reference(registration), output, options, progress)
+    sources, _ = _read(paths, options, skip_bad=False)
+    registration = register(sources, options, skip_bad=False, progress=progress)
+    registration = in_frame_of_reference(registration)
+    return _composite(registration, output, options, progress)
+
+
+def mosaic(
+    inputs: Inputs,
+    output: str | Path | None = None,
+    options: StitchOptions | None = None,
+    *,
+    every: int = 1,
+    progress: Progress = silent,
+) -> StitchResult:
+    """Stitch a whole sequence on the rectified plane: seen straight from above, metric up to scale.
+
+    Parameters
+    ----------
+    inputs : iterable of path
+        Folders, pictures, patterns, ``@list`` files or videos. Pictures that cannot be read are left out by name.
+    output : path, optional
+        As for :func:`pano`.
+    options : StitchOptions, optional
+    every : int
+        Of a video, every so manieth frame.
+    progress : callable
+
+    Raises
+    ------
+    RdstitchError
+        See the tree in :mod:`rdstitch.errors`.
+    """
+    options = options or StitchOptions()
+    with _pictures(inputs, output, every) as paths:
+        _check_outputs(output, options, paths)
+        registration = _register_all(paths, options, progress)
+        return _composite(registration, output, options, progress)
+
+
+def calibrate(
+    inputs: Inputs, options: StitchOptions | None = None, *, every: int = 1, progress: Progress = silent
+) -> Registration:
+    """Find the lens from pictures of a plane; the camera is ``result.camera``.
+
+    Parameters are those of :func:`mosaic`; nothing is composited. ``options.save_camera`` names the file to write.
+    """
+    options = options or StitchOptions()
+    with _pictures(inputs, None, every) as paths:
+        _check_outputs(None, options, paths)
+        registration = _register_all(paths, options, progress)
+    _accept(registration, options)
+    _save_camera(registration, options)
+    return registration
+
+
+def trajectory(
+    inputs: Inputs,
+    output: str | Path | None = None,
+    options: StitchOptions | None = None,
+    *,
+    layout: Layout = "csv",
+    plot: str | Path | None = None,
+    height: float = 1.0,
+    every: int = 1,
+    progress: Progress = silent,
+) -> tuple[Trajectory, Registration]:
+    """Find the path of the camera over the plane.
+
+    Parameters
+    ----------
+    inputs, options, every, progress
+        As for :func:`mosaic`.
+    output : path, optional
+        File to write.
+    layout : str
+        "csv" or "tum".
+    plot : path, optional
+        SVG file to draw the path to.
+    height : float
+        Height of the first frame above the plane, in the unit that positions shall have.
+
+    Returns
+    -------
+    Trajectory, Registration
+        The path, and the registration that it comes from.
+    """
+    options = options or StitchOptions()
+    with _pictures(inputs, None, every) as paths:
+        for file in (output, plot):
+            if file is not None:
+                check_output(file, options.overwrite, paths, suffixes=())
+        registration = _register_all(paths, options, progress, metric=True)
+    _accept(registration, options)
+    path = Trajectory.from_alignment(registration.alignment, height)
+    if output is not None:
+        write_text_atomic(output, path.as_csv() if layout == "csv" else path.as_tum())
+    if plot is not None:
+        write_text_atomic(plot, path_as_svg(path))
+    return path, registration
+
+
+@contextmanager
+def _pictures(inputs: Inputs, output: str | Path | None, every: int) -> Iterator[list[Path]]:
+    """The picture files that the inputs stand for; frames of videos exist only inside the block."""
+    with TemporaryDirectory(prefix="rdstitch-") as folder:
+        yield find_pictures(inputs, exclude=[] if output is None else [output], frames_folder=Path(folder), every=every)
+
+
+def _register_all(
+    paths: Sequence[Path], options: StitchOptions, progress: Progress, *, metric: bool = False
+) -> Registration:
+    """Register a sequence, leaving out what cannot be read."""
+    sources, unread = _read(paths, options, skip_bad=True)
+    registration = register(sources, options, skip_bad=True, metric=metric, progress=progress)
+    return replace(registration, left_out=(*unread, *registration.left_out))
 
 
 def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Sequence[str | Path]) -> None:
@@ -63,37 +183,24 @@ def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Se
         check_output(options.save_camera, options.overwrite, inputs, suffixes=())
 
 
-def _read(paths: Sequence[str | Path], options: StitchOptions) -> list[Source]:
-    sources, _ = read_sources(
-        paths, camera=options.camera, focal=options.focal, distortion=options.distortion, skip_bad=False
+def _read(paths: Sequence[str | Path], options: StitchOptions, *, skip_bad: bool) -> tuple[list[Source], list[LeftOut]]:
+    sources, unread = read_sources(
+        paths, camera=options.camera, focal=options.focal, distortion=options.distortion, skip_bad=skip_bad
     )
     if len(sources) < 2:
-        raise ArgumentError("stitching needs two pictures or more; name at least one more")
-    return sources
+        if unread:
+            raise InputError(f"fewer than two pictures can be read; {unread[0].reason}")
+        raise ArgumentError("stitching needs two different pictures or more; name at least one more")
+    return sources, unread
 
 
-def _in_frame_of_reference(registration: Registration) -> FloatArray:
-    """Homographies (N, 3, 3) into the undistorted frame of the reference picture."""
-    alignment = registration.alignment
-    return np.linalg.inv(alignment.homographies[alignment.reference]) @ alignment.homographies
-
-
-def _finish(
-    registration: Registration,
-    homographies: FloatArray,
-    output: str | Path | None,
-    options: StitchOptions,
-    progress: Progress,
+def _composite(
+    registration: Registration, output: str | Path | None, options: StitchOptions, progress: Progress
 ) -> StitchResult:
     """Judge, compose, write."""
-    verdict = judge(registration, options.threshold)
-    if not verdict.ok and not options.force:
-        reasons = "; ".join(verdict.failures)
-        raise RegistrationError(f"no reliable result: {reasons} (--force writes it all the same)")
-    if options.strict and registration.left_out:
-        raise PartialResultError("; ".join(f"left out {m.path}: {m.reason}" for m in registration.left_out))
-    alignment = replace(registration.alignment, homographies=homographies)
-    registration = replace(registration, alignment=alignment)
+    verdict = _accept(registration, options)
+    alignment = registration.alignment
+    homographies = alignment.homographies
     used = np.flatnonzero(alignment.used)
     cameras = [alignment.cameras[i] for i in used]
     sources = [registration.sources[i] for i in used]
@@ -119,9 +226,24 @@ def _finish(
     if output is not None:
         result = replace(result, output=Path(output), composite=None)
         _write(result, composite, sources[0])
-    if options.save_camera is not None:
-        write_json_atomic(options.save_camera, alignment.cameras[alignment.reference].as_dict())
+    _save_camera(registration, options)
     return result
+
+
+def _accept(registration: Registration, options: StitchOptions) -> Verdict:
+    """Judge a registration; what cannot be relied on goes no further, unless forced."""
+    verdict = judge(registration, options.threshold)
+    if not verdict.ok and not options.force:
+        reasons = "; ".join(verdict.failures)
+        raise RegistrationError(f"no reliable result: {reasons} (--force writes it all the same)")
+    if options.strict and registration.left_out:
+        raise PartialResultError("; ".join(f"left out {m.path}: {m.reason}" for m in registration.left_out))
+    return verdict
+
+
+def _save_camera(registration: Registration, options: StitchOptions) -> None:
+    if options.save_camera is not None:
+        write_json_atomic(options.save_camera, registration.camera.as_dict())
 
 
 def _write(result: StitchResult, composite: Composite, first: Source) -> None:

@@ -1,21 +1,24 @@
 """The registration that pano, mosaic, calibrate and trajectory share: features, pairs, one alignment."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
+from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError, RegistrationError
 from rdstitch.features import Features, detect_all
 from rdstitch.io.read import Pixels, read_image
 from rdstitch.pipeline.options import StitchOptions
+from rdstitch.pipeline.pairing import Pairing
+from rdstitch.pipeline.progress import Progress, silent
 from rdstitch.pipeline.sources import LeftOut, Source
-from rdstitch.registration import Alignment, AlignmentOptions, align
-from rdstitch.registration.pairs import PairOptions, PairRegistration, estimate_pairs, match_pairs
+from rdstitch.registration import Alignment, AlignmentOptions, Link, align
+from rdstitch.registration.pairs import PairRegistration
+from rdstitch.registration.selection import first_pairs, neighbours
 
-Progress = Callable[[str, int, int], None]
-"""Called with the name of a stage, the number of steps done, and their total."""
+_CLOSURE_ROUNDS = 2
 
 
 @dataclass(frozen=True)
@@ -40,29 +43,33 @@ class Registration:
     alignment: Alignment
     left_out: tuple[LeftOut, ...]
 
-
-def silent(stage: str, done: int, total: int) -> None:
-    """A progress that nobody watches."""
+    @property
+    def camera(self) -> Camera:
+        """The camera of the reference picture, with everything that was found of it."""
+        return self.alignment.cameras[self.alignment.reference]
 
 
 def register(
     sources: Sequence[Source],
-    pairs: Sequence[tuple[int, int]],
     options: StitchOptions,
     *,
     skip_bad: bool,
+    metric: bool = False,
     progress: Progress = silent,
 ) -> Registration:
-    """Detect, match, estimate every pair, and align all pictures as one.
+    """Detect features, register pairs, and align all pictures as one.
+
+    Pairs that fail alone are tried again with the λ that the others agree on, which then takes only two or four points;
+    and once there are poses, pictures that these put beside each other are tried too (loop closures).
 
     Parameters
     ----------
     sources : sequence of Source
-    pairs : sequence of (int, int)
-        Pairs of pictures to try.
     options : StitchOptions
     skip_bad : bool
         Leave out damaged pictures instead of raising.
+    metric : bool
+        Metric poses are needed, so that the freest model is that of planar motion with small tilts.
     progress : callable
 
     Raises
@@ -72,41 +79,46 @@ def register(
     """
     reference = _reference(sources, options.reference)
     features, damaged = _detect(sources, options, skip_bad, progress)
-    matched = match_pairs(features, pairs, options.ratio, partial(progress, "matching"))
-    known = options.known_distortion
-    registered = estimate_pairs(
-        [source.camera for source in sources],
-        pairs,
-        matched,
-        PairOptions(
-            options.ratio,
-            options.solver,
-            known,
-            options.threshold,
-            options.confidence,
-            options.max_iterations,
-            options.seed,
-        ),
-        tilts=None if options.tilt is None else [options.tilt] * len(sources),
-        workers=options.threads,
-        progress=partial(progress, "registering pairs"),
+    pairing = Pairing(features, [source.camera for source in sources], options, progress)
+    pairs = pairing.estimate(first_pairs(features, options.seed))
+    pairs = pairing.rescue(pairs)
+    aligning = AlignmentOptions(
+        reference=reference, model=options.model, distortion=options.known_distortion, tilt=options.tilt
     )
-    links = [pair.link() for pair in registered if pair.relation]
-    if not links:
-        raise RegistrationError(_no_overlap(sources, registered))
-    alignment = align(
-        [source.camera.with_focal() for source in sources],
-        links,
-        AlignmentOptions(reference=reference, model=options.model, distortion=known, tilt=options.tilt),
-    )
+    cameras = [source.camera.with_focal() for source in sources]
+    alignment = align(cameras, _links(sources, pairs), aligning)
+    for _ in range(_CLOSURE_ROUNDS):
+        tried = {(pair.image1, pair.image2) for pair in pairs}
+        closures = pairing.estimate(
+            neighbours(alignment.cameras, alignment.homographies, tried), distortion=alignment.distortion
+        )
+        pairs = sorted([*pairs, *closures], key=lambda pair: (pair.image1, pair.image2))
+        if not any(pair.relation for pair in closures):
+            break
+        alignment = align(cameras, _links(sources, pairs), aligning)
+    if metric and alignment.poses is None and options.model == "auto":
+        alignment = align(cameras, _links(sources, pairs), replace(aligning, model="tilting"))
     left_out = [
         LeftOut(source.path, damaged.get(index, alignment.reasons[index]))
         for index, source in enumerate(sources)
         if not alignment.used[index]
     ]
-    return Registration(
-        tuple(sources), tuple(len(found) for found in features), tuple(registered), alignment, tuple(left_out)
-    )
+    return Registration(tuple(sources), tuple(map(len, features)), tuple(pairs), alignment, tuple(left_out))
+
+
+def in_frame_of_reference(registration: Registration) -> Registration:
+    """The same registration with the undistorted reference picture as its plane."""
+    alignment = registration.alignment
+    homographies = np.linalg.inv(alignment.homographies[alignment.reference]) @ alignment.homographies
+    return replace(registration, alignment=replace(alignment, homographies=homographies))
+
+
+def _links(sources: Sequence[Source], pairs: Sequence[PairRegistration]) -> list[Link]:
+    """The pairs that were registered, at least one."""
+    links = [pair.link() for pair in pairs if pair.relation]
+    if not links:
+        raise RegistrationError(_no_overlap(sources, pairs))
+    return links
 
 
 def _reference(sources: Sequence[Source], name: str | None) -> int | None:
@@ -141,6 +153,11 @@ def _detect(
 
 def _no_overlap(sources: Sequence[Source], registered: Sequence[PairRegistration]) -> str:
     """Why nothing came of any pair, told by the pair with the most matches."""
+    if not registered:
+        return "no two pictures could be compared"
     best = max(registered, key=lambda pair: len(pair.correspondences))
     names = f"{sources[best.image1].name} and {sources[best.image2].name}"
-    return f"no two pictures overlap: of the likeliest pair, {names}, {best.relation.reason}"
+    return (
+        f"no two pictures overlap: of the likeliest pair, {names}, {best.relation.reason}; "
+        "take pictures that overlap by a third or more"
+    )

@@ -22,7 +22,7 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
     second.
     """
     registration, alignment = result.registration, result.registration.alignment
-    camera = alignment.cameras[alignment.reference]
+    camera = registration.camera
     content = {
         "format": "rdstitch sidecar",
         "version": VERSION,

@@ -13,7 +13,7 @@ from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.io.atomic import check_output
 from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
-from rdstitch.pipeline.register import Progress, silent
+from rdstitch.pipeline.progress import Progress, silent
 from rdstitch.pipeline.sources import read_sources
 
 View = Literal["same", "all", "valid"]

@@ -53,6 +53,4 @@ def judge(registration: Registration, threshold: float) -> Verdict:
         for fit in used
         if fit.inliers < _LEAST_INLIERS * fit.count
     )
-    if alignment.relief.found:
-        doubts.append(alignment.relief.explanation)
     return Verdict(not failures, tuple(failures), tuple(doubts))

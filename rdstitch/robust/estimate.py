@@ -101,7 +101,7 @@ def estimate_radial_homography(
     if (found := places(p1, p2, camera2.image_size)) < LEAST_PLACES:
         reason = f"only {len(data)} matches, in {found} places of the picture"
         return RadialHomography.failed(reason, camera1, camera2, len(data))
-    search = ransac(solvers, data, RansacOptions(threshold, confidence, max_iterations, seed))
+    search = ransac(solvers, data, RansacOptions(threshold, confidence, max_iterations, seed, LEAST_PLACES))
     if search.best is None:
         reason = f"no plausible model in {search.iterations} samples of {len(data)} matches"
         return RadialHomography.failed(reason, camera1, camera2, len(data), search.iterations)

@@ -97,7 +97,7 @@ def refine(
         diagonal = np.diag(current.information)
         damped = current.information + np.diag(damping * diagonal + 1e-12 * diagonal.max(initial=1e-300))
         try:
-            step: FloatArray = -np.linalg.solve(damped, current.gradient)
+            step = np.asarray(-np.linalg.solve(damped, current.gradient), dtype=np.float64)
         except np.linalg.LinAlgError:
             break
         moved_distortion = distortion if fixed_distortion else float(distortion + step[0])

@@ -31,6 +31,7 @@ class RansacOptions:
     confidence: float = 0.999  # probability that a better model was not missed
     max_iterations: int = 10000  # samples, over all solvers
     seed: int = 0
+    least_inliers: int = 8  # a model with fewer would not be accepted, so none such is searched for
 
 
 @dataclass(frozen=True)
@@ -130,9 +131,9 @@ class _Lane:
 
     def needed(self, best: Hypothesis | None) -> float:
         """Samples after which a better model than the best is unlikely to have been missed."""
-        good = _SOLVER_SUCCESS * (0.0 if best is None else best.inlier_share) ** self._solver.sample_size
-        if good <= 0.0:
-            return np.inf
+        least = self._options.least_inliers / len(self._data)
+        share = least if best is None else max(best.inlier_share, least)
+        good = _SOLVER_SUCCESS * min(share, 1.0) ** self._solver.sample_size
         return float(np.log1p(-self._options.confidence) / np.log1p(-min(good, 1.0 - 1e-12)))
 
     def advance(self, batch: int, best: Hypothesis | None) -> Hypothesis | None:

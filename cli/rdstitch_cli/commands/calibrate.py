@@ -1,0 +1,40 @@
+"""``rdstitch calibrate``: the lens, from pictures of a plane."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rdstitch_cli import options
+from rdstitch_cli.progress import Reporter
+from rdstitch_cli.stitching import report_registration, stitch_options
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  rdstitch calibrate wall/ -o camera.json
+  rdstitch undistort other/*.jpg --camera camera.json -o straight/
+"""
+)
+@options.inputs
+@click.option(
+    "-o", "--output", type=options.PICTURE, required=True, metavar="FILE", help="Camera file to write (JSON)."
+)
+@options.overwrite
+@options.every
+@options.known
+@options.estimation
+@options.trust
+@options.verbosity
+def calibrate(inputs: tuple[Path, ...], output: Path, every: int, quiet: bool, verbose: bool, **given: Any) -> None:
+    """Find λ, and where they can be seen the tilt and the focal length, from pictures of a plane.
+
+    INPUT is what 'rdstitch mosaic' takes. The camera file is what 'undistort', 'pano' and 'mosaic' take as --camera.
+    """
+    from rdstitch.pipeline import calibrate as recipe
+
+    with Reporter(-quiet + verbose) as reporter:
+        wanted = stitch_options(save_camera=output, **given)
+        registration = recipe(options.resolve(inputs), wanted, every=every, progress=reporter)
+        report_registration(registration, reporter)

@@ -1,0 +1,43 @@
+"""``rdstitch mosaic``: a folder of frames becomes one rectified picture."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rdstitch_cli import options
+from rdstitch_cli.progress import Reporter
+from rdstitch_cli.stitching import stitch_options, summarize
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  rdstitch mosaic floor/ -o floor.tif
+  rdstitch mosaic flight/*.jpg -o field.tif --camera camera.json
+  find . -name '*.jpg' -print0 | rdstitch mosaic - -o all.tif
+  rdstitch mosaic drive.mp4 --every 10 -o drive.png
+"""
+)
+@options.inputs
+@options.output
+@options.overwrite
+@options.every
+@click.option("--reference", metavar="NAME", help="Picture that sets the frame; otherwise the best connected one.")
+@options.known
+@options.estimation
+@options.compositing
+@click.option("--save-camera", type=options.PICTURE, metavar="FILE", help="Write the estimated camera to FILE (JSON).")
+@options.trust
+@options.verbosity
+def mosaic(inputs: tuple[Path, ...], output: Path, every: int, quiet: bool, verbose: bool, **given: Any) -> None:
+    """Stitch a whole sequence over one plane, seen straight from above.
+
+    INPUT is a folder, a picture, a quoted pattern, @FILE with one input a line, - for such lines (or NUL-separated
+    names) on standard input, or a video. Pictures that do not fit are left out and named on standard error.
+    """
+    from rdstitch.pipeline import mosaic as recipe
+
+    with Reporter(-quiet + verbose) as reporter:
+        result = recipe(options.resolve(inputs), output, stitch_options(**given), every=every, progress=reporter)
+        summarize(result, reporter)

@@ -1,0 +1,69 @@
+"""``rdstitch trajectory``: the path of the camera over the plane."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+import click
+
+from rdstitch_cli import options
+from rdstitch_cli.progress import Reporter
+from rdstitch_cli.stitching import report_registration, stitch_options
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  rdstitch trajectory floor/ -o poses.csv
+  rdstitch trajectory floor/ -o poses.txt --format tum --height 0.42
+"""
+)
+@options.inputs
+@click.option("-o", "--output", type=options.PICTURE, required=True, metavar="FILE", help="File to write.")
+@click.option(
+    "--format",
+    "layout",
+    type=click.Choice(["csv", "tum"]),
+    default="csv",
+    show_default=True,
+    help="csv: frame, picture, x, y, height, yaw in degrees. tum: number, position and quaternion a line.",
+)
+@click.option(
+    "--height", type=float, default=1.0, show_default=True, help="Height of the first frame, in the unit of positions."
+)
+@click.option("--plot", type=options.PICTURE, metavar="FILE", help="Draw the path to FILE (SVG).")
+@options.overwrite
+@options.every
+@options.known
+@options.estimation
+@options.trust
+@options.verbosity
+def trajectory(
+    inputs: tuple[Path, ...],
+    output: Path,
+    layout: Literal["csv", "tum"],
+    height: float,
+    plot: Path | None,
+    every: int,
+    quiet: bool,
+    verbose: bool,
+    **given: Any,
+) -> None:
+    """Find where the camera was for each picture: x, y and yaw over the plane.
+
+    INPUT is what 'rdstitch mosaic' takes. Positions are in units of the first picture's height above the plane, or in
+    metres when --height says how many those are.
+    """
+    from rdstitch.pipeline import trajectory as recipe
+
+    with Reporter(-quiet + verbose) as reporter:
+        _, registration = recipe(
+            options.resolve(inputs),
+            output,
+            stitch_options(**given),
+            layout=layout,
+            plot=plot,
+            height=height,
+            every=every,
+            progress=reporter,
+        )
+        report_registration(registration, reporter)

@@ -1,0 +1,104 @@
+"""What the user names as input: folders, files, patterns, lists, videos; in the end a list of picture files."""
+
+import glob
+import json
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from rdstitch.errors import InputError
+from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames
+
+PICTURE_SUFFIXES = frozenset(
+    (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".jp2", ".ppm", ".pgm", ".pnm", ".gif")
+)
+"""What counts as a picture in a folder; a file that is named is tried whatever it is called."""
+
+
+def find_pictures(
+    arguments: Iterable[str | Path],
+    *,
+    exclude: Iterable[str | Path] = (),
+    frames_folder: Path | None = None,
+    every: int = 1,
+) -> list[Path]:
+    """The picture files that the arguments stand for, in natural order within a folder or pattern.
+
+    Parameters
+    ----------
+    arguments : iterable of path
+        Each a picture file, a folder, a pattern (``*``, ``?``, ``[...]``), ``@FILE`` with one argument a line, or a
+        video file.
+    exclude : iterable of path
+        Files that are no input, such as the output. Pictures in folders and patterns beside which rdstitch wrote a
+        sidecar are its own work and left out too.
+    frames_folder : Path, optional
+        Where frames of videos are written, losslessly; without it a video is refused.
+    every : int
+        Of a video, every so manieth frame.
+
+    Raises
+    ------
+    InputError
+        When an argument names nothing.
+    """
+    unwanted = {Path(path).resolve() for path in exclude}
+    return [path for path in _expand(arguments, frames_folder, every) if path.resolve() not in unwanted]
+
+
+def natural_key(path: Path) -> list[tuple[int, str | int]]:
+    """Sorting key by which ``frame10`` comes after ``frame9``."""
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", str(path)) if part]
+
+
+def _expand(arguments: Iterable[str | Path], frames_folder: Path | None, every: int) -> Iterator[Path]:
+    for argument in arguments:
+        path, text = Path(argument), str(argument)
+        if text.startswith("@") and not path.exists():
+            yield from _expand(_listed(Path(text[1:])), frames_folder, every)
+        elif path.is_dir():
+            yield from _in_folder(path)
+        elif path.suffix.lower() in VIDEO_SUFFIXES and path.exists():
+            if frames_folder is None:
+                raise InputError(f"{path}: a video is no picture here; use 'rdstitch mosaic' or extract its frames")
+            yield from extract_frames(path, frames_folder, every)
+        elif not path.exists() and glob.has_magic(text):
+            yield from _matching(text)
+        else:
+            yield path
+
+
+def _listed(file: Path) -> list[str]:
+    try:
+        return [line for line in file.read_text(encoding="utf-8", errors="surrogateescape").splitlines() if line]
+    except OSError as error:
+        raise InputError(f"{file}: cannot read the list of pictures: {error.strerror}") from error
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    try:
+        entries = [path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES]
+    except OSError as error:
+        raise InputError(f"{folder}: cannot read the folder: {error.strerror}") from error
+    found = [path for path in entries if not path.name.startswith(".") and not _own_work(path)]
+    if not found:
+        raise InputError(f"{folder}: there are no pictures in this folder")
+    return sorted(found, key=natural_key)
+
+
+def _matching(pattern: str) -> list[Path]:
+    matching = map(Path, glob.glob(pattern))  # noqa: PTH207 - a pattern may be absolute
+    found = [path for path in matching if path.is_file() and not _own_work(path)]
+    if not found:
+        raise InputError(f"{pattern}: no file matches this pattern")
+    return sorted(found, key=natural_key)
+
+
+def _own_work(path: Path) -> bool:
+    """Whether rdstitch made this picture: the sidecar beside it says so."""
+    sidecar = path.with_name(path.name + ".json")
+    try:
+        with sidecar.open(encoding="utf-8") as stream:
+            return bool(json.loads(stream.read()).get("format") == "rdstitch sidecar")
+    except (OSError, ValueError, AttributeError):
+        return False

@@ -1,0 +1,86 @@
+"""Pairs of pictures through all rounds: matched once, estimated alone, then with what the others know."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from rdstitch.camera import Camera
+from rdstitch.features import Features
+from rdstitch.pipeline.options import StitchOptions
+from rdstitch.pipeline.progress import Progress
+from rdstitch.registration.pairs import PairOptions, PairRegistration, estimate_pairs, match_pairs
+from rdstitch.registration.voting import vote
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """What it takes to register pairs.
+
+    Attributes
+    ----------
+    features : sequence of Features
+    cameras : sequence of Camera
+    options : StitchOptions
+    progress : callable
+    """
+
+    features: Sequence[Features]
+    cameras: Sequence[Camera]
+    options: StitchOptions
+    progress: Progress
+
+    def estimate(self, pairs: Sequence[tuple[int, int]], distortion: float | None = None) -> list[PairRegistration]:
+        """Match and estimate pairs (i, j), with λ free, or as the user or the other pairs say."""
+        if not pairs:
+            return []
+        matched = match_pairs(self.features, pairs, self.options.ratio, partial(self.progress, "matching"))
+        known = self.options.known_distortion
+        found = estimate_pairs(
+            self.cameras,
+            pairs,
+            matched,
+            self._pair_options(distortion if known is None else known),
+            tilts=self._tilts(),
+            workers=self.options.threads,
+            progress=partial(self.progress, "registering pairs"),
+        )
+        return found if known is not None or distortion is None else [_without_vote(pair) for pair in found]
+
+    def rescue(self, pairs: list[PairRegistration]) -> list[PairRegistration]:
+        """Estimate the pairs that failed again, with the λ that the others agree on."""
+        relations = [pair.relation for pair in pairs if pair.relation]
+        failed = [index for index, pair in enumerate(pairs) if not pair.relation]
+        if self.options.known_distortion is not None or not failed or not relations:
+            return pairs
+        consensus = vote([r.distortion for r in relations], [r.distortion_std for r in relations])
+        if not np.isfinite(consensus.distortion):
+            return pairs
+        again = estimate_pairs(
+            self.cameras,
+            [(pairs[index].image1, pairs[index].image2) for index in failed],
+            [pairs[index].correspondences for index in failed],
+            self._pair_options(consensus.distortion),
+            tilts=self._tilts(),
+            workers=self.options.threads,
+            progress=partial(self.progress, "retrying pairs"),
+        )
+        rescued = list(pairs)
+        for index, pair in zip(failed, again, strict=True):
+            if pair.relation:
+                rescued[index] = _without_vote(pair)
+        return rescued
+
+    def _pair_options(self, distortion: float | None) -> PairOptions:
+        o = self.options
+        solver = o.solver if distortion is None else "auto"
+        return PairOptions(o.ratio, solver, distortion, o.threshold, o.confidence, o.max_iterations, o.seed)
+
+    def _tilts(self) -> list[tuple[float, float] | None] | None:
+        return None if self.options.tilt is None else [self.options.tilt] * len(self.cameras)
+
+
+def _without_vote(pair: PairRegistration) -> PairRegistration:
+    """A pair whose λ was given by the others says nothing about λ."""
+    return replace(pair, relation=replace(pair.relation, distortion_std=np.inf))
