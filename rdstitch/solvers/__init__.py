@@ -18,6 +18,7 @@ All take batches of samples, (B, k, 2), and return every real solution; see :cla
 """
 
 from rdstitch.solvers.five_point import five_point
+from rdstitch.solvers.five_point_qep import five_point_qep
 from rdstitch.solvers.four_point import four_point
 from rdstitch.solvers.known_distortion import four_point_dlt, two_point_rigid, two_point_similarity
 from rdstitch.solvers.solutions import Solutions
@@ -28,6 +29,7 @@ from rdstitch.solvers.two_point import two_point
 __all__ = [
     "Solutions",
     "five_point",
+    "five_point_qep",
     "four_point",
     "four_point_dlt",
     "three_point",

@@ -184,12 +184,13 @@ def isolate(values: FloatArray) -> Brackets:
     changes = (positive[:, 1:] != positive[:, :-1]).sum(axis=1, dtype=np.uint8)
 
     width = 2.0 / _CELLS
+    edges = np.linspace(-1.0, 1.0, _CELLS + 1)
     cell, sample = np.nonzero(changes == 1)
-    left = width * cell - 1.0
+    left = edges[cell]
     ends = coefficients[:, [0, -1]][cell, :, sample]
     found = [Brackets.of_cells(sample, left, width, ends)]
     cell, sample = np.nonzero(changes > 1)
-    left = width * cell - 1.0
+    left = edges[cell]
     current = coefficients[cell, :, sample]
     split = bernstein_subdivision(degree, _PARTS).reshape(-1, count).T
     for _ in range(_DEPTH):
