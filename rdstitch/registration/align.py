@@ -57,6 +57,11 @@ class AlignmentOptions:
         is mounted on that.
     attitudes_std : float
         Their standard deviation, radians; 0 for exact ones.
+    center : bool
+        Estimate the distortion centre too, where the data support that.
+    second_coefficient : bool
+        Estimate μ, the coefficient of r⁴, too, where the data support that; λ is then no longer comparable with the
+        λ of a one-parameter lens.
     most : int
         Correspondences used of each link.
     """
@@ -68,6 +73,8 @@ class AlignmentOptions:
     tilt_std: float = 0.0
     attitudes: ArrayLike | None = None
     attitudes_std: float = 0.0
+    center: bool = True
+    second_coefficient: bool = False
     most: int = 250
 
     def __post_init__(self) -> None:
@@ -92,6 +99,14 @@ class AlignmentOptions:
             lens=np.zeros(4),
             lens_std=_LENS_STD,
         )
+
+    @property
+    def lenses(self) -> list[BoolArray]:
+        """What else of the lens may be freed, one after the other."""
+        if self.distortion is not None:
+            return []
+        center = [np.array([False, False, True, True])] if self.center else []
+        return center + ([np.array([False, True, False, False])] if self.second_coefficient else [])
 
     @property
     def models(self) -> list[str]:
@@ -151,7 +166,8 @@ def align(
     wrong = contradicting_links(apart, few, len(cameras))
     graph = _Graph(len(cameras), few, relations, lens, free_lens, known, options)
     problem, pictures = graph.problem(~wrong)
-    choice = choose_model(problem, options.models)
+    choice = choose_model(problem, options.models, options.lenses if observable else ())
+    graph = replace(graph, free_lens=choice.fit.free_lens)
     choice, pictures, wrong = _drop_wrong_pairs(graph, problem, pictures, choice, wrong)
 
     say("adjustment")

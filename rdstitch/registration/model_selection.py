@@ -24,6 +24,9 @@ from rdstitch.registration.relief import coherence
 _EXACTNESS = 0.1
 """px: how exactly a lens and a plane can be described at all."""
 
+_FARTHEST_CENTRE = 0.08
+"""Half diagonals: a distortion centre farther off is no lens, but something else that it takes the blame for."""
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -42,8 +45,10 @@ class Choice:
     overdispersion: float
 
 
-def choose_model(problem: Problem, names: Sequence[str]) -> Choice:
+def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolArray] = ()) -> Choice:
     """Adjust models from the least to the most free, and take the best.
+
+    The best two are then tried with more of the lens free: an off-centre lens looks like motion that is less regular.
 
     A homography for every link on its own leaves errors that no model of the family can undercut. Once freer models
     could not pay for their freedom even with those, they are not tried.
@@ -53,12 +58,26 @@ def choose_model(problem: Problem, names: Sequence[str]) -> Choice:
     fits: list[Fit] = []
     for name in names:
         model = MODELS[name]
-        if fits and min(bound.cost(problem, fit) for fit in fits) <= least + bound.price(problem, model):
+        if fits and min(bound.cost(problem, fit) for fit in fits) <= least + bound.price(
+            problem, model, problem.free_lens
+        ):
             break
         fits.append(problem.fit(model, fits[-1:]))
     yardstick = bound if len(fits) < len(names) else _Yardstick.of_fit(problem, fits[-1])
-    best = int(np.argmin([yardstick.cost(problem, fit) for fit in fits]))
+    costs = np.array([yardstick.cost(problem, fit) for fit in fits])
+    for lens in lenses:
+        for index in np.argsort(costs, kind="stable")[:2].tolist():
+            wider = problem.extend(fits[index], lens | fits[index].free_lens)
+            cost = yardstick.cost(problem, wider)
+            if cost < costs[index] and _within_reason(wider):
+                fits[index], costs[index] = wider, cost
+    best = int(np.argmin(costs))
     return Choice(fits[best], _reason(fits, best, list(names)), yardstick.overdispersion)
+
+
+def _within_reason(fit: Fit) -> bool:
+    """Whether the distortion centre is where lenses have it."""
+    return bool(np.abs(fit.adjusted.parameters.lens[2:]).max() < _FARTHEST_CENTRE)
 
 
 @dataclass(frozen=True)
@@ -111,14 +130,14 @@ class _Yardstick:
         ratio = np.minimum(squared[self.counted], 1e12) / self.noise**2
         return float((WIDTH_PER_SIGMA**2 * np.log1p(ratio / WIDTH_PER_SIGMA**2)).sum()) / self.overdispersion
 
-    def price(self, problem: Problem, model: Model) -> float:
+    def price(self, problem: Problem, model: Model, free_lens: BoolArray) -> float:
         """What the parameters of a model cost."""
         poses = problem.count * model.pose_size - int(model.gauge.sum())
-        return (poses + len(model.shared_names) + int(problem.free_lens.sum())) * math.log(self.effective)
+        return (poses + len(model.shared_names) + int(free_lens.sum())) * math.log(self.effective)
 
     def cost(self, problem: Problem, fit: Fit) -> float:
         """Misfit and price of a fit."""
-        return self.misfit(fit.adjusted.squared) + self.price(problem, fit.model)
+        return self.misfit(fit.adjusted.squared) + self.price(problem, fit.model, fit.free_lens)
 
 
 def _errors(problem: Problem, homographies: FloatArray, lens: FloatArray) -> FloatArray:

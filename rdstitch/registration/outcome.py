@@ -67,7 +67,7 @@ def describe(outcome: Outcome) -> Alignment:
     observations = problem.observations
     errors = whitened_errors(observations, adjusted.homographies, lens)
     inliers = adjusted.squared <= (WIDTH_PER_SIGMA * adjusted.sigma) ** 2
-    relief = judge_relief(coherence(observations, errors, inliers), adjusted.sigma, fit.model.name)
+    relief = judge_relief(coherence(observations, errors, inliers), fit.model.name)
     used = np.zeros(len(outcome.cameras), dtype=np.bool_)
     used[outcome.pictures] = True
     homographies, poses = _in_frame_of_reference(outcome)

@@ -111,12 +111,15 @@ class Fit:
     ----------
     model : Model
     adjusted : Adjusted
+    free_lens : ndarray of shape (4,), bool
+        Lens parameters that were estimated.
     tilt_spread : float
         Standard deviation of the pictures' own tilts, radians; 0 where the model has none.
     """
 
     model: Model
     adjusted: Adjusted
+    free_lens: BoolArray
     tilt_spread: float = 0.0
 
 
@@ -166,16 +169,22 @@ class Problem:
         """Adjust a model from a given start."""
         if not self._tilts_are_free(model) or self.knowledge.attitudes_std is not None:
             spread = self.knowledge.attitudes_std or 0.0
-            return Fit(model, self._run(model, start, spread), spread if self._tilts_are_free(model) else 0.0)
+            own = spread if self._tilts_are_free(model) else 0.0
+            return Fit(model, self._run(model, start, spread), self.free_lens, own)
         spread = tilt_spread or _TILT_SPREAD_START
         adjusted = self._run(model, start, spread)
         for _ in range(_TILT_SPREAD_ROUNDS):
-            own = adjusted.parameters.poses[:, [PSI, THETA]]
-            previous, spread = spread, max(float(np.sqrt(np.mean(own**2))), _TILT_SPREAD_LEAST)
+            tilts = adjusted.parameters.poses[:, [PSI, THETA]]
+            previous, spread = spread, max(float(np.sqrt(np.mean(tilts**2))), _TILT_SPREAD_LEAST)
             if abs(spread - previous) <= 0.1 * previous:
                 break
             adjusted = self._run(model, adjusted.parameters, spread)
-        return Fit(model, adjusted, spread)
+        return Fit(model, adjusted, self.free_lens, spread)
+
+    def extend(self, fit: Fit, lens: BoolArray) -> Fit:
+        """The same model with more of the lens free."""
+        wider = replace(self, free_lens=self.free_lens | lens)
+        return wider.refine(fit.model, fit.adjusted.parameters, fit.tilt_spread)
 
     @staticmethod
     def _tilts_are_free(model: Model) -> bool:
