@@ -1,8 +1,8 @@
-"""The compositor: pictures, cameras and homographies in, one picture out."""
+"""The compositor: pictures, cameras and homographies in, one picture out, in memory or in a file."""
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,20 +10,25 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.camera import Camera
 from rdstitch.compositing.canvas import Canvas
+from rdstitch.compositing.crop import coverage_map, crop_box
 from rdstitch.compositing.exposure import Exposure, estimate_exposure, no_exposure
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.pictures import PictureCache, PictureReader, Source
+from rdstitch.compositing.plan import CompositePlan, plan_composite
 from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seams import find_seams
 from rdstitch.compositing.survey import survey_pictures
-from rdstitch.compositing.warp import plan_warp
+from rdstitch.compositing.warp import Box, plan_warp
 from rdstitch.errors import ArgumentError
+from rdstitch.io.layout import STRIP_ROWS, Layout
+from rdstitch.io.metadata import Metadata
+from rdstitch.io.tiff import ExtraTag
+from rdstitch.io.write import check_format, write_strips
 
 # Called with the share of the work done, 0 to 1.
 Progress = Callable[[float], None]
 
-_DEFAULT_MEMORY = 2**30
-_MOST_BANDS = 5
+_PREPARATION = 0.25
 
 
 @dataclass(frozen=True)
@@ -40,12 +45,33 @@ class Composite:
         Geometry of ``pixels``, after cropping.
     exposure : Exposure
         What the pictures were corrected by.
+    notes : tuple of str
+        What the user should know, such as why nothing was cropped.
     """
 
     pixels: NDArray[Any]
     alpha: NDArray[np.uint8]
     canvas: Canvas
     exposure: Exposure
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class FileComposite:
+    """A stitched picture that went to a file; attributes as of :class:`Composite`.
+
+    Attributes
+    ----------
+    path : Path
+    coverage : float
+        Share of the output that pictures cover.
+    """
+
+    path: Path
+    canvas: Canvas
+    exposure: Exposure
+    coverage: float
+    notes: tuple[str, ...] = ()
 
 
 def compose(
@@ -56,7 +82,7 @@ def compose(
     options: CompositeOptions | None = None,
     progress: Progress | None = None,
 ) -> Composite:
-    """Put pictures together on a canvas.
+    """Put pictures together on a canvas, in memory.
 
     Parameters
     ----------
@@ -81,17 +107,113 @@ def compose(
         When the arguments do not fit together.
     InputError
         When a picture cannot be read.
+    LimitError
+        When the memory limit is too low.
     """
-    options = options or CompositeOptions()
-    renderer = prepare(sources, cameras, homographies, canvas, options, _part_of(progress, 0.0, 0.3))
-    width, height = canvas.size
-    # Held in BGR order, so that encoders that want it need no copy; seen in RGB order.
-    pixels = np.zeros((height, width, renderer.channels), dtype=renderer.dtype)[..., ::-1]
+    prepared = prepare(sources, cameras, homographies, canvas, options, _part_of(progress, 0.0, _PREPARATION))
+    renderer, (width, height) = prepared.renderer, prepared.canvas.size
+    pixels = np.zeros((height, width, renderer.channels), dtype=renderer.dtype)
     alpha = np.zeros((height, width), dtype=np.uint8)
-    for top, samples, covered in strips(renderer, canvas, _part_of(progress, 0.3, 1.0)):
-        pixels[top : top + len(samples)] = samples
-        alpha[top : top + len(samples)] = covered
-    return Composite(pixels if renderer.channels > 1 else pixels[..., 0], alpha, canvas, renderer.exposure)
+    top = 0
+    for samples, opaque in prepared.strips(_part_of(progress, _PREPARATION, 1.0)):
+        pixels[top : top + len(samples)], alpha[top : top + len(samples)] = samples, opaque
+        top += len(samples)
+    shaped = pixels if renderer.channels > 1 else pixels[..., 0]
+    return Composite(shaped, alpha, prepared.canvas, renderer.exposure, prepared.notes)
+
+
+def compose_to_file(
+    path: str | Path,
+    sources: Sequence[Source],
+    cameras: Sequence[Camera],
+    homographies: ArrayLike,
+    canvas: Canvas,
+    options: CompositeOptions | None = None,
+    metadata: Metadata | None = None,
+    progress: Progress | None = None,
+    extra_tags: Sequence[ExtraTag] = (),
+) -> FileComposite:
+    """Put pictures together straight into a file, whatever its size: memory is that of a strip of tiles.
+
+    Parameters
+    ----------
+    path
+        ``.tif`` (tiled, with overviews, BigTIFF where needed), ``.png``, ``.jpg`` or ``.webp`` (held in memory whole).
+    sources, cameras, homographies, canvas, options, progress
+        As for :func:`compose`.
+    metadata : Metadata, optional
+        Colour profile, EXIF and resolution to keep.
+    extra_tags
+        Further tags of a TIFF file.
+
+    Raises
+    ------
+    ArgumentError, InputError, LimitError
+        As for :func:`compose`; also LimitError when the picture is too large for the format.
+    OutputError
+        When the file cannot be written; nothing is left behind.
+    """
+    prepared = prepare(sources, cameras, homographies, canvas, options, _part_of(progress, 0.0, _PREPARATION))
+    renderer, size = prepared.renderer, prepared.canvas.size
+    layout = Layout(
+        size,
+        renderer.channels,
+        renderer.dtype,
+        transparent=True,
+        metadata=metadata or Metadata(size),
+        background=renderer.options.background,
+    )
+    check_format(path, layout)
+    covered = 0
+
+    def counted() -> Iterator[tuple[NDArray[Any], NDArray[np.uint8]]]:
+        nonlocal covered
+        for samples, alpha in prepared.strips(_part_of(progress, _PREPARATION, 1.0)):
+            covered += int(np.count_nonzero(alpha))
+            yield samples, alpha
+
+    write_strips(path, layout, counted(), extra_tags)
+    share = covered / (size[0] * size[1])
+    return FileComposite(Path(path), prepared.canvas, renderer.exposure, share, prepared.notes)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A composite that is decided on, and not yet computed.
+
+    Attributes
+    ----------
+    renderer : Renderer
+    canvas : Canvas
+        After cropping.
+    origin : (int, int)
+        Its top-left px on the canvas that the renderer knows.
+    plan : CompositePlan
+    notes : tuple of str
+    """
+
+    renderer: Renderer
+    canvas: Canvas
+    origin: tuple[int, int]
+    plan: CompositePlan
+    notes: tuple[str, ...]
+
+    def strips(self, progress: Progress | None = None) -> Iterator[tuple[NDArray[Any], NDArray[np.uint8]]]:
+        """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
+        (width, height), (x, y), side = self.canvas.size, self.origin, self.plan.tile_size
+        for top in range(0, height, side):
+            rows = min(side, height - top)
+            samples = np.zeros((rows, width, self.renderer.channels), dtype=self.renderer.dtype)
+            alpha = np.zeros((rows, width), dtype=np.uint8)
+            for left in range(0, width, side):
+                right = min(left + side, width)
+                box: Box = (x + left, y + top, x + right, y + top + rows)
+                samples[:, left:right], covered = self.renderer.tile(box)
+                alpha[:, left:right][covered] = 255
+                if progress is not None:
+                    progress((top * width + rows * right) / (width * height))
+            for start in range(0, rows, STRIP_ROWS):
+                yield samples[start : start + STRIP_ROWS], alpha[start : start + STRIP_ROWS]
 
 
 def prepare(
@@ -99,60 +221,32 @@ def prepare(
     cameras: Sequence[Camera],
     homographies: ArrayLike,
     canvas: Canvas,
-    options: CompositeOptions,
+    options: CompositeOptions | None = None,
     progress: Progress | None = None,
-) -> Renderer:
-    """Decide on exposure and seams, from one small look at each picture; parameters as for :func:`compose`."""
+) -> Prepared:
+    """Decide on exposure, seams and cropping, from one small look at each picture; see :func:`compose`."""
+    options = options or CompositeOptions()
     matrices = np.asarray(homographies, dtype=np.float64)
     if not len(sources) == len(cameras) == len(matrices) == len(canvas.footprints):
         raise ArgumentError("sources, cameras, homographies and footprints must be equally many")
-    warps = [plan_warp(c, g, canvas, k) for k, (c, g) in enumerate(zip(cameras, matrices, strict=True))]
     reader = PictureReader(sources, [c.image_size for c in cameras])
-    exposure, seams = None, None
-    if options.exposure != "none" or options.seam != "none":
+    channels, dtype = reader.samples
+    plan = plan_composite(cameras, canvas, options, channels, dtype.itemsize)
+    exposure, seams, survey = no_exposure(len(cameras), channels), None, None
+    if len(cameras) > 1 and (options.exposure != "none" or options.seam != "none"):
         survey = survey_pictures(reader, cameras, matrices, canvas, _part_of(progress, 0.0, 0.7))
         if options.exposure != "none":
             exposure = estimate_exposure(survey, cameras, blocks=options.exposure == "blocks")
         if options.seam != "none":
-            decided = exposure or no_exposure(len(cameras), reader.samples[0])
-            graphcut = options.seam == "graphcut"
-            seams = find_seams(survey, decided, graphcut, _part_of(progress, 0.7, 1.0))
-    channels, dtype = reader.samples
-    return Renderer(
-        warps,
-        PictureCache(reader, [w.shrink for w in warps], options.max_memory or _DEFAULT_MEMORY),
-        exposure or no_exposure(len(cameras), channels),
-        seams,
-        options,
-        options.bands or _bands(cameras),
-        channels,
-        dtype,
-    )
-
-
-def strips(
-    renderer: Renderer, canvas: Canvas, progress: Progress | None = None
-) -> Iterator[tuple[int, NDArray[Any], NDArray[np.uint8]]]:
-    """The output from top to bottom: first row, samples (h, W, C) and alpha (h, W) of each strip of tiles."""
-    width, height = canvas.size
-    side = renderer.options.tile_size
-    for top in range(0, height, side):
-        bottom = min(top + side, height)
-        samples = np.zeros((bottom - top, width, renderer.channels), dtype=renderer.dtype)
-        alpha = np.zeros((bottom - top, width), dtype=np.uint8)
-        for left in range(0, width, side):
-            right = min(left + side, width)
-            samples[:, left:right], covered = renderer.tile((left, top, right, bottom))
-            alpha[:, left:right][covered] = 255
-            if progress is not None:
-                progress((top * width + (bottom - top) * right) / (width * height))
-        yield top, samples, alpha
-
-
-def _bands(cameras: Sequence[Camera]) -> int:
-    """Bands that suit the smallest picture: the widest transition is a few per cent of its side."""
-    side = min(min(c.image_size) for c in cameras)
-    return int(np.clip(math.log2(max(side, 1)) - 4.5, 1, _MOST_BANDS))
+            seams = find_seams(survey, exposure, options.seam == "graphcut", _part_of(progress, 0.7, 1.0))
+    box, note = None, ""
+    if options.crop == "auto":
+        box, note = crop_box(*coverage_map(cameras, matrices, canvas, survey), canvas.size)
+    warps = [plan_warp(c, g, canvas, k) for k, (c, g) in enumerate(zip(cameras, matrices, strict=True))]
+    cache = PictureCache(reader, [w.shrink for w in warps], plan.cache_bytes)
+    renderer = Renderer(warps, cache, exposure, seams, options, plan.bands, channels, dtype)
+    cropped = canvas if box is None else canvas.cropped(box)
+    return Prepared(renderer, cropped, (0, 0) if box is None else box[:2], plan, (note,) if note else ())
 
 
 def _part_of(progress: Progress | None, start: float, stop: float) -> Progress | None:

@@ -38,7 +38,7 @@ class CompositeOptions:
     scale: float = 1.0
     # Degrees that the output is turned clockwise.
     rotate: float = 0.0
-    # Bytes that the compositor may hold in pictures and tiles; None: half of the memory that is free.
+    # Bytes that the compositor may hold in pictures and tiles; None: 384 MB, or more where the canvas needs it.
     max_memory: int | None = None
     # Kernel of the one resampling.
     interpolation: Interpolation = "cubic"
@@ -46,8 +46,9 @@ class CompositeOptions:
     background: int = 0
     # Bands of "multiband"; the widest transition is about 2**bands px. None: by the size of the pictures.
     bands: int | None = None
-    # Side of the square tiles that the canvas is worked on in, px; a multiple of 256. It does not change the result.
-    tile_size: int = 1024
+    # Side of the square tiles that the canvas is worked on in, px, a multiple of 256; None: 1024 where memory allows.
+    # It does not change the result.
+    tile_size: int | None = None
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -67,5 +68,5 @@ class CompositeOptions:
             raise ArgumentError(f"background must be a grey from 0 to 255, not {self.background}")
         if self.bands is not None and not 1 <= self.bands <= 8:
             raise ArgumentError(f"bands must be from 1 to 8, not {self.bands}")
-        if self.tile_size < 256 or self.tile_size % 256:
+        if self.tile_size is not None and (self.tile_size < 256 or self.tile_size % 256):
             raise ArgumentError(f"tile_size must be a multiple of 256, not {self.tile_size}")

@@ -21,6 +21,8 @@ from rdstitch.io.metadata import Metadata
 _TILE = 256
 # Smaller pictures need no overview.
 _SMALLEST_OVERVIEW = 256
+# Rows that are reduced at a time, even.
+_HALVED_ROWS = 32
 _BIGTIFF_FROM = 2**32 - 2**27
 _COPIED_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.Artist, ExifTags.Base.Copyright)
 # (code, type, count, value, only on the first page), as tifffile takes them.
@@ -104,7 +106,8 @@ def _spilling(strips: Iterable[NDArray[Any]], spill: IO[bytes] | None, transpare
     for strip in strips:
         # Before it is passed on: the writer does not come back after the last tile.
         if spill is not None:
-            spill.write(_halved(strip, transparent).data)
+            for top in range(0, len(strip), _HALVED_ROWS):
+                spill.write(_halved(strip[top : top + _HALVED_ROWS], transparent).data)
         yield strip
 
 

@@ -1,0 +1,91 @@
+"""Cropping: the largest upright rectangle of the canvas that pictures cover without a hole."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.compositing.canvas import Canvas
+from rdstitch.compositing.survey import Survey
+from rdstitch.compositing.warp import Box, locate, plan_warp
+
+# Coverage is looked at with this many px along the longer side of the canvas.
+_RESOLUTION = 1500
+# A rectangle that keeps less of what is covered is not what anybody wants.
+_LEAST_KEPT = 0.25
+
+
+def coverage_map(
+    cameras: Sequence[Camera], homographies: FloatArray, canvas: Canvas, survey: Survey | None = None
+) -> tuple[NDArray[np.bool_], int]:
+    """Which px of a reduced canvas are covered, and the reduction; with the masks of a survey where there is one."""
+    if survey is not None:
+        width, height = survey.canvas.size
+        covered = np.zeros((height, width), dtype=np.bool_)
+        for tile in survey.tiles:
+            if tile is not None:
+                x0, y0, x1, y1 = tile.box
+                covered[y0:y1, x0:x1] |= tile.inside
+        return covered, survey.factor
+    factor = max(1, -(-max(canvas.size) // _RESOLUTION))
+    small = canvas.reduced(factor)
+    covered = np.zeros(small.size[::-1], dtype=np.bool_)
+    for index, (camera, matrix) in enumerate(zip(cameras, homographies, strict=True)):
+        warp = plan_warp(camera, matrix, small, index)
+        x0, y0, x1, y1 = warp.box
+        covered[y0:y1, x0:x1] |= locate(warp, warp.box).inside
+    return covered, factor
+
+
+def crop_box(covered: NDArray[np.bool_], factor: int, size: tuple[int, int]) -> tuple[Box | None, str]:
+    """Largest rectangle without holes, on the canvas, and, when there is none worth having, why.
+
+    Parameters
+    ----------
+    covered : ndarray of shape (h, w), bool
+        From :func:`coverage_map`.
+    factor : int
+        Canvas px per px of ``covered``.
+    size : (int, int)
+        Width and height of the canvas.
+    """
+    # A reduced px stands for those around its centre: one more on each side makes sure of all of them.
+    whole = cv2.erode(
+        covered.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=(0,)
+    )
+    coarse = max(1, -(-max(covered.shape) // _RESOLUTION))
+    rows, columns = (n // coarse for n in whole.shape)
+    cells = whole[: rows * coarse, : columns * coarse].reshape(rows, coarse, columns, coarse).min(axis=(1, 3)) > 0
+    x0, y0, x1, y1 = largest_rectangle(cells)
+    kept = (x1 - x0) * (y1 - y0) * coarse**2 / max(1, int(covered.sum()))
+    if kept < _LEAST_KEPT:
+        return None, f"not cropped: the largest rectangle without holes would keep {100 * kept:.0f} % of the picture"
+    unit = coarse * factor
+    return (x0 * unit, y0 * unit, min(x1 * unit, size[0]), min(y1 * unit, size[1])), ""
+
+
+def largest_rectangle(cells: NDArray[np.bool_]) -> Box:
+    """Largest upright rectangle of true cells: x0, y0, x1, y1, end exclusive; empty where there is none.
+
+    Row by row, the height of the column of true cells above each cell, and for each the widest run of columns at least
+    as high, found with a stack.
+    """
+    heights = np.zeros(cells.shape[1] + 1, dtype=np.int64)
+    best, area = (0, 0, 0, 0), 0
+    for y, row in enumerate(cells):
+        heights[:-1] = np.where(row, heights[:-1] + 1, 0)
+        # Only where the column ends below can a rectangle be the largest; but a row's bound is cheap to test.
+        if int(heights.max()) * cells.shape[1] <= area:
+            continue
+        stack: list[tuple[int, int]] = []
+        for x, height in enumerate(heights.tolist()):
+            start = x
+            while stack and stack[-1][1] >= height:
+                start, tall = stack.pop()
+                if tall * (x - start) > area:
+                    area = tall * (x - start)
+                    best = (start, y + 1 - tall, x, y + 1)
+            stack.append((start, height))
+    return best

@@ -1,0 +1,123 @@
+"""What a composite will take: memory and time, found before the work, and the sizes that follow from a memory limit."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rdstitch.camera import Camera
+from rdstitch.compositing.canvas import Canvas
+from rdstitch.compositing.multiband import margin
+from rdstitch.compositing.options import CompositeOptions
+from rdstitch.errors import LimitError
+
+# What the compositor takes without being told; more memory means that fewer pictures are read twice.
+DEFAULT_MEMORY = 384 * 2**20
+_TILE_SIZES = (1024, 512, 256)
+_MOST_BANDS = 5
+# Arrays of the size of a tile with its margin that live at one time (float32): samples and sums of the pyramids in each
+# channel, and coordinates, weights, owners.
+_LIVE_PER_CHANNEL, _LIVE_PLANES = 5.0, 14.0
+# Seconds per megapixel of output, per megapixel of input, on one core of a machine of 2020; for an estimate only.
+_SECONDS_OUT, _SECONDS_IN = 0.25, 0.06
+
+
+@dataclass(frozen=True)
+class CompositePlan:
+    """Sizes of the work.
+
+    Attributes
+    ----------
+    canvas_size : (int, int)
+        px, before cropping.
+    pictures : int
+    tile_size : int
+        px.
+    bands : int
+    cache_bytes : int
+        For pictures held.
+    memory_bytes : int
+        Estimate of all that the compositor holds at one time.
+    output_bytes : int
+        Of the samples, not compressed.
+    seconds : float
+        Rough estimate.
+    """
+
+    canvas_size: tuple[int, int]
+    pictures: int
+    tile_size: int
+    bands: int
+    cache_bytes: int
+    memory_bytes: int
+    output_bytes: int
+    seconds: float
+
+
+def plan_composite(
+    cameras: Sequence[Camera],
+    canvas: Canvas,
+    options: CompositeOptions,
+    channels: int = 3,
+    itemsize: int = 1,
+) -> CompositePlan:
+    """Tile size and cache that keep within the memory limit, with estimates for a dry run.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+    canvas : Canvas
+    options : CompositeOptions
+    channels, itemsize : int
+        Channels and bytes per sample of the pictures.
+
+    Raises
+    ------
+    LimitError
+        When the limit is too low for the smallest tiles.
+    """
+    bands = options.bands or usual_bands(cameras)
+    limit = options.max_memory or DEFAULT_MEMORY
+    picture = max(c.image_size[0] * c.image_size[1] for c in cameras) * channels * itemsize
+    # While a picture is decoded it is there twice, beside those in the cache.
+    needs = {
+        side: _working_set(canvas, side, bands, options, channels, itemsize) + 2 * picture for side in _sides(options)
+    }
+    if options.max_memory is not None and min(needs.values()) > limit:
+        raise LimitError(
+            f"{limit / 2**20:.0f} MB are too little: this canvas needs {min(needs.values()) / 2**20:.0f} MB; "
+            "raise --max-memory or use a smaller --scale"
+        )
+    tile_size = next((side for side, need in needs.items() if need + picture <= limit), min(needs))
+    cache = max(picture, limit - needs[tile_size])
+    width, height = canvas.size
+    megapixels_in = sum(c.image_size[0] * c.image_size[1] for c in cameras) / 1e6
+    return CompositePlan(
+        canvas.size,
+        len(cameras),
+        tile_size,
+        bands,
+        cache,
+        needs[tile_size] + min(cache, picture * len(cameras)),
+        width * height * (channels * itemsize + 1),
+        _SECONDS_OUT * width * height / 1e6 + _SECONDS_IN * megapixels_in,
+    )
+
+
+def usual_bands(cameras: Sequence[Camera]) -> int:
+    """Bands that suit the smallest picture: the widest transition is a few per cent of its side."""
+    side = min(min(c.image_size) for c in cameras)
+    return int(np.clip(np.log2(max(side, 1)) - 4.5, 1, _MOST_BANDS))
+
+
+def _sides(options: CompositeOptions) -> tuple[int, ...]:
+    """Tile sizes that may be used, largest first."""
+    return _TILE_SIZES if options.tile_size is None else (options.tile_size,)
+
+
+def _working_set(canvas: Canvas, side: int, bands: int, options: CompositeOptions, channels: int, itemsize: int) -> int:
+    """Bytes of one tile at work and of the strip that it belongs to."""
+    outer = side + 2 * (margin(bands) if options.blend == "multiband" else 0)
+    tile = 4.0 * outer**2 * (_LIVE_PER_CHANNEL * channels + _LIVE_PLANES)
+    strip = canvas.size[0] * min(side, canvas.size[1]) * (channels * itemsize + 1)
+    return int(tile + strip)
