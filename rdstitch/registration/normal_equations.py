@@ -188,7 +188,7 @@ class NormalEquations:
 
     def shared_information(self) -> FloatArray:
         """Information (S, S) on the shared parameters when nothing is known of the poses: ``C - B' A⁻¹ B``."""
-        return self._eliminate(1e-10)[0]
+        return self._eliminate(0.0)[0]
 
     def _eliminate(self, damping: float) -> tuple[FloatArray, FloatArray]:
         """The Schur complement (S, S) and ``A⁻¹ [B, gradient]``."""
@@ -196,7 +196,7 @@ class NormalEquations:
         if self.poses.shape[0] == 0:
             return self.shared, right
         diagonal = self.poses.diagonal()
-        floor = max(float(diagonal.max()), 1e-300) * 1e-12
+        floor = max(float(diagonal.max()), 1e-300) * 1e-14
         damped = (self.poses + sparse.diags_array(damping * diagonal + floor)).tocsc()
         factor = splu(damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         solved = factor.solve(right)

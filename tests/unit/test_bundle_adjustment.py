@@ -1,0 +1,124 @@
+"""The adjustment: derivatives checked numerically, priors, robustness, covariance against scatter."""
+
+import numpy as np
+import pytest
+
+from rdstitch.registration.bundle_adjustment import Adjuster, Freedom, Parameters, Priors, sigma_of
+from rdstitch.registration.models import HOMOGRAPHY, MODELS, RIGID, TILTING, Model
+from rdstitch.registration.normal_equations import chain, link_equations, squared_errors
+from rdstitch.registration.observations import Observations, spread_choice
+from tests.alignment_scenes import Scene, grid, jittered, scene
+
+FREE_LENS = np.array([True, True, True, True])
+ONE_LENS = np.array([True, False, False, False])
+
+
+def _scene() -> Scene:
+    rng = np.random.default_rng(3)
+    poses = jittered(grid(3, 2, (0.4, 0.35), 0.2, rng), 0.1, 0.02, rng)
+    return scene(poses, tilt=(0.05, -0.04), rng=rng, per_link=60)
+
+
+def _start(model: Model, truth: Scene) -> Parameters:
+    shared = model.shared_from(np.array([0.05, -0.04, np.log(1.3)])) if model.shared_names else np.zeros(0)
+    poses = model.poses_from(truth.truth, shared, np.zeros((len(truth.truth), 2)))
+    return Parameters(poses, shared, np.array([-0.23, 0.01, 0.004, -0.006]))
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
+def test_gradient_and_curvature_of_the_whole_cost(model: Model) -> None:
+    """Against differences of the cost, with the whitening held as the adjustment holds it."""
+    truth = _scene()
+    observations = Observations.from_links(truth.links, truth.cameras)
+    start, count, width = _start(model, truth), len(truth.cameras), 1e6
+
+    def homographies(parameters: Parameters) -> np.ndarray:
+        matrices = model.matrices(parameters.poses, parameters.shared).matrices
+        return np.asarray(matrices[observations.image2] @ np.linalg.inv(matrices)[observations.image1])
+
+    equations = link_equations(observations, homographies(start), start.lens, width)
+    free = np.ones((count, model.pose_size), dtype=np.bool_)
+    free[0] = False
+    matrices = model.matrices(start.poses, start.shared)
+    normal = chain(equations, observations, matrices, homographies(start), free, FREE_LENS, 2.0)
+
+    def cost(poses_step: np.ndarray, shared_step: np.ndarray) -> float:
+        step = np.zeros((count, model.pose_size))
+        step[free] = poses_step
+        moved = start.moved(model, step, shared_step, FREE_LENS)
+        return 2.0 * float(squared_errors(observations, homographies(moved), moved.lens, equations.whitening).sum())
+
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        along = rng.normal(size=int(free.sum())), rng.normal(size=len(start.shared) + 4)
+        step = 1e-6
+        numeric = (cost(step * along[0], step * along[1]) - cost(-step * along[0], -step * along[1])) / (2 * step)
+        analytic = 2.0 * float(normal.gradient_poses @ along[0] + normal.gradient_shared @ along[1])
+        assert analytic == pytest.approx(numeric, rel=1e-5)
+
+    # the step solves the dense system
+    dense = np.block([[normal.poses.toarray(), normal.coupling], [normal.coupling.T, normal.shared]])
+    right = -np.concatenate([normal.gradient_poses, normal.gradient_shared])
+    damped = dense + 1e-3 * np.diag(np.diag(dense))
+    np.testing.assert_allclose(np.concatenate(normal.solve(1e-3)), np.linalg.solve(damped, right), rtol=1e-6, atol=1e-9)
+
+
+def test_information_on_shared_parameters_is_what_elimination_leaves() -> None:
+    truth = _scene()
+    observations = Observations.from_links(truth.links, truth.cameras)
+    start = _start(TILTING, truth)
+    matrices = TILTING.matrices(start.poses, start.shared)
+    h = matrices.matrices[observations.image2] @ np.linalg.inv(matrices.matrices)[observations.image1]
+    free = np.ones((len(truth.cameras), 6), dtype=np.bool_)
+    free[0] = ~TILTING.gauge
+    normal = chain(link_equations(observations, h, start.lens, 5.0), observations, matrices, h, free, ONE_LENS, 1.0)
+    normal = normal.with_priors(np.full(int(free.sum()), 1e4), np.zeros(int(free.sum())), np.eye(4), np.zeros(4))
+    dense = np.block([[normal.poses.toarray(), normal.coupling], [normal.coupling.T, normal.shared]])
+    expected = np.linalg.inv(np.linalg.inv(dense)[-4:, -4:])
+    np.testing.assert_allclose(normal.shared_information(), expected, rtol=1e-5, atol=1e-5)
+
+
+def _adjust(model: Model, truth: Scene, seen: Observations) -> tuple[float, float]:
+    start = _start(model, truth)
+    start = Parameters(start.poses, start.shared, np.array([-0.2, 0.0, 0.0, 0.0]))
+    freedom = Freedom.fixing(model, len(truth.cameras), [0], ONE_LENS)
+    found = Adjuster(model, seen, freedom, Priors.none(model, len(truth.cameras))).run(start)
+    assert found.converged
+    return float(found.parameters.lens[0]), float(np.sqrt(found.covariance[-1, -1]))
+
+
+def test_stated_standard_deviation_is_the_scatter() -> None:
+    errors = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        poses = grid(2, 2, (0.4, 0.35), 0.3, rng)
+        truth = scene(poses, rng=rng, per_link=50, noise=0.5, outliers=0.0)
+        value, std = _adjust(HOMOGRAPHY, truth, Observations.from_links(truth.links, truth.cameras))
+        errors.append((value - truth.distortion) / std)
+    assert 0.7 < float(np.std(errors)) < 1.4
+    assert abs(float(np.mean(errors))) < 0.5
+
+
+def test_outliers_do_not_move_the_result() -> None:
+    rng = np.random.default_rng(5)
+    poses = grid(3, 2, (0.4, 0.35), 0.3, rng)
+    truth = scene(poses, rng=rng, noise=0.3, outliers=0.3)
+    value, std = _adjust(RIGID, truth, Observations.from_links(truth.links, truth.cameras))
+    assert abs(value - truth.distortion) < 5 * std < 0.005
+
+
+def test_errors_of_a_given_scatter_give_their_sigma() -> None:
+    errors = np.random.default_rng(0).normal(0, 0.7, (20_000, 2))
+    assert sigma_of((errors**2).sum(axis=1)) == pytest.approx(0.7, rel=0.03)
+
+
+def test_thinning_keeps_the_overlap_covered() -> None:
+    rng = np.random.default_rng(0)
+    crowd = rng.normal(0.2, 0.01, (900, 2))
+    spread = rng.uniform(-1, 1, (100, 2))
+    points = np.concatenate([crowd, spread])
+    kept = spread_choice(points, 100)
+    assert len(kept) == 100
+    assert len(np.unique(kept)) == 100
+    assert (kept >= 900).sum() > 60
+    assert (spread_choice(points[:7], 100) == np.arange(7)).all()
