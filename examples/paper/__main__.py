@@ -11,6 +11,8 @@ from examples.paper.settings import Effort, Settings
 
 FIGURES = {
     "figure2": "numerical stability",
+    "figure3": "noise, tilt unknown",
+    "figure4": "noise, tilt known",
 }
 """Modules in the order in which they run, with what they measure."""
 

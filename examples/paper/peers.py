@@ -35,7 +35,11 @@ def homlib_solver(name: str, *arguments: bool) -> Callable[[FloatArray, FloatArr
 
     def solve(x1: FloatArray, x2: FloatArray) -> Solutions:
         columns = np.ascontiguousarray(np.swapaxes(np.stack([x1, x2]), -1, -2))
-        found = [estimate(a, b, *arguments) for a, b in zip(*columns, strict=True)]
+        # Of noisy points its solvers sometimes return a homography of NaN.
+        found = [
+            [model for model in estimate(a, b, *arguments) if np.isfinite(model.homography).all()]
+            for a, b in zip(*columns, strict=True)
+        ]
         counts = [len(models) for models in found]
         models = [model for own in found for model in own]
         return Solutions(

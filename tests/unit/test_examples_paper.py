@@ -5,10 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from examples.paper import figure2
+from examples.paper import figure2, figure3, figure4
 from examples.paper.__main__ import main
+from examples.paper.constraints import planar_quartics, quartic_monomials
 from examples.paper.report import Report, Table, save
 from examples.paper.settings import Effort, Settings
+from rdstitch.synthetic import general_instances, planar_instances
 
 TINY = Settings(Effort.TINY, Path("no real pictures"))
 
@@ -49,3 +51,29 @@ def test_figure2_solvers_are_stable() -> None:
         assert row["λ 99 %"] < -9.0, name
         assert row["λ off by > 0.01, %"] == 0.0, name
     assert table.row("3 points")["λ off by > 0.01, %"] < 5.0
+
+
+def test_quartics_vanish_for_planar_motion_only() -> None:
+    planar, free = planar_instances(50, 4, seed=1), general_instances(50, 4, seed=1)
+    values = [
+        quartic_monomials(h / np.linalg.norm(h, axis=(1, 2), keepdims=True)) @ planar_quartics()
+        for h in (planar.homography, free.homography)
+    ]
+    assert np.abs(values[0]).max() < 1e-12
+    assert np.median(np.abs(values[1]).max(axis=1)) > 1e-3
+
+
+def test_figure3_errors_grow_with_the_noise() -> None:
+    tables = figure3.run(TINY).tables
+    for table in tables:
+        for name in table.column("solver"):
+            row = table.row(name)
+            assert 0.0 < row["σ = 0.05 px"] < 0.5 * row["σ = 2 px"], (table.title, name)
+    assert tables[0].row("4 points, all quartics")["σ = 0.25 px"] < tables[0].row("5 points")["σ = 0.25 px"]
+
+
+def test_figure4_knowing_the_tilt_helps_unless_it_is_wrong() -> None:
+    table = figure4.run(TINY).tables[1]
+    least = "σ = 0.05 px"
+    assert table.row("2 points")[least] < 0.7 * table.row("5 points")[least]
+    assert table.row("2 points, tilt wrong by 1°")[least] > 3.0 * table.row("2 points")[least]
