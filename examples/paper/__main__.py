@@ -10,6 +10,7 @@ from examples.paper.report import save
 from examples.paper.settings import Effort, Settings
 
 FIGURES = {
+    "runtime": "time per instance of the solvers",
     "figure2": "numerical stability",
     "figure3": "noise, tilt unknown",
     "figure4": "noise, tilt known",

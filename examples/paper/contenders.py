@@ -11,8 +11,11 @@ from rdstitch.camera import FloatArray
 from rdstitch.solvers import Solutions
 from rdstitch.synthetic import PlanarInstances
 
-FITZGIBBON = "estimate_fitzgibbon_cvpr_2001_two_sided_equal"
-WADENBACK = "estimate_wadenback_3dv_2026_two_sided_equal"
+HOMLIB: tuple[tuple[str, str, tuple[bool, ...]], ...] = (
+    ("5 points, Fitzgibbon (homlib)", "estimate_fitzgibbon_cvpr_2001_two_sided_equal", ()),
+    ("5 points, Wadenbäck (homlib)", "estimate_wadenback_3dv_2026_two_sided_equal", (False,)),
+)
+"""Solvers of homlib for one λ in both pictures: name, function, further arguments."""
 
 
 @dataclass(frozen=True)
@@ -49,27 +52,28 @@ def known_tilt() -> list[Contender]:
     ]
 
 
-def unknown_tilt() -> list[Contender]:
-    """Solvers that are not told the tilt, ours and, where it is installed, homlib's."""
-    own = [
+def own_unknown_tilt() -> list[Contender]:
+    """Our solvers that are not told the tilt."""
+    return [
         Contender("3 points", 3, lambda a, b, _: solvers.three_point(a, b)),
         Contender("4 points", 4, lambda a, b, _: solvers.four_point(a, b)),
         Contender("5 points", 5, lambda a, b, _: solvers.five_point(a, b)),
     ]
-    return own + homlib_contenders()
 
 
 def homlib_contenders() -> list[Contender]:
-    """Solvers of homlib for one λ in both pictures; none where it is not installed."""
+    """Solvers of homlib; none where it is not installed."""
     found = []
-    for name, function, arguments in (
-        ("5 points, Fitzgibbon (homlib)", FITZGIBBON, ()),
-        ("5 points, Wadenbäck (homlib)", WADENBACK, (False,)),
-    ):
+    for name, function, arguments in HOMLIB:
         solve = homlib_solver(function, *arguments)
         if solve is not None:
             found.append(Contender(name, 5, lambda a, b, _, solve=solve: solve(a, b)))  # type: ignore[misc]
     return found
+
+
+def unknown_tilt() -> list[Contender]:
+    """Solvers that are not told the tilt, ours and, where it is installed, homlib's."""
+    return own_unknown_tilt() + homlib_contenders()
 
 
 def _per_picture(tilt: FloatArray) -> FloatArray:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from examples.paper import figure2, figure3, figure4
+from examples.paper import figure2, figure3, figure4, runtime
 from examples.paper.__main__ import main
 from examples.paper.constraints import planar_quartics, quartic_monomials
 from examples.paper.report import Report, Table, save
@@ -77,3 +77,10 @@ def test_figure4_knowing_the_tilt_helps_unless_it_is_wrong() -> None:
     least = "σ = 0.05 px"
     assert table.row("2 points")[least] < 0.7 * table.row("5 points")[least]
     assert table.row("2 points, tilt wrong by 1°")[least] > 3.0 * table.row("2 points")[least]
+
+
+def test_runtime_batches_are_faster_than_single_calls() -> None:
+    table = runtime.run(TINY).tables[0]
+    for name in ("2 points", "3 points", "4 points", "5 points"):
+        row = table.row(name)
+        assert 0.0 < row["batched, µs"] < row["one at a time, µs"], name
