@@ -24,7 +24,7 @@ class SampleArrays:
         return type(self)(np.take(self.rows, samples, axis=-1))
 
 
-def solve_in_blocks(solve: BlockSolver, x1: ArrayLike, x2: ArrayLike, count: int, block_size: int = 1024) -> Solutions:
+def solve_in_blocks(solve: BlockSolver, x1: ArrayLike, x2: ArrayLike, count: int, block_size: int = 4096) -> Solutions:
     """Check a batch of samples, and solve it block by block.
 
     Samples with a coordinate that is not finite have no solution.
@@ -47,21 +47,21 @@ def solve_in_blocks(solve: BlockSolver, x1: ArrayLike, x2: ArrayLike, count: int
         When a shape is wrong.
     """
     a, b = as_samples(x1, x2, count)
-    finite = np.isfinite(a).all(axis=(1, 2)) & np.isfinite(b).all(axis=(1, 2))
-    index = np.flatnonzero(finite)
-    if len(index) < len(a):
-        a, b = a[index], b[index]
+    index = np.arange(len(a))
     parts = []
     # A degenerate sample divides by zero on its way to being rejected.
     with np.errstate(all="ignore"):
+        if not np.isfinite(a.sum() + b.sum()):
+            index = np.flatnonzero(np.isfinite(a).all(axis=(1, 2)) & np.isfinite(b).all(axis=(1, 2)))
+            a, b = a[index], b[index]
         for start in range(0, len(a), block_size):
             block = slice(start, start + block_size)
             first = np.ascontiguousarray(np.moveaxis(a[block], 0, -1))
             second = np.ascontiguousarray(np.moveaxis(b[block], 0, -1))
             part = solve(first, second, index[block])
             parts.append(Solutions(index[part.sample + start], part.homography, part.distortion))
-    if not parts:
-        return Solutions.empty()
+    if len(parts) < 2:
+        return parts[0] if parts else Solutions.empty()
     return Solutions(
         np.concatenate([part.sample for part in parts]),
         np.concatenate([part.homography for part in parts]),

@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.camera import FloatArray
 from rdstitch.solvers.batch import SampleArrays, solve_in_blocks
-from rdstitch.solvers.homography import determinants, homography_through, replaced_determinants
+from rdstitch.solvers.homography import determinants, homography_through, oriented_samples, replaced_determinants
 from rdstitch.solvers.plane import lens_range
 from rdstitch.solvers.roots import real_roots
 from rdstitch.solvers.solutions import Solutions
@@ -43,14 +43,15 @@ def five_point(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, floa
     """
 
     def solve(a: FloatArray, b: FloatArray, _: NDArray[np.intp]) -> Solutions:
-        equation = DirectionEquation.from_points(a, b)
-        index, distortion = real_roots(equation, _DEGREE, *lens_range(a, b, distortion_range))
-        a, b = a[..., index], b[..., index]
+        usable, low, high = oriented_samples(a, b, *lens_range(a, b, distortion_range))
+        a, b = np.take(a, usable, axis=-1), np.take(b, usable, axis=-1)
+        index, distortion = real_roots(DirectionEquation.from_points(a, b), _DEGREE, low, high)
+        a, b = np.take(a, index, axis=-1), np.take(b, index, axis=-1)
         h, possible = homography_through(a, b, distortion)
         x, y = a[4]
         depth = h[:, 2, 0] * x + h[:, 2, 1] * y + h[:, 2, 2] * (1.0 + distortion * (x**2 + y**2))
         possible &= depth > 0.0
-        return Solutions(index[possible], h[possible], distortion[possible])
+        return Solutions(usable[index[possible]], h[possible], distortion[possible])
 
     return solve_in_blocks(solve, x1, x2, 5)
 

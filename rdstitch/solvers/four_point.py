@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.camera import FloatArray
 from rdstitch.solvers.batch import SampleArrays, solve_in_blocks
-from rdstitch.solvers.homography import determinants, homography_through, replaced_determinants
+from rdstitch.solvers.homography import determinants, homography_through, oriented_samples, replaced_determinants
 from rdstitch.solvers.plane import lens_range
 from rdstitch.solvers.roots import real_roots
 from rdstitch.solvers.solutions import Solutions
@@ -41,14 +41,15 @@ def four_point(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, floa
     """
 
     def solve(a: FloatArray, b: FloatArray, _: NDArray[np.intp]) -> Solutions:
-        low, high = lens_range(a, b, distortion_range)
+        usable, low, high = oriented_samples(a, b, *lens_range(a, b, distortion_range))
+        a, b = np.take(a, usable, axis=-1), np.take(b, usable, axis=-1)
         quartic = real_roots(QuarticEquation.from_points(a, b), _QUARTIC_DEGREE, low, high)
         sextic = real_roots(SexticEquation.from_points(a, b), _SEXTIC_DEGREE, low, high)
         index, distortion = (np.concatenate(pair) for pair in zip(quartic, sextic, strict=True))
-        order = np.lexsort((distortion, index))
+        order = np.argsort(index, kind="stable")
         index, distortion = index[order], distortion[order]
-        h, possible = homography_through(a[..., index], b[..., index], distortion)
-        return Solutions(index[possible], h[possible], distortion[possible])
+        h, possible = homography_through(np.take(a, index, axis=-1), np.take(b, index, axis=-1), distortion)
+        return Solutions(usable[index[possible]], h[possible], distortion[possible])
 
     return solve_in_blocks(solve, x1, x2, 4)
 

@@ -41,6 +41,43 @@ def replaced_determinants(x: FloatArray) -> FloatArray:
     return np.stack([np.stack([pair[i] for pair in both]) for i in (0, 1)])
 
 
+def oriented_samples(
+    x1: FloatArray, x2: FloatArray, low: FloatArray, high: FloatArray
+) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
+    """Narrow ranges of λ to the part where the first four points are not mirrored and keep their side of the camera.
+
+    The eight determinants are linear in λ. Between their zeros no sign changes, so that the middle of each piece tells
+    for all of it. Most samples with a wrong match have no such piece, and need no further work.
+
+    Parameters
+    ----------
+    x1, x2 : ndarray of shape (4 or more, 2, B)
+    low, high : ndarray of shape (B,)
+
+    Returns
+    -------
+    sample : ndarray of shape (M,), intp
+        Samples with any such λ.
+    low, high : ndarray of shape (M,)
+        From the first to the last piece where every ``α_i β_i > 0``.
+    """
+    constant, slope = np.concatenate([replaced_determinants(x1), replaced_determinants(x2)], axis=1)
+    edges = np.empty((10, len(low)))
+    edges[0], edges[-1] = low, high
+    edges[1:-1] = np.clip(-constant / np.where(slope != 0.0, slope, 1e-300), low, high)
+    edges[1:-1].sort(axis=0)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    positive = constant[:, None] + slope[:, None] * middle > 0.0
+    kept = (positive[:4] == positive[4:]).all(axis=0) & (edges[1:] > edges[:-1])
+    sample = np.flatnonzero(kept.any(axis=0))
+    kept, edges = kept[:, sample], edges[:, sample]
+    return (
+        sample,
+        np.where(kept, edges[:-1], np.inf).min(axis=0),
+        np.where(kept, edges[1:], -np.inf).max(axis=0),
+    )
+
+
 def homography_through(x1: FloatArray, x2: FloatArray, distortion: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Homography of the first four points for one λ a sample.
 

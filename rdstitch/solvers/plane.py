@@ -39,11 +39,13 @@ class TiltRotations:
         Raises
         ------
         ArgumentError
-            When the shape is another or a value is not finite.
+            When the shape is another, a value is not finite, or the camera does not look at the plane.
         """
         angles = np.asarray(tilt, dtype=np.float64)
-        if angles.shape not in ((2,), (2, 2), (count, 2, 2)) or not np.isfinite(angles).all():
-            raise ArgumentError(f"tilt must be (psi, theta) or one such pair for each picture, not {tilt!r}")
+        if angles.shape not in ((2,), (2, 2), (count, 2, 2)):
+            raise ArgumentError(f"tilt must be (psi, theta) or one such pair a picture, not of shape {angles.shape}")
+        if not (np.abs(angles) < np.pi / 2).all():
+            raise ArgumentError("tilt must be below a right angle")
         both = np.broadcast_to(angles, (*angles.shape[:-2], 2, 2)).reshape(-1, 2, 2)
         first, second = np.moveaxis(rotation_from_tilt(both), 0, -1)
         return cls(np.ascontiguousarray(first), np.ascontiguousarray(second))
@@ -52,7 +54,7 @@ class TiltRotations:
         """Those of some samples; indices may repeat."""
         if self.first.shape[-1] == 1:
             return self
-        return type(self)(self.first[..., samples], self.second[..., samples])
+        return type(self)(np.take(self.first, samples, axis=-1), np.take(self.second, samples, axis=-1))
 
 
 def depths(x: FloatArray, rotation: FloatArray) -> FloatArray:
@@ -99,10 +101,8 @@ def visible_range(
     low, high = lens_range(x1, x2, distortion_range)
     for x, rotation in ((x1, rotations.first), (x2, rotations.second)):
         constant, slope = depths(x, rotation)
-        bound = (_MIN_DEPTH - constant) / np.where(slope != 0.0, slope, 1.0)
-        flat = np.where(constant > _MIN_DEPTH, -np.inf, np.inf)
-        low = np.maximum(low, np.where(slope > 0.0, bound, np.where(slope < 0.0, -np.inf, flat)).max(axis=0))
-        high = np.minimum(high, np.where(slope < 0.0, bound, np.inf).min(axis=0))
+        # No slope is negative. At the centre it is 0, and the bound as infinite as it should be.
+        low = np.maximum(low, ((_MIN_DEPTH - constant) / slope).max(axis=0))
     return low, high
 
 

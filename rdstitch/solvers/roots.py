@@ -168,9 +168,9 @@ class Brackets:
 
     @classmethod
     def joined(cls, parts: Sequence["Brackets"]) -> Self:
-        """All of them, ascending by sample and then by root."""
+        """All of them, ascending by sample."""
         columns = [np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)]
-        order = np.lexsort((columns[1], columns[0]))
+        order = np.argsort(columns[0], kind="stable")
         return cls(*(column[order] for column in columns))
 
 

@@ -62,7 +62,7 @@ def three_point_similarity(
         own = rotations.take(samples)
         equation = DistanceRatioEquation.from_points(a, b, own)
         index, distortion = real_roots(equation, _DEGREE, *visible_range(a, b, own, distortion_range))
-        a, b, own = a[..., index], b[..., index], own.take(index)
+        a, b, own = np.take(a, index, axis=-1), np.take(b, index, axis=-1), own.take(index)
         upright = ~mirrored(plane_points(a, own.first, distortion), plane_points(b, own.second, distortion))
         if not upright.all():
             index, distortion, own = index[upright], distortion[upright], own.take(np.flatnonzero(upright))

@@ -52,8 +52,8 @@ def two_point(
         own = rotations.take(samples)
         equation = DistanceEquation.from_points(a, b, own)
         index, distortion = real_roots(equation, _DEGREE, *visible_range(a, b, own, distortion_range))
-        h = motion_homography(a[..., index], b[..., index], own.take(index), distortion)
-        return Solutions(index, h, distortion)
+        a, b = np.take(a, index, axis=-1), np.take(b, index, axis=-1)
+        return Solutions(index, motion_homography(a, b, own.take(index), distortion), distortion)
 
     return solve_in_blocks(solve, x1, x2, 2)
 
