@@ -5,7 +5,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.camera import FloatArray
 from rdstitch.solvers.batch import SampleArrays, solve_in_blocks
-from rdstitch.solvers.homography import determinants, homography_through, oriented_samples, replaced_determinants
+from rdstitch.solvers.homography import homography_through
+from rdstitch.solvers.orientation import determinants, oriented_samples, triangle_determinants
 from rdstitch.solvers.plane import lens_range
 from rdstitch.solvers.roots import real_roots
 from rdstitch.solvers.solutions import Solutions
@@ -62,7 +63,7 @@ class DirectionEquation(SampleArrays):
     @classmethod
     def from_points(cls, x1: FloatArray, x2: FloatArray) -> "DirectionEquation":
         """From points of shape (5, 2, B)."""
-        alpha, beta = replaced_determinants(x1)[:, 1:], replaced_determinants(x2)[:, 1:]
+        alpha, beta = triangle_determinants(x1)[:, 1:], triangle_determinants(x2)[:, 1:]
         a, b, c, _, fifth = x1
         gamma = np.stack([determinants(fifth, b, c), determinants(a, fifth, c), determinants(a, b, fifth)], axis=1)
         across = x2[4, 0] * x2[:3, 1] - x2[4, 1] * x2[:3, 0]

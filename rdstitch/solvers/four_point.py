@@ -5,7 +5,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.camera import FloatArray
 from rdstitch.solvers.batch import SampleArrays, solve_in_blocks
-from rdstitch.solvers.homography import determinants, homography_through, oriented_samples, replaced_determinants
+from rdstitch.solvers.homography import homography_through
+from rdstitch.solvers.orientation import determinants, oriented_samples, triangle_determinants
 from rdstitch.solvers.plane import lens_range
 from rdstitch.solvers.roots import real_roots
 from rdstitch.solvers.solutions import Solutions
@@ -69,7 +70,7 @@ class QuarticEquation(SampleArrays):
     @classmethod
     def from_points(cls, x1: FloatArray, x2: FloatArray) -> "QuarticEquation":
         """From points of shape (4, 2, B)."""
-        alpha, beta = replaced_determinants(x1), replaced_determinants(x2)
+        alpha, beta = triangle_determinants(x1), triangle_determinants(x2)
         x, y = x1[:3].swapaxes(0, 1)
         r2, q2 = x**2 + y**2, x2[:3, 0] ** 2 + x2[:3, 1] ** 2
         (xj, yj, rj), (xk, yk, rk) = ([v[order] for v in (x, y, r2)] for order in ([1, 2, 0], [2, 0, 1]))
@@ -124,7 +125,7 @@ class SexticEquation(SampleArrays):
         mixed = [
             np.stack([determinants(x[i], y[j], y[k]) for i, j, k in _CYCLES], axis=1) for x, y in ((x2, x1), (x1, x2))
         ]
-        return cls(np.concatenate([replaced_determinants(x1), replaced_determinants(x2), *mixed], axis=1))
+        return cls(np.concatenate([triangle_determinants(x1), triangle_determinants(x2), *mixed], axis=1))
 
     def _sides(self, distortion: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Products of α and β, F and G."""

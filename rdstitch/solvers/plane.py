@@ -21,8 +21,6 @@ from rdstitch.planar_motion import rotation_from_tilt
 _MIN_DEPTH = 1e-9
 # Points nearer than this, relative to their distance from the centre, count as coincident.
 _MIN_SEPARATION = 1e-9
-# Areas of triangles below this, relative to the product of their sides' squares, have no orientation.
-_NO_AREA = 1e-12
 
 
 @dataclass(frozen=True)
@@ -171,13 +169,3 @@ def motion_homography(
     )
     homography = r2[:, 0, None] * moved[0] + r2[:, 1, None] * moved[1] + r2[:, 2, None] * moved[2]
     return np.ascontiguousarray(np.moveaxis(homography, -1, 0))
-
-
-def mirrored(first: FloatArray, second: FloatArray) -> NDArray[np.bool_]:
-    """Whether triangles (3, 2, M) have opposite orientations; False for those that have none."""
-    areas, sizes = [], []
-    for triangle in (first, second):
-        (ux, uy), (vx, vy) = triangle[1] - triangle[0], triangle[2] - triangle[0]
-        areas.append(ux * vy - uy * vx)
-        sizes.append(ux**2 + uy**2 + vx**2 + vy**2)
-    return np.asarray(areas[0] * areas[1] < -_NO_AREA * sizes[0] * sizes[1])

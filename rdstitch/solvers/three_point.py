@@ -9,7 +9,8 @@ from rdstitch.camera import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.planar_motion import rotation_from_tilt, tilt_from_normal
 from rdstitch.solvers.batch import SampleArrays, solve_in_blocks
-from rdstitch.solvers.plane import TiltRotations, lens_range, mirrored, motion_homography, plane_points
+from rdstitch.solvers.orientation import mirrored, oriented_samples
+from rdstitch.solvers.plane import TiltRotations, lens_range, motion_homography
 from rdstitch.solvers.solutions import Solutions
 
 BoolArray = NDArray[np.bool_]
@@ -87,11 +88,10 @@ def three_point(
         raise ArgumentError(f"starts must be rows (a, b, lambda) of finite numbers, not shape {first.shape}")
 
     def solve(a: FloatArray, b: FloatArray, _: IndexArray) -> Solutions:
-        low, high = lens_range(a, b, distortion_range)
-        usable = np.flatnonzero(low < high)
-        a, b = a[..., usable], b[..., usable]
+        usable, low, high = oriented_samples(a, b, *lens_range(a, b, distortion_range))
+        a, b = np.take(a, usable, axis=-1), np.take(b, usable, axis=-1)
         index, state = newton(DistanceSystem.from_points(a, b), first)
-        inside = (state[2] > low[usable[index]]) & (state[2] < high[usable[index]])
+        inside = (state[2] > low[index]) & (state[2] < high[index])
         index, state = index[inside], state[:, inside]
         index, h, distortion = _motions(a, b, index, state)
         return Solutions(usable[index], h, distortion)
@@ -104,10 +104,10 @@ def _motions(
 ) -> tuple[IndexArray, FloatArray, FloatArray]:
     """Sample, homography and λ of the states (a, b, λ) that are physically possible."""
     a, b, distortion = state
-    x1, x2 = x1[..., index], x2[..., index]
+    x1, x2 = np.take(x1, index, axis=-1), np.take(x2, index, axis=-1)
     tilt = tilt_from_normal(np.stack([a, b, np.ones_like(a)], axis=-1))
     rotation = np.moveaxis(rotation_from_tilt(tilt), 0, -1)
-    possible = ~mirrored(plane_points(x1, rotation, distortion), plane_points(x2, rotation, distortion))
+    possible = ~mirrored(x1, x2, distortion)
     for x in (x1, x2):
         depth = 1.0 + a * x[:, 0] + b * x[:, 1] + distortion * (x[:, 0] ** 2 + x[:, 1] ** 2)
         possible &= (depth > 0.0).all(axis=0)

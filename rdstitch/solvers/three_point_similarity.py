@@ -5,15 +5,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.camera import FloatArray
 from rdstitch.solvers.batch import SampleArrays, solve_in_blocks
-from rdstitch.solvers.plane import (
-    TiltRotations,
-    depths,
-    differences,
-    mirrored,
-    motion_homography,
-    plane_points,
-    visible_range,
-)
+from rdstitch.solvers.orientation import mirrored, oriented_samples
+from rdstitch.solvers.plane import TiltRotations, depths, differences, motion_homography, visible_range
 from rdstitch.solvers.roots import real_roots
 from rdstitch.solvers.solutions import Solutions
 
@@ -60,14 +53,13 @@ def three_point_similarity(
 
     def solve(a: FloatArray, b: FloatArray, samples: NDArray[np.intp]) -> Solutions:
         own = rotations.take(samples)
-        equation = DistanceRatioEquation.from_points(a, b, own)
-        index, distortion = real_roots(equation, _DEGREE, *visible_range(a, b, own, distortion_range))
+        usable, low, high = oriented_samples(a, b, *visible_range(a, b, own, distortion_range))
+        a, b, own = np.take(a, usable, axis=-1), np.take(b, usable, axis=-1), own.take(usable)
+        index, distortion = real_roots(DistanceRatioEquation.from_points(a, b, own), _DEGREE, low, high)
         a, b, own = np.take(a, index, axis=-1), np.take(b, index, axis=-1), own.take(index)
-        upright = ~mirrored(plane_points(a, own.first, distortion), plane_points(b, own.second, distortion))
-        if not upright.all():
-            index, distortion, own = index[upright], distortion[upright], own.take(np.flatnonzero(upright))
-            a, b = a[..., upright], b[..., upright]
-        return Solutions(index, motion_homography(a, b, own, distortion, height_free=True), distortion)
+        h = motion_homography(a, b, own, distortion, height_free=True)
+        possible = ~mirrored(a, b, distortion)
+        return Solutions(usable[index[possible]], h[possible], distortion[possible])
 
     return solve_in_blocks(solve, x1, x2, 3)
 
