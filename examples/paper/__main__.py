@@ -14,6 +14,7 @@ FIGURES = {
     "figure2": "numerical stability",
     "figure3": "noise, tilt unknown",
     "figure4": "noise, tilt known",
+    "figure7": "inliers against RANSAC iterations",
 }
 """Modules in the order in which they run, with what they measure."""
 

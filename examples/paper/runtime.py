@@ -11,7 +11,7 @@ from examples.paper.report import Report, Table
 from examples.paper.settings import Settings
 from rdstitch.synthetic import PlanarInstances, planar_instances
 
-_SINGLES = 100
+_SINGLES = 40
 _REPETITIONS = 5
 
 Row = tuple[str, float | None, float, float]

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from examples.paper import figure2, figure3, figure4, runtime
+from examples.paper import figure2, figure3, figure4, figure7, runtime
 from examples.paper.__main__ import main
 from examples.paper.constraints import planar_quartics, quartic_monomials
 from examples.paper.report import Report, Table, save
@@ -83,4 +83,16 @@ def test_runtime_batches_are_faster_than_single_calls() -> None:
     table = runtime.run(TINY).tables[0]
     for name in ("2 points", "3 points", "4 points", "5 points"):
         row = table.row(name)
-        assert 0.0 < row["batched, µs"] < row["one at a time, µs"], name
+        assert 0.0 < row["batched, µs"] < row["one call each, µs"], name
+
+
+def test_figure7_fewer_points_need_fewer_iterations() -> None:
+    report = figure7.run(TINY)
+    assert any("garfield_red" in note for note in report.notes)
+    table = report.tables[0]
+    for name in table.column("solver"):
+        shares = list(table.row(name).values())[1:]
+        assert shares == sorted(shares), name
+        assert shares[-1] <= 100.0
+    assert table.row("2 points, tilt given")["20 it."] > 2.0 * table.row("5 points")["20 it."]
+    assert table.row("3 points")["200 it."] > table.row("4 points, no distortion (DLT)")["200 it."]

@@ -1,0 +1,80 @@
+"""Matched pairs of pictures, rendered with known truth and real, that several figures use."""
+
+from collections.abc import Sequence as Many
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.features import FeatureOptions, detect, match
+from rdstitch.io.read import read_image
+from rdstitch.synthetic import Photometry, Sequence, ground, pair_poses, sequence_over
+from rdstitch.synthetic.lenses import Lens
+
+Tilt = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class MatchedPair:
+    """Matches of two pictures.
+
+    Attributes
+    ----------
+    name : str
+    points1, points2 : ndarray of shape (N, 2)
+        Measured px.
+    quality : ndarray of shape (N,)
+        The higher, the more distinctive.
+    camera : Camera
+        Size and focal length; its λ is 0.
+    tilt : (float, float)
+        True tilt (ψ, θ), radians; where it is not known, that of a levelled camera.
+    """
+
+    name: str
+    points1: FloatArray
+    points2: FloatArray
+    quality: FloatArray
+    camera: Camera
+    tilt: Tilt = (0.0, 0.0)
+
+
+def rendered_pair(
+    lens: Lens,
+    *,
+    seed: int,
+    overlap: float = 0.35,
+    yaw: float = 0.3,
+    direction: float = 0.6,
+    scale: float = 1.0,
+    tilt: Tilt = (0.0, 0.0),
+) -> Sequence:
+    """Two pictures of a floor; noise and vignetting as of a small camera."""
+    poses = pair_poses(lens, overlap, yaw=yaw, direction=direction, scale=scale, tilt=tilt)
+    photometry = Photometry(gain=np.array([1.0, 0.85]), vignetting=0.2, blur=0.5, noise=0.01)
+    return sequence_over(lambda size: ground(size, seed), lens, poses, photometry=photometry, seed=seed)
+
+
+def match_rendered(sequence: Sequence, name: str, *, ratio: float | None = None, features: int = 2000) -> MatchedPair:
+    """Matches of the first two pictures of a sequence, whose poses have one tilt."""
+    options = FeatureOptions(max_features=features)
+    first, second = (detect(sequence.frame(index), options) for index in (0, 1))
+    matches = match(first, second, ratio)
+    camera = Camera(sequence.lens.image_size, focal=sequence.lens.focal, focal_source="option")
+    psi, theta = sequence.poses.tilt[0]
+    return MatchedPair(name, matches.points1, matches.points2, -matches.ratio, camera, (float(psi), float(theta)))
+
+
+def match_files(files: Many[Path], *, ratio: float | None = None, features: int = 4000) -> list[MatchedPair]:
+    """Matches of consecutive pictures; their focal length is guessed."""
+    options = FeatureOptions(max_features=features)
+    pictures = [read_image(file).pixels for file in files]
+    found = [detect(pixels, options) for pixels in pictures]
+    pairs = []
+    for k in range(len(files) - 1):
+        matches = match(found[k], found[k + 1], ratio)
+        camera = Camera((pictures[k].shape[1], pictures[k].shape[0])).with_focal()
+        name = f"{files[k].stem} and {files[k + 1].stem}"
+        pairs.append(MatchedPair(name, matches.points1, matches.points2, -matches.ratio, camera))
+    return pairs
