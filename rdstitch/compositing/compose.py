@@ -1,6 +1,7 @@
 """The compositor: pictures, cameras and homographies in, one picture out, in memory or in a file."""
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from rdstitch.compositing.plan import CompositePlan, plan_composite
 from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seams import find_seams
 from rdstitch.compositing.survey import survey_pictures
-from rdstitch.compositing.warp import Box, plan_warp
+from rdstitch.compositing.warp import plan_warp
 from rdstitch.errors import ArgumentError
 from rdstitch.io.layout import STRIP_ROWS, Layout
 from rdstitch.io.metadata import Metadata
@@ -200,15 +201,22 @@ class Prepared:
 
     def strips(self, progress: Progress | None = None) -> Iterator[tuple[NDArray[Any], NDArray[np.uint8]]]:
         """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
+        with ThreadPoolExecutor(self.plan.workers) as pool:
+            yield from self._strips(pool.map, progress)
+
+    def _strips(
+        self, run: Callable[..., Iterator[Any]], progress: Progress | None
+    ) -> Iterator[tuple[NDArray[Any], NDArray[np.uint8]]]:
+        """The same, with tiles computed by ``run``, which works like ``map``."""
         (width, height), (x, y), side = self.canvas.size, self.origin, self.plan.tile_size
         for top in range(0, height, side):
             rows = min(side, height - top)
             samples = np.zeros((rows, width, self.renderer.channels), dtype=self.renderer.dtype)
             alpha = np.zeros((rows, width), dtype=np.uint8)
-            for left in range(0, width, side):
-                right = min(left + side, width)
-                box: Box = (x + left, y + top, x + right, y + top + rows)
-                samples[:, left:right], covered = self.renderer.tile(box)
+            boxes = [(x + k, y + top, x + min(k + side, width), y + top + rows) for k in range(0, width, side)]
+            for box, (pixels, covered) in zip(boxes, run(self.renderer.tile, boxes), strict=True):
+                left, right = box[0] - x, box[2] - x
+                samples[:, left:right] = pixels
                 alpha[:, left:right][covered] = 255
                 if progress is not None:
                     progress((top * width + rows * right) / (width * height))

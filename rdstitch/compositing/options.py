@@ -46,9 +46,11 @@ class CompositeOptions:
     background: int = 0
     # Bands of "multiband"; the widest transition is about 2**bands px. None: by the size of the pictures.
     bands: int | None = None
-    # Side of the square tiles that the canvas is worked on in, px, a multiple of 256; None: 1024 where memory allows.
+    # Side of the square tiles that the canvas is worked on in, px, a multiple of 256; None: 512 where memory allows.
     # It does not change the result.
     tile_size: int | None = None
+    # Tiles that are worked on at one time; None: one per processor, up to 4. It does not change the result.
+    workers: int | None = None
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -68,5 +70,7 @@ class CompositeOptions:
             raise ArgumentError(f"background must be a grey from 0 to 255, not {self.background}")
         if self.bands is not None and not 1 <= self.bands <= 8:
             raise ArgumentError(f"bands must be from 1 to 8, not {self.bands}")
+        if self.workers is not None and self.workers < 1:
+            raise ArgumentError(f"workers must be at least 1, not {self.workers}")
         if self.tile_size is not None and (self.tile_size < 256 or self.tile_size % 256):
             raise ArgumentError(f"tile_size must be a multiple of 256, not {self.tile_size}")

@@ -4,6 +4,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from threading import Lock
 from typing import Any
 
 import cv2
@@ -187,21 +188,26 @@ class PictureCache:
     def __init__(self, reader: PictureReader, shrinks: Sequence[float], limit: int) -> None:
         self._reader, self._shrinks, self._limit = reader, shrinks, limit
         self._held: OrderedDict[int, LoadedPicture] = OrderedDict()
-        self._bytes = 0
+        self._bytes = self._largest = 0
+        self._lock = Lock()
 
     def masked(self, index: int) -> bool:
         """Whether a picture has transparent parts."""
         return self._reader.masked(index)
 
     def __getitem__(self, index: int) -> LoadedPicture:
-        """Picture ``index``, read unless it is held."""
-        if index in self._held:
-            self._held.move_to_end(index)
-            return self._held[index]
-        loaded = prepare_picture(self._reader(index), self._shrinks[index])
-        self._bytes += loaded.nbytes
-        while self._held and self._bytes > self._limit:
-            _, dropped = self._held.popitem(last=False)
-            self._bytes -= dropped.nbytes
-        self._held[index] = loaded
-        return loaded
+        """Picture ``index``, read unless it is held; may be asked for from several threads."""
+        with self._lock:
+            if index in self._held:
+                self._held.move_to_end(index)
+                return self._held[index]
+            # Room is made before reading, so that the limit holds meanwhile too.
+            while self._held and self._bytes + self._largest > self._limit:
+                _, dropped = self._held.popitem(last=False)
+                self._bytes -= dropped.nbytes
+                del dropped
+            loaded = prepare_picture(self._reader(index), self._shrinks[index])
+            self._largest = max(self._largest, loaded.nbytes)
+            self._bytes += loaded.nbytes
+            self._held[index] = loaded
+            return loaded

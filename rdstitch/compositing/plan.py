@@ -1,5 +1,6 @@
 """What a composite will take: memory and time, found before the work, and the sizes that follow from a memory limit."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,7 +14,8 @@ from rdstitch.errors import LimitError
 
 # What the compositor takes without being told; more memory means that fewer pictures are read twice.
 DEFAULT_MEMORY = 384 * 2**20
-_TILE_SIZES = (1024, 512, 256)
+_TILE_SIZES = (512, 256)
+_MOST_WORKERS = 4
 _MOST_BANDS = 5
 # Arrays of the size of a tile with its margin that live at one time (float32): samples and sums of the pyramids in each
 # channel, and coordinates, weights, owners.
@@ -33,6 +35,8 @@ class CompositePlan:
     pictures : int
     tile_size : int
         px.
+    workers : int
+        Tiles at one time.
     bands : int
     cache_bytes : int
         For pictures held.
@@ -47,6 +51,7 @@ class CompositePlan:
     canvas_size: tuple[int, int]
     pictures: int
     tile_size: int
+    workers: int
     bands: int
     cache_bytes: int
     memory_bytes: int
@@ -80,25 +85,28 @@ def plan_composite(
     limit = options.max_memory or DEFAULT_MEMORY
     picture = max(c.image_size[0] * c.image_size[1] for c in cameras) * channels * itemsize
     # While a picture is decoded it is there twice, beside those in the cache.
+    workers = options.workers or min(_MOST_WORKERS, os.cpu_count() or 1)
+    choices = [(side, count) for side in _sides(options) for count in range(workers, 0, -1)]
     needs = {
-        side: _working_set(canvas, side, bands, options, channels, itemsize) + 2 * picture for side in _sides(options)
+        choice: 2 * picture + _working_set(canvas, *choice, bands, options, channels, itemsize) for choice in choices
     }
-    if options.max_memory is not None and min(needs.values()) > limit:
+    least = min(needs, key=lambda choice: needs[choice])
+    if options.max_memory is not None and needs[least] > limit:
         raise LimitError(
-            f"{limit / 2**20:.0f} MB are too little: this canvas needs {min(needs.values()) / 2**20:.0f} MB; "
+            f"{limit / 2**20:.0f} MB are too little: this canvas needs {needs[least] / 2**20:.0f} MB; "
             "raise --max-memory or use a smaller --scale"
         )
-    tile_size = next((side for side, need in needs.items() if need + picture <= limit), min(needs))
-    cache = max(picture, limit - needs[tile_size])
+    chosen = next((choice for choice in choices if needs[choice] + picture <= limit), least)
+    cache = max(picture, limit - needs[chosen])
     width, height = canvas.size
     megapixels_in = sum(c.image_size[0] * c.image_size[1] for c in cameras) / 1e6
     return CompositePlan(
         canvas.size,
         len(cameras),
-        tile_size,
+        *chosen,
         bands,
         cache,
-        needs[tile_size] + min(cache, picture * len(cameras)),
+        needs[chosen] + min(cache, picture * len(cameras)),
         width * height * (channels * itemsize + 1),
         _SECONDS_OUT * width * height / 1e6 + _SECONDS_IN * megapixels_in,
     )
@@ -115,9 +123,11 @@ def _sides(options: CompositeOptions) -> tuple[int, ...]:
     return _TILE_SIZES if options.tile_size is None else (options.tile_size,)
 
 
-def _working_set(canvas: Canvas, side: int, bands: int, options: CompositeOptions, channels: int, itemsize: int) -> int:
-    """Bytes of one tile at work and of the strip that it belongs to."""
+def _working_set(
+    canvas: Canvas, side: int, workers: int, bands: int, options: CompositeOptions, channels: int, itemsize: int
+) -> int:
+    """Bytes of the tiles at work, and of the strip that they belong to, which is there twice for a moment."""
     outer = side + 2 * (margin(bands) if options.blend == "multiband" else 0)
     tile = 4.0 * outer**2 * (_LIVE_PER_CHANNEL * channels + _LIVE_PLANES)
-    strip = canvas.size[0] * min(side, canvas.size[1]) * (channels * itemsize + 1)
-    return int(tile + strip)
+    strip = 2.0 * canvas.size[0] * min(side, canvas.size[1]) * (channels * itemsize + 1)
+    return int(workers * tile + strip)

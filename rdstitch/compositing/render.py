@@ -229,7 +229,10 @@ def _won(owner: NDArray[np.int32], box: Box, layer: Layer) -> Layer | None:
     owned = _part(owner, box, layer.box) == layer.index
     # A picture may have a layer from the seam map and one for what the map left over: each gets its own px.
     owned &= layer.weight > 0
-    return Layer(layer.index, layer.geometry, owned.astype(np.float32)) if owned.any() else None
+    if not owned.any():
+        return None
+    bounds = _bounds(owned, layer.box)
+    return Layer(layer.index, layer.geometry.part(bounds), _part(owned, layer.box, bounds).astype(np.float32))
 
 
 def _bounds(values: NDArray[Any], box: Box) -> Box:

@@ -19,6 +19,7 @@ from rdstitch.io.metadata import Metadata, metadata_of, read_metadata
 Pixels = NDArray[Any]
 
 _OPAQUE = 255
+_ROWS_AT_A_TIME = 128
 _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _PNG_PIXEL_CHUNKS = (b"IHDR", b"tRNS", b"IDAT", b"IEND")
@@ -74,17 +75,28 @@ def read_image(path: str | Path) -> Picture:
 def _from_pillow(image: Image.Image) -> tuple[Pixels, Pixels | None]:
     """Samples and alpha of any mode of Pillow's."""
     if image.mode in _GREY_16:
-        image.load()
-        return np.asarray(image).astype(np.uint16), None
+        return _samples(image).astype(np.uint16), None
     if image.mode == "F":
-        return np.asarray(image, dtype=np.float32), None
+        return _samples(image), None
     transparent = "A" in image.getbands() or "transparency" in image.info or image.mode in ("La", "RGBa")
     grey = image.mode in ("1", "L", "LA", "La") or (image.mode == "P" and _is_grey(image))
-    image = image.convert("RGBA" if transparent else "L" if grey else "RGB")
-    samples = np.asarray(image)
+    mode = "RGBA" if transparent else "L" if grey else "RGB"
+    samples = _samples(image if image.mode == mode else image.convert(mode))
     if not transparent:
         return samples, None
     return (samples[..., 0] if grey else samples[..., :3]), samples[..., 3]
+
+
+def _samples(image: Image.Image) -> Pixels:
+    """The samples of a picture, taken in pieces: Pillow's own conversion holds them three times."""
+    image.load()
+    width, height = image.size
+    first = np.asarray(image.crop((0, 0, width, min(_ROWS_AT_A_TIME, height))))
+    samples = np.empty((height, *first.shape[1:]), dtype=first.dtype)
+    for top in range(0, height, _ROWS_AT_A_TIME):
+        bottom = min(top + _ROWS_AT_A_TIME, height)
+        samples[top:bottom] = np.asarray(image.crop((0, top, width, bottom)))
+    return samples
 
 
 def _is_grey(image: Image.Image) -> bool:
