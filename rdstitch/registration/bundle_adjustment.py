@@ -4,7 +4,7 @@ Levenberg-Marquardt on a robust loss of the transfer errors in measured px, gene
 the loss follows the scatter of the errors, from wide to narrow, so that good links are not lost to a rough start.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -167,6 +167,8 @@ class Adjuster:
         How much less the correspondences say than if their errors were independent; weighs them against the priors.
     max_iterations : int
         Linearizations at most.
+    tolerance : float
+        Relative decrease of the cost, as a step promises it, that is not worth the step.
     """
 
     model: Model
@@ -175,7 +177,7 @@ class Adjuster:
     priors: Priors
     overdispersion: float = 1.0
     max_iterations: int = 60
-    tolerance: float = field(default=1e-5)
+    tolerance: float = 1e-5
 
     def run(self, start: Parameters, width: float | None = None) -> Adjusted:
         """Adjust.
@@ -209,7 +211,7 @@ class Adjuster:
     def _descend(self, parameters: Parameters, sigma: float, width: float, most: int) -> tuple[_State, int, bool]:
         """Levenberg-Marquardt at one width of the loss; the state reached, linearizations, whether converged."""
         state = self._evaluate(parameters, sigma, width)
-        damping, used = 1e-4, 1
+        damping, used = 1e-5, 1
         while used < most:
             normal = self._normal_equations(state, sigma)
             flat, step_shared = normal.solve(damping)

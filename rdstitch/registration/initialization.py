@@ -14,6 +14,9 @@ from rdstitch.registration.bundle_adjustment import Adjusted, Adjuster, Freedom,
 from rdstitch.registration.models import BoolArray, Model
 from rdstitch.registration.observations import Observations
 
+_MOST_ITERATIONS = 24
+"""A start need not be the minimum."""
+
 
 def relations_at(observations: Observations, relations: Sequence[RadialHomography], lens: FloatArray) -> FloatArray:
     """Each link's homography (L, 3, 3) expressed with one common lens.
@@ -85,4 +88,4 @@ def adjust_apart(
         none.poses_precision,
     )
     freedom = Freedom.fixing(model, count, list(range(0, count, 2)), free_lens)
-    return Adjuster(model, apart, freedom, known).run(start)
+    return Adjuster(model, apart, freedom, known, max_iterations=_MOST_ITERATIONS).run(start)

@@ -37,6 +37,10 @@ YAW, X, Y, LOG_HEIGHT, PSI, THETA = range(6)
 """Columns of a planar model's poses."""
 
 _AROUND_X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+_TRACELESS = np.zeros((8, 3, 3))
+_TRACELESS[[0, 1, 2, 3, 4, 5], [0, 0, 1, 1, 2, 2], [1, 2, 0, 2, 0, 1]] = 1.0
+_TRACELESS[6] = np.diag([1.0, -1.0, 0.0]) / np.sqrt(2.0)
+_TRACELESS[7] = np.diag([1.0, 1.0, -2.0]) / np.sqrt(6.0)
 _AROUND_Y = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
 
 
@@ -223,10 +227,11 @@ def _motion_in_plane(poses: FloatArray, focal: float) -> tuple[FloatArray, Float
 
 @dataclass(frozen=True)
 class HomographyModel:
-    """One homography per picture: eight parameters, a step being ``P ← (I + Σ δ_k E_k) P``.
+    """One homography per picture: eight parameters, a step being ``P ← exp(Σ δ_k E_k) P``.
 
-    The step acts in the picture's frame, where coordinates are of order one however far away the picture lies.
-    ``E_k`` are the unit matrices without the last, which the scale of P leaves free. Poses are P, row by row.
+    The step acts in the picture's frame, where coordinates are of order one however far away the picture lies. ``E_k``
+    span the matrices without trace: only so does a change of the plane's frame, ``P M P⁻¹`` in every picture, leave
+    all relations of pictures as they are, to any order. Poses are P, row by row.
     """
 
     name: str = "homography"
@@ -241,8 +246,7 @@ class HomographyModel:
     def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
         """Homographies from the plane to the pictures, with derivatives."""
         matrices = poses.reshape(-1, 3, 3)
-        generators = np.eye(9)[:8].reshape(8, 3, 3)
-        return ModelMatrices(matrices, generators @ matrices[:, None], np.zeros((len(poses), 0, 3, 3)))
+        return ModelMatrices(matrices, _TRACELESS @ matrices[:, None], np.zeros((len(poses), 0, 3, 3)))
 
     def natural(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Nothing."""
@@ -254,8 +258,9 @@ class HomographyModel:
 
     def moved(self, poses: FloatArray, step: FloatArray) -> FloatArray:
         """Poses after a step of shape (N, 8)."""
-        change = np.concatenate([step, np.zeros((len(step), 1))], axis=1).reshape(-1, 3, 3)
-        return _unit_determinant(poses.reshape(-1, 3, 3) + change @ poses.reshape(-1, 3, 3))
+        change = np.einsum("nk,kij->nij", step, _TRACELESS)
+        growth = np.eye(3) + change @ (np.eye(3) + change / 2.0)  # exp to second order
+        return _unit_determinant(growth @ poses.reshape(-1, 3, 3))
 
     def offsets(self, poses: FloatArray) -> FloatArray:
         """Zeros: no prior speaks of a homography."""
