@@ -30,8 +30,7 @@ _TOUCHING = 1e-13
 _NEWTON_STEPS = 40
 # In units of half the interval. Newton's method squares the error: the next step would be below rounding error.
 _NEWTON_CONVERGED = 1e-7
-_POLISHING_STEPS = 2
-# A longer step belongs to a double root, whose slope says nothing.
+# In the same units. A longer step belongs to a double root, whose slope says nothing.
 _LONGEST_POLISHING_STEP = 1e-2
 
 
@@ -70,14 +69,34 @@ def real_roots(equation: Equation, degree: int, low: FloatArray, high: FloatArra
     brackets = isolate(values)
     sample = brackets.sample
     series = (chebyshev_from_values(degree) @ values)[:, sample]
-    t = bracketed_newton(series, brackets)
-    _, slope = chebyshev_value_and_slope(series, t)
-    middle, half, own = middle[sample], half[sample], equation.take(sample)
-    slope = np.where(slope != 0.0, slope, np.inf)
-    for _ in range(_POLISHING_STEPS):
-        step = own.polynomial(middle + t * half) / slope
-        t = t - np.where(np.abs(step) < _LONGEST_POLISHING_STEP, step, 0.0)
-    return sample, middle + t * half
+    t, slope = bracketed_newton(series, brackets)
+    half = half[sample]
+    return sample, polish(equation.take(sample), middle[sample] + t * half, slope / half, half)
+
+
+def polish(equation: Equation, start: FloatArray, slope: FloatArray, half: FloatArray) -> FloatArray:
+    """Improve one root of each equation by two steps on the equation itself, where they do improve it.
+
+    Parameters
+    ----------
+    equation : Equation
+        M equations.
+    start, slope : ndarray of shape (M,)
+        The root, and the derivative of the polynomial there, as far as the values at the nodes tell.
+    half : ndarray of shape (M,)
+        Half the length of each interval.
+    """
+    value = equation.polynomial(start)
+    step = value / np.where(slope != 0.0, slope, np.inf)
+    step = np.where(np.abs(step) < _LONGEST_POLISHING_STEP * half, step, 0.0)
+    closer = start - step
+    remainder = equation.polynomial(closer)
+    improved = np.abs(remainder) < np.abs(value)
+    # The secant through both values; where they are rounding errors it must not lead away.
+    change = value - remainder
+    second = step * remainder / np.where(change != 0.0, change, np.inf)
+    second = np.where(np.abs(second) < np.abs(step), second, 0.0)
+    return np.where(improved, closer - second, start)
 
 
 @lru_cache
@@ -266,8 +285,8 @@ def chebyshev_value_and_slope(coefficients: FloatArray, t: FloatArray) -> tuple[
     return coefficients[0] + t * value - before, value + t * slope - slope_before
 
 
-def bracketed_newton(coefficients: FloatArray, brackets: Brackets) -> FloatArray:
-    """The root of each Chebyshev series (degree + 1, M) in its bracket; shape (M,).
+def bracketed_newton(coefficients: FloatArray, brackets: Brackets) -> tuple[FloatArray, FloatArray]:
+    """The root of each Chebyshev series (degree + 1, M) in its bracket, and the derivative there; shape (M,).
 
     Newton's method from where the chord crosses zero; a step that leaves the bracket is replaced by its middle.
     """
@@ -275,7 +294,7 @@ def bracketed_newton(coefficients: FloatArray, brackets: Brackets) -> FloatArray
     change = brackets.value_right - brackets.value_left
     rising = change > 0.0
     t = left - brackets.value_left * (right - left) / np.where(change != 0.0, change, np.inf)
-    roots = t.copy()
+    roots, slopes = t.copy(), np.empty_like(t)
     active = np.arange(len(t))
     for _ in range(_NEWTON_STEPS):
         value, slope = chebyshev_value_and_slope(coefficients, t)
@@ -284,7 +303,7 @@ def bracketed_newton(coefficients: FloatArray, brackets: Brackets) -> FloatArray
         left = np.where(above, left, t)
         following = t - value / np.where(slope != 0.0, slope, np.inf)
         following = np.where((following >= left) & (following <= right), following, 0.5 * (left + right))
-        roots[active] = following
+        roots[active], slopes[active] = following, slope
         going = np.flatnonzero(np.abs(following - t) > _NEWTON_CONVERGED)
         if not len(going):
             break
@@ -292,4 +311,4 @@ def bracketed_newton(coefficients: FloatArray, brackets: Brackets) -> FloatArray
             active, coefficients = active[going], coefficients[:, going]
             left, right, rising, following = left[going], right[going], rising[going], following[going]
         t = following
-    return roots
+    return roots, slopes
