@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.errors import ArgumentError, RegistrationError
 from rdstitch.registration.alignment import Alignment
-from rdstitch.registration.consistency import contradicting_links, misfitting_links
+from rdstitch.registration.consistency import judge_in_triangles, misfitting_links
 from rdstitch.registration.graph import connected_components, spanning_tree
 from rdstitch.registration.initialization import relations_at
 from rdstitch.registration.links import Link
@@ -31,6 +31,9 @@ _LENS_STD = np.array([0.5, 0.05, 0.03, 0.03])
 
 _OBSERVABLE = 0.1
 """Standard deviation of λ from which on it counts as not observable."""
+
+_UNCONFIRMED = 0.1
+"""How much a link without a triangle that closes is relied on, relative to one with."""
 
 _ROUNDS = 3
 """Times that wrong pairs are looked for."""
@@ -163,8 +166,9 @@ def align(
         relations = apart.homographies
 
     say("choice of the model")
-    wrong = contradicting_links(apart, few, len(cameras))
-    graph = _Graph(len(cameras), few, relations, lens, free_lens, known, options)
+    wrong, confirmed = judge_in_triangles(apart, few, len(cameras))
+    trust = few.matches.astype(np.float64) * np.where(confirmed > 0, 1.0, _UNCONFIRMED)
+    graph = _Graph(len(cameras), few, relations, trust, lens, free_lens, known, options)
     problem, pictures = graph.problem(~wrong)
     choice = choose_model(problem, options.models, options.lenses if observable else ())
     graph = replace(graph, free_lens=choice.fit.free_lens)
@@ -205,6 +209,7 @@ class _Graph:
     count: int
     observations: Observations
     homographies: FloatArray
+    trust: FloatArray
     lens: FloatArray
     free_lens: BoolArray
     known: Knowledge
@@ -226,11 +231,11 @@ class _Graph:
         if wanted is not None and number[wanted] >= 0:
             reference = int(number[wanted])
         else:
-            matches = np.diff(own.start).astype(np.float64)
-            reference = spanning_tree(len(pictures), own.image1, own.image2, matches).root
+            reference = spanning_tree(len(pictures), own.image1, own.image2, self.trust[links]).root
         problem = Problem(
             own,
             self.homographies[links],
+            self.trust[links],
             len(pictures),
             reference,
             self.lens,

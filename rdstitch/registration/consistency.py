@@ -7,6 +7,7 @@ started, within what the links' covariances allow. After it, by the errors that 
 import itertools
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from rdstitch.camera import FloatArray
@@ -47,8 +48,8 @@ def triangles(count: int, image1: IntArray, image2: IntArray) -> IntArray:
     return result[::every]
 
 
-def contradicting_links(apart: Adjusted, observations: Observations, count: int) -> BoolArray:
-    """Links that most of their triangles speak against, shape (L,).
+def judge_in_triangles(apart: Adjusted, observations: Observations, count: int) -> tuple[BoolArray, NDArray[np.intp]]:
+    """Which links most of their triangles speak against.
 
     One after the other, the link with the most contradictions is taken out together with its triangles, until every
     link left is confirmed at least as often as it is contradicted.
@@ -60,20 +61,26 @@ def contradicting_links(apart: Adjusted, observations: Observations, count: int)
     observations : Observations
     count : int
         Number of pictures.
+
+    Returns
+    -------
+    suspect : ndarray of shape (L,), bool
+    confirmed : ndarray of shape (L,), intp
+        Triangles with each link that close, of those left.
     """
     suspect = np.zeros(len(observations), dtype=np.bool_)
     corners = triangles(count, observations.image1, observations.image2)
     if not len(corners):
-        return suspect
+        return suspect, np.zeros(len(observations), dtype=np.intp)
     bad = _open_triangles(apart, observations, corners)
-    matches = np.diff(observations.start)
-    known, alive = np.isfinite(bad), np.ones(len(corners), dtype=np.bool_)
+    alive = np.isfinite(bad)
     while True:
-        weight = np.where(known & alive, np.where(bad > 0, 1.0, -1.0), 0.0)
+        weight = np.where(alive, np.where(bad > 0, 1.0, -1.0), 0.0)
         balance = np.bincount(corners.ravel(), np.repeat(weight, 3), len(observations))
-        worst = int(np.lexsort((matches, -balance))[0])
+        worst = int(np.lexsort((observations.matches, -balance))[0])
         if balance[worst] <= 0:
-            return suspect
+            closed = corners[alive & (bad == 0)]
+            return suspect, np.bincount(closed.ravel(), minlength=len(observations)).astype(np.intp)
         suspect[worst] = True
         alive &= ~(corners == worst).any(axis=1)
 

@@ -28,6 +28,8 @@ class Observations:
         Measured, in half diagonals from the camera's distortion centre.
     scale1, scale2 : ndarray of shape (L,)
         Half the diagonal of each link's pictures, px.
+    matches : ndarray of shape (L,), intp
+        Correspondences that each link had before thinning.
     """
 
     image1: IntArray
@@ -37,6 +39,7 @@ class Observations:
     points2: FloatArray
     scale1: FloatArray
     scale2: FloatArray
+    matches: IntArray
 
     @classmethod
     def from_links(cls, links: Sequence[Link], cameras: Sequence[Camera], most: int | None = None) -> Self:
@@ -60,6 +63,7 @@ class Observations:
             ),
             np.array([sizes[i] for i in index1]),
             np.array([sizes[j] for j in index2]),
+            np.array([len(link) for link in links], dtype=np.intp),
         )
 
     def __len__(self) -> int:
@@ -81,7 +85,14 @@ class Observations:
         if image_index is not None:
             image1, image2 = image_index[image1], image_index[image2]
         return type(self)(
-            image1, image2, start, self.points1[rows], self.points2[rows], self.scale1[chosen], self.scale2[chosen]
+            image1,
+            image2,
+            start,
+            self.points1[rows],
+            self.points2[rows],
+            self.scale1[chosen],
+            self.scale2[chosen],
+            self.matches[chosen],
         )
 
     def thinned(self, most: int) -> Self:
@@ -94,7 +105,7 @@ class Observations:
     def taken_apart(self) -> Self:
         """Every link on its own: link l is between the pictures 2l and 2l + 1."""
         first = 2 * np.arange(len(self))
-        return type(self)(first, first + 1, self.start, self.points1, self.points2, self.scale1, self.scale2)
+        return replace(self, image1=first, image2=first + 1)
 
 
 def spread_choice(points: FloatArray, most: int | None) -> IntArray:

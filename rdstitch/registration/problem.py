@@ -133,6 +133,8 @@ class Problem:
         Links between the pictures 0 … N-1.
     homographies : ndarray of shape (L, 3, 3)
         Of the links, at the ``lens``.
+    trust : ndarray of shape (L,)
+        How much each link can be relied on to start with.
     count : int
         N.
     reference : int
@@ -147,6 +149,7 @@ class Problem:
 
     observations: Observations
     homographies: FloatArray
+    trust: FloatArray
     count: int
     reference: int
     lens: FloatArray
@@ -203,14 +206,13 @@ class Problem:
         return Adjuster(model, self.observations, freedom, priors, self.overdispersion)
 
     def _chained(self, model: Model, others: Sequence[Fit]) -> Parameters:
-        """Every link on its own, chained along the tree of the links with the most correspondences."""
+        """Every link on its own, chained along the tree of the links trusted most."""
         o, attitudes = self.observations, self.knowledge.attitudes
         shared, lens, homographies = np.zeros(0), self.lens, self.homographies
         if model.shared_names:
             apart = self._planar_apart(SIMILARITY if self._tilts_are_free(model) else model, others)
             shared, lens, homographies = apart.parameters.shared, apart.parameters.lens, apart.homographies
-        matches = np.diff(o.start).astype(np.float64)
-        tree = spanning_tree(self.count, o.image1, o.image2, matches, self.reference)
+        tree = spanning_tree(self.count, o.image1, o.image2, self.trust, self.reference)
         origin = model.origins(shared, attitudes[[tree.root]])[0]
         chained = tree.chained(homographies, o.image1, origin)
         return Parameters(model.poses_from(chained, shared, attitudes), shared, lens)
