@@ -15,6 +15,7 @@ FIGURES = {
     "figure3": "noise, tilt unknown",
     "figure4": "noise, tilt known",
     "figure7": "inliers against RANSAC iterations",
+    "figure9": "trajectories",
 }
 """Modules in the order in which they run, with what they measure."""
 

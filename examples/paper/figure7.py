@@ -1,37 +1,27 @@
-"""Fig. 7: inliers against RANSAC iterations, averaged over many runs, for every solver.
-
-Plain RANSAC, the same for all: draw a sample, solve it, count the matches that agree with the best of its solutions,
-keep the best so far. No local optimisation, which would hide the differences.
-"""
+"""Fig. 7: inliers against RANSAC iterations, averaged over many runs, for every solver."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
-from examples.paper.contenders import HOMLIB
 from examples.paper.matched import MatchedPair, match_files, match_rendered, rendered_pair
-from examples.paper.peers import absent, homlib_solver
+from examples.paper.peers import absent
+from examples.paper.plain_ransac import THRESHOLD, all_solvers, draw_samples
 from examples.paper.plots import curves
 from examples.paper.report import Report, Table
 from examples.paper.settings import Effort, Settings
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.robust.measurements import Measurements
-from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
-from rdstitch.robust.pair_models import HomographyModel
-from rdstitch.robust.sampling import Sampler
-from rdstitch.robust.scoring import plausible, transfer_errors2
-from rdstitch.solvers import Solutions
+from rdstitch.robust.minimal import MinimalSolver
 
 ITERATIONS = (1, 2, 5, 10, 20, 50, 100, 200)
 """At which the inliers are reported."""
 
-_THRESHOLD = 3.0  # px
 _RATIO = 0.95  # of the matches: loose, so that there is something to do
 _RENDERED_TILT = (0.05, -0.04)
-_SAMPLES_AT_ONCE = 1000
+_RUNS_AT_ONCE = 5
 
 
 @dataclass(frozen=True)
@@ -43,7 +33,7 @@ class _Curve:
 
 
 def run(settings: Settings) -> Report:
-    """Mean number of inliers of the best model after so many iterations."""
+    """Mean share of inliers of the best model after so many iterations."""
     runs = settings.count(5, 60, 500)
     pairs = _pairs(settings)
     curves_of = {pair.name: _curves(pair, runs) for pair in pairs}
@@ -74,60 +64,25 @@ def _pairs(settings: Settings) -> list[MatchedPair]:
 
 def _curves(pair: MatchedPair, runs: int) -> list[_Curve]:
     data = Measurements.from_pixels(pair.points1, pair.points2, pair.camera, pair.camera, None)
-    return [
-        _Curve(solver.name, _mean_share(solver, data, runs, seed))
-        for seed, solver in enumerate(_solvers(pair.camera, pair.tilt))
-    ]
+    return [_Curve(s.name, _mean_share(s, data, runs)) for s in all_solvers(pair.camera, pair.tilt)]
 
 
-def _solvers(camera: Camera, tilt: tuple[float, float]) -> list[MinimalSolver]:
-    """All minimal solvers, in the half-diagonal frame."""
-    assert camera.focal is not None
-    given = partial(minimal_solvers, camera.focal / camera.half_diagonal, 0.01)
-    told, untold, flat = given((tilt, tilt), None), given(None, None), given((tilt, tilt), 0.0)
-    names = {
-        "2 points, tilt given": (told, "two_point"),
-        "3 points, tilt given, height free": (told, "three_point_similarity"),
-        "3 points": (untold, "three_point"),
-        "4 points": (untold, "four_point"),
-        "5 points": (untold, "five_point"),
-        "4 points, no distortion (DLT)": (flat, "four_point_dlt"),
-    }
-    found = [replace(next(s for s in group if s.name == key), name=name) for name, (group, key) in names.items()]
-    for name, function, arguments in HOMLIB:
-        solve = homlib_solver(function, *arguments)
-        if solve is not None:
-            found.append(MinimalSolver(name, 5, solve, HomographyModel()))
-    return found
-
-
-def _mean_share(solver: MinimalSolver, data: Measurements, runs: int, seed: int) -> FloatArray:
+def _mean_share(solver: MinimalSolver, data: Measurements, runs: int) -> FloatArray:
     """Mean over the runs of the share of inliers of the best model so far, shape (iterations,)."""
     length = ITERATIONS[-1]
-    counts = np.zeros(runs * length)
-    sampler = Sampler(len(data), solver.sample_size, None, 1, [seed])
-    for start in range(0, len(counts), _SAMPLES_AT_ONCE):
-        part = slice(start, min(start + _SAMPLES_AT_ONCE, len(counts)))
-        picks = sampler.draw(part.stop - part.start)
-        found = solver.solve(data.x1[picks], data.x2[picks])
-        np.maximum.at(counts[part], found.sample, _inliers(found, data))
-    best = np.maximum.accumulate(counts.reshape(runs, length), axis=1)
-    mean: FloatArray = best.mean(axis=0) / len(data)
-    return mean
-
-
-def _inliers(found: Solutions, data: Measurements) -> FloatArray:
-    """Number of matches within the threshold, of each solution (M,)."""
-    result = np.zeros(len(found))
-    possible = np.flatnonzero(plausible(found, corner_radius=1.0))
-    for part in np.array_split(possible, max(1, len(possible) // 100)):
-        errors2 = transfer_errors2(found.homography[part], found.distortion[part], data)
-        result[part] = (errors2 < _THRESHOLD**2).sum(axis=1)
-    return result
+    total = np.zeros(length)
+    for first in range(0, runs, _RUNS_AT_ONCE):
+        together = min(_RUNS_AT_ONCE, runs - first)
+        found, inliers = draw_samples(solver, data, together * length, seed=first)
+        counts = np.zeros(together * length)
+        np.maximum.at(counts, found.sample, inliers)
+        total += np.maximum.accumulate(counts.reshape(together, length), axis=1).sum(axis=0)
+    share: FloatArray = total / (runs * len(data))
+    return share
 
 
 def _table(pair: MatchedPair, found: Sequence[_Curve], runs: int) -> Table:
     rows = tuple((c.solver, *(100.0 * float(c.share[k - 1]) for k in ITERATIONS)) for c in found)
     count = len(pair.points1)
-    title = f"Fig. 7: {pair.name}: inliers within {_THRESHOLD:g} px, % of {count} matches, mean of {runs} runs"
+    title = f"Fig. 7: {pair.name}: inliers within {THRESHOLD:g} px, % of {count} matches, mean of {runs} runs"
     return Table(title, ("solver", *(f"{k} it." for k in ITERATIONS)), rows)

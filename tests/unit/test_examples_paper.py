@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from examples.paper import figure2, figure3, figure4, figure7, runtime
+from examples.paper import figure2, figure3, figure4, figure7, figure9, runtime
 from examples.paper.__main__ import main
 from examples.paper.constraints import planar_quartics, quartic_monomials
 from examples.paper.report import Report, Table, save
@@ -96,3 +96,12 @@ def test_figure7_fewer_points_need_fewer_iterations() -> None:
         assert shares[-1] <= 100.0
     assert table.row("2 points, tilt given")["20 it."] > 2.0 * table.row("5 points")["20 it."]
     assert table.row("3 points")["200 it."] > table.row("4 points, no distortion (DLT)")["200 it."]
+
+
+def test_figure9_adjustment_brings_every_start_to_the_same_trajectory() -> None:
+    for table in figure9.run(TINY).tables:
+        for name in ("2 points, tilt given", "3 points", "4 points", figure9.RECIPE):
+            row = table.row(name)
+            assert row["adjusted, %"] < min(1.0, row["translation, chained, %"] + 0.1), (table.title, name)
+            assert row["λ error, adjusted"] < 5e-3, (table.title, name)
+        assert table.row("4 points, no distortion (DLT)")["translation, chained, %"] > 5.0

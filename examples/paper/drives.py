@@ -1,0 +1,103 @@
+"""The paper's drives (§5.5) as matches between frames, synthesised from true poses without rendering anything."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.registration.alignment import Poses as PlanePoses
+from rdstitch.registration.trajectory import Trajectory
+from rdstitch.synthetic import Poses, line_poses, parking_poses, turn_poses
+from rdstitch.synthetic.poses import to_picture, to_plane
+
+PATHS = {"line": line_poses, "turn": turn_poses, "parallel parking": parking_poses}
+
+_STEPS = (1, 2, 4)
+_LEAST_MATCHES = 30
+_PER_PICTURE = 200
+_WRONG = 0.1  # share of the matches
+
+
+@dataclass(frozen=True)
+class FramePair:
+    """Matches between two frames, px, in the order of their indices."""
+
+    image1: int
+    image2: int
+    points1: FloatArray
+    points2: FloatArray
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A robot's drive.
+
+    Attributes
+    ----------
+    camera : Camera
+        The true one.
+    tilt : (float, float)
+        (ψ, θ), radians.
+    poses : Poses
+        True ones.
+    pairs : tuple of FramePair
+        Consecutive frames and frames two and four apart.
+    """
+
+    camera: Camera
+    tilt: tuple[float, float]
+    poses: Poses
+    pairs: tuple[FramePair, ...]
+
+    @property
+    def truth(self) -> Trajectory:
+        """The true path."""
+        unit = self.poses.height[0]
+        p = self.poses
+        return Trajectory.from_poses(PlanePoses(p.yaw, p.position / unit, p.height / unit, p.tilt))
+
+    @property
+    def blank_cameras(self) -> list[Camera]:
+        """Of each frame, what is known before: size and focal length."""
+        camera = Camera(self.camera.image_size, focal=self.camera.focal, focal_source="option")
+        return [camera] * len(self.poses)
+
+
+def drive(path: str, frames: int, *, seed: int, noise: float = 0.5) -> Drive:
+    """One of :data:`PATHS`, seen by a tilted camera with strong barrel distortion.
+
+    Parameters
+    ----------
+    path : str
+    frames : int
+    seed : int
+        Of the matches.
+    noise : float
+        Standard deviation of the noise of the points, px.
+    """
+    camera = Camera((640, 480), -0.3, focal=520.0, focal_source="option")
+    tilt = (np.radians(4.0), np.radians(-3.0))
+    poses = PATHS[path](camera, frames, tilt=tilt)
+    rng = np.random.default_rng(seed)
+    pairs = []
+    for first in range(frames):
+        for step in _STEPS:
+            if first + step < frames:
+                points = _matches(camera, poses.from_plane()[[first, first + step]], noise, rng)
+                if len(points[0]) >= _LEAST_MATCHES:
+                    pairs.append(FramePair(first, first + step, *points))
+    return Drive(camera, tilt, poses, tuple(pairs))
+
+
+def _matches(
+    camera: Camera, from_plane: FloatArray, noise: float, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Noisy matches between two pictures, some of them wrong."""
+    limit = np.array(camera.image_size) - 1.0
+    points1 = rng.uniform((0.0, 0.0), limit, (_PER_PICTURE, 2))
+    points2 = to_picture(camera, from_plane[1], to_plane(camera, from_plane[0], points1))
+    seen = ((points2 >= 0.0) & (points2 <= limit)).all(axis=1)
+    points1, points2 = points1[seen], points2[seen]
+    wrong = rng.random(len(points2)) < _WRONG
+    points2[wrong] = rng.uniform((0.0, 0.0), limit, (int(wrong.sum()), 2))
+    return points1 + noise * rng.standard_normal(points1.shape), points2 + noise * rng.standard_normal(points2.shape)

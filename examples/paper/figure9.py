@@ -1,0 +1,202 @@
+"""Fig. 9: trajectories *line*, *turn* and *parallel parking*, with and without adjustment, from each solver.
+
+Each solver's plain RANSAC gives a motion for every pair of consecutive frames. Chained, they are the trajectory
+without adjustment, and where the adjustment starts. Beside them stands what rdstitch does of its own.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from examples.paper.drives import PATHS, Drive, drive
+from examples.paper.plain_ransac import all_solvers, best_of
+from examples.paper.report import Report, Table
+from examples.paper.settings import Settings
+from rdstitch.camera import FloatArray
+from rdstitch.planar_motion import PlanarMotion, rotation_from_tilt
+from rdstitch.radial_homography import RadialHomography
+from rdstitch.registration import align
+from rdstitch.registration.alignment import Poses
+from rdstitch.registration.bundle_adjustment import Adjusted, Adjuster, Freedom, Parameters, Priors
+from rdstitch.registration.links import Link
+from rdstitch.registration.models import RIGID, YAW, X, Y
+from rdstitch.registration.observations import Observations
+from rdstitch.registration.trajectory import Trajectory, compare
+from rdstitch.robust import estimate_radial_homography
+from rdstitch.robust.measurements import Measurements
+from rdstitch.robust.minimal import MinimalSolver
+
+RECIPE = "rdstitch as it is"
+
+_ITERATIONS = 60  # of RANSAC, for each pair
+_FOCAL_STD = 0.01
+_LEFT_OUT = ("3 points, tilt given, height free", "5 points, Fitzgibbon (homlib)", "5 points, Wadenbäck (homlib)")
+
+
+@dataclass(frozen=True)
+class _Path:
+    """A trajectory before and after adjustment, and what the adjustment took."""
+
+    solver: str
+    before: Trajectory
+    after: Trajectory
+    distortion_before: float
+    distortion_after: float
+    iterations: int | None
+
+
+def run(settings: Settings) -> Report:
+    """Errors of the trajectories and number of adjustment iterations."""
+    frames = settings.count(6, 24, 107)
+    drives = {name: drive(name, frames, seed=90 + k) for k, name in enumerate(PATHS)}
+    paths = {name: _paths(d) for name, d in drives.items()}
+    tables = tuple(_table(name, drives[name], paths[name]) for name in PATHS)
+
+    def draw(figure: Any) -> None:
+        for axes, (name, d) in zip(figure.subplots(1, len(drives)), drives.items(), strict=True):
+            shown = {"truth": d.truth}
+            for path in paths[name]:
+                if path.solver in ("2 points, tilt given", "5 points"):
+                    shown[f"{path.solver}, chained"] = path.before
+                if path.solver == RECIPE:
+                    shown["rdstitch, adjusted"] = path.after
+            for k, (label, trajectory) in enumerate(shown.items()):
+                x, y = trajectory.position.T
+                axes.plot(x, y, label=label, linewidth=3.0 if k == 0 else 1.0)
+            axes.set_title(name, fontsize=8)
+            axes.set_aspect("equal", adjustable="datalim")
+            axes.legend(fontsize=6)
+
+    return Report(tables, draw)
+
+
+def _paths(d: Drive) -> list[_Path]:
+    """From each solver, and from the recipe."""
+    solvers = [s for s in all_solvers(d.camera, d.tilt) if s.name not in _LEFT_OUT]
+    return [*(_from_solver(d, s) for s in solvers), _recipe(d)]
+
+
+def _from_solver(d: Drive, solver: MinimalSolver) -> _Path:
+    cameras, found = d.blank_cameras, []
+    for pair in d.pairs:
+        if pair.image2 - pair.image1 == 1:
+            data = Measurements.from_pixels(pair.points1, pair.points2, cameras[0], cameras[0], None)
+            found.append(best_of(solver, data, _ITERATIONS, seed=pair.image1))
+    lam = float(np.median([model[1] for model in found if model is not None]))
+    identity = np.eye(3)
+    homographies = np.array([identity if model is None else _focal_normalized(d, model[0]) for model in found])
+    tilt = d.tilt if "tilt given" in solver.name else _median_tilt(homographies)
+    before = _chained(homographies, tilt)
+    adjusted = _adjusted(d, before, tilt, lam)
+    after = Trajectory.from_poses(_plane_poses(adjusted.parameters.poses, float(adjusted.parameters.shared[2])))
+    return _Path(solver.name, before, after, lam, float(adjusted.parameters.lens[0]), adjusted.iterations)
+
+
+def _focal_normalized(d: Drive, homography: FloatArray) -> FloatArray:
+    """From half diagonals to focal lengths."""
+    assert d.camera.focal is not None
+    k = np.array([d.camera.focal, d.camera.focal, d.camera.half_diagonal])
+    normalized: FloatArray = homography * (k / k[:, None])
+    return normalized
+
+
+def _median_tilt(homographies: FloatArray) -> tuple[float, float]:
+    psi, theta = np.median([PlanarMotion.from_homography(h).tilt for h in homographies], axis=0)
+    return float(psi), float(theta)
+
+
+def _chained(homographies: FloatArray, tilt: tuple[float, float]) -> Trajectory:
+    """The pairs' motions, each taken as planar, one after the other."""
+    normal = rotation_from_tilt(tilt)[:, 2]
+    yaw, position = [0.0], [np.zeros(2)]
+    for h in homographies:
+        motion = PlanarMotion.from_homography_and_normal(h, normal)
+        c, s = np.cos(yaw[-1]), np.sin(yaw[-1])
+        position.append(position[-1] + np.array([[c, s], [-s, c]]) @ motion.translation)
+        yaw.append(yaw[-1] + motion.yaw)
+    count = len(yaw)
+    return Trajectory(np.arange(count), np.array(position), np.array(yaw), np.ones(count))
+
+
+def _adjusted(d: Drive, start: Trajectory, tilt: tuple[float, float], distortion: float) -> Adjusted:
+    """All frames adjusted with the rigid model from a trajectory, a tilt and a λ."""
+    cameras, count = d.blank_cameras, len(start)
+    assert d.camera.focal is not None
+    focal = d.camera.focal / d.camera.half_diagonal
+    natural = np.array([*tilt, np.log(focal)])
+    poses = np.zeros((count, 6))
+    poses[:, YAW], poses[:, [X, Y]] = start.yaw, start.position * focal
+    links = [Link(p.image1, p.image2, p.points1, p.points2, _any_relation(d)) for p in d.pairs]
+    none = Priors.none(RIGID, count)
+    focal_prior = np.array([0.0, 0.0, _FOCAL_STD**-2.0])
+    known = Priors(natural, focal_prior, none.lens, none.lens_precision, none.poses, none.poses_precision)
+    free = Freedom.fixing(RIGID, count, [0], np.array([True, False, False, False]))
+    adjuster = Adjuster(RIGID, Observations.from_links(links, cameras), free, known)
+    lens = np.array([distortion, 0.0, 0.0, 0.0])
+    return adjuster.run(Parameters(poses, RIGID.shared_from(natural), lens))
+
+
+def _any_relation(d: Drive) -> RadialHomography:
+    """What a link must carry; the adjustment looks at its points only."""
+    return RadialHomography(np.eye(3), d.camera, d.camera, np.ones(0, dtype=np.bool_))
+
+
+def _plane_poses(poses: FloatArray, log_focal: float) -> Poses:
+    count = len(poses)
+    return Poses(poses[:, YAW], poses[:, [X, Y]] / np.exp(log_focal), np.ones(count), np.zeros((count, 2)))
+
+
+def _recipe(d: Drive) -> _Path:
+    """Pairs by :func:`estimate_radial_homography`, all frames by :func:`align`."""
+    cameras, links, consecutive = d.blank_cameras, [], []
+    for pair in d.pairs:
+        relation = estimate_radial_homography(
+            pair.points1, pair.points2, d.camera.image_size, focal=d.camera.focal, focal_source="option"
+        )
+        if not relation:
+            continue
+        keep = relation.inliers
+        links.append(Link(pair.image1, pair.image2, pair.points1[keep], pair.points2[keep], relation))
+        if pair.image2 - pair.image1 == 1:
+            consecutive.append(relation)
+    alignment = align(cameras, links)
+    homographies = np.array([_focal_normalized(d, relation.homography) for relation in consecutive])
+    lam = float(np.median([relation.distortion for relation in consecutive]))
+    before = _chained(homographies, _median_tilt(homographies))
+    return _Path(RECIPE, before, Trajectory.from_alignment(alignment), lam, alignment.distortion, None)
+
+
+def _table(name: str, d: Drive, paths: list[_Path]) -> Table:
+    rows = []
+    for path in paths:
+        before, after = compare(path.before, d.truth), compare(path.after, d.truth)
+        rows.append(
+            (
+                path.solver,
+                100.0 * before.translation,
+                100.0 * after.translation,
+                float(np.degrees(before.rotation)),
+                float(np.degrees(after.rotation)),
+                100.0 * before.drift,
+                100.0 * after.drift,
+                abs(path.distortion_before - d.camera.distortion),
+                abs(path.distortion_after - d.camera.distortion),
+                path.iterations,
+            )
+        )
+    header = (
+        "solver",
+        "translation, chained, %",
+        "adjusted, %",
+        "rotation, chained, °",
+        "adjusted, °",
+        "drift, chained, % of path",
+        "adjusted, % of path",
+        "λ error, median of pairs",
+        "λ error, adjusted",
+        "adjustment iterations",
+    )
+    return Table(
+        f"Fig. 9: {name}, {len(d.poses)} frames, 0.5 px of noise, λ = {d.camera.distortion:g}", header, tuple(rows)
+    )

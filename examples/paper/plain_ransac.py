@@ -1,0 +1,76 @@
+"""Plain RANSAC, the same for every solver: no local optimisation, which would hide what the solvers differ in."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from examples.paper.contenders import HOMLIB
+from examples.paper.peers import homlib_solver
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.robust.measurements import Measurements
+from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
+from rdstitch.robust.pair_models import HomographyModel
+from rdstitch.robust.sampling import Sampler
+from rdstitch.robust.scoring import plausible, transfer_errors2
+from rdstitch.solvers import Solutions
+
+THRESHOLD = 3.0
+"""Largest transfer error of an inlier, px."""
+
+_SOLUTIONS_AT_ONCE = 100
+
+
+def all_solvers(camera: Camera, tilt: tuple[float, float]) -> list[MinimalSolver]:
+    """All minimal solvers, ours and, where it is installed, homlib's, in the half-diagonal frame.
+
+    Parameters
+    ----------
+    camera : Camera
+        With a focal length.
+    tilt : (float, float)
+        (ψ, θ), radians, for the solvers that are told it.
+    """
+    assert camera.focal is not None
+    given = partial(minimal_solvers, camera.focal / camera.half_diagonal, 0.01)
+    told, untold, flat = given((tilt, tilt), None), given(None, None), given((tilt, tilt), 0.0)
+    names = {
+        "2 points, tilt given": (told, "two_point"),
+        "3 points, tilt given, height free": (told, "three_point_similarity"),
+        "3 points": (untold, "three_point"),
+        "4 points": (untold, "four_point"),
+        "5 points": (untold, "five_point"),
+        "4 points, no distortion (DLT)": (flat, "four_point_dlt"),
+    }
+    found = [replace(next(s for s in group if s.name == key), name=name) for name, (group, key) in names.items()]
+    for name, function, arguments in HOMLIB:
+        solve = homlib_solver(function, *arguments)
+        if solve is not None:
+            found.append(MinimalSolver(name, 5, solve, HomographyModel()))
+    return found
+
+
+def draw_samples(solver: MinimalSolver, data: Measurements, count: int, seed: int) -> tuple[Solutions, FloatArray]:
+    """Solutions (M) of ``count`` uniform samples, and how many matches agree with each (M,)."""
+    picks = Sampler(len(data), solver.sample_size, None, 1, [seed]).draw(count)
+    found = solver.solve(data.x1[picks], data.x2[picks])
+    return found, _inliers(found, data)
+
+
+def best_of(solver: MinimalSolver, data: Measurements, count: int, seed: int) -> tuple[FloatArray, float] | None:
+    """Homography (3, 3) and λ of the solution that most matches agree with; None where no sample has one."""
+    found, inliers = draw_samples(solver, data, count, seed)
+    if not len(found) or inliers.max() == 0.0:
+        return None
+    best = int(np.argmax(inliers))
+    return found.homography[best], float(found.distortion[best])
+
+
+def _inliers(found: Solutions, data: Measurements) -> FloatArray:
+    """Number of matches within the threshold, of each solution (M,)."""
+    result = np.zeros(len(found))
+    possible = np.flatnonzero(plausible(found, corner_radius=1.0))
+    for part in np.array_split(possible, max(1, len(possible) // _SOLUTIONS_AT_ONCE)):
+        errors2 = transfer_errors2(found.homography[part], found.distortion[part], data)
+        result[part] = (errors2 < THRESHOLD**2).sum(axis=1)
+    return result
