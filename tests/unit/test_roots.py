@@ -1,0 +1,152 @@
+"""All real roots in an interval, of polynomials with known roots."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import pytest
+
+from rdstitch.camera import FloatArray
+from rdstitch.solvers.roots import (
+    IndexArray,
+    bernstein_from_values,
+    bernstein_subdivision,
+    chebyshev_from_values,
+    chebyshev_nodes,
+    chebyshev_value_and_slope,
+    real_roots,
+)
+
+
+@dataclass(frozen=True)
+class Product:
+    """``scale Π (λ - root)`` times ``Π ((λ - centre)² + height²)``, whose roots are not real."""
+
+    roots: FloatArray
+    scale: FloatArray
+    centres: FloatArray
+    heights: FloatArray
+
+    def polynomial(self, distortion: FloatArray) -> FloatArray:
+        """Value of the product."""
+        value = np.broadcast_to(self.scale, distortion.shape).copy()
+        for root in self.roots:
+            value = value * (distortion - root)
+        for centre, height in zip(self.centres, self.heights, strict=True):
+            value = value * ((distortion - centre) ** 2 + height**2)
+        return value
+
+    def take(self, samples: IndexArray) -> Self:
+        """Some of them."""
+        return type(self)(*(a[..., samples] for a in (self.roots, self.scale, self.centres, self.heights)))
+
+
+def product(roots: FloatArray, pairs: int = 0, seed: int = 0) -> Product:
+    """Polynomials with given real roots (count, B), and random complex ones."""
+    rng = np.random.default_rng(seed)
+    batch = roots.shape[1]
+    return Product(
+        roots,
+        rng.choice([-1.0, 1.0], batch) * 10.0 ** rng.uniform(-12, 12, batch),
+        rng.uniform(-1.5, 0.5, (pairs, batch)),
+        rng.uniform(0.05, 1.0, (pairs, batch)),
+    )
+
+
+def interval(batch: int, low: float = -1.5, high: float = 0.5) -> tuple[FloatArray, FloatArray]:
+    """The same interval for all."""
+    return np.full(batch, low), np.full(batch, high)
+
+
+@pytest.mark.parametrize(("real", "pairs"), [(1, 0), (2, 1), (3, 2), (4, 7), (6, 0), (8, 5)])
+def test_finds_every_root_inside_and_none_else(real: int, pairs: int) -> None:
+    rng = np.random.default_rng(real + 100 * pairs)
+    batch = 3000
+    roots = rng.uniform(-2.0, 1.0, (real, batch))
+    close = (np.abs(np.diff(np.sort(roots, axis=0), axis=0)) < 1e-2).any(axis=0) if real > 1 else np.zeros(batch, bool)
+    roots = roots[:, ~close]
+    low, high = interval(roots.shape[1])
+    sample, found = real_roots(product(roots, pairs), real + 2 * pairs, low, high)
+    inside = (roots > -1.5) & (roots < 0.5)
+    assert np.array_equal(np.bincount(sample, minlength=roots.shape[1]), inside.sum(axis=0))
+    assert (np.diff(sample) >= 0).all()
+    expected = np.sort(np.where(inside, roots, np.inf), axis=0)
+    order = np.lexsort((found, sample))
+    sample, found = sample[order], found[order]
+    rank = np.arange(len(sample)) - np.searchsorted(sample, sample)
+    error = np.abs(found - expected[rank, sample])
+    # At degree 18 values next to a root can be 1e-15 of those at the ends.
+    assert np.quantile(error, 0.999) < 1e-12
+    assert error.max() < 1e-4
+
+
+@pytest.mark.parametrize("gap", [1e-2, 1e-3, 1e-4, 1e-5, 1e-6])
+def test_two_close_roots_are_both_found(gap: float) -> None:
+    batch = 500
+    first = np.random.default_rng(1).uniform(-1.4, 0.4, batch)
+    roots = np.stack([first, first + gap])
+    sample, found = real_roots(product(roots, pairs=2), 6, *interval(batch))
+    nearest = [np.abs(found[sample == i, None] - roots[:, i]).min(axis=0).max() for i in range(batch)]
+    # Nearer than about 1e-6 they are one double root to rounding error.
+    assert max(nearest) < max(1e-3 * gap, 1e-6)
+
+
+def test_a_double_root_is_found() -> None:
+    batch = 500
+    root = np.random.default_rng(2).uniform(-1.4, 0.4, batch)
+    sample, found = real_roots(product(np.stack([root, root]), pairs=2), 6, *interval(batch))
+    assert np.array_equal(np.unique(sample), np.arange(batch))
+    assert np.abs(found - root[sample]).max() < 1e-6
+
+
+def test_a_near_miss_is_no_root() -> None:
+    batch = 500
+    rng = np.random.default_rng(3)
+    equation = Product(
+        np.empty((0, batch)), np.ones(batch), rng.uniform(-1.4, 0.4, (1, batch)), np.full((1, batch), 1e-4)
+    )
+    sample, _ = real_roots(equation, 2, *interval(batch))
+    assert len(sample) == 0
+
+
+def test_every_sample_has_its_own_interval() -> None:
+    roots = np.full((1, 3), -0.2)
+    low, high = np.array([-0.3, -0.1, 0.2]), np.array([0.0, 0.3, -0.4])
+    sample, found = real_roots(product(roots), 1, low, high)
+    assert sample.tolist() == [0]
+    assert found[0] == pytest.approx(-0.2, abs=1e-15)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 0.0])
+def test_a_polynomial_without_meaning_has_no_roots(value: float) -> None:
+    equation = product(np.full((1, 2), -0.3))
+    equation.scale[1] = value
+    with np.errstate(invalid="ignore"):
+        sample, _ = real_roots(equation, 1, *interval(2))
+    assert sample.tolist() == [0]
+
+
+@pytest.mark.parametrize("degree", [1, 4, 6, 18])
+def test_matrices_agree_with_the_polynomial(degree: int) -> None:
+    rng = np.random.default_rng(degree)
+    monomials = rng.normal(size=degree + 1)
+    values = np.polynomial.polynomial.polyval(chebyshev_nodes(degree), monomials)
+    t = np.linspace(-1.0, 1.0, 41)
+    expected = np.polynomial.polynomial.polyval(t, monomials)
+    slopes = np.polynomial.polynomial.polyval(t, np.polynomial.polynomial.polyder(monomials))
+
+    series = chebyshev_from_values(degree) @ values
+    value, slope = chebyshev_value_and_slope(np.repeat(series[:, None], len(t), axis=1), t)
+    assert value == pytest.approx(expected, abs=1e-12)
+    assert slope == pytest.approx(slopes, abs=1e-10)
+
+    for cell, coefficients in enumerate(bernstein_from_values(degree, 4) @ values):
+        s = np.linspace(0.0, 1.0, 7)
+        binomials = np.array([np.prod([(degree - i) / (i + 1) for i in range(j)]) for j in range(degree + 1)])
+        basis = binomials * s[:, None] ** np.arange(degree + 1) * (1 - s[:, None]) ** (degree - np.arange(degree + 1))
+        there = np.polynomial.polynomial.polyval(-1.0 + 0.5 * (cell + s), monomials)
+        assert basis @ coefficients == pytest.approx(there, abs=1e-11)
+        # The second half of the cell, by subdivision.
+        half = bernstein_subdivision(degree, 2)[1] @ coefficients
+        there = np.polynomial.polynomial.polyval(-1.0 + 0.5 * (cell + 0.5 + 0.5 * s), monomials)
+        assert basis @ half == pytest.approx(there, abs=1e-11)
