@@ -101,11 +101,15 @@ def read_metadata(path: str | Path) -> Metadata:
             # Pillow knows few sample layouts of TIFF (no 16-bit colour with alpha, no five bands).
             with tifffile.TiffFile(file) as tiff:
                 page = tiff.pages.first
+                if min(page.imagewidth, page.imagelength) < 1:
+                    raise ValueError("no pixels") from None
                 return Metadata((page.imagewidth, page.imagelength), bit_depth=page.bitspersample)
 
 
 def metadata_of(image: Image.Image) -> Metadata:
     """Metadata of a picture that Pillow has opened."""
+    # First, since looking for EXIF at the end of a PNG file decodes it, and Pillow then forgets.
+    bit_depth = _bit_depth(image)
     exif = image.getexif()
     orientation = exif.get(_ORIENTATION, 1)
     orientation = orientation if orientation in range(1, 9) else 1
@@ -116,7 +120,7 @@ def metadata_of(image: Image.Image) -> Metadata:
     dpi = image.info.get("dpi")
     return Metadata(
         size=(height, width) if orientation in _TURNED_SIDEWAYS else (width, height),
-        bit_depth=_bit_depth(image),
+        bit_depth=bit_depth,
         orientation=orientation,
         focal_px=focal,
         focal_source=source,

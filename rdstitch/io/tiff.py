@@ -79,7 +79,8 @@ def _write_page(
         tile=(_TILE, _TILE),
         compression="zlib",
         compressionargs={"level": 1},
-        predictor=True,
+        # Plain tifffile has no predictor for floating point.
+        predictor=layout.dtype.kind == "u",
         metadata=None,
         software="rdstitch",
         subfiletype=int(reduced),

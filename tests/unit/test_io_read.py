@@ -1,0 +1,270 @@
+"""Reading pictures: every common file works or gives one line that names it."""
+
+import os
+import stat
+import struct
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image
+
+from rdstitch.errors import InputError
+from rdstitch.io import read_image, read_metadata
+
+Picture = NDArray[Any]
+
+
+@pytest.fixture
+def colours() -> Picture:
+    """A small picture whose every pixel differs, with 8 bits."""
+    v, u = np.mgrid[:23, :31]
+    return np.stack([u * 8, v * 11, (u * v) % 256], axis=-1).astype(np.uint8)
+
+
+def _expect_one_line(path: Path, function: Callable[[Path], object], capfd: pytest.CaptureFixture[str]) -> str:
+    """The text of the InputError; nothing may leak to standard error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(InputError) as caught:
+            function(path)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert str(path) in text
+    assert capfd.readouterr() == ("", "")
+    return text
+
+
+def test_colour_is_in_rgb_order(tmp_path: Path, colours: Picture) -> None:
+    for suffix in ("png", "tif", "bmp"):
+        Image.fromarray(colours).save(tmp_path / f"a.{suffix}")
+        picture = read_image(tmp_path / f"a.{suffix}")
+        np.testing.assert_array_equal(picture.pixels, colours)
+        assert picture.alpha is None
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_orientation_is_applied(tmp_path: Path, colours: Picture, orientation: int) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    upright = Image.fromarray(colours)
+    # What a camera held that way stores: the inverse of what a reader must do.
+    stored = {
+        1: upright,
+        2: upright.transpose(Image.Transpose.FLIP_LEFT_RIGHT),
+        3: upright.transpose(Image.Transpose.ROTATE_180),
+        4: upright.transpose(Image.Transpose.FLIP_TOP_BOTTOM),
+        5: upright.transpose(Image.Transpose.TRANSPOSE),
+        6: upright.transpose(Image.Transpose.ROTATE_90),
+        7: upright.transpose(Image.Transpose.TRANSVERSE),
+        8: upright.transpose(Image.Transpose.ROTATE_270),
+    }[orientation]
+    stored.save(tmp_path / "a.png", exif=exif)
+    picture = read_image(tmp_path / "a.png")
+    np.testing.assert_array_equal(picture.pixels, colours)
+    assert picture.metadata.orientation == orientation
+    assert picture.metadata.size == (31, 23)
+    assert Image.Exif().get(0x0112) is None
+    kept = Image.Exif()
+    kept.load(picture.metadata.exif)
+    assert kept[0x0112] == 1
+
+
+def test_sixteen_bits_stay_sixteen(tmp_path: Path, colours: Picture) -> None:
+    deep = colours.astype(np.uint16) * 257 + 3
+    tifffile.imwrite(tmp_path / "a.tif", deep, photometric="rgb")
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif").pixels, deep)
+    Image.fromarray(deep[..., 0]).save(tmp_path / "grey.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "grey.png").pixels, deep[..., 0])
+    assert read_metadata(tmp_path / "grey.png").bit_depth == 16
+
+
+def test_five_bands(tmp_path: Path) -> None:
+    bands = np.random.default_rng(0).integers(0, 60000, (5, 9, 13), dtype=np.uint16)
+    tifffile.imwrite(tmp_path / "a.tif", bands, photometric="minisblack", planarconfig="separate")
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif").pixels, np.moveaxis(bands, 0, -1))
+    assert read_metadata(tmp_path / "a.tif").size == (13, 9)
+
+
+def test_not_a_number_becomes_transparent(tmp_path: Path) -> None:
+    values = np.linspace(0, 1, 12, dtype=np.float32).reshape(3, 4)
+    values[1, 2], values[2, 0] = np.nan, np.inf
+    tifffile.imwrite(tmp_path / "a.tif", values)
+    picture = read_image(tmp_path / "a.tif")
+    assert picture.alpha is not None
+    assert np.isfinite(picture.pixels).all()
+    np.testing.assert_array_equal(picture.alpha == 0, ~np.isfinite(values))
+
+
+def test_alpha_is_apart(tmp_path: Path, colours: Picture) -> None:
+    alpha = np.where(colours[..., 0] > 100, 255, 0).astype(np.uint8)
+    Image.fromarray(np.dstack([colours, alpha])).save(tmp_path / "a.png")
+    picture = read_image(tmp_path / "a.png")
+    np.testing.assert_array_equal(picture.pixels, colours)
+    np.testing.assert_array_equal(picture.alpha, alpha)
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "CMYK", "YCbCr", "LAB", "I", "F", "I;16"])
+def test_every_mode_becomes_grey_or_rgb(tmp_path: Path, colours: Picture, mode: str) -> None:
+    image = Image.fromarray(colours).convert("L" if mode in ("I;16", "F") else "RGB").convert(mode)
+    image.save(tmp_path / "a.tif")
+    picture = read_image(tmp_path / "a.tif")
+    assert picture.pixels.shape[:2] == (23, 31)
+    assert picture.pixels.ndim == 2 or picture.pixels.shape[2] == 3
+    assert picture.pixels.dtype in (np.uint8, np.uint16, np.float32)
+
+
+def test_cmyk_jpeg(tmp_path: Path, colours: Picture) -> None:
+    Image.fromarray(colours).convert("CMYK").save(tmp_path / "a.jpg", quality=98)
+    assert np.abs(read_image(tmp_path / "a.jpg").pixels.astype(int) - colours).mean() < 12
+
+
+def test_first_picture_of_several(tmp_path: Path, colours: Picture) -> None:
+    frames = [Image.fromarray(colours), Image.fromarray(255 - colours)]
+    for name in ("a.gif", "a.png", "a.webp", "a.tif"):
+        frames[0].save(tmp_path / name, save_all=True, append_images=frames[1:])
+        pixels = read_image(tmp_path / name).pixels
+        assert np.abs(pixels.astype(int) - colours).mean() < 12
+
+
+def test_one_pixel(tmp_path: Path) -> None:
+    Image.new("RGB", (1, 1), (10, 20, 30)).save(tmp_path / "a.png")
+    assert read_image(tmp_path / "a.png").pixels.tolist() == [[[10, 20, 30]]]
+
+
+def test_very_long(tmp_path: Path) -> None:
+    Image.new("L", (30_000, 20), 7).save(tmp_path / "a.jpg")
+    assert read_image(tmp_path / "a.jpg").pixels.shape == (20, 30_000)
+
+
+@pytest.mark.parametrize("name", ["with space.png", "quo'te\".png", "new\nline.png", "ünï.png"])
+def test_odd_names(tmp_path: Path, colours: Picture, name: str) -> None:
+    Image.fromarray(colours).save(tmp_path / name)
+    np.testing.assert_array_equal(read_image(tmp_path / name).pixels, colours)
+
+
+class TestBadFiles:
+    """None of these may end otherwise than in one line."""
+
+    @pytest.mark.parametrize("function", [read_image, read_metadata])
+    @pytest.mark.parametrize(
+        ("name", "content"),
+        [
+            ("missing.jpg", None),
+            ("empty.jpg", b""),
+            ("text.jpg", b"This is not a picture.\n" * 20),
+            ("zeros.tif", bytes(1000)),
+            ("header.png", b"\x89PNG\r\n\x1a\n"),
+            ("header.jpg", b"\xff\xd8\xff\xe0"),
+            ("header.tif", b"II*\0\x08\0\0\0"),
+            ("big.tif", b"II+\0\x08\0\0\0" + bytes(8)),
+            ("loop.tif", b"II*\0\x08\0\0\0\0\0\x08\0\0\0"),
+        ],
+    )
+    def test_content(
+        self,
+        tmp_path: Path,
+        name: str,
+        content: bytes | None,
+        function: Callable[[Path], object],
+        capfd: pytest.CaptureFixture[str],
+    ) -> None:
+        if content is not None:
+            (tmp_path / name).write_bytes(content)
+        _expect_one_line(tmp_path / name, function, capfd)
+
+    def test_folder(self, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+        assert "folder" in _expect_one_line(tmp_path, read_image, capfd)
+
+    def test_link_to_itself(self, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+        (tmp_path / "a.jpg").symlink_to(tmp_path / "a.jpg")
+        _expect_one_line(tmp_path / "a.jpg", read_image, capfd)
+
+    def test_pipe_does_not_block(self, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+        os.mkfifo(tmp_path / "a.jpg")
+        _expect_one_line(tmp_path / "a.jpg", read_image, capfd)
+
+    @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+    def test_unreadable(self, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+        Image.new("L", (4, 4)).save(tmp_path / "a.png")
+        (tmp_path / "a.png").chmod(stat.S_IWUSR)
+        assert "permission" in _expect_one_line(tmp_path / "a.png", read_image, capfd)
+
+    @pytest.mark.parametrize("kind", ["jpg", "png", "deep.png", "tif", "packed.tif", "webp"])
+    def test_truncated(self, tmp_path: Path, colours: Picture, kind: str, capfd: pytest.CaptureFixture[str]) -> None:
+        path = tmp_path / f"a.{kind}"
+        large = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
+        if kind == "deep.png":
+            from rdstitch.io import write_image
+
+            write_image(path, large.astype(np.uint16) * 257)
+        else:
+            Image.fromarray(large).save(path, **({"compression": "tiff_lzw"} if kind == "packed.tif" else {}))
+        whole = path.read_bytes()
+        for share in (0.1, 0.5, 0.9):
+            path.write_bytes(whole[: int(len(whole) * share)])
+            _expect_one_line(path, read_image, capfd)
+
+    def test_lying_sizes(self, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+        header = struct.pack(">IIBBBBB", 2_000_000, 2_000_000, 8, 2, 0, 0, 0)
+        from rdstitch.io.embedding import png_chunk
+
+        (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", header) + png_chunk(b"IEND", b""))
+        _expect_one_line(tmp_path / "a.png", read_image, capfd)
+
+
+class TestMetadata:
+    """What drones and cameras write."""
+
+    def test_focal_length(self, tmp_path: Path) -> None:
+        exif = Image.Exif()
+        photo = exif.get_ifd(0x8769)
+        photo[0xA405] = 28
+        Image.new("L", (400, 300)).save(tmp_path / "a.jpg", exif=exif)
+        metadata = read_metadata(tmp_path / "a.jpg")
+        assert metadata.focal_source == "FocalLengthIn35mmFilm"
+        assert metadata.focal_px == pytest.approx(500 * 28 / np.hypot(36, 24))
+
+    def test_focal_plane_resolution_counts_original_pixels(self, tmp_path: Path) -> None:
+        exif = Image.Exif()
+        photo = exif.get_ifd(0x8769)
+        # 5 mm, 800 px per mm at a width of 4000 px; the file was made smaller since.
+        photo[0x920A], photo[0xA20E], photo[0xA210], photo[0xA002] = 5.0, 800.0, 4, 4000
+        Image.new("L", (1000, 750)).save(tmp_path / "a.jpg", exif=exif)
+        assert read_metadata(tmp_path / "a.jpg").focal_px == pytest.approx(1000.0)
+
+    def test_place_and_attitude(self, tmp_path: Path) -> None:
+        exif = Image.Exif()
+        exif[0x010F], exif[0x0110] = "Maker", "Model"
+        exif.get_ifd(0x8825).update(
+            {1: "S", 2: (33.0, 30.0, 36.0), 3: "W", 4: (70.0, 15.0, 0.0), 5: b"\x01", 6: 12.5},
+        )
+        xmp = (
+            '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:GimbalYawDegree="+31.5" '
+            'drone-dji:GimbalPitchDegree="-89.90" drone-dji:FlightYawDegree="1">'
+            "<drone-dji:GimbalRollDegree>+0.25</drone-dji:GimbalRollDegree></rdf:Description></x:xmpmeta>"
+        )
+        Image.new("L", (8, 8)).save(tmp_path / "a.jpg", exif=exif, xmp=xmp.encode())
+        metadata = read_metadata(tmp_path / "a.jpg")
+        assert metadata.gps is not None
+        assert (metadata.gps.latitude, metadata.gps.longitude) == pytest.approx((-33.51, -70.25))
+        assert metadata.gps.altitude == -12.5
+        assert metadata.attitude is not None
+        assert (metadata.attitude.yaw, metadata.attitude.pitch, metadata.attitude.roll) == (31.5, -89.9, 0.25)
+        assert metadata.attitude.source == "dji-gimbal"
+        assert (metadata.make, metadata.model) == ("Maker", "Model")
+
+    def test_real_drone_picture(self, shared_data: Callable[[str], Path]) -> None:
+        (path,) = (p for p in shared_data("textures_cc0").iterdir() if p.suffix == ".JPG")
+        metadata = read_metadata(path)
+        assert metadata.focal_px == pytest.approx(3641.79, abs=0.01)
+        assert metadata.attitude is not None
+        assert metadata.attitude.source == "pix4d-camera"
+        assert metadata.serial == "PI040378AA6C000032"
+        assert metadata.gps is not None
+        assert metadata.gps.latitude == pytest.approx(41.429198, abs=1e-6)

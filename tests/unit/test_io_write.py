@@ -1,0 +1,247 @@
+"""Writing pictures: whole or not at all, the same bytes for the same picture, nothing lost."""
+
+import itertools
+import os
+import stat
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from PIL import Image
+
+from rdstitch.errors import ArgumentError, LimitError, OutputError
+from rdstitch.io import (
+    Layout,
+    Metadata,
+    check_output,
+    read_image,
+    write_image,
+    write_json_atomic,
+    write_strips,
+)
+from rdstitch.io.atomic import atomic_output
+
+Pixels = NDArray[Any]
+
+
+def _picture(height: int, width: int, channels: int, dtype: type, seed: int = 0) -> Pixels:
+    """Smooth colours with some texture."""
+    rng = np.random.default_rng(seed)
+    coarse = rng.integers(0, 256, (max(2, height // 16), max(2, width // 16), channels)).astype(np.float32)
+    smooth = np.asarray(cv2.resize(coarse, (width, height))).reshape(height, width, channels)
+    full = np.iinfo(dtype).max if np.issubdtype(dtype, np.integer) else 1.0
+    pixels = np.clip(smooth / 255 + rng.normal(0, 0.02, smooth.shape), 0, 1) * full
+    return pixels.astype(dtype) if channels > 1 else pixels[..., 0].astype(dtype)
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("transparent", [False, True])
+def test_lossless_formats_lose_nothing(
+    tmp_path: Path, suffix: str, dtype: type, channels: int, transparent: bool
+) -> None:
+    pixels = _picture(300, 257, channels, dtype)
+    alpha = np.full((300, 257), 255, np.uint8)
+    alpha[:70, 30:] = 0
+    write_image(tmp_path / f"a.{suffix}", pixels, alpha if transparent else None)
+    back = read_image(tmp_path / f"a.{suffix}")
+    same = back.pixels if back.pixels.ndim == pixels.ndim else back.pixels[..., 0]
+    np.testing.assert_array_equal(same, pixels)
+    if transparent:
+        np.testing.assert_array_equal(back.alpha, alpha)
+    else:
+        assert back.alpha is None
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_jpeg_from_strips_is_what_one_piece_gives(tmp_path: Path, channels: int) -> None:
+    pixels = _picture(256 * 9 + 37, 333, channels, np.uint8)
+    write_image(tmp_path / "a.jpg", pixels)
+    bgr = np.ascontiguousarray(pixels[..., ::-1]) if channels == 3 else pixels
+    done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    assert done
+    whole = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    joined = cv2.imread(str(tmp_path / "a.jpg"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(joined, whole)
+    with Image.open(tmp_path / "a.jpg") as image:
+        assert image.size == (333, 256 * 9 + 37)
+        image.load()
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
+@settings(max_examples=8, deadline=None)
+@given(data=st.data())
+def test_strips_do_not_matter(tmp_path_factory: pytest.TempPathFactory, suffix: str, data: st.DataObject) -> None:
+    folder = tmp_path_factory.mktemp("strips")
+    height, width = data.draw(st.integers(1, 1400)), data.draw(st.integers(1, 300))
+    pixels = _picture(height, width, 3, np.uint8)
+    alpha = np.where(pixels[..., 0] > 60, 255, 0).astype(np.uint8)
+    write_image(folder / f"whole.{suffix}", pixels, alpha)
+    layout = Layout((width, height), 3, np.dtype(np.uint8), transparent=True, metadata=Metadata((width, height)))
+    starts = [0]
+    while starts[-1] < height:
+        starts.append(starts[-1] + 256 * data.draw(st.integers(1, 3)))
+    strips = [(pixels[a:b], alpha[a:b]) for a, b in itertools.pairwise(starts)]
+    write_strips(folder / f"strips.{suffix}", layout, strips)
+    if suffix == "png":  # the compressor may cut its output elsewhere; the pixels may not differ
+        np.testing.assert_array_equal(read_image(folder / "whole.png").pixels, read_image(folder / "strips.png").pixels)
+    else:
+        a, b = (read_image(folder / f"{name}.{suffix}") for name in ("whole", "strips"))
+        np.testing.assert_array_equal(a.pixels, b.pixels)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
+def test_same_bytes_twice(tmp_path: Path, suffix: str) -> None:
+    pixels = _picture(700, 400, 3, np.uint8)
+    for name in ("a", "b"):
+        write_image(tmp_path / f"{name}.{suffix}", pixels)
+    assert (tmp_path / f"a.{suffix}").read_bytes() == (tmp_path / f"b.{suffix}").read_bytes()
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
+def test_profile_and_exif_are_kept(tmp_path: Path, suffix: str) -> None:
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110] = "Maker", "Model"
+    profile = bytes(range(256)) * 400
+    metadata = Metadata((64, 64), dpi=(150.0, 150.0), exif=exif.tobytes(), icc_profile=profile)
+    write_image(tmp_path / f"a.{suffix}", _picture(64, 64, 3, np.uint8), None, metadata)
+    back = read_image(tmp_path / f"a.{suffix}").metadata
+    assert back.icc_profile == profile
+    assert (back.make, back.model) == ("Maker", "Model")
+    if suffix != "webp":
+        assert back.dpi == pytest.approx((150, 150), abs=0.02)
+
+
+def test_tiff_has_overviews_of_half_the_size(tmp_path: Path) -> None:
+    pixels = _picture(1301, 1003, 3, np.uint8)
+    alpha = np.full(pixels.shape[:2], 255, np.uint8)
+    alpha[:200] = 0
+    write_image(tmp_path / "a.tif", pixels, alpha)
+    with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
+        shapes = [page.shape for page in tiff.pages]
+        assert shapes == [(1301, 1003, 4), (651, 502, 4), (326, 251, 4), (163, 126, 4)]
+        assert [level.shape for level in tiff.series[0].levels] == shapes
+        half = tiff.pages[1].asarray()
+    expected = pixels[200:1300, :1002].astype(float).reshape(550, 2, 501, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(half[100:650, :501, :3], expected, atol=0.51)
+    assert (half[:100, :, 3] == 0).all()
+
+
+def test_floats_need_tiff(tmp_path: Path) -> None:
+    pixels = _picture(40, 50, 3, np.float32)
+    write_image(tmp_path / "a.tif", pixels)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif").pixels, pixels)
+    with pytest.raises(OutputError, match=r"\.tif"):
+        write_image(tmp_path / "a.png", pixels)
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_background_of_jpeg(tmp_path: Path) -> None:
+    pixels = np.full((64, 64, 3), 128, np.uint8)
+    alpha = np.full((64, 64), 255, np.uint8)
+    alpha[:, 32:] = 0
+    for grey in (0, 255):
+        write_image(tmp_path / "a.jpg", pixels, alpha, background=grey)
+        back = read_image(tmp_path / "a.jpg").pixels
+        assert abs(int(back[32, 60, 0]) - grey) < 4
+        assert abs(int(back[32, 4, 0]) - 128) < 4
+
+
+def test_too_large_for_the_format(tmp_path: Path) -> None:
+    with pytest.raises(LimitError, match=r"write a \.tif"):
+        write_image(tmp_path / "a.jpg", np.zeros((1, 70_000), np.uint8))
+    with pytest.raises(LimitError):
+        write_image(tmp_path / "a.webp", np.zeros((17_000, 2), np.uint8))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_arguments(tmp_path: Path) -> None:
+    with pytest.raises(ArgumentError):
+        write_image(tmp_path / "a.png", np.zeros((4, 4), np.int32))
+    with pytest.raises(ArgumentError):
+        write_image(tmp_path / "a.png", np.zeros((4, 4), np.uint8), np.zeros((4, 5), np.uint8))
+    with pytest.raises(OutputError):
+        write_image(tmp_path / "a.xyz", np.zeros((4, 4), np.uint8))
+    layout = Layout((4, 10), 1, np.dtype(np.uint8), metadata=Metadata((4, 10)))
+    with pytest.raises(ArgumentError, match="rows"):
+        write_strips(tmp_path / "a.png", layout, [(np.zeros((9, 4, 1), np.uint8), None)])
+    assert list(tmp_path.iterdir()) == []
+
+
+class TestAtomic:
+    """A reader sees the old file or the new one."""
+
+    def test_failure_leaves_the_old_file(self, tmp_path: Path) -> None:
+        target = tmp_path / "a.txt"
+        target.write_text("old")
+
+        def interrupted() -> None:
+            with atomic_output(target) as temporary:
+                temporary.write_text("new, half-writ")
+                raise RuntimeError
+
+        with pytest.raises(RuntimeError):
+            interrupted()
+        assert target.read_text() == "old"
+        assert list(tmp_path.iterdir()) == [target]
+
+    def test_full_disk(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def full(descriptor: int) -> None:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(os, "fsync", full)
+        with pytest.raises(OutputError, match="No space left"):
+            write_json_atomic(tmp_path / "a.json", {"x": 1})
+        assert list(tmp_path.iterdir()) == []
+
+    def test_mode_is_kept(self, tmp_path: Path) -> None:
+        target = tmp_path / "a.json"
+        target.write_text("{}")
+        target.chmod(0o640)
+        write_json_atomic(target, {"x": 1})
+        assert stat.S_IMODE(target.stat().st_mode) == 0o640
+
+    def test_missing_folder(self, tmp_path: Path) -> None:
+        with pytest.raises(OutputError):
+            write_json_atomic(tmp_path / "none" / "a.json", {})
+
+
+class TestCheckOutput:
+    """Found out before long work."""
+
+    def test_good(self, tmp_path: Path) -> None:
+        assert check_output(tmp_path / "a.tif") == tmp_path / "a.tif"
+        assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.parametrize(
+        ("name", "words"),
+        [
+            ("a.xyz", "unknown file type"),
+            ("a", "no file type"),
+            ("none/a.jpg", "does not exist"),
+            ("old.jpg", "exists"),
+        ],
+    )
+    def test_bad(self, tmp_path: Path, name: str, words: str) -> None:
+        (tmp_path / "old.jpg").write_bytes(b"x")
+        with pytest.raises(OutputError, match=words):
+            check_output(tmp_path / name)
+
+    def test_overwrite_but_never_an_input(self, tmp_path: Path) -> None:
+        (tmp_path / "old.jpg").write_bytes(b"x")
+        (tmp_path / "link.jpg").symlink_to(tmp_path / "old.jpg")
+        check_output(tmp_path / "old.jpg", overwrite=True)
+        with pytest.raises(OutputError, match="input"):
+            check_output(tmp_path / "link.jpg", overwrite=True, inputs=[tmp_path / "old.jpg"])
+
+    def test_folder(self, tmp_path: Path) -> None:
+        (tmp_path / "a.jpg").mkdir()
+        with pytest.raises(OutputError, match="folder"):
+            check_output(tmp_path / "a.jpg")
