@@ -136,9 +136,17 @@ def _whitened(
     homography = np.repeat(homographies[first:last], counts, axis=0)
     result = transfer_jacobian(homography, float(lens[0]), observations.points1[rows] - lens[2:], float(lens[1]))
     whitening = measurement_whitening(result.by_point * (scale2 / scale1)) * scale2
-    jacobian = whitening @ np.concatenate([result.by_homography, result.by_lens], axis=2)
-    error = whitening @ (result.points - (observations.points2[rows] - lens[2:]))[:, :, None]
-    return jacobian, error[:, :, 0], whitening
+    jacobian = np.concatenate([result.by_homography, result.by_lens], axis=2)
+    error = result.points - (observations.points2[rows] - lens[2:])
+    return _whiten(whitening, jacobian), _whiten(whitening, error[:, :, None])[:, :, 0], whitening
+
+
+def _whiten(whitening: FloatArray, values: FloatArray) -> FloatArray:
+    """``W v`` of values (m, 2, k), W upper triangular; written out, which is several times faster than matmul."""
+    result = np.empty_like(values)
+    result[:, 0] = whitening[:, 0, :1] * values[:, 0] + whitening[:, 0, 1:] * values[:, 1]
+    result[:, 1] = whitening[:, 1, 1:] * values[:, 1]
+    return result
 
 
 @dataclass(frozen=True)

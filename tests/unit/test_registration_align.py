@@ -1,0 +1,239 @@
+"""The whole adjustment, on links synthesised from known poses: does it find the model, the camera and the poses?"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rdstitch.camera import Camera
+from rdstitch.errors import ArgumentError, RegistrationError
+from rdstitch.planar_motion import PlanarMotion
+from rdstitch.radial_homography import RadialHomography, transfer
+from rdstitch.registration.align import AlignmentOptions, align
+from rdstitch.registration.alignment import Alignment, Poses
+from rdstitch.registration.links import Link
+from rdstitch.registration.models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
+from rdstitch.registration.trajectory import Trajectory, compare
+from tests.alignment_scenes import Scene, grid, jittered, robot_path, scene
+
+
+def _run(given: Scene, **options: object) -> Alignment:
+    return align(given.cameras, given.links, AlignmentOptions(**options))  # type: ignore[arg-type]
+
+
+def _pair_errors(found: Alignment, truth: Scene) -> np.ndarray:
+    """Distance between where a link's points should be and where the alignment puts them, px."""
+    errors = []
+    for link, fit in zip(truth.links, found.links, strict=True):
+        if fit.used:
+            camera = truth.cameras[link.image1]
+            x = camera.normalize(link.points1)
+            right = truth.truth[link.image2] @ np.linalg.inv(truth.truth[link.image1])
+            should = transfer(right, truth.distortion, x)
+            center = (np.array(found.cameras[0].center) - camera.center) / camera.half_diagonal
+            own = found.relation(link.image1, link.image2)
+            there = transfer(own, found.distortion, x - center) + center
+            errors.append(np.linalg.norm(there - should, axis=1) * camera.half_diagonal)
+    return np.concatenate(errors)
+
+
+def _true_path(truth: Scene) -> Trajectory:
+    p = truth.poses
+    return Trajectory.from_poses(Poses(p[:, YAW], p[:, [X, Y]], np.exp(p[:, LOG_HEIGHT]), p[:, [PSI, THETA]]))
+
+
+def _wrong_link(given: Scene, i: int, j: int, rng: np.random.Generator) -> Link:
+    """A pair that fits perfectly, but for the wrong motion: repeated structure."""
+    camera = replace(given.cameras[0], distortion=given.distortion, distortion_std=0.01)
+    focal = np.diag([1.3, 1.3, 1.0])
+    motion = PlanarMotion((0.04, -0.03), rng.uniform(-0.3, 0.3), (rng.uniform(-0.3, 0.3), 0.1))
+    h = focal @ motion.homography() @ np.linalg.inv(focal)
+    width, height = camera.image_size
+    p = rng.uniform((0.0, 0.0), (width - 1, height - 1), (300, 2))
+    q = camera.denormalize(transfer(h, given.distortion, camera.normalize(p)))
+    inside = np.isfinite(q).all(axis=1) & (q >= 0).all(axis=1) & (q <= (width - 1, height - 1)).all(axis=1)
+    p, q = p[inside][:100], q[inside][:100] + rng.normal(0, 0.3, (100, 2))
+    relation = RadialHomography(h, camera, camera, np.ones(100, dtype=np.bool_), distortion_std=0.01, rms=0.4)
+    return Link(i, j, p, q, relation)
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows", "size", "focal", "distortion", "tilt", "yaw"),
+    [
+        (4, 3, (640, 480), 520.0, -0.25, (2.5, -2.0), 8.0),
+        (6, 2, (800, 600), 650.0, -0.25, (2.0, -1.5), 8.0),
+        (4, 3, (640, 480), 420.0, -0.45, (-6.0, 5.0), 15.0),
+        (4, 3, (640, 480), 520.0, 0.0, (0.0, 0.0), 180.0),
+    ],
+)
+def test_a_robots_grid_is_rigid(
+    columns: int,
+    rows: int,
+    size: tuple[int, int],
+    focal: float,
+    distortion: float,
+    tilt: tuple[float, float],
+    yaw: float,
+) -> None:
+    rng = np.random.default_rng(columns)
+    poses = grid(columns, rows, (0.5, 0.4), math.radians(yaw), rng)
+    tilt = (math.radians(tilt[0]), math.radians(tilt[1]))
+    given = scene(poses, size=size, focal=focal, distortion=distortion, tilt=tilt, rng=rng)
+    found = _run(given)
+    assert found.model == "rigid"
+    assert found.used.all()
+    assert abs(found.distortion - distortion) < 0.001
+    assert abs(found.distortion - distortion) < 5 * found.distortion_std
+    assert found.tilt == pytest.approx(tilt, abs=math.radians(0.1))
+    assert float(np.quantile(_pair_errors(found, given), 0.95)) < 0.2
+    assert compare(Trajectory.from_alignment(found), _true_path(given)).drift < 1e-3
+    assert not found.relief.found
+    assert found.warnings == ()
+
+
+@pytest.mark.parametrize(("height", "tilt", "model"), [(0.2, 0.0, "similarity"), (0.2, 3.0, "tilting")])
+def test_a_drone_needs_more_freedom(height: float, tilt: float, model: str) -> None:
+    rng = np.random.default_rng(2)
+    poses = jittered(grid(4, 3, (0.4, 0.3), 0.25, rng), height, math.radians(tilt), rng)
+    given = scene(poses, tilt=(0.04, -0.03), focal_source="exif", rng=rng, per_link=120)
+    found = _run(given)
+    assert found.model == model
+    assert abs(found.distortion + 0.25) < 0.001
+    assert float(np.quantile(_pair_errors(found, given), 0.95)) < 0.2
+    assert found.poses is not None
+    ratio = found.poses.height / np.exp(poses[:, LOG_HEIGHT])
+    assert float(np.std(ratio) / np.mean(ratio)) < 0.005
+    if tilt:
+        assert found.tilt_spread == pytest.approx(float(np.sqrt(np.mean(poses[:, [PSI, THETA]] ** 2))), rel=0.25)
+
+
+def test_focal_length_that_is_guessed_wrong_is_found() -> None:
+    rng = np.random.default_rng(4)
+    poses = grid(4, 3, (0.5, 0.4), 0.3, rng)
+    given = scene(poses, tilt=(0.1, -0.08), guess=690.0, focal_source="guess", rng=rng)
+    found = _run(given)
+    assert found.focal is not None
+    assert found.focal_std is not None
+    true = 520.0 / given.cameras[0].half_diagonal
+    assert found.focal_std < 0.05 * true
+    assert abs(found.focal - true) < 4 * found.focal_std
+    assert found.cameras[0].focal_source == "estimate"
+
+
+def test_an_off_centre_lens_is_noticed_and_a_centred_one_left_alone() -> None:
+    rng = np.random.default_rng(6)
+    given = scene(grid(3, 3, (0.4, 0.3), 0.3, rng), rng=rng, per_link=120)
+    shift = np.array([14.0, -9.0])
+    moved = [replace(link, points1=link.points1 + shift, points2=link.points2 + shift) for link in given.links]
+    found = align(given.cameras, moved)
+    middle = np.array(given.cameras[0].center)
+    np.testing.assert_allclose(np.array(found.cameras[0].center) - middle, shift, atol=1.0)
+    assert abs(found.distortion + 0.25) < 0.001
+    np.testing.assert_array_equal(align(given.cameras, given.links).cameras[0].center, middle)
+
+
+@pytest.mark.parametrize("model", ["auto", "homography"])
+def test_wrong_pairs_are_dropped_by_name(model: str) -> None:
+    rng = np.random.default_rng(7)
+    given = scene(robot_path(40, 0.2), tilt=(-0.1, 0.08), rng=rng, overlap=0.3, reach=3, per_link=80)
+    wrong = [(2, 35), (10, 30), (20, 38)]
+    given = replace(given, links=[*given.links, *(_wrong_link(given, i, j, rng) for i, j in wrong)])
+    found = _run(given, model=model)
+    dropped = {(fit.image1, fit.image2) for fit in found.links if not fit.used}
+    assert dropped == set(wrong)
+    assert all("contradicts" in fit.reason for fit in found.links if not fit.used)
+    assert found.used.all()
+    assert float(np.quantile(_pair_errors(found, given), 0.95)) < 0.3
+
+
+def test_pictures_without_connection_are_named() -> None:
+    rng = np.random.default_rng(8)
+    poses = np.concatenate([grid(3, 2, (0.4, 0.3), 0.2, rng), grid(2, 1, (0.4, 0.3), 0.2, rng), np.zeros((1, 6))])
+    poses[6:8, X] += 50.0
+    poses[8, X] = 100.0
+    found = _run(scene(poses, rng=rng))
+    assert found.used.tolist() == [True] * 6 + [False] * 3
+    assert found.components == ((0, 1, 2, 3, 4, 5), (6, 7), (8,))
+    assert "one of 2 pictures" in found.reasons[6]
+    assert "no reliable overlap" in found.reasons[8]
+    assert np.isnan(found.homographies[6:]).all()
+    assert np.isfinite(found.homographies[:6]).all()
+
+
+def test_turning_on_the_spot_says_nothing_of_the_lens() -> None:
+    rng = np.random.default_rng(9)
+    poses = np.zeros((5, 6))
+    poses[:, YAW] = np.linspace(0, 1.5, 5)
+    found = _run(scene(poses, distortion=-0.2, rng=rng))
+    assert math.isinf(found.distortion_std)
+    assert any("not observable" in warning for warning in found.warnings)
+
+
+def test_hills_are_noticed() -> None:
+    rng = np.random.default_rng(10)
+    poses = jittered(grid(4, 3, (0.4, 0.3), 0.2, rng), 0.1, 0.03, rng)
+    found = _run(scene(poses, rng=rng, relief=0.05))
+    assert found.relief.found
+    assert found.relief.coherence > 0.6
+    assert found.relief.explanation in found.warnings
+
+
+def test_known_lens_and_tilt_are_kept() -> None:
+    rng = np.random.default_rng(11)
+    given = scene(grid(3, 2, (0.4, 0.3), 0.2, rng), tilt=(0.05, -0.04), rng=rng)
+    found = _run(given, distortion=-0.25, tilt=(0.05, -0.04))
+    assert found.distortion == -0.25
+    assert found.distortion_std == 0.0
+    assert found.tilt == pytest.approx((0.05, -0.04), abs=1e-5)
+
+
+@pytest.mark.parametrize(("std", "model"), [(0.0, "similarity"), (0.01, "tilting")])
+def test_measured_attitudes_replace_estimated_ones(std: float, model: str) -> None:
+    rng = np.random.default_rng(12)
+    poses = jittered(grid(4, 3, (0.4, 0.3), 0.2, rng), 0.1, 0.05, rng)
+    given = scene(poses, tilt=(0.03, 0.02), rng=rng)
+    attitudes = poses[:, [PSI, THETA]] + std * rng.normal(size=(len(poses), 2))
+    found = _run(given, attitudes=attitudes, attitudes_std=std)
+    assert found.model == model
+    assert found.poses is not None
+    np.testing.assert_allclose(found.poses.tilt, poses[:, [PSI, THETA]] + (0.03, 0.02), atol=0.005)
+    assert float(np.quantile(_pair_errors(found, given), 0.95)) < 0.2
+
+
+def test_the_reference_picture_is_the_frame() -> None:
+    rng = np.random.default_rng(13)
+    given = scene(grid(3, 2, (0.4, 0.3), 0.2, rng), rng=rng)
+    for model in ("similarity", "homography"):
+        found = _run(given, model=model, reference=4)
+        assert found.reference == 4
+    np.testing.assert_allclose(found.homographies[4], np.eye(3), atol=1e-12)
+    rigid = _run(given, model="rigid", reference=4)
+    assert rigid.poses is not None
+    np.testing.assert_allclose([rigid.poses.yaw[4], *rigid.poses.position[4], rigid.poses.height[4]], [0, 0, 0, 1])
+
+
+def test_the_order_of_links_does_not_matter() -> None:
+    rng = np.random.default_rng(14)
+    given = scene(grid(3, 2, (0.4, 0.3), 0.2, rng), rng=rng)
+    there, back = align(given.cameras, given.links), align(given.cameras, given.links[::-1])
+    assert there.distortion == pytest.approx(back.distortion, abs=1e-5)
+    assert there.model == back.model
+
+
+def test_mistakes_of_the_caller() -> None:
+    rng = np.random.default_rng(15)
+    given = scene(grid(2, 1, (0.4, 0.3), 0.2, rng), rng=rng)
+    with pytest.raises(RegistrationError, match="no two pictures overlap"):
+        align(given.cameras, [])
+    with pytest.raises(ArgumentError, match="same pictures"):
+        align(given.cameras, [given.links[0], given.links[0]])
+    with pytest.raises(ArgumentError, match="none of the 1"):
+        align(given.cameras[:1], given.links)
+    with pytest.raises(ArgumentError, match="model must be"):
+        AlignmentOptions(model="affine")
+    with pytest.raises(ArgumentError, match="with itself"):
+        replace(given.links[0], image2=0)
+    failed = RadialHomography.failed("none", Camera((4, 3)), Camera((4, 3)), 0)
+    with pytest.raises(ArgumentError, match="failed fit"):
+        replace(given.links[0], relation=failed)
