@@ -129,9 +129,11 @@ class TrajectoryError:
     Attributes
     ----------
     translation : float
-        Median error of the relative translations, as a share of their length.
+        Median error of the relative translations, as a share of their length, in heights.
     translation_rms : float
         Root mean square error of the relative translations over their root mean square length.
+    translation_in_own_unit : float
+        As ``translation``, after the best scale: the height in px is known only as well as the focal length.
     rotation : float
         Median error of the relative rotations, radians.
     rotation_rms : float
@@ -145,6 +147,7 @@ class TrajectoryError:
 
     translation: float
     translation_rms: float
+    translation_in_own_unit: float
     rotation: float
     rotation_rms: float
     drift: float
@@ -169,6 +172,8 @@ def compare(estimate: Trajectory, truth: Trajectory, step: int = 1) -> Trajector
     (move_a, turn_a), (move_b, turn_b) = a.relative(step), b.relative(step)
     off = np.linalg.norm(move_a - move_b, axis=1)
     size = np.linalg.norm(move_b, axis=1)
+    unit = float(np.vdot(move_a, move_b) / max(float(np.vdot(move_a, move_a)), 1e-300))
+    off_scaled = np.linalg.norm(unit * move_a - move_b, axis=1)
     moving = size > 1e-9 * max(float(size.max()), 1e-300)
     turn = np.abs(np.remainder(turn_a - turn_b + np.pi, 2 * np.pi) - np.pi)
     complex_a, complex_b = (t.position[:, 0] + 1j * t.position[:, 1] for t in (a, b))
@@ -179,6 +184,7 @@ def compare(estimate: Trajectory, truth: Trajectory, step: int = 1) -> Trajector
     return TrajectoryError(
         translation=float(np.median(off[moving] / size[moving])) if moving.any() else 0.0,
         translation_rms=float(np.sqrt(np.mean(off**2) / max(float(np.mean(size**2)), 1e-300))),
+        translation_in_own_unit=float(np.median(off_scaled[moving] / size[moving])) if moving.any() else 0.0,
         rotation=float(np.median(turn)),
         rotation_rms=float(np.sqrt(np.mean(turn**2))),
         drift=float(np.sqrt(np.mean(distance**2))) / max(b.length, 1e-300),
