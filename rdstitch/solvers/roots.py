@@ -21,6 +21,7 @@ from rdstitch.camera import FloatArray
 
 IndexArray = NDArray[np.intp]
 
+_VALUES_IN_CACHE = 20480
 _CELLS = 8
 _PARTS = 4
 _DEPTH = 6
@@ -64,12 +65,21 @@ def real_roots(equation: Equation, degree: int, low: FloatArray, high: FloatArra
     """
     half = 0.5 * (high - low)
     middle = low + half
-    values = equation.polynomial(middle + chebyshev_nodes(degree)[:, None] * half)
-    values[:, ~((half > 0.0) & np.isfinite(values).all(axis=0))] = 1.0
-    brackets = isolate(values)
+    # With all nodes of all samples at once the intermediate values of an equation would not stay in cache.
+    size = max(1, _VALUES_IN_CACHE // (degree + 1))
+    series, found = np.empty((degree + 1, len(half))), []
+    for start in range(0, len(half), size):
+        part = np.arange(start, min(start + size, len(half)))
+        some = equation.take(part) if len(part) < len(half) else equation
+        values = some.polynomial(middle[part] + chebyshev_nodes(degree)[:, None] * half[part])
+        values[:, ~((half[part] > 0.0) & np.isfinite(values).all(axis=0))] = 1.0
+        series[:, part] = chebyshev_from_values(degree) @ values
+        found.append(isolate(values, start))
+    if not found:
+        return np.empty(0, dtype=np.intp), np.empty(0)
+    brackets = Brackets.joined(found)
     sample = brackets.sample
-    series = (chebyshev_from_values(degree) @ values)[:, sample]
-    t, slope = bracketed_newton(series, brackets)
+    t, slope = bracketed_newton(series[:, sample], brackets)
     half = half[sample]
     return sample, polish(equation.take(sample), middle[sample] + t * half, slope / half, half)
 
@@ -186,15 +196,19 @@ class Brackets:
         return cls(sample, left, left + width, coefficients[:, 0], coefficients[:, -1])
 
     @classmethod
-    def joined(cls, parts: Sequence["Brackets"]) -> Self:
-        """All of them, ascending by sample."""
+    def joined(cls, parts: Sequence["Brackets"], first: int = 0) -> Self:
+        """All of them, ascending by sample, whose numbers grow by ``first``."""
         columns = [np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)]
         order = np.argsort(columns[0], kind="stable")
+        columns[0] += first
         return cls(*(column[order] for column in columns))
 
 
-def isolate(values: FloatArray) -> Brackets:
-    """Brackets of all roots in [-1, 1] of polynomials given by their values (degree + 1, B) at Chebyshev nodes."""
+def isolate(values: FloatArray, first: int = 0) -> Brackets:
+    """Brackets of all roots in [-1, 1] of polynomials given by their values (degree + 1, B) at Chebyshev nodes.
+
+    The polynomials are numbered from ``first``.
+    """
     degree = len(values) - 1
     count = degree + 1
     matrix = bernstein_from_values(degree, _CELLS)
@@ -226,7 +240,7 @@ def isolate(values: FloatArray) -> Brackets:
         sample, left, current = sample[more], left[more], current[more]
     if len(sample):
         found.append(_close_pairs(current, sample, left, width, np.abs(values).max(axis=0)))
-    return Brackets.joined(found)
+    return Brackets.joined(found, first)
 
 
 def _close_pairs(

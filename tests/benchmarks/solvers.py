@@ -2,7 +2,7 @@
 
 Accuracy on 20,000 noise-free instances a solver; time on batches of 4,096 and on single samples. Times are printed with
 their ratio to the linear algebra that elimination templates of the same problems cost, measured in turns with the
-solvers in the same run. Set OMP_NUM_THREADS=1 for one core.
+solvers in the same run; it is processor time, of all cores together.
 """
 
 import argparse
@@ -106,13 +106,13 @@ def template_floors() -> dict[str, tuple[Callable[[], object], int]]:
 
 
 def best_time(works: Sequence[Callable[[], object]], rounds: int = ROUNDS) -> list[float]:
-    """Shortest time of each, seconds; measured in turns, so that a busy machine slows all of them alike."""
+    """Shortest processor time of each, seconds; measured in turns, so that a busy machine slows all of them alike."""
     times = np.empty((rounds, len(works)))
     for row in times:
         for i, work in enumerate(works):
-            start = time.perf_counter()
+            start = time.process_time()
             work()
-            row[i] = time.perf_counter() - start
+            row[i] = time.process_time() - start
     return [float(t) for t in times.min(axis=0)]
 
 
