@@ -12,7 +12,7 @@ from rdstitch.features.nearest import mutual_nearest
 __all__ = ["Correspondences", "match"]
 
 _DEFAULT_RATIO = 0.85
-_BLOCK_BYTES = 2**24
+_BLOCK_BYTES = 2**22  # stays in the cache
 
 
 def match(

@@ -75,7 +75,7 @@ def mutual_nearest(features1: Features, features2: Features, block_bytes: int) -
     nearest = np.empty(len(one), dtype=np.intp)
     best, second = np.empty((2, len(one)), similarity.dtype)
     best_of_column, second_of_column = np.full((2, len(two)), similarity.lowest, similarity.dtype)
-    step = max(1, block_bytes // (similarity.dtype.itemsize * len(columns)) // len(one.layers))
+    step = max(1, block_bytes // (similarity.bytes_each * len(columns)) // len(one.layers))
     for start in range(0, len(one), step):
         layers = one.rows(start, start + step)
         block = _merge(similarity.block(np.concatenate(layers)), layers, two)

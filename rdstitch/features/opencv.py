@@ -48,7 +48,7 @@ class OpenCVDetection:
             [keypoints[i] for i in order],
             points=table[:, :2],
             scale=table[:, 2],
-            response=table[:, 5],
+            response=_strength(options.kind, table[:, 5], table[:, 2]),
             kind=options.kind,
         )
 
@@ -67,7 +67,7 @@ class OpenCVDetection:
             scale=size,
             # OpenCV marks "no orientation" by -1.
             angle=np.where(degrees < 0, 0.0, np.radians(degrees) % (2 * np.pi)),
-            response=response,
+            response=_strength(self.kind, response, size),
             laplacian_sign=None,
             kind=self.kind,
         )
@@ -100,6 +100,15 @@ def root(descriptors: Descriptors) -> NDArray[np.float32]:
     return rooted
 
 
+def _strength(kind: str, response: FloatArray, size: FloatArray) -> FloatArray:
+    """By which keypoints are chosen.
+
+    For SIFT contrast times size: by contrast alone the choice is mostly tiny ones, which drown in noise. On real pairs
+    of pictures the product gives a fifth to a half more inliers, among other detectors it does not help.
+    """
+    return response * size if kind in ("sift", "rootsift") else response
+
+
 def _sift(options: FeatureOptions) -> Any:
     # Without the precise upscale all points are a quarter of a pixel off.
     return cv2.SIFT.create(nfeatures=0, contrastThreshold=options.sift_contrast, enable_precise_upscale=True)
@@ -110,21 +119,29 @@ def _orb(options: FeatureOptions) -> Any:
     return cv2.ORB.create(nfeatures=8 * options.max_features, fastThreshold=options.orb_fast_threshold)
 
 
-def _moved(name: str) -> Callable[[FeatureOptions], Any]:
+def _akaze(options: FeatureOptions) -> Any:
+    return _moved("AKAZE_create")(threshold=options.kaze_threshold)
+
+
+def _kaze(options: FeatureOptions) -> Any:
+    return _moved("KAZE_create")(threshold=options.kaze_threshold)
+
+
+def _brisk(options: FeatureOptions) -> Any:
+    return _moved("BRISK_create")(thresh=options.brisk_threshold)
+
+
+def _moved(name: str) -> Callable[..., Any]:
     """Factory of a detector that OpenCV 5 moved to ``cv2.xfeatures2d``."""
-
-    def create(_options: FeatureOptions) -> Any:
-        module = cv2 if hasattr(cv2, name) else cv2.xfeatures2d
-        return getattr(module, name)()
-
-    return create
+    factory: Callable[..., Any] = getattr(cv2 if hasattr(cv2, name) else cv2.xfeatures2d, name)
+    return factory
 
 
 _FACTORIES: dict[str, Callable[[FeatureOptions], Any]] = {
     "rootsift": _sift,
     "sift": _sift,
     "orb": _orb,
-    "akaze": _moved("AKAZE_create"),
-    "kaze": _moved("KAZE_create"),
-    "brisk": _moved("BRISK_create"),
+    "akaze": _akaze,
+    "kaze": _kaze,
+    "brisk": _brisk,
 }

@@ -31,6 +31,8 @@ class FeatureOptions:
     surf_upright: bool = False  # no orientation: for pictures that are turned by less than about 15°
     surf_refine: bool = True  # place blobs by Gaussian derivatives; False: by box filters alone, as the paper does
     orb_fast_threshold: int = 7  # grey levels by which a corner must differ from its surroundings
+    kaze_threshold: float = 0.0005  # least response of KAZE and AKAZE; 0.001 is OpenCV's
+    brisk_threshold: int = 25  # grey levels by which a corner must differ; 30 is OpenCV's
     aliked_model: str | Path | None = None  # ONNX file of the network
     aliked_size: int = 640  # side of the square picture that the network takes, px
 

@@ -23,6 +23,8 @@ class Similarity(Protocol):
     """Less than any similarity."""
     dtype: np.dtype[Any]
     """Type of a similarity."""
+    bytes_each: int
+    """Memory that one similarity takes while it is made."""
 
     def block(self, rows: NDArray[np.intp]) -> NDArray[Any]:
         """Similarities of some descriptors of picture 1 to all of picture 2, shape (len(rows), count 2)."""
@@ -46,6 +48,7 @@ class Euclidean:
 
     lowest = -np.inf
     dtype = np.dtype(np.float32)
+    bytes_each = 4
 
     def __init__(self, descriptors1: NDArray[np.float32], descriptors2: NDArray[np.float32]) -> None:
         norms = (float(np.linalg.norm(d, axis=1).max(initial=0.0)) for d in (descriptors1, descriptors2))
@@ -75,6 +78,7 @@ class Hamming:
 
     lowest = -1.0
     dtype = np.dtype(np.int16)
+    bytes_each = 8 + 1 + 2
 
     def __init__(self, descriptors1: NDArray[np.uint8], descriptors2: NDArray[np.uint8]) -> None:
         self._bits = 64 * -(-descriptors1.shape[1] // 8)
