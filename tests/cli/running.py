@@ -1,0 +1,84 @@
+"""The command line, run in this process or as a stranger runs it, and small pictures to run it on."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.radial_homography import project
+from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
+
+DISTORTION = -0.2
+
+# Small pictures need no more, and every command of these tests takes a second less.
+FAST = ("-j", "1", "--max-features", "600")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run of the command line left behind."""
+
+    status: int
+    out: str
+    err: str
+
+    @property
+    def line(self) -> str:
+        """The one line of an error."""
+        lines = self.err.splitlines()
+        assert len(lines) == 1, self.err
+        return lines[0]
+
+
+Run = Callable[..., Outcome]
+
+
+def flight(seed: int, columns: int, rows: int = 1, distortion: float = DISTORTION, overlap: float = 0.5) -> Sequence:
+    """Small pictures of a textured plane."""
+    lens = Camera((400, 300), distortion=distortion, focal=380.0)
+    poses = grid_poses(lens, columns, rows, overlap=overlap, yaw=0.1, shift=0.05, tilt=(0.05, -0.03), seed=seed)
+    return sequence_over(partial(ground, seed=seed), lens, poses, photometry=Photometry(noise=0.01), seed=seed)
+
+
+def start(
+    *arguments: str | bytes | Path, stdin: int | None = subprocess.DEVNULL, **environment: str
+) -> "subprocess.Popen[bytes]":
+    """Start the command line as a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-c", "from rdstitch_cli.main import main; main()", *arguments],
+        stdin=stdin,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
+    )
+
+
+def finished(process: "subprocess.Popen[bytes]", data: bytes | None = None) -> Outcome:
+    """Wait for a process of :func:`start`."""
+    out, err = process.communicate(data, timeout=300)
+    assert b"Traceback" not in err, err.decode("utf-8", "replace")
+    return Outcome(process.returncode, out.decode("utf-8", "replace"), err.decode("utf-8", "replace"))
+
+
+def transfers(record: dict[str, Any]) -> Mapping[int, Callable[[FloatArray], FloatArray]]:
+    """By its sidecar: where each picture's measured px lie in the output, for the pictures that were used."""
+    camera = record["camera"]
+    found = {}
+    for index, image in enumerate(record["images"]):
+        if image["used"]:
+            width, height = image["size"]
+            lens = Camera((width, height), camera["lambda"], camera["lambda2"], tuple(camera["center_px"]))
+            found[index] = partial(_to_output, lens, np.array(image["to_output"]))
+    return found
+
+
+def _to_output(lens: Camera, matrix: FloatArray, points: FloatArray) -> FloatArray:
+    flat = lens.normalize(lens.undistort(points))
+    return project(np.column_stack([flat, np.ones(len(flat))]) @ (matrix * np.sign(matrix[2, 2])).T)

@@ -1,0 +1,86 @@
+"""Help: every command and option is described, by examples too, and quickly."""
+
+import re
+import subprocess
+import sys
+
+import click
+import pytest
+from rdstitch_cli.main import EXIT_STATUSES, cli
+
+from tests.cli.running import Run
+
+COMMANDS = sorted(cli.commands)
+
+
+def _options(command: click.Command) -> list[click.Option]:
+    return [parameter for parameter in command.params if isinstance(parameter, click.Option)]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_has_examples_exit_statuses_and_every_option(rdstitch: Run, name: str) -> None:
+    shown = rdstitch(name, "--help")
+    assert shown.status == 0
+    assert f"rdstitch {name} " in shown.out
+    assert "Exit status:" in shown.out
+    for option in _options(cli.commands[name]):
+        assert option.help, option.name
+        assert any(
+            f"{text} " in shown.out or f"{text}," in shown.out or f"{text}\n" in shown.out for text in option.opts
+        )
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_examples_use_only_options_that_exist(name: str) -> None:
+    epilog = cli.commands[name].epilog or ""
+    examples = [line for line in epilog.splitlines() if "rdstitch " in line and "find " not in line]
+    assert examples
+    for line in examples:
+        command = cli.commands[line.split("rdstitch ")[1].split()[0]]
+        known = {text for option in _options(command) for text in option.opts}
+        used = set(re.findall(r"(?<=\s)--?[a-z][a-z-]*", line))
+        assert used <= known, line
+
+
+def test_every_status_of_the_error_tree_is_documented() -> None:
+    from rdstitch import errors
+
+    kinds = [
+        kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, errors.RdstitchError)
+    ]
+    assert len(kinds) > 5
+    for kind in kinds:
+        assert re.search(rf"^\s+{kind.exit_status}\s+\S", EXIT_STATUSES, re.MULTILINE), kind
+
+
+def test_options_of_one_name_mean_the_same_everywhere() -> None:
+    meanings: dict[str, set[str]] = {}
+    for name in COMMANDS:
+        for option in _options(cli.commands[name]):
+            if option.name not in ("output", "reference"):
+                meanings.setdefault(option.opts[-1], set()).add(f"{option.help} {option.default}")
+    assert {text: found for text, found in meanings.items() if len(found) > 1} == {}
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], *([name, "--help"] for name in COMMANDS)])
+def test_help_loads_neither_opencv_nor_scipy(arguments: list[str]) -> None:
+    check = (
+        "import sys; from rdstitch_cli.main import run; status = run(sys.argv[1:]); "
+        "heavy = {'cv2', 'scipy', 'numpy', 'PIL', 'tifffile'} & set(sys.modules); "
+        "sys.exit(status or (f'loads {heavy}' if heavy else 0))"
+    )
+    done = subprocess.run([sys.executable, "-c", check, *arguments], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout
+
+
+def test_version(rdstitch: Run) -> None:
+    shown = rdstitch("--version")
+    assert re.fullmatch(r"rdstitch, version \d+\.\d+\.\d+\n", shown.out)
+
+
+@pytest.mark.parametrize("arguments", [(), ("stitch",), ("pano",), ("pano", "a.jpg", "--colour"), ("mosaic", "a")])
+def test_wrong_usage_is_status_2(rdstitch: Run, arguments: tuple[str, ...]) -> None:
+    done = rdstitch(*arguments)
+    assert done.status == 2
+    assert done.err

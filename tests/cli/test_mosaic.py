@@ -1,0 +1,62 @@
+"""``rdstitch mosaic``, run for real."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rdstitch.synthetic import Sequence, alignment_error
+from tests.cli.running import DISTORTION, FAST, Run, finished, start, transfers
+
+
+def test_a_folder_becomes_one_rectified_picture(
+    rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path
+) -> None:
+    done = rdstitch("mosaic", frames[0].parent, "-o", tmp_path / "mosaic.tif", *FAST)
+    assert (done.status, done.err) == (0, "")
+    assert abs(float(done.out) - DISTORTION) < 0.01
+    record = json.loads((tmp_path / "mosaic.tif.json").read_text(encoding="utf-8"))
+    assert alignment_error(sequence, transfers(record), model="homography").median < 1.0
+    poses = [image["pose"] for image in record["images"]]
+    assert all(set(pose) == {"x", "y", "height", "yaw_deg", "tilt_deg"} for pose in poses)
+    true = sequence.poses.yaw - sequence.poses.yaw[[i["name"] for i in record["images"]].index(record["reference"])]
+    np.testing.assert_allclose([pose["yaw_deg"] for pose in poses], np.degrees(true), atol=0.5)
+
+
+@pytest.mark.parametrize("how", ["files", "pattern", "list", "newlines", "nul"])
+def test_every_way_to_name_pictures(frames: list[Path], tmp_path: Path, how: str) -> None:
+    names, data = [str(path) for path in frames], None
+    listing = tmp_path / "list.txt"
+    listing.write_text("\n".join(names), encoding="utf-8")
+    inputs = {"files": names, "pattern": [f"{frames[0].parent}/frame_*.png"], "list": [f"@{listing}"]}.get(how, ["-"])
+    if inputs == ["-"]:
+        data = ("\n" if how == "newlines" else "\0").join(names).encode()
+    process = start("mosaic", *inputs, "-o", tmp_path / "mosaic.jpg", "--scale", "0.5", *FAST, stdin=-1)
+    assert finished(process, data).status == 0
+    record = json.loads((tmp_path / "mosaic.jpg.json").read_text(encoding="utf-8"))
+    assert [image["name"] for image in record["images"]] == [path.name for path in frames]
+
+
+def test_an_unreadable_picture_is_left_out_by_name(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    folder = tmp_path / "folder"
+    shutil.copytree(frames[0].parent, folder)
+    broken = folder / "broken.png"
+    broken.write_bytes(frames[0].read_bytes()[:2000])
+    done = rdstitch("mosaic", folder, "-o", tmp_path / "mosaic.jpg", *FAST)
+    assert done.status == 0
+    assert str(broken) in done.line
+    record = json.loads((tmp_path / "mosaic.jpg.json").read_text(encoding="utf-8"))
+    assert {image["name"]: image["used"] for image in record["images"]} == {
+        "broken.png": False,
+        **{path.name: True for path in frames},
+    }
+
+
+def test_its_own_output_is_no_input(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    folder = tmp_path / "folder"
+    shutil.copytree(frames[0].parent, folder)
+    arguments = ("mosaic", folder, "-o", folder / "mosaic.png", "--overwrite", *FAST)
+    first, second = rdstitch(*arguments), rdstitch(*arguments)
+    assert (first.status, first.err, first.out) == (second.status, second.err, second.out) == (0, "", first.out)

@@ -1,0 +1,108 @@
+"""``rdstitch pano``, run for real."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rdstitch.camera import Camera
+from rdstitch.io import read_image
+from rdstitch.synthetic import Sequence, alignment_error, compare_with_plane
+from tests.cli.running import DISTORTION, FAST, Run, finished, start, transfers
+
+
+def test_writes_picture_sidecar_and_camera_and_prints_lambda(
+    rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path
+) -> None:
+    output, camera = tmp_path / "pano.png", tmp_path / "camera.json"
+    done = rdstitch("pano", *frames, "-o", output, "--save-camera", camera, *FAST)
+    assert (done.status, done.err) == (0, "")
+    assert done.out == f"{float(done.out):.6f}\n"
+    assert abs(float(done.out) - DISTORTION) < 0.01
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["camera.json", "pano.png", "pano.png.json"]
+
+    record = json.loads((tmp_path / "pano.png.json").read_text(encoding="utf-8"))
+    assert record["lambda"] == pytest.approx(float(done.out), abs=1e-6)
+    assert 0 < record["lambda_std"] < 0.01
+    assert record["lambda_px"] == pytest.approx(record["lambda"] / 250.0**2)
+    assert [image["name"] for image in record["images"]] == [path.name for path in frames]
+    assert all(image["used"] and image["reason"] == "" for image in record["images"])
+    assert record["verdict"]["ok"] is True
+    assert record["output"]["file"] == "pano.png"
+    assert Camera.load(camera).distortion == pytest.approx(record["lambda"])
+
+    picture = read_image(output)
+    assert [*picture.pixels.shape[1::-1]] == record["output"]["size"]
+    assert picture.alpha is not None
+    numbers = alignment_error(sequence, transfers(record), model="homography")
+    assert numbers.median < 1.0
+    seen = compare_with_plane(
+        picture.pixels, sequence.texture, model="homography", valid=picture.alpha > 0, start=numbers.transform
+    )
+    assert seen.median < 1.0
+
+
+def test_order_does_not_matter_and_reference_keeps_its_frame(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    output = tmp_path / "pano.tif"
+    done = rdstitch("pano", frames[2], frames[0], frames[1], "-o", output, "--reference", frames[0].name, *FAST)
+    assert done.status == 0
+    record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
+    assert record["reference"] == frames[0].name
+    matrix = np.array(record["images"][1]["to_output"])
+    matrix /= matrix[2, 2]
+    # An undistorted picture is only scaled and shifted into its own frame.
+    np.testing.assert_allclose(
+        matrix, [[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[0, 0], matrix[1, 2]], [0, 0, 1]], atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("how", ["lambda", "camera"])
+def test_known_lens_is_kept(rdstitch: Run, frames: list[Path], tmp_path: Path, how: str) -> None:
+    Camera((400, 300), distortion=-0.21).save(tmp_path / "camera.json")
+    known = ("--lambda", "-0.21") if how == "lambda" else ("--camera", tmp_path / "camera.json")
+    done = rdstitch("pano", *frames[:2], "-o", tmp_path / "pano.jpg", *known, *FAST)
+    assert (done.status, done.out) == (0, "-0.210000\n")
+    record = json.loads((tmp_path / "pano.jpg.json").read_text(encoding="utf-8"))
+    assert record["lambda_known"] is True
+    assert record["lambda_std"] in (None, 0.0)
+
+
+def test_a_picture_without_overlap_is_named(rdstitch: Run, frames: list[Path], stranger: Path, tmp_path: Path) -> None:
+    done = rdstitch("pano", *frames[:2], stranger, "-o", tmp_path / "pano.jpg", *FAST)
+    assert done.status == 0
+    assert str(stranger) in done.line
+    record = json.loads((tmp_path / "pano.jpg.json").read_text(encoding="utf-8"))
+    assert [image["used"] for image in record["images"]] == [True, True, False]
+    assert record["images"][2]["reason"]
+
+    strict = rdstitch("pano", *frames[:2], stranger, "-o", tmp_path / "strict.jpg", "--strict", *FAST)
+    assert strict.status == 5
+    assert str(stranger) in strict.line
+    assert not (tmp_path / "strict.jpg").exists()
+
+
+def test_quiet_says_nothing_and_verbose_says_more(
+    rdstitch: Run, frames: list[Path], stranger: Path, tmp_path: Path
+) -> None:
+    arguments = ("pano", *frames[:2], stranger, "-o", tmp_path / "pano.jpg", "--overwrite", *FAST)
+    quiet, usual, verbose = rdstitch(*arguments, "-q"), rdstitch(*arguments), rdstitch(*arguments, "-v")
+    assert quiet.err == ""
+    assert len(usual.err.splitlines()) < len(verbose.err.splitlines())
+    assert quiet.out == usual.out == verbose.out
+
+
+def test_unobservable_lambda_is_nan(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    again = tmp_path / "again.png"
+    again.write_bytes(frames[0].read_bytes())
+    done = rdstitch("pano", frames[0], again, "-o", tmp_path / "pano.jpg", *FAST)
+    assert done.status == 0
+    assert math.isnan(float(done.out))
+    assert "not observable" in done.err
+
+
+def test_as_a_process(frames: list[Path], tmp_path: Path) -> None:
+    done = finished(start("pano", *frames[:2], "-o", tmp_path / "pano.jpg", *FAST))
+    assert (done.status, done.err) == (0, "")
+    assert abs(float(done.out) - DISTORTION) < 0.01
