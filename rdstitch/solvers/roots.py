@@ -291,12 +291,19 @@ def bernstein_value(coefficients: FloatArray, s: FloatArray) -> FloatArray:
 def chebyshev_value_and_slope(coefficients: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Value and derivative of Chebyshev series (degree + 1, N) at t (N,), by Clenshaw's recurrence."""
     twice = 2.0 * t
-    value, before = coefficients[-1], np.zeros_like(t)
-    slope, slope_before = np.zeros_like(t), np.zeros_like(t)
+    value, before, spare = coefficients[-1].copy(), np.zeros_like(t), np.empty_like(t)
+    half_slope, half_before = np.zeros_like(t), np.zeros_like(t)
+    # In place, for this is the innermost loop of all solvers.
     for c in coefficients[-2:0:-1]:
-        slope, slope_before = 2.0 * value + twice * slope - slope_before, slope
-        value, before = c + twice * value - before, value
-    return coefficients[0] + t * value - before, value + t * slope - slope_before
+        np.multiply(twice, half_slope, out=spare)
+        spare -= half_before
+        spare += value
+        half_slope, half_before, spare = spare, half_slope, half_before
+        np.multiply(twice, value, out=spare)
+        spare -= before
+        spare += c
+        value, before, spare = spare, value, before
+    return coefficients[0] + t * value - before, value + 2.0 * (t * half_slope - half_before)
 
 
 def bracketed_newton(coefficients: FloatArray, brackets: Brackets) -> tuple[FloatArray, FloatArray]:
