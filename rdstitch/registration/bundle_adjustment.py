@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 
 from rdstitch.camera import FloatArray
-from rdstitch.registration.models import BoolArray, Model, ModelMatrices
+from rdstitch.registration.models import BoolArray, Model, ModelMatrices, inverses
 from rdstitch.registration.normal_equations import (
     LinkEquations,
     NormalEquations,
@@ -214,7 +214,10 @@ class Adjuster:
         damping, used = 1e-5, 1
         while used < most:
             normal = self._normal_equations(state, sigma)
-            flat, step_shared = normal.solve(damping)
+            try:
+                flat, step_shared = normal.solve(damping)
+            except RuntimeError:  # singular: some pictures are held by nothing but lost correspondences
+                return state, used, False
             step_poses = np.zeros(self.freedom.poses.shape)
             step_poses[self.freedom.poses] = flat
             predicted = -(
@@ -252,7 +255,8 @@ class Adjuster:
     def _of_links(self, matrices: ModelMatrices) -> FloatArray:
         """``H_ij = P_j P_i⁻¹`` of each link, shape (L, 3, 3)."""
         i, j = self.observations.image1, self.observations.image2
-        product: FloatArray = matrices.matrices[j] @ np.linalg.inv(matrices.matrices)[i]
+        with np.errstate(all="ignore"):
+            product: FloatArray = matrices.matrices[j] @ inverses(matrices.matrices)[i]
         return product
 
     def _weight(self, sigma: float) -> float:

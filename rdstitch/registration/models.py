@@ -275,6 +275,15 @@ class HomographyModel:
         return _unit_determinant(homographies)
 
 
+def inverses(matrices: FloatArray) -> FloatArray:
+    """Inverses of (N, 3, 3) by cofactors; not finite, without complaint, where a wild step made a matrix singular."""
+    a, b, c = matrices[:, 0], matrices[:, 1], matrices[:, 2]
+    with np.errstate(all="ignore"):
+        cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
+        inverse: FloatArray = cofactors / np.einsum("ni,ni->n", a, cofactors[:, :, 0])[:, None, None]
+    return inverse
+
+
 def _unit_determinant(matrices: FloatArray) -> FloatArray:
     """Scaled to determinant ±1 without changing sign, flattened to (N, 9)."""
     size = np.cbrt(np.maximum(np.abs(np.linalg.det(matrices)), 1e-300))

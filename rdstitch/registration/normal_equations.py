@@ -16,7 +16,7 @@ from scipy.sparse.linalg import splu
 
 from rdstitch.camera import FloatArray, distort
 from rdstitch.radial_homography import lift, measurement_whitening, project, transfer_jacobian
-from rdstitch.registration.models import BoolArray, ModelMatrices
+from rdstitch.registration.models import BoolArray, ModelMatrices, inverses
 from rdstitch.registration.observations import Observations
 
 _CHUNK = 8192
@@ -93,6 +93,7 @@ def link_equations(
     return LinkEquations(gram, gradient, squared, whitening)
 
 
+@np.errstate(all="ignore")  # a wild step may give homographies that are not finite
 def squared_errors(
     observations: Observations, homographies: FloatArray, lens: FloatArray, whitening: FloatArray
 ) -> FloatArray:
@@ -125,6 +126,7 @@ def _chunks(start: NDArray[np.intp]) -> list[tuple[int, int]]:
     return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 
 
+@np.errstate(all="ignore")
 def _whitened(
     observations: Observations, homographies: FloatArray, lens: FloatArray, first: int, last: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -249,7 +251,7 @@ def chain(
     """
     i, j = observations.image1, observations.image2
     size, count = model.by_pose.shape[1], len(observations)
-    inverse = np.linalg.inv(model.matrices)[i][:, None]
+    inverse = inverses(model.matrices)[i][:, None]
     along = homographies[:, None]
     blocks = [
         -along @ model.by_pose[i] @ inverse,

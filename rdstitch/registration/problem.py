@@ -31,6 +31,9 @@ _USUAL_FOCAL, _USUAL_FOCAL_STD = 1.9, 0.4
 _WIDEST_START = 0.05
 """Half diagonals: errors that a chain may have gathered before the adjustment, beyond which a link is doubted."""
 
+_LONG_CHAIN = 60
+"""Pictures over which chained homographies drift so far that a planar model is the better start."""
+
 _TRIAL_LINKS, _TRIAL_MATCHES = 30, 40
 """What the tilts to start from are tried on."""
 
@@ -159,6 +162,8 @@ class Problem:
 
     def fit(self, model: Model, others: Sequence[Fit] = ()) -> Fit:
         """Adjust a model from the chained links or from the solution of a less free model, whichever is nearer."""
+        if not others and not model.shared_names and self.count > _LONG_CHAIN:
+            others = [self.fit(SIMILARITY)]
         starts = [self._taken_over(model, other) for other in others]
         if not (others and self._tilts_are_free(model)):
             starts.append(self._chained(model, others))

@@ -58,13 +58,10 @@ def test_neither_frame_nor_unit_matter_to_the_error() -> None:
 
 def test_known_errors_are_measured() -> None:
     count = 20
-    straight = Poses(
-        np.zeros(count),
-        np.stack([np.arange(count) * 0.2, np.zeros(count)], axis=1),
-        np.ones(count),
-        np.zeros((count, 2)),
-    )
-    bent = Poses(0.001 * np.arange(count), straight.position * [1.01, 1.0], straight.height, straight.tilt)
+    along = np.stack([np.arange(count) * 0.2, np.zeros(count)], axis=1)
+    level, height = np.zeros((count, 2)), np.ones(count)
+    straight = Poses(np.zeros(count), along, height, level)
+    bent = Poses(0.001 * np.arange(count), 1.01 * along, height, level)
     error = compare(Trajectory.from_poses(bent), Trajectory.from_poses(straight))
     assert error.rotation == pytest.approx(0.001)
     assert error.scale == pytest.approx(1 / 1.01)
