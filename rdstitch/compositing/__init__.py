@@ -1,7 +1,7 @@
 """From registered pictures to one picture: canvas, resampling, exposure, seams, blending."""
 
 from rdstitch.compositing.canvas import Canvas, plan_canvas
-from rdstitch.compositing.compose import Composite, FileComposite, compose, compose_to_file
+from rdstitch.compositing.compositor import Composite, FileComposite, compose, compose_to_file
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.plan import CompositePlan, plan_composite
 

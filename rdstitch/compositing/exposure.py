@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
@@ -89,7 +90,9 @@ class Exposure:
             # Outside the picture only mirrored content is corrected; the model must not run away there.
             points = np.clip(np.nan_to_num(points), -0.5, (width - 0.5, height - 0.5))
             nodes = np.exp(-self.smooth_part(index, warp.camera, points)).astype(np.float32)
-            level = interpolate_lattice(nodes, box, _LATTICE)[..., None] * level
+            smooth = interpolate_lattice(nodes, box, _LATTICE)
+            # Planes are joined by OpenCV: numpy is slow along an axis of three.
+            level = np.asarray(cv2.merge([smooth * factor for factor in level])).reshape(pixels.shape)
         elif not self.log_gain[index].any():
             return pixels.astype(np.float32)
         values: Float32Array = pixels * level

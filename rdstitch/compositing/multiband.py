@@ -100,7 +100,7 @@ class MultibandBlender:
                 level = coarser
             height, width = share.shape
             cut = np.s_[y >> band : (y >> band) + height, x >> band : (x >> band) + width]
-            band_pixels *= share[..., None]
+            band_pixels *= spread(share, self.channels)
             self._sums[band][cut] += band_pixels
             self._weights[band][cut] += share
             if band < self.bands:
@@ -114,12 +114,21 @@ class MultibandBlender:
             weights = self._weights[band]
             np.maximum(weights, 1.0 / _WEIGHT_STEPS, out=weights)
             blended = self._sums[band]
-            blended /= weights[..., None]
+            blended /= spread(weights, self.channels)
             rounded(blended, self.constant)
             if band < self.bands:
                 blended += rounded(_up(result), self.constant)
             result = blended
         return result
+
+
+def spread(plane: Float32Array, channels: int) -> Float32Array:
+    """A plane (h, w) repeated for every channel, (h, w, C): a product with that is several times faster than with a
+    last axis of length 1.
+    """
+    if channels == 1:
+        return plane[..., None]
+    return np.asarray(cv2.merge([plane] * channels), dtype=np.float32)
 
 
 def _down(values: Float32Array) -> Float32Array:

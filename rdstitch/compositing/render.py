@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.compositing.exposure import Exposure, full_scale
-from rdstitch.compositing.multiband import MultibandBlender, aligned, grown, margin, rounded, rounding_constant
+from rdstitch.compositing.multiband import MultibandBlender, aligned, grown, margin, rounded, rounding_constant, spread
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.pictures import PictureCache
 from rdstitch.compositing.seams import SeamMap
@@ -117,12 +117,12 @@ class Renderer:
                 continue
             if self.options.blend != "feather":
                 # One owner per px: a product and a quotient would cost the last bit.
-                np.copyto(_part(total, box, common), self._samples(layer, common), where=weight[..., None] > 0)
+                np.copyto(_part(total, box, common), self._samples(layer, common), where=(weight > 0)[..., None])
                 continue
-            _part(total, box, common)[...] += self._samples(layer, common) * weight[..., None]
+            _part(total, box, common)[...] += self._samples(layer, common) * spread(weight, self.channels)
             _part(weights, box, common)[...] += weight
         if self.options.blend == "feather":
-            total /= np.where(weights > 0, weights, np.float32(1.0))[..., None]
+            total /= spread(np.where(weights > 0, weights, np.float32(1.0)), self.channels)
         return total
 
     def _multiband(self, layers: Sequence[Layer], outer: Box, box: Box) -> Float32Array:

@@ -201,6 +201,9 @@ class Prepared:
 
     def strips(self, progress: Progress | None = None) -> Iterator[tuple[NDArray[Any], NDArray[np.uint8]]]:
         """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
+        if self.plan.workers == 1:
+            yield from self._strips(map, progress)
+            return
         with ThreadPoolExecutor(self.plan.workers) as pool:
             yield from self._strips(pool.map, progress)
 
@@ -209,17 +212,21 @@ class Prepared:
     ) -> Iterator[tuple[NDArray[Any], NDArray[np.uint8]]]:
         """The same, with tiles computed by ``run``, which works like ``map``."""
         (width, height), (x, y), side = self.canvas.size, self.origin, self.plan.tile_size
+        done = 0
         for top in range(0, height, side):
             rows = min(side, height - top)
             samples = np.zeros((rows, width, self.renderer.channels), dtype=self.renderer.dtype)
             alpha = np.zeros((rows, width), dtype=np.uint8)
             boxes = [(x + k, y + top, x + min(k + side, width), y + top + rows) for k in range(0, width, side)]
+            # To and fro, so that the pictures used last are the ones needed next.
+            boxes = boxes[::-1] if top // side % 2 else boxes
             for box, (pixels, covered) in zip(boxes, run(self.renderer.tile, boxes), strict=True):
                 left, right = box[0] - x, box[2] - x
                 samples[:, left:right] = pixels
                 alpha[:, left:right][covered] = 255
                 if progress is not None:
-                    progress((top * width + rows * right) / (width * height))
+                    done += rows * (right - left)
+                    progress(done / (width * height))
             for start in range(0, rows, STRIP_ROWS):
                 yield samples[start : start + STRIP_ROWS], alpha[start : start + STRIP_ROWS]
 
