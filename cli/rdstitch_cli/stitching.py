@@ -32,7 +32,9 @@ def stitch_options(
         wanted["max_features"] = max_features
     if work_megapixels is not None:
         wanted["work_megapixels"] = work_megapixels or None
-    composite = {name: given.pop(name) for name in CompositeOptions.__dataclass_fields__ if name in given}
+    composite = {
+        name: given.pop(name) for name in CompositeOptions.__dataclass_fields__ if name in given and name != "workers"
+    }
     return StitchOptions(
         camera=None if camera is None else Camera.load(camera),
         features=FeatureOptions(**wanted),

@@ -36,7 +36,7 @@ def path_as_svg(path: Trajectory) -> str:
 <polyline points="{line}" fill="none" stroke="#236" stroke-width="2"/>
 <g stroke="#c33" stroke-width="1.2">{arrows}</g>
 <circle cx="{points[0, 0]:.1f}" cy="{points[0, 1]:.1f}" r="5" fill="#2a2"/>
-<line x1="20" y1="{height - 20:.1f}" x2="{20 + scale * unit:.1f}" y2="{height - 20:.1f}" stroke="black" stroke-width="2"/>
+<path d="M20,{height - 20:.1f} h{scale * unit:.1f}" stroke="black" stroke-width="2"/>
 <text x="20" y="{height - 26:.1f}" font-size="14">{scale:g}</text>
 </svg>
 """

@@ -219,7 +219,7 @@ def _composite(
         cameras,
         homographies[used],
         canvas,
-        options.composite,
+        replace(options.composite, workers=options.threads),
         progress=lambda share: progress("compositing", round(100 * share), 100),
     )
     result = StitchResult(registration, composite.canvas, verdict, options, None, composite)
