@@ -61,7 +61,7 @@ def test_known_errors_are_measured() -> None:
     along = np.stack([np.arange(count) * 0.2, np.zeros(count)], axis=1)
     level, height = np.zeros((count, 2)), np.ones(count)
     straight = Poses(np.zeros(count), along, height, level)
-    bent = Poses(0.001 * np.arange(count), 1.01 * along, height, level)
+    bent = Poses(np.linspace(0.0, 0.001 * (count - 1), count), 1.01 * along, height, level)
     error = compare(Trajectory.from_poses(bent), Trajectory.from_poses(straight))
     assert error.rotation == pytest.approx(0.001)
     assert error.scale == pytest.approx(1 / 1.01)
