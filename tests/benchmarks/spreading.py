@@ -1,0 +1,106 @@
+"""What spreading keypoints does to λ: python -m tests.benchmarks.spreading [FOLDER LAMBDA] [--kinds K,…].
+
+Features are detected with and without spreading, matched, and λ is estimated for every pair: on rendered pairs of known
+lens (dark and noisy towards the corners, as real ones are), or on consecutive pictures of a folder whose λ is given.
+Printed for each way: pairs of which λ was estimated, the median number of inliers, median and root mean square of λ's
+error (errors above 0.2 count as 0.2), and the median share of inliers in the outer quarter of the picture.
+"""
+
+import argparse
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch import Camera, estimate_radial_homography
+from rdstitch.features import FeatureOptions, Features, detect, match
+from rdstitch.synthetic import Photometry, ground, pair_poses, sequence_over
+
+SIZE = (1000, 750)
+PAIRS = 10
+LARGEST_ERROR = 0.2
+
+Pictures = tuple[list[NDArray[np.uint8]], list[tuple[int, int]], list[float]]
+
+
+def rendered() -> Pictures:
+    """Pairs with 30 to 60 % overlap, λ from -0.4 to -0.1."""
+    rng = np.random.default_rng(0)
+    pictures, distortions = [], []
+    for index in range(PAIRS):
+        distortion = float(rng.uniform(-0.4, -0.1))
+        lens = Camera(SIZE, distortion, focal=float(rng.uniform(700, 1000)))
+        poses = pair_poses(
+            lens,
+            overlap=float(rng.uniform(0.3, 0.6)),
+            yaw=float(rng.uniform(-0.3, 0.3)),
+            direction=float(rng.uniform(0, 6.28)),
+            tilt=(float(rng.normal(0, 0.03)), float(rng.normal(0, 0.03))),
+        )
+        photometry = Photometry(vignetting=0.7, blur=0.8, noise=0.015)
+        sequence = sequence_over(
+            partial(ground, seed=index, channels=1), lens, poses, photometry=photometry, seed=index
+        )
+        pictures += [np.asarray(frame, np.uint8) for frame in sequence.frames()]
+        distortions.append(distortion)
+    return pictures, [(2 * i, 2 * i + 1) for i in range(PAIRS)], distortions
+
+
+def photographed(folder: Path, distortion: float) -> Pictures:
+    """Consecutive pictures of a folder."""
+    pictures = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted(folder.iterdir())]
+    read = [np.asarray(picture, np.uint8) for picture in pictures if picture is not None]
+    pairs = [(i, i + 1) for i in range(len(read) - 1)]
+    return read, pairs, [distortion] * len(pairs)
+
+
+def errors(
+    features: list[Features], pairs: list[tuple[int, int]], truth: list[float]
+) -> Iterator[tuple[float, int, float]]:
+    """λ's error, inliers and their share in the outer quarter of the picture, of each pair that has a result."""
+    for (i, j), distortion in zip(pairs, truth, strict=True):
+        size = features[i].image_size
+        assert size is not None
+        found = match(features[i], features[j])
+        if len(found) < 20:
+            continue
+        result = estimate_radial_homography(found.points1, found.points2, size, solver="five_point")
+        if result.ok:
+            points = np.vstack([found.points1[result.inliers], found.points2[result.inliers]])
+            radius = np.linalg.norm(points - (np.array(size) - 1) / 2, axis=1) / (np.hypot(*size) / 2)
+            # A quarter of a 4:3 picture lies beyond 0.76 half diagonals.
+            yield abs(result.distortion - distortion), int(result.inliers.sum()), float((radius > 0.76).mean())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", nargs="?", type=Path)
+    parser.add_argument("distortion", nargs="?", type=float)
+    parser.add_argument("--kinds", default="rootsift,orb", help="kinds of features, separated by commas")
+    arguments = parser.parse_args()
+    if arguments.folder is None:
+        pictures, pairs, truth = rendered()
+    else:
+        pictures, pairs, truth = photographed(arguments.folder, arguments.distortion)
+    print("| features | choice | pairs | inliers | median error of λ | rms | in the outer quarter |")
+    print("| --- | --- | --: | --: | --: | --: | --: |")
+    for kind in arguments.kinds.split(","):
+        for count in (1000, 4000):
+            for spread in (False, True):
+                options = FeatureOptions(kind=kind, spread=spread, max_features=count)
+                rows = list(errors([detect(picture, options) for picture in pictures], pairs, truth))
+                error, inliers, outer = np.array(rows).reshape(-1, 3).T
+                rms = np.sqrt(np.mean(np.minimum(error, LARGEST_ERROR) ** 2))
+                choice = "spread" if spread else "strongest"
+                print(
+                    f"| {kind}, {count} | {choice} | {len(rows)} of {len(pairs)} | {np.median(inliers):.0f} "
+                    f"| {np.median(error):.4f} | {rms:.4f} | {np.median(outer):.2f} |",
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    main()
