@@ -3,21 +3,27 @@
 Every minimal problem of this package is one polynomial equation in λ per sample. The polynomial is known by its values
 at Chebyshev nodes of the sample's interval; one matrix product turns them into Bernstein coefficients on a few cells.
 By Descartes' rule a cell whose coefficients never change sign has no root, and one with a single change has exactly
-one. Cells with more changes are halved until they are isolated or as good as double; none is missed, as on a grid of
+one. Cells with more changes are divided until they are isolated or as good as double; none is missed, as on a grid of
 samples. Newton's method on the Chebyshev series finds each root, and its last steps use the equation itself, which
 is better conditioned than the polynomial through its values.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from functools import lru_cache
-from itertools import pairwise
 from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.camera import FloatArray
+from rdstitch.solvers.polynomials import (
+    bernstein_from_values,
+    bernstein_subdivision,
+    bernstein_value,
+    chebyshev_from_values,
+    chebyshev_nodes,
+    chebyshev_value_and_slope,
+)
 
 IndexArray = NDArray[np.intp]
 
@@ -107,67 +113,6 @@ def polish(equation: Equation, start: FloatArray, slope: FloatArray, half: Float
     second = step * remainder / np.where(change != 0.0, change, np.inf)
     second = np.where(np.abs(second) < np.abs(step), second, 0.0)
     return np.where(improved, closer - second, start)
-
-
-@lru_cache
-def chebyshev_nodes(degree: int) -> FloatArray:
-    """Chebyshev nodes of the first kind in [-1, 1], enough for a polynomial of this degree; shape (degree + 1,)."""
-    count = degree + 1
-    return np.cos((2 * np.arange(count) + 1) * np.pi / (2 * count))
-
-
-@lru_cache
-def chebyshev_from_values(degree: int) -> FloatArray:
-    """Matrix from values at the Chebyshev nodes to coefficients of the Chebyshev series."""
-    count = degree + 1
-    angles = (2 * np.arange(count) + 1) * np.pi / (2 * count)
-    matrix = 2.0 / count * np.cos(np.arange(count)[:, None] * angles)
-    matrix[0] /= 2.0
-    return np.asarray(matrix)
-
-
-@lru_cache
-def bernstein_from_values(degree: int, cells: int) -> FloatArray:
-    """Matrix from values at the Chebyshev nodes to Bernstein coefficients on equal cells of [-1, 1].
-
-    Coefficient j on the cell [a, b] is the blossom of the polynomial at ``degree - j`` times a and j times b. That of a
-    Lagrange polynomial ``Π (t - t_m) / Π (t_k - t_m)`` is coefficient j of ``Π ((a - t_m) + (b - t_m) z)``
-    over the binomial: a product whose factors, but for nodes inside the cell, do not cancel.
-
-    Returns
-    -------
-    ndarray of shape (cells, degree + 1, degree + 1)
-        Cell, coefficient, node.
-    """
-    nodes = chebyshev_nodes(degree)
-    edges = np.linspace(-1.0, 1.0, cells + 1)
-    count = degree + 1
-    matrix = np.empty((cells, count, count))
-    binomials = _binomials(degree)
-    for cell, (a, b) in enumerate(pairwise(edges)):
-        for k in range(count):
-            others = np.delete(nodes, k)
-            product = np.ones(1)
-            for node in others:
-                product = np.convolve(product, (a - node, b - node))
-            matrix[cell, :, k] = product / binomials / np.prod(nodes[k] - others)
-    return matrix
-
-
-@lru_cache
-def bernstein_subdivision(degree: int, parts: int) -> FloatArray:
-    """Matrix from Bernstein coefficients on a cell to those on its equal parts, by part, new and old."""
-    edges = np.linspace(0.0, 1.0, parts + 1)
-    matrix = np.empty((parts, degree + 1, degree + 1))
-    for part, (a, b) in enumerate(pairwise(edges)):
-        for j in range(degree + 1):
-            product = np.ones(1)
-            for _ in range(degree - j):
-                product = np.convolve(product, (1.0 - a, a))
-            for _ in range(j):
-                product = np.convolve(product, (1.0 - b, b))
-            matrix[part, j] = product
-    return matrix
 
 
 @dataclass(frozen=True)
@@ -269,41 +214,6 @@ def _close_pairs(
         (touches, vertex, vertex, lowest, lowest),
     )
     return Brackets.joined([Brackets(sample[mask], *(column[mask] for column in columns)) for mask, *columns in parts])
-
-
-@lru_cache
-def _binomials(degree: int) -> FloatArray:
-    """``C(degree, j)`` for all j."""
-    row = np.ones(1)
-    for _ in range(degree):
-        row = np.convolve(row, (1.0, 1.0))
-    return row
-
-
-def bernstein_value(coefficients: FloatArray, s: FloatArray) -> FloatArray:
-    """Values at s in [0, 1], (N,), of polynomials with Bernstein coefficients (N, degree + 1)."""
-    degree = coefficients.shape[1] - 1
-    j = np.arange(degree + 1)
-    weights = _binomials(degree) * s[:, None] ** j * (1.0 - s[:, None]) ** (degree - j)
-    return np.asarray(np.einsum("nj,nj->n", coefficients, weights))
-
-
-def chebyshev_value_and_slope(coefficients: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Value and derivative of Chebyshev series (degree + 1, N) at t (N,), by Clenshaw's recurrence."""
-    twice = 2.0 * t
-    value, before, spare = coefficients[-1].copy(), np.zeros_like(t), np.empty_like(t)
-    half_slope, half_before = np.zeros_like(t), np.zeros_like(t)
-    # In place, for this is the innermost loop of all solvers.
-    for c in coefficients[-2:0:-1]:
-        np.multiply(twice, half_slope, out=spare)
-        spare -= half_before
-        spare += value
-        half_slope, half_before, spare = spare, half_slope, half_before
-        np.multiply(twice, value, out=spare)
-        spare -= before
-        spare += c
-        value, before, spare = spare, value, before
-    return coefficients[0] + t * value - before, value + 2.0 * (t * half_slope - half_before)
 
 
 def bracketed_newton(coefficients: FloatArray, brackets: Brackets) -> tuple[FloatArray, FloatArray]:

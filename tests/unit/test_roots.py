@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 
 from rdstitch.camera import FloatArray
-from rdstitch.solvers.roots import (
-    IndexArray,
+from rdstitch.solvers.polynomials import (
     bernstein_from_values,
     bernstein_subdivision,
     chebyshev_from_values,
     chebyshev_nodes,
     chebyshev_value_and_slope,
-    real_roots,
 )
+from rdstitch.solvers.roots import IndexArray, real_roots
 
 
 @dataclass(frozen=True)
