@@ -16,6 +16,7 @@ FIGURES = {
     "figure4": "noise, tilt known",
     "figure7": "inliers against RANSAC iterations",
     "figure9": "trajectories",
+    "end_to_end": "rendered sets stitched by rdstitch and by the peers",
 }
 """Modules in the order in which they run, with what they measure."""
 
@@ -35,11 +36,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--pictures", type=Path, metavar="DIR", default=_REAL_PICTURES, help="folder of the real sequences"
     )
+    parser.add_argument("--peer-python", metavar="FILE", help="Python that has the package stitching")
     options = parser.parse_args(arguments)
     unknown = set(options.figures) - set(FIGURES)
     if unknown:
         parser.error(f"unknown figure {', '.join(sorted(unknown))}; there are {', '.join(FIGURES)}")
-    settings = Settings(Effort.FULL if options.full else Effort.SMALL, options.pictures)
+    settings = Settings(Effort.FULL if options.full else Effort.SMALL, options.pictures, options.peer_python)
     for name in options.figures or FIGURES:
         begun = time.perf_counter()
         report = import_module(f"examples.paper.{name}").run(settings)

@@ -24,10 +24,13 @@ class Settings:
     effort : Effort
     pictures : Path
         Folder of the real sequences (``garfield_red``, ``copr``); figures do without those that are absent.
+    peer_python : str, optional
+        Python that has the package stitching, which brings an OpenCV of its own; the one that runs if not given.
     """
 
     effort: Effort
     pictures: Path
+    peer_python: str | None = None
 
     def count(self, tiny: int, small: int, full: int) -> int:
         """The one of three counts that the effort allows."""

@@ -1,15 +1,18 @@
 """Every figure of examples/paper at tiny counts: its numbers make sense."""
 
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from examples.paper import figure2, figure3, figure4, figure7, figure9, runtime
+from examples.paper import end_to_end, figure2, figure3, figure4, figure7, figure9, runtime
 from examples.paper.__main__ import main
 from examples.paper.constraints import planar_quartics, quartic_monomials
 from examples.paper.report import Report, Table, save
 from examples.paper.settings import Effort, Settings
+from examples.paper.subprocesses import run_all
 from rdstitch.synthetic import general_instances, planar_instances
 
 TINY = Settings(Effort.TINY, Path("no real pictures"))
@@ -105,3 +108,26 @@ def test_figure9_adjustment_brings_every_start_to_the_same_trajectory() -> None:
             assert row["adjusted, %"] < min(1.0, row["translation, chained, %"] + 0.1), (table.title, name)
             assert row["λ error, adjusted"] < 5e-3, (table.title, name)
         assert table.row("4 points, no distortion (DLT)")["translation, chained, %"] > 5.0
+
+
+def test_programs_are_measured_and_ended_in_time(tmp_path: Path) -> None:
+    python = [sys.executable, "-c"]
+    failed = run_all([[*python, "import sys; sys.exit('no overlap')"], [*python, "never"]], tmp_path, 30.0)
+    assert (failed.status, failed.said) == (1, "no overlap")
+    large = run_all([[*python, "a = bytearray(300_000_000)"], [*python, "pass"]], tmp_path, 30.0)
+    assert large.ok
+    assert 300.0 < large.megabytes < 400.0
+    begun = time.perf_counter()
+    late = run_all([[*python, "import time; time.sleep(60)"]], tmp_path, 0.5)
+    assert late.status is None
+    assert time.perf_counter() - begun < 20.0
+
+
+def test_end_to_end_rdstitch_lies_on_the_true_plane() -> None:
+    row = end_to_end.run(TINY).tables[0].row("rdstitch mosaic")
+    assert row["exit"] == "0", row
+    assert row["median error, px"] < 1.0
+    assert row["95 % error, px"] < 3.0
+    assert row["coverage, %"] > 95.0
+    assert row["λ error"] < 0.1
+    assert row["memory, MB"] > 50.0

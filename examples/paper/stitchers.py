@@ -1,0 +1,105 @@
+"""The stitchers that are compared end to end, each as the commands that a user would run."""
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+_ROOT = Path(__file__).resolve().parents[2]
+_HUGIN = (
+    "pto_gen",
+    "cpfind",
+    "cpclean",
+    "pto_var",
+    "autooptimiser",
+    "pano_modify",
+    "hugin_executor",
+    "nona",
+    "enblend",
+)
+
+
+@dataclass(frozen=True)
+class Stitcher:
+    """A program that makes a mosaic of pictures.
+
+    Attributes
+    ----------
+    name : str
+    commands : callable
+        Takes the pictures, the file to write, and the horizontal field of view in degrees, which only the
+        hand-written recipe looks at; gives the commands.
+    """
+
+    name: str
+    commands: Callable[[Sequence[Path], Path, float], list[list[str]]]
+
+
+def installed_stitchers(peer_python: str | None) -> tuple[list[Stitcher], tuple[str, ...]]:
+    """The stitchers that are here, and a note for each that is not.
+
+    Parameters
+    ----------
+    peer_python : str, optional
+        Python that has the package stitching; this one if not given.
+    """
+    found = [
+        Stitcher("rdstitch mosaic", _worker(sys.executable, "rdstitch")),
+        Stitcher("OpenCV Stitcher, PANORAMA", _worker(sys.executable, "opencv_panorama")),
+        Stitcher("OpenCV Stitcher, SCANS", _worker(sys.executable, "opencv_scans")),
+    ]
+    notes = []
+    python = peer_python or sys.executable
+    if _imports(python, "stitching"):
+        found.append(Stitcher("stitching, Stitcher", _worker(python, "stitching_rotation")))
+        found.append(Stitcher("stitching, AffineStitcher", _worker(python, "stitching_affine")))
+    else:
+        notes.append("the package stitching is not installed and was left out")
+    missing = [program for program in _HUGIN if shutil.which(program) is None]
+    if missing:
+        notes.append(f"Hugin is not installed and was left out ({', '.join(missing)} not found)")
+    else:
+        found.append(Stitcher("Hugin, automatic", _hugin_automatic))
+        found.append(Stitcher("Hugin, hand-written recipe", _hugin_by_hand))
+    return found, tuple(notes)
+
+
+def _imports(python: str, module: str) -> bool:
+    done = subprocess.run([python, "-c", f"import {module}"], capture_output=True, check=False)
+    return done.returncode == 0
+
+
+def _worker(python: str, name: str) -> Callable[[Sequence[Path], Path, float], list[list[str]]]:
+    """One of :mod:`examples.paper.stitch_worker`."""
+    start = f"import sys; sys.path.insert(0, {str(_ROOT)!r}); from examples.paper.stitch_worker import main"
+    code = f"{start}; sys.exit(main(sys.argv[1:]))"
+    return lambda pictures, output, _: [[python, "-c", code, name, str(output), *map(str, pictures)]]
+
+
+def _hugin_automatic(pictures: Sequence[Path], output: Path, _: float) -> list[list[str]]:
+    """What Hugin does of its own: its assistant, from the pictures alone."""
+    return [
+        ["pto_gen", "-o", "a.pto", *map(str, pictures)],
+        ["hugin_executor", "--assistant", "a.pto"],
+        ["hugin_executor", "--stitching", f"--prefix={output.stem}", "a.pto"],
+    ]
+
+
+def _hugin_by_hand(pictures: Sequence[Path], output: Path, field_of_view: float) -> list[list[str]]:
+    """For a flat scene: the true field of view, positions first, then tilts, heights and distortion as well."""
+    others = range(1, len(pictures))
+    plane = ",".join(f"r{i},TrX{i},TrY{i}" for i in others)
+    everything = ",".join(["y0,p0,b0", plane, *(f"y{i},p{i},TrZ{i}" for i in others)])
+    return [
+        ["pto_gen", "-p", "0", "-f", f"{field_of_view:.3f}", "-o", "a.pto", *map(str, pictures)],
+        ["cpfind", "--multirow", "-o", "a.pto", "a.pto"],
+        ["cpclean", "-o", "a.pto", "a.pto"],
+        ["pto_var", f"--opt={plane}", "-o", "a.pto", "a.pto"],
+        ["autooptimiser", "-n", "-o", "a.pto", "a.pto"],
+        ["pto_var", f"--opt={everything}", "-o", "a.pto", "a.pto"],
+        ["autooptimiser", "-n", "-o", "a.pto", "a.pto"],
+        ["pano_modify", "--projection=0", "--fov=AUTO", "--canvas=AUTO", "--crop=AUTO", "-o", "a.pto", "a.pto"],
+        ["hugin_executor", "--stitching", f"--prefix={output.stem}", "a.pto"],
+    ]

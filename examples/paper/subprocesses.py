@@ -1,0 +1,66 @@
+"""Programs with a time limit, their exit status, wall time and peak memory."""
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+_LAUNCHER = Path(__file__).with_name("launcher.py")
+_SAID = 120  # characters of a program's last line that are kept
+
+
+@dataclass(frozen=True)
+class Run:
+    """What became of one or several programs run one after the other.
+
+    Attributes
+    ----------
+    status : int or None
+        Exit status of the last one that ran; negative for a signal, None when the time was up.
+    seconds : float
+        Wall time.
+    megabytes : float
+        Largest resident memory of any of them, 10⁶ bytes.
+    said : str
+        Last line on standard error.
+    """
+
+    status: int | None
+    seconds: float
+    megabytes: float
+    said: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether the last one succeeded, and with it all."""
+        return self.status == 0
+
+
+def run_all(commands: Sequence[Sequence[str]], folder: Path, timeout: float) -> Run:
+    """Run commands one after the other until one fails or the time is up.
+
+    Parameters
+    ----------
+    commands : sequence of sequence of str
+    folder : path
+        Working directory.
+    timeout : float
+        Seconds for all of them.
+    """
+    begun = time.perf_counter()
+    status: int | None = 0
+    megabytes, said = 0.0, ""
+    for command in commands:
+        left = timeout - (time.perf_counter() - begun)
+        launched = [sys.executable, "-I", "-S", str(_LAUNCHER), str(left), *command]
+        done = subprocess.run(launched, cwd=folder, capture_output=True, text=True, errors="replace", check=True)
+        told = json.loads(done.stdout)
+        status, lines = told["status"], done.stderr.strip().splitlines()
+        megabytes = max(megabytes, told["kilobytes"] / 1e3)
+        said = lines[-1][:_SAID] if lines else ""
+        if status != 0:
+            break
+    return Run(status, time.perf_counter() - begun, megabytes, said)
