@@ -18,7 +18,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rdstitch.errors import ArgumentError, InputError
+from rdstitch.errors import ArgumentError
+from rdstitch.records import Record, read_json
 
 FloatArray = NDArray[np.float64]
 
@@ -237,22 +238,29 @@ class Camera:
         InputError
             When the file cannot be read or is no camera file.
         """
+        return cls.from_record(read_json(path))
+
+    @classmethod
+    def from_record(cls, record: Record) -> Self:
+        """The camera that :meth:`as_dict` gave.
+
+        Raises
+        ------
+        InputError
+            When the record is something else; the text names the field.
+        """
+        if record["format"].value != "rdstitch camera" or record["version"].value != 1:
+            record.fail("is not an rdstitch camera of version 1")
+        focal, std, second = record.get("focal_px"), record.get("lambda_std"), record.get("lambda2")
         try:
-            data = json.loads(Path(path).read_text(encoding="utf-8"))
-            if data["format"] != "rdstitch camera" or data["version"] != 1:
-                raise InputError(f"{path}: not an rdstitch camera file of version 1")
-            width, height = data["image_size"]
-            cx, cy = data["center_px"]
             return cls(
-                image_size=(int(width), int(height)),
-                distortion=float(data["lambda"]),
-                distortion2=float(data.get("lambda2", 0.0)),
-                center=(float(cx), float(cy)),
-                focal=None if data.get("focal_px") is None else float(data["focal_px"]),
-                focal_source=None if data.get("focal_px") is None else "file",
-                distortion_std=None if data.get("lambda_std") is None else float(data["lambda_std"]),
+                image_size=record["image_size"].size(),
+                distortion=record["lambda"].number(),
+                distortion2=0.0 if second is None else second.number(),
+                center=record["center_px"].pair(),
+                focal=None if focal is None else focal.number(),
+                focal_source=None if focal is None else "file",
+                distortion_std=None if std is None else std.number(),
             )
-        except OSError as error:
-            raise InputError(f"{path}: cannot read the camera file: {error.strerror or error}") from error
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise InputError(f"{path}: not an rdstitch camera file: {error}") from error
+        except ArgumentError as error:
+            record.fail(str(error))

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from rdstitch.camera import Camera
 from rdstitch.pipeline.result import StitchResult
 
 VERSION = 1
@@ -17,9 +18,10 @@ VERSION = 1
 def sidecar(result: StitchResult) -> dict[str, Any]:
     """The sidecar's content; every number that does not exist is null.
 
-    ``lambda`` is for half the image diagonal. ``images[].to_output`` maps undistorted, half-diagonal-normalized
-    coordinates of a picture to px of the output; ``pairs[].homography`` maps those of the first picture to those of the
-    second.
+    ``lambda`` is for half the image diagonal. ``images[].to_plane`` maps undistorted, half-diagonal-normalized
+    coordinates of a picture to the plane, ``output.plane_to_output`` those to px of the output, ``images[].to_output``
+    is the product; ``pairs[].homography`` maps coordinates of the first picture to those of the second. All fields are
+    described in docs/sidecar.md.
     """
     registration, alignment = result.registration, result.registration.alignment
     camera = registration.camera
@@ -78,7 +80,8 @@ def _images(result: StitchResult) -> list[dict[str, Any]]:
             "used": used,
             "reason": reasons.pop(source.path, ""),
             "features": registration.keypoints[index],
-            "focal_px": alignment.cameras[index].focal,
+            **_lens(alignment.cameras[index]),
+            "to_plane": alignment.homographies[index] if used else None,
             "to_output": result.canvas.matrix @ alignment.homographies[index] if used else None,
             "pose": None,
         }
@@ -96,6 +99,17 @@ def _images(result: StitchResult) -> list[dict[str, Any]]:
         for path, reason in reasons.items()
     ]
     return entries + unread
+
+
+def _lens(camera: Camera) -> dict[str, Any]:
+    """What of a picture's camera depends on the size of the picture, and λ with it."""
+    return {
+        "center_px": camera.center,
+        "lambda": camera.distortion,
+        "lambda2": camera.distortion2,
+        "focal_px": camera.focal,
+        "focal_source": camera.focal_source,
+    }
 
 
 def _pairs(result: StitchResult) -> list[dict[str, Any]]:
