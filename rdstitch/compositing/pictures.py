@@ -57,13 +57,14 @@ def prepare_picture(picture: Picture, shrink: float) -> LoadedPicture:
     ----------
     picture : Picture
     shrink : float
-        Picture px per output px. From 2 on, the picture is averaged over whole blocks; the rest is a Gaussian.
+        Picture px per output px. From 4 on, the picture is averaged over whole blocks first; a Gaussian does the rest.
     """
     pixels, opaque = picture.pixels, None
     if picture.alpha is not None:
         opaque = picture.alpha >= _OPAQUE_FROM
         pixels = _filled(pixels, opaque)
-    reduction = max(1, int(shrink))
+    # Blocks alone alias; a Gaussian on at least two px per output px does not.
+    reduction = max(1, int(shrink / 2))
     if reduction > 1:
         pixels = _block_mean(pixels, reduction)
         opaque = None if opaque is None else _block_mean(opaque.astype(np.float32), reduction) > 0.999

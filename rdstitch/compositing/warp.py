@@ -182,8 +182,11 @@ def _mirrored(warp: Warp, picture: LoadedPicture, geometry: Geometry) -> tuple[F
     """Px of the (reduced) picture, all inside it."""
     map_x, map_y = geometry.map_x, geometry.map_y
     if not geometry.inside.all():
-        width, height = warp.camera.image_size
-        map_x, map_y = _mirror(map_x, width), _mirror(map_y, height)
+        # Mirroring rounds: what is inside keeps its coordinates, whatever else the box holds.
+        mirrored = [_mirror(m, n) for m, n in zip((map_x, map_y), warp.camera.image_size, strict=True)]
+        for values, own in zip(mirrored, (map_x, map_y), strict=True):
+            np.copyto(values, own, where=geometry.inside)
+        map_x, map_y = mirrored
     if picture.reduction > 1:
         map_x, map_y = (_reduce(m, picture.reduction) for m in (map_x, map_y))
     return map_x, map_y

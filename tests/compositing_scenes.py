@@ -1,0 +1,86 @@
+"""Rendered sets with known homographies, for the compositor alone."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.compositing import Canvas, plan_canvas
+from rdstitch.io import Metadata, Picture
+from rdstitch.synthetic.comparison import plane_under
+from rdstitch.synthetic.layouts import grid_poses
+from rdstitch.synthetic.rendering import Photometry, sequence_over
+from rdstitch.synthetic.rendering import Sequence as Rendering
+from rdstitch.synthetic.textures import ground
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Pictures of a plane with their true cameras and homographies, and the canvas they give."""
+
+    rendering: Rendering
+    frames: Sequence[NDArray[Any]]
+    cameras: Sequence[Camera]
+    homographies: FloatArray
+    canvas: Canvas
+
+    @property
+    def sources(self) -> list[Callable[[], Picture]]:
+        """What the compositor reads."""
+        return [partial(as_picture, frame) for frame in self.frames]
+
+    def truth(self, canvas: Canvas | None = None) -> NDArray[np.float32]:
+        """The plane as a perfect composite shows it: grey (h, w), 0 to 1."""
+        drawn, _ = plane_under(self.rendering.texture, np.linalg.inv((canvas or self.canvas).matrix), self.canvas.size)
+        return drawn.astype(np.float32)
+
+
+def as_picture(frame: NDArray[Any], alpha: NDArray[np.uint8] | None = None) -> Picture:
+    """A picture as if it had been read from a file."""
+    return Picture(frame, alpha, Metadata((frame.shape[1], frame.shape[0])))
+
+
+def render(
+    columns: int = 3,
+    rows: int = 2,
+    *,
+    size: tuple[int, int] = (320, 240),
+    distortion: float = -0.25,
+    channels: int = 3,
+    overlap: float = 0.45,
+    photometry: Photometry | None = None,
+    seed: int = 0,
+    **canvas_options: Any,
+) -> Scene:
+    """Views side by side with tilt, yaw and lens distortion."""
+    lens = Camera(size, distortion=distortion, focal=0.8 * size[0])
+    poses = grid_poses(lens, columns, rows, overlap=overlap, yaw=0.12, shift=0.08, tilt=(0.04, -0.03), seed=seed)
+    rendering = sequence_over(partial(ground, seed=seed + 1, channels=channels), lens, poses, photometry=photometry)
+    assert lens.focal is not None
+    scale = np.diag([lens.half_diagonal / lens.focal] * 2 + [1.0])
+    matrices = np.stack([np.linalg.inv(rendering.from_plane(i)) @ scale for i in range(len(rendering))])
+    cameras = [lens] * len(rendering)
+    return Scene(rendering, rendering.frames(), cameras, matrices, plan_canvas(cameras, matrices, **canvas_options))
+
+
+def grey(pixels: NDArray[Any]) -> NDArray[np.float32]:
+    """Mean of the channels, 0 to 1."""
+    full = np.iinfo(pixels.dtype).max
+    values = pixels.astype(np.float32) / np.float32(full)
+    return values if values.ndim == 2 else values.mean(axis=2, dtype=np.float32)
+
+
+def gradient(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Length of the gradient."""
+    return np.hypot(*(cv2.Sobel(values, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (1, 0)))
+
+
+def inner(alpha: NDArray[np.uint8], margin: int = 4) -> NDArray[np.bool_]:
+    """Covered px at least ``margin`` px from what is not."""
+    kernel = np.ones((2 * margin + 1,) * 2, np.uint8)
+    return cv2.erode((alpha > 0).astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)) > 0

@@ -1,0 +1,91 @@
+"""Tiles, their order, the cache and the number of workers never show in the result."""
+
+import functools
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from rdstitch.compositing import CompositeOptions
+from rdstitch.compositing.compositor import Prepared, prepare
+from rdstitch.compositing.multiband import MultibandBlender, aligned, grown, margin, rounding_constant
+from rdstitch.synthetic.rendering import Photometry
+from tests.compositing_scenes import Scene, render
+
+WAYS = [("multiband", "graphcut"), ("multiband", "none"), ("feather", "none"), ("feather", "voronoi"), ("none", "none")]
+
+
+@functools.cache
+def _scene(bits: int) -> Scene:
+    gains = np.linspace(0.8, 1.2, 6)
+    return render(
+        3, 2, size=(240, 180), photometry=Photometry(gain=gains, vignetting=0.3, noise=0.01, bits=bits), seed=8
+    )
+
+
+@functools.cache
+def _prepared(blend: str, seam: str, bits: int) -> tuple[Prepared, NDArray[Any], NDArray[np.bool_]]:
+    """A composite, and all of it as one tile."""
+    scene = _scene(bits)
+    options = CompositeOptions(blend=blend, seam=seam, max_memory=2**28)  # type: ignore[arg-type]
+    ready = prepare(scene.sources, scene.cameras, scene.homographies, scene.canvas, options)
+    return ready, *ready.renderer.tile((0, 0, *scene.canvas.size))
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize(("blend", "seam"), WAYS)
+@settings(max_examples=5, deadline=None)
+@given(data=st.data())
+def test_any_box_is_a_part_of_the_whole(blend: str, seam: str, bits: int, data: st.DataObject) -> None:
+    ready, whole, covered = _prepared(blend, seam, bits)
+    width, height = ready.canvas.size
+    x = data.draw(st.integers(0, width - 1))
+    y = data.draw(st.integers(0, height - 1))
+    box = (x, y, data.draw(st.integers(x + 1, width)), data.draw(st.integers(y + 1, height)))
+    pixels, inside = ready.renderer.tile(box)
+    np.testing.assert_array_equal(inside, covered[y : box[3], x : box[2]])
+    np.testing.assert_array_equal(pixels, whole[y : box[3], x : box[2]])
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_strips_are_the_whole(workers: int) -> None:
+    scene = _scene(8)
+    options = CompositeOptions(tile_size=256, workers=workers)
+    ready = prepare(scene.sources, scene.cameras, scene.homographies, scene.canvas, options)
+    pixels, alpha = (np.concatenate(parts) for parts in zip(*ready.strips(), strict=True))
+    _, whole, covered = _prepared("multiband", "graphcut", 8)
+    np.testing.assert_array_equal(pixels, whole)
+    np.testing.assert_array_equal(alpha > 0, covered)
+
+
+@settings(max_examples=25, deadline=None)
+@given(bands=st.integers(1, 4), seed=st.integers(0, 1000))
+def test_one_picture_is_not_changed_by_blending(bands: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    constant = rounding_constant(255.0, True)
+    box = aligned(grown((0, 0, 48, 32), margin(bands)), bands)
+    pixels = rng.integers(0, 256, (box[3] - box[1], box[2] - box[0], 3)).astype(np.float32)
+    weight = np.zeros(pixels.shape[:2], np.float32)
+    inner = np.s_[-box[1] : 32 - box[1], -box[0] : 48 - box[0]]
+    weight[inner] = 1.0
+    blender = MultibandBlender(box, bands, 3, constant)
+    blender.add(box, pixels.copy(), weight)
+    np.testing.assert_array_equal(blender.result()[inner], pixels[inner])
+
+
+@settings(max_examples=25, deadline=None)
+@given(bands=st.integers(1, 4), seed=st.integers(0, 1000))
+def test_blend_lies_between_constant_pictures(bands: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    size = 16 << bands
+    low, high = sorted(rng.uniform(0, 255, 2))
+    left = (rng.random((size, size)) < 0.5).astype(np.float32)
+    blender = MultibandBlender((0, 0, size, size), bands, 1, rounding_constant(255.0, True))
+    for value, weight in ((low, left), (high, 1 - left)):
+        blender.add((0, 0, size, size), np.full((size, size, 1), value, np.float32), weight)
+    result = blender.result()
+    assert result.min() >= low - 0.2
+    assert result.max() <= high + 0.2

@@ -1,0 +1,239 @@
+"""Composites of rendered sets: exposure, seams, blending, crop, files."""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from rdstitch.camera import Camera
+from rdstitch.compositing import CompositeOptions, compose, compose_to_file, plan_canvas
+from rdstitch.compositing.compositor import prepare
+from rdstitch.compositing.crop import largest_rectangle
+from rdstitch.compositing.pictures import Source
+from rdstitch.errors import ArgumentError, InputError, LimitError
+from rdstitch.io import Metadata, read_image
+from rdstitch.synthetic.comparison import sharpness
+from rdstitch.synthetic.rendering import Photometry
+from tests.compositing_scenes import Scene, as_picture, gradient, grey, inner, render
+
+
+def _compose(scene: Scene, **options: Any) -> Any:
+    return compose(scene.sources, scene.cameras, scene.homographies, scene.canvas, CompositeOptions(**options))
+
+
+def _seams(scene: Scene, options: CompositeOptions) -> NDArray[np.bool_]:
+    """Px within two of a seam."""
+    seams = prepare(scene.sources, scene.cameras, scene.homographies, scene.canvas, options).renderer.seams
+    assert seams is not None
+    box = (0, 0, *scene.canvas.size)
+    shares = np.stack([seams.share(k, box) for k in range(len(scene.frames))])
+    owner = np.where(shares.max(axis=0) > 0, shares.argmax(axis=0), -1)
+    edges = np.zeros(owner.shape, np.uint8)
+    edges[:, 1:] |= owner[:, 1:] != owner[:, :-1]
+    edges[1:] |= owner[1:] != owner[:-1]
+    return cv2.dilate(edges, np.ones((5, 5), np.uint8)) > 0
+
+
+@pytest.mark.parametrize(("gamma", "seed"), [(1.0, 0), (2.2, 1)])
+@pytest.mark.parametrize("exposure", ["gain", "blocks"])
+def test_unequal_light_leaves_no_visible_seam(gamma: float, seed: int, exposure: str) -> None:
+    rng = np.random.default_rng(seed)
+    gains = rng.uniform(0.7, 1.3, 9)
+    photometry = Photometry(gain=gains, vignetting=0.4, gamma=gamma, noise=0.004)
+    scene = render(3, 3, size=(360, 270), photometry=photometry, seed=seed)
+    options = CompositeOptions(exposure=exposure)  # type: ignore[arg-type]
+    result = _compose(scene, exposure=exposure)
+    ok, truth, mine = inner(result.alpha), scene.truth(), grey(result.pixels)
+    slope = np.polyfit(truth[ok].astype(float), mine[ok].astype(float), 1)[0]
+    seam = _seams(scene, options) & ok
+    ratio = [
+        gradient(mine / np.float32(slope))[where].mean() / gradient(truth)[where].mean() for where in (seam, ok & ~seam)
+    ]
+    assert ratio[0] / ratio[1] == pytest.approx(1.0, abs=0.05)
+    # Light is even over the whole plane: what is left of gain and vignetting after a wide blur of what is covered.
+    own, true = (cv2.GaussianBlur(np.where(ok, values, np.float32(0.0)), (0, 0), 12)[ok] for values in (mine, truth))
+    light = own / true
+    assert light.std() / light.mean() < 0.025
+    assert sharpness(mine, truth, ok) > 0.95
+    estimated = result.exposure.log_gain.mean(axis=1)
+    assert np.std(estimated - np.log(gains) / gamma) < 0.03
+
+
+def test_vignetting_is_found() -> None:
+    scene = render(3, 2, size=(480, 360), photometry=Photometry(vignetting=0.4), seed=3)
+    exposure = _compose(scene).exposure
+    radius2 = np.linspace(0, 0.9, 10)
+    estimate = np.exp(np.stack([radius2, radius2**2, radius2**3], axis=1) @ exposure.vignetting)
+    np.testing.assert_allclose(estimate, 1 - 0.4 * radius2, atol=0.03)
+
+
+def test_equal_pictures_are_not_touched() -> None:
+    scene = render(2, 1, seed=4)
+    exposure = _compose(scene).exposure
+    assert np.abs(exposure.log_gain).max() < 0.01
+    assert (exposure.vignetting == 0).all()
+
+
+@pytest.mark.parametrize("blend", ["none", "feather", "multiband"])
+@pytest.mark.parametrize("seam", ["none", "voronoi", "graphcut"])
+def test_every_combination_shows_the_plane(blend: str, seam: str) -> None:
+    scene = render(3, 2)
+    result = _compose(scene, blend=blend, seam=seam, exposure="none")
+    ok = inner(result.alpha)
+    mine, truth = grey(result.pixels), scene.truth()
+    assert np.sqrt(np.mean((mine[ok] - truth[ok]) ** 2)) < 0.03
+    assert sharpness(mine, truth, ok) > 0.95
+
+
+def test_nothing_of_the_covered_plane_is_missing() -> None:
+    scene = render(3, 2)
+    covered = [
+        _compose(scene, blend=blend, seam=seam).alpha for blend, seam in (("none", "none"), ("multiband", "graphcut"))
+    ]
+    np.testing.assert_array_equal(covered[0], covered[1])
+
+
+def test_what_moved_is_taken_from_one_picture() -> None:
+    """A disc that lies elsewhere in each of two pictures may appear whole, or not at all, but not cut or faded."""
+    scene = render(2, 1, size=(640, 480), overlap=0.7, distortion=-0.1, seed=5)
+    truth = scene.rendering
+    frames = [frame.copy() for frame in scene.frames]
+    middle = np.mean([truth.to_plane(i, np.array([[320.0, 240.0]]))[0] for i in (0, 1)], axis=0)
+    places = middle + np.array([(-20.0, 90.0), (25.0, -60.0)])
+    for index, place in enumerate(places):
+        x, y = truth.to_picture(index, place[None])[0]
+        cv2.circle(frames[index], (round(float(x)), round(float(y))), 28, (255, 0, 255), -1)
+    sources = [partial(as_picture, frame) for frame in frames]
+    result = compose(sources, scene.cameras, scene.homographies, scene.canvas, CompositeOptions(exposure="none"))
+    pink = (result.pixels[..., 0] > 200) & (result.pixels[..., 1] < 60) & (result.pixels[..., 2] > 200)
+    for place in places:
+        at = scene.canvas.matrix @ np.append(place, 1.0)
+        v, u = np.mgrid[: pink.shape[0], : pink.shape[1]]
+        share = pink[np.hypot(u - at[0], v - at[1]) < 22].mean()
+        assert share < 0.02 or share > 0.98
+
+
+def test_crop_keeps_no_hole_and_most_of_the_picture() -> None:
+    scene = render(3, 2)
+    whole, cropped = _compose(scene), _compose(scene, crop="auto")
+    assert (cropped.alpha == 255).all()
+    assert cropped.notes == ()
+    assert cropped.alpha.size > 0.7 * (whole.alpha > 0).sum()
+    # The crop is a part of the whole, px for px.
+    dx, dy = np.round(whole.canvas.matrix[:2, 2] - cropped.canvas.matrix[:2, 2]).astype(int)
+    height, width = cropped.alpha.shape
+    np.testing.assert_array_equal(whole.pixels[dy : dy + height, dx : dx + width], cropped.pixels)
+
+
+def test_crop_that_would_keep_little_is_not_done() -> None:
+    """Pictures that meet at their corners only."""
+    lens = Camera((100, 80))
+    steps = [np.array([[1.0, 0.0, 100.0 * k], [0.0, 1.0, 80.0 * k], [0.0, 0.0, lens.half_diagonal]]) for k in range(6)]
+    matrices = np.stack([step @ np.diag([lens.half_diagonal] * 2 + [1.0]) for step in steps])
+    canvas = plan_canvas([lens] * 6, matrices)
+    sources = [partial(as_picture, np.full((80, 100), 50, np.uint8))] * 6
+    result = compose(sources, [lens] * 6, matrices, canvas, CompositeOptions(crop="auto"))
+    assert result.canvas.size == canvas.size == (600, 480)
+    assert "not cropped" in result.notes[0]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_largest_rectangle_against_all_rectangles(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    cells = rng.random((9, 11)) < 0.8
+    x0, y0, x1, y1 = largest_rectangle(cells)
+    assert cells[y0:y1, x0:x1].all()
+    areas = [
+        (b - a) * (d - c)
+        for a in range(11)
+        for b in range(a + 1, 12)
+        for c in range(9)
+        for d in range(c + 1, 10)
+        if cells[c:d, a:b].all()
+    ]
+    assert (x1 - x0) * (y1 - y0) == max(areas)
+
+
+@pytest.mark.parametrize("suffix", ["tif", "png", "jpg"])
+def test_file_is_what_memory_is(tmp_path: Path, suffix: str) -> None:
+    scene = render(3, 1)
+    result = _compose(scene, tile_size=256)
+    told: list[float] = []
+    done = compose_to_file(
+        tmp_path / f"a.{suffix}",
+        scene.sources,
+        scene.cameras,
+        scene.homographies,
+        scene.canvas,
+        CompositeOptions(tile_size=256),
+        Metadata((1, 1), icc_profile=b"profile" * 30),
+        told.append,
+    )
+    back = read_image(tmp_path / f"a.{suffix}")
+    assert back.metadata.icc_profile == b"profile" * 30
+    assert told == sorted(told)
+    assert told[-1] == pytest.approx(1.0)
+    assert done.coverage == pytest.approx((result.alpha > 0).mean())
+    if suffix == "jpg":
+        assert np.abs(back.pixels.astype(int) - result.pixels)[inner(result.alpha)].mean() < 3
+    else:
+        np.testing.assert_array_equal(back.pixels, result.pixels)
+        np.testing.assert_array_equal(back.alpha, result.alpha)
+    if suffix == "tif":
+        with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
+            assert len(tiff.series[0].levels) > 1
+
+
+def test_sixteen_bits_grey_and_mixed_sizes() -> None:
+    scene = render(3, 1, channels=1, photometry=Photometry(bits=16))
+    frames = list(scene.frames)
+    # One picture at half the resolution: the same lens, another size.
+    frames[1] = cv2.resize(frames[1], (160, 120), interpolation=cv2.INTER_AREA)
+    cameras = [c if k != 1 else c.resized((160, 120)) for k, c in enumerate(scene.cameras)]
+    sources = [partial(as_picture, frame) for frame in frames]
+    result = compose(sources, cameras, scene.homographies, scene.canvas, CompositeOptions())
+    assert result.pixels.dtype == np.uint16
+    assert result.pixels.ndim == 2
+    ok = inner(result.alpha)
+    assert np.sqrt(np.mean((grey(result.pixels)[ok] - scene.truth()[ok]) ** 2)) < 0.06
+    assert len(np.unique(result.pixels)) > 1000
+
+
+def test_grey_among_colours_becomes_coloured() -> None:
+    scene = render(2, 1)
+    frames = [scene.frames[0], cv2.cvtColor(scene.frames[1], cv2.COLOR_RGB2GRAY)]
+    sources = [partial(as_picture, np.asarray(frame)) for frame in frames]
+    result = compose(sources, scene.cameras, scene.homographies, scene.canvas)
+    assert result.pixels.shape[2] == 3
+
+
+def test_pictures_that_do_not_fit() -> None:
+    scene = render(2, 1)
+    wrong: list[Source] = [scene.sources[0], partial(as_picture, np.zeros((10, 10, 3), np.uint8))]
+    with pytest.raises(InputError, match="picture 2"):
+        compose(wrong, scene.cameras, scene.homographies, scene.canvas)
+    deep: list[Source] = [scene.sources[0], partial(as_picture, np.zeros((240, 320, 3), np.uint16))]
+    with pytest.raises(InputError, match="uint16"):
+        compose(deep, scene.cameras, scene.homographies, scene.canvas)
+    with pytest.raises(ArgumentError):
+        compose(scene.sources[:1], scene.cameras, scene.homographies, scene.canvas)
+
+
+def test_memory_limit_is_checked_before_the_work() -> None:
+    scene = render(2, 1)
+    with pytest.raises(LimitError, match="--max-memory"):
+        _compose(scene, max_memory=10_000)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"blend": "soft"}, {"seam": ""}, {"tile_size": 300}, {"bands": 0}, {"scale": -1.0}, {"background": 300}],
+)
+def test_wrong_options(options: dict[str, Any]) -> None:
+    with pytest.raises(ArgumentError):
+        CompositeOptions(**options)

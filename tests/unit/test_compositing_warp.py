@@ -1,0 +1,144 @@
+"""Resampling: the right place, the right border, no aliasing."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rdstitch.camera import Camera
+from rdstitch.compositing import CompositeOptions, compose, plan_canvas
+from rdstitch.compositing.pictures import prepare_picture
+from rdstitch.compositing.warp import locate, plan_warp, sample
+from tests.compositing_scenes import as_picture, grey, inner, render
+
+PLAIN = CompositeOptions(exposure="none", seam="none", blend="none")
+
+
+def test_identity_gives_the_picture_back() -> None:
+    frame = np.random.default_rng(0).integers(0, 256, (150, 200, 3), dtype=np.uint8)
+    lens = Camera((200, 150))
+    result = compose([lambda: as_picture(frame)], [lens], np.eye(3)[None], plan_canvas([lens], np.eye(3)[None]), PLAIN)
+    np.testing.assert_array_equal(result.pixels, frame)
+    assert (result.alpha == 255).all()
+
+
+def test_quarter_turn_gives_the_picture_turned() -> None:
+    frame = np.random.default_rng(0).integers(0, 256, (150, 200), dtype=np.uint8)
+    lens = Camera((200, 150))
+    canvas = plan_canvas([lens], np.eye(3)[None], rotate=90)
+    result = compose([lambda: as_picture(frame)], [lens], np.eye(3)[None], canvas, PLAIN)
+    np.testing.assert_array_equal(result.pixels, np.rot90(frame, -1))
+
+
+@pytest.mark.parametrize("distortion", [-0.6, -0.25, 0.0, 0.3])
+def test_coordinates_are_exact_to_a_fiftieth(distortion: float) -> None:
+    """The interpolated lattice against the model itself, inside the picture."""
+    lens = Camera((800, 600), distortion=distortion)
+    matrix = np.array([[0.95, 0.2, 0.1], [-0.2, 0.95, 0.3], [0.05, -0.03, 1.0]])
+    canvas = plan_canvas([lens], matrix[None])
+    warp = plan_warp(lens, matrix, canvas, 0)
+    geometry = locate(warp, warp.box)
+    x0, y0, x1, y1 = warp.box
+    truth = warp.source_points(
+        np.arange(x0, x1, dtype=np.float64)[None, :], np.arange(y0, y1, dtype=np.float64)[:, None]
+    )
+    error = np.hypot(geometry.map_x - truth[..., 0], geometry.map_y - truth[..., 1])[geometry.inside]
+    assert np.nanmax(error) < 0.02
+    if distortion == 0.0:
+        assert warp.step > 4
+
+
+def test_source_points_go_back_to_where_they_came_from() -> None:
+    lens = Camera((640, 480), distortion=-0.3)
+    matrix = np.array([[0.9, 0.1, 2.0], [-0.1, 0.9, 1.0], [0.03, 0.02, 1.0]])
+    canvas = plan_canvas([lens], matrix[None], rotate=20, scale=1.7)
+    px = np.random.default_rng(1).uniform(0, [639, 479], (50, 2))
+    z = np.column_stack([lens.normalize(lens.undistort(px)), np.ones(50)]) @ (canvas.matrix @ matrix).T
+    back = plan_warp(lens, matrix, canvas, 0).source_points(z[:, 0] / z[:, 2], z[:, 1] / z[:, 2])
+    np.testing.assert_allclose(back, px, atol=1e-8)
+
+
+def test_a_box_anywhere_gives_the_same_coordinates() -> None:
+    lens = Camera((640, 480), distortion=-0.3)
+    canvas = plan_canvas([lens], np.eye(3)[None])
+    warp = plan_warp(lens, np.eye(3), canvas, 0)
+    whole = locate(warp, (-40, -40, 700, 600))
+    part = locate(warp, (33, 57, 201, 190))
+    np.testing.assert_array_equal(part.map_x, whole.part(part.box).map_x)
+    np.testing.assert_array_equal(part.map_y, whole.part(part.box).map_y)
+
+
+def test_coverage_ends_half_a_pixel_outside() -> None:
+    """Shifted by 0.3 px the picture still covers as many px; by 0.7 px it does too, one further on."""
+    lens = Camera((50, 40))
+    base = plan_canvas([lens], np.eye(3)[None])
+    for shift, first in ((0.3, 0), (0.7, 1)):
+        matrix = np.eye(3)
+        matrix[0, 2] = shift / lens.half_diagonal
+        canvas = type(base)((60, 40), base.matrix, (base.footprints[0] + (shift, 0.0),))
+        result = compose([lambda: as_picture(np.full((40, 50), 9, np.uint8))], [lens], matrix[None], canvas, PLAIN)
+        covered = np.flatnonzero(result.alpha[20])
+        assert (covered[0], covered[-1]) == (first, first + 49)
+        assert (result.pixels[result.alpha > 0] == 9).all()
+
+
+def test_shrinking_does_not_alias() -> None:
+    """A pattern finer than the output can show becomes its mean."""
+    v, u = np.mgrid[:600, :800]
+    stripes = np.where((u + v) % 3 == 0, 255, 0).astype(np.uint8)
+    lens = Camera((800, 600))
+    for scale in (0.5, 0.27, 0.1):
+        canvas = plan_canvas([lens], np.eye(3)[None], scale=scale)
+        result = compose([lambda: as_picture(stripes)], [lens], np.eye(3)[None], canvas, PLAIN)
+        middle = result.pixels[5:-5, 5:-5].astype(float)
+        assert middle.mean() == pytest.approx(85, abs=1.0)
+        assert middle.std() < 12
+
+
+def test_shrunk_picture_stays_in_place() -> None:
+    scene = render(1, 1, size=(640, 480), scale=0.23)
+    result = compose(scene.sources, scene.cameras, scene.homographies, scene.canvas, PLAIN)
+    truth, mine, ok = scene.truth(), grey(result.pixels), inner(result.alpha)
+    shifts = [np.mean((np.roll(mine, (dy, dx), (0, 1))[ok] - truth[ok]) ** 2) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+    assert int(np.argmin(shifts)) == 4
+    assert np.corrcoef(mine[ok], truth[ok])[0, 1] > 0.99
+
+
+@pytest.mark.parametrize("shape", [(90, 120), (90, 120, 3), (90, 120, 5)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_any_samples(shape: tuple[int, ...], dtype: type) -> None:
+    frame: NDArray[Any] = (np.random.default_rng(0).random(shape) * 200).astype(dtype)
+    lens = Camera((120, 90), distortion=-0.1)
+    canvas = plan_canvas([lens], np.eye(3)[None])
+    result = compose([lambda: as_picture(frame)], [lens], np.eye(3)[None], canvas, PLAIN)
+    assert result.pixels.dtype == dtype
+    assert result.pixels.shape[2:] == shape[2:]
+    lit = result.pixels[result.alpha > 0]
+    assert lit.mean() == pytest.approx(float(frame.mean()), rel=0.03)
+
+
+def test_transparent_parts_leave_no_trace() -> None:
+    frame = np.full((120, 160, 3), 200, np.uint8)
+    alpha = np.full((120, 160), 255, np.uint8)
+    frame[40:80, 50:100] = 0
+    alpha[40:80, 50:100] = 0
+    lens = Camera((160, 120), distortion=-0.2)
+    canvas = plan_canvas([lens], np.eye(3)[None])
+    result = compose([lambda: as_picture(frame, alpha)], [lens], np.eye(3)[None], canvas, PLAIN)
+    assert (result.pixels[result.alpha > 0] == 200).all()
+    hole = plan_warp(lens, np.eye(3), canvas, 0)
+    middle = hole.source_points(np.array([result.alpha.shape[1] / 2]), np.array([result.alpha.shape[0] / 2]))
+    assert result.alpha[result.alpha.shape[0] // 2, result.alpha.shape[1] // 2] == 0, middle
+
+
+def test_sampling_a_reduced_picture_is_centred() -> None:
+    ramp = np.tile(np.arange(360, dtype=np.float32), (60, 1))
+    lens = Camera((360, 60))
+    canvas = plan_canvas([lens], np.eye(3)[None], scale=1 / 6)
+    warp = plan_warp(lens, np.eye(3), canvas, 0)
+    picture = prepare_picture(as_picture(ramp), warp.shrink)
+    assert picture.reduction == 3
+    values = sample(warp, picture, locate(warp, (0, 0, *canvas.size)))
+    # The middle of six px; the Gaussian leaves a ramp alone, away from its ends.
+    np.testing.assert_allclose(values[5, 5:-5], 6 * np.arange(60)[5:-5] + 2.5, atol=0.05)
