@@ -14,6 +14,7 @@ FIGURES = {
     "figure2": "numerical stability",
     "figure3": "noise, tilt unknown",
     "figure4": "noise, tilt known",
+    "figure5": "pairs through a fisheye lens, stitched",
     "figure7": "inliers against RANSAC iterations",
     "figure9": "trajectories",
     "end_to_end": "rendered sets stitched by rdstitch and by the peers",

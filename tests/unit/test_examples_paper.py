@@ -3,11 +3,12 @@
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from examples.paper import end_to_end, figure2, figure3, figure4, figure7, figure9, runtime
+from examples.paper import end_to_end, figure2, figure3, figure4, figure5, figure7, figure9, runtime
 from examples.paper.__main__ import main
 from examples.paper.constraints import planar_quartics, quartic_monomials
 from examples.paper.report import Report, Table, save
@@ -99,6 +100,17 @@ def test_figure7_fewer_points_need_fewer_iterations() -> None:
         assert shares[-1] <= 100.0
     assert table.row("2 points, tilt given")["20 it."] > 2.0 * table.row("5 points")["20 it."]
     assert table.row("3 points")["200 it."] > table.row("4 points, no distortion (DLT)")["200 it."]
+
+
+def test_figure5_stitches_through_a_lens_that_is_no_division_model() -> None:
+    report = figure5.run(TINY)
+    measured: dict[str, Any] = dict(zip(report.tables[0].header, report.tables[0].rows[0], strict=True))
+    assert abs(measured["λ"] - measured["λ of the best division model"]) < 0.02
+    assert measured["its misfit, px"] > 0.05
+    assert measured["median error, px"] < 0.5
+    assert measured["95 %, px"] < 1.0
+    assert all(picture.shape[0] > 240 and picture.std() > 10.0 for picture in report.pictures.values())
+    assert [note.split(" are ")[0] for note in report.notes] == [f"the real pictures {n}" for n in figure5.REAL_PAIRS]
 
 
 def test_figure9_adjustment_brings_every_start_to_the_same_trajectory() -> None:

@@ -1,0 +1,62 @@
+"""Sequences through rdstitch's own recipes, and how far the result is from the truth."""
+
+from collections.abc import Sequence as Many
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from examples.paper.report import Pixels
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.errors import RegistrationError
+from rdstitch.io.read import read_image
+from rdstitch.pipeline import StitchOptions, calibrate, mosaic
+from rdstitch.pipeline.register import Registration
+from rdstitch.radial_homography import project
+from rdstitch.registration import Alignment
+from rdstitch.synthetic import AlignmentError, Sequence, alignment_error
+
+
+def stitch_files(files: Many[Path], options: StitchOptions) -> tuple[Registration, Pixels]:
+    """The registration and the mosaic of some pictures."""
+    with TemporaryDirectory(prefix="rdstitch-paper-") as folder:
+        output = Path(folder) / "mosaic.png"
+        result = mosaic(files, output, options)
+        return result.registration, np.asarray(read_image(output).pixels)
+
+
+def stitch_rendered(sequence: Sequence, options: StitchOptions) -> tuple[Registration, Pixels]:
+    """The same of a rendered sequence."""
+    with TemporaryDirectory(prefix="rdstitch-paper-") as folder:
+        return stitch_files(sequence.write(folder), options)
+
+
+def register_files(files: Many[Path], options: StitchOptions) -> Registration | str:
+    """The registration alone; the reason where there is none."""
+    try:
+        return calibrate(files, options)
+    except RegistrationError as error:
+        return str(error)
+
+
+def registration_error(alignment: Alignment, sequence: Sequence) -> AlignmentError:
+    """How far each point of the used pictures is from where it belongs on the true plane.
+
+    A rectified plane may differ from the true one by a similarity only, the frame of a picture by a homography.
+    """
+    used = np.flatnonzero(alignment.used)
+    transfers = {int(i): ToPlane(alignment.cameras[i], alignment.homographies[i]) for i in used}
+    return alignment_error(sequence, transfers, model="homography" if alignment.poses is None else "similarity")
+
+
+class ToPlane:
+    """Measured px of a picture to the estimated plane."""
+
+    def __init__(self, camera: Camera, homography: FloatArray) -> None:
+        self._camera = camera
+        self._homography = homography
+
+    def __call__(self, points: FloatArray) -> FloatArray:
+        """Points (N, 2); NaN where there is no such place."""
+        x = self._camera.normalize(self._camera.undistort(points))
+        return project(np.column_stack([x, np.ones(len(x))]) @ self._homography.T)
