@@ -17,6 +17,7 @@ FIGURES = {
     "figure5": "pairs through a fisheye lens, stitched",
     "figure7": "inliers against RANSAC iterations",
     "figure9": "trajectories",
+    "figure10": "aerial surveys with and without λ",
     "end_to_end": "rendered sets stitched by rdstitch and by the peers",
 }
 """Modules in the order in which they run, with what they measure."""

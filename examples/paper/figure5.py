@@ -36,7 +36,7 @@ def run(settings: Settings) -> Report:
     )
     title = f"Fig. 5: rendered pairs through an equidistant fisheye, {size[0]}x{size[1]} px, errors on the true plane"
     tables, notes = [Table(title, header, tuple(rows))], []
-    real = []
+    real: list[tuple[object, ...]] = []
     for name, truth in REAL_PAIRS.items():
         files = settings.real_sequence(name)[:2]
         if not files:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from examples.paper import end_to_end, figure2, figure3, figure4, figure5, figure7, figure9, runtime
+from examples.paper import aerial, end_to_end, figure2, figure3, figure4, figure5, figure7, figure9, figure10, runtime
 from examples.paper.__main__ import main
 from examples.paper.constraints import planar_quartics, quartic_monomials
 from examples.paper.report import Report, Table, save
@@ -120,6 +120,32 @@ def test_figure9_adjustment_brings_every_start_to_the_same_trajectory() -> None:
             assert row["adjusted, %"] < min(1.0, row["translation, chained, %"] + 0.1), (table.title, name)
             assert row["λ error, adjusted"] < 5e-3, (table.title, name)
         assert table.row("4 points, no distortion (DLT)")["translation, chained, %"] > 5.0
+
+
+def test_figure10_ignoring_the_distortion_makes_surveys_drift() -> None:
+    table = figure10.run(TINY).tables[0]
+    ignored = table.row(figure10.IGNORED)
+    for name in (figure10.ESTIMATED, figure10.TWO_POINTS):
+        row = table.row(name)
+        assert row["pictures"] == 6
+        assert abs(row["λ"] - figure10.DISTORTION) < 2e-3
+        assert row["95 %, px"] < 0.1
+        assert row["drift, chained, px"] < 0.5
+        for error in ("95 %, px", "drift, px", "drift, chained, px", "bend of a lane, px"):
+            assert row[error] < 0.2 * ignored[error], (name, error)
+
+
+def test_a_bent_lane_is_measured_whatever_its_frame() -> None:
+    along = np.arange(5.0)
+    lane = np.column_stack([np.zeros(5), 10.0 * along])
+    truth = np.concatenate([lane, lane[::-1] + np.array([7.0, 0.0])])
+    sagged = truth.copy()
+    sagged[2, 0] += 0.5
+    turned = 3.0 * sagged @ np.array([[0.6, -0.8], [0.8, 0.6]]) + np.array([4.0, -1.0])
+    assert [part.tolist() for part in aerial.lanes(truth)] == [[0, 1, 2, 3, 4], [5, 6, 7, 8, 9]]
+    assert aerial.bend(truth, turned) == pytest.approx(0.5, rel=0.02)
+    assert 0.4 < aerial.drift(truth, turned) < 0.5
+    assert aerial.bend(truth, truth) < 1e-12
 
 
 def test_programs_are_measured_and_ended_in_time(tmp_path: Path) -> None:

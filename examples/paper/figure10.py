@@ -1,0 +1,116 @@
+"""Fig. 10: aerial mosaics, with λ and without: what goes wrong when mild distortion is ignored.
+
+Homographies of consecutive pictures, chained one after the other, add up the error that a wrong λ makes in each. The
+adjustment of all pictures spreads it, but pictures that are bent cannot fit: what is left are seams, and bent lanes.
+"""
+
+from collections.abc import Sequence as Many
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from examples.paper.aerial import adjusted_centres, bend, chained_centres, drift, laid_on, rendered_survey, true_centres
+from examples.paper.report import Report, Table
+from examples.paper.settings import Effort, Settings
+from examples.paper.stitched import register_files, registration_error
+from rdstitch.camera import FloatArray
+from rdstitch.features import FeatureOptions
+from rdstitch.pipeline import StitchOptions
+from rdstitch.pipeline.register import Registration
+
+DISTORTION = -0.05
+"""λ of the rendered surveys: a compact camera."""
+
+ESTIMATED, TWO_POINTS, IGNORED = "λ estimated", "λ estimated, two points", "λ ignored (0)"
+
+_FEW = FeatureOptions(max_features=1000)
+_VARIANTS = {
+    ESTIMATED: StitchOptions(force=True, features=_FEW),
+    TWO_POINTS: StitchOptions(force=True, features=_FEW, solver="two_point", tilt=(0.0, 0.0)),
+    IGNORED: StitchOptions(force=True, features=_FEW, distortion=0.0),
+}
+_TOLD = ("variant", "pictures", "λ", "model", "rms of the matches, px")
+_MEASURED = ("median error, px", "95 %, px", "drift, px", "drift, chained, px", "bend of a lane, px")
+_COPR = "λ by structure from motion: -0.020 … -0.028"
+
+
+@dataclass
+class _Paths:
+    """Centres of the pictures (N, 2), texels: the true ones, and the estimates laid on them."""
+
+    truth: FloatArray
+    found: dict[str, FloatArray] = field(default_factory=dict)
+
+
+def run(settings: Settings) -> Report:
+    """Rendered surveys of the paper's lengths, and a real one."""
+    lengths = {Effort.TINY: (6,), Effort.SMALL: (24,), Effort.FULL: (117, 158)}[settings.effort]
+    size = (320, 240) if settings.effort is Effort.TINY else (480, 360)
+    done = [_rendered(count, size) for count in lengths]
+    tables = [table for table, _ in done]
+    notes = []
+    files = settings.real_sequence("copr")[: settings.count(0, 6, 41)]
+    if files:
+        tables.append(_real(files))
+    else:
+        notes.append("the real pictures copr are not here and were left out")
+
+    def draw(figure: Any) -> None:
+        for axes, (_, paths) in zip(np.atleast_1d(figure.subplots(1, len(done))), done, strict=True):
+            axes.plot(*paths.truth.T, label="truth", linewidth=3.0)
+            for name, centres in paths.found.items():
+                axes.plot(*centres.T, label=name, linewidth=1.0)
+            axes.set_title(f"{len(paths.truth)} pictures", fontsize=8)
+            axes.set_aspect("equal", adjustable="datalim")
+            axes.legend(fontsize=6)
+
+    return Report(tuple(tables), draw, notes=tuple(notes))
+
+
+def _rendered(count: int, size: tuple[int, int]) -> tuple[Table, _Paths]:
+    """How far every variant is from the truth, and the paths to be drawn."""
+    sequence = rendered_survey(count, size, DISTORTION, seed=500 + count)
+    paths = _Paths(true_centres(sequence))
+    rows = []
+    with TemporaryDirectory(prefix="rdstitch-paper-") as folder:
+        files = sequence.write(folder)
+        for variant, options in _VARIANTS.items():
+            registration = register_files(files, options)
+            if isinstance(registration, str):
+                rows.append(_failed(variant, registration, _MEASURED))
+                continue
+            error = registration_error(registration.alignment, sequence)
+            adjusted, chained = adjusted_centres(registration), chained_centres(registration)
+            drifts = [drift(paths.truth, centres) for centres in (adjusted, chained)]
+            measured = (error.median, error.percentile95, *drifts, bend(paths.truth, adjusted))
+            rows.append((*_told(variant, registration), *measured))
+            if variant != TWO_POINTS:
+                paths.found[f"{variant}, adjusted"] = laid_on(paths.truth, adjusted)
+                paths.found[f"{variant}, chained"] = laid_on(paths.truth, chained)
+    title = f"Fig. 10: rendered survey of {count} pictures, {size[0]}x{size[1]} px, λ = {DISTORTION:g}"
+    return Table(title, (*_TOLD, *_MEASURED), tuple(rows)), paths
+
+
+def _real(files: Many[Path]) -> Table:
+    """What can be said without truth: how well the matches agree."""
+    rows = []
+    for variant in (ESTIMATED, IGNORED):
+        registration = register_files(files, _VARIANTS[variant])
+        if isinstance(registration, str):
+            rows.append(_failed(variant, registration, ("",)))
+        else:
+            agreeing = sum(fit.inliers for fit in registration.alignment.links)
+            rows.append((*_told(variant, registration), agreeing))
+    return Table(f"Fig. 10: copr, {len(files)} real pictures, {_COPR}", (*_TOLD, "matches that agree"), tuple(rows))
+
+
+def _told(variant: str, registration: Registration) -> tuple[object, ...]:
+    alignment = registration.alignment
+    return variant, int(alignment.used.sum()), alignment.distortion, alignment.model, alignment.rms
+
+
+def _failed(variant: str, reason: str, columns: Many[str]) -> tuple[object, ...]:
+    return (variant, 0, None, f"failed: {reason}", None, *(None for _ in columns))
