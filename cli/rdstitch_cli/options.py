@@ -12,7 +12,7 @@ import click
 Command = TypeVar("Command", bound=Callable[..., Any])
 Decorator = Callable[[Command], Command]
 
-FEATURES = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk")
+FEATURES = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk", "aliked")
 SOLVERS = ("auto", "two-point", "three-point", "three-point-similarity", "four-point", "five-point")
 MODELS = ("auto", "rigid", "similarity", "tilting", "homography")
 
@@ -98,6 +98,10 @@ known = together(
 estimation = together(
     click.option(
         "--features", type=click.Choice(FEATURES), default="rootsift", show_default=True, help="Features to match."
+    ),
+    click.option("--aliked-model", type=PICTURE, metavar="FILE", help="ONNX file of the network of --features aliked."),
+    click.option(
+        "--lightglue-model", type=PICTURE, metavar="FILE", help="Match by this LightGlue network for these features."
     ),
     click.option("--max-features", type=click.IntRange(1), metavar="N", help="At most so many features a picture."),
     click.option(

@@ -16,6 +16,7 @@ def stitch_options(
     *,
     camera: Path | None,
     features: str,
+    aliked_model: Path | None,
     max_features: int | None,
     work_megapixels: float | None,
     solver: str,
@@ -27,7 +28,7 @@ def stitch_options(
     from rdstitch.features import FeatureOptions
     from rdstitch.pipeline import StitchOptions
 
-    wanted: dict[str, Any] = {"kind": features}
+    wanted: dict[str, Any] = {"kind": features, "aliked_model": aliked_model}
     if max_features is not None:
         wanted["max_features"] = max_features
     if work_megapixels is not None:

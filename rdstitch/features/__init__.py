@@ -3,7 +3,17 @@
 from rdstitch.features.detect import detect, detect_all
 from rdstitch.features.keypoints import Features
 from rdstitch.features.learned import LightGlue
-from rdstitch.features.match import Correspondences, match
+from rdstitch.features.match import Correspondences, Matcher, match
 from rdstitch.features.options import KINDS, FeatureOptions
 
-__all__ = ["KINDS", "Correspondences", "FeatureOptions", "Features", "LightGlue", "detect", "detect_all", "match"]
+__all__ = [
+    "KINDS",
+    "Correspondences",
+    "FeatureOptions",
+    "Features",
+    "LightGlue",
+    "Matcher",
+    "detect",
+    "detect_all",
+    "match",
+]

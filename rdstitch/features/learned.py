@@ -6,6 +6,8 @@ OpenCV's own tests use: ALIKED takes ``image`` and gives ``keypoints``, ``descri
 """
 
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -36,12 +38,11 @@ class AlikedDetection:
         Raises
         ------
         ArgumentError
-            When no file is named, or this OpenCV has no ALIKED.
+            When this OpenCV has no ALIKED.
         InputError
             When the file cannot be read, or holds another network.
         """
-        if options.aliked_model is None:
-            raise ArgumentError("features 'aliked' need the ONNX file of the network")
+        assert options.aliked_model is not None
         network = _load("ALIKED", options.aliked_model, _aliked_parameters(options.aliked_size))
         try:
             keypoints, descriptors = network.detectAndCompute(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), None)
@@ -135,9 +136,24 @@ def _load(name: str, model: str | Path, *arguments: Any) -> Any:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
-        return getattr(cv2, name).create(str(path), *arguments)
+        with _silent_opencv():
+            return getattr(cv2, name).create(str(path), *arguments)
     except cv2.error as error:
         raise InputError(f"{path}: not an ONNX file that OpenCV can read") from error
+
+
+_log_level_lock = threading.Lock()
+
+
+@contextmanager
+def _silent_opencv() -> Iterator[None]:
+    """Keep OpenCV from telling users that its new engine has no targets; they cannot do anything about it."""
+    with _log_level_lock:
+        level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        try:
+            yield
+        finally:
+            cv2.utils.logging.setLogLevel(level)
 
 
 def _aliked_parameters(size: int) -> Any:

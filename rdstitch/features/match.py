@@ -1,5 +1,7 @@
 """Matching: mutual nearest neighbours that pass the ratio test, exactly, by blocked matrix products."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,7 +11,10 @@ from rdstitch.features.correspondences import Correspondences
 from rdstitch.features.keypoints import Features
 from rdstitch.features.nearest import mutual_nearest
 
-__all__ = ["Correspondences", "match"]
+__all__ = ["Correspondences", "Matcher", "match"]
+
+Matcher = Callable[[Features, Features], Correspondences]
+"""What matches the features of two pictures: :func:`match`, or a network's."""
 
 _DEFAULT_RATIO = 0.85
 _BLOCK_BYTES = 2**22  # stays in the cache

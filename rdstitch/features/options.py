@@ -40,6 +40,10 @@ class FeatureOptions:
         """Check ranges."""
         if self.kind not in KINDS:
             raise ArgumentError(f"unknown kind of features {self.kind!r}; known are {', '.join(KINDS)}")
+        if self.kind == "aliked" and self.aliked_model is None:
+            raise ArgumentError("features 'aliked' need the ONNX file of the network (--aliked-model)")
+        if self.aliked_size < 1:
+            raise ArgumentError(f"aliked_size must be at least 1, not {self.aliked_size}")
         if self.max_features < 1:
             raise ArgumentError(f"max_features must be at least 1, not {self.max_features}")
         if self.work_megapixels is not None and not self.work_megapixels > 0:

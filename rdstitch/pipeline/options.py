@@ -24,6 +24,7 @@ class StitchOptions:
 
     features: FeatureOptions = field(default_factory=FeatureOptions)
     ratio: float | None = None  # largest ratio of distances of a match; None: what suits the features
+    lightglue_model: str | Path | None = None  # ONNX file of a network that matches the features instead
     solver: str = "auto"  # minimal solver of the pairs, one of rdstitch.robust.SOLVERS
     model: str = "auto"  # motion model of the whole, one of rdstitch.registration.MODELS
     threshold: float = 3.0  # px, largest transfer error of an inlier

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from rdstitch.camera import Camera
-from rdstitch.features import Features
+from rdstitch.features import Features, Matcher
 from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.progress import Progress
 from rdstitch.registration.pairs import PairOptions, PairRegistration, estimate_pairs, match_pairs
@@ -22,12 +22,14 @@ class Pairing:
     ----------
     features : sequence of Features
     cameras : sequence of Camera
+    matcher : callable
     options : StitchOptions
     progress : callable
     """
 
     features: Sequence[Features]
     cameras: Sequence[Camera]
+    matcher: Matcher
     options: StitchOptions
     progress: Progress
 
@@ -35,7 +37,7 @@ class Pairing:
         """Match and estimate pairs (i, j), with λ free, or as the user or the other pairs say."""
         if not pairs:
             return []
-        matched = match_pairs(self.features, pairs, self.options.ratio, partial(self.progress, "matching"))
+        matched = match_pairs(self.features, pairs, self.matcher, partial(self.progress, "matching"))
         known = self.options.known_distortion
         found = estimate_pairs(
             self.cameras,
@@ -75,7 +77,7 @@ class Pairing:
     def _pair_options(self, distortion: float | None) -> PairOptions:
         o = self.options
         solver = o.solver if distortion is None else "auto"
-        return PairOptions(o.ratio, solver, distortion, o.threshold, o.confidence, o.max_iterations, o.seed)
+        return PairOptions(solver, distortion, o.threshold, o.confidence, o.max_iterations, o.seed)
 
     def _tilts(self) -> list[tuple[float, float] | None] | None:
         return None if self.options.tilt is None else [self.options.tilt] * len(self.cameras)

@@ -8,7 +8,7 @@ import numpy as np
 
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError, RegistrationError
-from rdstitch.features import Features, detect_all
+from rdstitch.features import Features, LightGlue, Matcher, detect_all, match
 from rdstitch.io.read import Pixels, read_image
 from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.pairing import Pairing
@@ -78,8 +78,9 @@ def register(
         When no two pictures overlap.
     """
     reference = _reference(sources, options.reference)
+    matcher = _matcher(options)
     features, damaged = _detect(sources, options, skip_bad, progress)
-    pairing = Pairing(features, [source.camera for source in sources], options, progress)
+    pairing = Pairing(features, [source.camera for source in sources], matcher, options, progress)
     pairs = pairing.estimate(first_pairs(features, options.seed))
     pairs = pairing.rescue(pairs)
     aligning = AlignmentOptions(
@@ -149,6 +150,13 @@ def _detect(
     loaders = [partial(load, index) for index in range(len(sources))]
     features = detect_all(loaders, options.features, options.threads, partial(progress, "detecting features"))
     return features, damaged
+
+
+def _matcher(options: StitchOptions) -> Matcher:
+    """What matches features: the user's network, or distances."""
+    if options.lightglue_model is not None:
+        return LightGlue(options.lightglue_model).match
+    return partial(match, ratio=options.ratio)
 
 
 def _no_overlap(sources: Sequence[Source], registered: Sequence[PairRegistration]) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
-from rdstitch.features import Correspondences, Features, match
+from rdstitch.features import Correspondences, Features, Matcher
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.registration.links import Link
 from rdstitch.robust import SOLVERS, estimate_radial_homography
@@ -18,9 +18,8 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class PairOptions:
-    """How pairs are matched and estimated."""
+    """How pairs are estimated."""
 
-    ratio: float | None = None  # largest ratio of distances of a match; None: what suits the features
     solver: str = "auto"  # one of rdstitch.robust.SOLVERS
     distortion: float | None = None  # known λ, half-diagonal frame
     threshold: float = 3.0  # px, largest transfer error of an inlier
@@ -63,7 +62,7 @@ class PairRegistration:
 def match_pairs(
     features: Sequence[Features],
     pairs: Sequence[tuple[int, int]],
-    ratio: float | None,
+    matcher: Matcher,
     progress: Progress | None = None,
 ) -> list[Correspondences]:
     """Match the features of pairs of pictures; the matrix products keep all cores busy.
@@ -74,13 +73,14 @@ def match_pairs(
         One a picture.
     pairs : sequence of (int, int)
         Indices of the pictures of each pair.
-    ratio : float or None
+    matcher : callable
+        Matches the features of two pictures.
     progress : callable, optional
         Called with the number of pairs done and their total.
     """
     matched = []
     for image1, image2 in pairs:
-        matched.append(match(features[image1], features[image2], ratio))
+        matched.append(matcher(features[image1], features[image2]))
         if progress is not None:
             progress(len(matched), len(pairs))
     return matched

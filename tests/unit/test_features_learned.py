@@ -14,6 +14,8 @@ onnx = pytest.importorskip("onnx")
 if not hasattr(cv2, "ALIKED"):
     pytest.skip("this OpenCV has no ALIKED", allow_module_level=True)
 
+from tests.networks import save  # noqa: E402 - imports onnx
+
 SIDE = 64
 CELL = 8
 
@@ -21,7 +23,7 @@ CELL = 8
 @pytest.fixture
 def aliked(tmp_path: Path) -> Path:
     """A network that sees a keypoint in every cell of a grid, described by its pixels, brighter ones stronger."""
-    helper, numpy_helper, kind = onnx.helper, onnx.numpy_helper, onnx.TensorProto
+    helper = onnx.helper
     cells = SIDE // CELL
     place = (np.arange(cells) + 0.5) / cells * 2 - 1
     v, u = np.meshgrid(place, place, indexing="ij")
@@ -36,25 +38,16 @@ def aliked(tmp_path: Path) -> Path:
         helper.make_node("Transpose", ["columns"], ["descriptors"], perm=[1, 0]),
         helper.make_node("ReduceMean", ["descriptors", "one"], ["scores"], keepdims=1),
     ]
-    graph = helper.make_graph(
-        nodes,
-        "aliked",
-        [helper.make_tensor_value_info("image", kind.FLOAT, [1, 3, SIDE, SIDE])],
-        [
-            helper.make_tensor_value_info(name, kind.FLOAT, [cells**2, width])
-            for name, width in (("keypoints", 2), ("descriptors", 64), ("scores", 1))
-        ],
-        [numpy_helper.from_array(values, name) for name, values in weights.items()],
-    )
-    return save(graph, tmp_path / "aliked.onnx")
+    outputs = {"keypoints": (cells**2, 2), "descriptors": (cells**2, 64), "scores": (cells**2, 1)}
+    return save(tmp_path / "aliked.onnx", nodes, {"image": (1, 3, SIDE, SIDE)}, outputs, weights)
 
 
 @pytest.fixture
 def lightglue(tmp_path: Path) -> Path:
     """A network that matches keypoint i with keypoint i, the more certain the farther to the right it is."""
-    helper, numpy_helper, kind = onnx.helper, onnx.numpy_helper, onnx.TensorProto
+    helper = onnx.helper
     pairs = np.repeat(np.arange(5)[:, None], 2, axis=1).astype(np.int64)
-    weights = {"pairs": pairs, "zero": np.array(0), "half": np.array(0.5, np.float32), "axes": np.array([0, 2])}
+    weights = {"pairs": pairs, "zero": np.array(0), "half": np.array(0.5, np.float32)}
     nodes = [
         helper.make_node("Identity", ["pairs"], ["matches0"]),
         helper.make_node("Gather", ["kpts0", "zero"], ["u"], axis=2),
@@ -63,27 +56,8 @@ def lightglue(tmp_path: Path) -> Path:
         helper.make_node("Squeeze", ["certain", "squeezed"], ["mscores0"]),
     ]
     weights["squeezed"] = np.array([0])
-    graph = helper.make_graph(
-        nodes,
-        "lightglue",
-        [
-            helper.make_tensor_value_info(name, kind.FLOAT, [1, 5, width])
-            for name, width in (("kpts0", 2), ("kpts1", 2), ("desc0", 64), ("desc1", 64))
-        ],
-        [
-            helper.make_tensor_value_info("matches0", kind.INT64, [5, 2]),
-            helper.make_tensor_value_info("mscores0", kind.FLOAT, [5]),
-        ],
-        [numpy_helper.from_array(values, name) for name, values in weights.items() if name != "axes"],
-    )
-    return save(graph, tmp_path / "lightglue.onnx")
-
-
-def save(graph: object, path: Path) -> Path:
-    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=9)
-    onnx.checker.check_model(model)
-    onnx.save(model, str(path))
-    return path
+    inputs = {name: (1, 5, width) for name, width in (("kpts0", 2), ("kpts1", 2), ("desc0", 64), ("desc1", 64))}
+    return save(tmp_path / "lightglue.onnx", nodes, inputs, {"matches0": (5, 2), "mscores0": (5,)}, weights)
 
 
 def five(points: np.ndarray) -> Features:

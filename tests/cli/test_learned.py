@@ -1,0 +1,52 @@
+"""Networks from ONNX files, given on the command line."""
+
+import json
+from pathlib import Path
+
+import cv2
+import pytest
+
+from tests.cli.running import DISTORTION, FAST, Run
+
+pytest.importorskip("onnx")
+if not hasattr(cv2, "ALIKED"):
+    pytest.skip("this OpenCV has no ALIKED", allow_module_level=True)
+
+from tests.networks import KEYPOINTS, save_aliked, save_lightglue
+
+
+@pytest.mark.parametrize("matcher", ["distances", "lightglue"])
+def test_pictures_are_stitched_by_networks(rdstitch: Run, frames: list[Path], tmp_path: Path, matcher: str) -> None:
+    aliked = save_aliked(tmp_path / "aliked.onnx")
+    matching = ("--lightglue-model", save_lightglue(tmp_path / "glue.onnx")) if matcher == "lightglue" else ()
+    output = tmp_path / "pano.png"
+    done = rdstitch(
+        "pano", *frames[:2], "-o", output, "--features", "aliked", "--aliked-model", aliked, *matching, *FAST
+    )
+    assert (done.status, done.err) == (0, "")
+    assert abs(float(done.out) - DISTORTION) < 0.01
+    record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
+    assert [image["features"] for image in record["images"]] == [KEYPOINTS, KEYPOINTS]
+    assert record["options"]["features"]["aliked_model"] == str(aliked)
+
+
+def test_a_network_that_is_not_there_is_named(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    arguments = ("pano", *frames[:2], "-o", tmp_path / "pano.png", *FAST)
+    for option, more in (("--aliked-model", ("--features", "aliked")), ("--lightglue-model", ())):
+        done = rdstitch(*arguments, *more, option, tmp_path / "absent.onnx")
+        assert done.status == 3
+        assert str(tmp_path / "absent.onnx") in done.line
+    done = rdstitch(*arguments, "--features", "aliked")
+    assert done.status == 2
+    assert "--aliked-model" in done.line
+    assert not (tmp_path / "pano.png").exists()
+
+
+def test_an_opencv_without_networks_is_said_so(
+    rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(cv2, "ALIKED")
+    arguments = ("--features", "aliked", "--aliked-model", tmp_path / "absent.onnx")
+    done = rdstitch("pano", *frames[:2], "-o", tmp_path / "pano.png", *arguments, *FAST)
+    assert done.status == 2
+    assert f"this OpenCV ({cv2.__version__}) has no ALIKED" in done.line
