@@ -1,18 +1,23 @@
 """The command group, and the edge where errors become one line and an exit status."""
 
+import errno
 import os
+import signal
 import sys
 import traceback
 from importlib.metadata import version
+from typing import Never
 
 import click
+from click.shell_completion import shell_complete
 
-from rdstitch.errors import RdstitchError
+from rdstitch.errors import OutputError, RdstitchError
 from rdstitch_cli.commands.calibrate import calibrate
 from rdstitch_cli.commands.mosaic import mosaic
 from rdstitch_cli.commands.pano import pano
 from rdstitch_cli.commands.trajectory import trajectory
 from rdstitch_cli.commands.undistort import undistort
+from rdstitch_cli.progress import one_line
 
 EXIT_STATUSES = """\b
 Exit status:
@@ -24,10 +29,13 @@ Exit status:
   5    partial result under --strict
   6    output cannot be written, or exists (see --overwrite)
   7    refused: too large for memory, format or common sense
-  130  interrupted
+  130  interrupted; 143 when asked to end by SIGTERM, 129 by SIGHUP
+  141  nobody reads standard output any more; the files are written
 """
 
 _UNEXPECTED, _INTERRUPTED, _BROKEN_PIPE = 1, 130, 141
+_ASKED_TO_END = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+_NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}, epilog=EXIT_STATUSES)
@@ -46,6 +54,8 @@ for command in (pano, mosaic, calibrate, trajectory, undistort):
 
 def main() -> None:
     """Run the command line and leave with its exit status."""
+    for number in _ASKED_TO_END:
+        signal.signal(number, _end)
     sys.exit(run(sys.argv[1:]))
 
 
@@ -53,33 +63,80 @@ def run(arguments: list[str]) -> int:
     """Run one command; whatever goes wrong becomes one line on standard error and a status."""
     debug = "--debug" in arguments
     try:
-        status = cli.main(arguments, prog_name="rdstitch", standalone_mode=False)
-        sys.stdout.flush()
-    except click.exceptions.Abort:
+        return _invoke(arguments)
+    except (KeyboardInterrupt, click.exceptions.Abort):
         return _complain("interrupted", _INTERRUPTED, debug)
-    except KeyboardInterrupt:
-        return _complain("interrupted", _INTERRUPTED, debug)
-    except click.ClickException as error:
+    except _AskedToEndError as asked:
+        return _complain("interrupted", 128 + asked.number, debug)
+    except click.exceptions.NoArgsIsHelpError as error:
         error.show()
         return error.exit_code
+    except click.ClickException as error:
+        return _complain(_usage(error), error.exit_code, debug)
     except RdstitchError as error:
         return _complain(str(error), error.exit_status, debug)
-    except BrokenPipeError:
-        # The reader of standard output is gone; nothing may be written to it at exit either.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return _BROKEN_PIPE
     except MemoryError:
         return _complain("out of memory; try smaller pictures or a smaller --scale", 7, debug)
     except Exception as error:  # noqa: BLE001 - the last line of defence: no traceback for users
-        text = " ".join(str(error).split()) or type(error).__name__
+        if isinstance(error, OSError) and error.errno in _NO_SPACE:
+            return _complain(f"{error.filename or 'a file'}: cannot be written: {error.strerror}", 6, debug)
+        text = str(error) or type(error).__name__
         hint = "" if debug else "; run again as 'rdstitch --debug ...' and report the traceback"
         return _complain(f"unexpected failure ({type(error).__name__}): {text}{hint}", _UNEXPECTED, debug)
-    return status if isinstance(status, int) else 0
+
+
+def _invoke(arguments: list[str]) -> int:
+    """Run the command; its results are written when this returns.
+
+    Not :meth:`click.Command.main`, which has its own opinions on interrupts and closed pipes.
+    """
+    if completion := os.environ.get("_RDSTITCH_COMPLETE"):
+        return shell_complete(cli, {}, "rdstitch", "_RDSTITCH_COMPLETE", completion)
+    try:
+        with cli.make_context("rdstitch", list(arguments)) as context:
+            cli.invoke(context)
+    except click.exceptions.Exit as done:
+        if done.exit_code:
+            return done.exit_code
+    except BrokenPipeError:
+        return _nobody_listens()
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        return _nobody_listens()
+    except OSError as error:
+        _nobody_listens()
+        raise OutputError(f"standard output: cannot be written: {error.strerror}") from error
+    return 0
+
+
+def _nobody_listens() -> int:
+    """The reader of standard output is gone; nothing may be written to it at exit either."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return _BROKEN_PIPE
+
+
+class _AskedToEndError(BaseException):
+    """The system asked this process to end; what is half-written is cleared away on the way out."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+def _end(number: int, frame: object) -> Never:
+    raise _AskedToEndError(number)
+
+
+def _usage(error: click.ClickException) -> str:
+    """A wrong usage in one line, with where to look."""
+    context = getattr(error, "ctx", None)
+    hint = "" if context is None else f"; see '{context.command_path} --help'"
+    return error.format_message().rstrip(".") + hint
 
 
 def _complain(text: str, status: int, debug: bool) -> int:
     if debug and sys.exc_info()[0] is not None:
         traceback.print_exc()
-    line = "rdstitch: " + text.replace("\n", " ")
-    print(line.encode("utf-8", "backslashreplace").decode("utf-8"), file=sys.stderr)
+    print(one_line(f"rdstitch: {text}"), file=sys.stderr)
     return status

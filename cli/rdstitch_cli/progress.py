@@ -9,6 +9,12 @@ from typing import Never, Self
 from tqdm import tqdm
 
 
+def one_line(text: str) -> str:
+    """Text that a terminal shows as one line, whatever file names and cameras are called."""
+    shown = (c if c.isprintable() else " " if c.isspace() else c.encode("unicode_escape").decode() for c in text)
+    return "".join(shown).strip()
+
+
 class Reporter:
     """Receives what the library has to say while it works.
 
@@ -60,7 +66,7 @@ class Reporter:
 
     def _line(self, text: str) -> None:
         with self._paused():
-            print(text.encode("utf-8", "backslashreplace").decode("utf-8"), file=sys.stderr)
+            print(one_line(text), file=sys.stderr)
 
     @contextmanager
     def _paused(self) -> Iterator[None]:

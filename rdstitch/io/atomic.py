@@ -137,5 +137,15 @@ def write_text_atomic(path: str | Path, text: str) -> None:
 
 
 def write_json_atomic(path: str | Path, data: Any) -> None:
-    """Write JSON (two spaces, final newline, no NaN), whole or not at all; see :func:`write_bytes_atomic`."""
-    write_text_atomic(path, json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    """Write JSON, whole or not at all; see :func:`json_bytes` and :func:`write_bytes_atomic`."""
+    write_bytes_atomic(path, json_bytes(data))
+
+
+def json_bytes(data: Any) -> bytes:
+    """JSON in UTF-8 (two spaces, final newline, no NaN).
+
+    The bytes of a file name that are no UTF-8 become JSON's own escapes: the file stays valid, and the name can be
+    got back from it.
+    """
+    text = json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    return text.encode("utf-8", "backslashreplace")

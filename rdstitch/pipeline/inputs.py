@@ -30,8 +30,9 @@ def find_pictures(
         Each a picture file, a folder, a pattern (``*``, ``?``, ``[...]``), ``@FILE`` with one argument a line, or a
         video file.
     exclude : iterable of path
-        Files that are no input, such as the output. Pictures in folders and patterns beside which rdstitch wrote a
-        sidecar are its own work and left out too.
+        Files that are no input, such as the output, where they come from a folder or pattern or are rdstitch's own
+        work. Any other picture that is named stays: its user must hear that it would be written over. Pictures in
+        folders and patterns beside which rdstitch wrote a sidecar are its own work and left out too.
     frames_folder : Path, optional
         Where frames of videos are written, losslessly; without it a video is refused.
     every : int
@@ -42,8 +43,17 @@ def find_pictures(
     InputError
         When an argument names nothing.
     """
-    unwanted = {Path(path).resolve() for path in exclude}
-    return [path for path in _expand(arguments, frames_folder, every) if path.resolve() not in unwanted]
+    unwanted = {_entry(Path(path)) for path in exclude}
+    return [
+        path
+        for path, named in _expand(arguments, frames_folder, every)
+        if _entry(path) not in unwanted or (named and not _own_work(path))
+    ]
+
+
+def _entry(path: Path) -> Path:
+    """Where a name stands, links to folders followed but the last link not."""
+    return path.parent.resolve() / path.name
 
 
 def natural_key(path: Path) -> list[tuple[int, str | int]]:
@@ -51,21 +61,22 @@ def natural_key(path: Path) -> list[tuple[int, str | int]]:
     return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", str(path)) if part]
 
 
-def _expand(arguments: Iterable[str | Path], frames_folder: Path | None, every: int) -> Iterator[Path]:
+def _expand(arguments: Iterable[str | Path], frames_folder: Path | None, every: int) -> Iterator[tuple[Path, bool]]:
+    """Every picture, and whether it was named one by one."""
     for argument in arguments:
         path, text = Path(argument), str(argument)
         if text.startswith("@") and not path.exists():
             yield from _expand(_listed(Path(text[1:])), frames_folder, every)
         elif path.is_dir():
-            yield from _in_folder(path)
+            yield from ((found, False) for found in _in_folder(path))
         elif path.suffix.lower() in VIDEO_SUFFIXES and path.exists():
             if frames_folder is None:
                 raise InputError(f"{path}: a video is no picture here; use 'rdstitch mosaic' or extract its frames")
-            yield from extract_frames(path, frames_folder, every)
+            yield from ((frame, True) for frame in extract_frames(path, frames_folder, every))
         elif not path.exists() and glob.has_magic(text):
-            yield from _matching(text)
+            yield from ((found, False) for found in _matching(text))
         else:
-            yield path
+            yield path, True
 
 
 def _listed(file: Path) -> list[str]:

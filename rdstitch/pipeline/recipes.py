@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal
@@ -13,7 +12,6 @@ import numpy as np
 from rdstitch.compositing import Composite, compose, plan_canvas
 from rdstitch.errors import ArgumentError, InputError, PartialResultError, RegistrationError
 from rdstitch.io.atomic import check_output, write_json_atomic, write_text_atomic
-from rdstitch.io.read import read_image
 from rdstitch.io.write import check_size, write_image
 from rdstitch.pipeline.inputs import find_pictures
 from rdstitch.pipeline.options import StitchOptions
@@ -22,7 +20,7 @@ from rdstitch.pipeline.progress import Progress, silent
 from rdstitch.pipeline.register import Registration, in_frame_of_reference, register
 from rdstitch.pipeline.result import StitchResult
 from rdstitch.pipeline.sidecar import sidecar
-from rdstitch.pipeline.sources import LeftOut, Source, read_sources
+from rdstitch.pipeline.sources import LeftOut, Source, read_sources, readers
 from rdstitch.pipeline.verdict import Verdict, judge
 from rdstitch.registration.trajectory import Trajectory
 
@@ -215,7 +213,7 @@ def _composite(
     if output is not None:
         check_size(output, canvas.size)
     composite = compose(
-        [partial(read_image, source.path) for source in sources],
+        readers(sources),
         cameras,
         homographies[used],
         canvas,
@@ -232,7 +230,7 @@ def _composite(
 
 def _accept(registration: Registration, options: StitchOptions) -> Verdict:
     """Judge a registration; what cannot be relied on goes no further, unless forced."""
-    verdict = judge(registration, options.threshold)
+    verdict = judge(registration, options.threshold, options.threads)
     if not verdict.ok and not options.force:
         reasons = "; ".join(verdict.failures)
         raise RegistrationError(f"no reliable result: {reasons} (--force writes it all the same)")

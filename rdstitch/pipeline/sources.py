@@ -1,12 +1,14 @@
 """The input pictures: which files, what their headers say, and the camera each was taken with."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.io.metadata import Metadata, read_metadata
+from rdstitch.io.read import Picture, read_image
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,46 @@ class Source:
     def name(self) -> str:
         """File name, for messages and reports."""
         return self.path.name
+
+    def read(self) -> Picture:
+        """The pixels.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be read, or is no longer what it was.
+        """
+        picture = read_image(self.path)
+        height, width = picture.pixels.shape[:2]
+        if (width, height) != self.camera.image_size:
+            before = "{} x {}".format(*self.camera.image_size)
+            raise InputError(f"{self.path}: has {width} x {height} px now, but had {before} before; run again")
+        return picture
+
+
+def readers(sources: Sequence[Source]) -> list[Callable[[], Picture]]:
+    """What reads the pictures for the compositor; those whose samples cannot be mixed are named.
+
+    Raises
+    ------
+    InputError
+        By a reader: see :meth:`Source.read`, and when its samples are unlike those of the picture read first.
+    """
+    first: list[tuple[Source, str]] = []
+
+    def read(source: Source) -> Picture:
+        picture = source.read()
+        bands = 1 if picture.pixels.ndim == 2 else picture.pixels.shape[2]
+        # Grey becomes colour where it must.
+        kind = f"{picture.pixels.dtype} samples" + ("" if bands in (1, 3) else f" in {bands} bands")
+        first.append((source, kind))
+        if kind != first[0][1]:
+            raise InputError(
+                f"{source.path}: has {kind}, but {first[0][0].name} has {first[0][1]}; convert them to one kind"
+            )
+        return picture
+
+    return [partial(read, source) for source in sources]
 
 
 @dataclass(frozen=True)

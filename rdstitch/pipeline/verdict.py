@@ -1,13 +1,22 @@
 """Every run judges itself: can the result be relied on?"""
 
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from rdstitch.pipeline.overlap_check import CheckedLink, check_overlaps
 from rdstitch.pipeline.register import Registration
+from rdstitch.registration.alignment import LinkFit
 
 _LARGEST_RMS = 1.0  # of the whole, in thresholds
 _LEAST_INLIERS = 0.5  # share of a pair's own inliers that agree with the whole
+# Of the cells of an overlap that agree: chance lets up to 7 % do so, and right registrations of difficult pictures
+# (low sun, parallax, blur) have been seen to have 20 %.
+_LEAST_AGREEMENT, _DOUBTFUL_AGREEMENT = 0.10, 0.15
+_LEAST_CELLS = 8  # below, the overlap has too little texture to say anything
+_FOCAL_SPREAD = 1.03  # ratio of focal lengths in EXIF from which on the lens was zoomed
 
 
 @dataclass(frozen=True)
@@ -28,29 +37,72 @@ class Verdict:
     doubts: tuple[str, ...]
 
 
-def judge(registration: Registration, threshold: float) -> Verdict:
-    """Check an alignment against the pairs that it was made from.
+def judge(registration: Registration, threshold: float, workers: int = 1) -> Verdict:
+    """Check an alignment against the pairs that it was made from, and against the pixels.
 
     Parameters
     ----------
     registration : Registration
     threshold : float
         Largest transfer error of an inlier of a pair, px.
+    workers : int
+        Pictures read at the same time.
     """
     alignment = registration.alignment
-    failures: list[str] = []
-    doubts: list[str] = []
-    used = [fit for fit in alignment.links if fit.used]
     names = [source.name for source in registration.sources]
+    used = [fit for fit in alignment.links if fit.used]
+    failures: list[str] = []
     if not np.isfinite(alignment.rms) or alignment.rms > _LARGEST_RMS * threshold:
         failures.append(f"the pictures disagree by {alignment.rms:.1f} px, more than the threshold of {threshold:g} px")
     given, kept = sum(fit.count for fit in used), sum(fit.inliers for fit in used)
     if kept < _LEAST_INLIERS * given:
         failures.append(f"only {kept} of {given} matches of the pairs agree with the whole")
-    doubts.extend(
+    checked = check_overlaps(registration, workers)
+    failures.extend(_unlike(names, checked))
+    doubts = (*_disagreeing(names, used), *_little_alike(names, checked), *_several_cameras(registration))
+    return Verdict(not failures, tuple(failures), doubts)
+
+
+def _unlike(names: Sequence[str], checked: Sequence[CheckedLink]) -> list[str]:
+    """Pictures that were put together and do not look alike there."""
+    return [
+        f"{names[link.fit.image1]} and {names[link.fit.image2]} do not look alike where they are put together "
+        f"({link.agreement.confirming} of {link.agreement.cells} places agree); leave one of them out"
+        for link in checked
+        if link.agreement.cells >= _LEAST_CELLS and link.agreement.share < _LEAST_AGREEMENT
+    ]
+
+
+def _little_alike(names: Sequence[str], checked: Sequence[CheckedLink]) -> list[str]:
+    return [
+        f"{names[link.fit.image1]} and {names[link.fit.image2]}: only {link.agreement.confirming} of "
+        f"{link.agreement.cells} places look alike; look at the seam between them"
+        for link in checked
+        if link.agreement.cells >= _LEAST_CELLS and _LEAST_AGREEMENT <= link.agreement.share < _DOUBTFUL_AGREEMENT
+    ]
+
+
+def _disagreeing(names: Sequence[str], used: Sequence[LinkFit]) -> list[str]:
+    """Pairs whose matches do not fit into the whole."""
+    return [
         f"{names[fit.image1]} and {names[fit.image2]}: only {fit.inliers} of {fit.count} matches agree with the whole; "
         "look at the seam between them"
         for fit in used
         if fit.inliers < _LEAST_INLIERS * fit.count
-    )
-    return Verdict(not failures, tuple(failures), tuple(doubts))
+    ]
+
+
+def _several_cameras(registration: Registration) -> list[str]:
+    """Pictures that say of themselves that they come from another camera, or were zoomed."""
+    known = [source.metadata for source in registration.sources if source.metadata.model or source.metadata.serial]
+    bodies = Counter(" ".join(filter(None, (m.make, m.model, m.serial))) for m in known)
+    if len(bodies) > 1:
+        listed = ", ".join(f"{body} ({count})" for body, count in bodies.most_common(3))
+        return [f"the pictures come from {len(bodies)} cameras: {listed}; stitch those of each on their own"]
+    focal = [m.focal_px / max(m.size) for m in known if m.focal_px is not None]
+    if focal and max(focal) > _FOCAL_SPREAD * min(focal):
+        ratio = max(focal) / min(focal)
+        return [
+            f"the lens was zoomed between the pictures, by up to {ratio:.2f}; stitch those of one zoom on their own"
+        ]
+    return []

@@ -15,6 +15,8 @@ from rdstitch.camera import Camera, FloatArray
 from rdstitch.radial_homography import project
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
 
+_PROGRAM = "from rdstitch_cli.main import main; main()"
+
 DISTORTION = -0.2
 
 # Small pictures need no more, and every command of these tests takes a second less.
@@ -48,15 +50,15 @@ def flight(seed: int, columns: int, rows: int = 1, distortion: float = DISTORTIO
 
 
 def start(
-    *arguments: str | bytes | Path, stdin: int | None = subprocess.DEVNULL, **environment: str
+    *arguments: str | Path, stdin: int = subprocess.DEVNULL, program: str = _PROGRAM
 ) -> "subprocess.Popen[bytes]":
     """Start the command line as a process of its own."""
     return subprocess.Popen(
-        [sys.executable, "-c", "from rdstitch_cli.main import main; main()", *arguments],
+        [sys.executable, "-c", program, *arguments],
         stdin=stdin,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
-        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
     )
 
 

@@ -1,0 +1,226 @@
+"""Random rendered picture sets, solvable and hopeless ones, and whether what was made of them is right."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.errors import RdstitchError
+from rdstitch.features import FeatureOptions
+from rdstitch.pipeline import Registration, StitchOptions, calibrate
+from rdstitch.radial_homography import project
+from rdstitch.synthetic import (
+    Photometry,
+    Poses,
+    Sequence,
+    Texture,
+    alignment_error,
+    gradient,
+    grid_poses,
+    ground,
+    pair_poses,
+    repeated,
+    rotation_poses,
+    sequence_over,
+)
+
+SOLVABLE = ("pair", "chain", "grid")
+HOPELESS = ("apart", "textureless", "repeated", "turning", "mixed lenses", "little overlap", "mixed ground")
+
+LARGEST_MEDIAN, LARGEST_OF_A_PICTURE = 1.5, 4.0
+"""px of the pictures: more is a wrong registration."""
+
+
+@dataclass(frozen=True)
+class MixedSequence(Sequence):
+    """Pictures of one plane of which some were taken with another lens, or show other ground.
+
+    Attributes
+    ----------
+    other : Sequence
+        The same poses with what else there is.
+    taken : frozenset of int
+        Pictures that come from ``other``.
+    """
+
+    other: Sequence | None = None
+    taken: frozenset[int] = frozenset()
+
+    def _of(self, index: int) -> Sequence:
+        own = Sequence(self.texture, self.lens, self.poses, self.photometry, seed=self.seed)
+        return self.other if index in self.taken and self.other is not None else own
+
+    def to_plane(self, index: int, points: ArrayLike) -> FloatArray:
+        """See :meth:`Sequence.to_plane`."""
+        return self._of(index).to_plane(index, points)
+
+    def to_picture(self, index: int, points: ArrayLike) -> FloatArray:
+        """See :meth:`Sequence.to_picture`."""
+        return self._of(index).to_picture(index, points)
+
+    def frame(self, index: int) -> np.ndarray:
+        """See :meth:`Sequence.frame`."""
+        return self._of(index).frame(index)
+
+
+@dataclass(frozen=True)
+class TrustSet:
+    """One random set.
+
+    Attributes
+    ----------
+    kind : str
+        One of :data:`SOLVABLE` or :data:`HOPELESS`.
+    sequence : Sequence
+    """
+
+    kind: str
+    sequence: Sequence
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What became of a set.
+
+    Attributes
+    ----------
+    kind : str
+    status : int
+        That the command line would have ended with.
+    right : bool
+        Whether the registration of all pictures used agrees with the truth; True without one.
+    complete : bool
+        Whether every picture was used.
+    error : float
+        Median error, px.
+    text : str
+        What the user would have been told.
+    """
+
+    kind: str
+    status: int
+    right: bool
+    complete: bool
+    error: float
+    text: str
+
+
+def trust_set(seed: int, kind: str | None = None) -> TrustSet:
+    """A random set of a kind; of a random one if not given, half of them solvable."""
+    rng = np.random.default_rng((seed, 77))
+    if kind is None:
+        kind = str(rng.choice(SOLVABLE if rng.random() < 0.5 else HOPELESS))
+    size = (400, 300) if rng.random() < 0.7 else (520, 390)
+    lens = Camera(size, distortion=float(rng.uniform(-0.35, 0.05)), focal=float(rng.uniform(0.8, 1.6) * size[0]))
+    tilt = (float(rng.uniform(-0.12, 0.12)), float(rng.uniform(-0.12, 0.12)))
+    photometry = Photometry(float(rng.uniform(0.8, 1.1)), float(rng.uniform(0.0, 0.3)), noise=0.012)
+    poses = _poses(kind, lens, tilt, rng, seed)
+    plane: Callable[[tuple[int, int]], Texture] = partial(ground, seed=seed)
+    if kind == "textureless":
+        plane = gradient
+    elif kind == "repeated":
+        plane = partial(repeated, seed=seed, period=int(rng.integers(48, 140)))
+    sequence = sequence_over(plane, lens, poses, photometry=photometry, seed=seed, margin=60)
+    if kind.startswith("mixed"):
+        sequence = _mixed(kind, sequence, rng, seed)
+    return TrustSet(kind, sequence)
+
+
+def _poses(kind: str, lens: Camera, tilt: tuple[float, float], rng: np.random.Generator, seed: int) -> Poses:
+    turn, direction = float(rng.uniform(-0.6, 0.6)), float(rng.uniform(0.0, 2.0 * np.pi))
+    overlap = float(rng.uniform(0.35, 0.65))
+    if kind in ("pair", "textureless"):
+        return pair_poses(lens, overlap, yaw=turn, direction=direction, tilt=tilt)
+    if kind == "apart":
+        return pair_poses(lens, -0.3, yaw=turn, direction=direction, tilt=tilt)
+    if kind == "little overlap":
+        return pair_poses(lens, float(rng.uniform(0.02, 0.15)), yaw=turn, direction=direction, tilt=tilt)
+    if kind == "turning":
+        # About the optical axis nothing can be seen of λ; about the plane's normal something can.
+        about_axis = rng.random() < 0.5
+        return rotation_poses(lens, 3, yaw_step=float(rng.uniform(0.05, 0.5)), tilt=(0.0, 0.0) if about_axis else tilt)
+    columns, rows = (4, 1) if kind == "chain" else (2, 2) if kind == "grid" else (3, 1)
+    if kind == "mixed lenses":
+        columns, rows = 5, 1
+    return grid_poses(lens, columns, rows, overlap=overlap, yaw=0.2, shift=0.05, tilt=tilt, seed=seed)
+
+
+def _mixed(kind: str, sequence: Sequence, rng: np.random.Generator, seed: int) -> MixedSequence:
+    """Some pictures through another lens (a zoom), or over other ground."""
+    lens = sequence.lens
+    if kind == "mixed lenses":
+        assert isinstance(lens, Camera)
+        assert lens.focal is not None
+        zoomed = replace(lens, distortion=lens.distortion / 3 - 0.1 * (lens.distortion > -0.1), focal=1.3 * lens.focal)
+        other = replace(sequence, lens=zoomed)
+        # A camera that is zoomed in sees the plane from as high as before.
+        taken = frozenset(range(3, 5))
+    else:
+        other, taken = replace(sequence, texture=ground(sequence.texture.size, seed + 1)), frozenset({2})
+    return MixedSequence(
+        sequence.texture, lens, sequence.poses, sequence.photometry, seed=sequence.seed, other=other, taken=taken
+    )
+
+
+def judge_set(item: TrustSet, folder: Path, options: StitchOptions | None = None) -> Judged:
+    """Register a set as the command line does, and compare with the truth."""
+    paths = item.sequence.write(folder)
+    wanted = options or StitchOptions(features=FeatureOptions(max_features=1500), workers=1)
+    try:
+        registration = calibrate(paths, wanted)
+    except RdstitchError as refusal:
+        return Judged(item.kind, refusal.exit_status, True, False, np.nan, str(refusal))
+    alignment = registration.alignment
+    # Who is told that λ is not observable is promised pictures that fit, not straight lines.
+    measure = registration_error if np.isfinite(alignment.distortion_std) else overlap_error
+    error, worst = measure(item.sequence, registration)
+    text = "; ".join((*alignment.warnings, *(f"left out {m.path.name}: {m.reason}" for m in registration.left_out)))
+    right = error < LARGEST_MEDIAN and worst < LARGEST_OF_A_PICTURE
+    return Judged(item.kind, 0, right, not registration.left_out, error, text)
+
+
+def registration_error(sequence: Sequence, registration: Registration) -> tuple[float, float]:
+    """Median error of the pictures used, and that of the worst of them, px, up to one homography of the plane."""
+    alignment = registration.alignment
+    transfers = {}
+    for position, number in _used(registration).items():
+        camera, matrix = alignment.cameras[position], alignment.homographies[position]
+        transfers[number] = partial(_to_plane, camera, matrix)
+    measured = alignment_error(sequence, transfers, model="homography")
+    return measured.median, max(measured.per_image().values())
+
+
+def overlap_error(sequence: Sequence, registration: Registration) -> tuple[float, float]:
+    """Median error where pictures overlap, and that of the worst pair, px."""
+    alignment = registration.alignment
+    errors = []
+    for (i, first), (j, second) in permutations(_used(registration).items(), 2):
+        width, height = alignment.cameras[i].image_size
+        points = np.stack(np.meshgrid(np.linspace(0, width - 1, 12), np.linspace(0, height - 1, 9)), -1).reshape(-1, 2)
+        true = sequence.to_picture(second, sequence.to_plane(first, points))
+        flat = _to_plane(alignment.cameras[i], alignment.relation(i, j), points)
+        found = alignment.cameras[j].distort(alignment.cameras[j].denormalize(flat))
+        width, height = alignment.cameras[j].image_size
+        inside = ((true >= 0) & (true <= (width - 1, height - 1))).all(axis=1)
+        if inside.any():
+            errors.append(np.nan_to_num(np.linalg.norm(found - true, axis=1), nan=np.inf)[inside])
+    return float(np.median(np.concatenate(errors))), max(float(np.median(own)) for own in errors)
+
+
+def _used(registration: Registration) -> dict[int, int]:
+    """The number in its sequence of every picture that was used, by its position in the registration."""
+    return {
+        position: int(source.path.stem.split("_")[-1])
+        for position, source in enumerate(registration.sources)
+        if registration.alignment.used[position]
+    }
+
+
+def _to_plane(camera: Camera, matrix: FloatArray, points: FloatArray) -> FloatArray:
+    flat = camera.normalize(camera.undistort(points))
+    return project(np.column_stack([flat, np.ones(len(flat))]) @ (matrix * np.sign(matrix[2, 2])).T)
