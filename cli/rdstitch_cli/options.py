@@ -16,7 +16,8 @@ FEATURES = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk", "aliked
 SOLVERS = ("auto", "two-point", "three-point", "three-point-similarity", "four-point", "five-point")
 MODELS = ("auto", "rigid", "similarity", "tilting", "homography")
 
-PICTURE = click.Path(path_type=Path)
+# Whether a file can be read is for the library to say: it knows more, and has a status for it.
+PICTURE = click.Path(path_type=Path, readable=False)
 
 
 def together(*options: Callable[[Any], Any]) -> Decorator[Any]:
@@ -62,7 +63,11 @@ def resolve(inputs: tuple[Path, ...]) -> list[Path]:
 
 
 inputs = click.argument(
-    "inputs", nargs=-1, required=True, type=click.Path(path_type=Path, allow_dash=True), metavar="INPUT..."
+    "inputs",
+    nargs=-1,
+    required=True,
+    type=click.Path(path_type=Path, readable=False, allow_dash=True),
+    metavar="INPUT...",
 )
 
 every = click.option(
