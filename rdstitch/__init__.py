@@ -12,7 +12,17 @@ if TYPE_CHECKING:
     from rdstitch.camera import Camera
     from rdstitch.compositing import CompositeOptions
     from rdstitch.features import FeatureOptions
-    from rdstitch.pipeline import StitchOptions, StitchResult, calibrate, mosaic, pano, trajectory, undistort
+    from rdstitch.pipeline import (
+        Recomposition,
+        StitchOptions,
+        StitchResult,
+        apply,
+        calibrate,
+        mosaic,
+        pano,
+        trajectory,
+        undistort,
+    )
     from rdstitch.radial_homography import RadialHomography
     from rdstitch.robust import estimate_radial_homography
 
@@ -21,9 +31,11 @@ _HOMES = {
     "CompositeOptions": "rdstitch.compositing",
     "FeatureOptions": "rdstitch.features",
     "RadialHomography": "rdstitch.radial_homography",
+    "Recomposition": "rdstitch.pipeline",
     "StitchOptions": "rdstitch.pipeline",
     "StitchResult": "rdstitch.pipeline",
     "estimate_radial_homography": "rdstitch.robust",
+    "apply": "rdstitch.pipeline",
     "calibrate": "rdstitch.pipeline",
     "mosaic": "rdstitch.pipeline",
     "pano": "rdstitch.pipeline",
@@ -37,8 +49,10 @@ __all__ = [
     "CompositeOptions",
     "FeatureOptions",
     "RadialHomography",
+    "Recomposition",
     "StitchOptions",
     "StitchResult",
+    "apply",
     "calibrate",
     "estimate_radial_homography",
     "mosaic",

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rdstitch.errors import InputError
 
 _LARGEST_FILE = 256 * 2**20  # bytes; a sidecar of ten thousand pictures has about 30 MB
+_DEEPEST = 50  # objects and lists within one another
 
 
 def read_text(path: str | Path) -> str:
@@ -47,12 +48,35 @@ def read_json(path: str | Path) -> "Record":
 def parse_json(text: str, file: str) -> "Record":
     """JSON text as a record; ``file`` is what messages call it."""
     try:
-        return Record(file, "", json.loads(text))
+        value = json.loads(text)
     except json.JSONDecodeError as error:
         where = f"line {error.lineno}, column {error.colno}"
         raise InputError(f"{file}: is not JSON: {error.msg} at {where}") from error
     except (RecursionError, ValueError) as error:
         raise InputError(f"{file}: is not JSON that can be read: {error}") from error
+    _check(file, value)
+    return Record(file, "", value)
+
+
+def _check(file: str, value: Any) -> None:
+    """Refuse what is too deep to be walked through, and numbers that JSON cannot express."""
+    containers: list[tuple[str, int, Any]] = [("", 1, {"": value})]
+    while containers:
+        field, depth, container = containers.pop()
+        if depth > _DEEPEST:
+            raise InputError(f"{file}: {field}: is nested too deeply")
+        for key, item in container.items() if isinstance(container, dict) else enumerate(container):
+            if isinstance(item, float) and not math.isfinite(item):
+                raise InputError(f"{file}: {_within(field, key)}: expected a finite number, not {item}")
+            if isinstance(item, (dict, list)):
+                containers.append((_within(field, key), depth + 1, item))
+
+
+def _within(field: str, key: str | int) -> str:
+    """Name of a field of a field."""
+    if isinstance(key, int):
+        return f"{field}[{key}]"
+    return f"{field}.{key}" if field else key
 
 
 class Record:
@@ -103,7 +127,7 @@ class Record:
         if not isinstance(self.value, list):
             self.expected("a list [...]")
         for index, value in enumerate(self.value):
-            yield type(self)(self.file, f"{self.field}[{index}]", value)
+            yield type(self)(self.file, _within(self.field, index), value)
 
     def text(self) -> str:
         """A string."""
@@ -177,4 +201,4 @@ class Record:
         return array
 
     def _child(self, key: str, value: Any) -> Self:
-        return type(self)(self.file, f"{self.field}.{key}" if self.field else key, value)
+        return type(self)(self.file, _within(self.field, key), value)

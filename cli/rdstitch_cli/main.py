@@ -12,6 +12,7 @@ import click
 from click.shell_completion import shell_complete
 
 from rdstitch.errors import OutputError, RdstitchError
+from rdstitch_cli.commands.apply import apply
 from rdstitch_cli.commands.calibrate import calibrate
 from rdstitch_cli.commands.mosaic import mosaic
 from rdstitch_cli.commands.pano import pano
@@ -47,7 +48,7 @@ def cli(context: click.Context, debug: bool) -> None:
     context.obj = debug
 
 
-for command in (pano, mosaic, calibrate, trajectory, undistort):
+for command in (pano, mosaic, apply, calibrate, trajectory, undistort):
     command.epilog = f"{command.epilog or ''}\n\n{EXIT_STATUSES}"
     cli.add_command(command)
 

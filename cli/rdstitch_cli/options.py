@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 Decorator = Callable[[Command], Command]
@@ -16,8 +17,7 @@ FEATURES = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk", "aliked
 SOLVERS = ("auto", "two-point", "three-point", "three-point-similarity", "four-point", "five-point")
 MODELS = ("auto", "rigid", "similarity", "tilting", "homography")
 
-# Whether a file can be read is for the library to say: it knows more, and has a status for it.
-PICTURE = click.Path(path_type=Path, readable=False)
+PICTURE = click.Path(path_type=Path)
 
 
 def together(*options: Callable[[Any], Any]) -> Decorator[Any]:
@@ -62,12 +62,13 @@ def resolve(inputs: tuple[Path, ...]) -> list[Path]:
     return named
 
 
+def is_given(name: str) -> bool:
+    """Whether the user set an option of the running command, rather than left it at its default."""
+    return click.get_current_context().get_parameter_source(name) not in (None, ParameterSource.DEFAULT)
+
+
 inputs = click.argument(
-    "inputs",
-    nargs=-1,
-    required=True,
-    type=click.Path(path_type=Path, readable=False, allow_dash=True),
-    metavar="INPUT...",
+    "inputs", nargs=-1, required=True, type=click.Path(path_type=Path, allow_dash=True), metavar="INPUT..."
 )
 
 every = click.option(
@@ -100,6 +101,10 @@ known = together(
     click.option("--tilt", type=Angles(), help="Known tilt of the camera to the plane, degrees."),
 )
 
+workers = click.option(
+    "-j", "--workers", type=click.IntRange(0), default=0, help="Threads; 0, the default, is one for each core."
+)
+
 estimation = together(
     click.option(
         "--features", type=click.Choice(FEATURES), default="rootsift", show_default=True, help="Features to match."
@@ -125,13 +130,13 @@ estimation = together(
         "--threshold", type=float, default=3.0, show_default=True, metavar="PX", help="Largest error of an inlier, px."
     ),
     click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of random sampling."),
-    click.option(
-        "-j", "--workers", type=click.IntRange(0), default=0, help="Threads; 0, the default, is one for each core."
-    ),
+    workers,
 )
 
+strict = click.option("--strict", is_flag=True, help="Fail with status 5 when a picture is left out.")
+
 trust = together(
-    click.option("--strict", is_flag=True, help="Fail with status 5 when a picture is left out."),
+    strict,
     click.option("--force", is_flag=True, help="Write the result even when it fails its own checks."),
 )
 

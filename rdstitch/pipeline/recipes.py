@@ -9,10 +9,11 @@ from typing import Literal
 
 import numpy as np
 
-from rdstitch.compositing import Composite, compose, plan_canvas
+from rdstitch.compositing import Composite
 from rdstitch.errors import ArgumentError, InputError, PartialResultError, RegistrationError
 from rdstitch.io.atomic import check_output, write_json_atomic, write_text_atomic
-from rdstitch.io.write import check_size, write_image
+from rdstitch.io.write import write_image
+from rdstitch.pipeline.composing import compose_pictures
 from rdstitch.pipeline.inputs import find_pictures
 from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.path_plot import path_as_svg
@@ -198,27 +199,17 @@ def _composite(
     """Judge, compose, write."""
     verdict = _accept(registration, options)
     alignment = registration.alignment
-    homographies = alignment.homographies
     used = np.flatnonzero(alignment.used)
-    cameras = [alignment.cameras[i] for i in used]
     sources = [registration.sources[i] for i in used]
-    canvas = plan_canvas(
-        cameras,
-        homographies[used],
-        scale=options.composite.scale,
-        rotate=options.composite.rotate,
-        reference=int(np.flatnonzero(used == alignment.reference)[0]),
-        names=[source.name for source in sources],
-    )
-    if output is not None:
-        check_size(output, canvas.size)
-    composite = compose(
-        readers(sources),
-        cameras,
-        homographies[used],
-        canvas,
-        replace(options.composite, workers=options.threads),
-        progress=lambda share: progress("compositing", round(100 * share), 100),
+    composite = compose_pictures(
+        sources,
+        [alignment.cameras[i] for i in used],
+        alignment.homographies[used],
+        int(np.flatnonzero(used == alignment.reference)[0]),
+        output,
+        options.composite,
+        options.threads,
+        progress,
     )
     result = StitchResult(registration, composite.canvas, verdict, options, None, composite)
     if output is not None:

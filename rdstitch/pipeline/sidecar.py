@@ -56,15 +56,9 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
         },
         "options": result.options,
         "seed": result.options.seed,
-        "versions": {
-            "rdstitch": version("rdstitch"),
-            "numpy": version("numpy"),
-            "scipy": version("scipy"),
-            "opencv": version("opencv-contrib-python-headless"),
-            "python": platform.python_version(),
-        },
+        "versions": versions(),
     }
-    return {key: _plain(value) for key, value in content.items()}
+    return {key: plain(value) for key, value in content.items()}
 
 
 def _images(result: StitchResult) -> list[dict[str, Any]]:
@@ -80,7 +74,7 @@ def _images(result: StitchResult) -> list[dict[str, Any]]:
             "used": used,
             "reason": reasons.pop(source.path, ""),
             "features": registration.keypoints[index],
-            **_lens(alignment.cameras[index]),
+            **lens_fields(alignment.cameras[index]),
             "to_plane": alignment.homographies[index] if used else None,
             "to_output": result.canvas.matrix @ alignment.homographies[index] if used else None,
             "pose": None,
@@ -101,7 +95,7 @@ def _images(result: StitchResult) -> list[dict[str, Any]]:
     return entries + unread
 
 
-def _lens(camera: Camera) -> dict[str, Any]:
+def lens_fields(camera: Camera) -> dict[str, Any]:
     """What of a picture's camera depends on the size of the picture, and λ with it."""
     return {
         "center_px": camera.center,
@@ -142,16 +136,27 @@ def _pairs(result: StitchResult) -> list[dict[str, Any]]:
     return entries
 
 
-def _plain(value: Any) -> Any:
+def versions() -> dict[str, str]:
+    """Versions of what has a say in the result."""
+    return {
+        "rdstitch": version("rdstitch"),
+        "numpy": version("numpy"),
+        "scipy": version("scipy"),
+        "opencv": version("opencv-contrib-python-headless"),
+        "python": platform.python_version(),
+    }
+
+
+def plain(value: Any) -> Any:
     """Plain JSON values: arrays to lists, dataclasses to objects, paths to text, what is not finite to null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {item.name: _plain(getattr(value, item.name)) for item in dataclasses.fields(value)}
+        return {item.name: plain(getattr(value, item.name)) for item in dataclasses.fields(value)}
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, (np.ndarray, np.generic)):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, float) and not math.isfinite(value):

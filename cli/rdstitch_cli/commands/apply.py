@@ -1,0 +1,83 @@
+"""``rdstitch apply``: compose again by a registration that was saved."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import click
+
+from rdstitch_cli import options
+from rdstitch_cli.progress import Reporter
+
+
+@click.command(
+    epilog="""\b
+Examples:
+  rdstitch apply field.tif.json --images flight/ -o field_again.tif --blend feather
+  rdstitch apply field_red.tif.json --images flight_nir/ -o field_nir.tif
+  rdstitch apply small.jpg.json --images originals/ -o large.tif --match name --strict
+"""
+)
+@click.argument("sidecar", type=options.PICTURE, metavar="SIDECAR")
+@click.option(
+    "--images",
+    type=options.PICTURE,
+    required=True,
+    multiple=True,
+    metavar="INPUT",
+    help="Pictures to compose: what 'rdstitch mosaic' takes; may be given several times.",
+)
+@options.output
+@options.overwrite
+@options.every
+@click.option(
+    "--match",
+    type=click.Choice(["auto", "name", "order"]),
+    default="auto",
+    show_default=True,
+    help="How pictures find their places: by name (the suffix may differ), by order, or by order if no name fits.",
+)
+@options.compositing
+@options.workers
+@options.strict
+@options.verbosity
+def apply(
+    sidecar: Path,
+    images: tuple[Path, ...],
+    output: Path,
+    overwrite: bool,
+    every: int,
+    match: Literal["auto", "name", "order"],
+    workers: int,
+    strict: bool,
+    quiet: bool,
+    verbose: bool,
+    **compositing: Any,
+) -> None:
+    """Compose pictures by the registration in a sidecar, without estimating anything.
+
+    The pictures are those that the sidecar was made from, or others taken by the same lens from the same places:
+    another band of the same flight, the originals of reduced pictures, masks. They may have another size of the same
+    shape. Compositing options that are not given are those of the sidecar.
+    """
+    from rdstitch.pipeline import apply as recipe
+    from rdstitch.pipeline.saved import read_sidecar
+
+    given = {name: value for name, value in compositing.items() if options.is_given(name)}
+    with Reporter(-quiet + verbose) as reporter:
+        result = recipe(
+            sidecar,
+            options.resolve(images),
+            output,
+            replace(read_sidecar(sidecar).composite, **given),
+            match=match,
+            every=every,
+            workers=workers,
+            overwrite=overwrite,
+            strict=strict,
+            progress=reporter,
+        )
+        for missing in result.left_out.values():
+            reporter.warn(f"left out {missing.path}: {missing.reason}")
+        if result.matched == "order" and match == "auto":
+            reporter.warn("no picture has a name of the sidecar; they were taken in order")

@@ -1,0 +1,93 @@
+"""What applying a saved registration gives, and the sidecar of that."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rdstitch.compositing import Canvas, Composite, CompositeOptions
+from rdstitch.pipeline.saved import SavedRegistration
+from rdstitch.pipeline.sidecar import lens_fields, plain, versions
+from rdstitch.pipeline.sources import LeftOut, Source
+
+
+@dataclass(frozen=True)
+class Recomposition:
+    """A picture made from a saved registration.
+
+    Attributes
+    ----------
+    saved : SavedRegistration
+    sources : tuple of Source or None
+        For each picture of the registration the one that took its place, with its camera; None where there is none.
+    matched : str
+        "name" or "order".
+    left_out : dict of int to LeftOut
+        Pictures that the registration used and that are not in the output, by their number, with the reason.
+    canvas : Canvas
+    composite_options : CompositeOptions
+    output : Path or None
+        File that the picture was written to.
+    composite : Composite or None
+        The picture itself; None where it went to a file.
+    """
+
+    saved: SavedRegistration
+    sources: tuple[Source | None, ...]
+    matched: str
+    left_out: Mapping[int, LeftOut]
+    canvas: Canvas
+    composite_options: CompositeOptions
+    output: Path | None = None
+    composite: Composite | None = None
+
+
+def applied_sidecar(result: Recomposition) -> dict[str, Any]:
+    """The sidecar of a recomposed picture: what was estimated then, of the pictures that are in it now.
+
+    It can be applied like any other. Pairs are those of the sidecar that was applied, and stay there.
+    """
+    then = result.saved.content
+    entries = [_image(result, index, dict(entry)) for index, entry in enumerate(then["images"])]
+    reference = next(
+        (index for index in (result.saved.reference, *range(len(entries))) if entries[index]["used"]), None
+    )
+    assert reference is not None, "a picture without any picture in it is never written"
+    source = result.sources[reference]
+    assert source is not None
+    camera = source.camera
+    content = {
+        **then,
+        "lambda_px": camera.distortion_px,
+        "lambda_focal": camera.distortion_focal,
+        "camera": {**camera.as_dict(), "lambda_std": then.get("lambda_std")},
+        "focal_px": camera.focal,
+        "reference": source.name,
+        "output": {
+            "file": None if result.output is None else result.output.name,
+            "size": result.canvas.size,
+            "plane_to_output": result.canvas.matrix,
+        },
+        "images": entries,
+        "pairs": [],
+        "options": {**then["options"], "composite": result.composite_options},
+        "versions": versions(),
+        "applied": {"sidecar": str(result.saved.path), "matched": result.matched},
+    }
+    return {key: plain(value) for key, value in content.items()}
+
+
+def _image(result: Recomposition, index: int, entry: dict[str, Any]) -> dict[str, Any]:
+    """One picture's entry, brought up to date."""
+    source, picture = result.sources[index], result.saved.pictures[index]
+    if source is None or picture.to_plane is None:
+        reason = result.left_out[index].reason if index in result.left_out else picture.reason
+        return {**entry, "used": False, "reason": reason, "to_plane": None, "to_output": None, "pose": None}
+    return {
+        **entry,
+        "name": source.name,
+        "path": str(source.path),
+        "size": source.camera.image_size,
+        **lens_fields(source.camera),
+        "to_output": result.canvas.matrix @ picture.to_plane,
+    }

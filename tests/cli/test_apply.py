@@ -1,0 +1,157 @@
+"""``rdstitch apply``, run for real."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rdstitch.io import read_image
+from tests.cli.running import FAST, Outcome, Run
+
+
+@pytest.fixture(scope="module")
+def stitched(frames: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A mosaic of ``frames`` with some options; never written to."""
+    from rdstitch_cli.main import run
+
+    folder = tmp_path_factory.mktemp("stitched")
+    arguments = ["mosaic", *map(str, frames), "-o", str(folder / "field.tif"), "--scale", "0.8", "--rotate", "10"]
+    assert run([*arguments, *FAST]) == 0
+    return folder / "field.tif"
+
+
+def _sidecar(picture: Path) -> Path:
+    return picture.with_name(picture.name + ".json")
+
+
+def _apply(rdstitch: Run, sidecar: Path, images: Path, output: Path, *options: str) -> Outcome:
+    return rdstitch("apply", sidecar, "--images", images, "-o", output, "-j", "1", *options)
+
+
+def test_same_pictures_give_the_same_bytes(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
+    output = tmp_path / "again.tif"
+    done = _apply(rdstitch, _sidecar(stitched), frames[0].parent, output)
+    assert (done.status, done.out, done.err) == (0, "", "")
+    assert output.read_bytes() == stitched.read_bytes()
+    then, now = (json.loads(_sidecar(picture).read_text(encoding="utf-8")) for picture in (stitched, output))
+    assert now.pop("applied") == {"sidecar": str(_sidecar(stitched)), "matched": "name"}
+    assert (now.pop("pairs"), now["output"].pop("file")) == ([], "again.tif")
+    assert now == {key: value for key, value in then.items() if key != "pairs"} | {"output": now["output"]}
+
+    third = tmp_path / "third.tif"
+    assert _apply(rdstitch, _sidecar(output), frames[0].parent, third).status == 0
+    assert third.read_bytes() == stitched.read_bytes()
+
+
+def test_given_options_win_over_those_of_the_sidecar(
+    rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path
+) -> None:
+    changed, direct = tmp_path / "changed.png", tmp_path / "direct.png"
+    options = ("--scale", "0.4", "--rotate", "0", "--blend", "feather")
+    assert _apply(rdstitch, _sidecar(stitched), frames[0].parent, changed, *options).status == 0
+    assert rdstitch("mosaic", *frames, "-o", direct, *options, *FAST).status == 0
+    assert changed.read_bytes() == direct.read_bytes()
+
+
+def _written(frames: list[Path], folder: Path, names: list[str], factor: float = 1.0, band: int | None = None) -> Path:
+    """The frames under other names, in another size, or one band of them."""
+    folder.mkdir()
+    for frame, name in zip(frames, names, strict=True):
+        picture = cv2.imread(str(frame))
+        assert picture is not None
+        if band is not None:
+            picture = picture[..., band]
+        assert cv2.imwrite(str(folder / name), cv2.resize(picture, None, fx=factor, fy=factor))
+    return folder
+
+
+def test_pictures_of_another_size(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
+    # The same names before the suffix.
+    large = _written(frames, tmp_path / "large", [frame.stem + ".bmp" for frame in frames], factor=2.0)
+    done = _apply(rdstitch, _sidecar(stitched), large, tmp_path / "large.tif")
+    assert (done.status, done.err) == (0, "")
+    small, twice = read_image(stitched), read_image(tmp_path / "large.tif")
+    assert np.abs(np.array(twice.pixels.shape[:2]) - 2 * np.array(small.pixels.shape[:2])).max() <= 2
+    assert small.alpha is not None
+    height, width = small.pixels.shape[:2]
+    reduced = cv2.resize(twice.pixels, (width, height), interpolation=cv2.INTER_AREA)
+    inside = cv2.erode(small.alpha, np.ones((15, 15), np.uint8)) > 0
+    a, b = (image[inside].astype(float).ravel() for image in (reduced, small.pixels))
+    assert np.corrcoef(a, b)[0, 1] > 0.98
+    record = json.loads((tmp_path / "large.tif.json").read_text(encoding="utf-8"))
+    assert [image["size"] for image in record["images"]] == [[800, 600]] * 3
+    assert record["camera"]["image_size"] == [800, 600]
+    assert record["lambda_px"] == pytest.approx(record["lambda"] / 500.0**2)
+    again = _apply(rdstitch, tmp_path / "large.tif.json", frames[0].parent, tmp_path / "small.tif")
+    assert (again.status, again.err) == (0, "")
+    # Centres are divided by two again; nothing else was rounded.
+    assert read_image(tmp_path / "small.tif").pixels.shape == small.pixels.shape
+
+
+def test_another_band_in_order(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
+    band = _written(frames, tmp_path / "nir", [f"nir{index}.png" for index in (1, 2, 10)], band=1)
+    done = _apply(rdstitch, _sidecar(stitched), band, tmp_path / "nir.tif")
+    assert done.status == 0
+    assert "in order" in done.line
+    quiet = _apply(rdstitch, _sidecar(stitched), band, tmp_path / "q.tif", "--match", "order")
+    assert (quiet.status, quiet.err) == (0, "")
+    assert (tmp_path / "q.tif").read_bytes() == (tmp_path / "nir.tif").read_bytes()
+    colour = tmp_path / "colour.tif"
+    assert _apply(rdstitch, _sidecar(stitched), frames[0].parent, colour).status == 0
+    grey, green = read_image(tmp_path / "nir.tif").pixels, read_image(colour).pixels[..., 1]
+    assert grey.shape == green.shape
+    assert np.abs(grey.astype(float) - green).mean() < 3.0
+    refused = _apply(rdstitch, _sidecar(stitched), band, tmp_path / "n.tif", "--match", "name")
+    assert refused.status == 3
+    assert frames[0].name in refused.line
+
+
+def test_a_missing_picture_is_named(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "some"
+    folder.mkdir()
+    for frame in frames[:2]:
+        shutil.copy(frame, folder)
+    done = _apply(rdstitch, _sidecar(stitched), folder, tmp_path / "some.tif")
+    assert done.status == 0
+    assert frames[2].name in done.line
+    record = json.loads((tmp_path / "some.tif.json").read_text(encoding="utf-8"))
+    assert [image["used"] for image in record["images"]] == [True, True, False]
+    strict = _apply(rdstitch, _sidecar(stitched), folder, tmp_path / "strict.tif", "--strict")
+    assert strict.status == 5
+    assert not (tmp_path / "strict.tif").exists()
+
+
+def test_what_does_not_fit_is_refused(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
+    sidecar = _sidecar(stitched)
+    fewer = _written(frames[:2], tmp_path / "fewer", ["x.png", "y.png"])
+    done = _apply(rdstitch, sidecar, fewer, tmp_path / "out.tif")
+    assert (done.status, str(sidecar) in done.line) == (3, True)
+    cut = tmp_path / "cut"
+    cut.mkdir()
+    for frame in frames:
+        assert cv2.imwrite(str(cut / frame.name), read_image(frame).pixels[:200])
+    done = _apply(rdstitch, sidecar, cut, tmp_path / "out.tif")
+    assert (done.status, str(cut / frames[0].name) in done.line) == (3, True)
+    shutil.copy(frames[0], cut / f"{frames[0].stem}.jpeg")
+    for picture in cut.glob("*.png"):
+        picture.rename(picture.with_suffix(".bmp"))
+    done = _apply(rdstitch, sidecar, cut, tmp_path / "out.tif")
+    assert (done.status, "several pictures" in done.line) == (3, True)
+    assert _apply(rdstitch, frames[0], frames[0].parent, tmp_path / "out.tif").status == 3
+    assert not (tmp_path / "out.tif").exists()
+
+
+def test_never_writes_over_the_sidecar_that_it_applies(
+    rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path
+) -> None:
+    for file in (stitched, _sidecar(stitched)):
+        shutil.copy(file, tmp_path)
+    own = tmp_path / stitched.name
+    done = _apply(rdstitch, _sidecar(own), frames[0].parent, own, "--overwrite")
+    assert (done.status, str(own) in done.line) == (6, True)
+    assert _sidecar(own).read_bytes() == _sidecar(stitched).read_bytes()
+    assert _apply(rdstitch, _sidecar(stitched), frames[0].parent, own).status == 6
+    assert _apply(rdstitch, _sidecar(stitched), frames[0].parent, own, "--overwrite").status == 0

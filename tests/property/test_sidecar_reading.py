@@ -1,0 +1,121 @@
+"""Whatever a sidecar holds, reading it gives a registration or one line that names the file and the field."""
+
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rdstitch.errors import InputError
+from rdstitch.pipeline.options import StitchOptions
+from rdstitch.pipeline.saved import read_sidecar
+from rdstitch.pipeline.sidecar import plain
+from tests.mutations import damaged, damaged_text
+
+_IMAGE = {
+    "name": "a.jpg",
+    "path": "flight/a.jpg",
+    "size": [400, 300],
+    "center_px": [199.5, 149.5],
+    "lambda": -0.2,
+    "lambda2": 0.0,
+    "focal_px": 380.0,
+    "focal_source": "exif",
+    "used": True,
+    "reason": "",
+    "to_plane": [[1.0, 0.0, 0.1], [0.0, 1.0, 0.2], [0.0, 0.01, 1.0]],
+}
+_LEFT_OUT = {**_IMAGE, "name": "b.jpg", "used": False, "reason": "no overlap", "to_plane": None}
+_UNREAD = {"name": "c.jpg", "path": "c.jpg", "size": None, "used": False, "reason": "is damaged"}
+GOOD: dict[str, Any] = {
+    "format": "rdstitch sidecar",
+    "version": 1,
+    "lambda": -0.2,
+    "reference": "a.jpg",
+    "images": [_IMAGE, _LEFT_OUT, _UNREAD],
+    "pairs": [],
+    "verdict": {"ok": True},
+    "options": plain(StitchOptions()),
+}
+
+
+def _write(folder: str | Path, content: bytes) -> Path:
+    file = Path(folder) / "out.tif.json"
+    file.write_bytes(content)
+    return file
+
+
+def _reads_or_complains(content: bytes) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        file = _write(folder, content)
+        complaint = ""
+        try:
+            saved = read_sidecar(file)
+            assert saved.pictures[saved.reference].to_plane is not None
+        except InputError as error:
+            complaint = str(error)
+        assert not complaint or str(file) in complaint
+
+
+def test_a_good_one_is_read_whole(tmp_path: Path) -> None:
+    saved = read_sidecar(_write(tmp_path, json.dumps(GOOD).encode()))
+    used, left_out, unread = saved.pictures
+    assert (saved.reference, saved.distortion, saved.composite) == (0, -0.2, StitchOptions().composite)
+    assert used.camera is not None
+    assert (used.camera.image_size, used.camera.focal, used.camera.focal_source) == ((400, 300), 380.0, "exif")
+    assert used.to_plane is not None
+    assert used.to_plane.tolist() == _IMAGE["to_plane"]
+    assert (left_out.to_plane, left_out.reason) == (None, "no overlap")
+    assert unread.camera is None
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "field"),
+    [
+        (("format",), "rdstitch camera", "format"),
+        (("version",), 2, "version"),
+        (("images", 0, "size"), "wide", "images[0].size"),
+        (("images", 0, "size"), [400], "images[0].size"),
+        (("images", 0, "size"), [400, 0], "images[0].size[1]"),
+        (("images", 0, "size"), None, "images[0].size"),
+        (("images", 0, "lambda"), -5, "images[0]"),
+        (("images", 0, "lambda"), True, "images[0].lambda"),
+        (("images", 0, "used"), 1, "images[0].used"),
+        (("images", 0, "focal_source"), "guesswork", "images[0].focal_source"),
+        (("images", 0, "to_plane"), [[1, 0, 0], [0, 1, 0], [1, 1, 0]], "images[0].to_plane"),
+        (("images", 0, "to_plane"), [[1, 0, 0], [0, "1", 0], [0, 0, 1]], "images[0].to_plane[1][1]"),
+        (("images",), [], "reference"),
+        (("reference",), "b.jpg", "reference"),
+        (("options", "composite", "blend"), "magic", "options.composite"),
+        (("options", "composite", "blur"), 1, "options.composite.blur"),
+        (("options", "composite", "scale"), float("inf"), "options.composite.scale"),
+    ],
+)
+def test_complaints_name_the_field(tmp_path: Path, path: tuple[str | int, ...], value: Any, field: str) -> None:
+    content = json.loads(json.dumps(GOOD))
+    holder = content
+    for key in path[:-1]:
+        holder = holder[key]
+    holder[path[-1]] = value
+    file = _write(tmp_path, json.dumps(content).encode())
+    with pytest.raises(InputError) as caught:
+        read_sidecar(file)
+    assert str(caught.value).startswith(f"{file}: {field}: ")
+
+
+@given(damaged(GOOD))
+def test_damaged_fields(content: Any) -> None:
+    _reads_or_complains(json.dumps(content).encode("utf-8", "surrogatepass"))
+
+
+@given(st.binary(max_size=200) | damaged_text(json.dumps(GOOD)))
+def test_damaged_text(content: bytes) -> None:
+    _reads_or_complains(content)
+
+
+@pytest.mark.parametrize("content", [b"[" * 100_000, b'{"a":' * 60 + b"1" + b"}" * 60, b"\xff\xfe" * 9, b"1" * 5000])
+def test_text_that_parsers_choke_on(content: bytes) -> None:
+    _reads_or_complains(content)
