@@ -2,10 +2,11 @@
 
 import math
 import os
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import click
 from click.core import ParameterSource
@@ -17,7 +18,8 @@ FEATURES = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk", "aliked
 SOLVERS = ("auto", "two-point", "three-point", "three-point-similarity", "four-point", "five-point")
 MODELS = ("auto", "rigid", "similarity", "tilting", "homography")
 
-PICTURE = click.Path(path_type=Path)
+# Whether a file can be read is for the library to say: it knows more, and has a status for it.
+PICTURE = click.Path(path_type=Path, readable=False)
 
 
 def together(*options: Callable[[Any], Any]) -> Decorator[Any]:
@@ -49,6 +51,23 @@ class Angles(click.ParamType[tuple[float, float]]):
         return psi, theta
 
 
+class Bytes(click.ParamType[int]):
+    """An amount of memory like ``800M`` or ``1.5G``; the value is in bytes."""
+
+    name = "SIZE"
+    units: ClassVar[dict[str, int]] = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Parse the text."""
+        if isinstance(value, int):
+            return value
+        parts = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([KMGT]?)(?:i?B)?\s*", str(value), re.IGNORECASE)
+        amount = int(float(parts[1]) * self.units[parts[2].upper()]) if parts else 0
+        if amount < 1:
+            self.fail(f"{value!r} is no amount of memory like 800M or 2G", param, ctx)
+        return amount
+
+
 def resolve(inputs: tuple[Path, ...]) -> list[Path]:
     """The inputs, with - replaced by the names on standard input, one a line or separated by NUL."""
     named: list[Path] = []
@@ -68,7 +87,11 @@ def is_given(name: str) -> bool:
 
 
 inputs = click.argument(
-    "inputs", nargs=-1, required=True, type=click.Path(path_type=Path, allow_dash=True), metavar="INPUT..."
+    "inputs",
+    nargs=-1,
+    required=True,
+    type=click.Path(path_type=Path, readable=False, allow_dash=True),
+    metavar="INPUT...",
 )
 
 every = click.option(
@@ -142,12 +165,49 @@ trust = together(
 
 compositing = together(
     click.option(
+        "--exposure",
+        type=click.Choice(["none", "gain", "blocks"]),
+        default="gain",
+        show_default=True,
+        help="Equal brightness: a gain per picture and one vignetting; blocks also evens out parts of pictures.",
+    ),
+    click.option(
+        "--seam",
+        type=click.Choice(["none", "voronoi", "graphcut"]),
+        default="graphcut",
+        show_default=True,
+        help="Where pictures meet: round what differs, midway, or wherever they overlap.",
+    ),
+    click.option(
         "--blend",
         type=click.Choice(["none", "feather", "multiband"]),
         default="multiband",
         show_default=True,
-        help="How pictures pass into one another.",
+        help="How pictures pass into one another; none cuts, for measuring.",
     ),
+    click.option(
+        "--crop",
+        type=click.Choice(["none", "auto"]),
+        default="none",
+        show_default=True,
+        help="Cut to the largest rectangle without holes.",
+    ),
+    click.option(
+        "--interpolation",
+        type=click.Choice(["linear", "cubic", "lanczos"]),
+        default="cubic",
+        show_default=True,
+        help="Kernel of the one resampling.",
+    ),
+    click.option(
+        "--background",
+        type=click.IntRange(0, 255),
+        default=0,
+        show_default=True,
+        metavar="GREY",
+        help="What no picture covers, in JPEG: 0 black to 255 white.",
+    ),
+    click.option("--max-memory", type=Bytes(), help="Memory that compositing may take; otherwise what suits the size."),
     click.option("--scale", type=float, default=1.0, show_default=True, help="Size of the output; 1 keeps resolution."),
     click.option(
         "--rotate", type=float, default=0.0, show_default=True, metavar="DEG", help="Turn the output clockwise."

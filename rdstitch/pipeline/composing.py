@@ -2,17 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from numpy.typing import ArrayLike
 
 from rdstitch.camera import Camera
 from rdstitch.compositing import Composite, CompositeOptions, compose, plan_canvas
-from rdstitch.io.read import read_image
 from rdstitch.io.write import check_size
 from rdstitch.pipeline.progress import Progress
-from rdstitch.pipeline.sources import Source
+from rdstitch.pipeline.sources import Source, readers
 
 
 def compose_pictures(
@@ -48,7 +46,7 @@ def compose_pictures(
     if output is not None:
         check_size(output, canvas.size)
     return compose(
-        [partial(read_image, source.path) for source in sources],
+        readers(sources),
         cameras,
         homographies,
         canvas,

@@ -21,7 +21,7 @@ from rdstitch.pipeline.progress import Progress, silent
 from rdstitch.pipeline.register import Registration, in_frame_of_reference, register
 from rdstitch.pipeline.result import StitchResult
 from rdstitch.pipeline.sidecar import sidecar
-from rdstitch.pipeline.sources import LeftOut, Source, read_sources, readers
+from rdstitch.pipeline.sources import LeftOut, Source, read_sources
 from rdstitch.pipeline.verdict import Verdict, judge
 from rdstitch.registration.trajectory import Trajectory
 
