@@ -11,6 +11,7 @@ from rdstitch.features import Features, Matcher
 from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.progress import Progress
 from rdstitch.registration.pairs import PairOptions, PairRegistration, estimate_pairs, match_pairs
+from rdstitch.registration.resting import most_rest, moving_features, show_motion
 from rdstitch.registration.voting import vote
 
 
@@ -49,6 +50,15 @@ class Pairing:
             progress=partial(self.progress, "registering pairs"),
         )
         return found if known is not None or distortion is None else [_without_vote(pair) for pair in found]
+
+    def look_past_rest(self, pairs: list[PairRegistration]) -> "tuple[Pairing, list[PairRegistration]]":
+        """Where most pairs seem to rest, the pairing and pairs of what moves; the same again where nothing does."""
+        threshold = self.options.threshold
+        if not most_rest(pairs, threshold):
+            return self, pairs
+        moving = replace(self, features=moving_features(self.features, pairs, threshold))
+        again = moving.estimate([(pair.image1, pair.image2) for pair in pairs])
+        return (moving, again) if show_motion(again, len(self.features), threshold) else (self, pairs)
 
     def rescue(self, pairs: list[PairRegistration]) -> list[PairRegistration]:
         """Estimate the pairs that failed again, with the λ that the others agree on."""

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.errors import ArgumentError, RegistrationError
 from rdstitch.registration.alignment import Alignment
+from rdstitch.registration.bundle_adjustment import Adjusted
 from rdstitch.registration.consistency import judge_in_triangles, misfitting_links
 from rdstitch.registration.graph import connected_components, spanning_tree
 from rdstitch.registration.initialization import relations_at
@@ -31,6 +32,9 @@ _LENS_STD = np.array([0.5, 0.05, 0.03, 0.03])
 
 _OBSERVABLE = 0.1
 """Standard deviation of λ from which on it counts as not observable."""
+
+_PLAUSIBLE = (-1.0, 0.5)
+"""Limits of λ: below, the corners see behind the camera; no lens pulls its corners in as far as above."""
 
 _UNCONFIRMED = 0.1
 """How much a link without a triangle that closes is relied on, relative to one with."""
@@ -157,7 +161,7 @@ def align(
     few = everything.thinned(thin_for_selection(len(links)))
     relations = relations_at(few, [link.relation for link in links], lens)
     apart = homography_apart(few, relations, lens, free_lens, known)
-    observable = options.distortion is not None or float(np.sqrt(apart.covariance[0, 0])) < _OBSERVABLE
+    observable = options.distortion is not None or _observable(apart)
     if observable:
         lens, relations = apart.parameters.lens, apart.homographies
     else:
@@ -200,6 +204,12 @@ def _lens_start(cameras: Sequence[Camera], options: AlignmentOptions, votes: Con
     if options.distortion is not None:
         lens[0] = options.distortion
     return lens, np.array([options.distortion is None, False, False, False])
+
+
+def _observable(apart: Adjusted) -> bool:
+    """Whether one homography a pair leaves λ well determined, at a value that a lens can have."""
+    distortion, std = float(apart.parameters.lens[0]), float(np.sqrt(apart.covariance[0, 0]))
+    return std < _OBSERVABLE and _PLAUSIBLE[0] < distortion < _PLAUSIBLE[1]
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,8 @@ BoolArray = NDArray[np.bool_]
 YAW, X, Y, LOG_HEIGHT, PSI, THETA = range(6)
 """Columns of a planar model's poses."""
 
+_LARGEST_LOG_HEIGHT = 10.0  # where the motion is none of the model's, heights may run away
+
 _AROUND_X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _TRACELESS = np.zeros((8, 3, 3))
 _TRACELESS[[0, 1, 2, 3, 4, 5], [0, 0, 1, 1, 2, 2], [1, 2, 0, 2, 0, 1]] = 1.0
@@ -167,6 +169,7 @@ class PlanarModel:
         """Poses after a step of shape (N, D)."""
         result = poses.copy()
         result[:, list(self.free)] += step
+        result[:, LOG_HEIGHT] = np.clip(result[:, LOG_HEIGHT], -_LARGEST_LOG_HEIGHT, _LARGEST_LOG_HEIGHT)
         return result
 
     def offsets(self, poses: FloatArray) -> FloatArray:

@@ -197,8 +197,18 @@ class NormalEquations:
         )
 
     def shared_information(self) -> FloatArray:
-        """Information (S, S) on the shared parameters when nothing is known of the poses: ``C - B' A⁻¹ B``."""
-        return self._eliminate(0.0)[0]
+        """Information (S, S) on the shared parameters when nothing is known of the poses: ``C - B' A⁻¹ B``.
+
+        Poses that nothing holds are damped as little as makes them solvable; where nothing does, nothing is known.
+        """
+        for damping in (0.0, 1e-12, 1e-8, 1e-4):
+            try:
+                information = self._eliminate(damping)[0]
+            except RuntimeError:  # singular
+                continue
+            if np.isfinite(information).all():
+                return information
+        return np.zeros_like(self.shared)
 
     def _eliminate(self, damping: float) -> tuple[FloatArray, FloatArray]:
         """The Schur complement (S, S) and ``A⁻¹ [B, gradient]``."""

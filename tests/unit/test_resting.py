@@ -1,0 +1,77 @@
+"""What rests in the pictures does not hide what moves; and where nothing moves, nothing is lost."""
+
+from functools import partial
+
+import numpy as np
+
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.features import Features, match
+from rdstitch.pipeline.options import StitchOptions
+from rdstitch.pipeline.pairing import Pairing
+from rdstitch.pipeline.progress import silent
+from rdstitch.registration.resting import rests
+
+LENS = Camera((640, 480), distortion=-0.2, focal=520.0)
+PICTURES = 4
+
+
+def _features(points: FloatArray, descriptors: FloatArray) -> Features:
+    count = len(points)
+    one = np.ones(count)
+    return Features(points, descriptors.astype(np.float32), one, one, one, None, "rootsift", LENS.image_size)
+
+
+def _descriptors(count: int, rng: np.random.Generator) -> FloatArray:
+    drawn = rng.normal(size=(count, 64))
+    unit: FloatArray = drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+    return unit
+
+
+def _pairing(resting: int, moving: int, seed: int = 0) -> Pairing:
+    """Pictures in which some points rest, while a board with others is carried about, or is not there."""
+    rng = np.random.default_rng(seed)
+    background = rng.uniform((0, 0), (639, 479), (resting, 2))
+    board = rng.uniform(-0.5, 0.5, (moving, 2)) * 1.2
+    names = _descriptors(resting + moving, rng)
+    found = []
+    for index in range(PICTURES):
+        angle, offset = 0.3 * index, np.array([0.12, -0.08]) * index
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        seen = board @ turn.T + offset
+        flat = seen / (1.0 + seen @ np.array([0.1 * index, 0.05 * index]))[:, None]
+        points = np.concatenate([background, LENS.distort(LENS.denormalize(flat / 2.0 * 1.2))])
+        points += rng.normal(scale=0.2, size=points.shape)
+        inside = ((points > 0) & (points < (639, 479))).all(axis=1)
+        found.append(_features(points[inside], names[inside]))
+    matcher = partial(match, ratio=None)
+    return Pairing(found, [LENS.with_focal()] * PICTURES, matcher, StitchOptions(workers=1), silent)
+
+
+ALL = [(i, j) for i in range(PICTURES) for j in range(i + 1, PICTURES)]
+
+
+def test_a_moving_board_is_found_before_a_resting_background() -> None:
+    pairing = _pairing(400, 150)
+    alone = pairing.estimate(ALL)
+    assert all(rests(pair, 3.0) for pair in alone)
+    moving, again = pairing.look_past_rest(alone)
+    assert moving is not pairing
+    assert all(pair.relation and not rests(pair, 3.0) for pair in again)
+    distortion = np.median([pair.relation.distortion for pair in again])
+    assert abs(distortion - LENS.distortion) < 0.02
+
+
+def test_pictures_that_really_rest_stay_together() -> None:
+    pairing = _pairing(400, 0)
+    alone = pairing.estimate(ALL)
+    same, again = pairing.look_past_rest(alone)
+    assert same is pairing
+    assert again is alone
+    assert all(rests(pair, 3.0) for pair in again)
+
+
+def test_a_few_resting_points_change_nothing() -> None:
+    pairing = _pairing(40, 300)
+    alone = pairing.estimate(ALL)
+    assert not any(rests(pair, 3.0) for pair in alone)
+    assert pairing.look_past_rest(alone) == (pairing, alone)
