@@ -16,6 +16,7 @@ FIGURES = {
     "figure4": "noise, tilt known",
     "figure5": "pairs through a fisheye lens, stitched",
     "figure7": "inliers against RANSAC iterations",
+    "figure8": "votes on λ, and a chart undistorted and rectified",
     "figure9": "trajectories",
     "figure10": "aerial surveys with and without λ",
     "end_to_end": "rendered sets stitched by rdstitch and by the peers",

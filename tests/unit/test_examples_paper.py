@@ -2,13 +2,26 @@
 
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from examples.paper import aerial, end_to_end, figure2, figure3, figure4, figure5, figure7, figure9, figure10, runtime
+from examples.paper import (
+    aerial,
+    end_to_end,
+    figure2,
+    figure3,
+    figure4,
+    figure5,
+    figure7,
+    figure8,
+    figure9,
+    figure10,
+    runtime,
+)
 from examples.paper.__main__ import main
 from examples.paper.constraints import planar_quartics, quartic_monomials
 from examples.paper.report import Report, Table, save
@@ -111,6 +124,33 @@ def test_figure5_stitches_through_a_lens_that_is_no_division_model() -> None:
     assert measured["95 %, px"] < 1.0
     assert all(picture.shape[0] > 240 and picture.std() > 10.0 for picture in report.pictures.values())
     assert [note.split(" are ")[0] for note in report.notes] == [f"the real pictures {n}" for n in figure5.REAL_PAIRS]
+
+
+def test_figure8_the_votes_straighten_and_rectify_a_chart() -> None:
+    report = figure8.run(TINY)
+    votes, chart = report.tables
+    errors = {name: votes.row(name)["λ error"] for name in votes.column("solver")}
+    assert errors[figure8.WEIGHTED] < 2e-3
+    assert errors[figure8.ADJUSTED] < 2e-3
+    assert votes.row(figure8.OWN)["interquartile range"] < 0.5 * votes.row("5 points")["interquartile range"]
+    straight, rectified = "off by a homography, %", "off by a similarity, %"
+    measured, undistorted, final = (chart.row(name) for name in chart.column("picture"))
+    assert undistorted[straight] < 0.01 * measured[straight]
+    assert final[rectified] < 0.1 * undistorted[rectified]
+    assert len(report.notes) == len(figure8.BOARDS)
+
+
+def test_a_real_board_is_straightened_without_knowing_that_it_is_one(
+    shared_data: Callable[[str], Path],
+) -> None:
+    folder = shared_data("opencv_chess_right")
+    pictures = Settings(Effort.TINY, folder.parent)
+    corners, truth = figure8.BOARDS["opencv_chess_right"]
+    found = figure8.vote_on_boards(pictures.real_sequence(folder.name), corners, truth, reach=1)
+    assert len(found.votes) >= 10
+    assert abs(found.adjusted - truth) < 0.02
+    assert found.off_by_adjusted < 1.2 * found.off_by_truth < 0.3 * found.off_before
+    assert found.picture.std() > 20.0
 
 
 def test_figure9_adjustment_brings_every_start_to_the_same_trajectory() -> None:

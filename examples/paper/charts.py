@@ -1,0 +1,102 @@
+"""Chessboards: seen by a camera, found in pictures, undistorted, laid on their grid, and drawn so."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from examples.paper.report import Pixels
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.compositing import Canvas, CompositeOptions, compose
+from rdstitch.io.read import read_image
+from rdstitch.synthetic import PictureTexture, Poses, fit_homography, fit_similarity, sequence_over
+from rdstitch.synthetic import Sequence as RenderedSequence
+from rdstitch.synthetic.fitting import apply
+
+_SQUARE = 80  # texels of a rendered chart
+_SQUARES = 30  # a side
+_DARK, _LIGHT = 40, 225
+_HALF_WINDOW = 5  # px, for finding corners to a fraction of a pixel
+_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-4)
+_AS_IT_IS = CompositeOptions(exposure="none", seam="none", blend="none", background=255)
+
+
+def rendered_chart(camera: Camera, tilt: tuple[float, float], yaw: float) -> RenderedSequence:
+    """One picture of an endless chessboard; a texel is a pixel at the picture's centre."""
+    dark = np.indices((_SQUARES, _SQUARES)).sum(axis=0) % 2 == 0
+    chart = np.kron(np.where(dark, _DARK, _LIGHT), np.ones((_SQUARE, _SQUARE))).astype(np.uint8)
+    assert camera.focal is not None
+    return sequence_over(PictureTexture(chart), camera, Poses.of([(0.0, 0.0)], camera.focal, yaw, tilt))
+
+
+def seen_corners(sequence: RenderedSequence) -> tuple[FloatArray, FloatArray]:
+    """Corners of the rendered chart that the picture shows: measured px, and grid coordinates, both (N, 2)."""
+    steps = np.arange(1.0, _SQUARES)
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    points = sequence.to_picture(0, grid * _SQUARE - 0.5)
+    limit = np.array(sequence.lens.image_size) - 1.0
+    with np.errstate(invalid="ignore"):
+        seen = ((points >= 0.0) & (points <= limit)).all(axis=1)
+    return points[seen], grid[seen]
+
+
+def find_boards(files: Sequence[Path], corners: tuple[int, int]) -> tuple[Camera, dict[Path, FloatArray]]:
+    """The corners (N, 2), px, of the board in every picture that shows all of it, and the camera of blank λ."""
+    boards, size = {}, (0, 0)
+    for file in files:
+        grey = np.asarray(read_image(file).pixels)
+        grey = grey if grey.ndim == 2 else cv2.cvtColor(grey, cv2.COLOR_RGB2GRAY)
+        found, points = cv2.findChessboardCorners(grey, corners)
+        if found and size in ((0, 0), grey.shape[::-1]):
+            cv2.cornerSubPix(grey, points, (_HALF_WINDOW, _HALF_WINDOW), (-1, -1), _STOP)
+            boards[file], size = points.reshape(-1, 2).astype(np.float64), grey.shape[::-1]
+    return Camera((int(size[0]), int(size[1]))), boards
+
+
+def board_grid(corners: tuple[int, int]) -> FloatArray:
+    """Grid coordinates of a board's corners in the order in which they are found, shape (N, 2)."""
+    across, down = corners
+    return np.stack(np.meshgrid(np.arange(float(across)), np.arange(float(down))), axis=-1).reshape(-1, 2)
+
+
+def off_grid(points: FloatArray, grid: FloatArray, *, metric: bool) -> float:
+    """Rms distance from the grid, % of a square, after the best similarity (metric) or homography."""
+    fit = fit_similarity if metric else fit_homography
+    residual = apply(fit(points, grid), points) - grid
+    return 100.0 * float(np.sqrt((residual**2).sum(axis=1).mean()))
+
+
+def undistorted(camera: Camera, points: FloatArray) -> FloatArray:
+    """Measured px to undistorted coordinates in half diagonals."""
+    return camera.normalize(camera.undistort(points))
+
+
+def before_and_after(file: Path, camera: Camera, to_grid: FloatArray, size: tuple[float, float], px: float) -> Pixels:
+    """A picture beside itself, undistorted and rectified.
+
+    Parameters
+    ----------
+    camera : Camera
+        With the λ that undistorts it.
+    to_grid : ndarray of shape (3, 3)
+        Undistorted half diagonals to grid coordinates, of which the square from (0, 0) to ``size`` is drawn.
+    px : float
+        Size of a square.
+    """
+    width, height = (round(px * extent) for extent in size)
+    frame = np.array([(0.0, 0.0), (width - 1.0, 0.0), (width - 1.0, height - 1.0), (0.0, height - 1.0)])
+    canvas = Canvas((width, height), np.diag([px, px, 1.0]), (frame,))
+    after = compose([partial(read_image, file)], [camera], to_grid[None], canvas, _AS_IT_IS)
+    pixels = np.where(after.alpha[..., None] > 0, _as_rgb(after.pixels), np.uint8(255))
+    measured = _as_rgb(np.asarray(read_image(file).pixels))
+    shape = (round(measured.shape[1] * height / measured.shape[0]), height)
+    before = cv2.resize(measured, shape, interpolation=cv2.INTER_AREA)
+    gap = np.full((height, 8, 3), 255, np.uint8)
+    both: Pixels = np.concatenate([before, gap, pixels], axis=1)
+    return both
+
+
+def _as_rgb(pixels: Pixels) -> Pixels:
+    return pixels if pixels.ndim == 3 else np.repeat(pixels[:, :, None], 3, axis=2)
