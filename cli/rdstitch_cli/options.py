@@ -124,11 +124,19 @@ known = together(
     click.option("--tilt", type=Angles(), help="Known tilt of the camera to the plane, degrees."),
 )
 
+mask = click.option(
+    "--mask",
+    type=PICTURE,
+    metavar="DIR|FILE",
+    help="Black is excluded: a folder of masks with the pictures' names, or one mask for all pictures.",
+)
+
 workers = click.option(
     "-j", "--workers", type=click.IntRange(0), default=0, help="Threads; 0, the default, is one for each core."
 )
 
 estimation = together(
+    mask,
     click.option(
         "--features", type=click.Choice(FEATURES), default="rootsift", show_default=True, help="Features to match."
     ),

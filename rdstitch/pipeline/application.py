@@ -16,6 +16,7 @@ from rdstitch.io.atomic import check_output, write_json_atomic
 from rdstitch.io.write import write_image
 from rdstitch.pipeline.composing import compose_pictures
 from rdstitch.pipeline.inputs import find_pictures
+from rdstitch.pipeline.masks import with_masks
 from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.progress import Progress, silent
 from rdstitch.pipeline.recomposition import Recomposition, applied_sidecar
@@ -33,6 +34,7 @@ def apply(
     composite: CompositeOptions | None = None,
     *,
     match: Match = "auto",
+    mask: str | Path | None = None,
     every: int = 1,
     workers: int = 0,
     overwrite: bool = False,
@@ -55,6 +57,8 @@ def apply(
     match : str
         Which picture takes whose place. "name": the one of the same file name, or of the same name before the suffix.
         "order": the one at the same position of equally many. "auto": by name, or by order where no name is the same.
+    mask : path, optional
+        Picture, or folder of them, that is dark where the pictures do not count.
     every : int
         Of a video, every so manieth frame.
     workers : int
@@ -90,6 +94,7 @@ def apply(
         if not used:
             first = next(iter(left_out.values()))
             raise InputError(f"{saved.path}: none of its pictures can be used; {first.path}: {first.reason}")
+        used = dict(zip(used, with_masks(list(used.values()), mask), strict=True))
         picture = compose_pictures(
             list(used.values()),
             [source.camera for source in used.values()],

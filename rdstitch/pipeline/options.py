@@ -34,6 +34,7 @@ class StitchOptions:
     distortion: float | None = None  # known λ, half-diagonal frame; kept
     focal: float | None = None  # known focal length, px
     tilt: tuple[float, float] | None = None  # known tilt (psi, theta) of all pictures, radians
+    mask: str | Path | None = None  # picture, or folder of them, that is dark where the pictures do not count
     reference: str | None = None  # name of the picture whose frame is kept; None: the best connected
     composite: CompositeOptions = field(default_factory=CompositeOptions)
     seed: int = 0

@@ -15,6 +15,7 @@ from rdstitch.io.atomic import check_output, write_json_atomic, write_text_atomi
 from rdstitch.io.write import write_image
 from rdstitch.pipeline.composing import compose_pictures
 from rdstitch.pipeline.inputs import find_pictures
+from rdstitch.pipeline.masks import with_masks
 from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.path_plot import path_as_svg
 from rdstitch.pipeline.progress import Progress, silent
@@ -190,7 +191,7 @@ def _read(paths: Sequence[str | Path], options: StitchOptions, *, skip_bad: bool
         if unread:
             raise InputError(f"fewer than two pictures can be read; {unread[0].reason}")
         raise ArgumentError("stitching needs two different pictures or more; name at least one more")
-    return sources, unread
+    return with_masks(sources, options.mask), unread
 
 
 def _composite(

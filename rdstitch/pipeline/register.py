@@ -9,7 +9,7 @@ import numpy as np
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError, RegistrationError
 from rdstitch.features import Features, LightGlue, Matcher, detect_all, match
-from rdstitch.io.read import Pixels, read_image
+from rdstitch.io.read import Pixels
 from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.pairing import Pairing
 from rdstitch.pipeline.progress import Progress, silent
@@ -139,7 +139,7 @@ def _detect(
 
     def load(index: int) -> tuple[Pixels, Pixels | None]:
         try:
-            picture = read_image(sources[index].path)
+            picture = sources[index].read()
         except InputError as error:
             if not skip_bad:
                 raise

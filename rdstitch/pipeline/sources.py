@@ -5,8 +5,11 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError
+from rdstitch.io.mask import read_mask
 from rdstitch.io.metadata import Metadata, read_metadata
 from rdstitch.io.read import Picture, read_image
 
@@ -21,11 +24,14 @@ class Source:
     metadata : Metadata
     camera : Camera
         What is known of the camera before registration: size, centre, focal length, and λ where it was given.
+    mask : Path or None
+        Picture that is dark where this one does not count.
     """
 
     path: Path
     metadata: Metadata
     camera: Camera
+    mask: Path | None = None
 
     @property
     def name(self) -> str:
@@ -33,7 +39,7 @@ class Source:
         return self.path.name
 
     def read(self) -> Picture:
-        """The pixels.
+        """The pixels; what the mask excludes is transparent.
 
         Raises
         ------
@@ -45,7 +51,12 @@ class Source:
         if (width, height) != self.camera.image_size:
             before = "{} x {}".format(*self.camera.image_size)
             raise InputError(f"{self.path}: has {width} x {height} px now, but had {before} before; run again")
-        return picture
+        if self.mask is None:
+            return picture
+        alpha = read_mask(self.mask, (width, height))
+        if picture.alpha is not None:
+            alpha = np.minimum(alpha, picture.alpha)
+        return replace(picture, alpha=alpha)
 
 
 def readers(sources: Sequence[Source]) -> list[Callable[[], Picture]]:

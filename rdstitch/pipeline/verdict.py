@@ -59,7 +59,7 @@ def judge(registration: Registration, threshold: float, workers: int = 1) -> Ver
         failures.append(f"only {kept} of {given} matches of the pairs agree with the whole")
     checked = check_overlaps(registration, workers)
     failures.extend(_unlike(names, checked))
-    doubts = (*_disagreeing(names, used), *_little_alike(names, checked), *_several_cameras(registration))
+    doubts = (*_disagreeing(names, used), *_little_alike(names, checked), *_inputs(registration))
     return Verdict(not failures, tuple(failures), doubts)
 
 
@@ -90,6 +90,20 @@ def _disagreeing(names: Sequence[str], used: Sequence[LinkFit]) -> list[str]:
         for fit in used
         if fit.inliers < _LEAST_INLIERS * fit.count
     ]
+
+
+def _inputs(registration: Registration) -> list[str]:
+    """What may be wrong with the pictures themselves."""
+    return [*_several_cameras(registration), *_unmasked(registration)]
+
+
+def _unmasked(registration: Registration) -> list[str]:
+    """Pictures without a mask among others that have one: perhaps a name is misspelt."""
+    without = [source.name for source in registration.sources if source.mask is None]
+    if not 0 < len(without) < len(registration.sources):
+        return []
+    named = ", ".join(without[:3]) + ", …" * (len(without) > 3)
+    return [f"{len(without)} of {len(registration.sources)} pictures have no mask: {named}"]
 
 
 def _several_cameras(registration: Registration) -> list[str]:

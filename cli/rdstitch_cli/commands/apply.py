@@ -37,6 +37,7 @@ Examples:
     show_default=True,
     help="How pictures find their places: by name (the suffix may differ), by order, or by order if no name fits.",
 )
+@options.mask
 @options.compositing
 @options.workers
 @options.strict
@@ -48,6 +49,7 @@ def apply(
     overwrite: bool,
     every: int,
     match: Literal["auto", "name", "order"],
+    mask: Path | None,
     workers: int,
     strict: bool,
     quiet: bool,
@@ -71,6 +73,7 @@ def apply(
             output,
             replace(read_sidecar(sidecar).composite, **given),
             match=match,
+            mask=mask,
             every=every,
             workers=workers,
             overwrite=overwrite,

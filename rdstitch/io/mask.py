@@ -1,0 +1,71 @@
+"""Masks: pictures that say which part of another picture counts."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.errors import InputError
+from rdstitch.io.metadata import read_metadata
+from rdstitch.io.read import read_image
+
+_OPAQUE = 255
+
+
+def check_mask(path: str | Path, picture: str | Path, size: tuple[int, int]) -> None:
+    """Find out from its header whether a mask fits to a picture.
+
+    Parameters
+    ----------
+    path, picture : path
+        The mask, and the picture that it is for.
+    size : (int, int)
+        Width and height of the picture, px.
+
+    Raises
+    ------
+    InputError
+        When the mask cannot be read, or has another shape than the picture; the text names it.
+    """
+    (width, height), (w, h) = size, read_metadata(path).size
+    # Sizes are whole px, so that the shape may differ by one px of the larger.
+    if abs(width * h - height * w) > max(width, height, w, h):
+        raise InputError(
+            f"{path}: a mask of {w} x {h} px does not fit on {picture}, which has {width} x {height} px; "
+            "a mask has its picture's size, or another size of the same shape"
+        )
+
+
+def read_mask(path: str | Path, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Read a mask as alpha for a picture.
+
+    What is darker than half of the mask's brightest value is excluded, so that masks of 0 and 1, masks of 0 and 255,
+    and lossily compressed ones all mean what they show. What is transparent in the mask is excluded, too.
+
+    Parameters
+    ----------
+    path : path
+    size : (int, int)
+        Width and height, px, that the mask is brought to; nearest pixels.
+
+    Returns
+    -------
+    ndarray of shape (height, width), uint8
+        255 where the picture counts, 0 where it is excluded.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read.
+    """
+    mask = read_image(path)
+    light = mask.pixels if mask.pixels.ndim == 2 else mask.pixels.max(axis=2)
+    brightest = light.max()
+    counts = light >= (brightest / 2 if brightest > 0 else 1)
+    if mask.alpha is not None:
+        counts &= mask.alpha >= (_OPAQUE + 1) // 2
+    height, width = counts.shape
+    rows = (np.arange(size[1]) + 0.5) * (height / size[1])
+    columns = (np.arange(size[0]) + 0.5) * (width / size[0])
+    resized = counts[np.ix_(rows.astype(np.intp), columns.astype(np.intp))]
+    return np.where(resized, np.uint8(_OPAQUE), np.uint8(0))

@@ -1,0 +1,102 @@
+"""``--mask``: what it excludes is neither matched nor shown."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rdstitch.io import read_image
+from tests.cli.running import DISTORTION, FAST, Run
+
+LEG = (255, 0, 255)
+
+
+@pytest.fixture
+def legs(frames: list[Path], tmp_path: Path) -> Path:
+    """The pictures, each with the same textured leg in it, which moves with the camera; the mask beside them."""
+    folder = tmp_path / "legs"
+    folder.mkdir()
+    mask = np.full((300, 400), 255, np.uint8)
+    cv2.fillPoly(mask, [np.array([[0, 170], [150, 190], [170, 215], [0, 230]])], 0)
+    leg = np.zeros((300, 400, 3), np.uint8)
+    leg[:] = LEG
+    leg[np.random.default_rng(0).random((300, 400)) < 0.2] = 0
+    for path in frames:
+        picture = cv2.imread(str(path))
+        assert picture is not None
+        picture[mask == 0] = leg[mask == 0]
+        assert cv2.imwrite(str(folder / path.name), picture)
+    assert cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    return folder
+
+
+def leg_pixels(output: Path) -> int:
+    """Number of px that have the leg's colour."""
+    picture = read_image(output)
+    assert picture.alpha is not None
+    away = np.abs(picture.pixels.astype(int) - LEG).max(axis=2)
+    return int(((away < 60) & (picture.alpha > 0)).sum())
+
+
+@pytest.mark.parametrize("command", ["mosaic", "pano"])
+@pytest.mark.parametrize("one", [True, False])
+def test_a_leg_is_neither_matched_nor_shown(
+    rdstitch: Run, legs: Path, tmp_path: Path, command: str, *, one: bool
+) -> None:
+    mask = tmp_path / "mask.png"
+    if not one:
+        (tmp_path / "masks").mkdir()
+        for path in legs.iterdir():
+            shutil.copy(mask, tmp_path / "masks" / path.name)
+        mask = tmp_path / "masks"
+    output = tmp_path / "out.png"
+    done = rdstitch(command, *sorted(legs.iterdir()), "-o", output, "--mask", mask, *FAST)
+    assert (done.status, done.err) == (0, "")
+    assert abs(float(done.out) - DISTORTION) < 0.01
+    assert leg_pixels(output) == 0
+    record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
+    assert record["options"]["mask"] == str(mask)
+
+
+def test_without_a_mask_the_leg_is_seen_and_apply_takes_masks_too(rdstitch: Run, legs: Path, tmp_path: Path) -> None:
+    output, again = tmp_path / "out.png", tmp_path / "again.png"
+    assert rdstitch("mosaic", legs, "-o", output, "--mask", tmp_path / "mask.png", *FAST).status == 0
+    arguments = ("apply", f"{output}.json", "--images", legs, "-o", again, "--overwrite", "-j", "1")
+    assert rdstitch(*arguments).status == 0
+    assert leg_pixels(again) > 1000
+    assert rdstitch(*arguments, "--mask", tmp_path / "mask.png").status == 0
+    np.testing.assert_array_equal(read_image(again).pixels, read_image(output).pixels)
+
+
+@pytest.mark.parametrize(("command", "suffix"), [("calibrate", "json"), ("trajectory", "csv")])
+def test_masks_help_where_nothing_is_composited(
+    rdstitch: Run, legs: Path, tmp_path: Path, command: str, suffix: str
+) -> None:
+    done = rdstitch(command, legs, "-o", tmp_path / f"out.{suffix}", "--mask", tmp_path / "mask.png", *FAST)
+    assert done.status == 0
+    assert abs(float(done.out) - DISTORTION) < 0.01
+
+
+def test_pictures_without_a_mask_are_told(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    (tmp_path / "masks").mkdir()
+    assert cv2.imwrite(str(tmp_path / "masks" / f"{frames[0].stem}.bmp"), np.full((30, 40), 255, np.uint8))
+    done = rdstitch("pano", *frames, "-o", tmp_path / "out.png", "--mask", tmp_path / "masks", *FAST)
+    assert done.status == 0
+    assert done.line.endswith(f"2 of 3 pictures have no mask: {frames[1].name}, {frames[2].name}")
+
+
+def test_a_mask_that_does_not_fit_is_named(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    mask = tmp_path / "mask.png"
+    arguments = ("mosaic", frames[0].parent, "-o", tmp_path / "out.png", "--mask", mask, *FAST)
+    done = rdstitch(*arguments)
+    assert done.status == 3
+    assert str(mask) in done.line
+    assert cv2.imwrite(str(mask), np.full((40, 30), 255, np.uint8))
+    done = rdstitch(*arguments)
+    assert done.status == 3
+    assert f"{mask}: a mask of 30 x 40 px does not fit" in done.line
+    mask.write_bytes(b"no picture")
+    assert rdstitch(*arguments).status == 3
