@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rdstitch import solvers
     from rdstitch.camera import Camera
+    from rdstitch.camera_files import load_camera, save_camera
     from rdstitch.compositing import CompositeOptions
     from rdstitch.features import FeatureOptions
     from rdstitch.pipeline import (
@@ -36,6 +37,8 @@ _HOMES = {
     "StitchResult": "rdstitch.pipeline",
     "estimate_radial_homography": "rdstitch.robust",
     "apply": "rdstitch.pipeline",
+    "load_camera": "rdstitch.camera_files",
+    "save_camera": "rdstitch.camera_files",
     "calibrate": "rdstitch.pipeline",
     "mosaic": "rdstitch.pipeline",
     "pano": "rdstitch.pipeline",
@@ -55,8 +58,10 @@ __all__ = [
     "apply",
     "calibrate",
     "estimate_radial_homography",
+    "load_camera",
     "mosaic",
     "pano",
+    "save_camera",
     "solvers",
     "trajectory",
     "undistort",

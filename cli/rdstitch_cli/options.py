@@ -111,10 +111,13 @@ verbosity = together(
 
 lens = together(
     click.option(
-        "--camera", type=PICTURE, metavar="FILE", help="Camera file with a known lens; λ is then not estimated."
+        "--camera",
+        type=PICTURE,
+        metavar="FILE",
+        help="Camera file of rdstitch, OpenCV, OpenDroneMap or Hugin; its λ is kept.",
     ),
     click.option(
-        "--lambda", "distortion", type=float, metavar="L", help="Known λ for half the image diagonal; not estimated."
+        "--lambda", "distortion", type=float, metavar="L", help="Known λ for half the image diagonal; it is kept."
     ),
 )
 

@@ -9,10 +9,27 @@ import click
 from rdstitch_cli.progress import Reporter
 
 if TYPE_CHECKING:
+    from rdstitch.camera import Camera
     from rdstitch.pipeline import Registration, StitchOptions, StitchResult
 
 
+def read_lens(file: Path | None, reporter: Reporter) -> "Camera | None":
+    """The camera of a file; how well λ describes the lens of a foreign one is said on standard error."""
+    from rdstitch.camera_files import read_camera_file
+
+    if file is None:
+        return None
+    found = read_camera_file(file)
+    if found.fit is not None:
+        reporter.warn(
+            f"{file}: λ = {found.camera.distortion:.6f} was fitted to the {found.kind} lens model, "
+            f"rms {found.fit.rms:.2f} px, at most {found.fit.largest:.2f} px"
+        )
+    return found.camera
+
+
 def stitch_options(
+    reporter: Reporter,
     *,
     camera: Path | None,
     features: str,
@@ -23,7 +40,6 @@ def stitch_options(
     **given: Any,
 ) -> "StitchOptions":
     """The library's options from a command's flags."""
-    from rdstitch.camera import Camera
     from rdstitch.compositing import CompositeOptions
     from rdstitch.features import FeatureOptions
     from rdstitch.pipeline import StitchOptions
@@ -37,7 +53,7 @@ def stitch_options(
         name: given.pop(name) for name in CompositeOptions.__dataclass_fields__ if name in given and name != "workers"
     }
     return StitchOptions(
-        camera=None if camera is None else Camera.load(camera),
+        camera=read_lens(camera, reporter),
         features=FeatureOptions(**wanted),
         composite=CompositeOptions(**composite),
         solver=solver.replace("-", "_"),

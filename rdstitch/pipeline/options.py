@@ -42,7 +42,7 @@ class StitchOptions:
     overwrite: bool = False  # replace existing outputs
     strict: bool = False  # fail when a picture is left out
     force: bool = False  # write the picture even when the result failed its checks
-    save_camera: Path | None = None  # camera file to write
+    save_camera: Path | None = None  # camera file to write; see rdstitch.camera_files for formats
 
     def __post_init__(self) -> None:
         """Check ranges and contradictions."""

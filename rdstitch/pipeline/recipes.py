@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from rdstitch.camera_files import CAMERA_SUFFIXES, save_camera
 from rdstitch.compositing import Composite
 from rdstitch.errors import ArgumentError, InputError, PartialResultError, RegistrationError
 from rdstitch.io.atomic import check_output, write_json_atomic, write_text_atomic
@@ -180,7 +181,7 @@ def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Se
         check_output(output, options.overwrite, inputs)
         check_output(f"{output}.json", options.overwrite, inputs, suffixes=())
     if options.save_camera is not None:
-        check_output(options.save_camera, options.overwrite, inputs, suffixes=())
+        check_output(options.save_camera, options.overwrite, inputs, suffixes=CAMERA_SUFFIXES)
 
 
 def _read(paths: Sequence[str | Path], options: StitchOptions, *, skip_bad: bool) -> tuple[list[Source], list[LeftOut]]:
@@ -233,7 +234,7 @@ def _accept(registration: Registration, options: StitchOptions) -> Verdict:
 
 def _save_camera(registration: Registration, options: StitchOptions) -> None:
     if options.save_camera is not None:
-        write_json_atomic(options.save_camera, registration.camera.as_dict())
+        save_camera(registration.camera, options.save_camera)
 
 
 def _write(result: StitchResult, composite: Composite, first: Source) -> None:

@@ -1,8 +1,13 @@
 """``rdstitch calibrate``, run for real."""
 
+import json
+import re
 from pathlib import Path
 
+import pytest
+
 from rdstitch.camera import Camera
+from rdstitch.camera_files import load_camera
 from tests.cli.running import DISTORTION, FAST, Run
 
 
@@ -30,3 +35,29 @@ def test_keeps_an_existing_camera_file(rdstitch: Run, frames: list[Path], tmp_pa
     assert file.read_text(encoding="utf-8") == "mine"
     assert rdstitch("calibrate", *frames, "-o", file, "--overwrite", *FAST).status == 0
     assert Camera.load(file).image_size == (400, 300)
+
+
+@pytest.mark.parametrize("name", ["camera.yml", "cameras.json", "lens.pto"])
+def test_camera_files_of_others(rdstitch: Run, frames: list[Path], tmp_path: Path, name: str) -> None:
+    done = rdstitch("calibrate", *frames[:2], "-o", tmp_path / name, *FAST)
+    assert (done.status, done.err) == (0, "")
+    assert f"{load_camera(tmp_path / name).distortion:.6f}\n" == done.out
+    straight = rdstitch("undistort", frames[0], "--camera", tmp_path / name, "-o", tmp_path / "straight")
+    assert (straight.status, straight.err) == (0, "")
+
+
+def test_the_residual_of_a_foreign_lens_is_told(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    entry = {"projection_type": "perspective", "width": 400, "height": 300, "focal": 0.95, "k1": -0.2, "k2": 0.02}
+    file = tmp_path / "cameras.json"
+    file.write_text(json.dumps({"lens": entry}), encoding="utf-8")
+    arguments = ("undistort", frames[0], "--camera", file, "-o", tmp_path / "straight", "--overwrite")
+    told = rdstitch(*arguments)
+    assert told.status == 0
+    assert re.search(r"OpenDroneMap.* rms \d+\.\d\d px", told.line)
+    assert rdstitch(*arguments, "-q").err == ""
+
+
+def test_a_name_that_is_no_camera_file_is_refused_early(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    done = rdstitch("calibrate", *frames, "-o", tmp_path / "camera.txt", *FAST)
+    assert done.status == 6
+    assert ".yml" in done.line

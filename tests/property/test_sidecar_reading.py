@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rdstitch.errors import InputError
@@ -106,11 +106,13 @@ def test_complaints_name_the_field(tmp_path: Path, path: tuple[str | int, ...], 
     assert str(caught.value).startswith(f"{file}: {field}: ")
 
 
+@settings(deadline=None)
 @given(damaged(GOOD))
 def test_damaged_fields(content: Any) -> None:
     _reads_or_complains(json.dumps(content).encode("utf-8", "surrogatepass"))
 
 
+@settings(deadline=None)
 @given(st.binary(max_size=200) | damaged_text(json.dumps(GOOD)))
 def test_damaged_text(content: bytes) -> None:
     _reads_or_complains(content)

@@ -19,7 +19,12 @@ Examples:
 )
 @options.inputs
 @click.option(
-    "-o", "--output", type=options.PICTURE, required=True, metavar="FILE", help="Camera file to write (JSON)."
+    "-o",
+    "--output",
+    type=options.PICTURE,
+    required=True,
+    metavar="FILE",
+    help="Camera file to write: .json, .yml (OpenCV), .pto (Hugin), cameras.json (OpenDroneMap).",
 )
 @options.overwrite
 @options.every
@@ -35,6 +40,6 @@ def calibrate(inputs: tuple[Path, ...], output: Path, every: int, quiet: bool, v
     from rdstitch.pipeline import calibrate as recipe
 
     with Reporter(-quiet + verbose) as reporter:
-        wanted = stitch_options(save_camera=output, **given)
+        wanted = stitch_options(reporter, save_camera=output, **given)
         registration = recipe(options.resolve(inputs), wanted, every=every, progress=reporter)
         report_registration(registration, reporter)

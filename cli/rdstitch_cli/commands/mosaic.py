@@ -27,7 +27,12 @@ Examples:
 @options.known
 @options.estimation
 @options.compositing
-@click.option("--save-camera", type=options.PICTURE, metavar="FILE", help="Write the estimated camera to FILE (JSON).")
+@click.option(
+    "--save-camera",
+    type=options.PICTURE,
+    metavar="FILE",
+    help="Write the estimated camera to FILE: .json, .yml (OpenCV), .pto (Hugin).",
+)
 @options.trust
 @options.verbosity
 def mosaic(inputs: tuple[Path, ...], output: Path, every: int, quiet: bool, verbose: bool, **given: Any) -> None:
@@ -39,5 +44,7 @@ def mosaic(inputs: tuple[Path, ...], output: Path, every: int, quiet: bool, verb
     from rdstitch.pipeline import mosaic as recipe
 
     with Reporter(-quiet + verbose) as reporter:
-        result = recipe(options.resolve(inputs), output, stitch_options(**given), every=every, progress=reporter)
+        result = recipe(
+            options.resolve(inputs), output, stitch_options(reporter, **given), every=every, progress=reporter
+        )
         summarize(result, reporter)

@@ -25,7 +25,12 @@ Examples:
 @options.known
 @options.estimation
 @options.compositing
-@click.option("--save-camera", type=options.PICTURE, metavar="FILE", help="Write the estimated camera to FILE (JSON).")
+@click.option(
+    "--save-camera",
+    type=options.PICTURE,
+    metavar="FILE",
+    help="Write the estimated camera to FILE: .json, .yml (OpenCV), .pto (Hugin).",
+)
 @options.trust
 @options.verbosity
 def pano(pictures: tuple[Path, ...], output: Path, quiet: bool, verbose: bool, **given: Any) -> None:
@@ -37,5 +42,5 @@ def pano(pictures: tuple[Path, ...], output: Path, quiet: bool, verbose: bool, *
     from rdstitch.pipeline import pano as recipe
 
     with Reporter(-quiet + verbose) as reporter:
-        result = recipe(pictures, output, stitch_options(**given), progress=reporter)
+        result = recipe(pictures, output, stitch_options(reporter, **given), progress=reporter)
         summarize(result, reporter)

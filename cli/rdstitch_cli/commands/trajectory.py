@@ -59,7 +59,7 @@ def trajectory(
         _, registration = recipe(
             options.resolve(inputs),
             output,
-            stitch_options(**given),
+            stitch_options(reporter, **given),
             layout=layout,
             plot=plot,
             height=height,

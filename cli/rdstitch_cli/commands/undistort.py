@@ -7,6 +7,7 @@ import click
 
 from rdstitch_cli import options
 from rdstitch_cli.progress import Reporter
+from rdstitch_cli.stitching import read_lens
 
 
 @click.command(
@@ -45,11 +46,10 @@ def undistort(
     The lens comes from a camera file, as 'rdstitch pano --save-camera' and 'rdstitch calibrate' write it, or is given
     as λ for half the image diagonal.
     """
-    from rdstitch.camera import Camera
     from rdstitch.pipeline import undistort as recipe
 
     if (camera is None) == (distortion is None):
         raise click.UsageError("give either --camera FILE or --lambda L")
     with Reporter(-quiet + verbose) as reporter:
-        lens = None if camera is None else Camera.load(camera)
+        lens = read_lens(camera, reporter)
         recipe(pictures, output, camera=lens, distortion=distortion, view=view, overwrite=overwrite, progress=reporter)

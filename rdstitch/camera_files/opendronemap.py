@@ -1,0 +1,82 @@
+"""OpenDroneMap's ``cameras.json``: lens models of OpenSfM, with lengths in units of the longer side."""
+
+import json
+
+from rdstitch.camera import Camera
+from rdstitch.camera_files.brown import Brown, brown_of
+from rdstitch.camera_files.division import CameraFile, fitted_camera, own_node
+from rdstitch.errors import ArgumentError
+from rdstitch.records import Record
+
+_KIND = "OpenDroneMap"
+_OWN = "rdstitch"
+_MODELS = ("perspective", "brown", "simple_radial", "radial")
+
+
+def is_opendronemap(record: Record) -> bool:
+    """Whether JSON looks like a ``cameras.json``."""
+    values = record.value.values() if isinstance(record.value, dict) else ()
+    return any(isinstance(value, dict) and "projection_type" in value for value in values)
+
+
+def read_opendronemap(record: Record) -> CameraFile:
+    """The one camera of the file; without rdstitch's own node, λ is fitted.
+
+    Raises
+    ------
+    InputError
+        When there are several cameras, a field is missing or wrong, or the model is one that λ cannot describe.
+    """
+    cameras = record.fields()
+    if len(cameras) != 1:
+        record.fail(f"has {len(cameras)} cameras; keep the one that took the pictures")
+    ((_, entry),) = cameras.items()
+    if (own := entry.get(_OWN)) is not None:
+        return CameraFile(Camera.from_record(own), _KIND)
+    entry["projection_type"].choice(_MODELS)
+    size = (entry["width"].integer(1), entry["height"].integer(1))
+    longer = max(size)
+    either = entry.get("focal")
+    fx, fy = (entry[f"focal_{axis}"].number() if either is None else either.number() for axis in "xy")
+    if not (fx > 0.0 and fy > 0.0):
+        entry.fail("the focal length must be positive")
+    shift = (_or_zero(entry, "c_x"), _or_zero(entry, "c_y"))
+    lens = Brown(
+        (fx * longer, fy * longer),
+        ((size[0] - 1) / 2 + shift[0] * longer, (size[1] - 1) / 2 + shift[1] * longer),
+        (_or_zero(entry, "k1"), _or_zero(entry, "k2"), _or_zero(entry, "k3")),
+        (_or_zero(entry, "p1"), _or_zero(entry, "p2")),
+    )
+    try:
+        camera = Camera(size, center=lens.center, focal=lens.mean_focal, focal_source="file")
+    except ArgumentError as error:
+        entry.fail(str(error))
+    return fitted_camera(entry, _KIND, lens.distort, camera)
+
+
+def opendronemap_json(camera: Camera) -> str:
+    """The camera as OpenDroneMap takes it with ``--cameras``: Brown's model."""
+    lens, fit = brown_of(camera)
+    (width, height), longer = camera.image_size, max(camera.image_size)
+    focal, (k1, k2, k3) = lens.focal[0] / longer, lens.radial
+    entry = {
+        "projection_type": "brown",
+        "width": width,
+        "height": height,
+        "focal_x": focal,
+        "focal_y": focal,
+        "c_x": (camera.center[0] - (width - 1) / 2) / longer,
+        "c_y": (camera.center[1] - (height - 1) / 2) / longer,
+        "k1": k1,
+        "k2": k2,
+        "p1": 0.0,
+        "p2": 0.0,
+        "k3": k3,
+        _OWN: own_node(camera, fit),
+    }
+    return json.dumps({f"v2 unknown unknown {width} {height} brown {focal:.4g}": entry}, indent=4) + "\n"
+
+
+def _or_zero(record: Record, name: str) -> float:
+    found = record.get(name)
+    return 0.0 if found is None else found.number()

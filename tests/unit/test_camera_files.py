@@ -1,0 +1,194 @@
+"""Camera files of others: λ comes back exactly, others read what is written, and what is not λ is fitted."""
+
+import json
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.camera_files import load_camera, read_camera_file, save_camera
+from rdstitch.camera_files.brown import Brown
+from rdstitch.errors import InputError, OutputError
+
+NAMES = ["own.json", "c.yml", "c.yaml", "opencv.json", "left.opencv.json", "cameras.json", "c.pto"]
+FOREIGN = [name for name in NAMES if name != "own.json"]
+CAMERAS = [
+    Camera((4000, 3000), -0.21, 0.0, (2013.25, 1490.5), 3300.0, "file", 0.0012),
+    Camera((640, 480), 0.08, 0.01),
+    Camera((3000, 4000), 0.0, focal=2500.0, focal_source="file"),
+    Camera((1280, 720), -0.45, focal=700.0, focal_source="file"),
+]
+
+
+def _points(camera: Camera) -> FloatArray:
+    """Measured px all over the picture."""
+    width, height = camera.image_size
+    u, v = np.meshgrid(np.linspace(0, width - 1, 23), np.linspace(0, height - 1, 17))
+    return np.column_stack([u.ravel(), v.ravel()])
+
+
+def _without_own_node(text: str) -> str:
+    """The file as anyone else would have written it."""
+    if text.startswith("{"):
+        content = json.loads(text)
+        for holder in (content, *content.values()):
+            if isinstance(holder, dict):
+                holder.pop("rdstitch", None)
+        return json.dumps(content)
+    text = re.sub(r"(?m)^#rdstitch .*\n", "", text)
+    return re.sub(r"(?m)^rdstitch:\n(?: +.*\n)*", "", text)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("name", NAMES)
+def test_a_camera_comes_back_as_it_was(tmp_path: Path, name: str, camera: Camera) -> None:
+    save_camera(camera, tmp_path / name)
+    found = read_camera_file(tmp_path / name)
+    assert found.camera == camera
+    assert found.fit is None
+
+
+@pytest.mark.parametrize("camera", CAMERAS[:3])
+@pytest.mark.parametrize("name", FOREIGN)
+def test_of_a_foreign_file_the_lens_is_fitted_and_the_residual_told(tmp_path: Path, name: str, camera: Camera) -> None:
+    save_camera(camera, tmp_path / name)
+    text = _without_own_node((tmp_path / name).read_text(encoding="utf-8"))
+    assert "lambda" not in text
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    found = read_camera_file(tmp_path / name)
+    assert found.fit is not None
+    assert found.camera.image_size == camera.image_size
+    np.testing.assert_allclose(found.camera.center, camera.center, atol=1e-6)
+    assert found.camera.focal == pytest.approx(camera.with_focal().focal, rel=1e-6)
+    # λ alone stands for λ and μ of the second camera.
+    assert found.camera.distortion == pytest.approx(camera.distortion + camera.distortion2, abs=0.006)
+    # The residual is what a user sees: px between the two lenses. The file's own model is off by some px too.
+    apart = np.linalg.norm(found.camera.distort(camera.undistort(_points(camera))) - _points(camera), axis=1)
+    assert apart.max() < found.fit.largest + 0.002 * camera.half_diagonal
+    assert found.fit.rms <= found.fit.largest
+    assert found.fit.largest < 0.004 * camera.half_diagonal
+
+
+@pytest.mark.parametrize("name", ["c.yml", "opencv.json"])
+def test_opencv_reads_what_is_written_and_distorts_alike(tmp_path: Path, name: str) -> None:
+    camera = CAMERAS[0]
+    save_camera(camera, tmp_path / name)
+    storage = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_READ)
+    matrix = storage.getNode("camera_matrix").mat()
+    coefficients = storage.getNode("distortion_coefficients").mat()
+    assert matrix is not None
+    assert coefficients is not None
+    assert storage.getNode("image_width").real() == 4000
+    own = storage.getNode("rdstitch")
+    assert own.getNode("lambda").real() == camera.distortion
+    straight = camera.undistort(_points(camera))
+    rays = np.column_stack([(straight - camera.center) / 3300.0, np.ones(len(straight))])
+    seen, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, coefficients)
+    apart = np.linalg.norm(np.asarray(seen)[:, 0] - _points(camera), axis=1)
+    largest = own.getNode("fit_largest_px").real()
+    assert 0.5 * largest < apart.max() < 1.05 * largest < 5.0
+
+
+def test_what_opencv_writes_is_read(tmp_path: Path) -> None:
+    matrix = np.array([[700.0, 0, 320], [0, 703.0, 242], [0, 0, 1]])
+    coefficients = np.array([[-0.25, 0.08, 0.0004, -0.0002, -0.01]])
+    for name in ("c.yml", "c.json"):
+        storage = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_WRITE)
+        storage.write("calibration_time", "Sat Nov 21 2026")
+        storage.write("image_width", 640)
+        storage.write("image_height", 480)
+        storage.write("camera_matrix", matrix)
+        storage.write("distortion_coefficients", coefficients)
+        storage.release()
+    found, same = (read_camera_file(tmp_path / name) for name in ("c.yml", "c.json"))
+    assert found == same
+    assert found.kind == "OpenCV"
+    assert found.fit is not None
+    assert 0.0 < found.fit.rms < found.fit.largest < 4.0
+    assert found.camera.focal is not None
+    straight = found.camera.undistort(_points(found.camera))
+    rays = np.column_stack([(straight - found.camera.center) / found.camera.focal, np.ones(len(straight))])
+    seen, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, coefficients)
+    apart = np.linalg.norm(np.asarray(seen)[:, 0] - _points(found.camera), axis=1)
+    assert np.sqrt(np.mean(apart**2)) == pytest.approx(found.fit.rms, rel=0.35)
+
+
+@pytest.mark.parametrize("count", [4, 5, 8])
+def test_brown_is_what_opencv_calls_so(count: int) -> None:
+    k = np.random.default_rng(count).normal(0.0, 0.05, count)
+    matrix = np.array([[700.0, 0, 320], [0, 720.0, 242], [0, 0, 1]])
+    padded = [*k.tolist(), *[0.0] * (8 - count)]
+    lens = Brown((700.0, 720.0), (320.0, 242.0), (padded[0], padded[1], padded[4]), (padded[2], padded[3]))
+    lens = Brown(lens.focal, lens.center, lens.radial, lens.tangential, tuple(padded[5:]))
+    points = _points(Camera((640, 480)))
+    rays = np.column_stack([(points - lens.center) / lens.mean_focal, np.ones(len(points))])
+    seen, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, k)
+    np.testing.assert_allclose(lens.distort(points), np.asarray(seen)[:, 0], atol=1e-9)
+
+
+def test_hugin_means_what_its_manual_says(tmp_path: Path) -> None:
+    camera = CAMERAS[0]
+    save_camera(camera, tmp_path / "c.pto")
+    line = next(line for line in (tmp_path / "c.pto").read_text(encoding="utf-8").splitlines() if line[:2] == "i ")
+    a, b, c, d, e, v = (float(re.findall(rf" {name}(-?[\d.e-]+)", line)[0]) for name in "abcdev")
+    # r_src = (a r³ + b r² + c r + 1 - a - b - c) r, in halves of the shorter side; v spans the width.
+    ideal = (camera.undistort(_points(camera)) - camera.center) / 3300.0 * (2000.0 / np.tan(np.radians(v) / 2)) / 1500.0
+    r = np.linalg.norm(ideal, axis=1, keepdims=True)
+    seen = ideal * (a * r**3 + b * r**2 + c * r + 1 - a - b - c) * 1500.0 + [1999.5 + d, 1499.5 + e]
+    assert np.linalg.norm(seen - _points(camera), axis=1).max() < 5.0
+
+
+def test_opendronemap_of_others(tmp_path: Path) -> None:
+    entry = {"projection_type": "perspective", "width": 4000, "height": 3000, "focal": 0.85, "k1": -0.02, "k2": 0.004}
+    file = tmp_path / "cameras.json"
+    file.write_text(json.dumps({"v2 dji fc300x 4000 3000 perspective 0.55": entry}), encoding="utf-8")
+    found = read_camera_file(file)
+    assert found.kind == "OpenDroneMap"
+    assert found.camera.focal == pytest.approx(3400.0)
+    assert found.camera.center == (1999.5, 1499.5)
+    # Near the centre r_d = r_u (1 + k1 r²), and r_u = r_d / (1 + λ r_d²): λ is about k1 in focal lengths.
+    assert found.camera.distortion_focal == pytest.approx(-0.02, abs=0.004)
+    file.write_text(json.dumps({"one": entry, "two": entry}), encoding="utf-8")
+    with pytest.raises(InputError, match="2 cameras"):
+        load_camera(file)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "named"),
+    [
+        ("c.yml", "cols: 5", "cols: 4", "distortion_coefficients"),
+        ("c.yml", "rows: 3", "rows: x", "camera_matrix.rows"),
+        ("c.yml", "image_width: 4000\n", "", "image_width"),
+        ("c.yml", "3300.0, 0.0, 2013.25", "3300.0, 0.5, 2013.25", "camera_matrix"),
+        ("c.yml", "image_height: 3000", "image_height: 3000\n\tx", "line 5"),
+        ("opencv.json", '"image_height": 3000', '"image_height": 0', "image_height"),
+        ("cameras.json", '"projection_type": "brown"', '"projection_type": "fisheye"', "projection_type"),
+        ("cameras.json", '"focal_x"', '"focal_z"', "focal_x"),
+        ("cameras.json", '"k1": ', '"k1": 1', "folds"),
+        ("c.pto", " f0 v", " f3 v", "fisheye"),
+        ("c.pto", "i w4000", "i w40.5", "w: "),
+        ("c.pto", "\ni ", "\nj ", "image line"),
+    ],
+)
+def test_complaints_name_file_and_field(tmp_path: Path, name: str, old: str, new: str, named: str) -> None:
+    save_camera(CAMERAS[0], tmp_path / name)
+    text = _without_own_node((tmp_path / name).read_text(encoding="utf-8"))
+    if new == '"k1": 1':
+        text = re.sub(r'"k1": [-\d.e]+', '"k1": -30.0', text)
+    else:
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=re.escape(str(tmp_path / name))) as caught:
+        load_camera(tmp_path / name)
+    assert named in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["camera", "camera.xml", "camera.yml.txt"])
+def test_a_name_that_says_no_format_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(OutputError, match="camera file"):
+        save_camera(CAMERAS[0], tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
