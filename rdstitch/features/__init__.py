@@ -1,6 +1,7 @@
 """Features of pictures, and their matches."""
 
 from rdstitch.features.detect import detect, detect_all
+from rdstitch.features.guided import match_near
 from rdstitch.features.keypoints import Features
 from rdstitch.features.learned import LightGlue
 from rdstitch.features.match import Correspondences, Matcher, match
@@ -16,4 +17,5 @@ __all__ = [
     "detect",
     "detect_all",
     "match",
+    "match_near",
 ]

@@ -43,15 +43,21 @@ def match(
     ArgumentError
         When the kinds differ, or ``ratio`` is out of range.
     """
-    limit = _DEFAULT_RATIO if ratio is None else ratio
-    if not 0 < limit <= 1:
-        raise ArgumentError(f"ratio must be in (0, 1], not {limit}")
+    limit = check_ratio(ratio)
     if features1.kind != features2.kind:
         raise ArgumentError(f"features of different kinds do not match: {features1.kind} and {features2.kind}")
     pairs, ratios = _match_signs(features1, features2, block_bytes)
     passed = np.flatnonzero(ratios < limit)
     order = passed[np.lexsort((pairs[passed, 1], pairs[passed, 0], ratios[passed]))]
     return Correspondences.of(features1, features2, pairs[order], ratios[order])
+
+
+def check_ratio(ratio: float | None) -> float:
+    """The limit to the ratio of distances, where none is given the usual one; ArgumentError when out of range."""
+    limit = _DEFAULT_RATIO if ratio is None else ratio
+    if not 0 < limit <= 1:
+        raise ArgumentError(f"ratio must be in (0, 1], not {limit}")
+    return limit
 
 
 def _match_signs(features1: Features, features2: Features, block_bytes: int) -> tuple[NDArray[np.intp], FloatArray]:

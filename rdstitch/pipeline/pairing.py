@@ -7,12 +7,16 @@ from functools import partial
 import numpy as np
 
 from rdstitch.camera import Camera
-from rdstitch.features import Features, Matcher
+from rdstitch.features import Correspondences, Features, Matcher, match_near
 from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.progress import Progress
+from rdstitch.registration import Alignment
 from rdstitch.registration.pairs import PairOptions, PairRegistration, estimate_pairs, match_pairs
 from rdstitch.registration.resting import most_rest, moving_features, show_motion
 from rdstitch.registration.voting import vote
+
+_FEW_MATCHES = 100  # from which on a pair needs no more
+_SEARCH_RADIUS = 3.0  # thresholds around the place where a match is expected
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,37 @@ class Pairing:
             if pair.relation:
                 rescued[index] = _without_vote(pair)
         return rescued
+
+    def strengthen(self, pairs: list[PairRegistration], alignment: Alignment) -> list[PairRegistration]:
+        """Match pairs that hold together by little again, looking only where the alignment says."""
+        weak = {(fit.image1, fit.image2) for fit in alignment.links if fit.used and fit.inliers < _FEW_MATCHES}
+        chosen = [index for index, pair in enumerate(pairs) if pair.relation and (pair.image1, pair.image2) in weak]
+        known = self.options.known_distortion
+        again = estimate_pairs(
+            self.cameras,
+            [(pairs[index].image1, pairs[index].image2) for index in chosen],
+            [self._near(pairs[index], alignment) for index in chosen],
+            self._pair_options(known),
+            tilts=self._tilts(),
+            workers=self.options.threads,
+        )
+        stronger = list(pairs)
+        for index, pair in zip(chosen, again, strict=True):
+            if pair.relation and pair.relation.inliers.sum() > pairs[index].relation.inliers.sum():
+                stronger[index] = pair
+        return stronger
+
+    def _near(self, pair: PairRegistration, alignment: Alignment) -> Correspondences:
+        """Matches of a pair near the places where the alignment expects them."""
+        features1, features2 = self.features[pair.image1], self.features[pair.image2]
+        return match_near(
+            features1,
+            features2,
+            alignment.transfer(pair.image1, pair.image2, features1.points),
+            _SEARCH_RADIUS * self.options.threshold,
+            pair.correspondences.indices[pair.relation.inliers],
+            self.options.ratio,
+        )
 
     def _pair_options(self, distortion: float | None) -> PairOptions:
         o = self.options

@@ -19,6 +19,10 @@ from rdstitch.registration.pairs import PairRegistration
 from rdstitch.registration.selection import first_pairs, neighbours
 
 _CLOSURE_ROUNDS = 2
+_PAST_REST = (
+    "most of what the pictures show stays where it is in them (a background, dirt, a date); "
+    "only what moves was registered"
+)
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,8 @@ class Registration:
     alignment : Alignment
     left_out : tuple of LeftOut
         Every file that is not in the result, with the reason.
+    resting : bool
+        Whether most of what the pictures show stays where it is in them, and only what moves was registered.
     """
 
     sources: tuple[Source, ...]
@@ -42,6 +48,7 @@ class Registration:
     pairs: tuple[PairRegistration, ...]
     alignment: Alignment
     left_out: tuple[LeftOut, ...]
+    resting: bool = False
 
     @property
     def camera(self) -> Camera:
@@ -82,6 +89,7 @@ def register(
     features, damaged = _detect(sources, options, skip_bad, progress)
     pairing = Pairing(features, [source.camera for source in sources], matcher, options, progress)
     pairs = pairing.estimate(first_pairs(features, options.seed))
+    pairing, pairs = pairing.look_past_rest(pairs)
     pairs = pairing.rescue(pairs)
     aligning = AlignmentOptions(
         reference=reference, model=options.model, distortion=options.known_distortion, tilt=options.tilt
@@ -97,14 +105,20 @@ def register(
         if not any(pair.relation for pair in closures):
             break
         alignment = align(cameras, _links(sources, pairs), aligning)
+    stronger = pairing.strengthen(pairs, alignment)
+    if any(new is not old for new, old in zip(stronger, pairs, strict=True)):
+        pairs, alignment = stronger, align(cameras, _links(sources, stronger), aligning)
     if metric and alignment.poses is None and options.model == "auto":
         alignment = align(cameras, _links(sources, pairs), replace(aligning, model="tilting"))
+    resting = pairing.features is not features
+    if resting:
+        alignment = replace(alignment, warnings=(*alignment.warnings, _PAST_REST))
     left_out = [
         LeftOut(source.path, damaged.get(index, alignment.reasons[index]))
         for index, source in enumerate(sources)
         if not alignment.used[index]
     ]
-    return Registration(tuple(sources), tuple(map(len, features)), tuple(pairs), alignment, tuple(left_out))
+    return Registration(tuple(sources), tuple(map(len, features)), tuple(pairs), alignment, tuple(left_out), resting)
 
 
 def in_frame_of_reference(registration: Registration) -> Registration:

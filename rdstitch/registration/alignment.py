@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.camera import Camera, FloatArray
+from rdstitch.radial_homography import project
 
 
 @dataclass(frozen=True)
@@ -159,3 +160,10 @@ class Alignment:
         """Homography (3, 3) from undistorted normalized coordinates of one picture to those of another."""
         product: FloatArray = np.linalg.solve(self.homographies[image2], self.homographies[image1])
         return product
+
+    def transfer(self, image1: int, image2: int, points: FloatArray) -> FloatArray:
+        """Where points (N, 2) of one picture, px, are in another; NaN where its lens cannot see them."""
+        camera1, camera2 = self.cameras[image1], self.cameras[image2]
+        flat = camera1.normalize(camera1.undistort(points))
+        lifted = np.column_stack([flat, np.ones(len(flat))]) @ self.relation(image1, image2).T
+        return camera2.distort(camera2.denormalize(project(lifted)))
