@@ -19,6 +19,7 @@ FIGURES = {
     "figure8": "votes on λ, and a chart undistorted and rectified",
     "figure9": "trajectories",
     "figure10": "aerial surveys with and without λ",
+    "homography_estimation": "robust estimators on pairs with distortion",
     "end_to_end": "rendered sets stitched by rdstitch and by the peers",
 }
 """Modules in the order in which they run, with what they measure."""
@@ -40,11 +41,14 @@ def main(arguments: list[str] | None = None) -> int:
         "--pictures", type=Path, metavar="DIR", default=_REAL_PICTURES, help="folder of the real sequences"
     )
     parser.add_argument("--peer-python", metavar="FILE", help="Python that has the package stitching")
+    parser.add_argument("--hpatches", type=Path, metavar="DIR", help="folder of HPatches' sequences")
     options = parser.parse_args(arguments)
     unknown = set(options.figures) - set(FIGURES)
     if unknown:
         parser.error(f"unknown figure {', '.join(sorted(unknown))}; there are {', '.join(FIGURES)}")
-    settings = Settings(Effort.FULL if options.full else Effort.SMALL, options.pictures, options.peer_python)
+    settings = Settings(
+        Effort.FULL if options.full else Effort.SMALL, options.pictures, options.peer_python, options.hpatches
+    )
     for name in options.figures or FIGURES:
         begun = time.perf_counter()
         report = import_module(f"examples.paper.{name}").run(settings)

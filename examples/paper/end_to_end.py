@@ -81,7 +81,7 @@ def run(settings: Settings) -> Report:
         chosen, stitchers = [_TINY], stitchers[:2]
     else:
         chosen = list(SETS[: settings.count(1, 1, len(SETS))])
-    timeout = float(settings.count(60, 120, 600))
+    timeout = float(settings.count(60, 120, 120))
     tables, pictures = [], {}
     for number, picture_set in enumerate(chosen):
         with TemporaryDirectory(prefix="rdstitch-peers-") as folder:

@@ -26,11 +26,14 @@ class Settings:
         Folder of the real sequences (``garfield_red``, ``copr``); figures do without those that are absent.
     peer_python : str, optional
         Python that has the package stitching, which brings an OpenCV of its own; the one that runs if not given.
+    hpatches : Path, optional
+        Folder of HPatches' sequences.
     """
 
     effort: Effort
     pictures: Path
     peer_python: str | None = None
+    hpatches: Path | None = None
 
     def count(self, tiny: int, small: int, full: int) -> int:
         """The one of three counts that the effort allows."""

@@ -3,11 +3,13 @@
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from examples.paper import (
     aerial,
@@ -20,10 +22,14 @@ from examples.paper import (
     figure8,
     figure9,
     figure10,
+    homography_estimation,
     runtime,
 )
 from examples.paper.__main__ import main
 from examples.paper.constraints import planar_quartics, quartic_monomials
+from examples.paper.estimation_pairs import scene_pairs
+from examples.paper.estimators import installed_estimators, judge
+from examples.paper.planar_scenes import made_scenes, read_scenes
 from examples.paper.report import Report, Table, save
 from examples.paper.settings import Effort, Settings
 from examples.paper.subprocesses import run_all
@@ -186,6 +192,38 @@ def test_a_bent_lane_is_measured_whatever_its_frame() -> None:
     assert aerial.bend(truth, turned) == pytest.approx(0.5, rel=0.02)
     assert 0.4 < aerial.drift(truth, turned) < 0.5
     assert aerial.bend(truth, truth) < 1e-12
+
+
+def test_homography_estimation_needs_the_distortion() -> None:
+    for table in homography_estimation.run(TINY).tables:
+        row = table.row("rdstitch")
+        assert row["median error, px"] < 0.3, table.title
+        assert row["AUC at 1 px, %"] > 70.0, table.title
+        assert row["median error of λ"] < 0.02, table.title
+        if "no distortion" not in table.title:
+            assert row["median error, px"] < 0.2 * table.row("OpenCV USAC_MAGSAC, no λ")["median error, px"]
+
+
+def test_the_area_under_the_curve_is_that_of_the_shares() -> None:
+    assert homography_estimation.area_under_curve([0.0, 1.0, 2.0, np.inf], 2.0) == pytest.approx((1.0 + 0.5) / 4)
+
+
+def test_scenes_in_the_format_of_hpatches_are_read_and_distorted(tmp_path: Path) -> None:
+    (made,) = made_scenes(None, 1, seed=3)
+    folder = tmp_path / "v_ground"
+    folder.mkdir()
+    for number, picture in enumerate(made.pictures, start=1):
+        Image.fromarray(picture()).save(folder / f"{number}.ppm")
+    np.savetxt(folder / "H_1_2", made.homographies[1])
+    (tmp_path / "empty").mkdir()
+    (scene,) = read_scenes(tmp_path)
+    assert len(scene.pictures) == 2
+    np.testing.assert_allclose(scene.homographies[1], made.homographies[1])
+    (pair,) = scene_pairs([scene], -0.4, seed=4, per_scene=5)
+    assert -0.4 < pair.distortion < -0.01
+    own = installed_estimators()[0][0]
+    assert judge(own, pair).error < 0.5
+    assert judge(own, replace(pair, grid1=pair.grid2, grid2=pair.grid1)).error > 5.0
 
 
 def test_programs_are_measured_and_ended_in_time(tmp_path: Path) -> None:

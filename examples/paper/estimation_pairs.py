@@ -1,0 +1,132 @@
+"""Pairs of pictures with a known map between them, to judge estimators of homographies under distortion.
+
+Rendered ones, and planar scenes as in HPatches, to which division distortion is added.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+
+from examples.paper.planar_scenes import PlanarScene
+from examples.paper.report import Pixels
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.features import FeatureOptions, detect, match
+from rdstitch.synthetic import Photometry, ground, pair_poses, sequence_over
+from rdstitch.synthetic import Sequence as RenderedSequence
+from rdstitch.synthetic.fitting import apply
+
+_GRID = (20, 15)
+_FEATURES = FeatureOptions(max_features=1500)
+_RATIO = 0.9  # loose, so that the estimators have something to do
+
+
+@dataclass(frozen=True)
+class JudgedPair:
+    """Matches of two pictures of a plane through one lens, and where points truly go.
+
+    Attributes
+    ----------
+    points1, points2 : ndarray of shape (N, 2)
+        Matches, px.
+    image_size : (int, int)
+        Of both pictures.
+    distortion : float
+        True λ.
+    grid1, grid2 : ndarray of shape (M, 2)
+        Places all over what both pictures show, px in either.
+    """
+
+    points1: FloatArray
+    points2: FloatArray
+    image_size: tuple[int, int]
+    distortion: float
+    grid1: FloatArray
+    grid2: FloatArray
+
+
+def rendered_pairs(count: int, distortion: float, *, free: bool, seed: int) -> Iterator[JudgedPair]:
+    """Pairs of a floor; λ is uniform from ``distortion`` to 0.
+
+    Parameters
+    ----------
+    free : bool
+        The camera moves freely; a planar motion with one tilt otherwise.
+    """
+    for number in range(count):
+        rng = np.random.default_rng((seed, number))
+        lens = Camera((640, 480), rng.uniform(distortion, 0.0), focal=rng.uniform(450.0, 650.0), focal_source="option")
+        psi, theta = rng.uniform(-0.1, 0.1, 2)
+        poses = pair_poses(
+            lens,
+            rng.uniform(0.3, 0.6),
+            yaw=rng.uniform(-np.pi, np.pi),
+            direction=rng.uniform(-np.pi, np.pi),
+            tilt=(float(psi), float(theta)),
+        )
+        if free:
+            poses = poses.shaken(seed=number, height=0.15, tilt=0.15)
+        photometry = Photometry(gain=np.array([1.0, 0.85]), vignetting=0.2, blur=0.5, noise=0.01)
+        sequence = sequence_over(partial(ground, seed=seed + number), lens, poses, photometry=photometry, seed=number)
+        yield _judged(sequence.frame(0), sequence.frame(1), lens, partial(_over_the_plane, sequence))
+
+
+def _over_the_plane(sequence: RenderedSequence, points: FloatArray) -> FloatArray:
+    return sequence.to_picture(1, sequence.to_plane(0, points))
+
+
+def scene_pairs(scenes: Sequence[PlanarScene], distortion: float, *, seed: int, per_scene: int) -> Iterator[JudgedPair]:
+    """The first picture of every scene with others, all distorted by the same λ, uniform from ``distortion`` to 0.
+
+    Pictures of different sizes are brought to the size of the first, which a homography describes.
+    """
+    for number, scene in enumerate(scenes):
+        lam = float(np.random.default_rng((seed, number)).uniform(distortion, 0.0))
+        first = scene.pictures[0]()
+        size = (first.shape[1], first.shape[0])
+        lens = Camera(size, lam)
+        one = _through(lens, first, size)
+        for k in range(1, min(1 + per_scene, len(scene.pictures))):
+            other = scene.pictures[k]()
+            resize = np.diag([size[0] / other.shape[1], size[1] / other.shape[0], 1.0])
+            homography = resize @ scene.homographies[k]
+
+            def transfer(points: FloatArray, lens: Camera = lens, h: FloatArray = homography) -> FloatArray:
+                return _measured(lens, apply(h, _ideal(lens, points)))
+
+            yield _judged(one, _through(lens, other, size), lens, transfer)
+
+
+def _judged(one: Pixels, two: Pixels, lens: Camera, transfer: Callable[[FloatArray], FloatArray]) -> JudgedPair:
+    matches = match(detect(one, _FEATURES), detect(two, _FEATURES), _RATIO)
+    width, height = lens.image_size
+    grid = np.meshgrid(np.linspace(0.0, width - 1.0, _GRID[0]), np.linspace(0.0, height - 1.0, _GRID[1]))
+    places = np.stack(grid, axis=-1).reshape(-1, 2)
+    moved = transfer(places)
+    with np.errstate(invalid="ignore"):
+        seen = ((moved >= 0.0) & (moved <= (width - 1.0, height - 1.0))).all(axis=1)
+    return JudgedPair(matches.points1, matches.points2, lens.image_size, lens.distortion, places[seen], moved[seen])
+
+
+def _ideal(lens: Camera, points: FloatArray) -> FloatArray:
+    """Px of the distorted picture to px of the one without distortion, with the corners where they were."""
+    centre = np.array(lens.center)
+    ideal: FloatArray = centre + (lens.undistort(points) - centre) * (1.0 + lens.distortion)
+    return ideal
+
+
+def _measured(lens: Camera, points: FloatArray) -> FloatArray:
+    """The inverse."""
+    centre = np.array(lens.center)
+    return lens.distort(centre + (points - centre) / (1.0 + lens.distortion))
+
+
+def _through(lens: Camera, picture: Pixels, size: tuple[int, int]) -> Pixels:
+    """A picture as the lens would have taken it."""
+    resized = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    grid = np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1])), axis=-1).astype(np.float64)
+    u, v = np.moveaxis(_ideal(lens, grid.reshape(-1, 2)).reshape(grid.shape).astype(np.float32), -1, 0)
+    distorted = cv2.remap(resized, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    return np.asarray(distorted, dtype=np.uint8)
