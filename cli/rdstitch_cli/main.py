@@ -18,6 +18,7 @@ from rdstitch_cli.commands.mosaic import mosaic
 from rdstitch_cli.commands.pano import pano
 from rdstitch_cli.commands.trajectory import trajectory
 from rdstitch_cli.commands.undistort import undistort
+from rdstitch_cli.config import config_option
 from rdstitch_cli.progress import one_line
 
 EXIT_STATUSES = """\b
@@ -34,12 +35,22 @@ Exit status:
   141  nobody reads standard output any more; the files are written
 """
 
+_EXAMPLES = """\b
+Examples:
+  rdstitch pano left.jpg right.jpg -o pano.jpg
+  rdstitch mosaic flight/ -o field.tif --config survey.toml
+  rdstitch calibrate wall/ -o camera.yml
+"""
+
 _UNEXPECTED, _INTERRUPTED, _BROKEN_PIPE = 1, 130, 141
 _ASKED_TO_END = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}, epilog=EXIT_STATUSES)
+@click.group(
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog=f"{_EXAMPLES}\n\n{EXIT_STATUSES}",
+)
 @click.version_option(version("rdstitch"), prog_name="rdstitch")
 @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
 @click.pass_context
@@ -49,6 +60,7 @@ def cli(context: click.Context, debug: bool) -> None:
 
 
 for command in (pano, mosaic, apply, calibrate, trajectory, undistort):
+    command.params.append(config_option())
     command.epilog = f"{command.epilog or ''}\n\n{EXIT_STATUSES}"
     cli.add_command(command)
 

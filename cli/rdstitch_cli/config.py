@@ -1,0 +1,117 @@
+"""``--config FILE.toml``: defaults of options, for all commands and for single ones; flags win."""
+
+import difflib
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rdstitch.errors import InputError
+
+COMMON = "common"
+"""The table that holds for every command."""
+
+
+def config_option() -> click.Option:
+    """The option ``--config``, which sets defaults before any other option is looked at."""
+    return click.Option(
+        ["--config"],
+        type=click.Path(path_type=Path, readable=False),
+        metavar="FILE",
+        is_eager=True,
+        expose_value=False,
+        callback=_apply,
+        help="Take options from this TOML file; those on the command line win.",
+    )
+
+
+def read_config(path: Path, commands: Mapping[str, click.Command], running: str) -> dict[str, Any]:
+    """The defaults that a file gives a command, by parameter name; all tables are checked.
+
+    Parameters
+    ----------
+    path : Path
+        TOML with a table for each command, and one that holds for all of them. Keys are long options without dashes.
+    commands : mapping of str to Command
+    running : str
+        Name of the command that runs.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, is no TOML, names an unknown command or option, or gives one a wrong value.
+    """
+    tables = _parse(path)
+    known = {name: _options(command) for name, command in commands.items()}
+    known[COMMON] = {key: option for options in known.values() for key, option in options.items()}
+    found: dict[str, Any] = {}
+    for table in sorted(tables, key=lambda name: name != COMMON):  # the command's own table wins
+        if table not in known:
+            raise InputError(f"{path}: there is no command {table!r}{_suggestion(table, known)}")
+        if not isinstance(tables[table], dict):
+            raise InputError(f"{path}: {table}: options belong into a table, such as [{COMMON}] or [{running}]")
+        for key, value in tables[table].items():
+            if key not in known[table]:
+                raise InputError(f"{path}: {table}.{key}: there is no such option{_suggestion(key, known[table])}")
+            option = known[table][key]
+            converted = _converted(option, value, f"{path}: {table}.{key}")
+            if table in (COMMON, running) and key in known[running] and option.name is not None:
+                found[option.name] = converted
+    return found
+
+
+def _apply(context: click.Context, option: click.Parameter, path: Path | None) -> None:
+    """Make the values of the file the defaults of the running command."""
+    group = context.find_root().command
+    if path is None or context.resilient_parsing or not isinstance(group, click.Group):
+        return
+    context.default_map = read_config(path, group.commands, str(context.command.name))
+
+
+def _parse(path: Path) -> dict[str, Any]:
+    from rdstitch.records import read_text
+
+    try:
+        return tomllib.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: is not TOML: {error}") from error
+
+
+def _options(command: click.Command) -> dict[str, click.Option]:
+    """Options that a file may set, by their long names."""
+    return {
+        max(option.opts, key=len).lstrip("-"): option
+        for option in command.params
+        if isinstance(option, click.Option) and option.expose_value
+    }
+
+
+def _converted(option: click.Option, value: Any, where: str) -> Any:
+    """The value as the command line would have it; a wrong type is not bent into a right one."""
+    if option.multiple:
+        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+            raise InputError(f"{where}: expected a list of texts, not {value!r}")
+    elif option.is_flag:
+        if not isinstance(value, bool):
+            raise InputError(f"{where}: expected true or false, not {value!r}")
+    elif isinstance(option.type, (click.types.IntParamType, click.types.FloatParamType)):
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise InputError(f"{where}: expected a number, not {value!r}")
+        if isinstance(option.type, click.types.IntParamType) and not isinstance(value, int):
+            raise InputError(f"{where}: expected a whole number, not {value!r}")
+    elif not isinstance(value, str):
+        raise InputError(f"{where}: expected a text, not {value!r}")
+    try:
+        # A text goes through the option's own checks when the command line is read; here they only name the place.
+        option.type_cast_value(click.Context(click.Command("config")), value)
+    except (click.BadParameter, ValueError, OverflowError) as error:
+        problem = error.message if isinstance(error, click.BadParameter) else error
+        raise InputError(f"{where}: {problem}") from error
+    return value
+
+
+def _suggestion(name: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name.replace("_", "-"), list(known), n=1)
+    return f"; do you mean {close[0]!r}?" if close else ""

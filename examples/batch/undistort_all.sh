@@ -1,0 +1,16 @@
+#!/bin/sh
+# All pictures of a tree, straight, in a tree of the same shape: undistort_all.sh CAMERA FOLDER OUT
+set -eu
+camera=$(realpath "$1") folder=$2 out=$3
+mkdir -p "$out"
+out=$(realpath "$out")
+cd "$folder"
+
+status=0
+find . -type d -exec sh -c '
+    camera=$1 out=$2 folder=$3
+    # As many pictures as fit on one command line at a time; xargs without any input runs nothing.
+    find "$folder" -maxdepth 1 -type f \( -iname "*.jpg" -o -iname "*.png" -o -iname "*.tif" \) -print0 |
+        xargs -0 -r sh -c '\''rdstitch undistort "$@"'\'' undistort --camera "$camera" -o "$out/$folder" --overwrite
+' undistort_all.sh "$camera" "$out" '{}' \; || status=1
+exit $status

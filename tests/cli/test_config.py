@@ -1,0 +1,153 @@
+"""``--config``: defaults from a file, checked, and flags that win."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rdstitch_cli.config import read_config
+from rdstitch_cli.main import cli
+
+from rdstitch.camera import Camera
+from rdstitch.errors import InputError
+from tests.cli.running import FAST, Run
+from tests.mutations import damaged_text
+
+_DOCUMENT = Path(__file__).parents[2] / "docs" / "configuration.md"
+
+
+def _example() -> str:
+    found = re.search(r"```toml\n(.*?)```", _DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
+    assert found is not None
+    return found[1]
+
+
+def _written(folder: Path, text: str) -> Path:
+    file = folder / "config.toml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def test_the_documented_example_is_read(tmp_path: Path) -> None:
+    file = _written(tmp_path, _example())
+    common = {"features": "sift", "work_megapixels": 2.5, "camera": "camera.json", "overwrite": True, "workers": 2}
+    assert read_config(file, cli.commands, "calibrate") == common
+    # The parameter of --format is called otherwise.
+    assert read_config(file, cli.commands, "trajectory") == {**common, "layout": "tum", "height": 0.42}
+    assert read_config(file, cli.commands, "undistort") == {"camera": "camera.json", "overwrite": True}
+
+
+def test_flags_win_then_the_command_then_common(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    file = _written(
+        tmp_path,
+        "[common]\nlambda = -0.15\nseed = 7\nthreshold = 2.5\n[pano]\nlambda = -0.2\nscale = 0.5\nworkers = 1\n",
+    )
+    arguments = ("pano", *frames[:2], "--config", file, "--max-features", "600")
+    assert rdstitch(*arguments, "-o", tmp_path / "a.png").out == "-0.200000\n"
+    assert rdstitch(*arguments, "-o", tmp_path / "b.png", "--lambda", "-0.21", "--scale", "1").out == "-0.210000\n"
+    a, b = (json.loads((tmp_path / f"{name}.png.json").read_text(encoding="utf-8"))["options"] for name in "ab")
+    assert (a["seed"], a["threshold"], a["composite"]["scale"], a["workers"]) == (7, 2.5, 0.5, 1)
+    assert (b["seed"], b["composite"]["scale"]) == (7, 1.0)
+
+
+def test_a_required_option_may_be_in_the_file(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    Camera((400, 300), -0.2).save(tmp_path / "camera.json")
+    lines = ["[undistort]", f"camera = '{tmp_path / 'camera.json'}'", f"output = '{tmp_path / 'straight'}'"]
+    done = rdstitch("undistort", frames[0], "--config", _written(tmp_path, "\n".join(lines)))
+    assert (done.status, done.err) == (0, "")
+    assert (tmp_path / "straight" / frames[0].name).exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "named", "hint"),
+    [
+        ("[mosaik]\n", "mosaik", "do you mean 'mosaic'"),
+        ("[mosaic]\nblent = 'none'\n", "mosaic.blent", "do you mean 'blend'"),
+        ("[common]\nwork_megapixels = 2\n", "common.work_megapixels", "do you mean 'work-megapixels'"),
+        ("[trajectory]\nscale = 2\n", "trajectory.scale", "no such option"),
+        ("[common]\ndebug = true\n", "common.debug", "no such option"),
+        ("[common]\nconfig = 'more.toml'\n", "common.config", "no such option"),
+        ("scale = 2\n", "scale", ""),
+        ("pano = 2\n", "pano", "table"),
+        ("[pano]\nscale = 'large'\n", "pano.scale", "a number"),
+        ("[pano]\nscale = true\n", "pano.scale", "a number"),
+        ("[pano]\nseed = 1.5\n", "pano.seed", "a whole number"),
+        ("[pano]\nseed = -1\n", "pano.seed", "-1"),
+        ("[pano]\nstrict = 1\n", "pano.strict", "true or false"),
+        ("[pano]\nblend = 'magic'\n", "pano.blend", "feather"),
+        ("[pano]\ntilt = [1, 2]\n", "pano.tilt", "a text"),
+        ("[pano]\ntilt = '1'\n", "pano.tilt", "two angles"),
+        ("[apply]\nimages = 'flight'\n", "apply.images", "a list"),
+        ("[pano\n", "is not TOML", "line 1"),
+    ],
+)
+def test_what_does_not_fit_is_refused(
+    rdstitch: Run, frames: list[Path], tmp_path: Path, text: str, named: str, hint: str
+) -> None:
+    file = _written(tmp_path, text)
+    # The whole file is checked, whichever command runs.
+    done = rdstitch("pano", *frames[:2], "-o", tmp_path / "out.png", "--config", file, *FAST)
+    assert done.status == 3
+    assert done.line.startswith(f"rdstitch: {file}: ")
+    assert named in done.line
+    assert hint in done.line
+    assert not (tmp_path / "out.png").exists()
+
+
+def test_a_missing_file_is_status_3(rdstitch: Run, tmp_path: Path) -> None:
+    done = rdstitch("pano", "a.png", "b.png", "-o", "c.png", "--config", tmp_path / "missing.toml")
+    assert (done.status, "missing.toml" in done.line) == (3, True)
+
+
+def _plausible(option: click.Option) -> Any:
+    if option.is_flag:
+        return True
+    if isinstance(option.type, click.Choice):
+        return str(option.type.choices[0])
+    if isinstance(option.type, (click.types.IntParamType, click.types.FloatParamType)):
+        return 1
+    return {"tilt": "1,2", "max_memory": "1G"}.get(option.name or "", "name")
+
+
+@pytest.mark.parametrize("name", sorted(cli.commands))
+def test_every_option_can_be_in_the_file(name: str, tmp_path: Path) -> None:
+    options = [p for p in cli.commands[name].params if isinstance(p, click.Option) and p.name != "config"]
+    values = {p.name: [_plausible(p)] if p.multiple else _plausible(p) for p in options}
+    lines = [f"{max(p.opts, key=len)[2:]} = {json.dumps(values[p.name])}" for p in options]
+    assert read_config(_written(tmp_path, "\n".join([f"[{name}]", *lines])), cli.commands, name) == values
+
+
+@settings(deadline=None)
+@given(st.binary(max_size=60) | damaged_text(_example()))
+def test_fuzz(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
+    folder = tmp_path_factory.mktemp("config")
+    complaint = ""
+    try:
+        (folder / "config.toml").write_bytes(content)
+        read_config(folder / "config.toml", cli.commands, "mosaic")
+    except InputError as error:
+        complaint = str(error)
+    finally:
+        shutil.rmtree(folder)
+    assert not complaint or complaint.startswith(f"{folder / 'config.toml'}: ")
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_is_offered(rdstitch: Run, monkeypatch: pytest.MonkeyPatch, shell: str) -> None:
+    monkeypatch.setenv("_RDSTITCH_COMPLETE", f"{shell}_source")
+    monkeypatch.setattr("click.shell_completion.BashComplete._check_version", staticmethod(lambda: None))
+    done = rdstitch()
+    assert (done.status, "_RDSTITCH_COMPLETE" in done.out) == (0, True)
+    assert f"_RDSTITCH_COMPLETE={shell}_source" in _DOCUMENT.read_text(encoding="utf-8")
+
+
+def test_completion_knows_choices(rdstitch: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("_RDSTITCH_COMPLETE", "bash_complete")
+    monkeypatch.setenv("COMP_WORDS", "rdstitch mosaic --config nowhere.toml --blend fe")
+    monkeypatch.setenv("COMP_CWORD", "5")
+    assert rdstitch().out == "plain,feather\n"
