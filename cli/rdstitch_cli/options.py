@@ -223,4 +223,7 @@ compositing = together(
     click.option(
         "--rotate", type=float, default=0.0, show_default=True, metavar="DEG", help="Turn the output clockwise."
     ),
+    click.option(
+        "--dry-run", is_flag=True, help="Say what compositing would take (size, memory, time); write nothing."
+    ),
 )

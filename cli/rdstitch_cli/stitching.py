@@ -10,6 +10,7 @@ from rdstitch_cli.progress import Reporter
 
 if TYPE_CHECKING:
     from rdstitch.camera import Camera
+    from rdstitch.compositing import CompositePlan
     from rdstitch.pipeline import Registration, StitchOptions, StitchResult
 
 
@@ -62,10 +63,32 @@ def stitch_options(
 
 
 def summarize(result: "StitchResult", reporter: Reporter) -> None:
-    """λ to standard output; what the user must know to standard error."""
-    for doubt in result.verdict.doubts:
+    """λ, and the plan of a dry run, to standard output; what the user must know to standard error."""
+    for doubt in (*result.verdict.doubts, *result.notes):
         reporter.warn(doubt)
     report_registration(result.registration, reporter)
+    if result.plan is not None:
+        show_plan(result.plan)
+
+
+def show_plan(plan: "CompositePlan") -> None:
+    """What compositing would take, to standard output."""
+    (width, height), megapixels = plan.canvas_size, plan.canvas_size[0] * plan.canvas_size[1] / 1e6
+    click.echo(f"pictures: {plan.pictures}")
+    click.echo(f"canvas: {width} x {height} px, {megapixels:.4g} megapixels")
+    click.echo(f"output: {_amount(plan.output_bytes)} of samples, before compression")
+    click.echo(f"memory: about {_amount(plan.memory_bytes)} for {plan.workers} tiles of {plan.tile_size} px at a time")
+    click.echo(f"time: about {_duration(plan.seconds)} for compositing")
+
+
+def _amount(size: int) -> str:
+    """Bytes for people."""
+    return f"{size / 2**30:.1f} GB" if size >= 2**30 else f"{max(1, round(size / 2**20))} MB"
+
+
+def _duration(seconds: float) -> str:
+    """Seconds for people."""
+    return f"{seconds / 60:.0f} min" if seconds >= 120 else f"{max(1, round(seconds))} s"
 
 
 def report_registration(registration: "Registration", reporter: Reporter) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -254,6 +254,8 @@ def prepare(
             exposure = estimate_exposure(survey, cameras, blocks=options.exposure == "blocks")
         if options.seam != "none":
             seams = find_seams(survey, exposure, options.seam == "graphcut", _part_of(progress, 0.7, 1.0))
+            if options.blend == "feather":
+                seams = replace(seams, softness=max(1, (1 << plan.bands) // (2 * seams.factor)))
     box, note = None, ""
     if options.crop == "auto":
         box, note = crop_box(*coverage_map(cameras, matrices, canvas, survey), canvas.size)

@@ -29,8 +29,8 @@ class CompositeOptions:
     # Where one picture ends and the next begins: "graphcut" goes round what differs between them (parallax, people),
     # "voronoi" where their borders are equally far, "none" leaves it to the blending.
     seam: Seam = "graphcut"
-    # "multiband" hides the seam over a width that suits each size of detail, "feather" averages over the whole
-    # overlap, "none" cuts.
+    # "multiband" hides the seam over a width that suits each size of detail, "feather" averages over a strip along
+    # the seam (without seams: over the whole overlap), "none" cuts.
     blend: Blend = "multiband"
     # "auto" cuts to the largest upright rectangle without holes, where that keeps a fair part of the picture.
     crop: Crop = "none"

@@ -37,28 +37,41 @@ class SeamMap:
         Index of the picture, or -1 where there is none.
     factor : int
         Canvas px per reduced px, even or 1.
+    softness : int
+        Shares pass from one owner to the next over so many reduced px on either side of a seam, for feathering.
     """
 
     labels: NDArray[np.int32]
     factor: int
+    softness: int = 0
 
     def owners(self, box: Box) -> list[int]:
         """Pictures that own anything on a box (canvas px), ascending."""
-        x, y = self._neighbours(box)
-        window = self.labels[y[0].min() : y[1].max() + 1, x[0].min() : x[1].max() + 1]
+        window = self._window(*self._neighbours(box))[0]
         return [int(owner) for owner in np.unique(window) if owner != NOBODY]
 
     def share(self, owner: int, box: Box) -> Float32Array:
         """How much of each px of a box (canvas px) a picture owns: labels interpolated linearly, (h, w).
 
-        Every value depends on the four nearest labels alone, bit for bit, whatever the box.
+        Every value depends on the labels around it alone, bit for bit, whatever the box.
         """
         x, y = self._neighbours(box)
-        top, left = y[0].min(), x[0].min()
-        owned = (self.labels[top : y[1].max() + 1, left : x[1].max() + 1] == owner).astype(np.float32)
+        window, left, top = self._window(x, y)
+        owned = (window == owner).astype(np.float32)
+        if self.softness:
+            # Sums of ones are exact, in any order.
+            side = 2 * self.softness + 1
+            owned = cv2.boxFilter(owned, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
+            owned *= np.float32(1.0 / side**2)
         rows = owned[y[0] - top] * (1 - y[2])[:, None] + owned[y[1] - top] * y[2][:, None]
         share: Float32Array = rows[:, x[0] - left] * (1 - x[2]) + rows[:, x[1] - left] * x[2]
         return share
+
+    def _window(self, x: _Neighbours, y: _Neighbours) -> tuple[NDArray[np.int32], int, int]:
+        """The labels that have a say in a box, and the indices of the first column and row."""
+        left, top = (max(0, int(axis[0].min()) - self.softness) for axis in (x, y))
+        right, bottom = (int(axis[1].max()) + 1 + self.softness for axis in (x, y))
+        return self.labels[top:bottom, left:right], left, top
 
     def _neighbours(self, box: Box) -> tuple[_Neighbours, _Neighbours]:
         """Labels before and after the px of a box, along x and along y."""

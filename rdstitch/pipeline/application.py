@@ -13,7 +13,6 @@ from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, InputError, OutputError, PartialResultError
 from rdstitch.io.atomic import check_output, write_json_atomic
-from rdstitch.io.write import write_image
 from rdstitch.pipeline.composing import compose_pictures
 from rdstitch.pipeline.inputs import find_pictures
 from rdstitch.pipeline.masks import with_masks
@@ -39,6 +38,7 @@ def apply(
     workers: int = 0,
     overwrite: bool = False,
     strict: bool = False,
+    dry_run: bool = False,
     progress: Progress = silent,
 ) -> Recomposition:
     """Compose pictures by a registration that was found before; nothing is estimated.
@@ -67,6 +67,8 @@ def apply(
         Replace existing outputs.
     strict : bool
         Fail when a picture that the registration used is missing or cannot be read.
+    dry_run : bool
+        Only plan; nothing is written.
     progress : callable
 
     Raises
@@ -95,7 +97,7 @@ def apply(
             first = next(iter(left_out.values()))
             raise InputError(f"{saved.path}: none of its pictures can be used; {first.path}: {first.reason}")
         used = dict(zip(used, with_masks(list(used.values()), mask), strict=True))
-        picture = compose_pictures(
+        composed = compose_pictures(
             list(used.values()),
             [source.camera for source in used.values()],
             np.array([saved.pictures[index].to_plane for index in used]),
@@ -104,12 +106,21 @@ def apply(
             options,
             threads,
             progress,
+            dry_run=dry_run,
         )
-        result = Recomposition(saved, tuple(sources), matched, left_out, picture.canvas, options, None, picture)
-        if output is not None:
-            metadata = next(iter(used.values())).metadata
-            write_image(output, picture.pixels, picture.alpha, metadata, background=options.background)
-            result = replace(result, output=Path(output), composite=None)
+        result = Recomposition(
+            saved,
+            tuple(sources),
+            matched,
+            left_out,
+            composed.canvas,
+            options,
+            None if output is None else Path(output),
+            composed.composite,
+            composed.plan,
+            composed.notes,
+        )
+        if output is not None and not dry_run:
             write_json_atomic(f"{output}.json", applied_sidecar(result))
         return result
 

@@ -1,16 +1,47 @@
-"""The last stage of every picture: from registered pictures to pixels."""
+"""The last stage of every picture: from registered pictures to pixels, in memory or in a file."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from numpy.typing import ArrayLike
 
 from rdstitch.camera import Camera
-from rdstitch.compositing import Composite, CompositeOptions, compose, plan_canvas
+from rdstitch.compositing import (
+    Canvas,
+    Composite,
+    CompositeOptions,
+    CompositePlan,
+    compose,
+    compose_to_file,
+    plan_canvas,
+    plan_composite,
+)
 from rdstitch.io.write import check_size
 from rdstitch.pipeline.progress import Progress
 from rdstitch.pipeline.sources import Source, readers
+
+
+@dataclass(frozen=True)
+class Composed:
+    """Pictures put together, or the plan of doing so.
+
+    Attributes
+    ----------
+    canvas : Canvas
+        Where the pictures lie in the output.
+    composite : Composite or None
+        The picture; None where it went to a file, or was only planned.
+    plan : CompositePlan or None
+        Of a dry run.
+    notes : tuple of str
+        What the user should know, such as why nothing was cropped.
+    """
+
+    canvas: Canvas
+    composite: Composite | None = None
+    plan: CompositePlan | None = None
+    notes: tuple[str, ...] = ()
 
 
 def compose_pictures(
@@ -22,7 +53,9 @@ def compose_pictures(
     options: CompositeOptions,
     threads: int,
     progress: Progress,
-) -> Composite:
+    *,
+    dry_run: bool = False,
+) -> Composed:
     """Plan the canvas, see whether a file can hold it, and put the pictures on it.
 
     Parameters
@@ -34,22 +67,33 @@ def compose_pictures(
     reference : int or None
         Picture whose resolution the output has; None for the median one's.
     output : path or None
-        File that the picture will be written to.
+        File that the picture is written to, a strip at a time, with colour profile and EXIF of the first picture;
+        without it the picture is made in memory.
     options : CompositeOptions
     threads : int
     progress : callable
+    dry_run : bool
+        Only plan.
     """
     names = [source.name for source in sources]
     canvas = plan_canvas(
         cameras, homographies, scale=options.scale, rotate=options.rotate, reference=reference, names=names
     )
-    if output is not None:
+    # A crop may yet make it fit.
+    if output is not None and options.crop == "none":
         check_size(output, canvas.size)
-    return compose(
-        readers(sources),
-        cameras,
-        homographies,
-        canvas,
-        replace(options, workers=threads),
-        progress=lambda share: progress("compositing", round(100 * share), 100),
-    )
+    options = replace(options, workers=threads)
+    read = readers(sources)
+    if dry_run:
+        pixels = read[0]().pixels
+        channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+        return Composed(canvas, plan=plan_composite(cameras, canvas, options, channels, pixels.dtype.itemsize))
+
+    def told(share: float) -> None:
+        progress("compositing", round(100 * share), 100)
+
+    if output is None:
+        composite = compose(read, cameras, homographies, canvas, options, told)
+        return Composed(composite.canvas, composite, notes=composite.notes)
+    written = compose_to_file(output, read, cameras, homographies, canvas, options, sources[0].metadata, told)
+    return Composed(written.canvas, notes=written.notes)

@@ -43,6 +43,7 @@ class StitchOptions:
     strict: bool = False  # fail when a picture is left out
     force: bool = False  # write the picture even when the result failed its checks
     save_camera: Path | None = None  # camera file to write; see rdstitch.camera_files for formats
+    dry_run: bool = False  # register, and plan the compositing; write nothing
 
     def __post_init__(self) -> None:
         """Check ranges and contradictions."""

@@ -10,10 +10,8 @@ from typing import Literal
 import numpy as np
 
 from rdstitch.camera_files import CAMERA_SUFFIXES, save_camera
-from rdstitch.compositing import Composite
 from rdstitch.errors import ArgumentError, InputError, PartialResultError, RegistrationError
 from rdstitch.io.atomic import check_output, write_json_atomic, write_text_atomic
-from rdstitch.io.write import write_image
 from rdstitch.pipeline.composing import compose_pictures
 from rdstitch.pipeline.inputs import find_pictures
 from rdstitch.pipeline.masks import with_masks
@@ -198,12 +196,12 @@ def _read(paths: Sequence[str | Path], options: StitchOptions, *, skip_bad: bool
 def _composite(
     registration: Registration, output: str | Path | None, options: StitchOptions, progress: Progress
 ) -> StitchResult:
-    """Judge, compose, write."""
+    """Judge, compose into the file or into memory, write the sidecar."""
     verdict = _accept(registration, options)
     alignment = registration.alignment
     used = np.flatnonzero(alignment.used)
     sources = [registration.sources[i] for i in used]
-    composite = compose_pictures(
+    composed = compose_pictures(
         sources,
         [alignment.cameras[i] for i in used],
         alignment.homographies[used],
@@ -212,11 +210,22 @@ def _composite(
         options.composite,
         options.threads,
         progress,
+        dry_run=options.dry_run,
     )
-    result = StitchResult(registration, composite.canvas, verdict, options, None, composite)
+    result = StitchResult(
+        registration,
+        composed.canvas,
+        verdict,
+        options,
+        None if output is None else Path(output),
+        composed.composite,
+        composed.plan,
+        composed.notes,
+    )
+    if options.dry_run:
+        return result
     if output is not None:
-        result = replace(result, output=Path(output), composite=None)
-        _write(result, composite, sources[0])
+        write_json_atomic(f"{output}.json", sidecar(result))
     _save_camera(registration, options)
     return result
 
@@ -235,11 +244,3 @@ def _accept(registration: Registration, options: StitchOptions) -> Verdict:
 def _save_camera(registration: Registration, options: StitchOptions) -> None:
     if options.save_camera is not None:
         save_camera(registration.camera, options.save_camera)
-
-
-def _write(result: StitchResult, composite: Composite, first: Source) -> None:
-    """The picture, then the sidecar."""
-    output, options = result.output, result.options
-    assert output is not None
-    write_image(output, composite.pixels, composite.alpha, first.metadata, background=options.composite.background)
-    write_json_atomic(f"{output}.json", sidecar(result))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rdstitch.compositing import Canvas, Composite, CompositeOptions
+from rdstitch.compositing import Canvas, Composite, CompositeOptions, CompositePlan
 from rdstitch.pipeline.saved import SavedRegistration
 from rdstitch.pipeline.sidecar import lens_fields, plain, versions
 from rdstitch.pipeline.sources import LeftOut, Source
@@ -29,7 +29,11 @@ class Recomposition:
     output : Path or None
         File that the picture was written to.
     composite : Composite or None
-        The picture itself; None where it went to a file.
+        The picture itself; None where it went to a file, or was only planned.
+    plan : CompositePlan or None
+        Of a dry run.
+    notes : tuple of str
+        What the user should know of the compositing.
     """
 
     saved: SavedRegistration
@@ -40,6 +44,8 @@ class Recomposition:
     composite_options: CompositeOptions
     output: Path | None = None
     composite: Composite | None = None
+    plan: CompositePlan | None = None
+    notes: tuple[str, ...] = ()
 
 
 def applied_sidecar(result: Recomposition) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from rdstitch.compositing import Canvas, Composite
+from rdstitch.compositing import Canvas, Composite, CompositePlan
 from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.register import Registration
 from rdstitch.pipeline.verdict import Verdict
@@ -24,7 +24,11 @@ class StitchResult:
     output : Path or None
         File that the picture was written to.
     composite : Composite or None
-        The picture itself; None where it went to a file.
+        The picture itself; None where it went to a file, or was only planned.
+    plan : CompositePlan or None
+        Of a dry run.
+    notes : tuple of str
+        What the user should know of the compositing.
     """
 
     registration: Registration
@@ -33,6 +37,8 @@ class StitchResult:
     options: StitchOptions
     output: Path | None = None
     composite: Composite | None = None
+    plan: CompositePlan | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def distortion(self) -> float:
@@ -42,4 +48,4 @@ class StitchResult:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What the user should know although there is a result, one sentence each."""
-        return (*self.registration.alignment.warnings, *self.verdict.doubts)
+        return (*self.registration.alignment.warnings, *self.verdict.doubts, *self.notes)

@@ -8,6 +8,7 @@ import click
 
 from rdstitch_cli import options
 from rdstitch_cli.progress import Reporter
+from rdstitch_cli.stitching import show_plan
 
 
 @click.command(
@@ -52,6 +53,7 @@ def apply(
     mask: Path | None,
     workers: int,
     strict: bool,
+    dry_run: bool,
     quiet: bool,
     verbose: bool,
     **compositing: Any,
@@ -78,9 +80,14 @@ def apply(
             workers=workers,
             overwrite=overwrite,
             strict=strict,
+            dry_run=dry_run,
             progress=reporter,
         )
         for missing in result.left_out.values():
             reporter.warn(f"left out {missing.path}: {missing.reason}")
         if result.matched == "order" and match == "auto":
             reporter.warn("no picture has a name of the sidecar; they were taken in order")
+        for note in result.notes:
+            reporter.warn(note)
+        if result.plan is not None:
+            show_plan(result.plan)

@@ -1,0 +1,125 @@
+"""Options of compositing on the command line, for real."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rdstitch_cli.main import cli
+
+from rdstitch.compositing import CompositeOptions
+from rdstitch.io import read_image
+from rdstitch.pipeline import StitchOptions, mosaic
+from tests.cli.running import FAST, Run
+
+LIBRARY_ONLY = {"bands", "tile_size", "workers"}
+
+
+@pytest.mark.parametrize("name", ["pano", "mosaic", "apply"])
+def test_names_and_defaults_are_the_librarys(name: str) -> None:
+    arguments = {"apply": ["a.json", "--images", "."]}.get(name, ["a.png", "b.png"])
+    given = cli.commands[name].make_context(name, [*arguments, "-o", "out.png"]).params
+    standard = CompositeOptions()
+    for field in set(CompositeOptions.__dataclass_fields__) - LIBRARY_ONLY:
+        assert given[field] == getattr(standard, field), field
+
+
+@pytest.fixture(scope="module")
+def sidecar(frames: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A registration of ``frames``."""
+    from rdstitch_cli.main import run
+
+    output = tmp_path_factory.mktemp("registered") / "small.png"
+    assert run(["mosaic", *map(str, frames), "-o", str(output), "--scale", "0.3", *FAST]) == 0
+    return output.with_name("small.png.json")
+
+
+WAYS: list[tuple[str, ...]] = [
+    ("--exposure", "none", "--seam", "none", "--blend", "none"),
+    ("--exposure", "gain", "--seam", "voronoi", "--blend", "feather"),
+    ("--exposure", "blocks", "--seam", "graphcut", "--blend", "multiband"),
+    ("--interpolation", "linear"),
+    ("--interpolation", "lanczos"),
+]
+
+
+def test_every_way_makes_another_picture_of_the_same_place(
+    rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path
+) -> None:
+    pictures = []
+    for number, way in enumerate(WAYS):
+        output = tmp_path / f"{number}.png"
+        done = rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--scale", "0.5", "-j", "1", *way)
+        assert (done.status, done.err) == (0, "")
+        record = json.loads(output.with_name(output.name + ".json").read_text(encoding="utf-8"))
+        used = record["options"]["composite"]
+        assert {name: used[name.removeprefix("--")] for name in way[::2]} == dict(zip(way[::2], way[1::2], strict=True))
+        pictures.append(read_image(output).pixels.astype(int))
+    for number, picture in enumerate(pictures):
+        assert np.abs(picture - pictures[0]).mean() < 3
+        assert [k for k in range(number) if (pictures[k] == picture).all()] == []
+
+
+def test_crop_leaves_no_hole(rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path) -> None:
+    output = tmp_path / "cropped.png"
+    done = rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--crop", "auto", "--scale", "1")
+    assert (done.status, done.err) == (0, "")
+    picture = read_image(output)
+    assert picture.alpha is None or (picture.alpha == 255).all()
+
+
+def test_background_is_what_no_picture_covers(rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path) -> None:
+    output = tmp_path / "white.jpg"
+    done = rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--background", "255")
+    assert done.status == 0
+    assert (read_image(output).pixels[0, 0] > 250).all()
+
+
+def test_too_little_memory_is_refused_with_the_reason(
+    rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path
+) -> None:
+    output = tmp_path / "none.tif"
+    done = rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--max-memory", "2M")
+    assert done.status == 7
+    assert "2 MB are too little" in done.line
+    assert "--max-memory" in done.line
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("text", ["much", "0", "-3M", "2X"])
+def test_no_amount_of_memory(rdstitch: Run, sidecar: Path, tmp_path: Path, text: str) -> None:
+    done = rdstitch("apply", sidecar, "--images", tmp_path, "-o", tmp_path / "a.tif", "--max-memory", text)
+    assert done.status == 2
+    assert "800M or 2G" in done.line
+
+
+def test_amounts_of_memory() -> None:
+    from rdstitch_cli.options import Bytes
+
+    amounts = {"800M": 800 * 2**20, "2G": 2**31, "1.5 GiB": 3 * 2**29, "64k": 65536, "12345": 12345}
+    assert {text: Bytes().convert(text, None, None) for text in amounts} == amounts
+
+
+def test_dry_run_tells_and_writes_nothing(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    done = rdstitch("mosaic", *frames, "-o", tmp_path / "a.tif", "--dry-run", *FAST)
+    assert (done.status, done.err) == (0, "")
+    assert not list(tmp_path.iterdir())
+    distortion, *plan = done.out.splitlines()
+    float(distortion)
+    told = dict(line.split(": ") for line in plan)
+    assert set(told) == {"pictures", "canvas", "output", "memory", "time"}
+    assert told["pictures"] == "3"
+    assert rdstitch("mosaic", *frames, "-o", tmp_path / "a.png", *FAST).status == 0
+    height, width = read_image(tmp_path / "a.png").pixels.shape[:2]
+    assert told["canvas"].startswith(f"{width} x {height} px")
+
+
+def test_file_and_memory_hold_the_same_picture(frames: list[Path], tmp_path: Path) -> None:
+    options = StitchOptions(workers=1)
+    held = mosaic(frames, None, options).composite
+    assert held is not None
+    written = mosaic(frames, tmp_path / "a.tif", options)
+    assert written.composite is None
+    back = read_image(tmp_path / "a.tif")
+    np.testing.assert_array_equal(back.pixels, held.pixels)
+    np.testing.assert_array_equal(back.alpha, held.alpha)
