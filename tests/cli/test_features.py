@@ -1,0 +1,63 @@
+"""``--features``: every kind gives what the default gives."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rdstitch_cli.options import FEATURES
+
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.features import KINDS
+from tests.cli.running import Run, transfers
+
+PAIR = sorted((Path(__file__).resolve().parents[2] / "examples/data/garfield_red").glob("*.jpg"))
+# What is looked at is the registration; the picture may be small.
+SMALL = ("--scale", "0.1", "--blend", "feather", "--seam", "voronoi", "-j", "1")
+
+
+def stitched(rdstitch: Run, folder: Path, kind: str) -> dict[str, Any]:
+    """The sidecar of the bundled pair."""
+    output = folder / f"{kind}.jpg"
+    done = rdstitch("pano", *PAIR, "-o", output, "--features", kind, "--reference", PAIR[0].name, *SMALL)
+    assert (done.status, done.err) == (0, "")
+    record: dict[str, Any] = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
+    return record
+
+
+def overlap(record: dict[str, Any]) -> FloatArray:
+    """Where a grid over the second picture lies in the first one, px; NaN where it is outside."""
+    camera = record["camera"]
+    width, height = camera["image_size"]
+    lens = Camera((width, height), camera["lambda"], camera["lambda2"], tuple(camera["center_px"]))
+    u, v = np.meshgrid(np.linspace(0, width - 1, 40), np.linspace(0, height - 1, 30))
+    # The frame is that of the first picture: its undistorted px are only scaled and shifted.
+    first = np.array(record["images"][0]["to_output"])
+    first /= first[2, 2]
+    flat = (transfers(record)[1](np.column_stack([u.ravel(), v.ravel()])) - first[:2, 2]) / first[0, 0]
+    points = lens.distort(lens.denormalize(flat))
+    inside = np.asarray((points >= 0) & (points <= (width - 1, height - 1))).all(axis=1, keepdims=True)
+    return np.where(inside, points, np.nan)
+
+
+@pytest.fixture(scope="module")
+def default() -> dict[str, Any]:
+    """Filled by the first test that needs it."""
+    return {}
+
+
+@pytest.mark.parametrize("kind", [kind for kind in FEATURES if kind not in ("rootsift", "aliked")])
+def test_every_kind_reproduces_the_default(rdstitch: Run, tmp_path: Path, default: dict[str, Any], kind: str) -> None:
+    if not default:
+        default.update(stitched(rdstitch, tmp_path, "rootsift"))
+    found = stitched(rdstitch, tmp_path, kind)
+    assert found["options"]["features"]["kind"] == kind
+    assert abs(found["lambda"] - default["lambda"]) < 0.006
+    here, there = overlap(found), overlap(default)
+    assert abs(np.isfinite(here).mean() - np.isfinite(there).mean()) < 0.01
+    assert np.nanmedian(np.linalg.norm(here - there, axis=1)) < 1.5
+
+
+def test_the_command_line_offers_every_kind() -> None:
+    assert FEATURES == KINDS
