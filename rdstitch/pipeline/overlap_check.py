@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from itertools import chain
 
 from rdstitch.compositing.agreement import Agreement, Grey, overlap_agreement, reduced_grey
+from rdstitch.compositing.ambiguity import Ambiguity, placement_ambiguity
 from rdstitch.pipeline.register import Registration
 from rdstitch.registration.alignment import LinkFit
 
@@ -21,10 +22,19 @@ class CheckedLink:
     ----------
     fit : LinkFit
     agreement : Agreement
+        Whether the two look alike where they are put together.
+    ambiguity : Ambiguity
+        Whether they would look as much alike elsewhere.
     """
 
     fit: LinkFit
     agreement: Agreement
+    ambiguity: Ambiguity
+
+    @property
+    def pair(self) -> tuple[int, int]:
+        """Its pictures."""
+        return self.fit.image1, self.fit.image2
 
 
 def check_overlaps(registration: Registration, workers: int = 1) -> list[CheckedLink]:
@@ -48,22 +58,19 @@ def check_overlaps(registration: Registration, workers: int = 1) -> list[Checked
     def grey(index: int) -> Grey:
         return reduced_grey(registration.sources[index].read())
 
+    def compare(fit: LinkFit) -> CheckedLink:
+        i, j = fit.image1, fit.image2
+        pair = greys[i], greys[j], cameras[i], cameras[j]
+        return CheckedLink(
+            fit,
+            overlap_agreement(*pair, alignment.relation(i, j)),
+            placement_ambiguity(*pair, alignment.homographies[i], alignment.homographies[j]),
+        )
+
     with ThreadPoolExecutor(workers) as pool:
         greys = dict(zip(pictures, pool.map(grey, pictures), strict=True))
-    cameras = {k: alignment.cameras[k].resized((grey.shape[1], grey.shape[0])) for k, grey in greys.items()}
-    return [
-        CheckedLink(
-            fit,
-            overlap_agreement(
-                greys[fit.image1],
-                greys[fit.image2],
-                cameras[fit.image1],
-                cameras[fit.image2],
-                alignment.relation(fit.image1, fit.image2),
-            ),
-        )
-        for fit in chosen
-    ]
+        cameras = {k: alignment.cameras[k].resized((grey.shape[1], grey.shape[0])) for k, grey in greys.items()}
+        return list(pool.map(compare, chosen))
 
 
 def _least_confirmed(links: Sequence[LinkFit]) -> list[LinkFit]:

@@ -1,7 +1,7 @@
 """Every run judges itself: can the result be relied on?"""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +9,9 @@ import numpy as np
 from rdstitch.pipeline.overlap_check import CheckedLink, check_overlaps
 from rdstitch.pipeline.register import Registration
 from rdstitch.registration.alignment import LinkFit
+from rdstitch.registration.graph import connected_components
+
+Pair = tuple[int, int]
 
 _LARGEST_RMS = 1.0  # of the whole, in thresholds
 _LEAST_INLIERS = 0.5  # share of a pair's own inliers that agree with the whole
@@ -16,6 +19,7 @@ _LEAST_INLIERS = 0.5  # share of a pair's own inliers that agree with the whole
 # (low sun, parallax, blur) have been seen to have 20 %.
 _LEAST_AGREEMENT, _DOUBTFUL_AGREEMENT = 0.10, 0.15
 _LEAST_CELLS = 8  # below, the overlap has too little texture to say anything
+_MOST_NAMED = 3  # pairs in one message
 _FOCAL_SPREAD = 1.03  # ratio of focal lengths in EXIF from which on the lens was zoomed
 
 
@@ -58,19 +62,51 @@ def judge(registration: Registration, threshold: float, workers: int = 1) -> Ver
     if kept < _LEAST_INLIERS * given:
         failures.append(f"only {kept} of {given} matches of the pairs agree with the whole")
     checked = check_overlaps(registration, workers)
-    failures.extend(_unlike(names, checked))
-    doubts = (*_disagreeing(names, used), *_little_alike(names, checked), *_inputs(registration))
-    return Verdict(not failures, tuple(failures), doubts)
+    suspicions = {**_disagreeing(names, used), **_unlike(names, checked), **_ambiguous(names, checked)}
+    decisive = _decisive(suspicions, used, len(names))
+    failures.extend(suspicions[pair] for pair in decisive[:_MOST_NAMED])
+    if len(decisive) > _MOST_NAMED:
+        failures.append(f"{len(decisive) - _MOST_NAMED} more pairs like these")
+    harmless = [clause for pair, clause in suspicions.items() if pair not in decisive]
+    return Verdict(not failures, tuple(failures), (*harmless, *_little_alike(names, checked), *_inputs(registration)))
 
 
-def _unlike(names: Sequence[str], checked: Sequence[CheckedLink]) -> list[str]:
+def _decisive(suspicions: Mapping[Pair, str], used: Sequence[LinkFit], count: int) -> list[Pair]:
+    """The suspicious pairs without which the pictures fall apart; those of the others are held by better ones."""
+    sound = [fit for fit in used if (fit.image1, fit.image2) not in suspicions]
+    parts = connected_components(count, [fit.image1 for fit in sound], [fit.image2 for fit in sound])
+    part = {picture: number for number, pictures in enumerate(parts) for picture in pictures}
+    return [(i, j) for i, j in suspicions if part[i] != part[j]]
+
+
+def _disagreeing(names: Sequence[str], used: Sequence[LinkFit]) -> dict[Pair, str]:
+    """Pairs whose matches do not fit into the whole."""
+    return {
+        (fit.image1, fit.image2): f"{names[fit.image1]} and {names[fit.image2]}: only {fit.inliers} of {fit.count} "
+        "matches agree with the whole; another camera or zoom, or no plane? stitch them on their own"
+        for fit in used
+        if fit.inliers < _LEAST_INLIERS * fit.count
+    }
+
+
+def _unlike(names: Sequence[str], checked: Sequence[CheckedLink]) -> dict[Pair, str]:
     """Pictures that were put together and do not look alike there."""
-    return [
-        f"{names[link.fit.image1]} and {names[link.fit.image2]} do not look alike where they are put together "
-        f"({link.agreement.confirming} of {link.agreement.cells} places agree); leave one of them out"
+    return {
+        link.pair: f"{names[link.fit.image1]} and {names[link.fit.image2]} do not look alike where they are put "
+        f"together ({link.agreement.confirming} of {link.agreement.cells} places agree); leave one of them out"
         for link in checked
         if link.agreement.cells >= _LEAST_CELLS and link.agreement.share < _LEAST_AGREEMENT
-    ]
+    }
+
+
+def _ambiguous(names: Sequence[str], checked: Sequence[CheckedLink]) -> dict[Pair, str]:
+    """Pictures of a repeated pattern, of which nobody can say by how many periods they are apart."""
+    return {
+        link.pair: f"{names[link.fit.image1]} and {names[link.fit.image2]} fit as well elsewhere, "
+        f"{link.ambiguity.shift:.0%} of a picture away (a repeated pattern?); take pictures that share something unique"
+        for link in checked
+        if link.ambiguity.ambiguous
+    }
 
 
 def _little_alike(names: Sequence[str], checked: Sequence[CheckedLink]) -> list[str]:
@@ -79,16 +115,6 @@ def _little_alike(names: Sequence[str], checked: Sequence[CheckedLink]) -> list[
         f"{link.agreement.cells} places look alike; look at the seam between them"
         for link in checked
         if link.agreement.cells >= _LEAST_CELLS and _LEAST_AGREEMENT <= link.agreement.share < _DOUBTFUL_AGREEMENT
-    ]
-
-
-def _disagreeing(names: Sequence[str], used: Sequence[LinkFit]) -> list[str]:
-    """Pairs whose matches do not fit into the whole."""
-    return [
-        f"{names[fit.image1]} and {names[fit.image2]}: only {fit.inliers} of {fit.count} matches agree with the whole; "
-        "look at the seam between them"
-        for fit in used
-        if fit.inliers < _LEAST_INLIERS * fit.count
     ]
 
 
