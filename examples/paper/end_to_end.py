@@ -33,9 +33,13 @@ HEADER = (
     "coverage, %",
     "λ error",
     "time, s",
+    "processor time, s",
     "memory, MB",
     "last words",
 )
+
+
+_SEARCH = 16  # px of the mosaic about each of its places, within which the place is looked for on the plane
 
 
 @dataclass(frozen=True)
@@ -107,27 +111,33 @@ def _judge(
     output = folder / "mosaic.tif"
     done = run_all(stitcher.commands(files, output, picture_set.field_of_view), folder, timeout)
     mosaic = _mosaic(folder) if done.ok else None
-    found = None if mosaic is None else compare_with_plane(mosaic, sequence.texture, reachable=sequence.reachable())
+    found = None if mosaic is None else _compared(mosaic, sequence)
     return (stitcher.name, *_row(done, found, _distortion_error(output, sequence))), mosaic
 
 
 def _row(done: Run, found: PlaneComparison | None, distortion_error: float | None) -> tuple[object, ...]:
     """Errors are given in px of the pictures, for mosaics of any scale."""
     status = "time is up" if done.status is None else str(done.status)
-    said = "" if done.ok else done.said
+    cost = (done.seconds, done.processor_seconds, done.megabytes, "" if done.ok else done.said)
     if found is None:
-        return status, None, None, None, distortion_error, done.seconds, done.megabytes, said
-    scale = found.texels_per_pixel
+        return status, None, None, None, distortion_error, *cost
     return (
         status,
-        found.median * scale,
-        found.percentile95 * scale,
+        _in_pictures(found.median, found),
+        _in_pictures(found.percentile95, found),
         100.0 * found.coverage,
         distortion_error,
-        done.seconds,
-        done.megabytes,
-        said,
+        *cost,
     )
+
+
+def _compared(mosaic: Pixels, sequence: Sequence) -> PlaneComparison:
+    return compare_with_plane(mosaic, sequence.texture, reachable=sequence.reachable(), search=_SEARCH)
+
+
+def _in_pictures(error: float, found: PlaneComparison) -> object:
+    """An error in px of the mosaic as px of the pictures, or that it is beyond what was searched."""
+    return error * found.texels_per_pixel if np.isfinite(error) else f"> {_SEARCH}"
 
 
 def _mosaic(folder: Path) -> Pixels | None:

@@ -1,7 +1,8 @@
 """Run one command with a time limit and tell how it went: ``python launcher.py SECONDS COMMAND …``.
 
 It is a script of its own because the kernel counts the memory of the process that forks a command as the command's:
-this one is small. It prints the exit status, null when the time was up, and the peak memory in kB, as JSON.
+this one is small. It prints as JSON the exit status, null when the time was up, the peak memory in kB, and
+the processor time of the command and all that it has waited for.
 """
 
 import json
@@ -32,7 +33,8 @@ def main() -> None:
             break
         time.sleep(_POLL)
     process.returncode = -1
-    print(json.dumps({"status": code, "kilobytes": usage.ru_maxrss}))
+    seconds = usage.ru_utime + usage.ru_stime
+    print(json.dumps({"status": code, "kilobytes": usage.ru_maxrss, "processor_seconds": seconds}))
 
 
 def _kill(parent: int) -> None:

@@ -22,6 +22,8 @@ class Run:
         Exit status of the last one that ran; negative for a signal, None when the time was up.
     seconds : float
         Wall time.
+    processor_seconds : float
+        Processor time of all of them; of one that was ended, without what its own children used.
     megabytes : float
         Largest resident memory of any of them, 10⁶ bytes.
     said : str
@@ -30,6 +32,7 @@ class Run:
 
     status: int | None
     seconds: float
+    processor_seconds: float
     megabytes: float
     said: str
 
@@ -52,15 +55,16 @@ def run_all(commands: Sequence[Sequence[str]], folder: Path, timeout: float) -> 
     """
     begun = time.perf_counter()
     status: int | None = 0
-    megabytes, said = 0.0, ""
+    processor, megabytes, said = 0.0, 0.0, ""
     for command in commands:
         left = timeout - (time.perf_counter() - begun)
         launched = [sys.executable, "-I", "-S", str(_LAUNCHER), str(left), *command]
         done = subprocess.run(launched, cwd=folder, capture_output=True, text=True, errors="replace", check=True)
         told = json.loads(done.stdout)
         status, lines = told["status"], done.stderr.strip().splitlines()
+        processor += told["processor_seconds"]
         megabytes = max(megabytes, told["kilobytes"] / 1e3)
         said = lines[-1][:_SAID] if lines else ""
         if status != 0:
             break
-    return Run(status, time.perf_counter() - begun, megabytes, said)
+    return Run(status, time.perf_counter() - begun, processor, megabytes, said)

@@ -236,6 +236,7 @@ def test_programs_are_measured_and_ended_in_time(tmp_path: Path) -> None:
     begun = time.perf_counter()
     late = run_all([[*python, "import time; time.sleep(60)"]], tmp_path, 0.5)
     assert late.status is None
+    assert late.processor_seconds < late.seconds
     assert time.perf_counter() - begun < 20.0
 
 
@@ -247,3 +248,4 @@ def test_end_to_end_rdstitch_lies_on_the_true_plane() -> None:
     assert row["coverage, %"] > 95.0
     assert row["λ error"] < 0.1
     assert row["memory, MB"] > 50.0
+    assert row["processor time, s"] > 0.5
