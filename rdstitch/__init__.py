@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         undistort,
     )
     from rdstitch.radial_homography import RadialHomography
+    from rdstitch.report import write_report
     from rdstitch.robust import estimate_radial_homography
 
 _HOMES = {
@@ -45,6 +46,7 @@ _HOMES = {
     "trajectory": "rdstitch.pipeline",
     "solvers": "rdstitch",
     "undistort": "rdstitch.pipeline",
+    "write_report": "rdstitch.report",
 }
 
 __all__ = [
@@ -65,6 +67,7 @@ __all__ = [
     "solvers",
     "trajectory",
     "undistort",
+    "write_report",
 ]
 
 

@@ -169,6 +169,13 @@ estimation = together(
 
 strict = click.option("--strict", is_flag=True, help="Fail with status 5 when a picture is left out.")
 
+report = click.option(
+    "--report",
+    type=PICTURE,
+    metavar="FILE",
+    help="Write a report to FILE (.html): graph, votes on λ, matches, residuals.",
+)
+
 trust = together(
     strict,
     click.option("--force", is_flag=True, help="Write the result even when it fails its own checks."),

@@ -1,6 +1,7 @@
 """What the stitching commands share: from flags to options, from a result to lines."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,6 +61,36 @@ def stitch_options(
         solver=solver.replace("-", "_"),
         **given,
     )
+
+
+class Report:
+    """The report of a run: the progress that measures its stages, and the file that is written at the end.
+
+    Parameters
+    ----------
+    file : Path or None
+        None writes nothing.
+    reporter : Reporter
+    inputs : sequence of Path
+        Files that it must not be written over.
+    overwrite : bool
+    """
+
+    def __init__(self, file: Path | None, reporter: Reporter, inputs: Sequence[Path], overwrite: bool) -> None:
+        from rdstitch.pipeline.timing import StageTimer
+
+        self._file, self.progress = file, StageTimer(reporter)
+        if file is not None:
+            from rdstitch.io.atomic import check_output
+
+            check_output(file, overwrite, inputs, suffixes=(".html", ".htm"))
+
+    def write(self, result: "StitchResult | Registration") -> None:
+        """Write the file, if one is wanted; a dry run writes nothing."""
+        if self._file is not None and getattr(result, "plan", None) is None:
+            from rdstitch.report import write_report
+
+            write_report(self._file, result, self.progress.stages)
 
 
 def summarize(result: "StitchResult", reporter: Reporter) -> None:

@@ -7,13 +7,14 @@ import click
 
 from rdstitch_cli import options
 from rdstitch_cli.progress import Reporter
-from rdstitch_cli.stitching import report_registration, stitch_options
+from rdstitch_cli.stitching import Report, report_registration, stitch_options
 
 
 @click.command(
     epilog="""\b
 Examples:
   rdstitch calibrate wall/ -o camera.json
+  rdstitch calibrate wall/ -o camera.yml --report lens.html
   rdstitch undistort other/*.jpg --camera camera.json -o straight/
 """
 )
@@ -30,9 +31,18 @@ Examples:
 @options.every
 @options.known
 @options.estimation
+@options.report
 @options.trust
 @options.verbosity
-def calibrate(inputs: tuple[Path, ...], output: Path, every: int, quiet: bool, verbose: bool, **given: Any) -> None:
+def calibrate(
+    inputs: tuple[Path, ...],
+    output: Path,
+    every: int,
+    report: Path | None,
+    quiet: bool,
+    verbose: bool,
+    **given: Any,
+) -> None:
     """Find λ, and where they can be seen the tilt and the focal length, from pictures of a plane.
 
     INPUT is what 'rdstitch mosaic' takes. The camera file is what 'undistort', 'pano' and 'mosaic' take as --camera.
@@ -41,5 +51,8 @@ def calibrate(inputs: tuple[Path, ...], output: Path, every: int, quiet: bool, v
 
     with Reporter(-quiet + verbose) as reporter:
         wanted = stitch_options(reporter, save_camera=output, **given)
-        registration = recipe(options.resolve(inputs), wanted, every=every, progress=reporter)
+        paths = options.resolve(inputs)
+        told = Report(report, reporter, paths, given["overwrite"])
+        registration = recipe(paths, wanted, every=every, progress=told.progress)
         report_registration(registration, reporter)
+        told.write(registration)

@@ -7,7 +7,7 @@ import click
 
 from rdstitch_cli import options
 from rdstitch_cli.progress import Reporter
-from rdstitch_cli.stitching import stitch_options, summarize
+from rdstitch_cli.stitching import Report, stitch_options, summarize
 
 
 @click.command(
@@ -16,7 +16,7 @@ Examples:
   rdstitch mosaic floor/ -o floor.tif
   rdstitch mosaic flight/*.jpg -o field.tif --camera camera.json
   find . -name '*.jpg' -print0 | rdstitch mosaic - -o all.tif
-  rdstitch mosaic drive.mp4 --every 10 -o drive.png
+  rdstitch mosaic drive.mp4 --every 10 -o drive.png --report drive.html
 """
 )
 @options.inputs
@@ -33,9 +33,18 @@ Examples:
     metavar="FILE",
     help="Write the estimated camera to FILE: .json, .yml (OpenCV), .pto (Hugin).",
 )
+@options.report
 @options.trust
 @options.verbosity
-def mosaic(inputs: tuple[Path, ...], output: Path, every: int, quiet: bool, verbose: bool, **given: Any) -> None:
+def mosaic(
+    inputs: tuple[Path, ...],
+    output: Path,
+    every: int,
+    report: Path | None,
+    quiet: bool,
+    verbose: bool,
+    **given: Any,
+) -> None:
     """Stitch a whole sequence over one plane, seen straight from above.
 
     INPUT is a folder, a picture, a quoted pattern, @FILE with one input a line, - for such lines (or NUL-separated
@@ -44,7 +53,8 @@ def mosaic(inputs: tuple[Path, ...], output: Path, every: int, quiet: bool, verb
     from rdstitch.pipeline import mosaic as recipe
 
     with Reporter(-quiet + verbose) as reporter:
-        result = recipe(
-            options.resolve(inputs), output, stitch_options(reporter, **given), every=every, progress=reporter
-        )
+        paths = options.resolve(inputs)
+        told = Report(report, reporter, paths, given["overwrite"])
+        result = recipe(paths, output, stitch_options(reporter, **given), every=every, progress=told.progress)
         summarize(result, reporter)
+        told.write(result)

@@ -7,14 +7,14 @@ import click
 
 from rdstitch_cli import options
 from rdstitch_cli.progress import Reporter
-from rdstitch_cli.stitching import stitch_options, summarize
+from rdstitch_cli.stitching import Report, stitch_options, summarize
 
 
 @click.command(
     epilog="""\b
 Examples:
   rdstitch pano left.jpg right.jpg -o pano.jpg
-  rdstitch pano *.png -o wall.png --reference middle.png
+  rdstitch pano *.png -o wall.png --reference middle.png --report wall.html
   rdstitch pano a.jpg b.jpg -o ab.tif --camera camera.json
 """
 )
@@ -31,9 +31,12 @@ Examples:
     metavar="FILE",
     help="Write the estimated camera to FILE: .json, .yml (OpenCV), .pto (Hugin).",
 )
+@options.report
 @options.trust
 @options.verbosity
-def pano(pictures: tuple[Path, ...], output: Path, quiet: bool, verbose: bool, **given: Any) -> None:
+def pano(
+    pictures: tuple[Path, ...], output: Path, report: Path | None, quiet: bool, verbose: bool, **given: Any
+) -> None:
     """Stitch two or more pictures that overlap, in any order.
 
     Writes the picture to the output, everything estimated to the output's name with .json added, and λ to standard
@@ -42,5 +45,7 @@ def pano(pictures: tuple[Path, ...], output: Path, quiet: bool, verbose: bool, *
     from rdstitch.pipeline import pano as recipe
 
     with Reporter(-quiet + verbose) as reporter:
-        result = recipe(pictures, output, stitch_options(reporter, **given), progress=reporter)
+        told = Report(report, reporter, pictures, given["overwrite"])
+        result = recipe(pictures, output, stitch_options(reporter, **given), progress=told.progress)
         summarize(result, reporter)
+        told.write(result)

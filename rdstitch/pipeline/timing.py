@@ -1,0 +1,39 @@
+"""How long each stage of a recipe took."""
+
+import time
+
+from rdstitch.pipeline.progress import Progress, silent
+
+
+class StageTimer:
+    """A progress that passes on what it is told, and keeps how long each stage took.
+
+    Parameters
+    ----------
+    progress : callable
+        What the calls are passed on to.
+    """
+
+    def __init__(self, progress: Progress = silent) -> None:
+        self._progress = progress
+        self._seconds: dict[str, float] = {}
+        self._stage = "reading headers"
+        self._since = time.perf_counter()
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Note a step of a stage."""
+        if stage != self._stage:
+            self._close()
+            self._stage = stage
+        self._progress(stage, done, total)
+
+    @property
+    def stages(self) -> tuple[tuple[str, float], ...]:
+        """Name and seconds of every stage, in the order of their beginnings; the last one lasts until now."""
+        self._close()
+        return tuple(self._seconds.items())
+
+    def _close(self) -> None:
+        now = time.perf_counter()
+        self._seconds[self._stage] = self._seconds.get(self._stage, 0.0) + now - self._since
+        self._since = now

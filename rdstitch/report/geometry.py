@@ -1,0 +1,52 @@
+"""Where pictures and matches lie: what several sections draw."""
+
+import numpy as np
+
+from rdstitch.camera import FloatArray
+from rdstitch.pipeline.register import Registration
+from rdstitch.radial_homography import project
+from rdstitch.registration.alignment import LinkFit
+from rdstitch.registration.pairs import PairRegistration
+
+_POINTS_PER_SIDE = 16
+
+
+def footprint(registration: Registration, index: int) -> FloatArray:
+    """Outline (K, 2) of a picture on the plane."""
+    camera = registration.alignment.cameras[index]
+    return _on_plane(registration, index, camera.outline(_POINTS_PER_SIDE))
+
+
+def middle(registration: Registration, index: int) -> FloatArray:
+    """Centre (2,) of a picture on the plane."""
+    width, height = registration.alignment.cameras[index].image_size
+    return _on_plane(registration, index, np.array([[(width - 1) / 2, (height - 1) / 2]])).reshape(2)
+
+
+def pairs_of(registration: Registration) -> dict[tuple[int, int], PairRegistration]:
+    """The pairs by their pictures."""
+    return {(pair.image1, pair.image2): pair for pair in registration.pairs}
+
+
+def residuals(registration: Registration, fit: LinkFit) -> tuple[FloatArray, FloatArray]:
+    """Where the matches of a link are in the second picture, and how far from there the alignment puts them, px.
+
+    Matches that the pair itself takes for wrong are left out, and those that miss by more than four times the link's
+    error.
+    """
+    pair, alignment = pairs_of(registration)[fit.image1, fit.image2], registration.alignment
+    first, second = alignment.cameras[fit.image1], alignment.cameras[fit.image2]
+    inliers = pair.relation.inliers
+    given, measured = pair.correspondences.points1[inliers], pair.correspondences.points2[inliers]
+    flat = first.normalize(first.undistort(given))
+    mapped = project(np.column_stack([flat, np.ones(len(flat))]) @ alignment.relation(fit.image1, fit.image2).T)
+    off = second.distort(second.denormalize(mapped)) - measured
+    kept = np.linalg.norm(off, axis=1) <= 4.0 * fit.rms
+    return measured[kept], off[kept]
+
+
+def _on_plane(registration: Registration, index: int, points: FloatArray) -> FloatArray:
+    camera, matrix = registration.alignment.cameras[index], registration.alignment.homographies[index]
+    flat = camera.normalize(camera.undistort(points))
+    z = np.column_stack([flat, np.ones(len(flat))]) @ (matrix * np.sign(matrix[2, 2])).T
+    return project(np.where(z[:, 2:] > 0.0, z, np.nan))

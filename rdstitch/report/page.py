@@ -1,0 +1,78 @@
+"""The page: all sections in one self-contained HTML file."""
+
+from collections.abc import Sequence
+from html import escape
+from importlib.metadata import version
+from pathlib import Path
+
+from rdstitch.io.atomic import write_bytes_atomic
+from rdstitch.pipeline.register import Registration
+from rdstitch.pipeline.result import StitchResult
+from rdstitch.report.camera_path import path_over_plane
+from rdstitch.report.grid import grid
+from rdstitch.report.match_graph import match_graph
+from rdstitch.report.matched import matched
+from rdstitch.report.mosaic import mosaic
+from rdstitch.report.residual_map import residual_map
+from rdstitch.report.summary import notices, summary
+from rdstitch.report.timings import timings
+from rdstitch.report.votes import votes
+
+REPORT_SUFFIXES = (".html", ".htm")
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 960px; margin: 2em auto; padding: 0 1em; }
+h1 { font-size: 1.6em; }
+h2 { font-size: 1.25em; margin-top: 2em; border-bottom: 1px solid #ddd; }
+h3 { font-size: 1em; }
+p, li, td { overflow-wrap: anywhere; } table { border-collapse: collapse; }
+td, th { padding: 0.2em 1em 0.2em 0; vertical-align: top; text-align: left; } td:first-child { white-space: nowrap; }
+img, svg { display: block; width: 100%; height: auto; } .beside { display: flex; gap: 1em; }
+.good { color: #1c7a36; font-weight: bold; } .bad { color: #b3261e; font-weight: bold; }
+"""
+
+
+def write_report(
+    path: str | Path, result: StitchResult | Registration, stages: Sequence[tuple[str, float]] = ()
+) -> None:
+    """Write the report of a result: one HTML file without anything outside of it.
+
+    Parameters
+    ----------
+    path : path
+    result : StitchResult or Registration
+    stages : sequence of (str, float)
+        Name and seconds of each stage; see :class:`rdstitch.pipeline.timing.StageTimer`.
+
+    Raises
+    ------
+    OutputError
+        When the file cannot be written.
+    """
+    # Names of files need not be UTF-8.
+    write_bytes_atomic(path, report_page(result, stages).encode("utf-8", "backslashreplace"))
+
+
+def report_page(result: StitchResult | Registration, stages: Sequence[tuple[str, float]] = ()) -> str:
+    """The report as HTML; see :func:`write_report`."""
+    stitched = result if isinstance(result, StitchResult) else None
+    registration = result.registration if isinstance(result, StitchResult) else result
+    title = "rdstitch report" if stitched is None or stitched.output is None else stitched.output.name
+    body = [
+        summary(registration, stitched),
+        notices(registration, stitched),
+        "" if stitched is None else mosaic(stitched),
+        match_graph(registration),
+        votes(registration),
+        grid(registration),
+        matched(registration),
+        residual_map(registration),
+        path_over_plane(registration),
+        timings(stages),
+    ]
+    return (
+        f'<!DOCTYPE html>\n<html lang="en">\n<head><meta charset="utf-8"><title>{escape(title)}</title>'
+        f"<style>{_STYLE}</style></head>\n<body>\n<h1>{escape(title)}</h1>\n"
+        + "\n".join(body)
+        + f"\n<footer><p>rdstitch {version('rdstitch')}</p></footer>\n</body>\n</html>\n"
+    )

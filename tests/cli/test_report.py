@@ -1,0 +1,166 @@
+"""``--report``: one self-contained page, well-formed, made from the result alone."""
+
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rdstitch.io import read_image
+from rdstitch.pipeline import calibrate, pano
+from rdstitch.pipeline.options import StitchOptions
+from rdstitch.pipeline.timing import StageTimer
+from rdstitch.report import report_page, write_report
+from tests.cli.running import FAST, Run
+
+_VOID = {"meta", "img"}
+_SECTIONS = ["Summary", "Warnings and left-out pictures", "Mosaic", "Match graph", "Votes on λ", "Lens", "Matches"]
+_SECTIONS += ["Residuals", "Trajectory", "Timings"]
+
+
+class _Page(HTMLParser):
+    """Checks that every element is closed, and keeps what the tests ask for."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.headings: list[str] = []
+        self.sources: list[str] = []
+        self.words: list[str] = []
+        self.counts: dict[str, int] = {}
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.counts[tag] = self.counts.get(tag, 0) + 1
+        self.sources += [value or "" for name, value in attrs if name in ("src", "href")]
+        assert not any(value and "nan" in value for name, value in attrs if name in ("d", "x", "y", "x1", "points"))
+        if tag not in _VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.counts[tag] = self.counts.get(tag, 0) + 1
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag, self.getpos()
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] == "h2":
+            self.headings.append(data)
+        self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(self.words)
+
+
+def _checked(text: str) -> _Page:
+    page = _Page(text)
+    # Nothing outside of the file: only data, and names of namespaces.
+    assert all(source.startswith("data:image/jpeg;base64,") for source in page.sources)
+    assert not re.search(r"<script|<link|<iframe|@import|url\((?!#)", text)
+    assert set(re.findall(r"https?://[^\"'<\s]+", text)) <= {"http://www.w3.org/2000/svg"}
+    return page
+
+
+@pytest.fixture(scope="module")
+def reported(frames: list[Path], stranger: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report of a mosaic that left out a picture; never written to."""
+    from rdstitch_cli.main import run
+
+    report = tmp_path_factory.mktemp("report") / "report.html"
+    pictures = [*map(str, frames), str(stranger)]
+    assert run(["mosaic", *pictures, "-o", str(report.with_name("out.png")), "--report", str(report), *FAST]) == 0
+    return report
+
+
+def test_a_mosaic_has_every_section(reported: Path, stranger: Path, frames: list[Path]) -> None:
+    page = _checked(reported.read_text(encoding="utf-8"))
+    assert page.headings == _SECTIONS
+    assert "3 of 4" in page.text
+    assert str(stranger) in page.text
+    assert re.search(r"-0\.(19|20)\d+ ± 0\.0", page.text)
+    for stage in ("detecting features", "matching", "registering pairs", "compositing"):
+        assert re.search(rf"{stage} +\d+\.\d\d s", page.text)
+    # Mosaic; the lens; two pairs of pictures.
+    assert (page.counts["img"], page.counts["image"]) == (1, 5)
+    assert all(frame.name in page.text for frame in frames)
+
+
+def test_the_numbers_are_those_of_the_result(frames: list[Path]) -> None:
+    result = pano(frames[:2], options=StitchOptions(workers=1))
+    page = _checked(report_page(result))
+    (fit,) = result.registration.alignment.links
+    assert f"{fit.inliers} of {result.registration.pairs[0].relation.inliers.sum()} inliers" in page.text
+    assert f"{result.distortion:.6f} ± {result.registration.alignment.distortion_std:.6f}" in page.text
+    assert "{} x {} px".format(*result.canvas.size) in page.text
+    assert "They were not measured." in page.text
+    # One pair is best and worst.
+    assert "The pair: " in page.text
+    assert result.composite is not None
+    # Outlines and the pair over them; nothing is drawn twice.
+    graph = report_page(result).split("<h2>Match graph</h2>")[1].split("</section>")[0]
+    assert (graph.count("<path"), graph.count("<line"), graph.count("<circle")) == (2, 1, 2)
+
+
+def test_calibrate_has_no_mosaic(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    report = tmp_path / "lens.html"
+    done = rdstitch("calibrate", *frames, "-o", tmp_path / "camera.json", "--report", report, *FAST)
+    assert (done.status, done.err) == (0, "")
+    headings = [heading for heading in _SECTIONS if heading != "Mosaic"]
+    assert _checked(report.read_text(encoding="utf-8")).headings == headings
+    again = rdstitch("calibrate", *frames, "-o", tmp_path / "b.json", "--report", report, *FAST)
+    assert (again.status, str(report) in again.line) == (6, True)
+    wrong = rdstitch("calibrate", *frames, "-o", tmp_path / "b.json", "--report", tmp_path / "report.pdf", *FAST)
+    assert (wrong.status, ".html" in wrong.line) == (6, True)
+    assert not (tmp_path / "b.json").exists()
+
+
+def test_names_are_escaped_and_vanished_pictures_do_not_matter(frames: list[Path], tmp_path: Path) -> None:
+    names = ["<b>&\"bold'.png", "caf\udce9<.png"]
+    pictures = [tmp_path / name for name in names]
+    for frame, picture in zip(frames, pictures, strict=False):
+        shutil.copy(frame, picture)
+    registration = calibrate(pictures, StitchOptions(workers=1, distortion=-0.2))
+    for picture in pictures:
+        picture.unlink()
+    write_report(tmp_path / "report.html", registration)
+    page = _checked((tmp_path / "report.html").read_text(encoding="utf-8"))
+    assert names[0] in page.text
+    assert "caf\\udce9<.png" in page.text
+    assert "b" not in page.counts
+    assert "(given)" in page.text
+    assert "no pair voted" in page.text
+    assert page.sources == []
+
+
+def test_stages_are_measured_and_passed_on() -> None:
+    seen: list[tuple[str, int, int]] = []
+    timer = StageTimer(lambda *step: seen.append(step))
+    steps = [("one", 0, 2), ("one", 2, 2), ("two", 1, 1), ("one", 1, 1)]
+    for step in steps:
+        timer(*step)
+    assert seen == steps
+    names, seconds = zip(*timer.stages, strict=True)
+    assert names == ("reading headers", "one", "two")
+    assert min(seconds) >= 0.0
+
+
+def test_a_browser_shows_it(reported: Path, tmp_path: Path) -> None:
+    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("there is no Chromium")
+    shot = tmp_path / "shot.png"
+    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
+    command += ["--window-size=1000,5000", f"--screenshot={shot}", reported.as_uri()]
+    subprocess.run(command, capture_output=True, check=True, timeout=120)
+    pixels = read_image(shot).pixels[..., :3].astype(int)
+    assert pixels.shape[:2] == (5000, 1000)
+    # The mosaic, the pictures of the lens and of the matches: coloured stretches all down the page.
+    colourful = np.ptp(pixels, axis=2).mean(axis=1) > 4.0
+    assert colourful[:2000].sum() > 200
+    assert colourful[2000:].sum() > 300
