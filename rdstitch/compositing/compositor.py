@@ -30,6 +30,8 @@ from rdstitch.io.write import check_format, write_strips
 Progress = Callable[[float], None]
 
 _PREPARATION = 0.25
+# Pictures that the survey reads at one time: what the tiles need is not there yet.
+_READERS = 2
 
 
 @dataclass(frozen=True)
@@ -249,7 +251,9 @@ def prepare(
     plan = plan_composite(cameras, canvas, options, channels, dtype.itemsize)
     exposure, seams, survey = no_exposure(len(cameras), channels), None, None
     if len(cameras) > 1 and (options.exposure != "none" or options.seam != "none"):
-        survey = survey_pictures(reader, cameras, matrices, canvas, _part_of(progress, 0.0, 0.7))
+        survey = survey_pictures(
+            reader, cameras, matrices, canvas, min(plan.workers, _READERS), _part_of(progress, 0.0, 0.7)
+        )
         if options.exposure != "none":
             exposure = estimate_exposure(survey, cameras, blocks=options.exposure == "blocks")
         if options.seam != "none":

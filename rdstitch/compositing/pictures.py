@@ -190,7 +190,8 @@ class PictureCache:
         self._reader, self._shrinks, self._limit = reader, shrinks, limit
         self._held: OrderedDict[int, LoadedPicture] = OrderedDict()
         self._bytes = self._largest = 0
-        self._lock = Lock()
+        # One picture is read at a time; meanwhile those that are held can be had.
+        self._lock, self._reading = Lock(), Lock()
 
     def masked(self, index: int) -> bool:
         """Whether a picture has transparent parts."""
@@ -198,17 +199,29 @@ class PictureCache:
 
     def __getitem__(self, index: int) -> LoadedPicture:
         """Picture ``index``, read unless it is held; may be asked for from several threads."""
-        with self._lock:
-            if index in self._held:
-                self._held.move_to_end(index)
-                return self._held[index]
+        if (held := self._find(index)) is not None:
+            return held
+        with self._reading:
+            # Another thread may have read it in the meantime.
+            if (held := self._find(index)) is not None:
+                return held
             # Room is made before reading, so that the limit holds meanwhile too.
-            while self._held and self._bytes + self._largest > self._limit:
-                _, dropped = self._held.popitem(last=False)
-                self._bytes -= dropped.nbytes
-                del dropped
+            with self._lock:
+                while self._held and self._bytes + self._largest > self._limit:
+                    _, dropped = self._held.popitem(last=False)
+                    self._bytes -= dropped.nbytes
+                    del dropped
             loaded = prepare_picture(self._reader(index), self._shrinks[index])
-            self._largest = max(self._largest, loaded.nbytes)
-            self._bytes += loaded.nbytes
-            self._held[index] = loaded
+            with self._lock:
+                self._largest = max(self._largest, loaded.nbytes)
+                self._bytes += loaded.nbytes
+                self._held[index] = loaded
             return loaded
+
+    def _find(self, index: int) -> LoadedPicture | None:
+        """A picture that is held."""
+        with self._lock:
+            if index not in self._held:
+                return None
+            self._held.move_to_end(index)
+            return self._held[index]

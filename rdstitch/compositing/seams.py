@@ -25,6 +25,7 @@ _Neighbours = tuple[NDArray[np.intp], NDArray[np.intp], Float32Array]
 
 # Band in which a seam may wander: the new picture's share of both border weights.
 _LEAST_SHARE, _LARGEST_SHARE = 0.2, 0.8
+_AROUND_FREE = 2
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,8 @@ class SeamMap:
         x, y = self._neighbours(box)
         window, left, top = self._window(x, y)
         owned = (window == owner).astype(np.float32)
+        if owned.all():
+            return np.ones((len(y[0]), len(x[0])), dtype=np.float32)
         if self.softness:
             # Sums of ones are exact, in any order.
             side = 2 * self.softness + 1
@@ -144,9 +147,20 @@ def _cut(
         return np.asarray(surely_new | free)
     if not surely_new.any():
         return surely_new
-    masks = [(free | sure).astype(np.uint8) * np.uint8(255) for sure in (surely_old, surely_new)]
-    images = [_three_channels(image) for image in (below, pixels)]
-    return np.asarray(surely_new | (free & _graph_cut(images, masks)))
+    # A cut runs where it is free to; what is farther off only takes time.
+    y0, y1, x0, x1 = (limit for axis in (1, 0) for limit in _reach(free.any(axis=axis)))
+    part = np.s_[y0:y1, x0:x1]
+    masks = [(free | sure)[part].astype(np.uint8) * np.uint8(255) for sure in (surely_old, surely_new)]
+    images = [_three_channels(image[part]) for image in (below, pixels)]
+    won = surely_new.copy()
+    won[part] |= free[part] & _graph_cut(images, masks)
+    return won
+
+
+def _reach(present: NDArray[np.bool_]) -> tuple[int, int]:
+    """Start and stop of what is present along an axis, with room for what surely belongs to either side."""
+    where = np.flatnonzero(present)
+    return max(0, int(where[0]) - _AROUND_FREE), min(len(present), int(where[-1]) + 1 + _AROUND_FREE)
 
 
 def _graph_cut(images: list[Float32Array], masks: list[NDArray[np.uint8]]) -> NDArray[np.bool_]:

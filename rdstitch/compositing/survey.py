@@ -1,7 +1,9 @@
 """A first look at all pictures, small, on the canvas: what exposure and seams are decided on."""
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -82,17 +84,19 @@ def survey_pictures(
     cameras: Sequence[Camera],
     homographies: FloatArray,
     canvas: Canvas,
+    workers: int = 1,
     progress: Callable[[float], None] | None = None,
 ) -> Survey:
-    """Read every picture once and lay it, small, on the reduced canvas."""
+    """Read every picture once, ``workers`` at a time, and lay it, small, on the reduced canvas."""
     factor = survey_factor(canvas)
     small = canvas.reduced(factor)
     warps = tuple(plan_warp(c, g, small, k) for k, (c, g) in enumerate(zip(cameras, homographies, strict=True)))
     tiles = []
-    for k, warp in enumerate(warps):
-        tiles.append(_survey_tile(reader, k, warp))
-        if progress is not None:
-            progress((k + 1) / len(warps))
+    with ThreadPoolExecutor(workers) as pool:
+        for tile in pool.map(partial(_survey_tile, reader), range(len(warps)), warps):
+            tiles.append(tile)
+            if progress is not None:
+                progress(len(tiles) / len(warps))
     return Survey(factor, small, warps, tuple(tiles))
 
 

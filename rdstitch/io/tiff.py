@@ -23,6 +23,7 @@ _TILE = 256
 _SMALLEST_OVERVIEW = 256
 # Rows that are reduced at a time, even.
 _HALVED_ROWS = 32
+_BUFFER = 2**24
 _BIGTIFF_FROM = 2**32 - 2**27
 _COPIED_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.Artist, ExifTags.Base.Copyright)
 # (code, type, count, value, only on the first page), as tifffile takes them.
@@ -81,6 +82,8 @@ def _write_page(
         compressionargs={"level": 1},
         # Plain tifffile has no predictor for floating point.
         predictor=layout.dtype.kind == "u",
+        # Tiles that tifffile holds before it compresses and writes them; 256 MB if not told.
+        buffersize=_BUFFER,
         metadata=None,
         software="rdstitch",
         subfiletype=int(reduced),
