@@ -8,6 +8,8 @@ from numpy.typing import ArrayLike
 
 from examples.paper.peers import optional_module
 
+_MARKED = 20
+
 
 def new_figure() -> Any | None:
     """An empty Figure, or None where matplotlib is not installed."""
@@ -31,9 +33,10 @@ def histograms(axes: Any, samples: Mapping[str, ArrayLike], label: str) -> None:
 def curves(
     axes: Any, x: ArrayLike, series: Mapping[str, Sequence[float]], xlabel: str, ylabel: str, *, log: bool = False
 ) -> None:
-    """One line a series over common abscissae."""
+    """One line a series over common abscissae; places are marked where there are few."""
+    marker = "." if np.size(x) <= _MARKED else ""
     for name, values in series.items():
-        axes.plot(x, values, marker=".", label=name)
+        axes.plot(x, values, marker=marker, label=name)
     if log:
         axes.set_yscale("log")
     axes.set_xlabel(xlabel)
