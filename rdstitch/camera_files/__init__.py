@@ -33,7 +33,12 @@ CAMERA_SUFFIXES = (".json", ".yml", ".yaml", ".pto")
 
 
 def load_camera(path: str | Path) -> Camera:
-    """Read a camera file of any known format; see :func:`read_camera_file`, which also tells how well λ fits."""
+    """Read a camera file of any known format; see :func:`read_camera_file`, which also tells how well λ fits.
+
+    Parameters
+    ----------
+    path : path
+    """
     return read_camera_file(path).camera
 
 
@@ -62,6 +67,12 @@ def read_camera_file(path: str | Path) -> CameraFile:
 
 def save_camera(camera: Camera, path: str | Path) -> None:
     """Write a camera file; the name says which format.
+
+    Parameters
+    ----------
+    camera : Camera
+    path : path
+        ``.json``, ``.yml``, ``.pto``, …; see :mod:`rdstitch.camera_files`.
 
     Raises
     ------

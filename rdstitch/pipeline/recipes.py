@@ -100,7 +100,15 @@ def calibrate(
 ) -> Registration:
     """Find the lens from pictures of a plane; the camera is ``result.camera``.
 
-    Parameters are those of :func:`mosaic`; nothing is composited. ``options.save_camera`` names the file to write.
+    Parameters
+    ----------
+    inputs, options, every, progress
+        As for :func:`mosaic`; nothing is composited. ``options.save_camera`` names the file to write.
+
+    Raises
+    ------
+    RdstitchError
+        See the tree in :mod:`rdstitch.errors`.
     """
     options = options or StitchOptions()
     with _pictures(inputs, None, every) as paths:
