@@ -1,6 +1,6 @@
 """The compositor: pictures, cameras and homographies in, one picture out, in memory or in a file."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -134,7 +134,7 @@ def compose_to_file(
     options: CompositeOptions | None = None,
     metadata: Metadata | None = None,
     progress: Progress | None = None,
-    extra_tags: Sequence[ExtraTag] = (),
+    extra_tags: Callable[[Canvas], Iterable[ExtraTag]] | None = None,
 ) -> FileComposite:
     """Put pictures together straight into a file, whatever its size: memory is that of a strip of tiles.
 
@@ -146,8 +146,8 @@ def compose_to_file(
         As for :func:`compose`.
     metadata : Metadata, optional
         Colour profile, EXIF and resolution to keep.
-    extra_tags
-        Further tags of a TIFF file.
+    extra_tags : callable, optional
+        Gives further tags of a TIFF file for the canvas after cropping.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def compose_to_file(
             covered += int(np.count_nonzero(alpha))
             yield samples, alpha
 
-    write_strips(path, layout, counted(), extra_tags)
+    write_strips(path, layout, counted(), () if extra_tags is None else extra_tags(prepared.canvas))
     share = covered / (size[0] * size[1])
     return FileComposite(Path(path), prepared.canvas, renderer.exposure, share, prepared.notes)
 

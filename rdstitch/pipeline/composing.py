@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.camera import Camera
@@ -17,7 +18,9 @@ from rdstitch.compositing import (
     plan_canvas,
     plan_composite,
 )
+from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_size
+from rdstitch.pipeline.georeference import Georeference, georeference
 from rdstitch.pipeline.progress import Progress
 from rdstitch.pipeline.sources import Source, readers
 
@@ -67,8 +70,8 @@ def compose_pictures(
     reference : int or None
         Picture whose resolution the output has; None for the median one's.
     output : path or None
-        File that the picture is written to, a strip at a time, with colour profile and EXIF of the first picture;
-        without it the picture is made in memory.
+        File that the picture is written to, a strip at a time, with colour profile and EXIF of the first picture, and
+        with its place on the Earth where three pictures have a GPS position; without it the picture is made in memory.
     options : CompositeOptions
     threads : int
     progress : callable
@@ -95,5 +98,15 @@ def compose_pictures(
     if output is None:
         composite = compose(read, cameras, homographies, canvas, options, told)
         return Composed(composite.canvas, composite, notes=composite.notes)
-    written = compose_to_file(output, read, cameras, homographies, canvas, options, sources[0].metadata, told)
-    return Composed(written.canvas, notes=written.notes)
+    matrices = np.asarray(homographies, dtype=np.float64)
+    placed: list[tuple[Georeference | None, str]] = []
+
+    def tags(final: Canvas) -> list[ExtraTag]:
+        placed.append(georeference([source.metadata.gps for source in sources], cameras, final.matrix @ matrices))
+        return placed[0][0].tiff_tags() if placed[0][0] is not None else []
+
+    written = compose_to_file(output, read, cameras, matrices, canvas, options, sources[0].metadata, told, tags)
+    place, note = placed[0]
+    if place is not None and Path(output).suffix.lower() not in (".tif", ".tiff"):
+        place.write_beside(output)
+    return Composed(written.canvas, notes=(*written.notes, *([note] if note else [])))

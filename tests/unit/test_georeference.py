@@ -1,0 +1,109 @@
+"""The place of a mosaic on the Earth, from made-up positions."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from PIL import ExifTags, Image
+
+from rdstitch.camera import Camera, FloatArray
+from rdstitch.compositing import CompositeOptions
+from rdstitch.io.metadata import GpsPosition
+from rdstitch.pipeline import StitchOptions, mosaic
+from rdstitch.pipeline.georeference import georeference, utm
+from tests.cli.running import flight, transfers
+
+
+# Values of PROJ 9.
+@pytest.mark.parametrize(
+    ("latitude", "longitude", "zone", "place"),
+    [
+        (48.8582222, 2.2945, 31, (448251.8181, 5411935.1455)),
+        (-33.9, 18.5, -34, (268832.2996, 6246117.7881)),
+        (0.0, -177.2, 1, (477744.9619, 0.0)),
+        (69.65, 18.95, 33, (653210.0895, 7731796.8304)),
+    ],
+)
+def test_utm(latitude: float, longitude: float, zone: int, place: tuple[float, float]) -> None:
+    np.testing.assert_allclose(utm([latitude], [longitude], zone), [place], atol=0.001)
+
+
+def _degrees(value: float) -> tuple[float, float, float]:
+    minutes = abs(value) % 1 * 60
+    return float(int(abs(value))), float(int(minutes)), minutes % 1 * 60
+
+
+METRES_PER_TEXEL = 0.05
+
+
+@pytest.fixture(scope="module")
+def located(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], FloatArray]:
+    """A flight with positions in its EXIF, and where the middles of its pictures are: easting and northing, m."""
+    sequence, folder = flight(4, 3, 2), tmp_path_factory.mktemp("located")
+    middles = np.concatenate([sequence.to_plane(k, np.array([[199.5, 149.5]])) for k in range(len(sequence))])
+    east, north = middles[:, 0] * METRES_PER_TEXEL, -middles[:, 1] * METRES_PER_TEXEL
+    # Degrees of latitude and longitude at 33 degrees on the ellipsoid.
+    latitude, longitude = -33.0 + north / 110_903.9, 18.5 + east / 93_453.2
+    paths = sequence.write(folder, "f{}.jpg")
+    for path, phi, lam in zip(paths, latitude, longitude, strict=True):
+        with Image.open(path) as image:
+            exif = image.getexif()
+            exif[ExifTags.IFD.GPSInfo] = {1: "S", 2: _degrees(phi), 3: "E", 4: _degrees(lam)}
+            image.save(path, exif=exif, quality=95)
+    return paths, utm(latitude, longitude, -34)
+
+
+def _middles(output: Path) -> FloatArray:
+    """Px of the output where the pictures' middles are, by the sidecar."""
+    record = json.loads(output.with_name(output.name + ".json").read_text(encoding="utf-8"))
+    found = transfers(record)
+    return np.concatenate([found[k](np.array([[199.5, 149.5]])) for k in sorted(found)])
+
+
+@pytest.mark.parametrize("crop", ["none", "auto"])
+def test_a_tiff_lies_in_the_right_place(located: tuple[list[Path], FloatArray], tmp_path: Path, crop: Any) -> None:
+    paths, truth = located
+    mosaic(paths, tmp_path / "a.tif", StitchOptions(workers=1, composite=CompositeOptions(scale=0.7, crop=crop)))
+    with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
+        tags = tiff.pages.first.tags
+        keys, matrix = tags[34735].value, np.reshape(tags[34264].value, (4, 4))
+    assert keys[-4:] == (3072, 0, 1, 32734)
+    px = _middles(tmp_path / "a.tif")
+    # GeoTIFF counts from the corner of the first px.
+    corners = np.column_stack([px + 0.5, np.zeros(len(px)), np.ones(len(px))])
+    error = np.hypot(*((corners @ matrix.T)[:, :2] - truth).T)
+    assert error.max() < 4 * METRES_PER_TEXEL
+    assert np.hypot(matrix[0, 0], matrix[1, 0]) == pytest.approx(METRES_PER_TEXEL / 0.7, rel=0.25)
+
+
+def test_other_formats_get_a_world_file(located: tuple[list[Path], FloatArray], tmp_path: Path) -> None:
+    paths, truth = located
+    mosaic(paths, tmp_path / "a.jpg", StitchOptions(workers=1))
+    a, d, b, e, c, f = map(float, (tmp_path / "a.jgw").read_text(encoding="ascii").split())
+    px = _middles(tmp_path / "a.jpg")
+    place = np.column_stack([a * px[:, 0] + b * px[:, 1] + c, d * px[:, 0] + e * px[:, 1] + f])
+    assert np.hypot(*(place - truth).T).max() < 4 * METRES_PER_TEXEL
+    assert "UTM_Zone_34S" in (tmp_path / "a.prj").read_text(encoding="ascii")
+
+
+def test_positions_that_do_not_fit_are_refused() -> None:
+    lens = Camera((400, 300))
+    to_output = np.stack([np.array([[250.0, 0, 300 * k], [0, 250.0, 40 * k**2], [0, 0, 1]]) for k in range(4)])
+    straight = [GpsPosition(50.0, 8.0 + 1e-4 * k) for k in range(4)]
+    place, reason = georeference(straight, [lens] * 4, to_output)
+    assert place is not None
+    assert reason == ""
+    mixed = [straight[k] for k in (2, 0, 3, 1)]
+    place, reason = georeference(mixed, [lens] * 4, to_output)
+    assert place is None
+    assert "not georeferenced" in reason
+    assert georeference([straight[0], None, straight[1], None], [lens] * 4, to_output) == (None, "")
+
+
+def test_pictures_without_positions_leave_no_world_file(tmp_path: Path) -> None:
+    mosaic(flight(4, 2).write(tmp_path), tmp_path / "a.png", StitchOptions(workers=1))
+    assert not list(tmp_path.glob("*.pgw"))
+    assert not list(tmp_path.glob("*.prj"))
