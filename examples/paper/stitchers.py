@@ -100,6 +100,6 @@ def _hugin_by_hand(pictures: Sequence[Path], output: Path, field_of_view: float)
         ["autooptimiser", "-n", "-o", "a.pto", "a.pto"],
         ["pto_var", f"--opt={everything}", "-o", "a.pto", "a.pto"],
         ["autooptimiser", "-n", "-o", "a.pto", "a.pto"],
-        ["pano_modify", "--projection=0", "--fov=AUTO", "--canvas=AUTO", "--crop=AUTO", "-o", "a.pto", "a.pto"],
+        ["pano_modify", "--projection=0", "--fov=AUTO", "--canvas=AUTO", "-o", "a.pto", "a.pto"],
         ["hugin_executor", "--stitching", f"--prefix={output.stem}", "a.pto"],
     ]
