@@ -1,5 +1,6 @@
 """Mutual nearest neighbours with the ratio of the nearest to the second nearest, in bounded memory."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -44,6 +45,19 @@ class Locations:
         """Number of locations."""
         return len(self.layers[0])
 
+    def blocks(self, most: int) -> Iterator[tuple[int, int]]:
+        """Ranges of locations with at most so many keypoints together, or with one location."""
+        counts = np.zeros(len(self), dtype=np.intp)
+        for layer in self.layers:
+            counts[: len(layer)] += 1
+        until = np.cumsum(counts)
+        start = 0
+        while start < len(self):
+            before = until[start] - counts[start]
+            stop = max(start + 1, int(np.searchsorted(until, before + most, side="right")))
+            yield start, stop
+            start = stop
+
     def rows(self, start: int, stop: int) -> list[NDArray[np.intp]]:
         """The layers of locations ``start`` to ``stop``."""
         return [layer[start:stop] for layer in self.layers if len(layer) > start]
@@ -75,11 +89,10 @@ def mutual_nearest(features1: Features, features2: Features, block_bytes: int) -
     nearest = np.empty(len(one), dtype=np.intp)
     best, second = np.empty((2, len(one)), similarity.dtype)
     best_of_column, second_of_column = np.full((2, len(two)), similarity.lowest, similarity.dtype)
-    step = max(1, block_bytes // (similarity.bytes_each * len(columns)) // len(one.layers))
-    for start in range(0, len(one), step):
-        layers = one.rows(start, start + step)
+    for start, stop in one.blocks(block_bytes // (similarity.bytes_each * len(columns))):
+        layers = one.rows(start, stop)
         block = _merge(similarity.block(np.concatenate(layers)), layers, two)
-        here = slice(start, start + len(block))
+        here = slice(start, stop)
         _update_two_best(best_of_column, second_of_column, block)
         index = np.arange(len(block))
         nearest[here] = block.argmax(axis=1)

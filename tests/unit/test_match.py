@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from rdstitch.errors import ArgumentError
 from rdstitch.features import Features, match
 from rdstitch.features.keypoints import Descriptors
+from rdstitch.features.nearest import Locations
 
 
 def features(descriptors: Descriptors, points: NDArray[np.float64] | None = None, kind: str = "sift") -> Features:
@@ -174,3 +175,20 @@ def test_bad_arguments_are_refused() -> None:
         replace(one, descriptors=one.descriptors[1:])
     with pytest.raises(ArgumentError, match="finite"):
         replace(one, points=one.points * np.nan)
+
+
+def test_blocks_hold_as_many_keypoints_as_they_may() -> None:
+    rng = np.random.default_rng(4)
+    points = np.repeat(rng.uniform(0, 100, (40, 2)), rng.integers(1, 6, 40), axis=0)
+    locations = Locations.group(points)
+    for most in (0, 1, 7, 30, 1000):
+        blocks = list(locations.blocks(most))
+        assert [start for start, _ in blocks] == [0, *(stop for _, stop in blocks[:-1])]
+        assert blocks[-1][1] == len(locations) == 40
+        sizes = [sum(map(len, locations.rows(start, stop))) for start, stop in blocks]
+        assert sum(sizes) == len(points)
+        assert all(size <= most or stop == start + 1 for size, (start, stop) in zip(sizes, blocks, strict=True))
+        # No block could take the next location, too.
+        for (start, stop), size in zip(blocks[:-1], sizes[:-1], strict=True):
+            assert size + len(locations.rows(stop, stop + 1)) > most
+            assert stop > start
