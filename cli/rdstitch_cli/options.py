@@ -164,6 +164,12 @@ estimation = together(
         "--threshold", type=float, default=3.0, show_default=True, metavar="PX", help="Largest error of an inlier, px."
     ),
     click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of random sampling."),
+    click.option(
+        "--cache",
+        type=PICTURE,
+        metavar="DIR",
+        help="Keep features, pairs and alignments in this folder, and continue from what is there; made if missing.",
+    ),
     workers,
 )
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -15,7 +16,10 @@ from rdstitch.features.options import KINDS, FeatureOptions
 from rdstitch.features.picture import Image, Mask, prepare
 from rdstitch.features.spread import spread, strongest
 
-__all__ = ["KINDS", "FeatureOptions", "Features", "Source", "detect", "detect_all"]
+__all__ = ["KINDS", "FeatureOptions", "Features", "Recall", "Source", "detect", "detect_all"]
+
+Recall = Callable[[int, Callable[[], Features]], Features]
+"""Called with a picture's index and what detects its features; gives these, perhaps from an earlier run."""
 
 Source = Callable[[], tuple[Image, Mask | None]]
 """Loads one picture and its mask (True or non-zero: use it; None: use all) when it is called."""
@@ -67,6 +71,7 @@ def detect_all(
     options: FeatureOptions | None = None,
     workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
+    recall: Recall | None = None,
 ) -> list[Features]:
     """Detect the features of many pictures, several at a time; at most ``workers`` pictures are in memory.
 
@@ -79,6 +84,8 @@ def detect_all(
         Pictures to work on at the same time, each in one thread.
     progress : callable, optional
         Called in this thread with the number of pictures done and their total.
+    recall : callable, optional
+        Stands between this function and the detection of each picture; see :data:`Recall`. Called in other threads.
 
     Returns
     -------
@@ -96,13 +103,17 @@ def detect_all(
     if workers < 1:
         raise ArgumentError(f"workers must be at least 1, not {workers}")
 
-    def work(source: Source) -> Features:
+    def find_features(source: Source) -> Features:
         image, mask = source()
         return detect(image, options, mask)
 
+    def work(index: int) -> Features:
+        compute = partial(find_features, sources[index])
+        return compute() if recall is None else recall(index, compute)
+
     results: list[Features] = []
     with _one_opencv_thread(), ThreadPoolExecutor(workers) as pool:
-        for features in pool.map(work, sources):
+        for features in pool.map(work, range(len(sources))):
             results.append(features)
             if progress is not None:
                 progress(len(results), len(sources))

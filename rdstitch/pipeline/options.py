@@ -37,6 +37,7 @@ class StitchOptions:
     mask: str | Path | None = None  # picture, or folder of them, that is dark where the pictures do not count
     reference: str | None = None  # name of the picture whose frame is kept; None: the best connected
     composite: CompositeOptions = field(default_factory=CompositeOptions)
+    cache: Path | None = None  # folder of results of earlier runs, to continue from; made if missing
     seed: int = 0
     workers: int = 0  # pictures and pairs worked on at the same time; 0: as many as there are cores
     overwrite: bool = False  # replace existing outputs

@@ -3,10 +3,12 @@
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 
 from rdstitch.compositing.agreement import Agreement, Grey, overlap_agreement, reduced_grey
 from rdstitch.compositing.ambiguity import Ambiguity, placement_ambiguity
+from rdstitch.pipeline.cache import NO_CACHE, Cache
 from rdstitch.pipeline.register import Registration
 from rdstitch.registration.alignment import LinkFit
 
@@ -37,7 +39,7 @@ class CheckedLink:
         return self.fit.image1, self.fit.image2
 
 
-def check_overlaps(registration: Registration, workers: int = 1) -> list[CheckedLink]:
+def check_overlaps(registration: Registration, workers: int = 1, cache: Cache = NO_CACHE) -> list[CheckedLink]:
     """Compare the pictures of every used link, or of those that the fewest others confirm.
 
     Parameters
@@ -45,6 +47,7 @@ def check_overlaps(registration: Registration, workers: int = 1) -> list[Checked
     registration : Registration
     workers : int
         Pictures read at the same time.
+    cache : Cache
 
     Raises
     ------
@@ -54,6 +57,19 @@ def check_overlaps(registration: Registration, workers: int = 1) -> list[Checked
     alignment = registration.alignment
     chosen = _least_confirmed([fit for fit in alignment.links if fit.used])
     pictures = sorted(set(chain.from_iterable((fit.image1, fit.image2) for fit in chosen)))
+    placed = [
+        (k, cache.file(source.path), cache.file(source.mask), alignment.cameras[k], alignment.homographies[k])
+        for k, source in ((k, registration.sources[k]) for k in pictures)
+    ]
+    compute = partial(_compare, registration, chosen, pictures, workers)
+    return cache.recall("overlaps", (CheckedLink, LinkFit, Agreement, Ambiguity), (placed, chosen), compute)
+
+
+def _compare(
+    registration: Registration, chosen: Sequence[LinkFit], pictures: Sequence[int], workers: int
+) -> list[CheckedLink]:
+    """Read the pictures, and compare those of the chosen links."""
+    alignment = registration.alignment
 
     def grey(index: int) -> Grey:
         return reduced_grey(registration.sources[index].read())

@@ -1,15 +1,18 @@
 """Pairs of pictures through all rounds: matched once, estimated alone, then with what the others know."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
 from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features, Matcher, match_near
+from rdstitch.pipeline.cache import NO_CACHE, Cache
 from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.progress import Progress
+from rdstitch.planar_motion import PlanarMotion
+from rdstitch.radial_homography import RadialHomography
 from rdstitch.registration import Alignment
 from rdstitch.registration.pairs import PairOptions, PairRegistration, estimate_pairs, match_pairs
 from rdstitch.registration.resting import most_rest, moving_features, show_motion
@@ -30,6 +33,7 @@ class Pairing:
     matcher : callable
     options : StitchOptions
     progress : callable
+    cache : Cache
     """
 
     features: Sequence[Features]
@@ -37,22 +41,15 @@ class Pairing:
     matcher: Matcher
     options: StitchOptions
     progress: Progress
+    cache: Cache = NO_CACHE
 
     def estimate(self, pairs: Sequence[tuple[int, int]], distortion: float | None = None) -> list[PairRegistration]:
         """Match and estimate pairs (i, j), with λ free, or as the user or the other pairs say."""
         if not pairs:
             return []
-        matched = match_pairs(self.features, pairs, self.matcher, partial(self.progress, "matching"))
         known = self.options.known_distortion
-        found = estimate_pairs(
-            self.cameras,
-            pairs,
-            matched,
-            self._pair_options(distortion if known is None else known),
-            tilts=self._tilts(),
-            workers=self.options.threads,
-            progress=partial(self.progress, "registering pairs"),
-        )
+        lens = distortion if known is None else known
+        found = self._relate(pairs, self._match(pairs), lens, "registering pairs")
         return found if known is not None or distortion is None else [_without_vote(pair) for pair in found]
 
     def look_past_rest(self, pairs: list[PairRegistration]) -> "tuple[Pairing, list[PairRegistration]]":
@@ -73,14 +70,11 @@ class Pairing:
         consensus = vote([r.distortion for r in relations], [r.distortion_std for r in relations])
         if not np.isfinite(consensus.distortion):
             return pairs
-        again = estimate_pairs(
-            self.cameras,
+        again = self._relate(
             [(pairs[index].image1, pairs[index].image2) for index in failed],
             [pairs[index].correspondences for index in failed],
-            self._pair_options(consensus.distortion),
-            tilts=self._tilts(),
-            workers=self.options.threads,
-            progress=partial(self.progress, "retrying pairs"),
+            consensus.distortion,
+            "retrying pairs",
         )
         rescued = list(pairs)
         for index, pair in zip(failed, again, strict=True):
@@ -92,14 +86,10 @@ class Pairing:
         """Match pairs that hold together by little again, looking only where the alignment says."""
         weak = {(fit.image1, fit.image2) for fit in alignment.links if fit.used and fit.inliers < _FEW_MATCHES}
         chosen = [index for index, pair in enumerate(pairs) if pair.relation and (pair.image1, pair.image2) in weak]
-        known = self.options.known_distortion
-        again = estimate_pairs(
-            self.cameras,
+        again = self._relate(
             [(pairs[index].image1, pairs[index].image2) for index in chosen],
             [self._near(pairs[index], alignment) for index in chosen],
-            self._pair_options(known),
-            tilts=self._tilts(),
-            workers=self.options.threads,
+            self.options.known_distortion,
         )
         stronger = list(pairs)
         for index, pair in zip(chosen, again, strict=True):
@@ -119,13 +109,57 @@ class Pairing:
             self.options.ratio,
         )
 
+    def _match(self, pairs: Sequence[tuple[int, int]]) -> list[Correspondences]:
+        """Matches of every pair, from an earlier run where the cache has them."""
+
+        def recall(index: int, compute: Callable[[], Correspondences]) -> Correspondences:
+            i, j = pairs[index]
+            inputs = (self._digests[i], self._digests[j], self._matching)
+            return self.cache.recall("matches", (Correspondences,), inputs, compute)
+
+        return match_pairs(self.features, pairs, self.matcher, partial(self.progress, "matching"), recall)
+
+    def _relate(
+        self,
+        pairs: Sequence[tuple[int, int]],
+        matched: Sequence[Correspondences],
+        distortion: float | None,
+        stage: str | None = None,
+    ) -> list[PairRegistration]:
+        """The relation of every pair, from an earlier run where the cache has it."""
+        options, tilt = self._pair_options(distortion), self.options.tilt
+
+        def recall(index: int, compute: Callable[[], RadialHomography]) -> RadialHomography:
+            i, j = pairs[index]
+            inputs = (self.cameras[i], self.cameras[j], self.cache.digest(matched[index]), options, tilt)
+            return self.cache.recall("pairs", (RadialHomography, Camera, PlanarMotion), inputs, compute)
+
+        return estimate_pairs(
+            self.cameras,
+            pairs,
+            matched,
+            options,
+            tilts=None if tilt is None else [tilt] * len(self.cameras),
+            workers=self.options.threads,
+            progress=None if stage is None else partial(self.progress, stage),
+            recall=recall,
+        )
+
+    @cached_property
+    def _digests(self) -> list[str]:
+        """What stands for the features of each picture."""
+        return [self.cache.digest(found) for found in self.features]
+
+    @cached_property
+    def _matching(self) -> tuple[float | str | None, ...]:
+        """What stands for the way of matching."""
+        model = self.options.lightglue_model
+        return self.options.ratio, None if model is None else self.cache.file(model)
+
     def _pair_options(self, distortion: float | None) -> PairOptions:
         o = self.options
         solver = o.solver if distortion is None else "auto"
         return PairOptions(solver, distortion, o.threshold, o.confidence, o.max_iterations, o.seed)
-
-    def _tilts(self) -> list[tuple[float, float] | None] | None:
-        return None if self.options.tilt is None else [self.options.tilt] * len(self.cameras)
 
 
 def _without_vote(pair: PairRegistration) -> PairRegistration:

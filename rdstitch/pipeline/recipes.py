@@ -12,6 +12,7 @@ import numpy as np
 from rdstitch.camera_files import CAMERA_SUFFIXES, save_camera
 from rdstitch.errors import ArgumentError, InputError, PartialResultError, RegistrationError
 from rdstitch.io.atomic import check_output, write_json_atomic, write_text_atomic
+from rdstitch.pipeline.cache import Cache
 from rdstitch.pipeline.composing import compose_pictures
 from rdstitch.pipeline.inputs import find_pictures
 from rdstitch.pipeline.masks import with_masks
@@ -240,7 +241,7 @@ def _composite(
 
 def _accept(registration: Registration, options: StitchOptions) -> Verdict:
     """Judge a registration; what cannot be relied on goes no further, unless forced."""
-    verdict = judge(registration, options.threshold, options.threads)
+    verdict = judge(registration, options.threshold, options.threads, Cache(options.cache))
     if not verdict.ok and not options.force:
         reasons = "; ".join(verdict.failures)
         raise RegistrationError(f"no reliable result: {reasons} (--force writes it all the same)")

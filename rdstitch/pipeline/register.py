@@ -1,6 +1,6 @@
 """The registration that pano, mosaic, calibrate and trajectory share: features, pairs, one alignment."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -10,11 +10,13 @@ from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError, RegistrationError
 from rdstitch.features import Features, LightGlue, Matcher, detect_all, match
 from rdstitch.io.read import Pixels
+from rdstitch.pipeline.cache import Cache
 from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.pairing import Pairing
 from rdstitch.pipeline.progress import Progress, silent
 from rdstitch.pipeline.sources import LeftOut, Source
 from rdstitch.registration import Alignment, AlignmentOptions, Link, align
+from rdstitch.registration.alignment import LinkFit, Poses, Relief
 from rdstitch.registration.pairs import PairRegistration
 from rdstitch.registration.selection import first_pairs, neighbours
 
@@ -86,8 +88,9 @@ def register(
     """
     reference = _reference(sources, options.reference)
     matcher = _matcher(options)
-    features, damaged = _detect(sources, options, skip_bad, progress)
-    pairing = Pairing(features, [source.camera for source in sources], matcher, options, progress)
+    cache = Cache(options.cache)
+    features, damaged = _detect(sources, options, cache, skip_bad, progress)
+    pairing = Pairing(features, [source.camera for source in sources], matcher, options, progress, cache)
     pairs = pairing.estimate(first_pairs(features, options.seed))
     pairing, pairs = pairing.look_past_rest(pairs)
     pairs = pairing.rescue(pairs)
@@ -95,7 +98,7 @@ def register(
         reference=reference, model=options.model, distortion=options.known_distortion, tilt=options.tilt
     )
     cameras = [source.camera.with_focal() for source in sources]
-    alignment = align(cameras, _links(sources, pairs), aligning)
+    alignment = _align(cache, cameras, _links(sources, pairs), aligning)
     for _ in range(_CLOSURE_ROUNDS):
         tried = {(pair.image1, pair.image2) for pair in pairs}
         closures = pairing.estimate(
@@ -104,12 +107,12 @@ def register(
         pairs = sorted([*pairs, *closures], key=lambda pair: (pair.image1, pair.image2))
         if not any(pair.relation for pair in closures):
             break
-        alignment = align(cameras, _links(sources, pairs), aligning)
+        alignment = _align(cache, cameras, _links(sources, pairs), aligning)
     stronger = pairing.strengthen(pairs, alignment)
     if any(new is not old for new, old in zip(stronger, pairs, strict=True)):
-        pairs, alignment = stronger, align(cameras, _links(sources, stronger), aligning)
+        pairs, alignment = stronger, _align(cache, cameras, _links(sources, stronger), aligning)
     if metric and alignment.poses is None and options.model == "auto":
-        alignment = align(cameras, _links(sources, pairs), replace(aligning, model="tilting"))
+        alignment = _align(cache, cameras, _links(sources, pairs), replace(aligning, model="tilting"))
     resting = pairing.features is not features
     if resting:
         alignment = replace(alignment, warnings=(*alignment.warnings, _PAST_REST))
@@ -145,8 +148,16 @@ def _reference(sources: Sequence[Source], name: str | None) -> int | None:
     raise ArgumentError(f"the reference picture {name!r} is not among the input pictures")
 
 
+def _align(cache: Cache, cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions) -> Alignment:
+    """The alignment, from an earlier run where the cache has it."""
+    inputs = (tuple(cameras), cache.digest(tuple(links)), options)
+    return cache.recall(
+        "alignment", (Alignment, Camera, LinkFit, Poses, Relief), inputs, partial(align, cameras, links, options)
+    )
+
+
 def _detect(
-    sources: Sequence[Source], options: StitchOptions, skip_bad: bool, progress: Progress
+    sources: Sequence[Source], options: StitchOptions, cache: Cache, skip_bad: bool, progress: Progress
 ) -> tuple[list[Features], dict[int, str]]:
     """Features of every picture, and which pictures turned out to be damaged; these have no features."""
     damaged: dict[int, str] = {}
@@ -161,8 +172,18 @@ def _detect(
             return np.zeros((1, 1), dtype=np.uint8), None
         return picture.pixels, picture.alpha
 
+    network = cache.file(options.features.aliked_model)
+    wanted = replace(options.features, aliked_model=None) if network else options.features
+
+    def recall(index: int, compute: Callable[[], Features]) -> Features:
+        source = sources[index]
+        inputs = (cache.file(source.path), cache.file(source.mask), source.camera.image_size, wanted, network)
+        # A damaged picture has no features, but that must be said again the next time.
+        return cache.recall("features", (Features,), inputs, compute, unless=lambda: index in damaged)
+
     loaders = [partial(load, index) for index in range(len(sources))]
-    features = detect_all(loaders, options.features, options.threads, partial(progress, "detecting features"))
+    progress_of = partial(progress, "detecting features")
+    features = detect_all(loaders, options.features, options.threads, progress_of, recall)
     return features, damaged
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rdstitch.pipeline.cache import NO_CACHE, Cache
 from rdstitch.pipeline.overlap_check import CheckedLink, check_overlaps
 from rdstitch.pipeline.register import Registration
 from rdstitch.registration.alignment import LinkFit
@@ -41,7 +42,7 @@ class Verdict:
     doubts: tuple[str, ...]
 
 
-def judge(registration: Registration, threshold: float, workers: int = 1) -> Verdict:
+def judge(registration: Registration, threshold: float, workers: int = 1, cache: Cache = NO_CACHE) -> Verdict:
     """Check an alignment against the pairs that it was made from, and against the pixels.
 
     Parameters
@@ -51,6 +52,7 @@ def judge(registration: Registration, threshold: float, workers: int = 1) -> Ver
         Largest transfer error of an inlier of a pair, px.
     workers : int
         Pictures read at the same time.
+    cache : Cache
     """
     alignment = registration.alignment
     names = [source.name for source in registration.sources]
@@ -61,7 +63,8 @@ def judge(registration: Registration, threshold: float, workers: int = 1) -> Ver
     given, kept = sum(fit.count for fit in used), sum(fit.inliers for fit in used)
     if kept < _LEAST_INLIERS * given:
         failures.append(f"only {kept} of {given} matches of the pairs agree with the whole")
-    checked = check_overlaps(registration, workers)
+    # Pictures that mostly show what rests in them look alike anywhere but where the moving plane puts them.
+    checked = [] if registration.resting else check_overlaps(registration, workers, cache)
     suspicions = {**_disagreeing(names, used), **_unlike(names, checked), **_ambiguous(names, checked)}
     decisive = _decisive(suspicions, used, len(names))
     failures.extend(suspicions[pair] for pair in decisive[:_MOST_NAMED])

@@ -3,6 +3,8 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,7 +15,12 @@ from rdstitch.radial_homography import RadialHomography
 from rdstitch.registration.links import Link
 from rdstitch.robust import SOLVERS, estimate_radial_homography
 
+Value = TypeVar("Value")
+
 Progress = Callable[[int, int], None]
+
+Recall = Callable[[int, Callable[[], Value]], Value]
+"""Called with the position of a pair and what computes something of it; gives that, perhaps from an earlier run."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +71,7 @@ def match_pairs(
     pairs: Sequence[tuple[int, int]],
     matcher: Matcher,
     progress: Progress | None = None,
+    recall: Recall[Correspondences] | None = None,
 ) -> list[Correspondences]:
     """Match the features of pairs of pictures; the matrix products keep all cores busy.
 
@@ -77,10 +85,13 @@ def match_pairs(
         Matches the features of two pictures.
     progress : callable, optional
         Called with the number of pairs done and their total.
+    recall : callable, optional
+        Stands between this function and the matching of each pair; see :data:`Recall`.
     """
     matched = []
-    for image1, image2 in pairs:
-        matched.append(matcher(features[image1], features[image2]))
+    for index, (image1, image2) in enumerate(pairs):
+        compute = partial(matcher, features[image1], features[image2])
+        matched.append(compute() if recall is None else recall(index, compute))
         if progress is not None:
             progress(len(matched), len(pairs))
     return matched
@@ -95,6 +106,7 @@ def estimate_pairs(
     tilts: Sequence[tuple[float, float] | None] | None = None,
     workers: int = 1,
     progress: Progress | None = None,
+    recall: Recall[RadialHomography] | None = None,
 ) -> list[PairRegistration]:
     """Estimate the relation of every pair, several at a time.
 
@@ -112,13 +124,15 @@ def estimate_pairs(
         Threads.
     progress : callable, optional
         Called with the number of pairs done and their total.
+    recall : callable, optional
+        Stands between this function and the estimation of each pair; see :data:`Recall`. Called in other threads.
     """
 
-    def work(index: int) -> PairRegistration:
+    def relate(index: int) -> RadialHomography:
         image1, image2 = pairs[index]
         camera1, camera2, found = cameras[image1], cameras[image2], matched[index]
         tilt1, tilt2 = (None, None) if tilts is None else (tilts[image1], tilts[image2])
-        relation = estimate_radial_homography(
+        return estimate_radial_homography(
             found.points1,
             found.points2,
             camera1.image_size,
@@ -135,7 +149,11 @@ def estimate_pairs(
             max_iterations=options.max_iterations,
             seed=options.seed,
         )
-        return PairRegistration(image1, image2, found, relation)
+
+    def work(index: int) -> PairRegistration:
+        compute = partial(relate, index)
+        relation = compute() if recall is None else recall(index, compute)
+        return PairRegistration(*pairs[index], matched[index], relation)
 
     registered = []
     with ThreadPoolExecutor(workers) as pool:

@@ -1,0 +1,134 @@
+"""Results of earlier runs, so that an interrupted run continues and a changed option repeats only what depends on it.
+
+Every result is a file named by everything that it depends on: the content of the pictures, the options that matter to
+it, and the versions of the software. So nothing is ever out of date; what is damaged is computed again.
+"""
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, TypeVar
+
+from rdstitch.errors import ArgumentError, InputError, OutputError
+from rdstitch.io.packing import digest, pack, unpack
+
+Value = TypeVar("Value")
+
+_FORMAT = 1
+_PACKAGES = ("rdstitch", "numpy", "scipy", "opencv-contrib-python-headless", "pillow", "tifffile")
+
+
+@dataclass(frozen=True)
+class Cache:
+    """Results on disk; several processes may share one.
+
+    Attributes
+    ----------
+    folder : Path or None
+        Without one nothing is kept, and everything is computed.
+
+    Raises
+    ------
+    OutputError
+        When the folder cannot be made, or not be written to.
+    """
+
+    folder: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Make the folder before long work begins."""
+        if self.folder is None:
+            return
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{self.folder}: cannot make the folder of the cache: {error.strerror}") from error
+        if not os.access(self.folder, os.W_OK | os.X_OK):
+            raise OutputError(f"{self.folder}: no permission to write into the folder of the cache")
+
+    def recall(
+        self,
+        stage: str,
+        kinds: tuple[type, ...],
+        inputs: tuple[Any, ...],
+        compute: Callable[[], Value],
+        unless: Callable[[], bool] = lambda: False,
+    ) -> Value:
+        """What a stage gives for its inputs: from an earlier run, else computed now and kept.
+
+        Parameters
+        ----------
+        stage : str
+            Name of the stage.
+        kinds : tuple of dataclass
+            What the result is made of.
+        inputs : tuple
+            Everything that the result depends on, as :func:`rdstitch.io.packing.pack` takes it.
+        compute : callable
+            Gives the result.
+        unless : callable
+            Asked after the computation: whether its result must not be kept.
+        """
+        if self.folder is None:
+            return compute()
+        name = digest((_FORMAT, _versions(), stage, inputs))
+        file = self.folder / stage / name[:2] / name[2:]
+        with suppress(InputError, ArgumentError, OSError):
+            # The name once more: an entry that was mistaken for another is no better than a damaged one.
+            kept: tuple[str, Value] = unpack(file.read_bytes(), kinds)
+            if isinstance(kept, tuple) and kept[0] == name:
+                return kept[1]
+        value = compute()
+        # A cache that has become full or read-only is no reason to stop.
+        with suppress(OSError):
+            if not unless():
+                _write(file, pack((name, value)))
+        return value
+
+    def file(self, path: str | Path | None) -> str:
+        """What stands for the content of a file in the inputs of a stage; empty without a file or a cache.
+
+        A file that cannot be read is unlike any other, and itself the next time: nothing is kept of it.
+        """
+        if self.folder is None or path is None:
+            return ""
+        try:
+            with Path(path).open("rb") as stream:
+                return hashlib.file_digest(stream, "sha256").hexdigest()
+        except OSError:
+            return os.urandom(16).hex()
+
+    def digest(self, value: Any) -> str:
+        """What stands for a large value in the inputs of several results; empty without a cache."""
+        return "" if self.folder is None else digest(value)
+
+
+@cache
+def _versions() -> dict[str, str]:
+    """Of everything that results may depend on."""
+    return {package: version(package) for package in _PACKAGES}
+
+
+NO_CACHE = Cache()
+"""Keeps nothing."""
+
+
+def _write(file: Path, data: bytes) -> None:
+    """Write a file at once; unlike an output it need not survive a loss of power, since damage is noticed."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=".", suffix=".part", dir=file.parent)
+    temporary = Path(name)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+        temporary.replace(file)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink()
+        raise

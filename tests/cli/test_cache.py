@@ -1,0 +1,174 @@
+"""``--cache``: an interrupted run continues, a changed option repeats only what depends on it, damage does no harm."""
+
+import json
+import os
+import random
+import shutil
+import time
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rdstitch_cli.main import run
+
+from rdstitch.pipeline import overlap_check, register
+from rdstitch.registration import pairs
+from tests.cli.running import FAST, Run, finished, start
+
+
+def _result(output: Path) -> tuple[bytes, dict[str, Any]]:
+    """The picture, and the sidecar apart from the options that say nothing of it."""
+    record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
+    del record["options"]["cache"], record["options"]["overwrite"]
+    return output.read_bytes(), record
+
+
+@pytest.fixture(scope="session")
+def plain(frames: list[Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, dict[str, Any]]:
+    """What comes without a cache."""
+    output = tmp_path_factory.mktemp("plain") / "out.png"
+    assert run(["mosaic", *map(str, frames), "-o", str(output), *FAST]) == 0
+    return _result(output)
+
+
+@pytest.fixture
+def work(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The names of the expensive functions that were called, in order."""
+    called: list[str] = []
+
+    def watch(module: Any, name: str) -> None:
+        function: Callable[..., Any] = getattr(module, name)
+
+        def wrapped(*arguments: Any, **options: Any) -> Any:
+            called.append(name)
+            return function(*arguments, **options)
+
+        monkeypatch.setattr(module, name, wrapped)
+
+    # The package has a function of the module's name.
+    watch(import_module("rdstitch.features.detect"), "detect")
+    watch(pairs, "estimate_radial_homography")
+    watch(register, "align")
+    watch(overlap_check, "overlap_agreement")
+    return called
+
+
+def test_only_what_depends_on_a_changed_option_is_done_again(
+    rdstitch: Run, frames: list[Path], plain: tuple[bytes, dict[str, Any]], tmp_path: Path, work: list[str]
+) -> None:
+    output = tmp_path / "out.png"
+    arguments = ("mosaic", *frames, "-o", output, "--overwrite", "--cache", tmp_path / "new" / "cache", *FAST)
+    for expected in ({"detect", "estimate_radial_homography", "align", "overlap_agreement"}, set()):
+        work.clear()
+        first = rdstitch(*arguments)
+        assert (first.status, set(work)) == (0, expected)
+        assert _result(output) == plain
+    for options, expected in (
+        (("--blend", "feather", "--scale", "0.5"), set()),
+        (("--seed", "1"), {"estimate_radial_homography", "align", "overlap_agreement"}),
+        (("--features", "orb"), {"detect", "estimate_radial_homography", "align", "overlap_agreement"}),
+    ):
+        work.clear()
+        assert rdstitch(*arguments, *options).status == 0
+        assert set(work) == expected, options
+    # A picture that was copied is the same picture; one that was changed is another.
+    moved = [Path(shutil.copy(frame, tmp_path / f"moved_{frame.name}")) for frame in frames]
+    work.clear()
+    assert rdstitch("calibrate", *moved, "-o", tmp_path / "camera.json", *arguments[-2 - len(FAST) :]).status == 0
+    assert work == []
+
+
+def test_a_picture_more_needs_only_its_own(
+    rdstitch: Run, frames: list[Path], plain: tuple[bytes, dict[str, Any]], tmp_path: Path, work: list[str]
+) -> None:
+    cached = ("--cache", tmp_path / "cache", *FAST)
+    assert rdstitch("calibrate", *frames[:2], "-o", tmp_path / "camera.json", *cached).status == 0
+    work.clear()
+    assert rdstitch("mosaic", *frames, "-o", tmp_path / "out.png", *cached).status == 0
+    assert work.count("detect") == 1
+    assert _result(tmp_path / "out.png") == plain
+
+
+@pytest.mark.parametrize("damage", ["cut", "emptied", "bit turned", "replaced by another", "a folder"])
+def test_damaged_entries_are_computed_again(
+    rdstitch: Run, frames: list[Path], plain: tuple[bytes, dict[str, Any]], tmp_path: Path, damage: str
+) -> None:
+    output, cache = tmp_path / "out.png", tmp_path / "cache"
+    arguments = ("mosaic", *frames, "-o", output, "--overwrite", "--cache", cache, *FAST)
+    assert rdstitch(*arguments).status == 0
+    entries = sorted(path for path in cache.rglob("*") if path.is_file())
+    assert {path.relative_to(cache).parts[0] for path in entries} >= {"features", "matches", "pairs", "alignment"}
+    contents = [entry.read_bytes() for entry in entries]
+    for entry, content, other in zip(entries, contents, contents[1:] + contents[:1], strict=True):
+        if damage == "a folder":
+            entry.unlink()
+            entry.mkdir()
+            continue
+        middle = len(content) // 2
+        turned = content[:middle] + bytes([content[middle] ^ 4]) + content[middle + 1 :]
+        entry.write_bytes({"cut": content[:middle], "emptied": b"", "bit turned": turned}.get(damage, other))
+    assert rdstitch(*arguments).status == 0
+    assert _result(output) == plain
+    if damage != "a folder":
+        assert [entry.read_bytes() for entry in entries] == contents
+
+
+def test_damaged_pictures_are_left_out_every_time(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    bad = tmp_path / "bad.png"
+    bad.write_bytes(frames[2].read_bytes()[:-3000])
+    arguments = ("mosaic", *frames[:2], bad, "-o", tmp_path / "out.png", "--overwrite", *FAST)
+    without = rdstitch(*arguments)
+    assert str(bad) in without.line
+    for _ in range(2):
+        assert rdstitch(*arguments, "--cache", tmp_path / "cache") == without
+
+
+def test_a_cache_that_cannot_be(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine", encoding="utf-8")
+    for cache in (tmp_path / "file", tmp_path / "file" / "cache"):
+        done = rdstitch("mosaic", *frames, "-o", tmp_path / "out.png", "--cache", cache, *FAST)
+        assert done.status == 6
+        assert str(cache) in done.line
+    assert (tmp_path / "file").read_text(encoding="utf-8") == "mine"
+
+
+def test_a_cache_that_is_full_is_no_reason_to_stop(
+    rdstitch: Run, frames: list[Path], plain: tuple[bytes, dict[str, Any]], tmp_path: Path
+) -> None:
+    cache = tmp_path / "cache"
+    cache.mkdir()
+    for stage in ("features", "matches", "pairs", "alignment", "overlaps"):
+        (cache / stage).write_text("in the way", encoding="utf-8")
+    assert rdstitch("mosaic", *frames, "-o", tmp_path / "out.png", "--cache", cache, *FAST).status == 0
+    assert _result(tmp_path / "out.png") == plain
+
+
+@pytest.mark.parametrize("attempt", range(int(os.environ.get("RDSTITCH_KILLS", "3"))))
+def test_killed_runs_continue(
+    frames: list[Path], plain: tuple[bytes, dict[str, Any]], tmp_path: Path, attempt: int
+) -> None:
+    output = tmp_path / "out.png"
+    arguments: tuple[str | Path, ...] = ("mosaic", *frames, "-o", output, "--overwrite")
+    arguments = (*arguments, "--cache", tmp_path / "cache", *FAST)
+    random_moment = random.Random(attempt)
+    for _ in range(2):
+        process = start(*arguments, "-v")
+        assert process.stderr is not None
+        assert process.stderr.readline()
+        time.sleep(random_moment.uniform(0.0, 1.0))
+        process.kill()
+        finished(process)
+    assert finished(start(*arguments)).status == 0
+    assert _result(output) == plain
+
+
+def test_two_processes_share_a_cache(frames: list[Path], plain: tuple[bytes, dict[str, Any]], tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+    outputs = [tmp_path / name / "out.png" for name in ("a", "b")]
+    running = [start("mosaic", *frames, "-o", output, "--cache", tmp_path / "cache", *FAST) for output in outputs]
+    for process, output in zip(running, outputs, strict=True):
+        assert finished(process).status == 0
+        assert _result(output) == plain
