@@ -55,7 +55,7 @@ def area_under_curve(errors: ArrayLike, limit: float) -> float:
 
 
 def _families(settings: Settings) -> dict[str, Iterable[JudgedPair]]:
-    count = settings.count(2, 8, 100)
+    count = settings.count(2, 16, 100)
     families: dict[str, Iterable[JudgedPair]] = {
         "rendered, planar motion": rendered_pairs(count, DISTORTION, free=False, seed=600),
         "rendered, free motion": rendered_pairs(count, DISTORTION, free=True, seed=900),
