@@ -104,6 +104,10 @@ output = click.option(
 
 overwrite = click.option("--overwrite", is_flag=True, help="Replace existing output files.")
 
+as_json = click.option(
+    "--json", "as_json", is_flag=True, help="Print all that was estimated as JSON, the sidecar or camera, not only λ."
+)
+
 verbosity = together(
     click.option("-q", "--quiet", is_flag=True, help="Say nothing on standard error but errors."),
     click.option("-v", "--verbose", is_flag=True, help="Say what is going on."),

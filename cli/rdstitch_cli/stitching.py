@@ -93,11 +93,17 @@ class Report:
             write_report(self._file, result, self.progress.stages)
 
 
-def summarize(result: "StitchResult", reporter: Reporter) -> None:
-    """λ, and the plan of a dry run, to standard output; what the user must know to standard error."""
+def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = False) -> None:
+    """λ and the plan of a dry run, or the sidecar, to standard output; what the user must know to standard error."""
     for doubt in (*result.verdict.doubts, *result.notes):
         reporter.warn(doubt)
-    report_registration(result.registration, reporter)
+    _warn_of(result.registration, reporter)
+    if as_json:
+        from rdstitch.pipeline.sidecar import sidecar
+
+        _echo_json(sidecar(result))
+        return
+    _echo_lambda(result.registration)
     if result.plan is not None:
         show_plan(result.plan)
 
@@ -122,8 +128,19 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds >= 120 else f"{max(1, round(seconds))} s"
 
 
-def report_registration(registration: "Registration", reporter: Reporter) -> None:
-    """λ to standard output, nan where it is not observable; pictures left out to standard error."""
+def report_registration(registration: "Registration", reporter: Reporter, *, as_json: bool = False) -> None:
+    """λ, or the camera, to standard output; pictures left out to standard error."""
+    _warn_of(registration, reporter)
+    if as_json:
+        from rdstitch.pipeline.sidecar import plain
+
+        _echo_json(plain(registration.camera.as_dict()))
+    else:
+        _echo_lambda(registration)
+
+
+def _warn_of(registration: "Registration", reporter: Reporter) -> None:
+    """What the user must know of a registration."""
     alignment = registration.alignment
     for warning in alignment.warnings:
         reporter.warn(warning)
@@ -131,5 +148,16 @@ def report_registration(registration: "Registration", reporter: Reporter) -> Non
         reporter.warn(f"left out {missing.path}: {missing.reason}")
     used = int(alignment.used.sum())
     reporter.log(f"{used} of {len(alignment.used)} pictures, rms {alignment.rms:.2f} px; {alignment.model_reason}")
+
+
+def _echo_json(content: Any) -> None:
+    from rdstitch.io.atomic import json_bytes
+
+    click.echo(json_bytes(content), nl=False)
+
+
+def _echo_lambda(registration: "Registration") -> None:
+    """λ, or nan where it is not observable."""
+    alignment = registration.alignment
     observable = math.isfinite(alignment.distortion_std)
     click.echo(f"{alignment.distortion:.6f}" if observable else "nan")

@@ -6,7 +6,7 @@ import pytest
 from rdstitch_cli.main import run
 
 from rdstitch.synthetic import Sequence
-from tests.cli.running import Outcome, Run, flight
+from tests.cli.running import Outcome, Run, check_sidecar, flight
 
 
 @pytest.fixture(scope="session")
@@ -36,6 +36,8 @@ def rdstitch(capsys: pytest.CaptureFixture[str]) -> Run:
         status = run([str(argument) for argument in arguments])
         captured = capsys.readouterr()
         assert "Traceback" not in captured.err
+        if status == 0 and "-o" in arguments:
+            check_sidecar(Path(f"{arguments[arguments.index('-o') + 1]}.json"))
         return Outcome(status, captured.out, captured.err)
 
     return call

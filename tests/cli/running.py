@@ -1,19 +1,26 @@
 """The command line, run in this process or as a stranger runs it, and small pictures to run it on."""
 
+import json
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jsonschema import Draft202012Validator
 
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.radial_homography import project
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
+
+SIDECAR_SCHEMA = Draft202012Validator(
+    json.loads(files("rdstitch.pipeline").joinpath("sidecar.schema.json").read_text(encoding="utf-8"))
+)
 
 _PROGRAM = "from rdstitch_cli.main import main; main()"
 
@@ -67,6 +74,12 @@ def finished(process: "subprocess.Popen[bytes]", data: bytes | None = None) -> O
     out, err = process.communicate(data, timeout=300)
     assert b"Traceback" not in err, err.decode("utf-8", "replace")
     return Outcome(process.returncode, out.decode("utf-8", "replace"), err.decode("utf-8", "replace"))
+
+
+def check_sidecar(file: Path) -> None:
+    """A sidecar, where there is one, must be what the schema says."""
+    if file.is_file():
+        SIDECAR_SCHEMA.validate(json.loads(file.read_text(encoding="utf-8")))
 
 
 def transfers(record: dict[str, Any]) -> Mapping[int, Callable[[FloatArray], FloatArray]]:

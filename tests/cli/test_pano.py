@@ -93,6 +93,30 @@ def test_quiet_says_nothing_and_verbose_says_more(
     assert quiet.out == usual.out == verbose.out
 
 
+def test_json_is_the_sidecar(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    done = rdstitch("pano", *frames[:2], "-o", tmp_path / "pano.png", "--json", *FAST)
+    assert (done.status, done.err) == (0, "")
+    assert json.loads(done.out) == json.loads((tmp_path / "pano.png.json").read_text(encoding="utf-8"))
+    found = rdstitch("calibrate", *frames[:2], "-o", tmp_path / "camera.json", "--json", *FAST)
+    assert (found.status, found.err) == (0, "")
+    assert json.loads(found.out) == json.loads((tmp_path / "camera.json").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("workers", ["1", "2", "2"])
+def test_same_bytes_whatever_the_number_of_workers(
+    rdstitch: Run, frames: list[Path], tmp_path: Path, workers: str
+) -> None:
+    results = []
+    for name, threads in (("one", "1"), ("other", workers)):
+        (tmp_path / name).mkdir()
+        output = tmp_path / name / "pano.tif"
+        assert rdstitch("pano", *frames, "-o", output, *FAST, "-j", threads).status == 0
+        record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
+        del record["options"]["workers"]
+        results.append((output.read_bytes(), record))
+    assert results[0] == results[1]
+
+
 def test_unobservable_lambda_is_nan(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     again = tmp_path / "again.png"
     again.write_bytes(frames[0].read_bytes())

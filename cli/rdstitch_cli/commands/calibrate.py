@@ -33,12 +33,14 @@ Examples:
 @options.estimation
 @options.report
 @options.trust
+@options.as_json
 @options.verbosity
 def calibrate(
     inputs: tuple[Path, ...],
     output: Path,
     every: int,
     report: Path | None,
+    as_json: bool,
     quiet: bool,
     verbose: bool,
     **given: Any,
@@ -54,5 +56,5 @@ def calibrate(
         paths = options.resolve(inputs)
         told = Report(report, reporter, paths, given["overwrite"])
         registration = recipe(paths, wanted, every=every, progress=told.progress)
-        report_registration(registration, reporter)
+        report_registration(registration, reporter, as_json=as_json)
         told.write(registration)

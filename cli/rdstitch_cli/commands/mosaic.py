@@ -35,12 +35,14 @@ Examples:
 )
 @options.report
 @options.trust
+@options.as_json
 @options.verbosity
 def mosaic(
     inputs: tuple[Path, ...],
     output: Path,
     every: int,
     report: Path | None,
+    as_json: bool,
     quiet: bool,
     verbose: bool,
     **given: Any,
@@ -56,5 +58,5 @@ def mosaic(
         paths = options.resolve(inputs)
         told = Report(report, reporter, paths, given["overwrite"])
         result = recipe(paths, output, stitch_options(reporter, **given), every=every, progress=told.progress)
-        summarize(result, reporter)
+        summarize(result, reporter, as_json=as_json)
         told.write(result)

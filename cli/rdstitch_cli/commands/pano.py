@@ -33,9 +33,16 @@ Examples:
 )
 @options.report
 @options.trust
+@options.as_json
 @options.verbosity
 def pano(
-    pictures: tuple[Path, ...], output: Path, report: Path | None, quiet: bool, verbose: bool, **given: Any
+    pictures: tuple[Path, ...],
+    output: Path,
+    report: Path | None,
+    as_json: bool,
+    quiet: bool,
+    verbose: bool,
+    **given: Any,
 ) -> None:
     """Stitch two or more pictures that overlap, in any order.
 
@@ -47,5 +54,5 @@ def pano(
     with Reporter(-quiet + verbose) as reporter:
         told = Report(report, reporter, pictures, given["overwrite"])
         result = recipe(pictures, output, stitch_options(reporter, **given), progress=told.progress)
-        summarize(result, reporter)
+        summarize(result, reporter, as_json=as_json)
         told.write(result)
