@@ -155,7 +155,7 @@ def utm(latitude: ArrayLike, longitude: ArrayLike, zone: int) -> FloatArray:
     series = (n / 2 - 2 * n**2 / 3 + 5 * n**3 / 16, 13 * n**2 / 48 - 3 * n**3 / 5, 61 * n**3 / 240)
     orders: list[NDArray[np.complex128]] = [xi + 1j * eta]
     for order, factor in enumerate(series, start=1):
-        orders.append(factor * np.sin(2 * order * (xi + 1j * eta)))
+        orders.append(np.asarray(factor * np.sin(2 * order * orders[0]), dtype=np.complex128))
     place = radius * np.sum(orders, axis=0)
     return np.stack([_FALSE_EASTING + place.imag, place.real + (_FALSE_NORTHING if zone < 0 else 0.0)], axis=-1)
 
