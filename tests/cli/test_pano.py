@@ -102,19 +102,16 @@ def test_json_is_the_sidecar(rdstitch: Run, frames: list[Path], tmp_path: Path) 
     assert json.loads(found.out) == json.loads((tmp_path / "camera.json").read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize("workers", ["1", "2", "2"])
-def test_same_bytes_whatever_the_number_of_workers(
-    rdstitch: Run, frames: list[Path], tmp_path: Path, workers: str
-) -> None:
+def test_same_bytes_whatever_the_number_of_workers(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     results = []
-    for name, threads in (("one", "1"), ("other", workers)):
-        (tmp_path / name).mkdir()
-        output = tmp_path / name / "pano.tif"
+    for number, threads in enumerate(("1", "2", "1", "2")):
+        output = tmp_path / str(number) / "pano.tif"
+        output.parent.mkdir()
         assert rdstitch("pano", *frames, "-o", output, *FAST, "-j", threads).status == 0
         record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
         del record["options"]["workers"]
         results.append((output.read_bytes(), record))
-    assert results[0] == results[1]
+    assert all(result == results[0] for result in results[1:])
 
 
 def test_unobservable_lambda_is_nan(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:

@@ -1,0 +1,22 @@
+"""No run says that all is well when it is not; ``python -m tests.benchmarks.trust`` asks 300 sets, this a few."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.trust_sets import HOPELESS, SOLVABLE, judge_set, trust_set
+
+
+@pytest.mark.parametrize("kind", [*SOLVABLE, *HOPELESS])
+def test_never_silently_wrong(kind: str, tmp_path: Path) -> None:
+    judged = judge_set(trust_set(153, kind), tmp_path)
+    assert judged.status in (0, 4), judged.text
+    assert judged.right, judged
+    if kind in SOLVABLE:
+        assert judged.status == 0, judged.text
+        assert judged.complete, judged.text
+    if kind in ("apart", "textureless", "repeated", "mixed lenses"):
+        assert judged.status == 4, judged.text
+        assert "frame_" in judged.text
+    if kind == "mixed ground" and judged.status == 0:
+        assert "frame_0002.png" in judged.text
