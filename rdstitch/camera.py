@@ -146,7 +146,9 @@ class Camera:
             raise ArgumentError(f"focal length must be positive, not {self.focal}")
         if self.focal_source is not None and self.focal_source not in FOCAL_LOG_STD:
             raise ArgumentError(f"unknown source of a focal length: {self.focal_source!r}")
-        if np.isnan(undistort(self.normalize(self.outline(1)), self.distortion, self.distortion2)).any():
+        with np.errstate(all="ignore"):  # absurd values, from a damaged file, overflow
+            corners = undistort(self.normalize(self.outline(1)), self.distortion, self.distortion2)
+        if not np.isfinite(corners).all():
             raise ArgumentError(f"distortion {self.distortion:g} folds the picture at a corner; it must be above -1")
 
     @property

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rdstitch.errors import InputError
 
 _LARGEST_FILE = 256 * 2**20  # bytes; a sidecar of ten thousand pictures has about 30 MB
+_LARGEST_SIDE = 10**7  # px
 _DEEPEST = 50  # objects and lists within one another
 
 
@@ -183,10 +184,17 @@ class Record:
 
     def size(self) -> tuple[int, int]:
         """Width and height of a picture, px."""
-        values = [item.integer(1) for item in self.items()]
-        if len(values) != 2 or max(values) > 10**7:
+        values = [item.side() for item in self.items()]
+        if len(values) != 2:
             self.expected("width and height in px")
         return values[0], values[1]
+
+    def side(self) -> int:
+        """Width or height of a picture, px."""
+        value = self.integer(1)
+        if value > _LARGEST_SIDE:
+            self.expected("a width or height in px")
+        return value
 
     def matrix(self) -> NDArray[np.float64]:
         """A 3 x 3 matrix that can be inverted."""

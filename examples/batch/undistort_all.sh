@@ -11,6 +11,6 @@ find . -type d -exec sh -c '
     camera=$1 out=$2 folder=$3
     # As many pictures as fit on one command line at a time; xargs without any input runs nothing.
     find "$folder" -maxdepth 1 -type f \( -iname "*.jpg" -o -iname "*.png" -o -iname "*.tif" \) -print0 |
-        xargs -0 -r sh -c '\''rdstitch undistort "$@"'\'' undistort --camera "$camera" -o "$out/$folder" --overwrite
+        xargs -0 -r rdstitch undistort --camera "$camera" -o "$out/$folder" --overwrite
 ' undistort_all.sh "$camera" "$out" '{}' \; || status=1
 exit $status

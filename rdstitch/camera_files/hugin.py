@@ -50,7 +50,7 @@ def read_hugin(text: str, file: str) -> CameraFile:
     lens = Record(file, "the first image", {name: _number(value) for name, value in _PARAMETER.findall(image[2:])})
     if lens["f"].integer() != _RECTILINEAR:
         lens["f"].fail("only rectilinear lenses (f0) are known here, no fisheyes")
-    size = (lens["w"].integer(1), lens["h"].integer(1))
+    size = (lens["w"].side(), lens["h"].side())
     a, b, c, d, e = (0.0 if lens.get(name) is None else lens[name].number() for name in "abcde")
     view = lens["v"].number()
     if not 0.0 < view < 180.0:

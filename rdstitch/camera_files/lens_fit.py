@@ -109,9 +109,9 @@ def _rays(forward: Forward, camera: Camera) -> tuple[FloatArray, FloatArray, Flo
     with np.errstate(all="ignore"):
         measured = forward(rays.reshape(-1, 2)).reshape(rays.shape)
         distance = np.linalg.norm(measured - camera.center, axis=2)
+        steps = np.diff(distance, axis=1, prepend=0.0)
     within = (measured > -0.5) & (measured < np.array(camera.image_size) - 0.5)
     inside = within[..., 0] & within[..., 1]
-    steps = np.diff(distance, axis=1, prepend=0.0)
     # Along each ray, what comes before it leaves the picture for the first time.
     leaves = np.argmin(inside, axis=1)
     seen = np.arange(_STEPS) < leaves[:, None]

@@ -37,7 +37,7 @@ def read_opencv(record: Record) -> CameraFile:
     (fx, skew, cx), (_, fy, cy) = _rows(_first(record, _MATRIX), 3, 3)[:2]
     if not (fx > 0.0 and fy > 0.0 and abs(skew) < 1e-6 * fx):
         _first(record, _MATRIX).fail("expected positive focal lengths and no skew")
-    size = (_first(record, _WIDTH).integer(1), _first(record, _HEIGHT).integer(1))
+    size = (_first(record, _WIDTH).side(), _first(record, _HEIGHT).side())
     given = _first(record, _COEFFICIENTS)
     k = [value for row in _rows(given) for value in row]
     if len(k) not in (0, 4, 5, 8, 12, 14) or any(k[8:]):

@@ -34,7 +34,7 @@ def read_opendronemap(record: Record) -> CameraFile:
     if (own := entry.get(_OWN)) is not None:
         return CameraFile(Camera.from_record(own), _KIND)
     entry["projection_type"].choice(_MODELS)
-    size = (entry["width"].integer(1), entry["height"].integer(1))
+    size = (entry["width"].side(), entry["height"].side())
     longer = max(size)
     either = entry.get("focal")
     fx, fy = (entry[f"focal_{axis}"].number() if either is None else either.number() for axis in "xy")

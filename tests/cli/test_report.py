@@ -1,5 +1,7 @@
 """``--report``: one self-contained page, well-formed, made from the result alone."""
 
+import base64
+import io
 import re
 import shutil
 import subprocess
@@ -8,12 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from PIL import Image
 
+from rdstitch.compositing import CompositeOptions
 from rdstitch.io import read_image
 from rdstitch.pipeline import calibrate, pano
 from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.timing import StageTimer
-from rdstitch.report import report_page, write_report
+from rdstitch.report import report_page, thumbnails, write_report
 from tests.cli.running import FAST, Run
 
 _VOID = {"meta", "img"}
@@ -136,6 +141,24 @@ def test_names_are_escaped_and_vanished_pictures_do_not_matter(frames: list[Path
     assert "(given)" in page.text
     assert "no pair voted" in page.text
     assert page.sources == []
+
+
+def test_of_a_large_tiff_an_overview_is_read(
+    rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = pano(frames[:2], tmp_path / "large.tif", StitchOptions(workers=1, composite=CompositeOptions(scale=3.0)))
+    whole = _decoded(thumbnails.of_mosaic(result, 300))
+    monkeypatch.setattr(thumbnails, "_LARGE", 1000)
+    monkeypatch.setattr(thumbnails, "read_image", None)
+    overview = _decoded(thumbnails.of_mosaic(result, 300))
+    assert overview.shape == whole.shape
+    assert max(whole.shape[:2]) == 300
+    assert np.abs(overview.astype(float) - whole).mean() < 12.0
+
+
+def _decoded(address: str | None) -> NDArray[np.uint8]:
+    assert address is not None
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))))
 
 
 def test_stages_are_measured_and_passed_on() -> None:
