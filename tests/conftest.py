@@ -4,6 +4,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# For an evening's search: pytest --hypothesis-profile long tests/property
+settings.register_profile("long", max_examples=20_000, deadline=None)
 
 # The development pictures lie beside the checkout; they are not part of the project.
 _SHARED_DATA = Path(__file__).resolve().parents[1] / "../shared/data"
