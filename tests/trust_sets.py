@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.errors import RdstitchError
 from rdstitch.features import FeatureOptions
-from rdstitch.pipeline import Registration, StitchOptions, calibrate
+from rdstitch.pipeline import Registration, StitchOptions, mosaic
 from rdstitch.radial_homography import project
 from rdstitch.synthetic import (
     Photometry,
@@ -168,11 +168,11 @@ def _mixed(kind: str, sequence: Sequence, rng: np.random.Generator, seed: int) -
 
 
 def judge_set(item: TrustSet, folder: Path, options: StitchOptions | None = None) -> Judged:
-    """Register a set as the command line does, and compare with the truth."""
+    """Stitch a set as the command line does, and compare its registration with the truth."""
     paths = item.sequence.write(folder)
     wanted = options or StitchOptions(features=FeatureOptions(max_features=1500), workers=1)
     try:
-        registration = calibrate(paths, wanted)
+        registration = mosaic(paths, None, wanted).registration
     except RdstitchError as refusal:
         return Judged(item.kind, refusal.exit_status, True, False, np.nan, str(refusal))
     alignment = registration.alignment

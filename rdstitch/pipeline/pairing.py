@@ -18,7 +18,7 @@ from rdstitch.registration.pairs import PairOptions, PairRegistration, estimate_
 from rdstitch.registration.resting import most_rest, moving_features, show_motion
 from rdstitch.registration.voting import vote
 
-_FEW_MATCHES = 100  # from which on a pair needs no more
+_ENOUGH_MATCHES = 200  # of a picture with all others, from which on it needs no more
 _SEARCH_RADIUS = 3.0  # thresholds around the place where a match is expected
 
 
@@ -83,8 +83,12 @@ class Pairing:
         return rescued
 
     def strengthen(self, pairs: list[PairRegistration], alignment: Alignment) -> list[PairRegistration]:
-        """Match pairs that hold together by little again, looking only where the alignment says."""
-        weak = {(fit.image1, fit.image2) for fit in alignment.links if fit.used and fit.inliers < _FEW_MATCHES}
+        """Match the pairs of pictures that hang on little again, looking only where the alignment says."""
+        held = np.zeros(len(self.features), dtype=np.intp)
+        used = [fit for fit in alignment.links if fit.used]
+        for fit in used:
+            held[[fit.image1, fit.image2]] += fit.inliers
+        weak = {(fit.image1, fit.image2) for fit in used if min(held[fit.image1], held[fit.image2]) < _ENOUGH_MATCHES}
         chosen = [index for index, pair in enumerate(pairs) if pair.relation and (pair.image1, pair.image2) in weak]
         again = self._relate(
             [(pairs[index].image1, pairs[index].image2) for index in chosen],

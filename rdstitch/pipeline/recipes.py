@@ -115,7 +115,7 @@ def calibrate(
     with _pictures(inputs, None, every) as paths:
         _check_outputs(None, options, paths)
         registration = _register_all(paths, options, progress)
-    _accept(registration, options)
+    _accept(registration, options, lens_only=True)
     _save_camera(registration, options)
     return registration
 
@@ -239,9 +239,9 @@ def _composite(
     return result
 
 
-def _accept(registration: Registration, options: StitchOptions) -> Verdict:
+def _accept(registration: Registration, options: StitchOptions, *, lens_only: bool = False) -> Verdict:
     """Judge a registration; what cannot be relied on goes no further, unless forced."""
-    verdict = judge(registration, options.threshold, options.threads, Cache(options.cache))
+    verdict = judge(registration, options.threshold, options.threads, Cache(options.cache), lens_only=lens_only)
     if not verdict.ok and not options.force:
         reasons = "; ".join(verdict.failures)
         raise RegistrationError(f"no reliable result: {reasons} (--force writes it all the same)")

@@ -44,8 +44,19 @@ class Verdict:
     doubts: tuple[str, ...]
 
 
-def judge(registration: Registration, threshold: float, workers: int = 1, cache: Cache = NO_CACHE) -> Verdict:
+def judge(
+    registration: Registration,
+    threshold: float,
+    workers: int = 1,
+    cache: Cache = NO_CACHE,
+    *,
+    lens_only: bool = False,
+) -> Verdict:
     """Check an alignment against the pairs that it was made from, and against the pixels.
+
+    What makes the places of pictures doubtful, a repeated pattern for one, leaves the lens as it is: a board shifted by
+    a square is as straight as before. And pictures that mostly show what rests in them keep some matches of that,
+    which agree with nothing, and look alike anywhere but where the moving plane puts them.
 
     Parameters
     ----------
@@ -55,6 +66,8 @@ def judge(registration: Registration, threshold: float, workers: int = 1, cache:
     workers : int
         Pictures read at the same time.
     cache : Cache
+    lens_only : bool
+        Only the lens is wanted, so that doubts about the places of pictures do not make the result fail.
     """
     alignment = registration.alignment
     names = [source.name for source in registration.sources]
@@ -65,11 +78,15 @@ def judge(registration: Registration, threshold: float, workers: int = 1, cache:
     given, kept = sum(fit.count for fit in used), sum(fit.inliers for fit in used)
     if kept < _LEAST_INLIERS * given:
         failures.append(f"only {kept} of {given} matches of the pairs agree with the whole")
-    failures.extend(_misfits(names, used))
-    # Pictures that mostly show what rests in them look alike anywhere but where the moving plane puts them.
-    checked = [] if registration.resting else check_overlaps(registration, workers, cache)
-    suspicions = {**_disagreeing(names, used), **_unlike(names, checked), **_ambiguous(names, checked)}
-    decisive = _decisive(suspicions, used, len(names))
+    disagreeing = _disagreeing(names, used)
+    checked: list[CheckedLink] = []
+    if not registration.resting:
+        failures.extend(_misfits(names, used))
+        checked = check_overlaps(registration, workers, cache)
+    misplaced = {**_unlike(names, checked), **_ambiguous(names, checked)}
+    suspicions = {**disagreeing, **misplaced}
+    grave = {} if registration.resting else disagreeing if lens_only else suspicions
+    decisive = _decisive(grave, used, len(names))
     failures.extend(suspicions[pair] for pair in decisive[:_MOST_NAMED])
     if len(decisive) > _MOST_NAMED:
         failures.append(f"{len(decisive) - _MOST_NAMED} more pairs like these")
