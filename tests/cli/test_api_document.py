@@ -30,7 +30,6 @@ def _code() -> str:
     return "\n".join(lines) + "\n"
 
 
-@pytest.mark.slow
 def test_the_examples_run(frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "flight").mkdir()
     for name, frame in zip(("left", "middle", "right"), frames, strict=True):
