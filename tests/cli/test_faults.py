@@ -365,8 +365,8 @@ def test_a_picture_vanishes_after_its_header_was_read(
 def test_a_picture_changes_after_its_registration(
     rdstitch: Run, place: Path, monkeypatch: pytest.MonkeyPatch, change: str
 ) -> None:
-    def spoil(*arguments: Any) -> Any:
-        verdict = judge(*arguments)
+    def spoil(*arguments: Any, **options: Any) -> Any:
+        verdict = judge(*arguments, **options)
         if change == "vanishes":
             (place / "b.png").unlink()
         else:
