@@ -67,6 +67,9 @@ for command in (pano, mosaic, apply, calibrate, trajectory, undistort):
 
 def main() -> None:
     """Run the command line and leave with its exit status."""
+    # Pictures and pairs are worked on side by side; threads within each matrix product would only be in the way.
+    # NumPy reads this when it is loaded, which is later.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     for number in _ASKED_TO_END:
         signal.signal(number, _end)
     sys.exit(run(sys.argv[1:]))

@@ -17,7 +17,7 @@ from rdstitch.radial_homography import project
 
 Grey = NDArray[np.float32]
 
-_LONGEST_SIDE = 800  # px of the pictures that are compared
+_LONGEST_SIDE = 512  # px of the pictures that are compared
 _CELL = 24  # px
 _REACH = 8  # px
 _LEAST_TEXTURE = 0.012  # standard deviation in a cell, of full range

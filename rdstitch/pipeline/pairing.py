@@ -121,7 +121,9 @@ class Pairing:
             inputs = (self._digests[i], self._digests[j], self._matching)
             return self.cache.recall("matches", (Correspondences,), inputs, compute)
 
-        return match_pairs(self.features, pairs, self.matcher, partial(self.progress, "matching"), recall)
+        # A network is no function: only one thread may use it.
+        workers = 1 if self.options.lightglue_model is not None else self.options.threads
+        return match_pairs(self.features, pairs, self.matcher, partial(self.progress, "matching"), recall, workers)
 
     def _relate(
         self,

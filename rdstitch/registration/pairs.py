@@ -72,8 +72,9 @@ def match_pairs(
     matcher: Matcher,
     progress: Progress | None = None,
     recall: Recall[Correspondences] | None = None,
+    workers: int = 1,
 ) -> list[Correspondences]:
-    """Match the features of pairs of pictures; the matrix products keep all cores busy.
+    """Match the features of pairs of pictures, several pairs at a time.
 
     Parameters
     ----------
@@ -87,13 +88,21 @@ def match_pairs(
         Called with the number of pairs done and their total.
     recall : callable, optional
         Stands between this function and the matching of each pair; see :data:`Recall`.
+    workers : int
+        Threads; more than one only for a matcher that may be called from several.
     """
-    matched = []
-    for index, (image1, image2) in enumerate(pairs):
+
+    def work(index: int) -> Correspondences:
+        image1, image2 = pairs[index]
         compute = partial(matcher, features[image1], features[image2])
-        matched.append(compute() if recall is None else recall(index, compute))
-        if progress is not None:
-            progress(len(matched), len(pairs))
+        return compute() if recall is None else recall(index, compute)
+
+    matched = []
+    with ThreadPoolExecutor(workers) as pool:
+        for found in pool.map(work, range(len(pairs))):
+            matched.append(found)
+            if progress is not None:
+                progress(len(matched), len(pairs))
     return matched
 
 
