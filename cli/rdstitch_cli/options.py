@@ -68,6 +68,22 @@ class Bytes(click.ParamType[int]):
         return amount
 
 
+class Angle(click.ParamType[float]):
+    """An angle in degrees that is not negative; the value is in radians."""
+
+    name = "DEG"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Parse the text."""
+        try:
+            angle = math.radians(float(value))
+        except ValueError:
+            angle = math.nan
+        if not 0.0 <= angle < math.inf:
+            self.fail(f"{value!r} is no angle in degrees like 0.5", param, ctx)
+        return angle
+
+
 def resolve(inputs: tuple[Path, ...]) -> list[Path]:
     """The inputs, with - replaced by the names on standard input, one a line or separated by NUL."""
     named: list[Path] = []
@@ -129,6 +145,19 @@ known = together(
     lens,
     click.option("--focal", type=float, metavar="PX", help="Focal length, px; otherwise from EXIF, else guessed."),
     click.option("--tilt", type=Angles(), help="Known tilt of the camera to the plane, degrees."),
+    click.option(
+        "--attitude",
+        type=PICTURE,
+        metavar="FILE",
+        help="CSV with the tilt of each picture, of a gimbal or IMU: name,psi,theta; degrees.",
+    ),
+    click.option(
+        "--attitude-std",
+        type=Angle(),
+        default="1",
+        show_default=True,
+        help="Standard deviation of the attitudes, degrees; 0 for exact ones.",
+    ),
 )
 
 mask = click.option(

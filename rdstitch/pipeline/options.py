@@ -1,5 +1,6 @@
 """Options of the recipes: the same names and defaults as on the command line."""
 
+import math
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,6 +35,8 @@ class StitchOptions:
     distortion: float | None = None  # known λ, half-diagonal frame; kept
     focal: float | None = None  # known focal length, px
     tilt: tuple[float, float] | None = None  # known tilt (psi, theta) of all pictures, radians
+    attitude: str | Path | None = None  # CSV with the measured tilt of each picture: name, psi, theta, degrees
+    attitude_std: float = math.radians(1.0)  # its standard deviation, radians; 0: exact
     mask: str | Path | None = None  # picture, or folder of them, that is dark where the pictures do not count
     reference: str | None = None  # name of the picture whose frame is kept; None: the best connected
     composite: CompositeOptions = field(default_factory=CompositeOptions)
@@ -52,14 +55,16 @@ class StitchOptions:
             raise ArgumentError(f"unknown solver {self.solver!r}; choose one of {', '.join(SOLVERS)}")
         if self.model not in ("auto", *MODELS):
             raise ArgumentError(f"unknown model {self.model!r}; choose one of auto, {', '.join(MODELS)}")
-        if self.solver == "two_point" and self.tilt is None:
-            raise ArgumentError("the two_point solver needs the tilt")
+        if self.solver == "two_point" and self.tilt is None and (self.attitude is None or self.attitude_std > 0.0):
+            raise ArgumentError("the two_point solver needs the tilt, or exact attitudes")
         if self.solver != "auto" and self.known_distortion is not None:
             raise ArgumentError("with a known λ there is no solver to choose")
         if self.distortion is not None and not -1.0 < self.distortion < 1.0:
             raise ArgumentError(f"λ must lie between -1 and 1, not {self.distortion}")
         if self.focal is not None and not 0.0 < self.focal < float("inf"):
             raise ArgumentError(f"the focal length must be positive, not {self.focal}")
+        if not 0.0 <= self.attitude_std < float("inf"):
+            raise ArgumentError(f"the standard deviation of attitudes must not be negative, not {self.attitude_std}")
         if not self.threshold > 0.0 or not 0.0 < self.confidence < 1.0 or self.max_iterations < 1:
             raise ArgumentError("threshold and max_iterations must be positive, confidence between 0 and 1")
         if self.workers < 0 or self.seed < 0:

@@ -34,6 +34,8 @@ class Pairing:
     options : StitchOptions
     progress : callable
     cache : Cache
+    tilts : sequence of (float, float), optional
+        (ψ, θ), radians, of each picture, where they are known exactly.
     """
 
     features: Sequence[Features]
@@ -42,6 +44,7 @@ class Pairing:
     options: StitchOptions
     progress: Progress
     cache: Cache = NO_CACHE
+    tilts: Sequence[tuple[float, float]] | None = None
 
     def estimate(self, pairs: Sequence[tuple[int, int]], distortion: float | None = None) -> list[PairRegistration]:
         """Match and estimate pairs (i, j), with λ free, or as the user or the other pairs say."""
@@ -133,11 +136,11 @@ class Pairing:
         stage: str | None = None,
     ) -> list[PairRegistration]:
         """The relation of every pair, from an earlier run where the cache has it."""
-        options, tilt = self._pair_options(distortion), self.options.tilt
+        options = self._pair_options(distortion)
 
         def recall(index: int, compute: Callable[[], RadialHomography]) -> RadialHomography:
             i, j = pairs[index]
-            inputs = (self.cameras[i], self.cameras[j], self.cache.digest(matched[index]), options, tilt)
+            inputs = (self.cameras[i], self.cameras[j], self.cache.digest(matched[index]), options, *self._tilts(i, j))
             return self.cache.recall("pairs", (RadialHomography, Camera, PlanarMotion), inputs, compute)
 
         return estimate_pairs(
@@ -145,7 +148,7 @@ class Pairing:
             pairs,
             matched,
             options,
-            tilts=None if tilt is None else [tilt] * len(self.cameras),
+            tilts=self.tilts,
             workers=self.options.threads,
             progress=None if stage is None else partial(self.progress, stage),
             recall=recall,
@@ -161,6 +164,9 @@ class Pairing:
         """What stands for the way of matching."""
         model = self.options.lightglue_model
         return self.options.ratio, None if model is None else self.cache.file(model)
+
+    def _tilts(self, *pictures: int) -> list[tuple[float, float] | None]:
+        return [None if self.tilts is None else self.tilts[picture] for picture in pictures]
 
     def _pair_options(self, distortion: float | None) -> PairOptions:
         o = self.options

@@ -12,6 +12,7 @@ import numpy as np
 from rdstitch.camera_files import CAMERA_SUFFIXES, save_camera
 from rdstitch.errors import ArgumentError, InputError, PartialResultError, RegistrationError
 from rdstitch.io.atomic import check_output, write_json_atomic, write_text_atomic
+from rdstitch.pipeline.attitudes import with_attitudes
 from rdstitch.pipeline.cache import Cache
 from rdstitch.pipeline.composing import compose_pictures
 from rdstitch.pipeline.inputs import find_pictures
@@ -199,7 +200,7 @@ def _read(paths: Sequence[str | Path], options: StitchOptions, *, skip_bad: bool
         if unread:
             raise InputError(f"fewer than two pictures can be read; {unread[0].reason}")
         raise ArgumentError("stitching needs two different pictures or more; name at least one more")
-    return with_masks(sources, options.mask), unread
+    return with_attitudes(with_masks(sources, options.mask), options.attitude), unread
 
 
 def _composite(

@@ -26,12 +26,15 @@ class Source:
         What is known of the camera before registration: size, centre, focal length, and λ where it was given.
     mask : Path or None
         Picture that is dark where this one does not count.
+    attitude : (float, float) or None
+        (ψ, θ), radians, as a gimbal or an IMU has measured it.
     """
 
     path: Path
     metadata: Metadata
     camera: Camera
     mask: Path | None = None
+    attitude: tuple[float, float] | None = None
 
     @property
     def name(self) -> str:

@@ -1,0 +1,91 @@
+"""``--attitude``: a gimbal's or IMU's tilt of every picture, exact or nearly so."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rdstitch
+from rdstitch.camera import Camera
+from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
+from tests.cli.running import FAST, Run
+
+
+@pytest.fixture(scope="module")
+def windy() -> Sequence:
+    """A drone that tilts by another few degrees for each of six pictures."""
+    lens = Camera((400, 300), -0.2, focal=380.0)
+    poses = grid_poses(lens, 3, 2, overlap=0.5, yaw=0.1, seed=4).shaken(seed=5, tilt=np.radians(4.0))
+    return sequence_over(
+        lambda size: ground(size, 4), lens, poses, photometry=Photometry(noise=0.01), seed=4, margin=80
+    )
+
+
+def _table(sequence: Sequence, paths: list[Path], error: float) -> str:
+    tilt = np.degrees(sequence.poses.tilt[: len(paths)]) + np.random.default_rng(1).normal(
+        scale=error, size=(len(paths), 2)
+    )
+    rows = [f"{path.name},{psi:.6f},{theta:.6f},50" for path, (psi, theta) in zip(paths, tilt, strict=True)]
+    return "\n".join(["name,psi,theta,altitude", *rows])
+
+
+@pytest.mark.parametrize(("error", "std"), [(0.0, 0.0), (0.3, np.radians(0.3))])
+def test_measured_tilts_are_used(windy: Sequence, tmp_path: Path, error: float, std: float) -> None:
+    paths = windy.write(tmp_path)
+    (tmp_path / "imu.csv").write_text(_table(windy, paths, error))
+    lens = windy.lens
+    assert isinstance(lens, Camera)
+    options = rdstitch.StitchOptions(
+        attitude=tmp_path / "imu.csv", attitude_std=std, focal=lens.focal, workers=1, model="auto"
+    )
+    path, registration = rdstitch.trajectory(paths, options=options)
+    assert registration.alignment.used.all()
+    assert registration.alignment.model != "homography"
+    assert abs(registration.alignment.distortion - lens.distortion) < 0.005
+    difference = np.degrees(registration.alignment.poses.tilt - windy.poses.tilt)  # type: ignore[union-attr]
+    assert np.abs(difference).max() < (0.01 if std == 0.0 else 1.0)
+    assert len(path.position) == len(paths)
+
+
+def test_pairs_get_one_tilt_a_picture(windy: Sequence, tmp_path: Path) -> None:
+    paths = windy.write(tmp_path)[:2]
+    (tmp_path / "imu.csv").write_text(_table(windy, paths, 0.0))
+    lens = windy.lens
+    assert isinstance(lens, Camera)
+    options = rdstitch.StitchOptions(
+        attitude=tmp_path / "imu.csv", attitude_std=0.0, focal=lens.focal, solver="two_point", workers=1
+    )
+    registration = rdstitch.calibrate(paths, options)
+    assert [pair.relation.solver for pair in registration.pairs] == ["two_point"]
+    assert abs(registration.alignment.distortion - lens.distortion) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("content", "wrong"),
+    [
+        ("", "psi"),
+        ("name,psi\n", "theta"),
+        ("name,psi,theta\nother.png,1,2\n", "no line for"),
+        ("name,psi,theta\nframe_0000.png,much,2\n", "line 2"),
+        ("name,psi,theta\nframe_0000.png,nan,2\n", "line 2"),
+        ("name,psi,theta\nframe_0000.png,95,2\n", "line 2"),
+        ("name,psi,theta\nframe_0000.png,1\n", "line 2"),
+        ("name,psi,theta\nframe_0000.png,1,2\nframe_0000.png,1,2\n", "twice"),
+    ],
+)
+def test_tables_that_are_none(rdstitch: Run, frames: list[Path], tmp_path: Path, content: str, wrong: str) -> None:
+    (tmp_path / "imu.csv").write_text(content.replace("frame_0000.png", frames[0].name))
+    arguments = ("mosaic", *frames, "--attitude", tmp_path / "imu.csv", "-o", tmp_path / "out.png", *FAST)
+    done = rdstitch(*arguments)
+    assert done.status == 3
+    assert "imu.csv" in done.line
+    assert wrong in done.line or (content == "" and "name" in done.line)
+    assert not (tmp_path / "out.png").exists()
+
+
+def test_the_command_takes_degrees(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    rows = [f"{frame.name},0,0" for frame in frames]
+    (tmp_path / "imu.csv").write_text("\n".join(["name,psi,theta", *rows]))
+    arguments = ("calibrate", *frames, "--attitude", tmp_path / "imu.csv", "-o", tmp_path / "camera.json", *FAST)
+    assert rdstitch(*arguments, "--attitude-std", "10").status == 0
+    assert rdstitch(*arguments, "--overwrite", "--attitude-std", "-1").status == 2
