@@ -111,7 +111,7 @@ def _plausible(option: click.Option) -> Any:
         return str(option.type.choices[0])
     if isinstance(option.type, (click.types.IntParamType, click.types.FloatParamType)):
         return 1
-    return {"tilt": "1,2", "max_memory": "1G"}.get(option.name or "", "name")
+    return {"tilt": "1,2", "attitude_std": "0.5", "max_memory": "1G"}.get(option.name or "", "name")
 
 
 @pytest.mark.parametrize("name", sorted(cli.commands))
