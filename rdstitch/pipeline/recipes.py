@@ -116,9 +116,9 @@ def calibrate(
     with _pictures(inputs, None, every) as paths:
         _check_outputs(None, options, paths)
         registration = _register_all(paths, options, progress)
-    _accept(registration, options, lens_only=True)
+        verdict = _accept(registration, options, lens_only=True)
     _save_camera(registration, options)
-    return registration
+    return _warned(registration, verdict)
 
 
 def trajectory(
@@ -158,7 +158,7 @@ def trajectory(
             if file is not None:
                 check_output(file, options.overwrite, paths, suffixes=())
         registration = _register_all(paths, options, progress, metric=True)
-    _accept(registration, options)
+        registration = _warned(registration, _accept(registration, options))
     path = Trajectory.from_alignment(registration.alignment, height)
     if output is not None:
         write_text_atomic(output, path.as_csv() if layout == "csv" else path.as_tum())
@@ -249,6 +249,13 @@ def _accept(registration: Registration, options: StitchOptions, *, lens_only: bo
     if options.strict and registration.left_out:
         raise PartialResultError("; ".join(f"left out {m.path}: {m.reason}" for m in registration.left_out))
     return verdict
+
+
+def _warned(registration: Registration, verdict: Verdict) -> Registration:
+    """The registration with what is wrong or doubtful among its warnings."""
+    alignment = registration.alignment
+    warned = replace(alignment, warnings=(*alignment.warnings, *verdict.complaints))
+    return replace(registration, alignment=warned)
 
 
 def _save_camera(registration: Registration, options: StitchOptions) -> None:

@@ -43,6 +43,11 @@ class Verdict:
     failures: tuple[str, ...]
     doubts: tuple[str, ...]
 
+    @property
+    def complaints(self) -> tuple[str, ...]:
+        """Everything that the user must be told: failures, which a forced result has, and doubts."""
+        return (*(f"not reliable: {failure}" for failure in self.failures), *self.doubts)
+
 
 def judge(
     registration: Registration,

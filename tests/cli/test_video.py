@@ -1,0 +1,36 @@
+"""Frames of a video exist only while a command runs: every command must have done with them by then."""
+
+from pathlib import Path
+
+import cv2
+import pytest
+
+from rdstitch.io import read_image
+from tests.cli.running import DISTORTION, FAST, Run
+
+
+@pytest.fixture
+def video(frames: list[Path], tmp_path: Path) -> Path:
+    """The frames one after the other."""
+    pictures = [cv2.cvtColor(read_image(frame).pixels, cv2.COLOR_RGB2BGR) for frame in frames]
+    height, width = pictures[0].shape[:2]
+    file = tmp_path / "drive.avi"
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, (width, height))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no videos")
+    for picture in pictures:
+        writer.write(picture)
+    writer.release()
+    return file
+
+
+@pytest.mark.parametrize(
+    ("command", "output"), [("mosaic", "out.png"), ("calibrate", "camera.json"), ("trajectory", "path.csv")]
+)
+def test_a_video_is_as_good_as_its_frames(
+    rdstitch: Run, video: Path, tmp_path: Path, command: str, output: str
+) -> None:
+    done = rdstitch(command, video, "-o", tmp_path / output, *FAST)
+    assert (done.status, done.err) == (0, "")
+    assert abs(float(done.out) - DISTORTION) < 0.01
+    assert (tmp_path / output).stat().st_size > 0
