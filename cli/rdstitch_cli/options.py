@@ -180,12 +180,21 @@ estimation = together(
     click.option(
         "--lightglue-model", type=PICTURE, metavar="FILE", help="Match by this LightGlue network for these features."
     ),
-    click.option("--max-features", type=click.IntRange(1), metavar="N", help="At most so many features a picture."),
+    click.option(
+        "--max-features",
+        type=click.IntRange(1),
+        default=4000,
+        show_default=True,
+        metavar="N",
+        help="At most so many features a picture.",
+    ),
     click.option(
         "--work-megapixels",
-        type=float,
+        type=click.FloatRange(0.0),
+        default=2.0,
+        show_default=True,
         metavar="MP",
-        help="Size at most that features are detected at; 0 is full size.",
+        help="Size at most that features are detected at, megapixels; 0 is full size.",
     ),
     click.option(
         "--solver", type=click.Choice(SOLVERS), default="auto", show_default=True, help="Minimal solver of the pairs."
@@ -265,9 +274,20 @@ compositing = together(
         help="What no picture covers, in JPEG: 0 black to 255 white.",
     ),
     click.option("--max-memory", type=Bytes(), help="Memory that compositing may take; otherwise what suits the size."),
-    click.option("--scale", type=float, default=1.0, show_default=True, help="Size of the output; 1 keeps resolution."),
     click.option(
-        "--rotate", type=float, default=0.0, show_default=True, metavar="DEG", help="Turn the output clockwise."
+        "--scale",
+        type=float,
+        default=1.0,
+        show_default=True,
+        help="Factor to the size of the output; 1 keeps resolution.",
+    ),
+    click.option(
+        "--rotate",
+        type=float,
+        default=0.0,
+        show_default=True,
+        metavar="DEG",
+        help="Turn the output clockwise, degrees.",
     ),
     click.option(
         "--dry-run", is_flag=True, help="Say what compositing would take (size, memory, time); write nothing."

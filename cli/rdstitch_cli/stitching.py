@@ -36,8 +36,8 @@ def stitch_options(
     camera: Path | None,
     features: str,
     aliked_model: Path | None,
-    max_features: int | None,
-    work_megapixels: float | None,
+    max_features: int,
+    work_megapixels: float,
     solver: str,
     **given: Any,
 ) -> "StitchOptions":
@@ -46,17 +46,14 @@ def stitch_options(
     from rdstitch.features import FeatureOptions
     from rdstitch.pipeline import StitchOptions
 
-    wanted: dict[str, Any] = {"kind": features, "aliked_model": aliked_model}
-    if max_features is not None:
-        wanted["max_features"] = max_features
-    if work_megapixels is not None:
-        wanted["work_megapixels"] = work_megapixels or None
     composite = {
         name: given.pop(name) for name in CompositeOptions.__dataclass_fields__ if name in given and name != "workers"
     }
     return StitchOptions(
         camera=read_lens(camera, reporter),
-        features=FeatureOptions(**wanted),
+        features=FeatureOptions(
+            features, max_features, work_megapixels=work_megapixels or None, aliked_model=aliked_model
+        ),
         composite=CompositeOptions(**composite),
         solver=solver.replace("-", "_"),
         **given,
@@ -95,8 +92,8 @@ class Report:
 
 def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = False) -> None:
     """λ and the plan of a dry run, or the sidecar, to standard output; what the user must know to standard error."""
-    for doubt in (*result.verdict.doubts, *result.notes):
-        reporter.warn(doubt)
+    for complaint in (*result.verdict.complaints, *result.notes):
+        reporter.warn(complaint)
     _warn_of(result.registration, reporter)
     if as_json:
         from rdstitch.pipeline.sidecar import sidecar

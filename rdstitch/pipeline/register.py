@@ -90,12 +90,12 @@ def register(
     matcher = _matcher(options)
     cache = Cache(options.cache)
     features, damaged = _detect(sources, options, cache, skip_bad, progress)
-    tilts = _exact_tilts(sources, options)
+    aligning = _alignment_options(sources, options, reference)
+    tilts = aligning.exact_tilts(len(sources))
     pairing = Pairing(features, [source.camera for source in sources], matcher, options, progress, cache, tilts)
     pairs = pairing.estimate(first_pairs(features, options.seed))
     pairing, pairs = pairing.look_past_rest(pairs)
     pairs = pairing.rescue(pairs)
-    aligning = _alignment_options(sources, options, reference)
     cameras = [source.camera.with_focal() for source in sources]
     alignment = _align(cache, cameras, _links(sources, pairs), aligning)
     for _ in range(_CLOSURE_ROUNDS):
@@ -147,33 +147,16 @@ def _reference(sources: Sequence[Source], name: str | None) -> int | None:
     raise ArgumentError(f"the reference picture {name!r} is not among the input pictures")
 
 
-def _attitudes(sources: Sequence[Source]) -> list[tuple[float, float]] | None:
-    """(ψ, θ) of every picture where they were measured."""
-    known = [source.attitude for source in sources if source.attitude is not None]
-    return known if len(known) == len(sources) else None
-
-
-def _exact_tilts(sources: Sequence[Source], options: StitchOptions) -> list[tuple[float, float]] | None:
-    """The tilt of every picture where it is known exactly; an attitude adds to that of the mount."""
-    attitudes = _attitudes(sources)
-    if attitudes is None:
-        return None if options.tilt is None else [options.tilt] * len(sources)
-    if options.attitude_std > 0.0:
-        return None
-    mount = options.tilt or (0.0, 0.0)
-    return [(psi + mount[0], theta + mount[1]) for psi, theta in attitudes]
-
-
 def _alignment_options(sources: Sequence[Source], options: StitchOptions, reference: int | None) -> AlignmentOptions:
     """What is decided or known beforehand; measured attitudes that are not exact leave the mount's tilt open."""
-    attitudes = _attitudes(sources)
-    exact = attitudes is not None and options.attitude_std == 0.0
+    attitudes = [source.attitude for source in sources if source.attitude is not None]
+    exact = bool(attitudes) and options.attitude_std == 0.0
     return AlignmentOptions(
         reference=reference,
         model=options.model,
         distortion=options.known_distortion,
         tilt=options.tilt or ((0.0, 0.0) if exact else None),
-        attitudes=None if attitudes is None else np.array(attitudes),
+        attitudes=np.array(attitudes) if attitudes else None,
         attitudes_std=options.attitude_std,
     )
 

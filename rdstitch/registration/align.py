@@ -91,6 +91,13 @@ class AlignmentOptions:
         if self.tilt_std < 0 or self.attitudes_std < 0:
             raise ArgumentError("a standard deviation cannot be negative")
 
+    def exact_tilts(self, count: int) -> list[tuple[float, float]] | None:
+        """(ψ, θ), radians, of each of ``count`` pictures, where they are known exactly; None where not."""
+        if self.tilt is None or self.tilt_std > 0.0 or (self.attitudes is not None and self.attitudes_std > 0.0):
+            return None
+        attitudes = np.zeros((count, 2)) if self.attitudes is None else np.asarray(self.attitudes, dtype=np.float64)
+        return [(psi, theta) for psi, theta in (attitudes + self.tilt).tolist()]
+
     def knowledge(self, cameras: Sequence[Camera]) -> Knowledge:
         """As the adjustment needs it."""
         count = len(cameras)

@@ -7,7 +7,10 @@ import sys
 import click
 import pytest
 from rdstitch_cli.main import EXIT_STATUSES, cli
+from rdstitch_cli.progress import Reporter
+from rdstitch_cli.stitching import stitch_options
 
+from rdstitch.pipeline import StitchOptions
 from tests.cli.running import Run
 
 COMMANDS = sorted(cli.commands)
@@ -60,6 +63,16 @@ def test_options_of_one_name_mean_the_same_everywhere() -> None:
             if option.name not in ("output", "reference"):
                 meanings.setdefault(option.opts[-1], set()).add(f"{option.help} {option.default}")
     assert {text: found for text, found in meanings.items() if len(found) > 1} == {}
+
+
+@pytest.mark.parametrize("name", ["pano", "mosaic", "calibrate", "trajectory"])
+def test_defaults_are_the_librarys(name: str) -> None:
+    context = cli.commands[name].make_context(name, ["a.png", "b.png", "-o", "out.png"])
+    of_command = {"inputs", "pictures", "output", "every", "report", "as_json", "quiet", "verbose"}
+    of_command |= {"layout", "plot", "height"}
+    given = {key: value for key, value in context.params.items() if key not in of_command}
+    with Reporter(-1) as reporter:
+        assert stitch_options(reporter, **given) == StitchOptions()
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["--version"], *([name, "--help"] for name in COMMANDS)])

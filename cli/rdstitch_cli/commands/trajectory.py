@@ -28,7 +28,11 @@ Examples:
     help="csv: frame, picture, x, y, height, yaw in degrees. tum: number, position and quaternion a line.",
 )
 @click.option(
-    "--height", type=float, default=1.0, show_default=True, help="Height of the first frame, in the unit of positions."
+    "--height",
+    type=float,
+    default=1.0,
+    show_default=True,
+    help="Height of the first frame above the plane, in the unit that positions shall have.",
 )
 @click.option("--plot", type=options.PICTURE, metavar="FILE", help="Draw the path to FILE (SVG).")
 @options.overwrite
