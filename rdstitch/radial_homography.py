@@ -31,6 +31,29 @@ def project(homogeneous: FloatArray) -> FloatArray:
     return homogeneous[..., :2] / np.where(third > 0.0, third, np.nan)
 
 
+def to_plane(camera: Camera, homography: FloatArray, points: ArrayLike) -> FloatArray:
+    """Where measured points of a picture, px (N, 2), lie on the plane; NaN at and beyond the horizon.
+
+    Parameters
+    ----------
+    camera : Camera
+    homography : ndarray of shape (3, 3)
+        From undistorted normalized coordinates to the plane, with positive third coordinates in front of the camera.
+    points : array_like of shape (N, 2)
+    """
+    return _mapped(homography, camera.normalize(camera.undistort(points)))
+
+
+def from_plane(camera: Camera, homography: FloatArray, points: ArrayLike) -> FloatArray:
+    """Where a picture shows points (N, 2) of the plane, px: the inverse of :func:`to_plane`; NaN where it cannot."""
+    back = np.asarray(np.linalg.inv(homography), dtype=np.float64)
+    return camera.distort(camera.denormalize(_mapped(back, np.asarray(points, dtype=np.float64))))
+
+
+def _mapped(homography: FloatArray, points: FloatArray) -> FloatArray:
+    return project(points @ homography[:, :2].T + homography[:, 2])
+
+
 def transfer(homography: ArrayLike, distortion: ArrayLike, points: ArrayLike, distortion2: float = 0.0) -> FloatArray:
     """Where measured points of picture 1 are measured in picture 2: undistort, apply H, distort.
 

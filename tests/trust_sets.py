@@ -13,7 +13,7 @@ from rdstitch.camera import Camera, FloatArray
 from rdstitch.errors import RdstitchError
 from rdstitch.features import FeatureOptions
 from rdstitch.pipeline import Registration, StitchOptions, mosaic
-from rdstitch.radial_homography import project
+from rdstitch.radial_homography import to_plane
 from rdstitch.synthetic import (
     Photometry,
     Poses,
@@ -190,7 +190,7 @@ def registration_error(sequence: Sequence, registration: Registration) -> tuple[
     transfers = {}
     for position, number in _used(registration).items():
         camera, matrix = alignment.cameras[position], alignment.homographies[position]
-        transfers[number] = partial(_to_plane, camera, matrix)
+        transfers[number] = partial(to_plane, camera, matrix)
     measured = alignment_error(sequence, transfers, model="homography")
     return measured.median, max(measured.per_image().values())
 
@@ -203,8 +203,7 @@ def overlap_error(sequence: Sequence, registration: Registration) -> tuple[float
         width, height = alignment.cameras[i].image_size
         points = np.stack(np.meshgrid(np.linspace(0, width - 1, 12), np.linspace(0, height - 1, 9)), -1).reshape(-1, 2)
         true = sequence.to_picture(second, sequence.to_plane(first, points))
-        flat = _to_plane(alignment.cameras[i], alignment.relation(i, j), points)
-        found = alignment.cameras[j].distort(alignment.cameras[j].denormalize(flat))
+        found = alignment.transfer(i, j, points)
         width, height = alignment.cameras[j].image_size
         inside = ((true >= 0) & (true <= (width - 1, height - 1))).all(axis=1)
         if inside.any():
@@ -219,8 +218,3 @@ def _used(registration: Registration) -> dict[int, int]:
         for position, source in enumerate(registration.sources)
         if registration.alignment.used[position]
     }
-
-
-def _to_plane(camera: Camera, matrix: FloatArray, points: FloatArray) -> FloatArray:
-    flat = camera.normalize(camera.undistort(points))
-    return project(np.column_stack([flat, np.ones(len(flat))]) @ (matrix * np.sign(matrix[2, 2])).T)

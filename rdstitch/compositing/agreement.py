@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.io.read import Picture
-from rdstitch.radial_homography import project
+from rdstitch.radial_homography import from_plane, to_plane
 
 Grey = NDArray[np.float32]
 
@@ -65,7 +65,9 @@ def reduced_grey(picture: Picture) -> Grey:
     return grey
 
 
-def overlap_agreement(grey1: Grey, grey2: Grey, camera1: Camera, camera2: Camera, relation: FloatArray) -> Agreement:
+def overlap_agreement(
+    grey1: Grey, grey2: Grey, camera1: Camera, camera2: Camera, homography1: FloatArray, homography2: FloatArray
+) -> Agreement:
     """Compare two registered pictures.
 
     Parameters
@@ -73,12 +75,14 @@ def overlap_agreement(grey1: Grey, grey2: Grey, camera1: Camera, camera2: Camera
     grey1, grey2 : ndarray of shape (h, w), float32
         Grey pictures in [0, 1], of the size of their cameras; NaN where transparent.
     camera1, camera2 : Camera
-    relation : ndarray of shape (3, 3)
-        From undistorted normalized coordinates of the first picture to those of the second.
+    homography1, homography2 : ndarray of shape (3, 3)
+        From undistorted normalized coordinates of each picture to the plane.
     """
-    back = np.asarray(np.linalg.inv(relation), dtype=np.float64)
-    seen = _as_seen_by(camera2, grey1, camera1, back)
     height, width = grey2.shape
+    u, v = np.meshgrid(np.arange(width), np.arange(height))
+    plane = to_plane(camera2, homography2, np.stack([u, v], axis=-1).reshape(-1, 2))
+    # The first picture as the second one's lens would have seen it.
+    seen = sampled(grey1, from_plane(camera1, homography1, plane).reshape(height, width, 2))
     margin = _CELL // 2 + _REACH
     rows, columns = (np.arange(margin, n - margin + 1, _CELL) for n in (height, width))
     corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2) - _CELL // 2
@@ -88,18 +92,11 @@ def overlap_agreement(grey1: Grey, grey2: Grey, camera1: Camera, camera2: Camera
     return Agreement(sum(vote is not None for vote in votes), votes.count(1), votes.count(-1))
 
 
-def _as_seen_by(camera2: Camera, grey1: Grey, camera1: Camera, back: FloatArray) -> Grey:
-    """The first picture resampled into the second one's px; NaN where it does not reach."""
-    width, height = camera2.image_size
-    u, v = np.meshgrid(np.arange(width), np.arange(height))
-    flat = camera2.normalize(camera2.undistort(np.stack([u, v], axis=-1).reshape(-1, 2)))
-    lifted = np.column_stack([flat, np.ones(len(flat))]) @ (back * np.sign(back[2, 2])).T
-    place = camera1.distort(camera1.denormalize(project(lifted)))
-    x, y = (np.nan_to_num(place[:, k], nan=-1e6).astype(np.float32).reshape(height, width) for k in (0, 1))
-    nowhere = (float("nan"),)
-    return np.asarray(
-        cv2.remap(grey1, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=nowhere), dtype=np.float32
-    )
+def sampled(grey: Grey, places: FloatArray) -> Grey:
+    """A picture at places (h, w, 2), px; NaN where it does not reach."""
+    x, y = (np.nan_to_num(places[..., k], nan=-1e6).astype(np.float32) for k in (0, 1))
+    found = cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(float("nan"),))
+    return np.asarray(found, dtype=np.float32)
 
 
 def _cell(picture: Grey, top: int, left: int, margin: int = 0) -> Grey:

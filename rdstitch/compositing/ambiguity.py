@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from rdstitch.camera import Camera, FloatArray
-from rdstitch.compositing.agreement import Grey
-from rdstitch.radial_homography import project
+from rdstitch.compositing.agreement import Grey, sampled
+from rdstitch.radial_homography import from_plane, to_plane
 
 _LONGEST_SIDE = 256  # px of the pictures that are compared
 _MOST_PX = 4  # times the sides of a picture that its outline on the plane may have
@@ -85,19 +85,14 @@ def _px_per_unit(grey: Grey, camera: Camera, homography: FloatArray) -> float:
     """Resolution of the plane at which the middle of a picture keeps its size, made small."""
     height, width = grey.shape
     around = np.array([[width / 2 + dx, height / 2 + dy] for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1))])
-    left, right, top, bottom = _to_plane(camera, homography, around)
+    left, right, top, bottom = to_plane(camera, homography, around)
     area = abs(np.linalg.det(np.stack([right - left, bottom - top]) / 2.0))
     return float(min(1.0, _LONGEST_SIDE / max(height, width)) / np.sqrt(area))
 
 
-def _to_plane(camera: Camera, homography: FloatArray, points: FloatArray) -> FloatArray:
-    flat = camera.normalize(camera.undistort(points))
-    return project(np.column_stack([flat, np.ones(len(flat))]) @ (homography * np.sign(homography[2, 2])).T)
-
-
 def _on_plane(grey: Grey, camera: Camera, homography: FloatArray, scale: float) -> tuple[Grey, FloatArray]:
     """A picture drawn on the plane without its brightness, NaN outside; and where its corner lies, px."""
-    outline = _to_plane(camera, homography, camera.outline(16)) * scale
+    outline = to_plane(camera, homography, camera.outline(16)) * scale
     middle = np.nanmedian(outline, axis=0)
     reach = _MOST_PX / 2.0 * _LONGEST_SIDE
     low, high = (
@@ -107,17 +102,12 @@ def _on_plane(grey: Grey, camera: Camera, homography: FloatArray, scale: float) 
     width, height = np.maximum(np.ceil(high - origin).astype(int), 1)
     u, v = np.meshgrid(np.arange(width), np.arange(height))
     plane = (np.stack([u, v], axis=-1).reshape(-1, 2) + origin) / scale
-    back = np.asarray(np.linalg.inv(homography), dtype=np.float64)
-    # In front of the camera is where the picture's own middle is.
-    third = back[2] @ np.append(_to_plane(camera, homography, np.array([camera.center]))[0], 1.0)
-    lifted = np.column_stack([plane, np.ones(len(plane))]) @ (back * np.sign(third)).T
-    place = camera.distort(camera.denormalize(project(lifted)))
-    x, y = (np.nan_to_num(place[:, k], nan=-1e6).astype(np.float32).reshape(height, width) for k in (0, 1))
+    places = from_plane(camera, homography, plane).reshape(height, width, 2)
     # The picture is smaller on the plane than it is: without a blur it would alias.
     factor = max(1.0, max(grey.shape) / _LONGEST_SIDE)
-    smooth = cv2.GaussianBlur(grey, (0, 0), 0.5 * factor) if factor > 1.05 else grey
-    drawn = cv2.remap(smooth, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(float("nan"),))
-    return _without_brightness(np.asarray(drawn, dtype=np.float32)), origin
+    if factor > 1.05:
+        grey = np.asarray(cv2.GaussianBlur(grey, (0, 0), 0.5 * factor), dtype=np.float32)
+    return _without_brightness(sampled(grey, places)), origin
 
 
 def _without_brightness(picture: Grey) -> Grey:

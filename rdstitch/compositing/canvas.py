@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.errors import ArgumentError, LimitError
+from rdstitch.radial_homography import to_plane
 
 # Straight sides are curved after undistortion: 64 points a side put the extremes within 0.02 px on 4000 px.
 _POINTS_PER_SIDE = 64
@@ -142,21 +143,18 @@ def _oriented(matrix: FloatArray) -> FloatArray:
 
 def _outline_on_plane(camera: Camera, matrix: FloatArray, name: str) -> FloatArray:
     """Densely sampled outline in plane coordinates."""
-    flat = camera.normalize(camera.undistort(camera.outline(_POINTS_PER_SIDE)))
-    z = np.column_stack([flat, np.ones(len(flat))]) @ matrix.T
-    # The third coordinate is linear, so it has one sign inside when it has one on the outline.
-    if not (z[:, 2] > 0).all():
+    outline = to_plane(camera, matrix, camera.outline(_POINTS_PER_SIDE))
+    # What is in front of the horizon on the outline is so inside.
+    if not np.isfinite(outline).all():
         raise LimitError(f"{name}: the horizon crosses the picture; leave it out, or choose another reference picture")
-    return z[:, :2] / z[:, 2:]
+    return outline
 
 
 def _resolution(camera: Camera, matrix: FloatArray) -> float:
     """Picture px per plane unit at the picture's centre, negative where the picture is mirrored."""
     width, height = camera.image_size
     middle = np.array([(width - 1) / 2, (height - 1) / 2])
-    flat = camera.normalize(camera.undistort(middle + np.array([(-0.5, 0), (0.5, 0), (0, -0.5), (0, 0.5)])))
-    z = np.column_stack([flat, np.ones(4)]) @ matrix.T
-    left, right, top, bottom = z[:, :2] / z[:, 2:]
+    left, right, top, bottom = to_plane(camera, matrix, middle + np.array([(-0.5, 0), (0.5, 0), (0, -0.5), (0, 0.5)]))
     (ax, ay), (bx, by) = right - left, bottom - top
     area = ax * by - ay * bx
     return float(math.copysign(1.0 / math.sqrt(max(abs(area), 1e-300)), area))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.pictures import LoadedPicture
+from rdstitch.radial_homography import to_plane
 
 Box = tuple[int, int, int, int]
 Float32Array = NDArray[np.float32]
@@ -106,7 +107,7 @@ def plan_warp(camera: Camera, homography: FloatArray, canvas: Canvas, index: int
     outline = canvas.footprints[index]
     # The sign of a homography is free; its inverse must put the footprint in front of the camera.
     if from_canvas[2] @ np.array([*outline.mean(axis=0), 1.0]) < 0:
-        from_canvas = -from_canvas
+        to_canvas, from_canvas = -to_canvas, -from_canvas
     box = canvas.boxes()[index]
     draft = Warp(camera, from_canvas, box, 1, 1.0)
     probes = _probes(camera, to_canvas, outline)
@@ -260,9 +261,7 @@ def _probes(camera: Camera, to_canvas: FloatArray, outline: FloatArray) -> Float
     """Canvas px (K, 2) spread over the picture, its outline included."""
     width, height = camera.image_size
     grid = np.stack(np.meshgrid(np.linspace(0, width - 1, _PROBES), np.linspace(0, height - 1, _PROBES)), axis=-1)
-    flat = camera.normalize(camera.undistort(grid.reshape(-1, 2)))
-    z = np.column_stack([flat, np.ones(len(flat))]) @ to_canvas.T
-    return np.concatenate([z[:, :2] / z[:, 2:], outline])
+    return np.concatenate([to_plane(camera, to_canvas, grid.reshape(-1, 2)), outline])
 
 
 def _lattice_step(warp: Warp, probes: FloatArray) -> int:

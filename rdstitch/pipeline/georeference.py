@@ -16,7 +16,7 @@ from rdstitch.camera import Camera, FloatArray
 from rdstitch.io.atomic import write_text_atomic
 from rdstitch.io.metadata import GpsPosition
 from rdstitch.io.tiff import ExtraTag
-from rdstitch.radial_homography import project
+from rdstitch.radial_homography import to_plane
 
 _FEWEST_POSITIONS = 3
 # Positions must agree with the picture to this share of their own spread: else it is no view from above, or the GPS
@@ -168,5 +168,4 @@ def _central_meridian(zone: int) -> float:
 def _middle(camera: Camera, to_output: FloatArray) -> FloatArray:
     """Where the centre of a picture lies in the output, px."""
     width, height = camera.image_size
-    flat = camera.normalize(camera.undistort(np.array([(width - 1) / 2, (height - 1) / 2])))
-    return project(to_output @ np.append(flat, 1.0))
+    return to_plane(camera, to_output, np.array([[(width - 1) / 2, (height - 1) / 2]])).reshape(2)

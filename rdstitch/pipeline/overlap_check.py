@@ -76,12 +76,8 @@ def _compare(
 
     def compare(fit: LinkFit) -> CheckedLink:
         i, j = fit.image1, fit.image2
-        pair = greys[i], greys[j], cameras[i], cameras[j]
-        return CheckedLink(
-            fit,
-            overlap_agreement(*pair, alignment.relation(i, j)),
-            placement_ambiguity(*pair, alignment.homographies[i], alignment.homographies[j]),
-        )
+        pair = greys[i], greys[j], cameras[i], cameras[j], alignment.homographies[i], alignment.homographies[j]
+        return CheckedLink(fit, overlap_agreement(*pair), placement_ambiguity(*pair))
 
     with ThreadPoolExecutor(workers) as pool:
         greys = dict(zip(pictures, pool.map(grey, pictures), strict=True))

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.camera import Camera, FloatArray
-from rdstitch.radial_homography import project
+from rdstitch.radial_homography import from_plane, to_plane
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,5 @@ class Alignment:
 
     def transfer(self, image1: int, image2: int, points: FloatArray) -> FloatArray:
         """Where points (N, 2) of one picture, px, are in another; NaN where its lens cannot see them."""
-        camera1, camera2 = self.cameras[image1], self.cameras[image2]
-        flat = camera1.normalize(camera1.undistort(points))
-        lifted = np.column_stack([flat, np.ones(len(flat))]) @ self.relation(image1, image2).T
-        return camera2.distort(camera2.denormalize(project(lifted)))
+        plane = to_plane(self.cameras[image1], self.homographies[image1], points)
+        return from_plane(self.cameras[image2], self.homographies[image2], plane)

@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.features import Features
+from rdstitch.radial_homography import to_plane
 
 EXHAUSTIVE_UP_TO = 30
 """Number of pictures up to which every pair is tried."""
@@ -80,8 +81,9 @@ def neighbours(cameras: Sequence[Camera], homographies: FloatArray, tried: set[t
     tried : set of (int, int)
         Pairs (i, j), i < j.
     """
-    known = np.flatnonzero(np.isfinite(homographies).all(axis=(1, 2))).tolist()
-    boxes = np.array([_footprint(cameras[i], homographies[i]) for i in known]).reshape(-1, 2, 2)
+    footprints = np.array([_footprint(*placed) for placed in zip(cameras, homographies, strict=True)])
+    known = np.flatnonzero(np.isfinite(footprints).all(axis=(1, 2))).tolist()
+    boxes = footprints[known]
     centres = boxes.mean(axis=1)
     nearest = KDTree(centres).query(centres, k=min(_NEIGHBOURS + 1, len(known)))[1].reshape(len(known), -1)
     found = set()
@@ -112,10 +114,8 @@ def _aggregate(descriptors: FloatArray, words: FloatArray) -> FloatArray:
 
 
 def _footprint(camera: Camera, homography: FloatArray) -> FloatArray:
-    """Lower and upper bounds (2, 2) of a picture in the plane."""
-    outline = camera.normalize(camera.undistort(camera.outline(8)))
-    lifted = np.column_stack([outline, np.ones(len(outline))]) @ homography.T
-    plane = lifted[:, :2] / lifted[:, 2:]
+    """Lower and upper bounds (2, 2) of a picture in the plane; NaN where the horizon crosses it."""
+    plane = to_plane(camera, homography, camera.outline(8))
     return np.stack([plane.min(axis=0), plane.max(axis=0)])
 
 

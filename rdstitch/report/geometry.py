@@ -4,7 +4,7 @@ import numpy as np
 
 from rdstitch.camera import FloatArray
 from rdstitch.pipeline.register import Registration
-from rdstitch.radial_homography import project
+from rdstitch.radial_homography import to_plane
 from rdstitch.registration.alignment import LinkFit
 from rdstitch.registration.pairs import PairRegistration
 
@@ -34,19 +34,13 @@ def residuals(registration: Registration, fit: LinkFit) -> tuple[FloatArray, Flo
     Matches that the pair itself takes for wrong are left out, and those that miss by more than four times the link's
     error.
     """
-    pair, alignment = pairs_of(registration)[fit.image1, fit.image2], registration.alignment
-    first, second = alignment.cameras[fit.image1], alignment.cameras[fit.image2]
+    pair = pairs_of(registration)[fit.image1, fit.image2]
     inliers = pair.relation.inliers
     given, measured = pair.correspondences.points1[inliers], pair.correspondences.points2[inliers]
-    flat = first.normalize(first.undistort(given))
-    mapped = project(np.column_stack([flat, np.ones(len(flat))]) @ alignment.relation(fit.image1, fit.image2).T)
-    off = second.distort(second.denormalize(mapped)) - measured
+    off = registration.alignment.transfer(fit.image1, fit.image2, given) - measured
     kept = np.linalg.norm(off, axis=1) <= 4.0 * fit.rms
     return measured[kept], off[kept]
 
 
 def _on_plane(registration: Registration, index: int, points: FloatArray) -> FloatArray:
-    camera, matrix = registration.alignment.cameras[index], registration.alignment.homographies[index]
-    flat = camera.normalize(camera.undistort(points))
-    z = np.column_stack([flat, np.ones(len(flat))]) @ (matrix * np.sign(matrix[2, 2])).T
-    return project(np.where(z[:, 2:] > 0.0, z, np.nan))
+    return to_plane(registration.alignment.cameras[index], registration.alignment.homographies[index], points)

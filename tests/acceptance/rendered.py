@@ -6,16 +6,17 @@ from pathlib import Path
 import numpy as np
 
 from rdstitch import StitchResult
-from rdstitch.camera import FloatArray
 from rdstitch.io.read import read_image
-from rdstitch.radial_homography import project
+from rdstitch.radial_homography import to_plane
 from rdstitch.synthetic import AlignmentError, PlaneComparison, Sequence, alignment_error, compare_with_plane
 
 
 def geometry(sequence: Sequence, result: StitchResult, model: str) -> AlignmentError:
     """How far the stitched plane is from the true one, px, up to one similarity or homography."""
     alignment = result.registration.alignment
-    places = {i: partial(_to_output, result, i) for i in range(len(sequence)) if alignment.used[i]}
+    to_output = result.canvas.matrix @ alignment.homographies
+    used = np.flatnonzero(alignment.used).tolist()
+    places = {i: partial(to_plane, alignment.cameras[i], to_output[i]) for i in used}
     return alignment_error(sequence, places, model=model)
 
 
@@ -25,11 +26,3 @@ def picture(sequence: Sequence, output: Path, model: str) -> PlaneComparison:
     assert found.alpha is not None
     shown = np.dstack([found.pixels, found.alpha])
     return compare_with_plane(shown, sequence.texture, model=model, reachable=sequence.reachable())
-
-
-def _to_output(result: StitchResult, index: int, points: FloatArray) -> FloatArray:
-    alignment = result.registration.alignment
-    camera = alignment.cameras[index]
-    flat = camera.normalize(camera.undistort(points))
-    matrix = result.canvas.matrix @ alignment.homographies[index]
-    return project(np.column_stack([flat, np.ones(len(flat))]) @ matrix.T)

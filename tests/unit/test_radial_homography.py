@@ -7,7 +7,14 @@ import pytest
 
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.planar_motion import PlanarMotion
-from rdstitch.radial_homography import RadialHomography, measurement_whitening, transfer, transfer_jacobian
+from rdstitch.radial_homography import (
+    RadialHomography,
+    from_plane,
+    measurement_whitening,
+    to_plane,
+    transfer,
+    transfer_jacobian,
+)
 
 H = PlanarMotion((0.1, -0.2), 0.1, (0.2, -0.1), 1.1).homography() + 0.02 * np.arange(9).reshape(3, 3)
 POINTS = np.random.default_rng(1).uniform(-0.5, 0.5, (8, 2))
@@ -71,3 +78,13 @@ def test_a_failed_fit_is_falsy_and_says_why() -> None:
     assert np.isnan(failed.distortion)
     assert failed.inliers.shape == (7,)
     assert not failed.inliers.any()
+
+
+def test_to_the_plane_and_back() -> None:
+    camera = Camera((640, 480), distortion=-0.2, center=(330.0, 230.0))
+    points = np.array([[0.0, 0.0], [320.0, 240.0], [639.0, 479.0]])
+    tilted = np.array([[1.1, 0.1, 0.3], [-0.1, 0.9, -0.2], [0.3, -0.2, 1.0]])
+    np.testing.assert_allclose(from_plane(camera, tilted, to_plane(camera, tilted, points)), points, atol=1e-9)
+    beyond = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 2.0, 1.0]])
+    assert np.isnan(to_plane(camera, beyond, [[320.0, 0.0]])).all()
+    assert np.isfinite(to_plane(camera, beyond, [[320.0, 479.0]])).all()
