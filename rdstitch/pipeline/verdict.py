@@ -95,8 +95,16 @@ def judge(
     failures.extend(suspicions[pair] for pair in decisive[:_MOST_NAMED])
     if len(decisive) > _MOST_NAMED:
         failures.append(f"{len(decisive) - _MOST_NAMED} more pairs like these")
-    harmless = [clause for pair, clause in suspicions.items() if pair not in decisive]
-    return Verdict(not failures, tuple(failures), (*harmless, *_little_alike(names, checked), *_inputs(registration)))
+    outvoted = _outvoted(names, [pair for pair in suspicions if pair not in decisive])
+    return Verdict(not failures, tuple(failures), (*outvoted, *_little_alike(names, checked), *_inputs(registration)))
+
+
+def _outvoted(names: Sequence[str], pairs: Sequence[Pair]) -> list[str]:
+    """Suspicious pairs that decide nothing, in one clause."""
+    if not pairs:
+        return []
+    named = ", ".join(f"{names[i]} and {names[j]}" for i, j in pairs[:_MOST_NAMED]) + ", …" * (len(pairs) > _MOST_NAMED)
+    return [f"{len(pairs)} of the pairs fit badly, and little depends on them: {named}; look at the seams between them"]
 
 
 def _misfits(names: Sequence[str], used: Sequence[LinkFit]) -> list[str]:

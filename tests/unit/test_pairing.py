@@ -1,4 +1,4 @@
-"""What rests in the pictures does not hide what moves; and where nothing moves, nothing is lost."""
+"""Rounds of pairing: what rests does not hide what moves; pairs that hang on little find more where it must be."""
 
 from functools import partial
 
@@ -9,6 +9,7 @@ from rdstitch.features import Features, match
 from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.pairing import Pairing
 from rdstitch.pipeline.progress import silent
+from rdstitch.registration import AlignmentOptions, align
 from rdstitch.registration.resting import rests
 
 LENS = Camera((640, 480), distortion=-0.2, focal=520.0)
@@ -27,12 +28,16 @@ def _descriptors(count: int, rng: np.random.Generator) -> FloatArray:
     return unit
 
 
-def _pairing(resting: int, moving: int, seed: int = 0) -> Pairing:
-    """Pictures in which some points rest, while a board with others is carried about, or is not there."""
+def _pairing(resting: int, moving: int, repeated: int = 0, seed: int = 0) -> Pairing:
+    """Pictures in which some points rest, while a board with others is carried about, or is not there.
+
+    Of the points of the board so many look like one another, in fives.
+    """
     rng = np.random.default_rng(seed)
     background = rng.uniform((0, 0), (639, 479), (resting, 2))
     board = rng.uniform(-0.5, 0.5, (moving, 2)) * 1.2
     names = _descriptors(resting + moving, rng)
+    names[resting : resting + repeated] = np.repeat(names[resting : resting + repeated : 5], 5, axis=0)
     found = []
     for index in range(PICTURES):
         angle, offset = 0.3 * index, np.array([0.12, -0.08]) * index
@@ -41,8 +46,9 @@ def _pairing(resting: int, moving: int, seed: int = 0) -> Pairing:
         flat = seen / (1.0 + seen @ np.array([0.1 * index, 0.05 * index]))[:, None]
         points = np.concatenate([background, LENS.distort(LENS.denormalize(flat / 2.0 * 1.2))])
         points += rng.normal(scale=0.2, size=points.shape)
+        seen_as = names + rng.normal(scale=0.01, size=names.shape)
         inside = ((points > 0) & (points < (639, 479))).all(axis=1)
-        found.append(_features(points[inside], names[inside]))
+        found.append(_features(points[inside], seen_as[inside]))
     matcher = partial(match, ratio=None)
     return Pairing(found, [LENS.with_focal()] * PICTURES, matcher, StitchOptions(workers=1), silent)
 
@@ -75,3 +81,24 @@ def test_a_few_resting_points_change_nothing() -> None:
     alone = pairing.estimate(ALL)
     assert not any(rests(pair, 3.0) for pair in alone)
     assert pairing.look_past_rest(alone) == (pairing, alone)
+
+
+def test_pictures_that_hang_on_little_find_what_repeats_where_it_must_be() -> None:
+    pairing = _pairing(0, 160, repeated=120)
+    alone = pairing.estimate(ALL)
+    assert all(pair.relation for pair in alone)
+    cameras = [camera.with_focal() for camera in pairing.cameras]
+    alignment = align(cameras, [pair.link() for pair in alone], AlignmentOptions(model="homography"))
+    stronger = pairing.strengthen(alone, alignment)
+    for before, after in zip(alone, stronger, strict=True):
+        assert after.relation.inliers.sum() > 1.5 * before.relation.inliers.sum()
+    errors = [abs(pair.relation.distortion - LENS.distortion) for pair in stronger]
+    assert np.median(errors) < 0.02
+
+
+def test_pictures_with_many_matches_are_left_as_they_are() -> None:
+    pairing = _pairing(0, 400)
+    alone = pairing.estimate(ALL)
+    cameras = [camera.with_focal() for camera in pairing.cameras]
+    alignment = align(cameras, [pair.link() for pair in alone], AlignmentOptions(model="homography"))
+    assert all(new is old for new, old in zip(pairing.strengthen(alone, alignment), alone, strict=True))
