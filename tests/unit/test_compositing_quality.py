@@ -98,13 +98,14 @@ def test_nothing_of_the_covered_plane_is_missing() -> None:
     np.testing.assert_array_equal(covered[0], covered[1])
 
 
-def test_what_moved_is_taken_from_one_picture() -> None:
+@pytest.mark.parametrize("shift", range(-150, 151, 25))
+def test_what_moved_is_taken_from_one_picture(shift: int) -> None:
     """A disc that lies elsewhere in each of two pictures may appear whole, or not at all, but not cut or faded."""
     scene = render(2, 1, size=(640, 480), overlap=0.7, distortion=-0.1, seed=5)
     truth = scene.rendering
     frames = [frame.copy() for frame in scene.frames]
     middle = np.mean([truth.to_plane(i, np.array([[320.0, 240.0]]))[0] for i in (0, 1)], axis=0)
-    places = middle + np.array([(-20.0, 90.0), (25.0, -60.0)])
+    places = middle + np.array([(shift - 20.0, 90.0), (shift + 25.0, -60.0)])
     for index, place in enumerate(places):
         x, y = truth.to_picture(index, place[None])[0]
         cv2.circle(frames[index], (round(float(x)), round(float(y))), 28, (255, 0, 255), -1)
