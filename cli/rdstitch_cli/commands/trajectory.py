@@ -25,7 +25,7 @@ Examples:
     type=click.Choice(["csv", "tum"]),
     default="csv",
     show_default=True,
-    help="csv: frame, picture, x, y, height, yaw in degrees. tum: number, position and quaternion a line.",
+    help="csv: frame, x, y, yaw in degrees, height. tum: number, position and quaternion a line.",
 )
 @click.option(
     "--height",

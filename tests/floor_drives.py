@@ -1,0 +1,43 @@
+"""A robot's camera over a floor, as in the paper's §5.5: rendered frames, and the path that they were taken on."""
+
+from functools import partial
+
+import numpy as np
+
+from rdstitch.camera import Camera
+from rdstitch.registration.alignment import Poses
+from rdstitch.registration.trajectory import Trajectory
+from rdstitch.synthetic import Photometry, Sequence, ground, line_poses, parking_poses, sequence_over, turn_poses
+
+DISTORTION = -0.25
+
+PATHS = {"line": line_poses, "turn": turn_poses, "parking": parking_poses}
+
+
+def floor_drive(
+    path: str, count: int, *, seed: int, size: tuple[int, int] = (640, 480), overlap: float = 0.8
+) -> Sequence:
+    """Frames of one of :data:`PATHS`, through a lens of λ = :data:`DISTORTION` that is tilted by 3 and -2 degrees.
+
+    Parameters
+    ----------
+    path : str
+    count : int
+        Frames.
+    seed : int
+        Of the floor and the noise.
+    size : (int, int)
+        Width and height of the frames, px.
+    overlap : float
+        Of consecutive frames.
+    """
+    lens = Camera(size, DISTORTION, focal=0.8 * size[0])
+    poses = PATHS[path](lens, count, overlap=overlap, heading=0.3, tilt=(np.radians(3.0), np.radians(-2.0)))
+    floor = partial(ground, seed=seed)
+    return sequence_over(floor, lens, poses, photometry=Photometry(noise=0.01), seed=seed)
+
+
+def true_path(sequence: Sequence) -> Trajectory:
+    """The path of a sequence's camera, in units of its first height."""
+    p, unit = sequence.poses, sequence.poses.height[0]
+    return Trajectory.from_poses(Poses(p.yaw, p.position / unit, p.height / unit, p.tilt))
