@@ -5,13 +5,17 @@ the place where the two correlate best is searched around where the registration
 right nearly all cells find it there; elsewhere they find it anywhere.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.camera import Camera, FloatArray
+from rdstitch.compositing.warp import Box, lattice_maps
 from rdstitch.io.read import Picture
 from rdstitch.radial_homography import from_plane, to_plane
 
@@ -25,6 +29,7 @@ _ALIKE = 0.5  # correlation from which on two cells show the same
 _SLACK = 2.5  # px
 _MOST_CELLS = 120
 _OPAQUE = 250
+_LATTICE = 8  # px between the places that are computed; those between are interpolated
 
 
 @dataclass(frozen=True)
@@ -51,8 +56,45 @@ class Agreement:
         return self.confirming / self.cells if self.cells else 1.0
 
 
-def reduced_grey(picture: Picture) -> Grey:
-    """A picture as :func:`overlap_agreement` takes it: grey in [0, 1], small, NaN where transparent."""
+@dataclass(frozen=True)
+class PlacedPicture:
+    """A registered picture as it is compared.
+
+    Attributes
+    ----------
+    grey : ndarray of shape (h, w), float32
+        In [0, 1], small; NaN where transparent.
+    camera : Camera
+        Of the size of ``grey``.
+    homography : ndarray of shape (3, 3)
+        From undistorted normalized coordinates to the plane.
+    """
+
+    grey: Grey
+    camera: Camera
+    homography: FloatArray
+
+    @classmethod
+    def of(cls, picture: Picture, camera: Camera, homography: FloatArray) -> Self:
+        """A picture with its camera and its place, made small."""
+        grey = _reduced_grey(picture)
+        return cls(grey, camera.resized((grey.shape[1], grey.shape[0])), homography)
+
+    def sampled(self, plane: Callable[[FloatArray], FloatArray], box: Box) -> Grey:
+        """The picture where ``plane`` (M, 2) to (M, 2) puts the px x, y of a box on the plane; NaN where it is not."""
+
+        def places(x: FloatArray, y: FloatArray) -> FloatArray:
+            grid = np.stack(np.broadcast_arrays(x, y), axis=-1)
+            return from_plane(self.camera, self.homography, plane(grid.reshape(-1, 2))).reshape(grid.shape)
+
+        x, y = lattice_maps(places, box, _LATTICE)
+        found = cv2.remap(
+            self.grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(float("nan"),)
+        )
+        return np.asarray(found, dtype=np.float32)
+
+
+def _reduced_grey(picture: Picture) -> Grey:
     pixels = picture.pixels
     full = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else max(float(pixels.max()), 1e-12)
     height, width = pixels.shape[:2]
@@ -65,38 +107,18 @@ def reduced_grey(picture: Picture) -> Grey:
     return grey
 
 
-def overlap_agreement(
-    grey1: Grey, grey2: Grey, camera1: Camera, camera2: Camera, homography1: FloatArray, homography2: FloatArray
-) -> Agreement:
-    """Compare two registered pictures.
-
-    Parameters
-    ----------
-    grey1, grey2 : ndarray of shape (h, w), float32
-        Grey pictures in [0, 1], of the size of their cameras; NaN where transparent.
-    camera1, camera2 : Camera
-    homography1, homography2 : ndarray of shape (3, 3)
-        From undistorted normalized coordinates of each picture to the plane.
-    """
-    height, width = grey2.shape
-    u, v = np.meshgrid(np.arange(width), np.arange(height))
-    plane = to_plane(camera2, homography2, np.stack([u, v], axis=-1).reshape(-1, 2))
+def overlap_agreement(first: PlacedPicture, second: PlacedPicture) -> Agreement:
+    """Compare two registered pictures where they overlap."""
+    height, width = second.grey.shape
     # The first picture as the second one's lens would have seen it.
-    seen = sampled(grey1, from_plane(camera1, homography1, plane).reshape(height, width, 2))
+    seen = first.sampled(partial(to_plane, second.camera, second.homography), (0, 0, width, height))
     margin = _CELL // 2 + _REACH
     rows, columns = (np.arange(margin, n - margin + 1, _CELL) for n in (height, width))
     corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2) - _CELL // 2
     textured = [(top, left) for top, left in corners.tolist() if _has_texture(_cell(seen, top, left))]
     step = max(1, -(-len(textured) // _MOST_CELLS))
-    votes = [_vote(seen, grey2, top, left) for top, left in textured[::step]]
+    votes = [_vote(seen, second.grey, top, left) for top, left in textured[::step]]
     return Agreement(sum(vote is not None for vote in votes), votes.count(1), votes.count(-1))
-
-
-def sampled(grey: Grey, places: FloatArray) -> Grey:
-    """A picture at places (h, w, 2), px; NaN where it does not reach."""
-    x, y = (np.nan_to_num(places[..., k], nan=-1e6).astype(np.float32) for k in (0, 1))
-    found = cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(float("nan"),))
-    return np.asarray(found, dtype=np.float32)
 
 
 def _cell(picture: Grey, top: int, left: int, margin: int = 0) -> Grey:

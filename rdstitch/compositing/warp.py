@@ -1,6 +1,7 @@
 """One resampling from the original: canvas px → plane → undistorted → measured px of one picture."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,12 +67,7 @@ class Warp:
 
         The lattice is anchored to the canvas, so that every box gives the same coordinates, bit for bit.
         """
-        nodes = self.source_points(*lattice_nodes(box, self.step)).astype(np.float32)
-        nodes[~np.isfinite(nodes).all(axis=-1)] = _NOWHERE
-        return (
-            interpolate_lattice(nodes[..., 0], box, self.step),
-            interpolate_lattice(nodes[..., 1], box, self.step),
-        )
+        return lattice_maps(self.source_points, box, self.step)
 
 
 @dataclass(frozen=True)
@@ -255,6 +251,18 @@ def interpolate_lattice(nodes: Float32Array, box: Box, step: int) -> Float32Arra
     values: Float32Array = (columns[1:] - columns[:-1])[:, None, :] * share[:, None]
     values += columns[:-1, None, :]
     return np.asarray(values.reshape(-1, x1 - x0)[top : top + y1 - y0])
+
+
+def lattice_maps(
+    places: Callable[[FloatArray, FloatArray], FloatArray], box: Box, step: int
+) -> tuple[Float32Array, Float32Array]:
+    """What maps x (1, w) and y (h, 1) to px (h, w, 2) of a picture, computed on the lattice and interpolated.
+
+    Returns two arrays (h, w), far outside of any picture where there are no px.
+    """
+    nodes = places(*lattice_nodes(box, step)).astype(np.float32)
+    nodes[~np.isfinite(nodes).all(axis=-1)] = _NOWHERE
+    return interpolate_lattice(nodes[..., 0], box, step), interpolate_lattice(nodes[..., 1], box, step)
 
 
 def _probes(camera: Camera, to_canvas: FloatArray, outline: FloatArray) -> FloatArray:

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 
-from rdstitch.compositing.agreement import Agreement, Grey, overlap_agreement, reduced_grey
-from rdstitch.compositing.ambiguity import Ambiguity, placement_ambiguity
+import numpy as np
+
+from rdstitch.compositing.agreement import Agreement, PlacedPicture, overlap_agreement
+from rdstitch.compositing.ambiguity import Ambiguity, draw, drawing_scale, placement_ambiguity
 from rdstitch.pipeline.cache import NO_CACHE, Cache
 from rdstitch.pipeline.register import Registration
 from rdstitch.registration.alignment import LinkFit
@@ -71,18 +73,29 @@ def _compare(
     """Read the pictures, and compare those of the chosen links."""
     alignment = registration.alignment
 
-    def grey(index: int) -> Grey:
-        return reduced_grey(registration.sources[index].read())
+    def place(index: int) -> PlacedPicture:
+        picture = registration.sources[index].read()
+        return PlacedPicture.of(picture, alignment.cameras[index], alignment.homographies[index])
 
-    def compare(fit: LinkFit) -> CheckedLink:
+    def compare(fit: LinkFit, scale: float) -> CheckedLink:
         i, j = fit.image1, fit.image2
-        pair = greys[i], greys[j], cameras[i], cameras[j], alignment.homographies[i], alignment.homographies[j]
-        return CheckedLink(fit, overlap_agreement(*pair), placement_ambiguity(*pair))
+        ambiguity = placement_ambiguity(drawings[i, scale], drawings[j, scale])
+        return CheckedLink(fit, overlap_agreement(placed[i], placed[j]), ambiguity)
 
     with ThreadPoolExecutor(workers) as pool:
-        greys = dict(zip(pictures, pool.map(grey, pictures), strict=True))
-        cameras = {k: alignment.cameras[k].resized((grey.shape[1], grey.shape[0])) for k, grey in greys.items()}
-        return list(pool.map(compare, chosen))
+        placed = dict(zip(pictures, pool.map(place, pictures), strict=True))
+        scales = _scales([drawing_scale(placed[fit.image2]) for fit in chosen])
+        wanted = sorted(
+            {(k, scale) for fit, scale in zip(chosen, scales, strict=True) for k in (fit.image1, fit.image2)}
+        )
+        drawings = dict(zip(wanted, pool.map(lambda key: draw(placed[key[0]], key[1]), wanted), strict=True))
+        return list(pool.map(compare, chosen, scales))
+
+
+def _scales(fitting: Sequence[float]) -> list[float]:
+    """The scales that fit, but few different ones, so that a picture is drawn once and not for every link."""
+    middle = np.median(fitting)
+    return [float(middle * 2.0 ** np.rint(np.log2(scale / middle))) for scale in fitting]
 
 
 def _least_confirmed(links: Sequence[LinkFit]) -> list[LinkFit]:
