@@ -51,6 +51,18 @@ class Angles(click.ParamType[tuple[float, float]]):
         return psi, theta
 
 
+class FileOr(click.Path):
+    """A file, or a word that stands for something else; a file of that name is written ``./word``."""
+
+    def __init__(self, word: str) -> None:
+        super().__init__(path_type=Path, readable=False)
+        self.word = word
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Keep the word; of anything else, make a path."""
+        return value if value == self.word else super().convert(value, param, ctx)
+
+
 class Bytes(click.ParamType[int]):
     """An amount of memory like ``800M`` or ``1.5G``; the value is in bytes."""
 
@@ -147,9 +159,9 @@ known = together(
     click.option("--tilt", type=Angles(), help="Known tilt of the camera to the plane, degrees."),
     click.option(
         "--attitude",
-        type=PICTURE,
-        metavar="FILE",
-        help="CSV with the tilt of each picture, of a gimbal or IMU: name,psi,theta; degrees.",
+        type=FileOr("xmp"),
+        metavar="FILE|xmp",
+        help="Tilt of each picture: CSV name,psi,theta in degrees; xmp: what drones write into their pictures.",
     ),
     click.option(
         "--attitude-std",

@@ -1,7 +1,6 @@
 """What a picture file says about itself: size, lens, place, attitude, camera; read without decoding pixels."""
 
 import math
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,11 +8,13 @@ from typing import Any
 import tifffile
 from PIL import ExifTags, Image, UnidentifiedImageError
 
+from rdstitch.io.attitude import Attitude, read_attitude
 from rdstitch.io.decoding import check_readable, decoding
+from rdstitch.io.orientation import SIDEWAYS, turned_direction
+from rdstitch.io.xmp import finite, xmp_number, xmp_text
 
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-_TURNED_SIDEWAYS = (5, 6, 7, 8)
 _BIT_DEPTHS = {"1": 1, "I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
 _ORIENTATION, _PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE = 0x0112, 0xA002, 0xA003, 0x927C
 
@@ -25,20 +26,6 @@ class GpsPosition:
     latitude: float
     longitude: float
     altitude: float | None = None
-
-
-@dataclass(frozen=True)
-class Attitude:
-    """Attitude as the drone wrote it, degrees; ``source`` names the tags, since makers differ in convention.
-
-    ``"dji-gimbal"`` (pitch -90 looks straight down), ``"dji-flight"`` (of the body), ``"pix4d-camera"``
-    (Parrot, senseFly, MicaSense: pitch 0 and roll 0 look straight down).
-    """
-
-    yaw: float
-    pitch: float
-    roll: float
-    source: str
 
 
 @dataclass(frozen=True)
@@ -82,6 +69,14 @@ class Metadata:
     exif: bytes = b""
     icc_profile: bytes = b""
 
+    @property
+    def nadir(self) -> tuple[float, float, float] | None:
+        """Unit vector straight down from the camera: to the right, to the bottom of the picture as read, and ahead."""
+        if self.attitude is None:
+            return None
+        x, y, z = self.attitude.nadir
+        return *turned_direction(x, y, self.orientation), z
+
 
 def read_metadata(path: str | Path) -> Metadata:
     """Read a picture file's header; no pixel is decoded.
@@ -115,21 +110,21 @@ def metadata_of(image: Image.Image) -> Metadata:
     orientation = orientation if orientation in range(1, 9) else 1
     width, height = image.size
     photo = exif.get_ifd(ExifTags.IFD.Exif)
-    xmp = _xmp_text(image)
+    xmp = xmp_text(image)
     focal, source = _focal_px(exif, photo, xmp, image.size)
     dpi = image.info.get("dpi")
     return Metadata(
-        size=(height, width) if orientation in _TURNED_SIDEWAYS else (width, height),
+        size=(height, width) if orientation in SIDEWAYS else (width, height),
         bit_depth=bit_depth,
         orientation=orientation,
         focal_px=focal,
         focal_source=source,
         gps=_gps(exif.get_ifd(ExifTags.IFD.GPSInfo)),
-        attitude=_attitude(xmp),
+        attitude=read_attitude(xmp),
         make=_text(exif.get(ExifTags.Base.Make)),
         model=_text(exif.get(ExifTags.Base.Model)),
         serial=_text(photo.get(ExifTags.Base.BodySerialNumber)) or _text(exif.get(ExifTags.Base.CameraSerialNumber)),
-        dpi=(float(dpi[0]), float(dpi[1])) if dpi and all(_number(d) for d in dpi) else None,
+        dpi=(float(dpi[0]), float(dpi[1])) if dpi and all(finite(d) for d in dpi) else None,
         exif=_clean_exif(exif),
         icc_profile=image.info.get("icc_profile") or b"",
     )
@@ -147,15 +142,6 @@ def _bit_depth(image: Image.Image) -> int:
     return _BIT_DEPTHS.get(image.mode, 8)
 
 
-def _number(value: Any) -> float | None:
-    """A positive or negative finite number, else None; EXIF rationals may be 0/0."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
-        return None
-    return number if math.isfinite(number) else None
-
-
 def _text(value: Any) -> str:
     """Printable text of a tag that may be bytes, padded with zeros, or absent."""
     text = value.decode("latin-1") if isinstance(value, bytes) else str(value or "")
@@ -166,19 +152,19 @@ def _focal_px(
     exif: Image.Exif, photo: dict[int, Any], xmp: str, size: tuple[int, int]
 ) -> tuple[float | None, str | None]:
     """Focal length in px and the tag it comes from, the most direct tag first."""
-    calibrated = _xmp_number(xmp, "CalibratedFocalLength")
+    calibrated = xmp_number(xmp, "CalibratedFocalLength")
     if calibrated and calibrated > 0:
         return calibrated, "CalibratedFocalLength"
-    focal = _number(photo.get(ExifTags.Base.FocalLength))
-    resolution = _number(photo.get(ExifTags.Base.FocalPlaneXResolution))
+    focal = finite(photo.get(ExifTags.Base.FocalLength))
+    resolution = finite(photo.get(ExifTags.Base.FocalPlaneXResolution))
     unit = _MM_PER_RESOLUTION_UNIT.get(photo.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
     if focal and resolution and unit and focal > 0 and resolution > 0:
         # The resolution counts pixels of the original; a resized picture keeps the tag.
-        original = _number(photo.get(_PIXEL_WIDTH)) or size[0]
+        original = finite(photo.get(_PIXEL_WIDTH)) or size[0]
         focal_px = focal * resolution / unit * size[0] / original
         if 0.1 < focal_px / math.hypot(*size) < 100.0:
             return focal_px, "FocalPlaneXResolution"
-    equivalent = _number(photo.get(ExifTags.Base.FocalLengthIn35mmFilm))
+    equivalent = finite(photo.get(ExifTags.Base.FocalLengthIn35mmFilm))
     if equivalent and equivalent > 0:
         return equivalent / _DIAGONAL_35MM * math.hypot(*size), "FocalLengthIn35mmFilm"
     return None, None
@@ -190,7 +176,7 @@ def _gps(tags: dict[int, Any]) -> GpsPosition | None:
     longitude = _degrees(tags.get(ExifTags.GPS.GPSLongitude), _text(tags.get(ExifTags.GPS.GPSLongitudeRef)) == "W")
     if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
         return None
-    altitude = _number(tags.get(ExifTags.GPS.GPSAltitude))
+    altitude = finite(tags.get(ExifTags.GPS.GPSAltitude))
     below_sea = tags.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01")
     return GpsPosition(latitude, longitude, -altitude if altitude and below_sea else altitude)
 
@@ -199,37 +185,11 @@ def _degrees(value: Any, negative: bool) -> float | None:
     """Degrees, minutes, seconds to signed degrees."""
     if not isinstance(value, tuple) or not 1 <= len(value) <= 3:
         return None
-    parts = [_number(part) for part in value]
+    parts = [finite(part) for part in value]
     if any(part is None for part in parts):
         return None
     degrees = sum((part or 0.0) / 60.0**k for k, part in enumerate(parts))
     return -degrees if negative else degrees
-
-
-def _xmp_text(image: Image.Image) -> str:
-    """The XMP block as text; empty where there is none."""
-    block = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
-    return block.decode("utf-8", "replace") if isinstance(block, bytes) else str(block)
-
-
-def _xmp_number(xmp: str, name: str) -> float | None:
-    """Number of the XMP property ``name`` (in any namespace), written as attribute or as element."""
-    # A search rather than an XML parser: drones write XMP that no parser accepts.
-    found = re.search(rf"""[:\s]{name}\s*(?:=\s*["']([^"'<]*)|>([^<]*)<)""", xmp)
-    return None if found is None else _number((found.group(1) or found.group(2) or "").strip())
-
-
-def _attitude(xmp: str) -> Attitude | None:
-    """Yaw, pitch and roll that a drone wrote, the camera's before the body's."""
-    for source, names in (
-        ("dji-gimbal", ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree")),
-        ("pix4d-camera", ("Yaw", "Pitch", "Roll")),
-        ("dji-flight", ("FlightYawDegree", "FlightPitchDegree", "FlightRollDegree")),
-    ):
-        yaw, pitch, roll = (_xmp_number(xmp, name) for name in names)
-        if yaw is not None and pitch is not None and roll is not None:
-            return Attitude(yaw, pitch, roll, source)
-    return None
 
 
 def _clean_exif(exif: Image.Exif) -> bytes:

@@ -15,6 +15,7 @@ from PIL import Image
 from rdstitch.errors import InputError
 from rdstitch.io.decoding import check_readable, decoding
 from rdstitch.io.metadata import Metadata, metadata_of, read_metadata
+from rdstitch.io.orientation import turned
 
 Pixels = NDArray[Any]
 
@@ -189,9 +190,9 @@ def _finish(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Metadat
             opaque = np.where(valid, whole, np.uint8(0))
     if opaque is not None and bool((opaque == _OPAQUE).all()):
         opaque = None
-    upright = np.ascontiguousarray(_turn(samples, metadata.orientation))
-    turned = None if opaque is None else np.ascontiguousarray(_turn(opaque, metadata.orientation))
-    return Picture(upright, turned, metadata)
+    if opaque is not None:
+        opaque = np.ascontiguousarray(turned(opaque, metadata.orientation))
+    return Picture(np.ascontiguousarray(turned(samples, metadata.orientation)), opaque, metadata)
 
 
 def _as_uint8(alpha: Pixels) -> NDArray[np.uint8]:
@@ -201,15 +202,3 @@ def _as_uint8(alpha: Pixels) -> NDArray[np.uint8]:
     full = np.iinfo(alpha.dtype).max if np.issubdtype(alpha.dtype, np.integer) else 1.0
     share = np.clip(np.nan_to_num(alpha.astype(np.float32) / full), 0.0, 1.0)
     return np.asarray(np.rint(share * _OPAQUE), dtype=np.uint8)
-
-
-def _turn(samples: Pixels, orientation: int) -> Pixels:
-    """Apply an EXIF orientation (1 to 8)."""
-    if orientation >= 5:
-        samples = np.swapaxes(samples, 0, 1)
-    # After the transposition of 5..8: which axes run backwards.
-    if orientation in (3, 4, 7, 8):
-        samples = samples[::-1]
-    if orientation in (2, 3, 6, 7):
-        samples = samples[:, ::-1]
-    return samples

@@ -8,36 +8,68 @@ from pathlib import Path
 
 from rdstitch.errors import InputError
 from rdstitch.pipeline.sources import Source
+from rdstitch.planar_motion import tilt_from_normal
 from rdstitch.records import read_text
 
+XMP = "xmp"
+"""What asks for the attitudes in the pictures' own XMP."""
+
 _COLUMNS = ("name", "psi", "theta")
+_NAMED = 3  # pictures in a message
 
 
-def with_attitudes(sources: Sequence[Source], file: str | Path | None) -> list[Source]:
-    """The sources, each with its attitude, if there is a file of them.
+def with_attitudes(sources: Sequence[Source], wanted: str | Path | None) -> list[Source]:
+    """The sources, each with its attitude, if these are wanted.
 
     Parameters
     ----------
     sources : sequence of Source
-    file : path or None
-        CSV with a header that names the columns ``name`` (of the picture's file), ``psi`` and ``theta``, degrees;
-        others are ignored.
+    wanted : str, path or None
+        The text :data:`XMP`: what drones write into pictures, see :mod:`rdstitch.io.attitude`; the plane is then taken
+        to be level. Or a CSV file with a header that names the columns ``name`` (of the picture's file), ``psi`` and
+        ``theta``, degrees; others are ignored.
 
     Raises
     ------
     InputError
-        When the file cannot be read, is no such table, or has no line for a picture.
+        When the file cannot be read, is no such table, or has no line for a picture; when a picture's XMP has no
+        attitude of the camera, or one in which it does not look down.
     """
-    if file is None:
+    if wanted is None:
         return list(sources)
-    attitudes = _attitudes(file)
+    attitudes = _of_pictures(sources) if wanted == XMP else _of_table(sources, wanted)
+    return [replace(source, attitude=attitude) for source, attitude in zip(sources, attitudes, strict=True)]
+
+
+def _of_pictures(sources: Sequence[Source]) -> list[tuple[float, float]]:
+    """(ψ, θ), radians, of each source by its XMP."""
+    tilts, lacking = [], []
     for source in sources:
-        if source.name not in attitudes:
+        nadir = source.metadata.nadir
+        if nadir is None:
+            lacking.append(source.name)
+            continue
+        psi, theta = tilt_from_normal(nadir).tolist()
+        if not _plausible(psi, theta):
+            raise InputError(f"{source.path}: by the attitude in its XMP the camera does not look down at the ground")
+        tilts.append((psi, theta))
+    if lacking:
+        more = f" and {len(lacking) - _NAMED} more" if len(lacking) > _NAMED else ""
+        named = ", ".join(lacking[:_NAMED])
+        raise InputError(f"{named}{more}: no attitude of the camera can be read from the XMP; give a CSV file instead")
+    return tilts
+
+
+def _of_table(sources: Sequence[Source], file: str | Path) -> list[tuple[float, float]]:
+    """(ψ, θ), radians, of each source by its line."""
+    table = _read_table(file)
+    for source in sources:
+        if source.name not in table:
             raise InputError(f"{file}: has no line for {source.name}; add one with its psi and theta")
-    return [replace(source, attitude=attitudes[source.name]) for source in sources]
+    return [table[source.name] for source in sources]
 
 
-def _attitudes(file: str | Path) -> dict[str, tuple[float, float]]:
+def _read_table(file: str | Path) -> dict[str, tuple[float, float]]:
     """(ψ, θ), radians, of each name."""
     rows = csv.DictReader(read_text(file).splitlines(), skipinitialspace=True)
     missing = [name for name in _COLUMNS if name not in (rows.fieldnames or ())]
@@ -50,9 +82,14 @@ def _attitudes(file: str | Path) -> dict[str, tuple[float, float]]:
             psi, theta = (math.radians(float(row[column])) for column in _COLUMNS[1:])
         except (TypeError, ValueError):
             raise InputError(f"{file}: line {rows.line_num}: psi and theta must be numbers, in degrees") from None
-        if not (abs(psi) < math.pi / 2 and abs(theta) < math.pi / 2):
+        if not _plausible(psi, theta):
             raise InputError(f"{file}: line {rows.line_num}: psi and theta must lie between -90 and 90 degrees")
         if name in attitudes:
             raise InputError(f"{file}: line {rows.line_num}: {name} is here twice; remove one")
         attitudes[name] = psi, theta
     return attitudes
+
+
+def _plausible(psi: float, theta: float) -> bool:
+    """Whether the camera looks at the plane at all."""
+    return abs(psi) < math.pi / 2 and abs(theta) < math.pi / 2

@@ -1,14 +1,16 @@
-"""``--attitude``: a gimbal's or IMU's tilt of every picture, exact or nearly so."""
+"""``--attitude``: a gimbal's or IMU's tilt of every picture, exact or nearly so, from a table or from XMP."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import rdstitch
 from rdstitch.camera import Camera
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
 from tests.cli.running import FAST, Run
+from tests.drone_xmp import euler_angles, xmp_of
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +31,16 @@ def _table(sequence: Sequence, paths: list[Path], error: float) -> str:
     return "\n".join(["name,psi,theta,altitude", *rows])
 
 
+def _with_xmp(sequence: Sequence, folder: Path, source: str) -> list[Path]:
+    """The pictures as JPEG files that tell the true attitudes in one maker's words."""
+    paths = []
+    for index in range(len(sequence)):
+        xmp = xmp_of(source, *euler_angles(source, sequence.from_plane(index)[:, :2], north=0.7))
+        paths.append(folder / f"drone_{index}.jpg")
+        Image.fromarray(sequence.frame(index)).save(paths[-1], quality=95, xmp=xmp.encode())
+    return paths
+
+
 @pytest.mark.parametrize(("error", "std"), [(0.0, 0.0), (0.3, np.radians(0.3))])
 def test_measured_tilts_are_used(windy: Sequence, tmp_path: Path, error: float, std: float) -> None:
     paths = windy.write(tmp_path)
@@ -45,6 +57,55 @@ def test_measured_tilts_are_used(windy: Sequence, tmp_path: Path, error: float, 
     difference = np.degrees(registration.alignment.poses.tilt - windy.poses.tilt)  # type: ignore[union-attr]
     assert np.abs(difference).max() < (0.01 if std == 0.0 else 1.0)
     assert len(path.position) == len(paths)
+
+
+@pytest.mark.parametrize(("source", "std"), [("dji-gimbal", 0.0), ("pix4d-camera", np.radians(1.0))])
+def test_drones_write_tilts_into_their_pictures(windy: Sequence, tmp_path: Path, source: str, std: float) -> None:
+    paths = _with_xmp(windy, tmp_path, source)
+    lens = windy.lens
+    assert isinstance(lens, Camera)
+    options = rdstitch.StitchOptions(attitude="xmp", attitude_std=std, focal=lens.focal, workers=1)
+    _, registration = rdstitch.trajectory(paths, options=options)
+    alignment = registration.alignment
+    assert alignment.used.all()
+    assert abs(alignment.distortion - lens.distortion) < 0.005
+    assert alignment.poses is not None
+    assert np.degrees(np.abs(alignment.poses.tilt - windy.poses.tilt)).max() < (0.01 if std == 0.0 else 1.0)
+
+
+def test_pictures_without_attitude_are_named(
+    rdstitch: Run, windy: Sequence, frames: list[Path], tmp_path: Path
+) -> None:
+    paths = _with_xmp(windy, tmp_path, "parrot-camera")[:2]
+    arguments = ("calibrate", "--attitude", "xmp", "-o", tmp_path / "camera.json", *FAST)
+    assert rdstitch(*arguments, *paths).status == 0
+    (tmp_path / "camera.json").unlink()
+    some = rdstitch(*arguments, *paths, frames[0])
+    none = rdstitch(*arguments, *windy.write(tmp_path))
+    assert some.status == none.status == 3
+    assert f" {frames[0].name}: no attitude" in some.line
+    assert paths[0].name not in some.line
+    assert "frame_0002.png and 3 more: no attitude" in none.line
+    assert not (tmp_path / "camera.json").exists()
+
+
+def test_cameras_that_look_at_the_horizon_are_refused(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    for frame in frames:
+        xmp = xmp_of("dji-gimbal", 10.0, 0.5, 0.0).encode()
+        Image.open(frame).save(tmp_path / f"{frame.stem}.jpg", xmp=xmp)
+    done = rdstitch("calibrate", tmp_path, "--attitude", "xmp", "-o", tmp_path / "camera.json")
+    assert done.status == 3
+    assert "does not look down" in done.line
+
+
+def test_a_file_may_be_named_like_the_word(
+    rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("xmp").write_text("name,psi\n")
+    done = rdstitch("calibrate", *frames, "--attitude", "./xmp", "-o", "camera.json")
+    assert done.status == 3
+    assert "no column 'theta'" in done.line
 
 
 def test_pairs_get_one_tilt_a_picture(windy: Sequence, tmp_path: Path) -> None:

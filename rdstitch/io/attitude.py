@@ -1,0 +1,55 @@
+"""The camera's attitude as drones write it into XMP, each maker in a convention of its own.
+
+All of them give yaw, pitch and roll of a body, ``Rz(yaw) Ry(pitch) Rx(roll)`` from its axes (ahead, right, below) to
+north, east, down. What differs is where the camera looks in it:
+
+============= ===================================== ============================================ =================
+source        properties                            the camera looks                             straight down
+============= ===================================== ============================================ =================
+dji-gimbal    GimbalYawDegree, GimbalPitchDegree, … ahead                                        pitch -90
+parrot-camera CameraYawDegree, CameraPitchDegree, … ahead                                        pitch -90
+pix4d-camera  Camera:Yaw, Camera:Pitch, Camera:Roll below, the top of its picture points ahead   pitch 0, roll 0
+============= ===================================== ============================================ =================
+
+The last, defined by Pix4D, is what senseFly and Parrot's Sequoia write. What tells the attitude of the drone alone, or
+of a light sensor on it (``FlightPitchDegree``, ``DLS:Pitch``), is not the camera's and not read.
+"""
+
+import math
+from dataclasses import dataclass
+
+from rdstitch.io.xmp import xmp_number
+
+_PROPERTIES = {
+    "dji-gimbal": ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"),
+    "parrot-camera": ("CameraYawDegree", "CameraPitchDegree", "CameraRollDegree"),
+    "pix4d-camera": ("Camera:Yaw", "Camera:Pitch", "Camera:Roll"),
+}
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """Attitude as the drone wrote it, degrees; ``source`` is the convention, see above."""
+
+    yaw: float
+    pitch: float
+    roll: float
+    source: str
+
+    @property
+    def nadir(self) -> tuple[float, float, float]:
+        """Unit vector straight down, in the camera's axes: right, towards the bottom of its picture, ahead."""
+        pitch, roll = math.radians(self.pitch), math.radians(self.roll)
+        # Down in the body's axes: the last row of Rz(yaw) Ry(pitch) Rx(roll), in which yaw is no matter.
+        ahead = -math.sin(pitch)
+        right, below = math.cos(pitch) * math.sin(roll), math.cos(pitch) * math.cos(roll)
+        return (right, -ahead, below) if self.source == "pix4d-camera" else (right, below, ahead)
+
+
+def read_attitude(xmp: str) -> Attitude | None:
+    """The camera's attitude in an XMP block, or None where it is absent, incomplete or no number."""
+    for source, names in _PROPERTIES.items():
+        yaw, pitch, roll = (xmp_number(xmp, name) for name in names)
+        if yaw is not None and pitch is not None and roll is not None:
+            return Attitude(yaw, pitch, roll, source)
+    return None

@@ -1,0 +1,36 @@
+"""Numbers in a picture's XMP block."""
+
+import math
+import re
+from typing import Any
+
+from PIL import Image
+
+
+def xmp_text(image: Image.Image) -> str:
+    """The XMP block as text; empty where there is none."""
+    block = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
+    return block.decode("utf-8", "replace") if isinstance(block, bytes) else str(block)
+
+
+def xmp_number(xmp: str, name: str) -> float | None:
+    """Finite number of a property, written as attribute or as element; None where there is none.
+
+    Parameters
+    ----------
+    xmp : str
+    name : str
+        With the customary prefix of its namespace, or without for any.
+    """
+    # A search rather than an XML parser: drones write XMP that no parser accepts.
+    found = re.search(rf"""[<:\s]{name}\s*(?:=\s*["']([^"'<]*)|>([^<]*)<)""", xmp)
+    return None if found is None else finite((found.group(1) or found.group(2) or "").strip())
+
+
+def finite(value: Any) -> float | None:
+    """A positive or negative finite number, else None; EXIF rationals may be 0/0."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if math.isfinite(number) else None
