@@ -35,9 +35,7 @@ class StitchOptions:
     distortion: float | None = None  # known λ, half-diagonal frame; kept
     focal: float | None = None  # known focal length, px
     tilt: tuple[float, float] | None = None  # known tilt (psi, theta) of all pictures, radians
-    attitude: str | Path | None = (
-        None  # measured tilt of each picture: CSV of name, psi, theta, degrees; or "xmp"
-    )
+    attitude: str | Path | None = None  # measured tilt of each picture: CSV of name, psi, theta, degrees; or "xmp"
     attitude_std: float = math.radians(1.0)  # its standard deviation, radians; 0: exact
     mask: str | Path | None = None  # picture, or folder of them, that is dark where the pictures do not count
     reference: str | None = None  # name of the picture whose frame is kept; None: the best connected
