@@ -53,17 +53,21 @@ def lookalikes(features: Sequence[Features], seed: int) -> set[tuple[int, int]]:
     residuals are added up per word, square-rooted, normalized per word and as a whole (Arandjelović and Zisserman
     2013). One matrix product then compares all pictures.
     """
-    descriptors = [_as_float(found)[:_DESCRIBING] for found in features]
-    total = sum(map(len, descriptors))
+    counts = np.array([min(len(found), _DESCRIBING) for found in features])
+    total = int(counts.sum())
     if total < _WORDS * 10:
         return set()
     random = np.random.default_rng([seed, 2])
-    pool = np.concatenate(descriptors)
-    training = pool[np.sort(random.choice(total, min(_TRAINING, total), replace=False))]
+    chosen = np.sort(random.choice(total, min(_TRAINING, total), replace=False))
+    starts = np.cumsum(counts) - counts
+    own = np.split(chosen, np.searchsorted(chosen, starts[1:]))
+    training = np.concatenate(
+        [_describing(found)[part - start] for found, part, start in zip(features, own, starts, strict=True)]
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a word that no descriptor is nearest to does no harm
         words, _ = kmeans2(training, _WORDS, iter=8, minit="points", rng=random)
-    vectors = np.stack([_aggregate(own, words) for own in descriptors])
+    vectors = np.stack([_aggregate(_describing(found), words) for found in features])
     alike = vectors @ vectors.T
     np.fill_diagonal(alike, -np.inf)
     best = np.argsort(-alike, axis=1, kind="stable")[:, :_LOOKALIKES]
@@ -95,10 +99,10 @@ def neighbours(cameras: Sequence[Camera], homographies: FloatArray, tried: set[t
     return sorted(found)
 
 
-def _as_float(features: Features) -> FloatArray:
-    if features.binary:
-        return np.unpackbits(features.descriptors.astype(np.uint8), axis=1).astype(np.float64)
-    return features.descriptors.astype(np.float64)
+def _describing(features: Features) -> FloatArray:
+    """The descriptors that stand for a picture."""
+    descriptors = features.descriptors[:_DESCRIBING]
+    return (np.unpackbits(descriptors.astype(np.uint8), axis=1) if features.binary else descriptors).astype(np.float64)
 
 
 def _aggregate(descriptors: FloatArray, words: FloatArray) -> FloatArray:
