@@ -189,14 +189,14 @@ class Adjuster:
             Of the robust loss at the start, px; the scatter of the first errors decides if not given. It narrows to
             what the scatter of the errors asks for.
         """
-        sigma = sigma_of(self._evaluate(start, 1.0, 1.0).equations.squared)
+        sigma = self._sigma(self._evaluate(start, 1.0, 1.0))
         wide = max(width or 0.0, WIDTH_PER_SIGMA * sigma)
         parameters, used, converged = start, 0, False
         while used < self.max_iterations:
             last = wide <= WIDTH_PER_SIGMA * sigma * 1.05
             state, iterations, converged = self._descend(parameters, sigma, wide, 12 if last else 4)
             parameters, used = state.parameters, used + iterations
-            sigma, previous = sigma_of(state.equations.squared), sigma
+            sigma, previous = self._sigma(state), sigma
             wide = max(wide / 3.0, WIDTH_PER_SIGMA * sigma)
             if last and converged and abs(sigma - previous) <= 0.02 * previous:
                 break
@@ -258,6 +258,9 @@ class Adjuster:
         with np.errstate(all="ignore"):
             product: FloatArray = matrices.matrices[j] @ inverses(matrices.matrices)[i]
         return product
+
+    def _sigma(self, state: _State) -> float:
+        return sigma_of(state.equations.squared[self.observations.telling])
 
     def _weight(self, sigma: float) -> float:
         return 1.0 / (sigma**2 * self.overdispersion)

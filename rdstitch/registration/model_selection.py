@@ -118,7 +118,7 @@ class _Yardstick:
     @classmethod
     def _from(cls, problem: Problem, errors: FloatArray, enlarged: float) -> Self:
         squared = np.nan_to_num(np.einsum("mi,mi->m", errors, errors), nan=np.inf)
-        sigma = sigma_of(squared)
+        sigma = sigma_of(squared[problem.observations.telling])
         inliers = squared <= (WIDTH_PER_SIGMA * sigma) ** 2
         overdispersion = coherence(problem.observations, errors, inliers).overdispersion
         counted = ~misfitting_links(squared, problem.observations)[problem.observations.link]

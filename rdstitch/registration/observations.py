@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -12,6 +13,9 @@ from rdstitch.camera import Camera, FloatArray
 from rdstitch.registration.links import Link
 
 IntArray = NDArray[np.intp]
+
+_RESTING = 1.0
+"""px that most correspondences of a link stay below where the camera stood still."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,18 @@ class Observations:
     def link(self) -> IntArray:
         """The link of each correspondence, shape (M,)."""
         return np.repeat(np.arange(len(self)), np.diff(self.start))
+
+    @cached_property
+    def telling(self) -> NDArray[np.bool_]:
+        """Which correspondences, shape (M,), tell how large errors are: all but those of links that rest, if others do.
+
+        What stays where it is in the picture is found again in the same px, without the errors that a change of view
+        brings: a camera that stands still for a while would make all other links look wrong.
+        """
+        px = np.linalg.norm(self.points2 - self.points1, axis=1) * self.scale1[self.link]
+        moves = [b > a and float(np.median(px[a:b])) > _RESTING for a, b in itertools.pairwise(self.start)]
+        telling = np.repeat(np.array(moves, dtype=np.bool_), np.diff(self.start))
+        return telling if telling.any() else np.ones_like(telling)
 
     def subset(self, links: IntArray | NDArray[np.bool_], image_index: IntArray | None = None) -> Self:
         """Only some links; with ``image_index`` (N,) pictures get new numbers."""

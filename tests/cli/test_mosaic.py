@@ -60,3 +60,10 @@ def test_its_own_output_is_no_input(rdstitch: Run, frames: list[Path], tmp_path:
     arguments = ("mosaic", folder, "-o", folder / "mosaic.png", "--overwrite", *FAST)
     first, second = rdstitch(*arguments), rdstitch(*arguments)
     assert (first.status, first.err, first.out) == (second.status, second.err, second.out) == (0, "", first.out)
+
+
+def test_a_camera_that_stands_still_for_a_while(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    paused = [shutil.copy(frames[0], tmp_path / f"frame_0000_{again}.png") for again in range(2)]
+    done = rdstitch("mosaic", *paused, *frames, "-o", tmp_path / "out.png", "--strict", *FAST)
+    assert (done.status, done.err) == (0, "")
+    assert abs(float(done.out) - DISTORTION) < 0.005
