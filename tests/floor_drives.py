@@ -1,6 +1,8 @@
 """A robot's camera over a floor, as in the paper's §5.5: rendered frames, and the path that they were taken on."""
 
+import csv
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -41,3 +43,12 @@ def true_path(sequence: Sequence) -> Trajectory:
     """The path of a sequence's camera, in units of its first height."""
     p, unit = sequence.poses, sequence.poses.height[0]
     return Trajectory.from_poses(Poses(p.yaw, p.position / unit, p.height / unit, p.tilt))
+
+
+def read_path(file: Path) -> Trajectory:
+    """The path of a CSV file that the command has written."""
+    with file.open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    x, y, yaw, height = (np.array([float(row[name]) for row in rows]) for name in ("x", "y", "phi_deg", "height"))
+    frame = np.array([int(row["frame"]) for row in rows], dtype=np.intp)
+    return Trajectory(frame, np.stack([x, y], axis=1), np.radians(yaw), height)

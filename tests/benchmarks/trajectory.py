@@ -9,7 +9,6 @@ frame to that of the fewest frames of the path.
 """
 
 import argparse
-import csv
 import math
 import os
 import subprocess
@@ -19,10 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
-
 from rdstitch.registration.trajectory import Trajectory, compare
-from tests.floor_drives import DISTORTION, PATHS, floor_drive, true_path
+from tests.floor_drives import DISTORTION, PATHS, floor_drive, read_path, true_path
 
 _PROGRAM = "from rdstitch_cli.main import main; main()"
 _COLUMNS = ("path", "frames", "used", "transl. %", "drift %", "rot. °", "Δλ", "s/frame", "cpu s/frame", "ratio", "MB")
@@ -53,15 +50,6 @@ def command(folder: Path, output: Path) -> Run:
         raise SystemExit(f"the command ended with status {process.returncode}")
     wall = time.perf_counter() - start
     return Run(float(printed), read_path(output), wall, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
-
-
-def read_path(file: Path) -> Trajectory:
-    """The path of a CSV file that the command has written."""
-    with file.open(encoding="utf-8", newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    x, y, yaw, height = (np.array([float(row[name]) for row in rows]) for name in ("x", "y", "phi_deg", "height"))
-    frame = np.array([int(row["frame"]) for row in rows], dtype=np.intp)
-    return Trajectory(frame, np.stack([x, y], axis=1), np.radians(yaw), height)
 
 
 def main() -> None:
