@@ -31,10 +31,11 @@ class Locations:
     @classmethod
     def group(cls, points: FloatArray) -> Self:
         """Group points (N, 2) that are equal; keypoints of one location keep their order."""
-        _, location, count = np.unique(points, axis=0, return_inverse=True, return_counts=True)
-        location = location.reshape(-1)
-        by_location = np.argsort(location, kind="stable")
-        starts = np.concatenate([[0], np.cumsum(count)[:-1]]).astype(np.intp)
+        by_location = np.lexsort((points[:, 1], points[:, 0]))
+        first = np.ones(len(points), dtype=np.bool_)
+        first[1:] = (np.diff(points[by_location], axis=0) != 0.0).any(axis=1)
+        starts = np.flatnonzero(first)
+        count = np.diff(np.append(starts, len(points)))
         # Among equally many keypoints the first keypoint decides: the order of the input, not that of coordinates.
         order = np.lexsort((by_location[starts], -count)) if len(points) else np.zeros(0, np.intp)
         starts, count = starts[order], count[order]

@@ -18,6 +18,8 @@ from rdstitch.registration.pairs import PairOptions, PairRegistration, estimate_
 from rdstitch.registration.resting import most_rest, moving_features, show_motion
 from rdstitch.registration.voting import vote
 
+_GLANCE = 1000  # strongest features of a picture, by which it is told whether a pair is worth a closer look
+_PROMISING = 8  # matches among these; pictures that share nothing have three to six by chance
 _ENOUGH_MATCHES = 200  # of a picture with all others, from which on it needs no more
 _SEARCH_RADIUS = 3.0  # thresholds around the place where a match is expected
 
@@ -46,13 +48,22 @@ class Pairing:
     cache: Cache = NO_CACHE
     tilts: Sequence[tuple[float, float]] | None = None
 
+    def promising(self, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+        """The pairs that share something at a glance, which costs a sixteenth of a closer look.
+
+        A pair that is passed over may overlap nevertheless, by little: the others then tell its place.
+        """
+        strongest = replace(self, features=[found.take(np.arange(min(len(found), _GLANCE))) for found in self.features])
+        matched = strongest._match(pairs, "comparing pictures")
+        return [pair for pair, found in zip(pairs, matched, strict=True) if len(found) >= _PROMISING]
+
     def estimate(self, pairs: Sequence[tuple[int, int]], distortion: float | None = None) -> list[PairRegistration]:
         """Match and estimate pairs (i, j), with λ free, or as the user or the other pairs say."""
         if not pairs:
             return []
         known = self.options.known_distortion
         lens = distortion if known is None else known
-        found = self._relate(pairs, self._match(pairs), lens, "registering pairs")
+        found = self._relate(pairs, self._match(pairs, "matching"), lens, "registering pairs")
         return found if known is not None or distortion is None else [_without_vote(pair) for pair in found]
 
     def look_past_rest(self, pairs: list[PairRegistration]) -> "tuple[Pairing, list[PairRegistration]]":
@@ -116,7 +127,7 @@ class Pairing:
             self.options.ratio,
         )
 
-    def _match(self, pairs: Sequence[tuple[int, int]]) -> list[Correspondences]:
+    def _match(self, pairs: Sequence[tuple[int, int]], stage: str) -> list[Correspondences]:
         """Matches of every pair, from an earlier run where the cache has them."""
 
         def recall(index: int, compute: Callable[[], Correspondences]) -> Correspondences:
@@ -126,7 +137,7 @@ class Pairing:
 
         # A network is no function: only one thread may use it.
         workers = 1 if self.options.lightglue_model is not None else self.options.threads
-        return match_pairs(self.features, pairs, self.matcher, partial(self.progress, "matching"), recall, workers)
+        return match_pairs(self.features, pairs, self.matcher, partial(self.progress, stage), recall, workers)
 
     def _relate(
         self,

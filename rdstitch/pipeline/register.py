@@ -68,8 +68,9 @@ def register(
 ) -> Registration:
     """Detect features, register pairs, and align all pictures as one.
 
-    Pairs that fail alone are tried again with the λ that the others agree on, which then takes only two or four points;
-    and once there are poses, pictures that these put beside each other are tried too (loop closures).
+    Pairs that fail alone are tried again with the λ that the others agree on, which then takes only two or four points.
+    Once there are poses, pictures that these put beside each other are tried too (loop closures), and every pair of a
+    picture that found no place.
 
     Parameters
     ----------
@@ -93,16 +94,19 @@ def register(
     aligning = _alignment_options(sources, options, reference)
     tilts = aligning.exact_tilts(len(sources))
     pairing = Pairing(features, [source.camera for source in sources], matcher, options, progress, cache, tilts)
-    pairs = pairing.estimate(first_pairs(features, options.seed))
+    candidates = first_pairs(features, options.seed)
+    pairs = pairing.estimate(pairing.promising(candidates))
+    if not any(pair.relation for pair in pairs):
+        pairs = pairing.estimate(candidates)
     pairing, pairs = pairing.look_past_rest(pairs)
     pairs = pairing.rescue(pairs)
     cameras = [source.camera.with_focal() for source in sources]
     alignment = _align(cache, cameras, _links(sources, pairs), aligning)
     for _ in range(_CLOSURE_ROUNDS):
         tried = {(pair.image1, pair.image2) for pair in pairs}
-        closures = pairing.estimate(
-            neighbours(alignment.cameras, alignment.homographies, tried), distortion=alignment.distortion
-        )
+        beside = neighbours(alignment.cameras, alignment.homographies, tried)
+        astray = {(i, j) for i, j in candidates if not (alignment.used[i] and alignment.used[j])} - tried
+        closures = pairing.estimate(sorted(astray.union(beside)), distortion=alignment.distortion)
         pairs = sorted([*pairs, *closures], key=lambda pair: (pair.image1, pair.image2))
         if not any(pair.relation for pair in closures):
             break

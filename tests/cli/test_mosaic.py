@@ -2,11 +2,13 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from rdstitch.pipeline.pairing import Pairing
 from rdstitch.synthetic import Sequence, alignment_error
 from tests.cli.running import DISTORTION, FAST, Run, finished, start, transfers
 
@@ -67,3 +69,19 @@ def test_a_camera_that_stands_still_for_a_while(rdstitch: Run, frames: list[Path
     done = rdstitch("mosaic", *paused, *frames, "-o", tmp_path / "out.png", "--strict", *FAST)
     assert (done.status, done.err) == (0, "")
     assert abs(float(done.out) - DISTORTION) < 0.005
+
+
+@pytest.mark.parametrize(
+    "glance",
+    [lambda _, pairs: list(pairs), lambda _, pairs: [], lambda _, pairs: [pair for pair in pairs if 2 not in pair]],
+    ids=["everything looks promising", "nothing does", "one picture does not"],
+)
+def test_whatever_a_glance_says_every_picture_finds_its_place(
+    rdstitch: Run,
+    frames: list[Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    glance: Callable[[Pairing, list[tuple[int, int]]], list[tuple[int, int]]],
+) -> None:
+    monkeypatch.setattr(Pairing, "promising", glance)
+    assert rdstitch("mosaic", *frames, "-o", tmp_path / "out.png", "--strict", *FAST).status == 0

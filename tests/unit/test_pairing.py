@@ -1,5 +1,6 @@
 """Rounds of pairing: what rests does not hide what moves; pairs that hang on little find more where it must be."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -102,3 +103,9 @@ def test_pictures_with_many_matches_are_left_as_they_are() -> None:
     cameras = [camera.with_focal() for camera in pairing.cameras]
     alignment = align(cameras, [pair.link() for pair in alone], AlignmentOptions(model="homography"))
     assert all(new is old for new, old in zip(pairing.strengthen(alone, alignment), alone, strict=True))
+
+
+def test_pictures_that_share_nothing_are_told_at_a_glance() -> None:
+    one, other = _pairing(0, 400), _pairing(0, 400, seed=1)
+    together = replace(one, features=[*one.features[:2], *other.features[:2]])
+    assert together.promising(ALL) == [(0, 1), (2, 3)]
