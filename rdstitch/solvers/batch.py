@@ -1,7 +1,10 @@
-"""Batches of samples: blocks that stay in cache, with the batch axis last."""
+"""Batches of samples: blocks that stay in cache, with the batch axis last.
+
+Inside a solver the points of both pictures are one array of shape (2, 2, k, b): coordinate, picture, point, sample.
+"""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Self
 
 import numpy as np
@@ -10,18 +13,21 @@ from numpy.typing import ArrayLike, NDArray
 from rdstitch.camera import FloatArray
 from rdstitch.solvers.solutions import Solutions, as_samples
 
-BlockSolver = Callable[[FloatArray, FloatArray, NDArray[np.intp]], Solutions]
+IndexArray = NDArray[np.intp]
+BlockSolver = Callable[[FloatArray, IndexArray], Solutions]
 
 
 @dataclass(frozen=True)
 class SampleArrays:
-    """Numbers per sample, shape (..., B): what an equation is evaluated from."""
+    """Numbers per sample: arrays whose last axis is that of the samples."""
 
-    rows: FloatArray
-
-    def take(self, samples: NDArray[np.intp]) -> Self:
+    def take(self, samples: IndexArray) -> Self:
         """Those of some samples; indices may repeat."""
-        return type(self)(np.take(self.rows, samples, axis=-1))
+        return type(self)(*(_take(getattr(self, field.name), samples) for field in fields(self)))
+
+
+def _take(values: "FloatArray | SampleArrays", samples: IndexArray) -> "FloatArray | SampleArrays":
+    return values.take(samples) if isinstance(values, SampleArrays) else np.take(values, samples, axis=-1)
 
 
 def solve_in_blocks(solve: BlockSolver, x1: ArrayLike, x2: ArrayLike, count: int, block_size: int = 4096) -> Solutions:
@@ -32,8 +38,7 @@ def solve_in_blocks(solve: BlockSolver, x1: ArrayLike, x2: ArrayLike, count: int
     Parameters
     ----------
     solve : callable
-        Takes the two point arrays of a block, each of shape (count, 2, b) with the batch axis last, and the place of
-        the block's samples in the batch, (b,).
+        Takes the points of a block, (2, 2, count, b), and the place of the block's samples in the batch, (b,).
     x1, x2 : array_like of shape (B, count, 2) or (count, 2)
         Normalized points of picture 1 and picture 2.
     count : int
@@ -56,9 +61,8 @@ def solve_in_blocks(solve: BlockSolver, x1: ArrayLike, x2: ArrayLike, count: int
             a, b = a[index], b[index]
         for start in range(0, len(a), block_size):
             block = slice(start, start + block_size)
-            first = np.ascontiguousarray(np.moveaxis(a[block], 0, -1))
-            second = np.ascontiguousarray(np.moveaxis(b[block], 0, -1))
-            part = solve(first, second, index[block])
+            points = np.ascontiguousarray(np.stack([a[block].T, b[block].T], axis=1))
+            part = solve(points, index[block])
             parts.append(Solutions(index[part.sample + start], part.homography, part.distortion))
     if len(parts) < 2:
         return parts[0] if parts else Solutions.empty()

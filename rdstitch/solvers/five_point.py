@@ -1,12 +1,15 @@
 """Five points, general homography: λ from the direction of the fifth point."""
 
+from dataclasses import dataclass
+
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rdstitch.camera import FloatArray
-from rdstitch.solvers.batch import SampleArrays, solve_in_blocks
-from rdstitch.solvers.homography import homography_through
-from rdstitch.solvers.orientation import determinants, oriented_samples, triangle_determinants
+from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
+from rdstitch.solvers.homography import Quadrangles
+from rdstitch.solvers.lines import determinants, squared_radii
+from rdstitch.solvers.orientation import oriented_samples
 from rdstitch.solvers.plane import lens_range
 from rdstitch.solvers.roots import real_roots
 from rdstitch.solvers.solutions import Solutions
@@ -43,35 +46,46 @@ def five_point(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, floa
         When a shape is wrong or the range is empty.
     """
 
-    def solve(a: FloatArray, b: FloatArray, _: NDArray[np.intp]) -> Solutions:
-        usable, low, high = oriented_samples(a, b, *lens_range(a, b, distortion_range))
-        a, b = np.take(a, usable, axis=-1), np.take(b, usable, axis=-1)
-        index, distortion = real_roots(DirectionEquation.from_points(a, b), _DEGREE, low, high)
-        a, b = np.take(a, index, axis=-1), np.take(b, index, axis=-1)
-        h, possible = homography_through(a, b, distortion)
-        x, y = a[4]
-        depth = h[:, 2, 0] * x + h[:, 2, 1] * y + h[:, 2, 2] * (1.0 + distortion * (x**2 + y**2))
-        possible &= depth > 0.0
+    def solve(points: FloatArray, _: IndexArray) -> Solutions:
+        quadrangles = Quadrangles.of(points)
+        usable, low, high = oriented_samples(quadrangles.triangles, *lens_range(points, distortion_range))
+        quadrangles = quadrangles.take(usable)
+        index, distortion = real_roots(DirectionEquation.of(quadrangles), _DEGREE, low, high)
+        quadrangles = quadrangles.take(index)
+        h, possible = quadrangles.homography(distortion)
+        fifth = quadrangles.points[:, 0, 4]
+        x, y = fifth
+        possible &= h[:, 2, 0] * x + h[:, 2, 1] * y + h[:, 2, 2] * (1.0 + distortion * squared_radii(fifth)) > 0.0
         return Solutions(usable[index[possible]], h[possible], distortion[possible])
 
     return solve_in_blocks(solve, x1, x2, 5)
 
 
+@dataclass(frozen=True)
 class DirectionEquation(SampleArrays):
-    """The equation of :func:`five_point`; rows: α_1..3, β_1..3, γ_1..3 with their factors."""
+    """The equation of :func:`five_point`.
+
+    Attributes
+    ----------
+    linear : ndarray of shape (2, 3, 3, b)
+        Constant and slope of α_1..3, of β_1..3, and of γ_1..3 with their factors.
+    """
+
+    linear: FloatArray
 
     @classmethod
-    def from_points(cls, x1: FloatArray, x2: FloatArray) -> "DirectionEquation":
-        """From points of shape (5, 2, B)."""
-        alpha, beta = triangle_determinants(x1)[:, 1:], triangle_determinants(x2)[:, 1:]
-        a, b, c, _, fifth = x1
-        gamma = np.stack([determinants(fifth, b, c), determinants(a, fifth, c), determinants(a, b, fifth)], axis=1)
-        across = x2[4, 0] * x2[:3, 1] - x2[4, 1] * x2[:3, 0]
-        return cls(np.concatenate([alpha, beta, gamma * across], axis=1))
+    def of(cls, quadrangles: Quadrangles) -> "DirectionEquation":
+        """Of samples of five points."""
+        (x, y), fifth = quadrangles.points[:, 1, :3], quadrangles.points[:, :, 4:]
+        across = fifth[0, 1] * y - fifth[1, 1] * x
+        gamma = determinants(fifth, quadrangles.opposite)[:, :1]
+        return cls(np.concatenate([quadrangles.triangles[:, :, 1:], gamma * across], axis=1))
 
     def polynomial(self, distortion: FloatArray) -> FloatArray:
         """The equation itself."""
-        constant, slope = self.rows[:, :, None] if distortion.ndim > 1 else self.rows
-        a1, a2, a3, b1, b2, b3, g1, g2, g3 = constant + slope * distortion
-        value: FloatArray = b1 * a2 * a3 * g1 + b2 * a3 * a1 * g2 + b3 * a1 * a2 * g3
+        constant, slope = self.linear[:, :, :, None] if distortion.ndim > 1 else self.linear
+        alpha, beta, gamma = constant + slope * distortion
+        a1, a2, a3 = alpha
+        first, second, third = beta * gamma
+        value: FloatArray = first * (a2 * a3) + second * (a3 * a1) + third * (a1 * a2)
         return value

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.camera import FloatArray
-from rdstitch.solvers.batch import solve_in_blocks
+from rdstitch.solvers.batch import IndexArray, solve_in_blocks
 from rdstitch.solvers.plane import lens_range
 from rdstitch.solvers.solutions import Solutions
 
@@ -44,10 +44,10 @@ def five_point_qep(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, 
     """
     shift = distortion_range[1] + 0.1 * (distortion_range[1] - distortion_range[0])
 
-    def solve(a: FloatArray, b: FloatArray, _: NDArray[np.intp]) -> Solutions:
-        low, high = lens_range(a, b, distortion_range)
+    def solve(points: FloatArray, _: IndexArray) -> Solutions:
+        low, high = lens_range(points, distortion_range)
         usable = np.flatnonzero(low < high)
-        a, b = np.moveaxis(a[..., usable], -1, 0), np.moveaxis(b[..., usable], -1, 0)
+        a, b = points[..., usable].transpose(1, 3, 2, 0)
         eigenvalues, vectors = np.linalg.eig(_companion(*_shifted(_dlt_rows(a, b), shift)))
         real = (np.abs(eigenvalues.imag) <= _REAL * np.abs(eigenvalues)) & (eigenvalues.real != 0.0)
         sample, which = np.nonzero(real)

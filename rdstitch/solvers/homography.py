@@ -1,9 +1,7 @@
 """The homography through four points, in closed form, as a function of λ.
 
-Inside a solver the batch axis is last: points of a picture have shape (k, 2, B).
-
 With lifted points ``p(λ) = (x, y, 1 + λ r²)`` let ``α_0 = det(p_1, p_2, p_3)``, and ``α_i`` the same with point i
-replaced by point 4; ``β`` likewise in picture 2. Each is linear in λ (:mod:`rdstitch.solvers.orientation`). Then
+replaced by point 4; ``β`` likewise in picture 2. Each is linear in λ (:mod:`rdstitch.solvers.lines`). Then
 
 ``H(λ) = Σ_i β_i α_j α_k p̂_i (p_j × p_k)'``
 
@@ -12,46 +10,64 @@ and H their orientation, exactly when every ``α_i β_i > 0``, and the sign that
 of all ``α``.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.camera import FloatArray
-from rdstitch.solvers.orientation import triangle_determinants
+from rdstitch.solvers.batch import SampleArrays
+from rdstitch.solvers.lines import Lines, squared_radii, triangle_determinants
 
 # Triangles with an area below this, relative to the largest of the four, count as collinear.
 _COLLINEAR = 1e-9
 
 
-def homography_through(x1: FloatArray, x2: FloatArray, distortion: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Homography of the first four points for one λ a sample.
+@dataclass(frozen=True)
+class Quadrangles(SampleArrays):
+    """Samples of four or more points, of which the first four have a homography for every λ.
 
-    Parameters
+    Attributes
     ----------
-    x1, x2 : ndarray of shape (4 or more, 2, M)
-    distortion : ndarray of shape (M,)
-
-    Returns
-    -------
-    homography : ndarray of shape (M, 3, 3)
-        With unit Frobenius norm, and the sign that puts the points in front of the camera.
-    possible : ndarray of shape (M,), bool
-        False where the points change sides, are mirrored, or three are collinear.
+    points : ndarray of shape (2, 2, k, b)
+    opposite : Lines
+        ``p_j × p_k`` of the first three points.
+    triangles : ndarray of shape (2, 2, 4, b)
+        ``α_0..3`` and ``β_0..3``, constants and slopes.
     """
-    (c1, s1), (c2, s2) = triangle_determinants(x1), triangle_determinants(x2)
-    alpha, beta = c1 + s1 * distortion, c2 + s2 * distortion
-    possible = np.ones(len(distortion), dtype=np.bool_)
-    for minors in (alpha, beta):
-        size = np.abs(minors)
-        possible &= size.min(axis=0) > _COLLINEAR * size.max(axis=0)
-    possible &= (alpha * beta > 0.0).all(axis=0)
 
-    third1, third2 = (1.0 + distortion * (x[:3, 0] ** 2 + x[:3, 1] ** 2) for x in (x1, x2))
-    h = np.zeros((3, 3, len(distortion)))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        (xj, yj), (xk, yk) = x1[j], x1[k]
-        weight = beta[i + 1] * alpha[j + 1] * alpha[k + 1]
-        line = np.stack([yj * third1[k] - yk * third1[j], xk * third1[j] - xj * third1[k], xj * yk - xk * yj])
-        h += np.stack([x2[i, 0], x2[i, 1], third2[i]])[:, None] * (weight * line)
-    norm = np.sqrt(np.einsum("ijm,ijm->m", h, h))
-    scale = np.sign(alpha.prod(axis=0)) / np.where(norm > 0.0, norm, np.inf)
-    return np.ascontiguousarray(np.moveaxis(h * scale, -1, 0)), possible
+    points: FloatArray
+    opposite: Lines
+    triangles: FloatArray
+
+    @classmethod
+    def of(cls, points: FloatArray) -> "Quadrangles":
+        """Of points (2, 2, k, b)."""
+        opposite = Lines.opposite(points)
+        return cls(points, opposite, triangle_determinants(points, opposite))
+
+    def homography(self, distortion: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """H for one λ a sample (b,).
+
+        Returns
+        -------
+        homography : ndarray of shape (b, 3, 3)
+            With unit Frobenius norm, and the sign that puts the points in front of the camera.
+        possible : ndarray of shape (b,), bool
+            False where the points change sides, are mirrored, or three are collinear.
+        """
+        minors = self.triangles[0] + self.triangles[1] * distortion
+        size = np.abs(minors)
+        possible = (size.min(axis=1) > _COLLINEAR * size.max(axis=1)).all(axis=0)
+        alpha, beta = minors
+        possible &= (alpha * beta > 0.0).all(axis=0)
+
+        first, second, third = alpha[1:]
+        weight = beta[1:] * np.stack([second * third, third * first, first * second])
+        lines = self.opposite.at(distortion)[:, 0] * weight
+        images = self.points[:, 1, :3]
+        lifted = (*images, 1.0 + squared_radii(images) * distortion)
+        h = np.stack([(row * lines).sum(axis=1) for row in lifted])
+        norm = np.sqrt((h * h).sum(axis=(0, 1)))
+        scale = np.sign(alpha[0] * first * (second * third)) / np.where(norm > 0.0, norm, np.inf)
+        return np.ascontiguousarray((h * scale).transpose(2, 0, 1)), possible

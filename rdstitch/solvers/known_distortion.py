@@ -1,13 +1,13 @@
 """Minimal solvers for a lens that is known already: λ comes from a camera file."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rdstitch.camera import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.solvers.batch import solve_in_blocks
-from rdstitch.solvers.homography import homography_through
-from rdstitch.solvers.plane import TiltRotations, lens_range, motion_homography, visible_range
+from rdstitch.solvers.batch import IndexArray, solve_in_blocks
+from rdstitch.solvers.homography import Quadrangles
+from rdstitch.solvers.plane import TiltRotations, depths, lens_range, motion_homography, visible_range
 from rdstitch.solvers.solutions import Solutions
 
 
@@ -66,10 +66,10 @@ def four_point_dlt(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike) -> Solut
     """
     lam = _distortions(distortion, x1)
 
-    def solve(a: FloatArray, b: FloatArray, samples: NDArray[np.intp]) -> Solutions:
+    def solve(points: FloatArray, samples: IndexArray) -> Solutions:
         own = lam[samples]
-        low, _ = lens_range(a, b, (-np.inf, np.inf))
-        h, possible = homography_through(a, b, own)
+        low, _ = lens_range(points, (-np.inf, np.inf))
+        h, possible = Quadrangles.of(points).homography(own)
         index = np.flatnonzero(possible & (own > low))
         return Solutions(index, h[index], own[index])
 
@@ -81,11 +81,11 @@ def _motion(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike, tilt: ArrayLike
     rotations = TiltRotations.from_tilt(tilt, np.shape(x1)[0] if np.ndim(x1) else 0)
     lam = _distortions(distortion, x1)
 
-    def solve(a: FloatArray, b: FloatArray, samples: NDArray[np.intp]) -> Solutions:
+    def solve(points: FloatArray, samples: IndexArray) -> Solutions:
         own, rotation = lam[samples], rotations.take(samples)
-        low, high = visible_range(a, b, rotation, (-np.inf, np.inf))
+        low, high = visible_range(points, depths(points, rotation), (-np.inf, np.inf))
         index = np.flatnonzero((own > low) & (own < high))
-        h = motion_homography(a[..., index], b[..., index], rotation.take(index), own[index], height_free)
+        h = motion_homography(np.take(points, index, axis=-1), rotation.take(index), own[index], height_free)
         return Solutions(index, h, own[index])
 
     return solve_in_blocks(solve, x1, x2, 2)

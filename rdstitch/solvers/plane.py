@@ -1,21 +1,24 @@
 """The plane as cameras of known tilt see it: plane coordinates, distances, and motions in the plane.
 
-Inside a solver the batch axis is last: points of a picture have shape (k, 2, B). With the tilt's rotation R and the
-plane normal ``n = R e3``, a lifted point ``p(λ) = (x, y, 1 + λ r²)`` has the plane coordinates
+Inside a solver the points of both pictures have shape (2, 2, k, b): coordinate, picture, point, sample. With the tilt's
+rotation R and the plane normal ``n = R e3``, a lifted point ``p(λ) = (x, y, 1 + λ r²)`` has the plane coordinates
 ``X = (R' p)_xy / (n · p)``. The vector between two points of the plane is
 ``X_i - X_j = J (R' (p_i × p_j))_xy / ((n · p_i)(n · p_j))``, J a quarter turn: both its numerator and the depths
 ``n · p`` are linear in λ.
 """
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rdstitch.camera import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.planar_motion import rotation_from_tilt
+from rdstitch.solvers.batch import IndexArray, SampleArrays
+from rdstitch.solvers.lines import Lines, squared_radii
 
 # Depths and lens factors below this count as at the horizon or at the fold of the lens.
 _MIN_DEPTH = 1e-9
@@ -24,11 +27,16 @@ _MIN_SEPARATION = 1e-9
 
 
 @dataclass(frozen=True)
-class TiltRotations:
-    """Rotations of the two pictures' tilts, of shape (3, 3, 1), or (3, 3, B) when each sample has its own."""
+class TiltRotations(SampleArrays):
+    """Rotations of the two pictures' tilts.
 
-    first: FloatArray
-    second: FloatArray
+    Attributes
+    ----------
+    matrices : ndarray of shape (3, 3, 2, 1, 1), or (3, 3, 2, 1, b) when each sample has its own
+        Row, column, picture, any point, sample.
+    """
+
+    matrices: FloatArray
 
     @classmethod
     def from_tilt(cls, tilt: ArrayLike, count: int) -> Self:
@@ -44,95 +52,98 @@ class TiltRotations:
             raise ArgumentError(f"tilt must be (psi, theta) or one such pair a picture, not of shape {angles.shape}")
         if not (np.abs(angles) < np.pi / 2).all():
             raise ArgumentError("tilt must be below a right angle")
-        both = np.broadcast_to(angles, (*angles.shape[:-2], 2, 2)).reshape(-1, 2, 2)
-        first, second = np.moveaxis(rotation_from_tilt(both), 0, -1)
-        return cls(np.ascontiguousarray(first), np.ascontiguousarray(second))
+        both = np.broadcast_to(angles, (*angles.shape[:-2], 2, 2)).reshape(-1, 2, 1, 2)
+        return cls(np.ascontiguousarray(rotation_from_tilt(both).transpose(3, 4, 1, 2, 0)))
 
-    def take(self, samples: NDArray[np.intp]) -> Self:
+    @classmethod
+    def from_normal(cls, normal: FloatArray) -> Self:
+        """The smallest rotations that turn e3 to normals (3, b) of length 1, the same for both pictures."""
+        x, y, z = normal
+        first, second = x / (1.0 + z), y / (1.0 + z)
+        rows = [[1.0 - first * x, -first * y, x], [-second * x, 1.0 - second * y, y], [-x, -y, z]]
+        matrices = np.array(rows)[:, :, None, None]
+        return cls(np.repeat(matrices, 2, axis=2))
+
+    def take(self, samples: IndexArray) -> Self:
         """Those of some samples; indices may repeat."""
-        if self.first.shape[-1] == 1:
-            return self
-        return type(self)(np.take(self.first, samples, axis=-1), np.take(self.second, samples, axis=-1))
+        return self if self.matrices.shape[-1] == 1 else super().take(samples)
 
 
-def depths(x: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Depths ``n · p(λ)`` of points (k, 2, B): constant and slope, shape (2, k, B)."""
-    nx, ny, nz = rotation[:, 2]
-    radius2 = x[:, 0] ** 2 + x[:, 1] ** 2
-    return np.stack([nx * x[:, 0] + ny * x[:, 1] + nz, nz * radius2])
+def depths(points: FloatArray, rotations: TiltRotations) -> FloatArray:
+    """Depths ``n · p(λ)`` of points (2, 2, k, b): constant and slope, shape (2, 2, k, b)."""
+    x, y = points
+    nx, ny, nz = rotations.matrices[:, 2]
+    return np.stack([nx * x + ny * y + nz, nz * squared_radii(points)])
 
 
-def differences(x: FloatArray, rotation: FloatArray, pairs: tuple[tuple[int, int], ...]) -> FloatArray:
-    """Numerators ``J (R' (p_i × p_j))_xy`` of ``X_i - X_j`` for pairs of points (k, 2, B).
+def differences(lines: Lines, rotations: TiltRotations) -> FloatArray:
+    """``(R' (p_i × p_j))_xy`` of lines: the numerator of ``X_i - X_j`` after a quarter turn.
 
     Returns
     -------
-    ndarray of shape (2, 2, len(pairs), B)
-        Constant and slope in λ; x and y.
+    ndarray of shape (2, 2, 2, L, b)
+        Constant and slope in λ, coordinate, picture, line, sample.
     """
-    i, j = ([pair[end] for pair in pairs] for end in (0, 1))
-    (xi, yi), (xj, yj) = x[i].swapaxes(0, 1), x[j].swapaxes(0, 1)
-    ri, rj = xi**2 + yi**2, xj**2 + yj**2
-    dx, dy = xi - xj, yi - yj
-    third = yj * dx - xj * dy
-    r = rotation
-    lengthwise = np.stack(
-        [-(r[0, 1] * dy - r[1, 1] * dx + r[2, 1] * third), r[0, 0] * dy - r[1, 0] * dx + r[2, 0] * third]
-    )
-    cx, cy = yi * rj - yj * ri, ri * xj - rj * xi
-    slope = np.stack([-(r[0, 1] * cx + r[1, 1] * cy), r[0, 0] * cx + r[1, 0] * cy])
-    return np.stack([lengthwise, slope])
+    turn = rotations.matrices[:, :2]
+    (c1, c2, c3), (s1, s2) = lines.constant, lines.slope
+    return np.stack([turn[0] * c1 + turn[1] * c2 + turn[2] * c3, turn[0] * s1 + turn[1] * s2])
 
 
 def visible_range(
-    x1: FloatArray, x2: FloatArray, rotations: TiltRotations, distortion_range: tuple[float, float]
+    points: FloatArray, depth: FloatArray, distortion_range: tuple[float, float]
 ) -> tuple[FloatArray, FloatArray]:
     """The λ for which all points lie within the lens model and in front of the camera, and no two coincide.
 
     ``1 + λ r²`` and the depth of each point are linear in λ, so that each leaves a half-line.
 
+    Parameters
+    ----------
+    points : ndarray of shape (2, 2, k, b)
+    depth : ndarray of shape (2, 2, k, b)
+        From :func:`depths`.
+
     Returns
     -------
-    low, high : ndarray of shape (B,)
+    low, high : ndarray of shape (b,)
         Empty, ``low > high``, for a degenerate sample.
     """
-    low, high = lens_range(x1, x2, distortion_range)
-    for x, rotation in ((x1, rotations.first), (x2, rotations.second)):
-        constant, slope = depths(x, rotation)
-        # No slope is negative. At the centre it is 0, and the bound as infinite as it should be.
-        low = np.maximum(low, ((_MIN_DEPTH - constant) / slope).max(axis=0))
-    return low, high
+    low, high = lens_range(points, distortion_range)
+    constant, slope = depth
+    # No slope is negative. At the centre it is 0, and the bound as infinite as it should be.
+    return np.maximum(low, ((_MIN_DEPTH - constant) / slope).max(axis=(0, 1))), high
 
 
-def lens_range(x1: FloatArray, x2: FloatArray, distortion_range: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
+def lens_range(points: FloatArray, distortion_range: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
     """The λ for which all points lie within the lens model, none if two points coincide; see :func:`visible_range`."""
     low, high = distortion_range
     if not low < high:
         raise ArgumentError(f"distortion range must be (low, high) with low < high, not {distortion_range}")
-    radius2 = np.maximum(np.einsum("kib,kib->kb", x1, x1), np.einsum("kib,kib->kb", x2, x2)).max(axis=0)
+    radius2 = squared_radii(points).max(axis=(0, 1))
     lows = np.maximum(low, -(1.0 - _MIN_DEPTH) / np.maximum(radius2, 1e-300))
-    apart = distinct(x1, radius2) & distinct(x2, radius2)
-    return np.where(apart, lows, np.inf), np.full_like(lows, high)
+    first, second = _all_pairs(points.shape[2])
+    nearest2 = squared_radii(np.take(points, first, axis=2) - np.take(points, second, axis=2)).min(axis=(0, 1))
+    lows[~(nearest2 > _MIN_SEPARATION**2 * radius2)] = np.inf
+    return lows, np.full_like(lows, high)
 
 
-def distinct(x: FloatArray, radius2: FloatArray) -> NDArray[np.bool_]:
-    """Whether no two of the points (k, 2, B) coincide, relative to ``radius2``; shape (B,)."""
-    first, second = np.triu_indices(len(x), 1)
-    between = x[first] - x[second]
-    distance2 = between[:, 0] ** 2 + between[:, 1] ** 2
-    return np.asarray((distance2 > _MIN_SEPARATION**2 * radius2).all(axis=0))
+@cache
+def _all_pairs(count: int) -> tuple[IndexArray, IndexArray]:
+    """Indices of both of every two of some points."""
+    first, second = np.triu_indices(count, 1)
+    return first, second
 
 
-def plane_points(x: FloatArray, rotation: FloatArray, distortion: FloatArray) -> FloatArray:
-    """Plane coordinates of points (k, 2, M) for one λ a sample (M,); shape (k, 2, M)."""
-    third = 1.0 + distortion * (x[:, 0] ** 2 + x[:, 1] ** 2)
-    r = rotation
-    q = [r[0, i] * x[:, 0] + r[1, i] * x[:, 1] + r[2, i] * third for i in range(3)]
-    return np.stack([q[0] / q[2], q[1] / q[2]], axis=1)
+def plane_points(points: FloatArray, rotations: TiltRotations, distortion: FloatArray) -> FloatArray:
+    """Plane coordinates of points (2, 2, k, b) for one λ a sample (b,); shape (2, 2, k, b)."""
+    x, y = points
+    r = rotations.matrices
+    seen = r[0] * x + r[1] * y + r[2] * (1.0 + distortion * squared_radii(points))
+    plane: FloatArray = seen[:2] / seen[2]
+    return plane
 
 
 def motion_homography(
-    x1: FloatArray, x2: FloatArray, rotations: TiltRotations, distortion: FloatArray, height_free: bool = False
+    points: FloatArray, rotations: TiltRotations, distortion: FloatArray, height_free: bool = False
 ) -> FloatArray:
     """Homography ``R2 Rz(φ) diag(1, 1, height) T R1'`` of the plane motion that fits the points best.
 
@@ -141,31 +152,27 @@ def motion_homography(
 
     Parameters
     ----------
-    x1, x2 : ndarray of shape (k, 2, M)
-    distortion : ndarray of shape (M,)
+    points : ndarray of shape (2, 2, k, b)
+    distortion : ndarray of shape (b,)
 
     Returns
     -------
-    ndarray of shape (M, 3, 3)
+    ndarray of shape (b, 3, 3)
     """
-    first = plane_points(x1, rotations.first, distortion)
-    second = plane_points(x2, rotations.second, distortion)
-    mean1, mean2 = first.mean(axis=0), second.mean(axis=0)
-    (ax, ay), (bx, by) = (first - mean1).swapaxes(0, 1), (second - mean2).swapaxes(0, 1)
-    along = np.einsum("km,km->m", ax, bx) + np.einsum("km,km->m", ay, by)
-    across = np.einsum("km,km->m", ax, by) - np.einsum("km,km->m", ay, bx)
-    length = np.sqrt(along**2 + across**2)
+    plane = plane_points(points, rotations, distortion)
+    mean = plane.mean(axis=2)
+    (ax, bx), (ay, by) = plane - mean[:, :, None]
+    along, across = (ax * bx + ay * by).sum(axis=0), (ax * by - ay * bx).sum(axis=0)
+    length = np.sqrt(along * along + across * across)
     c, s = along / length, across / length
-    height = np.einsum("kim,kim->m", first - mean1, first - mean1) / length if height_free else 1.0
-    tx = height * mean2[0] - (c * mean1[0] - s * mean1[1])
-    ty = height * mean2[1] - (s * mean1[0] + c * mean1[1])
-    r1, r2 = rotations.first, rotations.second
-    moved = np.stack(
-        [
-            c * r1[:, 0] - s * r1[:, 1] + tx * r1[:, 2],
-            s * r1[:, 0] + c * r1[:, 1] + ty * r1[:, 2],
-            np.broadcast_to(height * r1[:, 2], (3, len(distortion))),
-        ]
+    height = (ax * ax + ay * ay).sum(axis=0) / length if height_free else 1.0
+    (x1, x2), (y1, y2) = mean
+    tx, ty = height * x2 - (c * x1 - s * y1), height * y2 - (s * x1 + c * y1)
+    r1, r2 = rotations.matrices[:, :, 0, 0], rotations.matrices[:, :, 1, 0]
+    right, down, normal = r1[:, 0], r1[:, 1], r1[:, 2]
+    homography = (
+        r2[:, 0, None] * (c * right - s * down + tx * normal)
+        + r2[:, 1, None] * (s * right + c * down + ty * normal)
+        + r2[:, 2, None] * (height * normal)
     )
-    homography = r2[:, 0, None] * moved[0] + r2[:, 1, None] * moved[1] + r2[:, 2, None] * moved[2]
-    return np.ascontiguousarray(np.moveaxis(homography, -1, 0))
+    return np.ascontiguousarray(homography.transpose(2, 0, 1))

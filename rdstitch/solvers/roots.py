@@ -13,9 +13,9 @@ from dataclasses import dataclass, fields
 from typing import Protocol, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rdstitch.camera import FloatArray
+from rdstitch.solvers.batch import IndexArray
 from rdstitch.solvers.polynomials import (
     bernstein_from_values,
     bernstein_subdivision,
@@ -25,10 +25,9 @@ from rdstitch.solvers.polynomials import (
     chebyshev_value_and_slope,
 )
 
-IndexArray = NDArray[np.intp]
-
 _VALUES_IN_CACHE = 20480
 _CELLS = 8
+_EDGES = np.linspace(-1.0, 1.0, _CELLS + 1)
 _PARTS = 4
 _DEPTH = 6
 # Relative to the largest value of the polynomial: what counts as a double root. Values of the polynomial are rounded
@@ -162,13 +161,12 @@ def isolate(values: FloatArray, first: int = 0) -> Brackets:
     changes = (positive[:, 1:] != positive[:, :-1]).sum(axis=1, dtype=np.uint8)
 
     width = 2.0 / _CELLS
-    edges = np.linspace(-1.0, 1.0, _CELLS + 1)
     cell, sample = np.nonzero(changes == 1)
-    left = edges[cell]
+    left = _EDGES[cell]
     ends = coefficients[:, [0, -1]][cell, :, sample]
     found = [Brackets.of_cells(sample, left, width, ends)]
     cell, sample = np.nonzero(changes > 1)
-    left = edges[cell]
+    left = _EDGES[cell]
     current = coefficients[cell, :, sample]
     split = bernstein_subdivision(degree, _PARTS).reshape(-1, count).T
     for _ in range(_DEPTH):

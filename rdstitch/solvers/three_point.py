@@ -1,5 +1,6 @@
 """Three points, tilt unknown: the minimal case, by Newton's method from several starts."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -7,14 +8,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.camera import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.planar_motion import rotation_from_tilt, tilt_from_normal
-from rdstitch.solvers.batch import SampleArrays, solve_in_blocks
+from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
+from rdstitch.solvers.lines import Lines, squared_radii, triangle_determinants
 from rdstitch.solvers.orientation import mirrored, oriented_samples
 from rdstitch.solvers.plane import TiltRotations, lens_range, motion_homography
 from rdstitch.solvers.solutions import Solutions
 
 BoolArray = NDArray[np.bool_]
-IndexArray = NDArray[np.intp]
 RealArray = NDArray[np.floating[Any]]
 
 DEFAULT_STARTS: FloatArray = np.array(
@@ -87,51 +87,48 @@ def three_point(
     if first.ndim != 2 or first.shape[1] != 3 or not len(first) or not np.isfinite(first).all():
         raise ArgumentError(f"starts must be rows (a, b, lambda) of finite numbers, not shape {first.shape}")
 
-    def solve(a: FloatArray, b: FloatArray, _: IndexArray) -> Solutions:
-        usable, low, high = oriented_samples(a, b, *lens_range(a, b, distortion_range))
-        a, b = np.take(a, usable, axis=-1), np.take(b, usable, axis=-1)
-        index, state = newton(DistanceSystem.from_points(a, b), first)
+    def solve(points: FloatArray, _: IndexArray) -> Solutions:
+        opposite = Lines.opposite(points)
+        triangles = triangle_determinants(points, opposite)
+        usable, low, high = oriented_samples(triangles, *lens_range(points, distortion_range))
+        system = DistanceSystem.of(np.take(points, usable, axis=-1), opposite.take(usable))
+        index, state = newton(system, first)
         inside = (state[2] > low[index]) & (state[2] < high[index])
-        index, state = index[inside], state[:, inside]
-        index, h, distortion = _motions(a, b, index, state)
-        return Solutions(usable[index], h, distortion)
+        index, state = usable[index[inside]], state[:, inside]
+        points = np.take(points, index, axis=-1)
+        possible = np.flatnonzero(_in_front(points, state) & ~mirrored(np.take(triangles, index, axis=-1), state[2]))
+        (a, b, distortion), index = state[:, possible], index[possible]
+        normal = np.stack([a, b, np.ones_like(a)]) / np.sqrt(a * a + b * b + 1.0)
+        h = motion_homography(np.take(points, possible, axis=-1), TiltRotations.from_normal(normal), distortion)
+        return Solutions(index, h, distortion)
 
     return solve_in_blocks(solve, x1, x2, 3, block_size=max(1, _STATES_IN_BLOCK // len(first)))
 
 
-def _motions(
-    x1: FloatArray, x2: FloatArray, index: IndexArray, state: FloatArray
-) -> tuple[IndexArray, FloatArray, FloatArray]:
-    """Sample, homography and λ of the states (a, b, λ) that are physically possible."""
+def _in_front(points: FloatArray, state: FloatArray) -> BoolArray:
+    """Whether all points (2, 2, 3, b) are in front of the camera of each state (a, b, λ)."""
     a, b, distortion = state
-    x1, x2 = np.take(x1, index, axis=-1), np.take(x2, index, axis=-1)
-    tilt = tilt_from_normal(np.stack([a, b, np.ones_like(a)], axis=-1))
-    rotation = np.moveaxis(rotation_from_tilt(tilt), 0, -1)
-    possible = ~mirrored(x1, x2, distortion)
-    for x in (x1, x2):
-        depth = 1.0 + a * x[:, 0] + b * x[:, 1] + distortion * (x[:, 0] ** 2 + x[:, 1] ** 2)
-        possible &= (depth > 0.0).all(axis=0)
-    rotations = TiltRotations(rotation, rotation).take(np.flatnonzero(possible))
-    distortion = distortion[possible]
-    h = motion_homography(x1[..., possible], x2[..., possible], rotations, distortion)
-    return index[possible], h, distortion
+    depth = 1.0 + a * points[0] + b * points[1] + distortion * squared_radii(points)
+    return np.asarray((depth > 0.0).all(axis=(0, 1)))
 
 
+@dataclass(frozen=True)
 class DistanceSystem(SampleArrays):
     """The three equations of :func:`three_point`.
 
-    Rows: x, y, r² of each point, then constants of the three coordinates of ``p_i × p_j`` and slopes of the first two,
-    for the pair opposite to each point; shape (8, 2, 3, B), picture before point.
+    Attributes
+    ----------
+    rows : ndarray of shape (8, 2, 3, b)
+        x, y, r² of each point, then constants of the three coordinates of the line opposite to it, and slopes of the
+        first two; picture, point, sample.
     """
 
+    rows: RealArray
+
     @classmethod
-    def from_points(cls, x1: FloatArray, x2: FloatArray) -> "DistanceSystem":
-        """From points of shape (3, 2, B)."""
-        x, y = np.stack([x1, x2]).transpose(2, 0, 1, 3)
-        r2 = x**2 + y**2
-        (xi, yi, ri), (xj, yj, rj) = ([v[:, order] for v in (x, y, r2)] for order in (_NEXT, _LAST))
-        dx, dy = xi - xj, yi - yj
-        return cls(np.stack([x, y, r2, dy, -dx, yj * dx - xj * dy, yi * rj - yj * ri, ri * xj - rj * xi]))
+    def of(cls, points: FloatArray, opposite: Lines) -> "DistanceSystem":
+        """Of points (2, 2, 3, b)."""
+        return cls(np.concatenate([points, squared_radii(points)[None], opposite.constant, opposite.slope]))
 
     def step(self, state: RealArray) -> RealArray:
         """Newton's step from the states (a, b, λ), shape (3, B)."""

@@ -1,10 +1,13 @@
 """Three points, known tilt, free height: λ from the ratio of two distances."""
 
+from dataclasses import dataclass
+
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rdstitch.camera import FloatArray
-from rdstitch.solvers.batch import SampleArrays, solve_in_blocks
+from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
+from rdstitch.solvers.lines import Lines, triangle_determinants
 from rdstitch.solvers.orientation import mirrored, oriented_samples
 from rdstitch.solvers.plane import TiltRotations, depths, differences, motion_homography, visible_range
 from rdstitch.solvers.roots import real_roots
@@ -51,46 +54,47 @@ def three_point_similarity(
     """
     rotations = TiltRotations.from_tilt(tilt, np.shape(x1)[0] if np.ndim(x1) else 0)
 
-    def solve(a: FloatArray, b: FloatArray, samples: NDArray[np.intp]) -> Solutions:
+    def solve(points: FloatArray, samples: IndexArray) -> Solutions:
         own = rotations.take(samples)
-        usable, low, high = oriented_samples(a, b, *visible_range(a, b, own, distortion_range))
-        a, b, own = np.take(a, usable, axis=-1), np.take(b, usable, axis=-1), own.take(usable)
-        index, distortion = real_roots(DistanceRatioEquation.from_points(a, b, own), _DEGREE, low, high)
-        a, b, own = np.take(a, index, axis=-1), np.take(b, index, axis=-1), own.take(index)
-        h = motion_homography(a, b, own, distortion, height_free=True)
-        possible = ~mirrored(a, b, distortion)
-        return Solutions(usable[index[possible]], h[possible], distortion[possible])
+        opposite, depth = Lines.opposite(points), depths(points, own)
+        triangles = triangle_determinants(points, opposite)
+        usable, low, high = oriented_samples(triangles, *visible_range(points, depth, distortion_range))
+        own = own.take(usable)
+        equation = DistanceRatioEquation.of(differences(opposite.take(usable), own), np.take(depth, usable, axis=-1))
+        index, distortion = real_roots(equation, _DEGREE, low, high)
+        own, index = own.take(index), usable[index]
+        h = motion_homography(np.take(points, index, axis=-1), own, distortion, height_free=True)
+        possible = ~mirrored(np.take(triangles, index, axis=-1), distortion)
+        return Solutions(index[possible], h[possible], distortion[possible])
 
     return solve_in_blocks(solve, x1, x2, 3)
 
 
+@dataclass(frozen=True)
 class DistanceRatioEquation(SampleArrays):
     """The equation of :func:`three_point_similarity`.
 
-    Rows: for each picture the x of m_12 and m_13, their y, then w_2 and w_3; constants, then slopes.
+    Attributes
+    ----------
+    linear : ndarray of shape (2, 6, 2, b)
+        Constants and slopes; the x of m_13 and m_12, their y, then w_2 and w_3; picture, sample.
     """
 
-    @classmethod
-    def from_points(cls, x1: FloatArray, x2: FloatArray, rotations: TiltRotations) -> "DistanceRatioEquation":
-        """From points of shape (3, 2, B)."""
-        rows = []
-        for x, rotation in ((x1, rotations.first), (x2, rotations.second)):
-            m = differences(x, rotation, ((0, 1), (0, 2)))
-            rows.append(np.concatenate([m[:, 0], m[:, 1], depths(x, rotation)[:, 1:]], axis=1))
-        return cls(np.stack(rows, axis=1))
+    linear: FloatArray
 
-    def _sides(self, distortion: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """``|m_12|² |m̂_13|²`` and ``w_3 ŵ_2``, then the same with the pictures exchanged."""
-        constant, slope = self.rows[:, :, :, None] if distortion.ndim > 1 else self.rows
-        (ax, bx, ay, by, w2, w3), (cx, dx, cy, dy, v2, v3) = constant + slope * distortion
-        return (
-            (ax**2 + ay**2) * (dx**2 + dy**2),
-            w3 * v2,
-            (bx**2 + by**2) * (cx**2 + cy**2),
-            w2 * v3,
-        )
+    @classmethod
+    def of(cls, difference: FloatArray, depth: FloatArray) -> "DistanceRatioEquation":
+        """From :func:`rdstitch.solvers.plane.differences` and :func:`rdstitch.solvers.plane.depths` of triangles."""
+        x, y = difference[:, 0, :, 1:], difference[:, 1, :, 1:]
+        return cls(np.concatenate([x, y, depth[:, :, 1:]], axis=2).swapaxes(1, 2))
 
     def polynomial(self, distortion: FloatArray) -> FloatArray:
         """The equation itself."""
-        m2, w, o2, v = self._sides(distortion)
-        return m2 * w**2 - o2 * v**2
+        constant, slope = self.linear[:, :, :, None] if distortion.ndim > 1 else self.linear
+        linear = constant + slope * distortion
+        x, y = linear[:2], linear[2:4]
+        m13, m12 = x * x + y * y
+        w2, w3 = linear[4:]
+        w, v = w3[0] * w2[1], w3[1] * w2[0]
+        value: FloatArray = m12[0] * m13[1] * (w * w) - m12[1] * m13[0] * (v * v)
+        return value

@@ -1,10 +1,13 @@
 """Two points, known tilt: λ from the one distance between them."""
 
+from dataclasses import dataclass
+
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rdstitch.camera import FloatArray
-from rdstitch.solvers.batch import SampleArrays, solve_in_blocks
+from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
+from rdstitch.solvers.lines import Lines
 from rdstitch.solvers.plane import TiltRotations, depths, differences, motion_homography, visible_range
 from rdstitch.solvers.roots import real_roots
 from rdstitch.solvers.solutions import Solutions
@@ -48,32 +51,39 @@ def two_point(
     """
     rotations = TiltRotations.from_tilt(tilt, np.shape(x1)[0] if np.ndim(x1) else 0)
 
-    def solve(a: FloatArray, b: FloatArray, samples: NDArray[np.intp]) -> Solutions:
+    def solve(points: FloatArray, samples: IndexArray) -> Solutions:
         own = rotations.take(samples)
-        equation = DistanceEquation.from_points(a, b, own)
-        index, distortion = real_roots(equation, _DEGREE, *visible_range(a, b, own, distortion_range))
-        a, b = np.take(a, index, axis=-1), np.take(b, index, axis=-1)
-        return Solutions(index, motion_homography(a, b, own.take(index), distortion), distortion)
+        depth = depths(points, own)
+        between = Lines.through(points[:, :, :1], points[:, :, 1:])
+        equation = DistanceEquation.of(differences(between, own), depth)
+        index, distortion = real_roots(equation, _DEGREE, *visible_range(points, depth, distortion_range))
+        found = motion_homography(np.take(points, index, axis=-1), own.take(index), distortion)
+        return Solutions(index, found, distortion)
 
     return solve_in_blocks(solve, x1, x2, 2)
 
 
+@dataclass(frozen=True)
 class DistanceEquation(SampleArrays):
-    """``|m|² (ŵ_1 ŵ_2)² - |m̂|² (w_1 w_2)² = 0``; rows: for each picture m_x, m_y, w_1, w_2, constants then slopes."""
+    """``|m|² (ŵ_1 ŵ_2)² - |m̂|² (w_1 w_2)² = 0``.
+
+    Attributes
+    ----------
+    linear : ndarray of shape (2, 4, 2, b)
+        Constants and slopes; m_x, m_y, w_1, w_2; picture, sample.
+    """
+
+    linear: FloatArray
 
     @classmethod
-    def from_points(cls, x1: FloatArray, x2: FloatArray, rotations: TiltRotations) -> "DistanceEquation":
-        """From points of shape (2, 2, B)."""
-        pictures = ((x1, rotations.first), (x2, rotations.second))
-        rows = [np.concatenate([differences(x, r, ((0, 1),))[:, :, 0], depths(x, r)], axis=1) for x, r in pictures]
-        return cls(np.stack(rows, axis=1))
-
-    def _factors(self, distortion: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        constant, slope = self.rows[:, :, :, None] if distortion.ndim > 1 else self.rows
-        (mx, my, w1, w2), (ox, oy, v1, v2) = constant + slope * distortion
-        return mx**2 + my**2, w1 * w2, ox**2 + oy**2, v1 * v2
+    def of(cls, difference: FloatArray, depth: FloatArray) -> "DistanceEquation":
+        """From :func:`rdstitch.solvers.plane.differences` and :func:`rdstitch.solvers.plane.depths`."""
+        return cls(np.concatenate([difference[:, :, :, 0], depth.swapaxes(1, 2)], axis=1))
 
     def polynomial(self, distortion: FloatArray) -> FloatArray:
         """The equation itself."""
-        m2, w, o2, v = self._factors(distortion)
-        return m2 * v**2 - o2 * w**2
+        constant, slope = self.linear[:, :, :, None] if distortion.ndim > 1 else self.linear
+        mx, my, w1, w2 = constant + slope * distortion
+        length, (w, v) = mx * mx + my * my, w1 * w2
+        value: FloatArray = length[0] * (v * v) - length[1] * (w * w)
+        return value

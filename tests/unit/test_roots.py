@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rdstitch.camera import FloatArray
+from rdstitch.solvers.batch import IndexArray
 from rdstitch.solvers.polynomials import (
     bernstein_from_values,
     bernstein_subdivision,
@@ -14,7 +15,7 @@ from rdstitch.solvers.polynomials import (
     chebyshev_nodes,
     chebyshev_value_and_slope,
 )
-from rdstitch.solvers.roots import IndexArray, real_roots
+from rdstitch.solvers.roots import real_roots
 
 
 @dataclass(frozen=True)
