@@ -28,6 +28,8 @@ _NEWTON_STEPS = 12
 FOCAL_LOG_STD = {"option": 0.01, "file": 0.01, "estimate": 0.05, "exif": 0.05, "guess": 0.3}
 """Standard deviation of the logarithm of a focal length, by where it comes from."""
 
+_FOCAL_LIMITS = 0.05, 1e3  # half diagonals; the widest fisheyes have 0.3
+
 _GUESSED_FOCAL = 1.2  # half diagonals: a 26 mm lens on 36 x 24 mm, in the middle of what phones and drones carry
 
 
@@ -97,6 +99,12 @@ def _two_coefficient_ratio(
     return np.where(solved, ratio, np.nan)
 
 
+def is_focal_length(focal: float, image_size: tuple[int, int]) -> bool:
+    """Whether a number can be a focal length, px, of pictures of a size; damaged files hold others."""
+    low, high = _FOCAL_LIMITS
+    return low < focal / (math.hypot(*image_size) / 2) < high
+
+
 @dataclass(frozen=True)
 class Camera:
     """One camera with one lens.
@@ -142,8 +150,8 @@ class Camera:
         numbers = (self.distortion, self.distortion2, *self.center)
         if not all(math.isfinite(value) for value in numbers):
             raise ArgumentError(f"camera has a value that is not finite: {numbers}")
-        if self.focal is not None and not (math.isfinite(self.focal) and self.focal > 0):
-            raise ArgumentError(f"focal length must be positive, not {self.focal}")
+        if self.focal is not None and not is_focal_length(self.focal, self.image_size):
+            raise ArgumentError(f"no lens has a focal length of {self.focal:g} px for {width} x {height} px")
         if self.focal_source is not None and self.focal_source not in FOCAL_LOG_STD:
             raise ArgumentError(f"unknown source of a focal length: {self.focal_source!r}")
         with np.errstate(all="ignore"):  # absurd values, from a damaged file, overflow

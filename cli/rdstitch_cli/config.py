@@ -48,10 +48,10 @@ def read_config(path: Path, commands: Mapping[str, click.Command], running: str)
     known[COMMON] = {key: option for options in known.values() for key, option in options.items()}
     found: dict[str, Any] = {}
     for table in sorted(tables, key=lambda name: name != COMMON):  # the command's own table wins
-        if table not in known:
-            raise InputError(f"{path}: there is no command {table!r}{_suggestion(table, known)}")
         if not isinstance(tables[table], dict):
             raise InputError(f"{path}: {table}: options belong into a table, such as [{COMMON}] or [{running}]")
+        if table not in known:
+            raise InputError(f"{path}: there is no command {table!r}{_suggestion(table, known)}")
         for key, value in tables[table].items():
             if key not in known[table]:
                 raise InputError(f"{path}: {table}.{key}: there is no such option{_suggestion(key, known[table])}")

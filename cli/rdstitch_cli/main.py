@@ -5,7 +5,9 @@ import os
 import signal
 import sys
 import traceback
+from contextlib import suppress
 from importlib.metadata import version
+from pathlib import Path
 from typing import Never
 
 import click
@@ -67,12 +69,24 @@ for command in (pano, mosaic, apply, calibrate, trajectory, undistort):
 
 def main() -> None:
     """Run the command line and leave with its exit status."""
+    _open_standard_streams()
     # Pictures and pairs are worked on side by side; threads within each matrix product would only be in the way.
     # NumPy reads this when it is loaded, which is later.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     for number in _ASKED_TO_END:
         signal.signal(number, _end)
     sys.exit(run(sys.argv[1:]))
+
+
+def _open_standard_streams() -> None:
+    """What was closed by whoever started this leads to nowhere: the next file opened must not become its successor."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            if nowhere != number:
+                os.dup2(nowhere, number)
+                os.close(nowhere)
+            setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8"))  # noqa: PTH123, SIM115
 
 
 def run(arguments: list[str]) -> int:
@@ -95,7 +109,9 @@ def run(arguments: list[str]) -> int:
         return _complain("out of memory; try smaller pictures or a smaller --scale", 7, debug)
     except Exception as error:  # noqa: BLE001 - the last line of defence: no traceback for users
         if isinstance(error, OSError) and error.errno in _NO_SPACE:
-            return _complain(f"{error.filename or 'a file'}: cannot be written: {error.strerror}", 6, debug)
+            return _complain(f"{error.filename or 'standard output'}: cannot be written: {error.strerror}", 6, debug)
+        if isinstance(error, FileNotFoundError) and _is_nowhere():
+            return _complain("the current folder does not exist any more; change to another one", 3, debug)
         text = str(error) or type(error).__name__
         hint = "" if debug else "; run again as 'rdstitch --debug ...' and report the traceback"
         return _complain(f"unexpected failure ({type(error).__name__}): {text}{hint}", _UNEXPECTED, debug)
@@ -132,6 +148,15 @@ def _nobody_listens() -> int:
     return _BROKEN_PIPE
 
 
+def _is_nowhere() -> bool:
+    """Whether the current folder has been deleted, so that relative names lead nowhere."""
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        return True
+    return False
+
+
 class _AskedToEndError(BaseException):
     """The system asked this process to end; what is half-written is cleared away on the way out."""
 
@@ -152,7 +177,9 @@ def _usage(error: click.ClickException) -> str:
 
 
 def _complain(text: str, status: int, debug: bool) -> int:
-    if debug and sys.exc_info()[0] is not None:
-        traceback.print_exc()
-    print(one_line(f"rdstitch: {text}"), file=sys.stderr)
+    # The status tells it to those who cannot be told otherwise.
+    with suppress(OSError):
+        if debug and sys.exc_info()[0] is not None:
+            traceback.print_exc()
+        print(one_line(f"rdstitch: {text}"), file=sys.stderr, flush=True)
     return status

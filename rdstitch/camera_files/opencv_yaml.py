@@ -40,7 +40,7 @@ def parse_yaml(text: str, file: str) -> Record:
     for number, line in _logical_lines(text):
         match = _FIELD.fullmatch(line)
         if match is None:
-            raise InputError(f"{file}: line {number}: is not what OpenCV writes as YAML")
+            raise InputError(f"{file}: line {number}: is not what OpenCV writes as YAML; no camera file?")
         value = (match["value"] or "").strip()
         if match["indent"]:
             if nested is None:

@@ -18,6 +18,7 @@ from rdstitch.radial_homography import to_plane
 # Straight sides are curved after undistortion: 64 points a side put the extremes within 0.02 px on 4000 px.
 _POINTS_PER_SIDE = 64
 _LARGEST_GROWTH = 100.0
+_LARGEST_ENLARGEMENT = 400.0  # px of the canvas for each of the pictures, where --scale asks for it
 
 
 @dataclass(frozen=True)
@@ -116,6 +117,7 @@ def plan_canvas(
     low = np.min([outline.min(axis=0) for outline in placed], axis=0)
     high = np.max([outline.max(axis=0) for outline in placed], axis=0)
     _refuse_absurd(cameras, placed, high - low, scale, called)
+    _refuse_scale(cameras, high - low)
     # The outermost edge is the canvas' edge, half a pixel before the centre of the first pixel.
     size = np.maximum(np.ceil(high - low - 1e-6), 1).astype(int)
     matrix = np.eye(3)
@@ -187,3 +189,10 @@ def _refuse_absurd(
             f"the canvas would have {extent[0]:.0f} x {extent[1]:.0f} px, over {_LARGEST_GROWTH:.0f} times all "
             f"pictures; {names[farthest]} lies farthest off: leave it out"
         )
+
+
+def _refuse_scale(cameras: Sequence[Camera], extent: FloatArray) -> None:
+    """Refuse a scale that leaves nothing of the pictures, or blows them up beyond all sense."""
+    pixels = sum(c.image_size[0] * c.image_size[1] for c in cameras)
+    if float(extent.min()) < 1.0 or float(np.prod(extent)) > _LARGEST_ENLARGEMENT * pixels:
+        raise LimitError(f"the canvas would have {extent[0]:.3g} x {extent[1]:.3g} px; use a --scale nearer to 1")

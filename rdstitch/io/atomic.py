@@ -59,6 +59,22 @@ def check_output(
     return file
 
 
+def check_distinct(paths: Iterable[str | Path]) -> None:
+    """Find out before long work whether two outputs would be written into one file.
+
+    Raises
+    ------
+    OutputError
+        When two of the names lead to the same place.
+    """
+    seen: set[Path] = set()
+    for file in map(Path, paths):
+        place = file.parent.resolve() / file.name
+        if place in seen:
+            raise OutputError(f"{file}: is the name of two outputs; choose another one for each")
+        seen.add(place)
+
+
 def _same_file(first: Path, second: Path) -> bool:
     """Whether two names lead to the same file; a missing file is the same as none."""
     try:

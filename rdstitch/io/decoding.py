@@ -15,6 +15,11 @@ from PIL import Image
 
 from rdstitch.errors import InputError
 
+FOREIGN_SUFFIXES = frozenset(
+    (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
+)
+"""Pictures of phones and cameras that nothing here can read; what TIFF readers see in raw files is their thumbnail."""
+
 # What Pillow, tifffile and OpenCV have been seen to raise on damaged files.
 _DAMAGE = (
     OSError,
@@ -45,6 +50,8 @@ def check_readable(path: Path) -> None:
     try:
         status = path.stat()
     except FileNotFoundError:
+        if str(path).startswith(("http:/", "https:/")):
+            raise InputError(f"{path}: is an address, not a file; download it first") from None
         hint = "a link to nothing" if path.is_symlink() else "no such file"
         raise InputError(f"{path}: {hint}; check the name") from None
     except (OSError, ValueError) as error:
@@ -55,6 +62,8 @@ def check_readable(path: Path) -> None:
         raise InputError(f"{path}: is not a regular file; copy it to one first")
     if status.st_size == 0:
         raise InputError(f"{path}: is empty (0 bytes); copy it again from its source")
+    if path.suffix.lower() in FOREIGN_SUFFIXES:
+        raise InputError(f"{path}: {path.suffix} is not read here; convert it to JPEG or TIFF first")
     if not os.access(path, os.R_OK):
         raise InputError(f"{path}: permission denied; make it readable")
 

@@ -8,6 +8,7 @@ from typing import Any
 import tifffile
 from PIL import ExifTags, Image, UnidentifiedImageError
 
+from rdstitch.camera import is_focal_length
 from rdstitch.io.attitude import Attitude, read_attitude
 from rdstitch.io.decoding import check_readable, decoding
 from rdstitch.io.orientation import SIDEWAYS, turned_direction
@@ -153,7 +154,7 @@ def _focal_px(
 ) -> tuple[float | None, str | None]:
     """Focal length in px and the tag it comes from, the most direct tag first."""
     calibrated = xmp_number(xmp, "CalibratedFocalLength")
-    if calibrated and calibrated > 0:
+    if calibrated and is_focal_length(calibrated, size):
         return calibrated, "CalibratedFocalLength"
     focal = finite(photo.get(ExifTags.Base.FocalLength))
     resolution = finite(photo.get(ExifTags.Base.FocalPlaneXResolution))
@@ -162,10 +163,10 @@ def _focal_px(
         # The resolution counts pixels of the original; a resized picture keeps the tag.
         original = finite(photo.get(_PIXEL_WIDTH)) or size[0]
         focal_px = focal * resolution / unit * size[0] / original
-        if 0.1 < focal_px / math.hypot(*size) < 100.0:
+        if is_focal_length(focal_px, size):
             return focal_px, "FocalPlaneXResolution"
     equivalent = finite(photo.get(ExifTags.Base.FocalLengthIn35mmFilm))
-    if equivalent and equivalent > 0:
+    if equivalent and is_focal_length(equivalent, (36, 24)):
         return equivalent / _DIAGONAL_35MM * math.hypot(*size), "FocalLengthIn35mmFilm"
     return None, None
 

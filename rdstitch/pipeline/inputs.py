@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from rdstitch.errors import InputError
+from rdstitch.io.decoding import FOREIGN_SUFFIXES
 from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames
 
 PICTURE_SUFFIXES = frozenset(
@@ -87,11 +88,15 @@ def _listed(file: Path) -> list[str]:
 
 
 def _in_folder(folder: Path) -> list[Path]:
+    """The pictures of a folder, and those that nobody here can read: who reads them will say so."""
     try:
-        entries = [path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES]
+        entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
     except OSError as error:
         raise InputError(f"{folder}: cannot read the folder: {error.strerror}") from error
-    found = [path for path in entries if not path.name.startswith(".") and not _own_work(path)]
+    found = [path for path in entries if path.suffix.lower() in PICTURE_SUFFIXES and not _own_work(path)]
+    # Many cameras write a raw file beside each picture.
+    stems = {path.stem for path in found}
+    found += [path for path in entries if path.suffix.lower() in FOREIGN_SUFFIXES and path.stem not in stems]
     if not found:
         raise InputError(f"{folder}: there are no pictures in this folder")
     return sorted(found, key=natural_key)

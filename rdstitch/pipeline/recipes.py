@@ -11,7 +11,7 @@ import numpy as np
 
 from rdstitch.camera_files import CAMERA_SUFFIXES, save_camera
 from rdstitch.errors import ArgumentError, InputError, PartialResultError, RegistrationError
-from rdstitch.io.atomic import check_output, write_json_atomic, write_text_atomic
+from rdstitch.io.atomic import check_distinct, check_output, write_json_atomic, write_text_atomic
 from rdstitch.pipeline.attitudes import with_attitudes
 from rdstitch.pipeline.cache import Cache
 from rdstitch.pipeline.composing import compose_pictures
@@ -154,9 +154,10 @@ def trajectory(
     """
     options = options or StitchOptions()
     with _pictures(inputs, None, every) as paths:
-        for file in (output, plot):
-            if file is not None:
-                check_output(file, options.overwrite, paths, suffixes=())
+        files = [file for file in (output, plot) if file is not None]
+        for file in files:
+            check_output(file, options.overwrite, paths, suffixes=())
+        check_distinct(files)
         registration = _register_all(paths, options, progress, metric=True)
         registration = _warned(registration, _accept(registration, options))
     path = Trajectory.from_alignment(registration.alignment, height)
@@ -190,6 +191,7 @@ def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Se
         check_output(f"{output}.json", options.overwrite, inputs, suffixes=())
     if options.save_camera is not None:
         check_output(options.save_camera, options.overwrite, inputs, suffixes=CAMERA_SUFFIXES)
+        check_distinct([options.save_camera, *([] if output is None else [f"{output}.json"])])
 
 
 def _read(paths: Sequence[str | Path], options: StitchOptions, *, skip_bad: bool) -> tuple[list[Source], list[LeftOut]]:
