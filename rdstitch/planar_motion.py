@@ -18,8 +18,9 @@ from rdstitch.camera import FloatArray
 def rotation_from_tilt(tilt: ArrayLike) -> FloatArray:
     """``R = Rx(ψ) Ry(θ)`` for tilts (ψ, θ) of shape (..., 2), radians; shape (..., 3, 3)."""
     angles = np.asarray(tilt, dtype=np.float64)
-    sin_x, sin_y = np.moveaxis(np.sin(angles), -1, 0)
-    cos_x, cos_y = np.moveaxis(np.cos(angles), -1, 0)
+    sine, cosine = np.sin(angles), np.cos(angles)
+    sin_x, sin_y = sine[..., 0], sine[..., 1]
+    cos_x, cos_y = cosine[..., 0], cosine[..., 1]
     rotation = np.zeros((*angles.shape[:-1], 3, 3))
     rotation[..., 0, 0] = cos_y
     rotation[..., 0, 2] = sin_y

@@ -15,7 +15,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from rdstitch.camera import FloatArray, distort
-from rdstitch.radial_homography import lift, measurement_whitening, project, transfer_jacobian
+from rdstitch.radial_homography import lift, measurement_whitening, project, transfer_jacobian, whiten
 from rdstitch.registration.models import BoolArray, ModelMatrices, inverses
 from rdstitch.registration.observations import Observations
 
@@ -140,15 +140,7 @@ def _whitened(
     whitening = measurement_whitening(result.by_point * (scale2 / scale1)) * scale2
     jacobian = np.concatenate([result.by_homography, result.by_lens], axis=2)
     error = result.points - (observations.points2[rows] - lens[2:])
-    return _whiten(whitening, jacobian), _whiten(whitening, error[:, :, None])[:, :, 0], whitening
-
-
-def _whiten(whitening: FloatArray, values: FloatArray) -> FloatArray:
-    """``W v`` of values (m, 2, k), W upper triangular; written out, which is several times faster than matmul."""
-    result = np.empty_like(values)
-    result[:, 0] = whitening[:, 0, :1] * values[:, 0] + whitening[:, 0, 1:] * values[:, 1]
-    result[:, 1] = whitening[:, 1, 1:] * values[:, 1]
-    return result
+    return whiten(whitening, jacobian), whiten(whitening, error[:, :, None])[:, :, 0], whitening
 
 
 @dataclass(frozen=True)

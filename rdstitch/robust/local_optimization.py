@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.camera import FloatArray
-from rdstitch.radial_homography import measurement_whitening, transfer_jacobian
+from rdstitch.radial_homography import measurement_whitening, transfer_jacobian, whiten
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import PairModel
 
-_LEAST_GAIN = 1e-6  # relative fall of the loss that is worth another step
+_LEAST_GAIN = 1e-5  # expected relative fall of the loss that is worth another step: a hundredth of the noise
 _LARGEST_BEND = 0.98  # |λ| in the half-diagonal frame; beyond, the lens model folds at the corner
 
 
@@ -100,16 +100,15 @@ def refine(
             step = np.asarray(-np.linalg.solve(damped, current.gradient), dtype=np.float64)
         except np.linalg.LinAlgError:
             break
+        if -(step @ current.gradient) <= _LEAST_GAIN * current.cost:
+            break
         moved_distortion = distortion if fixed_distortion else float(distortion + step[0])
         moved_state = model.retract(state, step[first:])
         if abs(moved_distortion) < _LARGEST_BEND and np.isfinite(moved_state).all():
             moved = _linearize(model, moved_state, moved_distortion, data, scale, fixed_distortion, noise)
             if moved.cost < current.cost:
-                gain = (current.cost - moved.cost) / current.cost
                 state, distortion, current = moved_state, moved_distortion, moved
                 damping = max(damping / 10.0, 1e-9)
-                if gain < _LEAST_GAIN:
-                    break
                 continue
         damping *= 20.0
         if damping > 1e4:
@@ -132,7 +131,7 @@ def _linearize(
     lost = ~np.isfinite(residuals).all(axis=1)
     lens = transfer.by_lens[:, :, :0] if fixed_distortion else transfer.by_lens[:, :, :1]
     whitening = measurement_whitening(transfer.by_point * data.px_ratio)
-    residuals = np.einsum("nij,nj->ni", whitening, residuals)
+    residuals = whiten(whitening, residuals[:, :, None])[:, :, 0]
     residuals[lost] = 0.0
     errors2 = np.einsum("ni,ni->n", residuals, residuals)
     relative = 1.0 / (1.0 + errors2 / scale**2)
@@ -140,7 +139,7 @@ def _linearize(
 
     # The normal matrix is formed by the entries of H, whatever the model, and only then by the model's parameters.
     columns = np.concatenate([lens, transfer.by_homography], axis=2)
-    columns = (whitening * (data.px * relative)[:, None, None]) @ columns
+    columns = whiten(whitening * (data.px * relative)[:, None, None], columns)
     columns[lost] = 0.0
     flat = columns.reshape(-1, columns.shape[2])
     by_state = model.jacobian(state)
@@ -154,7 +153,7 @@ def _linearize(
 
     prior, by_prior = model.prior(state)
     if len(prior):
-        by_prior = np.pad(by_prior, ((0, 0), (lens.shape[2], 0)))
+        by_prior = np.hstack([np.zeros((len(prior), lens.shape[2])), by_prior])
         information = information + noise**2 * by_prior.T @ by_prior
         gradient = gradient + noise**2 * by_prior.T @ prior
         cost += noise**2 * float(prior @ prior)
