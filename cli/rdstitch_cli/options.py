@@ -98,14 +98,12 @@ class Angle(click.ParamType[float]):
 
 def resolve(inputs: tuple[Path, ...]) -> list[Path]:
     """The inputs, with - replaced by the names on standard input, one a line or separated by NUL."""
+    from rdstitch.pipeline.inputs import names_in
+
     named: list[Path] = []
     for item in inputs:
-        if str(item) != "-":
-            named.append(item)
-            continue
-        data = sys.stdin.buffer.read()
-        names = data.split(b"\0") if b"\0" in data else data.splitlines()
-        named.extend(Path(os.fsdecode(name)) for name in names if name)
+        listed = names_in(os.fsdecode(sys.stdin.buffer.read())) if str(item) == "-" else [item]
+        named.extend(map(Path, listed))
     return named
 
 

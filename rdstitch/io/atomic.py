@@ -67,9 +67,9 @@ def check_distinct(paths: Iterable[str | Path]) -> None:
     OutputError
         When two of the names lead to the same place.
     """
-    seen: set[Path] = set()
+    seen: set[tuple[str, str]] = set()
     for file in map(Path, paths):
-        place = file.parent.resolve() / file.name
+        place = os.path.realpath(file.parent), file.name
         if place in seen:
             raise OutputError(f"{file}: is the name of two outputs; choose another one for each")
         seen.add(place)

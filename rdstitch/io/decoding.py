@@ -20,6 +20,10 @@ FOREIGN_SUFFIXES = frozenset(
 )
 """Pictures of phones and cameras that nothing here can read; what TIFF readers see in raw files is their thumbnail."""
 
+# What they log is for programs that listen; without anybody, it would go to standard error.
+for _name in ("PIL", "tifffile"):
+    logging.getLogger(_name).addHandler(logging.NullHandler())
+
 # What Pillow, tifffile and OpenCV have been seen to raise on damaged files.
 _DAMAGE = (
     OSError,
@@ -71,8 +75,6 @@ def check_readable(path: Path) -> None:
 @contextmanager
 def decoding(path: Path) -> Iterator[None]:
     """Run a decoder: its warnings are swallowed, its failures become an InputError that names the file."""
-    logger = logging.getLogger("tifffile")
-    was_disabled, logger.disabled = logger.disabled, True
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -87,5 +89,3 @@ def decoding(path: Path) -> Iterator[None]:
         reason = " ".join(str(error).split()) or type(error).__name__
         reason = reason.replace(f"'{path}'", "the file")
         raise InputError(f"{path}: not a picture that can be read, or damaged ({reason[:160]})") from error
-    finally:
-        logger.disabled = was_disabled

@@ -2,6 +2,7 @@
 
 import glob
 import json
+import os
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 from rdstitch.errors import InputError
 from rdstitch.io.decoding import FOREIGN_SUFFIXES
 from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames
+from rdstitch.records import read_text
 
 PICTURE_SUFFIXES = frozenset(
     (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".jp2", ".ppm", ".pgm", ".pnm", ".gif")
@@ -28,8 +30,8 @@ def find_pictures(
     Parameters
     ----------
     arguments : iterable of path
-        Each a picture file, a folder, a pattern (``*``, ``?``, ``[...]``), ``@FILE`` with one argument a line, or a
-        video file.
+        Each a picture file, a folder, a pattern (``*``, ``?``, ``[...]``), ``@FILE`` with one argument a line or
+        separated by NUL, or a video file.
     exclude : iterable of path
         Files that are no input, such as the output, where they come from a folder or pattern or are rdstitch's own
         work. Any other picture that is named stays: its user must hear that it would be written over. Pictures in
@@ -54,7 +56,9 @@ def find_pictures(
 
 def _entry(path: Path) -> Path:
     """Where a name stands, links to folders followed but the last link not."""
-    return path.parent.resolve() / path.name
+    return (
+        Path(os.path.realpath(path.parent)) / path.name
+    )  # which, unlike Path.resolve, makes do with links in a circle
 
 
 def natural_key(path: Path) -> list[tuple[int, str | int]]:
@@ -62,29 +66,44 @@ def natural_key(path: Path) -> list[tuple[int, str | int]]:
     return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", str(path)) if part]
 
 
-def _expand(arguments: Iterable[str | Path], frames_folder: Path | None, every: int) -> Iterator[tuple[Path, bool]]:
-    """Every picture, and whether it was named one by one."""
+def _expand(
+    arguments: Iterable[str | Path], frames_folder: Path | None, every: int, lists: tuple[Path, ...] = ()
+) -> Iterator[tuple[Path, bool]]:
+    """Every picture, and whether it was named one by one; ``lists`` are those that the arguments come from."""
     for argument in arguments:
         path, text = Path(argument), str(argument)
-        if text.startswith("@") and not path.exists():
-            yield from _expand(_listed(Path(text[1:])), frames_folder, every)
+        if not _exists(path):
+            if text.startswith("@"):
+                file = Path(text[1:])
+                if file in lists:
+                    raise InputError(f"{file}: the list of pictures names itself")
+                yield from _expand(names_in(read_text(file)), frames_folder, every, (*lists, file))
+            elif glob.has_magic(text):
+                yield from ((found, False) for found in _matching(text))
+            else:
+                yield path, True
         elif path.is_dir():
             yield from ((found, False) for found in _in_folder(path))
-        elif path.suffix.lower() in VIDEO_SUFFIXES and path.exists():
+        elif path.suffix.lower() in VIDEO_SUFFIXES:
             if frames_folder is None:
                 raise InputError(f"{path}: a video is no picture here; use 'rdstitch mosaic' or extract its frames")
             yield from ((frame, True) for frame in extract_frames(path, frames_folder, every))
-        elif not path.exists() and glob.has_magic(text):
-            yield from ((found, False) for found in _matching(text))
         else:
             yield path, True
 
 
-def _listed(file: Path) -> list[str]:
+def _exists(path: Path) -> bool:
+    """Whether there is a file; who reads it will say why one cannot be looked for."""
     try:
-        return [line for line in file.read_text(encoding="utf-8", errors="surrogateescape").splitlines() if line]
-    except OSError as error:
-        raise InputError(f"{file}: cannot read the list of pictures: {error.strerror}") from error
+        return path.exists()
+    except OSError:
+        return False
+
+
+def names_in(text: str) -> list[str]:
+    """The names in a list: separated by NUL, if there is one, else one a line."""
+    names = text.split("\0") if "\0" in text else re.split(r"\r?\n", text)
+    return [name for name in names if name]
 
 
 def _in_folder(folder: Path) -> list[Path]:
@@ -116,5 +135,5 @@ def _own_work(path: Path) -> bool:
     try:
         with sidecar.open(encoding="utf-8") as stream:
             return bool(json.loads(stream.read()).get("format") == "rdstitch sidecar")
-    except (OSError, ValueError, AttributeError):
+    except (OSError, ValueError, AttributeError, RecursionError):
         return False

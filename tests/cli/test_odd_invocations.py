@@ -102,3 +102,25 @@ def test_a_current_folder_that_was_deleted(place: Path) -> None:
     assert "current folder" in done.line
     done = finished(start("mosaic", place / "more", "-o", place / "out.png", *FAST, program=gone))
     assert (done.status, done.err) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ("@list.txt\n", "list.txt: the list of pictures names itself"),
+        ("x" * 300, "File name too long"),
+        ("a/" * 3000, "File name too long"),
+        ("[ab].png\0missing\n.png", "missing .png: no such file"),
+        ("\ufeffa.png\r\nmissing.png\r\n", "missing.png: no such file"),
+    ],
+)
+def test_odd_lists(rdstitch: Run, place: Path, content: str, told: str) -> None:
+    (place / "list.txt").write_text(content, encoding="utf-8", newline="")
+    done = rdstitch("mosaic", "@list.txt", "-o", "out.png", "--strict", *FAST)
+    assert done.status in (3, 5), done.err
+    assert told in done.line
+
+
+def test_a_file_beside_a_picture_that_is_no_sidecar(rdstitch: Run, place: Path) -> None:
+    (place / "more" / "frame_0000.png.json").write_text("[" * 100_000, encoding="utf-8")
+    assert rdstitch("mosaic", "more", "-o", "out.png", *FAST).status == 0

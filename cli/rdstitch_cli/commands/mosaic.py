@@ -49,8 +49,8 @@ def mosaic(
 ) -> None:
     """Stitch a whole sequence over one plane, seen straight from above.
 
-    INPUT is a folder, a picture, a quoted pattern, @FILE with one input a line, - for such lines (or NUL-separated
-    names) on standard input, or a video. Pictures that do not fit are left out and named on standard error.
+    INPUT is a folder, a picture, a quoted pattern, @FILE with one input a line (or separated by NUL), - for such a
+    list on standard input, or a video. Pictures that do not fit are left out and named on standard error.
     """
     from rdstitch.pipeline import mosaic as recipe
 

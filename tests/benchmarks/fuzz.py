@@ -1,0 +1,238 @@
+"""Does any parser do anything with a damaged file but read it, or complain in one line that names it?
+
+python -m tests.benchmarks.fuzz [--minutes 10] [--seed 0] [--only sidecar] [--keep FOLDER]
+
+Good files are damaged at random: bits and bytes, numbers, words and lines changed, swapped, doubled, cut out, ends cut
+off, deep nesting put in. Each parser runs in a process of its own, so that a crash of a decoder is seen too; what a
+parser stumbles over is kept.
+"""
+
+import argparse
+import io
+import json
+import multiprocessing
+import random
+import resource
+import signal
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from PIL import Image
+from rdstitch_cli.config import read_config
+from rdstitch_cli.main import cli
+from rdstitch_cli.progress import one_line
+
+from rdstitch.camera import Camera
+from rdstitch.camera_files import load_camera
+from rdstitch.errors import RdstitchError
+from rdstitch.features import Features
+from rdstitch.io import packing, read_image, read_metadata
+from rdstitch.io.mask import read_mask
+from rdstitch.io.metadata import Metadata
+from rdstitch.pipeline.attitudes import with_attitudes
+from rdstitch.pipeline.inputs import find_pictures
+from rdstitch.pipeline.saved import read_sidecar
+from rdstitch.pipeline.sources import Source
+from rdstitch.registration.alignment import Poses, Relief
+from tests.damage import damaged
+from tests.property.test_camera_file_reading import TEXTS as CAMERA_FILES
+from tests.property.test_picture_reading import FILES as PICTURES
+from tests.property.test_sidecar_reading import GOOD as SIDECAR
+
+_SECONDS = 30  # a read that takes longer hangs
+_MEMORY = 6 * 2**30  # bytes; a read that needs more is a bomb
+_LARGEST = 2_000_000  # px of a picture that is decoded: fields that claim more cost nothing to say
+
+
+@dataclass(frozen=True)
+class Parser:
+    """What reads a kind of file, and good files of it."""
+
+    name: str
+    good: tuple[bytes, ...]
+    read: Callable[[Path], Any]
+    file: str = "file"
+
+
+def _encoded(kind: str, mode: str, **options: Any) -> bytes:
+    stream = io.BytesIO()
+    samples = np.random.default_rng(5).integers(0, 256, (20, 30, 3), dtype=np.uint8)
+    Image.fromarray(samples).convert(mode).save(stream, kind, **options)
+    return stream.getvalue()
+
+
+def _tiff(samples: Any, **options: Any) -> bytes:
+    stream = io.BytesIO()
+    tifffile.imwrite(stream, samples, **options)
+    return stream.getvalue()
+
+
+def _pictures() -> tuple[bytes, ...]:
+    rng = np.random.default_rng(6)
+    deep = rng.integers(0, 65536, (20, 30, 3), dtype=np.uint16)
+    return (
+        *PICTURES.values(),
+        *(_encoded("JPEG", mode, progressive=True) for mode in ("L", "CMYK")),
+        *(_encoded("PNG", mode) for mode in ("1", "P", "LA", "RGBA", "I;16")),
+        *(_encoded("TIFF", "RGB", compression=name) for name in ("packbits", "tiff_lzw", "jpeg")),
+        _tiff(deep, photometric="rgb"),
+        _tiff(rng.random((20, 30, 5)).astype(np.float32), planarconfig="separate", photometric="minisblack"),
+        _tiff(deep, photometric="rgb", tile=(16, 16), compression="zlib", predictor=True),
+        _tiff(deep, photometric="rgb", bigtiff=True, rowsperstrip=3),
+        *(_encoded(kind, "RGB") for kind in ("BMP", "GIF", "PPM")),
+        _encoded("JPEG2000", "RGB"),
+    )
+
+
+def _picture(file: Path) -> Any:
+    metadata = read_metadata(file)
+    return read_image(file) if metadata.size[0] * metadata.size[1] < _LARGEST else metadata
+
+
+def _mask(file: Path) -> Any:
+    width, height = read_metadata(file).size
+    return read_mask(file, (width, height)) if width * height < _LARGEST else None
+
+
+def _entries() -> tuple[bytes, ...]:
+    """What the cache holds, without the digest that guards it."""
+    rng = np.random.default_rng(7)
+    camera = Camera((400, 300), -0.2, focal=380.0, focal_source="exif", distortion_std=float("inf"))
+    numbers = rng.random(9)
+    descriptors = rng.random((9, 8)).astype(np.float32)
+    features = Features(rng.random((9, 2)), descriptors, numbers, numbers, numbers, None, "sift", (400, 300))
+    poses = Poses(rng.random(3), rng.random((3, 2)), rng.random(3), rng.random((3, 2)))
+    values = ("name", features), {"cameras": (camera, camera), "poses": poses, "file": Path("a/b"), "none": None}
+    return tuple(packing.pack(value)[packing._HEAD - 8 :] for value in values)
+
+
+def _entry(file: Path) -> Any:
+    body = file.read_bytes()
+    data = packing._MAGIC + sha256(body).digest() + body
+    # The cache computes again; nobody is told.
+    return _by_name(file, partial(packing.unpack, data, (Camera, Features, Poses, Relief)))
+
+
+def _attitudes(file: Path) -> Any:
+    sources = [Source(Path(f"{name}.jpg"), Metadata((400, 300)), Camera((400, 300))) for name in "ab"]
+    return with_attitudes(sources, file)
+
+
+def _configuration(file: Path) -> Any:
+    return read_config(file, cli.commands, "mosaic")
+
+
+def _list(file: Path) -> Any:
+    # What is named in the list is complained about by that name.
+    return _by_name(file, partial(find_pictures, [f"@{file}"]))
+
+
+def _by_name(file: Path, read: Callable[[], Any]) -> Any:
+    """Read what cannot know or need not say what it is read from."""
+    try:
+        return read()
+    except RdstitchError as error:
+        raise type(error)(one_line(f"{file}: {error}")) from error
+
+
+def _own_work(file: Path) -> Any:
+    """A folder with one picture beside which this file lies as its sidecar."""
+    (file.parent / "a.png").write_bytes(PICTURES["png"])
+    return find_pictures([file.parent])
+
+
+_CONFIGURATIONS = (
+    b'[common]\nfeatures = "sift"\nwork-megapixels = 2.5\noverwrite = true\nworkers = 2\n\n[mosaic]\nscale = 0.5\n'
+    b'blend = "feather"\ntilt = "1.5,-0.5"\nmax-memory = "800M"\n[trajectory]\nformat = "tum"\nheight = 0.42\n',
+    b'[pano]\nlambda = -0.2\nattitude-std = "0.5"\nseed = 0x10\n[apply]\ncrop = """auto"""\nmatch = "name"\n',
+)
+_TABLES = b"name,psi,theta\na.jpg,1.5,-2\nb.jpg,0,0\n", b'theta,"x",psi,name\r\n1,2,3,"a.jpg"\r\n4,5,6,b.jpg'
+_LISTS = b"a.jpg\nb c.jpg\n\n*.png\n@list\n", b"/nowhere/[a]?.tif\r\nx\0y\n"
+
+PARSERS = (
+    Parser("sidecar", (json.dumps(SIDECAR).encode(), json.dumps(SIDECAR, indent=2).encode()), read_sidecar),
+    Parser("camera file", tuple(text.encode() for text in CAMERA_FILES), load_camera),
+    Parser("config file", _CONFIGURATIONS, _configuration),
+    Parser("cache entry", _entries(), _entry),
+    Parser("attitude table", _TABLES, _attitudes),
+    Parser("list", _LISTS, _list),
+    Parser("sidecar beside a picture", (json.dumps(SIDECAR).encode(),), _own_work, "a.png.json"),
+    Parser("picture", _pictures(), _picture),
+    Parser("mask", tuple(_encoded("PNG", mode) for mode in ("1", "L", "RGBA", "I;16")), _mask),
+)
+
+
+def problem_of(parser: Parser, file: Path) -> str:
+    """What is wrong with how a file was received; empty if nothing is."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            parser.read(file)
+    except RdstitchError as error:
+        named = str(file.parent) in str(error)
+        return "" if named and "\n" not in str(error) else f"complains without the name, or in lines: {error}"
+    except Exception:  # noqa: BLE001 - whatever it is, it is what is looked for
+        return traceback.format_exc()
+    return ""
+
+
+def _fuzz(parser: Parser, seed: int, seconds: float, folder: Path) -> None:
+    """Damage files until the time is over or one of them is received badly; the last file stays."""
+    signal.signal(signal.SIGALRM, lambda number, frame: sys.exit("hangs"))
+    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
+    rng, file = random.Random(f"{parser.name} {seed}"), folder / parser.file
+    start, count = time.monotonic(), 0
+    while time.monotonic() - start < seconds:
+        file.write_bytes(damaged(rng, rng.choice(parser.good), parser.good))
+        signal.alarm(_SECONDS)
+        problem = problem_of(parser, file)
+        signal.alarm(0)
+        count += 1
+        if problem:
+            sys.exit(f"after {count} files: {problem}")
+    print(f"{parser.name}: {count} damaged files, nothing wrong", flush=True)
+
+
+def main() -> None:
+    """Fuzz one parser after the other; the status is 1 when one of them stumbled."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--minutes", type=float, default=10.0, help="for all parsers together")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", choices=[item.name for item in PARSERS])
+    parser.add_argument("--keep", type=Path, default=Path(), help="folder for files that something stumbled over")
+    wanted = parser.parse_args()
+    chosen = [item for item in PARSERS if wanted.only in (None, item.name)]
+    failed = 0
+    for item in chosen:
+        for good in item.good:
+            with tempfile.TemporaryDirectory() as folder:
+                file = Path(folder) / item.file
+                file.write_bytes(good)
+                if problem := problem_of(item, file):
+                    raise SystemExit(f"{item.name}: a good file is not read: {problem}")
+        with tempfile.TemporaryDirectory() as folder:
+            share = 60.0 * wanted.minutes / len(chosen)
+            process = multiprocessing.Process(target=_fuzz, args=(item, wanted.seed, share, Path(folder)))
+            process.start()
+            process.join()
+            if process.exitcode:
+                failed += 1
+                kept = wanted.keep / f"{item.name.replace(' ', '_')}_{wanted.seed}"
+                kept.write_bytes((Path(folder) / item.file).read_bytes())
+                print(f"{item.name}: stumbled (status {process.exitcode}); the file is {kept}", flush=True)
+    raise SystemExit(1 if failed else 0)
+
+
+if __name__ == "__main__":
+    main()
