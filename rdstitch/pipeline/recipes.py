@@ -25,10 +25,13 @@ from rdstitch.pipeline.result import StitchResult
 from rdstitch.pipeline.sidecar import sidecar
 from rdstitch.pipeline.sources import LeftOut, Source, read_sources
 from rdstitch.pipeline.verdict import Verdict, judge
+from rdstitch.registration import Alignment
 from rdstitch.registration.trajectory import Trajectory
 
 Inputs = Iterable[str | Path]
 Layout = Literal["csv", "tum"]
+
+_SURE_LENGTHS = 0.05  # share that lengths may be off by, as far as the focal length is, without a word
 
 
 def pano(
@@ -118,7 +121,7 @@ def calibrate(
         registration = _register_all(paths, options, progress)
         verdict = _accept(registration, options, lens_only=True)
     _save_camera(registration, options)
-    return _warned(registration, verdict)
+    return _warned(registration, verdict.complaints)
 
 
 def trajectory(
@@ -159,7 +162,8 @@ def trajectory(
             check_output(file, options.overwrite, paths, suffixes=())
         check_distinct(files)
         registration = _register_all(paths, options, progress, metric=True)
-        registration = _warned(registration, _accept(registration, options))
+        verdict = _accept(registration, options)
+    registration = _warned(registration, (*verdict.complaints, *_unsure_of_lengths(registration.alignment)))
     path = Trajectory.from_alignment(registration.alignment, height)
     if output is not None:
         write_text_atomic(output, path.as_csv() if layout == "csv" else path.as_tum())
@@ -253,11 +257,19 @@ def _accept(registration: Registration, options: StitchOptions, *, lens_only: bo
     return verdict
 
 
-def _warned(registration: Registration, verdict: Verdict) -> Registration:
+def _warned(registration: Registration, complaints: Iterable[str]) -> Registration:
     """The registration with what is wrong or doubtful among its warnings."""
     alignment = registration.alignment
-    warned = replace(alignment, warnings=(*alignment.warnings, *verdict.complaints))
+    warned = replace(alignment, warnings=(*alignment.warnings, *complaints))
     return replace(registration, alignment=warned)
+
+
+def _unsure_of_lengths(alignment: Alignment) -> list[str]:
+    """What to say where the focal length, and with it the length of every step, is hardly known."""
+    unsure = 0.0 if alignment.focal is None or alignment.focal_std is None else alignment.focal_std / alignment.focal
+    if unsure <= _SURE_LENGTHS:
+        return []
+    return [f"all lengths may be off together by {unsure:.0%}: the pictures hardly tell the focal length; give --focal"]
 
 
 def _save_camera(registration: Registration, options: StitchOptions) -> None:

@@ -55,7 +55,7 @@ def trajectory(
     """Find where the camera was for each picture: x, y and yaw over the plane.
 
     INPUT is what 'rdstitch mosaic' takes. Positions are in units of the first picture's height above the plane, or in
-    metres when --height says how many those are.
+    metres when --height says how many those are; they are as good as the focal length (see --focal).
     """
     from rdstitch.pipeline import trajectory as recipe
 
