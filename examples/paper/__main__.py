@@ -6,8 +6,8 @@ import time
 from importlib import import_module
 from pathlib import Path
 
-from examples.paper.report import save
-from examples.paper.settings import Effort, Settings
+from examples.paper.common.report import save
+from examples.paper.common.settings import Effort, Settings
 
 FIGURES = {
     "runtime": "time per instance of the solvers",

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from examples.paper.report import Pixels, Report, Table
-from examples.paper.settings import Effort, Settings
-from examples.paper.stitchers import Stitcher, installed_stitchers
-from examples.paper.subprocesses import Run, run_all
+from examples.paper.common.report import Pixels, Report, Table
+from examples.paper.common.settings import Effort, Settings
+from examples.paper.common.stitchers import Stitcher, installed_stitchers
+from examples.paper.common.subprocesses import Run, run_all
 from rdstitch.camera import Camera
 from rdstitch.io.read import read_image
 from rdstitch.synthetic import (
@@ -85,7 +85,7 @@ def run(settings: Settings) -> Report:
         chosen, stitchers = [_TINY], stitchers[:2]
     else:
         chosen = list(SETS[: settings.count(1, 1, len(SETS))])
-    timeout = float(settings.count(60, 120, 120))
+    timeout = float(settings.count(60, 120, 600))
     tables, pictures = [], {}
     for number, picture_set in enumerate(chosen):
         with TemporaryDirectory(prefix="rdstitch-peers-") as folder:

@@ -12,10 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from examples.paper.aerial import adjusted_centres, bend, chained_centres, drift, laid_on, rendered_survey, true_centres
-from examples.paper.report import Report, Table
-from examples.paper.settings import Effort, Settings
-from examples.paper.stitched import register_files, registration_error
+from examples.paper.common.aerial import (
+    adjusted_centres,
+    bend,
+    chained_centres,
+    drift,
+    laid_on,
+    rendered_survey,
+    true_centres,
+)
+from examples.paper.common.report import Report, Table
+from examples.paper.common.settings import Effort, Settings
+from examples.paper.common.stitched import register_files, registration_error
 from rdstitch.camera import FloatArray
 from rdstitch.features import FeatureOptions
 from rdstitch.pipeline import StitchOptions

@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 
-from examples.paper.contenders import known_tilt, unknown_tilt
-from examples.paper.peers import absent
-from examples.paper.plots import histograms
-from examples.paper.report import Report, Table
-from examples.paper.settings import Settings
+from examples.paper.common.contenders import known_tilt, unknown_tilt
+from examples.paper.common.peers import absent
+from examples.paper.common.plots import histograms
+from examples.paper.common.report import Report, Table
+from examples.paper.common.settings import Settings
 from rdstitch.camera import FloatArray
 from rdstitch.synthetic import planar_instances
 

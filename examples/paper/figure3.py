@@ -1,11 +1,11 @@
 """Fig. 3: errors against noise, tilt unknown; which constraint of planar motion serves four points best."""
 
-from examples.paper.constraints import by_constraint
-from examples.paper.contenders import unknown_tilt
-from examples.paper.noise import WITNESSES, sweep
-from examples.paper.peers import absent
-from examples.paper.report import Report
-from examples.paper.settings import Settings
+from examples.paper.common.constraints import by_constraint
+from examples.paper.common.contenders import unknown_tilt
+from examples.paper.common.noise import WITNESSES, sweep
+from examples.paper.common.peers import absent
+from examples.paper.common.report import Report
+from examples.paper.common.settings import Settings
 from rdstitch.synthetic import PlanarInstances, planar_instances
 
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from examples.paper.contenders import Contender, known_tilt, unknown_tilt
-from examples.paper.noise import WITNESSES, sweep
-from examples.paper.peers import absent
-from examples.paper.report import Report
-from examples.paper.settings import Settings
+from examples.paper.common.contenders import Contender, known_tilt, unknown_tilt
+from examples.paper.common.noise import WITNESSES, sweep
+from examples.paper.common.peers import absent
+from examples.paper.common.report import Report
+from examples.paper.common.settings import Settings
 from rdstitch import solvers
 from rdstitch.camera import FloatArray
 from rdstitch.solvers import Solutions

@@ -1,9 +1,9 @@
 """Fig. 5: a pair through a fisheye lens, which is no division model, rectified and stitched; and a real pair."""
 
-from examples.paper.matched import rendered_pair
-from examples.paper.report import Pixels, Report, Table
-from examples.paper.settings import Effort, Settings
-from examples.paper.stitched import registration_error, stitch_files, stitch_rendered
+from examples.paper.common.matched import rendered_pair
+from examples.paper.common.report import Pixels, Report, Table
+from examples.paper.common.settings import Effort, Settings
+from examples.paper.common.stitched import registration_error, stitch_files, stitch_rendered
 from rdstitch.errors import RegistrationError
 from rdstitch.pipeline import StitchOptions
 from rdstitch.synthetic import FisheyeLens, best_division_model

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from examples.paper.matched import MatchedPair, match_files, match_rendered, rendered_pair
-from examples.paper.peers import absent
-from examples.paper.plain_ransac import THRESHOLD, all_solvers, draw_samples
-from examples.paper.plots import curves
-from examples.paper.report import Report, Table
-from examples.paper.settings import Effort, Settings
+from examples.paper.common.matched import MatchedPair, match_files, match_rendered, rendered_pair
+from examples.paper.common.peers import absent
+from examples.paper.common.plain_ransac import THRESHOLD, all_solvers, draw_samples
+from examples.paper.common.plots import curves
+from examples.paper.common.report import Report, Table
+from examples.paper.common.settings import Effort, Settings
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver

@@ -4,7 +4,7 @@ The votes on a drive come from plain RANSAC with each solver, as in the paper, a
 by what each pair can know and then adjusts all pictures. Real chessboards, which move freely, vote by five points.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from examples.paper.charts import (
+from examples.paper.common.charts import (
     before_and_after,
     board_grid,
     find_boards,
@@ -22,16 +22,15 @@ from examples.paper.charts import (
     seen_corners,
     undistorted,
 )
-from examples.paper.drives import Drive, drive
-from examples.paper.plain_ransac import all_solvers, best_of
-from examples.paper.report import Pixels, Report, Table
-from examples.paper.settings import Settings
+from examples.paper.common.drives import Drive, FramePair, drive, estimated_links
+from examples.paper.common.plain_ransac import all_solvers, best_of
+from examples.paper.common.report import Pixels, Report, Table
+from examples.paper.common.settings import Settings
 from rdstitch.camera import FloatArray
 from rdstitch.planar_motion import rotation_from_tilt
 from rdstitch.radial_homography import project
 from rdstitch.registration import Alignment, AlignmentOptions, Link, align
 from rdstitch.registration.voting import Consensus, vote
-from rdstitch.robust import estimate_radial_homography
 from rdstitch.robust.measurements import Measurements
 from rdstitch.synthetic import fit_homography, fit_similarity
 
@@ -138,18 +137,15 @@ def _drive_election(d: Drive) -> _Election:
             data = Measurements.from_pixels(pair.points1, pair.points2, cameras[0], cameras[0], None)
             found.append(best_of(solver, data, _ITERATIONS, seed))
         votes[solver.name] = np.array([model[1] for model in found if model is not None])
-    own, links, std = [], [], []
-    for pair in d.pairs:
-        relation = estimate_radial_homography(
-            pair.points1, pair.points2, d.camera.image_size, focal=d.camera.focal, focal_source="option"
-        )
-        if relation:
-            keep = relation.inliers
-            links.append(Link(pair.image1, pair.image2, pair.points1[keep], pair.points2[keep], relation))
-            own.append(relation.distortion)
-            std.append(relation.distortion_std)
-    votes[OWN] = np.array(own)
-    return _Election(votes, vote(own, std), align(cameras, links))
+    links = estimated_links(d.pairs, cameras[0])
+    votes[OWN], std = _votes(links)
+    return _Election(votes, vote(votes[OWN], std), align(cameras, links))
+
+
+def _votes(links: Sequence[Link]) -> tuple[FloatArray, FloatArray]:
+    """λ of each pair, and its standard deviation."""
+    relations = [link.relation for link in links]
+    return np.array([r.distortion for r in relations]), np.array([r.distortion_std for r in relations])
 
 
 def _votes_table(d: Drive, election: _Election) -> Table:
@@ -206,15 +202,9 @@ def vote_on_boards(files: list[Path], corners: tuple[int, int], truth: float, re
     """
     camera, boards = find_boards(files, corners)
     grid, seen = board_grid(corners), list(boards.values())
-    links, own, std = [], [], []
-    for i, j in combinations(range(len(seen)), 2):
-        if j - i <= reach:
-            relation = estimate_radial_homography(seen[i], seen[j], camera.image_size, solver="five_point")
-            if relation:
-                keep = relation.inliers
-                links.append(Link(i, j, seen[i][keep], seen[j][keep], relation))
-                own.append(relation.distortion)
-                std.append(relation.distortion_std)
+    near = [(i, j) for i, j in combinations(range(len(seen)), 2) if j - i <= reach]
+    links = estimated_links((FramePair(i, j, seen[i], seen[j]) for i, j in near), camera, solver="five_point")
+    own, std = _votes(links)
     alignment = align([camera.with_focal()] * len(seen), links, AlignmentOptions(model="homography"))
     adjusted = alignment.cameras[alignment.reference]
     before, by_truth, by_adjusted = (
@@ -225,7 +215,7 @@ def vote_on_boards(files: list[Path], corners: tuple[int, int], truth: float, re
     to_grid = fit_homography(undistorted(adjusted, boards[largest]), grid + _MARGIN)
     extent = (corners[0] - 1 + 2 * _MARGIN, corners[1] - 1 + 2 * _MARGIN)
     return BoardVotes(
-        votes=np.array(own),
+        votes=own,
         elected=vote(own, std).distortion,
         adjusted=alignment.distortion,
         off_before=before,

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from examples.paper.drives import PATHS, Drive, drive
-from examples.paper.plain_ransac import all_solvers, best_of
-from examples.paper.report import Report, Table
-from examples.paper.settings import Settings
+from examples.paper.common.drives import PATHS, Drive, drive, estimated_links
+from examples.paper.common.plain_ransac import all_solvers, best_of
+from examples.paper.common.report import Report, Table
+from examples.paper.common.settings import Settings
 from rdstitch.camera import FloatArray
 from rdstitch.planar_motion import PlanarMotion, rotation_from_tilt
 from rdstitch.radial_homography import RadialHomography
@@ -23,7 +23,6 @@ from rdstitch.registration.links import Link
 from rdstitch.registration.models import RIGID, YAW, X, Y
 from rdstitch.registration.observations import Observations
 from rdstitch.registration.trajectory import Trajectory, compare
-from rdstitch.robust import estimate_radial_homography
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
 
@@ -148,19 +147,10 @@ def _plane_poses(poses: FloatArray, log_focal: float) -> Poses:
 
 
 def _recipe(d: Drive) -> _Path:
-    """Pairs by :func:`estimate_radial_homography`, all frames by :func:`align`."""
-    cameras, links, consecutive = d.blank_cameras, [], []
-    for pair in d.pairs:
-        relation = estimate_radial_homography(
-            pair.points1, pair.points2, d.camera.image_size, focal=d.camera.focal, focal_source="option"
-        )
-        if not relation:
-            continue
-        keep = relation.inliers
-        links.append(Link(pair.image1, pair.image2, pair.points1[keep], pair.points2[keep], relation))
-        if pair.image2 - pair.image1 == 1:
-            consecutive.append(relation)
-    alignment = align(cameras, links)
+    """Pairs by :func:`rdstitch.estimate_radial_homography`, all frames by :func:`rdstitch.registration.align`."""
+    links = estimated_links(d.pairs, d.blank_cameras[0])
+    consecutive = [link.relation for link in links if link.image2 - link.image1 == 1]
+    alignment = align(d.blank_cameras, links)
     homographies = np.array([_focal_normalized(d, relation.homography) for relation in consecutive])
     lam = float(np.median([relation.distortion for relation in consecutive]))
     before = _chained(homographies, _median_tilt(homographies))

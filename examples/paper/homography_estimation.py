@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from examples.paper.estimation_pairs import JudgedPair, rendered_pairs, scene_pairs
-from examples.paper.estimators import THRESHOLD, Estimator, Judgement, installed_estimators, judge
-from examples.paper.planar_scenes import made_scenes, read_scenes
-from examples.paper.report import Report, Table
-from examples.paper.settings import Settings
+from examples.paper.common.estimation_pairs import JudgedPair, rendered_pairs, scene_pairs
+from examples.paper.common.estimators import THRESHOLD, Estimator, Judgement, installed_estimators, judge
+from examples.paper.common.planar_scenes import made_scenes, read_scenes
+from examples.paper.common.report import Report, Table
+from examples.paper.common.settings import Settings
 from rdstitch.io.read import read_image
 
 LIMITS = (1.0, 3.0, 5.0)

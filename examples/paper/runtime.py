@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from examples.paper.contenders import HOMLIB, Contender, known_tilt, own_unknown_tilt
-from examples.paper.peers import absent, optional_module
-from examples.paper.report import Report, Table
-from examples.paper.settings import Settings
+from examples.paper.common.contenders import HOMLIB, Contender, known_tilt, own_unknown_tilt
+from examples.paper.common.peers import absent, optional_module
+from examples.paper.common.report import Report, Table
+from examples.paper.common.settings import Settings
 from rdstitch.synthetic import PlanarInstances, planar_instances
 
 _SINGLES = 40

@@ -12,7 +12,6 @@ import pytest
 from PIL import Image
 
 from examples.paper import (
-    aerial,
     end_to_end,
     figure2,
     figure3,
@@ -26,13 +25,14 @@ from examples.paper import (
     runtime,
 )
 from examples.paper.__main__ import main
-from examples.paper.constraints import planar_quartics, quartic_monomials
-from examples.paper.estimation_pairs import scene_pairs
-from examples.paper.estimators import installed_estimators, judge
-from examples.paper.planar_scenes import made_scenes, read_scenes
-from examples.paper.report import Report, Table, save
-from examples.paper.settings import Effort, Settings
-from examples.paper.subprocesses import run_all
+from examples.paper.common import aerial
+from examples.paper.common.constraints import planar_quartics, quartic_monomials
+from examples.paper.common.estimation_pairs import scene_pairs
+from examples.paper.common.estimators import installed_estimators, judge
+from examples.paper.common.planar_scenes import made_scenes, read_scenes
+from examples.paper.common.report import Report, Table, save
+from examples.paper.common.settings import Effort, Settings
+from examples.paper.common.subprocesses import run_all
 from rdstitch.synthetic import general_instances, planar_instances
 
 TINY = Settings(Effort.TINY, Path("no real pictures"))

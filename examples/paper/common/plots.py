@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from examples.paper.peers import optional_module
+from examples.paper.common.peers import optional_module
 
 _MARKED = 20
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from examples.paper.estimation_pairs import JudgedPair
-from examples.paper.peers import optional_module
+from examples.paper.common.estimation_pairs import JudgedPair
+from examples.paper.common.peers import optional_module
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.radial_homography import RadialHomography, transfer
 from rdstitch.robust import estimate_radial_homography

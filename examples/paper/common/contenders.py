@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from examples.paper.peers import homlib_solver
+from examples.paper.common.peers import homlib_solver
 from rdstitch import solvers
 from rdstitch.camera import FloatArray
 from rdstitch.solvers import Solutions

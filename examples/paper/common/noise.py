@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from examples.paper.contenders import Contender
-from examples.paper.plots import curves
-from examples.paper.report import Table
+from examples.paper.common.contenders import Contender
+from examples.paper.common.plots import curves
+from examples.paper.common.report import Table
 from rdstitch.camera import FloatArray
 from rdstitch.radial_homography import lift
 from rdstitch.solvers import Solutions

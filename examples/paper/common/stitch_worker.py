@@ -1,4 +1,4 @@
-"""One stitcher on one set of pictures, as a process of its own: ``python -m examples.paper.stitch_worker NAME OUT …``.
+"""One stitcher on one set of pictures, in a process of its own; arguments: its name, OUT, the pictures.
 
 It imports nothing of rdstitch but for rdstitch itself, so that it also runs in a Python that has only the peer.
 The exit status is the stitcher's word on whether it succeeded.

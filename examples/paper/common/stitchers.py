@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-_ROOT = Path(__file__).resolve().parents[2]
+_ROOT = Path(__file__).resolve().parents[3]
 _HUGIN = (
     "pto_gen",
     "cpfind",
@@ -72,8 +72,8 @@ def _imports(python: str, module: str) -> bool:
 
 
 def _worker(python: str, name: str) -> Callable[[Sequence[Path], Path, float], list[list[str]]]:
-    """One of :mod:`examples.paper.stitch_worker`."""
-    start = f"import sys; sys.path.insert(0, {str(_ROOT)!r}); from examples.paper.stitch_worker import main"
+    """One of :mod:`examples.paper.common.stitch_worker`."""
+    start = f"import sys; sys.path.insert(0, {str(_ROOT)!r}); from examples.paper.common.stitch_worker import main"
     code = f"{start}; sys.exit(main(sys.argv[1:]))"
     return lambda pictures, output, _: [[python, "-c", code, name, str(output), *map(str, pictures)]]
 

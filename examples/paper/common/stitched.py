@@ -6,7 +6,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from examples.paper.report import Pixels
+from examples.paper.common.report import Pixels
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.errors import RegistrationError
 from rdstitch.io.read import read_image

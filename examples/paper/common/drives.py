@@ -1,12 +1,15 @@
 """The paper's drives (§5.5) as matches between frames, synthesised from true poses without rendering anything."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from rdstitch.camera import Camera, FloatArray
+from rdstitch.registration import Link
 from rdstitch.registration.alignment import Poses as PlanePoses
 from rdstitch.registration.trajectory import Trajectory
+from rdstitch.robust import estimate_radial_homography
 from rdstitch.synthetic import Poses, line_poses, parking_poses, turn_poses
 from rdstitch.synthetic.poses import to_picture, to_plane
 
@@ -87,6 +90,33 @@ def drive(path: str, frames: int, *, seed: int, noise: float = 0.5) -> Drive:
                 if len(points[0]) >= _LEAST_MATCHES:
                     pairs.append(FramePair(first, first + step, *points))
     return Drive(camera, tilt, poses, tuple(pairs))
+
+
+def estimated_links(pairs: Iterable[FramePair], camera: Camera, solver: str = "auto") -> list[Link]:
+    """What rdstitch makes of each pair, for the adjustment; pairs for which it finds nothing are left out.
+
+    Parameters
+    ----------
+    pairs : iterable of FramePair
+    camera : Camera
+        Of all frames, as far as it is known before.
+    solver : str
+        See :func:`rdstitch.estimate_radial_homography`.
+    """
+    links = []
+    for pair in pairs:
+        relation = estimate_radial_homography(
+            pair.points1,
+            pair.points2,
+            camera.image_size,
+            focal=camera.focal,
+            focal_source=camera.focal_source,
+            solver=solver,
+        )
+        if relation:
+            keep = relation.inliers
+            links.append(Link(pair.image1, pair.image2, pair.points1[keep], pair.points2[keep], relation))
+    return links
 
 
 def _matches(

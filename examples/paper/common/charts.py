@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from examples.paper.report import Pixels
+from examples.paper.common.report import Pixels
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.compositing import Canvas, CompositeOptions, compose
 from rdstitch.io.read import read_image

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from examples.paper.report import Pixels
+from examples.paper.common.report import Pixels
 from rdstitch.camera import FloatArray
 from rdstitch.io.read import read_image
 from rdstitch.synthetic import ground

@@ -5,7 +5,7 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
-from examples.paper.contenders import Contender
+from examples.paper.common.contenders import Contender
 from rdstitch.camera import FloatArray
 from rdstitch.planar_motion import PlanarMotion
 from rdstitch.solvers import Solutions, four_point

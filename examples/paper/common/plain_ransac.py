@@ -5,8 +5,8 @@ from functools import partial
 
 import numpy as np
 
-from examples.paper.contenders import HOMLIB
-from examples.paper.peers import homlib_solver
+from examples.paper.common.contenders import HOMLIB
+from examples.paper.common.peers import homlib_solver
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers

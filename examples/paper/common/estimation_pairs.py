@@ -10,8 +10,8 @@ from functools import partial
 import cv2
 import numpy as np
 
-from examples.paper.planar_scenes import PlanarScene
-from examples.paper.report import Pixels
+from examples.paper.common.planar_scenes import PlanarScene
+from examples.paper.common.report import Pixels
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.features import FeatureOptions, detect, match
 from rdstitch.synthetic import Photometry, ground, pair_poses, sequence_over

@@ -100,7 +100,7 @@ def save(report: Report, name: str, folder: Path) -> list[str]:
 
 
 def _save_plot(draw: Draw, path: Path) -> str:
-    from examples.paper.plots import new_figure
+    from examples.paper.common.plots import new_figure
 
     figure = new_figure()
     if figure is None:
