@@ -34,6 +34,13 @@ def test_a_gimbal_that_points_straight_down_has_no_tilt(yaw: float, roll: float)
     np.testing.assert_allclose(Attitude(yaw, -90.0, roll, "dji-gimbal").nadir, (0.0, 0.0, 1.0), atol=1e-12)
 
 
+def test_a_gimbal_past_straight_down() -> None:
+    """DJI writes pitch -90.1 as -89.9, turned about: yaw and roll half a turn on."""
+    past, written = Attitude(14.4, -90.1, 0.0, "dji-gimbal"), Attitude(-165.6, -89.9, 180.0, "dji-gimbal")
+    np.testing.assert_allclose(written.nadir, past.nadir, atol=1e-12)
+    assert written.nadir[1] < 0.0
+
+
 def test_signs() -> None:
     """Who looks a little ahead has the ground below him towards the bottom of the picture."""
     c, s = np.cos(np.radians(10.0)), np.sin(np.radians(10.0))
