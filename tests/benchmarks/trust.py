@@ -1,15 +1,17 @@
 """Is any result wrong that claims to be right? And how many of the solvable sets are solved?
 
-python -m tests.benchmarks.trust [--sets 300] [--first 0] [--kind pair]
+python -m tests.benchmarks.trust [--sets 300] [--first 0] [--kind pair] [--keep FILE]
 """
 
 import argparse
+import json
 import time
 from collections import Counter
+from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from tests.trust_sets import HOPELESS, SOLVABLE, judge_set, trust_set
+from tests.trust_sets import HOPELESS, SOLVABLE, Judged, judge_set, trust_set
 
 
 def main() -> None:
@@ -18,21 +20,28 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=30, help="number of random sets")
     parser.add_argument("--first", type=int, default=0, help="seed of the first one")
     parser.add_argument("--kind", choices=(*SOLVABLE, *HOPELESS), help="only sets of this kind")
+    parser.add_argument(
+        "--keep", type=Path, help="a line here for each set; those that are here already are not done again"
+    )
     parser.add_argument("--verbose", action="store_true", help="one line for every set")
     wanted = parser.parse_args()
     counts: Counter[tuple[str, str]] = Counter()
-    start = time.process_time()
+    kept = _read(wanted.keep)
+    start, done = time.process_time(), 0
     for seed in range(wanted.first, wanted.first + wanted.sets):
-        item = trust_set(seed, wanted.kind)
-        with TemporaryDirectory() as folder:
-            judged = judge_set(item, Path(folder))
+        judged = kept.get(seed)
+        if judged is None:
+            judged, done = _judge(seed, wanted.kind), done + 1
+            if wanted.keep is not None:
+                with wanted.keep.open("a", encoding="utf-8") as stream:
+                    stream.write(json.dumps({"seed": seed, **asdict(judged)}) + "\n")
         silent = judged.status == 0 and not judged.right
         solved = judged.status == 0 and judged.right and judged.complete
         what = "silently wrong" if silent else "solved" if solved else "in part" if judged.status == 0 else "refused"
-        counts[item.kind, what] += 1
-        if silent or wanted.verbose or (item.kind in SOLVABLE and not solved):
+        counts[judged.kind, what] += 1
+        if silent or wanted.verbose or (judged.kind in SOLVABLE and not solved):
             print(
-                f"{seed} {item.kind}: {what}, status {judged.status}, {judged.error:.2f} px: {judged.text[:230]}",
+                f"{seed} {judged.kind}: {what}, status {judged.status}, {judged.error:.2f} px: {judged.text[:230]}",
                 flush=True,
             )
     columns = ("solved", "in part", "refused", "silently wrong")
@@ -43,7 +52,20 @@ def main() -> None:
     share = sum(counts[kind, "solved"] for kind in SOLVABLE) / max(solvable, 1)
     wrong = sum(counts[kind, "silently wrong"] for kind in (*SOLVABLE, *HOPELESS))
     print(f"\n{share:.1%} of {solvable} solvable sets solved; {wrong} of {wanted.sets} sets silently wrong; ", end="")
-    print(f"{(time.process_time() - start) / wanted.sets:.1f} s of processor time a set")
+    print(f"{(time.process_time() - start) / max(done, 1):.1f} s of processor time a set")
+
+
+def _judge(seed: int, kind: str | None) -> Judged:
+    with TemporaryDirectory() as folder:
+        return judge_set(trust_set(seed, kind), Path(folder))
+
+
+def _read(file: Path | None) -> dict[int, Judged]:
+    """What an earlier run has kept, by seed."""
+    if file is None or not file.exists():
+        return {}
+    lines = map(json.loads, file.read_text(encoding="utf-8").splitlines())
+    return {line.pop("seed"): Judged(**line) for line in lines}
 
 
 if __name__ == "__main__":
