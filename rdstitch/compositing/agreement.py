@@ -21,7 +21,7 @@ from rdstitch.radial_homography import from_plane, to_plane
 
 Grey = NDArray[np.float32]
 
-_LONGEST_SIDE = 512  # px of the pictures that are compared
+COMPARED_SIDE = 512  # px of the longer side of the pictures that are compared
 _CELL = 24  # px
 _REACH = 8  # px
 _LEAST_TEXTURE = 0.012  # standard deviation in a cell, of full range
@@ -98,7 +98,7 @@ def _reduced_grey(picture: Picture) -> Grey:
     pixels = picture.pixels
     full = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else max(float(pixels.max()), 1e-12)
     height, width = pixels.shape[:2]
-    factor = min(1.0, _LONGEST_SIDE / max(height, width))
+    factor = min(1.0, COMPARED_SIDE / max(height, width))
     size = max(1, round(width * factor)), max(1, round(height * factor))
     small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.float32) / np.float32(full)
     grey: Grey = small if small.ndim == 2 else small.mean(axis=2, dtype=np.float32)

@@ -13,13 +13,15 @@ from rdstitch.camera import Camera
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.crop import coverage_map, crop_box
 from rdstitch.compositing.exposure import Exposure, estimate_exposure, no_exposure
+from rdstitch.compositing.multiband import margin
 from rdstitch.compositing.options import CompositeOptions
-from rdstitch.compositing.pictures import PictureCache, PictureReader, Source
+from rdstitch.compositing.parts import ShownPart, shown_parts
+from rdstitch.compositing.pictures import PictureCache, PictureReader, Preview, Source
 from rdstitch.compositing.plan import CompositePlan, plan_composite
 from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seams import find_seams
 from rdstitch.compositing.survey import survey_pictures
-from rdstitch.compositing.warp import plan_warp
+from rdstitch.compositing.warp import Box, plan_warp
 from rdstitch.errors import ArgumentError
 from rdstitch.io.layout import STRIP_ROWS, Layout
 from rdstitch.io.metadata import Metadata
@@ -84,6 +86,7 @@ def compose(
     canvas: Canvas,
     options: CompositeOptions | None = None,
     progress: Progress | None = None,
+    previews: Sequence[Preview] | None = None,
 ) -> Composite:
     """Put pictures together on a canvas, in memory.
 
@@ -99,6 +102,9 @@ def compose(
     options : CompositeOptions, optional
     progress : callable, optional
         Told the share of the work done, 0 to 1.
+    previews : sequence of callables, optional
+        Each reads one picture reduced by the factor that it is given, 2, 4 or 8, which for JPEG files is much faster;
+        otherwise the whole pictures are read once more, for what is decided on small versions of them.
 
     Returns
     -------
@@ -113,7 +119,7 @@ def compose(
     LimitError
         When the memory limit is too low.
     """
-    prepared = prepare(sources, cameras, homographies, canvas, options, _part_of(progress, 0.0, _PREPARATION))
+    prepared = prepare(sources, cameras, homographies, canvas, options, _part_of(progress, 0.0, _PREPARATION), previews)
     renderer, (width, height) = prepared.renderer, prepared.canvas.size
     pixels = np.zeros((height, width, renderer.channels), dtype=renderer.dtype)
     alpha = np.zeros((height, width), dtype=np.uint8)
@@ -135,6 +141,7 @@ def compose_to_file(
     metadata: Metadata | None = None,
     progress: Progress | None = None,
     extra_tags: Callable[[Canvas], Iterable[ExtraTag]] | None = None,
+    previews: Sequence[Preview] | None = None,
 ) -> FileComposite:
     """Put pictures together straight into a file, whatever its size: memory is that of a strip of tiles.
 
@@ -142,7 +149,7 @@ def compose_to_file(
     ----------
     path
         ``.tif`` (tiled, with overviews, BigTIFF where needed), ``.png``, ``.jpg`` or ``.webp`` (held in memory whole).
-    sources, cameras, homographies, canvas, options, progress
+    sources, cameras, homographies, canvas, options, progress, previews
         As for :func:`compose`.
     metadata : Metadata, optional
         Colour profile, EXIF and resolution to keep.
@@ -156,7 +163,7 @@ def compose_to_file(
     OutputError
         When the file cannot be written; nothing is left behind.
     """
-    prepared = prepare(sources, cameras, homographies, canvas, options, _part_of(progress, 0.0, _PREPARATION))
+    prepared = prepare(sources, cameras, homographies, canvas, options, _part_of(progress, 0.0, _PREPARATION), previews)
     renderer, size = prepared.renderer, prepared.canvas.size
     layout = Layout(
         size,
@@ -193,6 +200,10 @@ class Prepared:
         Its top-left px on the canvas that the renderer knows.
     plan : CompositePlan
     notes : tuple of str
+    shown : sequence of ShownPart
+        Which part of each picture shows, where that is known before; else empty.
+    around : int
+        How far from there pictures are asked for too, canvas px.
     """
 
     renderer: Renderer
@@ -200,6 +211,8 @@ class Prepared:
     origin: tuple[int, int]
     plan: CompositePlan
     notes: tuple[str, ...]
+    shown: Sequence[ShownPart]
+    around: int
 
     def strips(self, progress: Progress | None = None) -> Iterator[tuple[NDArray[Any], NDArray[np.uint8]]]:
         """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
@@ -212,25 +225,40 @@ class Prepared:
     def _strips(
         self, run: Callable[..., Iterator[Any]], progress: Progress | None
     ) -> Iterator[tuple[NDArray[Any], NDArray[np.uint8]]]:
-        """The same, with tiles computed by ``run``, which works like ``map``."""
-        (width, height), (x, y), side = self.canvas.size, self.origin, self.plan.tile_size
-        done = 0
-        for top in range(0, height, side):
-            rows = min(side, height - top)
-            samples = np.zeros((rows, width, self.renderer.channels), dtype=self.renderer.dtype)
-            alpha = np.zeros((rows, width), dtype=np.uint8)
-            boxes = [(x + k, y + top, x + min(k + side, width), y + top + rows) for k in range(0, width, side)]
-            # To and fro, so that the pictures used last are the ones needed next.
-            boxes = boxes[::-1] if top // side % 2 else boxes
-            for box, (pixels, covered) in zip(boxes, run(self.renderer.tile, boxes), strict=True):
-                left, right = box[0] - x, box[2] - x
-                samples[:, left:right] = pixels
-                alpha[:, left:right][covered] = 255
+        """The same, with tiles computed by ``run``, which works like ``map`` and may work ahead."""
+        (width, height), (x, _), side = self.canvas.size, self.origin, self.plan.tile_size
+        rows = [self._row_of_tiles(top) for top in range(0, height, side)]
+        done, coming = 0, self._start(rows[0], run)
+        for number, boxes in enumerate(rows):
+            top, bottom = boxes[0][1], boxes[0][3]
+            samples = np.zeros((bottom - top, width, self.renderer.channels), dtype=self.renderer.dtype)
+            alpha = np.zeros((bottom - top, width), dtype=np.uint8)
+            for box, (pixels, covered) in zip(boxes, coming, strict=True):
+                samples[:, box[0] - x : box[2] - x] = pixels
+                alpha[:, box[0] - x : box[2] - x][covered] = 255
                 if progress is not None:
-                    done += rows * (right - left)
+                    done += covered.size
                     progress(done / (width * height))
-            for start in range(0, rows, STRIP_ROWS):
+            if number + 1 < len(rows):
+                # Computed while this strip is written.
+                coming = self._start(rows[number + 1], run)
+            for start in range(0, bottom - top, STRIP_ROWS):
                 yield samples[start : start + STRIP_ROWS], alpha[start : start + STRIP_ROWS]
+
+    def _row_of_tiles(self, top: int) -> list[Box]:
+        """The tiles whose first row is ``top``, in the order of work."""
+        (width, height), (x, y), side = self.canvas.size, self.origin, self.plan.tile_size
+        bottom = min(top + side, height)
+        boxes = [(x + k, y + top, x + min(k + side, width), y + bottom) for k in range(0, width, side)]
+        # To and fro, so that the pictures used last are the ones needed next.
+        return boxes[::-1] if top // side % 2 else boxes
+
+    def _start(self, boxes: Sequence[Box], run: Callable[..., Iterator[Any]]) -> Iterator[Any]:
+        """Begin with a row of tiles, when all above it are done."""
+        if self.shown:
+            row = boxes[0][1] - self.around
+            self.renderer.pictures.expect([part.from_row(row) for part in self.shown])
+        return run(self.renderer.tile, boxes)
 
 
 def prepare(
@@ -240,13 +268,14 @@ def prepare(
     canvas: Canvas,
     options: CompositeOptions | None = None,
     progress: Progress | None = None,
+    previews: Sequence[Preview] | None = None,
 ) -> Prepared:
     """Decide on exposure, seams and cropping, from one small look at each picture; see :func:`compose`."""
     options = options or CompositeOptions()
     matrices = np.asarray(homographies, dtype=np.float64)
     if not len(sources) == len(cameras) == len(matrices) == len(canvas.footprints):
         raise ArgumentError("sources, cameras, homographies and footprints must be equally many")
-    reader = PictureReader(sources, [c.image_size for c in cameras])
+    reader = PictureReader(sources, [c.image_size for c in cameras], previews)
     channels, dtype = reader.samples
     plan = plan_composite(cameras, canvas, options, channels, dtype.itemsize)
     exposure, seams, survey = no_exposure(len(cameras), channels), None, None
@@ -267,7 +296,10 @@ def prepare(
     cache = PictureCache(reader, [w.shrink for w in warps], plan.cache_bytes)
     renderer = Renderer(warps, cache, exposure, seams, options, plan.bands, channels, dtype)
     cropped = canvas if box is None else canvas.cropped(box)
-    return Prepared(renderer, cropped, (0, 0) if box is None else box[:2], plan, (note,) if note else ())
+    # What a tile's blending feels is aligned to the coarsest band.
+    around = margin(plan.bands) + (2 << plan.bands)
+    shown = [] if seams is None else shown_parts(warps, seams, around)
+    return Prepared(renderer, cropped, (0, 0) if box is None else box[:2], plan, (note,) if note else (), shown, around)
 
 
 def _part_of(progress: Progress | None, start: float, stop: float) -> Progress | None:

@@ -22,7 +22,7 @@ from scipy.sparse.linalg import spsolve
 
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.compositing.survey import Survey, SurveyTile
-from rdstitch.compositing.warp import Box, Float32Array, Warp, interpolate_lattice, intersection, lattice_nodes
+from rdstitch.compositing.warp import Box, Warp, interpolate_lattice, intersection, lattice_nodes
 
 _SRGB_OFFSET = 0.055
 # Samples outside this part of the range are clipped or mostly noise.
@@ -40,6 +40,7 @@ _ROUNDS = 6
 _WORTHWHILE = 0.02
 # The correction is smooth: it is computed at this spacing, canvas px, and interpolated.
 _LATTICE = 32
+_DEPTHS = {"uint8": cv2.CV_8U, "uint16": cv2.CV_16U, "float32": cv2.CV_32F}
 
 
 @dataclass(frozen=True)
@@ -76,31 +77,33 @@ class Exposure:
             log = log + (self.blocks[index].ravel()[nodes] * shares).sum(axis=-1)
         return np.asarray(log, dtype=np.float64)
 
-    def correct(self, index: int, warp: Warp, box: Box, pixels: NDArray[Any]) -> Float32Array:
+    def correct(self, index: int, warp: Warp, box: Box, pixels: NDArray[Any]) -> NDArray[Any]:
         """Resampled pixels (h, w, C) of picture ``index`` on ``box``, as if all were exposed alike.
 
-        Depends, px by px, on nothing but the px: every box gives the same, bit for bit.
+        In the type of the pixels. Depends, px by px, on nothing but the px: every box gives the same, bit for bit.
         """
-        full = np.float32(full_scale(pixels.dtype))
         level = np.exp(-self.log_gain[index]).astype(np.float32)
-        if self.vignetting.any() or self.blocks.size:
+        smooth = bool(self.vignetting.any() or self.blocks.size)
+        if not smooth and not self.log_gain[index].any():
+            return pixels
+        if smooth:
             x, y = np.broadcast_arrays(*lattice_nodes(box, _LATTICE))
             points = warp.source_points(x, y)
             width, height = warp.camera.image_size
             # Outside the picture only mirrored content is corrected; the model must not run away there.
             points = np.clip(np.nan_to_num(points), -0.5, (width - 0.5, height - 0.5))
             nodes = np.exp(-self.smooth_part(index, warp.camera, points)).astype(np.float32)
-            smooth = interpolate_lattice(nodes, box, _LATTICE)
+            plane = interpolate_lattice(nodes, box, _LATTICE)
             # Planes are joined by OpenCV: numpy is slow along an axis of three.
-            level = np.asarray(cv2.merge([smooth * factor for factor in level])).reshape(pixels.shape)
-        elif not self.log_gain[index].any():
-            return pixels.astype(np.float32)
-        values: Float32Array = pixels * level
-        if self.offset:
-            level -= np.float32(1.0)
-            level *= np.float32(self.offset) * full
-            values += level
-        return np.clip(values, 0, full, out=values) if pixels.dtype.kind == "u" else values
+            level = np.asarray(cv2.merge([plane * factor for factor in level])).reshape(pixels.shape)
+        flat = (pixels.shape[0], -1)
+        level = np.broadcast_to(level, pixels.shape).reshape(flat)
+        offset = np.float32(self.offset * full_scale(pixels.dtype))
+        values: Any = pixels.reshape(flat) + offset
+        values *= level
+        # Rounded and clipped to the type; the stubs know no scalars.
+        done = cv2.subtract(values, float(offset), dtype=_DEPTHS[pixels.dtype.name])  # type: ignore[call-overload]
+        return np.asarray(done).reshape(pixels.shape)
 
 
 def full_scale(dtype: np.dtype[Any]) -> float:

@@ -1,4 +1,7 @@
-"""Pictures read when their tiles come, smoothed for the output's resolution, in a cache of bounded size."""
+"""Pictures read when their tiles come, smoothed for the output's resolution, in a cache of bounded size.
+
+Most of a picture is often hidden by its neighbours: only the part that is asked for is kept.
+"""
 
 import math
 from collections import OrderedDict
@@ -13,14 +16,25 @@ from numpy.typing import NDArray
 
 from rdstitch.errors import InputError
 from rdstitch.io.read import Picture
+from rdstitch.io.reduction import block_mean, fitting_reduction, reduced_size
 
 Source = Callable[[], Picture]
+Preview = Callable[[int], Picture]
+# Of the original: x0, y0, x1, y1, px, end exclusive.
+Part = tuple[int, int, int, int]
+NOTHING: Part = (0, 0, 0, 0)
 
 _OPAQUE_FROM = 128
 # A picture that gets smaller by less than this keeps its pixels as they are.
 _NEGLIGIBLE_SHRINK = 1.05
 # Share of the shorter side over which the weight rises from the border of a mask.
 _MASK_FEATHER = 0.125
+# Room around a part of a picture for the kernel of the resampling, px.
+KERNEL_MARGIN = 8
+# Largest reduction at which previews are asked for, a power of two.
+_LARGEST_PREVIEW = 8
+# Share of the px below which a part is cut out.
+_WORTH_CUTTING = 0.8
 
 
 @dataclass(frozen=True)
@@ -37,37 +51,69 @@ class LoadedPicture:
         Opacity of the last opaque pixel beside a transparent one.
     reduction : int
         The picture is smaller than the original by this factor.
+    part : (int, int, int, int) or None
+        What it holds of the original; None for all of it.
     """
 
     pixels: NDArray[Any]
     opacity: NDArray[np.float32] | None = None
     opacity_step: float = 1.0
     reduction: int = 1
+    part: Part | None = None
 
     @property
     def nbytes(self) -> int:
         """Memory that it takes, bytes."""
         return self.pixels.nbytes + (0 if self.opacity is None else self.opacity.nbytes)
 
+    @property
+    def origin(self) -> tuple[int, int]:
+        """Where its first px lies in the whole reduced picture."""
+        return (0, 0) if self.part is None else (self.part[0] // self.reduction, self.part[1] // self.reduction)
 
-def prepare_picture(picture: Picture, shrink: float) -> LoadedPicture:
+    def holds(self, part: Part) -> bool:
+        """Whether a part of the original can be resampled from it."""
+        return self.part is None or _within(part, self.part)
+
+    def cut(self, part: Part) -> "LoadedPicture":
+        """A part of the original, with what the kernel of the resampling needs around it, in memory of its own.
+
+        The whole where the part is not much less: the copy would not be worth its time.
+        """
+        unit, room = self.reduction, KERNEL_MARGIN
+        height, width = self.pixels.shape[:2]
+        x, y = self.origin
+        left, right = (max(0, part[0] // unit - room - x), min(width, -(-part[2] // unit) + room - x))
+        top, bottom = (max(0, part[1] // unit - room - y), min(height, -(-part[3] // unit) + room - y))
+        if (right - left) * (bottom - top) > _WORTH_CUTTING * width * height:
+            return self
+        rows, columns = slice(top, bottom), slice(left, right)
+        opacity = None if self.opacity is None else self.opacity[rows, columns].copy()
+        held = ((left + x) * unit, (top + y) * unit, (right + x) * unit, (bottom + y) * unit)
+        return replace(self, pixels=self.pixels[rows, columns].copy(), opacity=opacity, part=held)
+
+
+def prepare_picture(picture: Picture, shrink: float, reduction: int = 1) -> LoadedPicture:
     """Fill what is transparent, and smooth the picture to what an output that shrinks it can show.
 
     Parameters
     ----------
     picture : Picture
     shrink : float
-        Picture px per output px. From 4 on, the picture is averaged over whole blocks first; a Gaussian does the rest.
+        Original px per output px. From 4 on, the picture is averaged over whole blocks first; a Gaussian does the rest.
+    reduction : int
+        What the picture was read smaller by.
     """
     pixels, opaque = picture.pixels, None
     if picture.alpha is not None:
         opaque = picture.alpha >= _OPAQUE_FROM
         pixels = _filled(pixels, opaque)
     # Blocks alone alias; a Gaussian on at least two px per output px does not.
-    reduction = max(1, int(shrink / 2))
-    if reduction > 1:
-        pixels = _block_mean(pixels, reduction)
-        opaque = None if opaque is None else _block_mean(opaque.astype(np.float32), reduction) > 0.999
+    further = max(1, int(shrink / reduction / 2))
+    if further > 1:
+        pixels = block_mean(pixels, further)
+        opaque = None if opaque is None else block_mean(opaque.astype(np.float32), further) > 0.999
+        reduction *= further
     rest = shrink / reduction
     if rest > _NEGLIGIBLE_SHRINK:
         sigma = 0.5 * math.sqrt(rest**2 - 1.0)
@@ -91,16 +137,6 @@ def _filled(pixels: NDArray[Any], opaque: NDArray[np.bool_]) -> NDArray[Any]:
     return np.ascontiguousarray(flat[position[labels]])
 
 
-def _block_mean(pixels: NDArray[Any], factor: int) -> NDArray[Any]:
-    """Mean over blocks of ``factor`` x ``factor`` px; the last block is completed by repetition."""
-    height, width = pixels.shape[:2]
-    down, right = -height % factor, -width % factor
-    whole = cv2.copyMakeBorder(pixels, 0, down, 0, right, cv2.BORDER_REPLICATE) if down or right else pixels
-    size = ((width + right) // factor, (height + down) // factor)
-    done = cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(done).reshape(size[1], size[0], *pixels.shape[2:])
-
-
 def _opacity(opaque: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float]:
     """Weight that rises from a mask's border, and its value at the first opaque pixel."""
     reach = max(2.0, _MASK_FEATHER * min(opaque.shape))
@@ -117,14 +153,27 @@ class PictureReader:
         Each reads one picture.
     sizes : sequence of (int, int)
         Width and height, px, that each picture must have.
+    previews : sequence of callables, optional
+        Each reads one picture reduced by a factor; see :func:`rdstitch.io.read_image`.
     """
 
-    def __init__(self, sources: Sequence[Source], sizes: Sequence[tuple[int, int]]) -> None:
-        self._sources, self._sizes = sources, sizes
+    def __init__(
+        self,
+        sources: Sequence[Source],
+        sizes: Sequence[tuple[int, int]],
+        previews: Sequence[Preview] | None = None,
+    ) -> None:
+        self._sources, self._sizes, self._previews = sources, sizes, previews
         self._samples: tuple[tuple[int, ...], np.dtype[Any]] | None = None
         self._masked: dict[int, bool] = {}
 
-    def __call__(self, index: int) -> Picture:
+    def prepared(self, index: int, shrink: float) -> LoadedPicture:
+        """Read picture ``index``, no larger than needed, for an output that shrinks it so much."""
+        # A Gaussian does the rest; it needs two px per output px.
+        reduction = 1 if self._previews is None else fitting_reduction(shrink / 2)
+        return prepare_picture(self(index, reduction), shrink, reduction)
+
+    def __call__(self, index: int, reduction: int = 1) -> Picture:
         """Read picture ``index``; a grey picture among coloured ones becomes coloured.
 
         Raises
@@ -132,10 +181,14 @@ class PictureReader:
         InputError
             When it cannot be read, has another size than its camera, or samples unlike the first picture's.
         """
-        picture = self._sources[index]()
+        if reduction > 1 and self._previews is not None:
+            picture = self._previews[index](reduction)
+        else:
+            picture = self._sources[index]()
         height, width = picture.pixels.shape[:2]
-        if (width, height) != self._sizes[index]:
-            expected = "{} x {}".format(*self._sizes[index])
+        wanted = reduced_size(self._sizes[index], reduction)
+        if (width, height) != wanted:
+            expected = "{} x {}".format(*wanted)
             raise InputError(f"picture {index + 1} has {width} x {height} px, but its camera has {expected}")
         if self._samples is None:
             self._samples = picture.pixels.shape[2:], picture.pixels.dtype
@@ -156,14 +209,14 @@ class PictureReader:
     def masked(self, index: int) -> bool:
         """Whether a picture has transparent parts; reads it when that is not known yet."""
         if index not in self._masked:
-            self(index)
+            self(index, _LARGEST_PREVIEW if self._previews is not None else 1)
         return self._masked[index]
 
     @property
     def samples(self) -> tuple[int, np.dtype[Any]]:
         """Number of channels and type of all pictures' samples; reads the first one when none has been read."""
         if self._samples is None:
-            self(0)
+            self(0, _LARGEST_PREVIEW if self._previews is not None else 1)
         assert self._samples is not None
         channels, dtype = self._samples
         return (channels[0] if channels else 1), dtype
@@ -175,7 +228,7 @@ def _kind(channels: tuple[int, ...], dtype: np.dtype[Any]) -> str:
 
 
 class PictureCache:
-    """The pictures used last, prepared for resampling, in at most ``limit`` bytes (though always one).
+    """The parts of pictures used last, prepared for resampling, in at most ``limit`` bytes (though always one).
 
     Parameters
     ----------
@@ -189,7 +242,8 @@ class PictureCache:
     def __init__(self, reader: PictureReader, shrinks: Sequence[float], limit: int) -> None:
         self._reader, self._shrinks, self._limit = reader, shrinks, limit
         self._held: OrderedDict[int, LoadedPicture] = OrderedDict()
-        self._bytes = self._largest = 0
+        self._expected: list[Part | None] = [None] * len(shrinks)
+        self._surprising: set[int] = set()
         # One picture is read at a time; meanwhile those that are held can be had.
         self._lock, self._reading = Lock(), Lock()
 
@@ -197,31 +251,56 @@ class PictureCache:
         """Whether a picture has transparent parts."""
         return self._reader.masked(index)
 
-    def __getitem__(self, index: int) -> LoadedPicture:
-        """Picture ``index``, read unless it is held; may be asked for from several threads."""
-        if (held := self._find(index)) is not None:
+    def expect(self, parts: Sequence[Part]) -> None:
+        """Keep no more of each picture than the part that will be asked for from now on.
+
+        It is a guess: a picture that more is asked of is read again, and from then on kept whole.
+        """
+        with self._lock:
+            for index, part in enumerate(parts):
+                if index in self._surprising:
+                    continue
+                self._expected[index] = part
+                if (held := self._held.get(index)) is None:
+                    continue
+                if part == NOTHING:
+                    del self._held[index]
+                else:
+                    self._held[index] = held.cut(part)
+
+    def get(self, index: int, part: Part) -> LoadedPicture:
+        """A part of picture ``index``, read unless it is held; may be asked for from several threads."""
+        if (held := self._find(index, part)) is not None:
             return held
         with self._reading:
             # Another thread may have read it in the meantime.
-            if (held := self._find(index)) is not None:
+            if (held := self._find(index, part)) is not None:
                 return held
-            # Room is made before reading, so that the limit holds meanwhile too.
+            expected = self._expected[index]
+            if expected is not None and not _within(part, expected):
+                self._surprising.add(index)
+                self._expected[index] = expected = None
             with self._lock:
-                while self._held and self._bytes + self._largest > self._limit:
-                    _, dropped = self._held.popitem(last=False)
-                    self._bytes -= dropped.nbytes
-                    del dropped
-            loaded = prepare_picture(self._reader(index), self._shrinks[index])
+                self._held.pop(index, None)
+            loaded = self._reader.prepared(index, self._shrinks[index])
+            if expected is not None:
+                loaded = loaded.cut(expected)
             with self._lock:
-                self._largest = max(self._largest, loaded.nbytes)
-                self._bytes += loaded.nbytes
+                while self._held and sum(p.nbytes for p in self._held.values()) + loaded.nbytes > self._limit:
+                    self._held.popitem(last=False)
                 self._held[index] = loaded
             return loaded
 
-    def _find(self, index: int) -> LoadedPicture | None:
+    def _find(self, index: int, part: Part) -> LoadedPicture | None:
         """A picture that is held."""
         with self._lock:
-            if index not in self._held:
+            held = self._held.get(index)
+            if held is None or not held.holds(part):
                 return None
             self._held.move_to_end(index)
-            return self._held[index]
+            return held
+
+
+def _within(part: Part, other: Part) -> bool:
+    """Whether a part lies in another."""
+    return part[0] >= other[0] and part[1] >= other[1] and part[2] <= other[2] and part[3] <= other[3]

@@ -1,17 +1,19 @@
 """One tile of the output: which pictures have a say where, and their samples put together."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.compositing.exposure import Exposure, full_scale
-from rdstitch.compositing.multiband import MultibandBlender, aligned, grown, margin, rounded, rounding_constant, spread
+from rdstitch.compositing.multiband import MultibandBlender, aligned, grown, margin, rounding_constant, spread
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.pictures import PictureCache
-from rdstitch.compositing.seams import SeamMap
+from rdstitch.compositing.seams import NOBODY, SeamMap
 from rdstitch.compositing.warp import (
     Box,
     Float32Array,
@@ -20,11 +22,10 @@ from rdstitch.compositing.warp import (
     border_weight,
     intersection,
     locate,
+    read_part,
     sample,
     sample_opacity,
 )
-
-_NOBODY = -1
 
 
 @dataclass(frozen=True)
@@ -35,24 +36,31 @@ class Layer:
     ----------
     index : int
         Of the picture.
-    geometry : Geometry
-        Of the part of the canvas.
+    box : (int, int, int, int)
+        Part of the canvas: x0, y0, x1, y1, px, end exclusive.
     weight : ndarray of shape (h, w), float32
         0 where the picture has no say.
+    geometry : Geometry or None
+        Of the same part, where it was needed already.
     """
 
     index: int
-    geometry: Geometry
+    box: Box
     weight: Float32Array
+    geometry: Geometry | None = None
 
-    @property
-    def box(self) -> Box:
-        """Part of the canvas: x0, y0, x1, y1, px, end exclusive."""
-        return self.geometry.box
+    def part(self, box: Box) -> "Layer":
+        """The same for a box within this one."""
+        geometry = None if self.geometry is None else self.geometry.part(box)
+        return Layer(self.index, box, _part(self.weight, self.box, box), geometry)
 
-    def bounds(self) -> Box:
-        """Smallest box that holds all of the weight."""
-        return _bounds(self.weight, self.box)
+    def weighted_part(self, box: Box) -> "Layer | None":
+        """The smallest part that holds all of the weight on ``box``; None where there is none."""
+        common = intersection(self.box, box)
+        if common is None:
+            return None
+        bounds = _bounds(_part(self.weight, self.box, common), common)
+        return None if bounds is None else self.part(bounds)
 
 
 @dataclass(frozen=True)
@@ -87,71 +95,84 @@ class Renderer:
 
         What a px gets does not depend on the box.
         """
-        outer = box
-        if self.options.blend == "multiband":
-            outer = aligned(grown(box, margin(self.bands)), self.bands)
-        layers = self._layers(outer)
+        blended = self.options.blend == "multiband"
+        around = aligned(grown(box, margin(self.bands)), self.bands) if blended else box
+        layers = [part for layer in self._layers(around) if (part := layer.weighted_part(around)) is not None]
         covered = np.zeros((box[3] - box[1], box[2] - box[0]), dtype=np.bool_)
         for layer in layers:
             if (common := intersection(layer.box, box)) is not None:
                 _part(covered, box, common)[...] |= _part(layer.weight, layer.box, common) > 0
-        if not covered.any():
-            return np.zeros((*covered.shape, self.channels), dtype=self.dtype), covered
-        if self.options.blend == "multiband" and len(layers) > 1:
-            values = self._multiband(layers, outer, box)
-        else:
-            values = self._mean(layers, box)
-        values[~covered] = 0.0
-        if self.dtype.kind == "u":
-            np.rint(values, out=values)
-            np.clip(values, 0, np.float32(full_scale(self.dtype)), out=values)
-        return values.astype(self.dtype), covered
+        pixels = np.zeros((*covered.shape, self.channels), dtype=self.dtype)
+        zone = self._contact_zone(layers, box) if blended else None
+        for rest in _without(box, zone):
+            self._lay(layers, rest, _part(pixels, box, rest))
+        if zone is not None:
+            _part(pixels, box, zone)[...] = self._multiband(layers, zone)
+        if not covered.all():
+            pixels[~covered] = 0
+        return pixels, covered
 
-    def _mean(self, layers: Sequence[Layer], box: Box) -> Float32Array:
-        """Weighted mean of the layers, px by px; of one layer, its samples."""
-        shape = (box[3] - box[1], box[2] - box[0])
-        total, weights = np.zeros((*shape, self.channels), dtype=np.float32), np.zeros(shape, dtype=np.float32)
-        for layer in layers:
-            common = intersection(layer.box, box)
-            if common is None or not (weight := _part(layer.weight, layer.box, common)).any():
-                continue
-            if self.options.blend != "feather":
-                # One owner per px: a product and a quotient would cost the last bit.
-                np.copyto(_part(total, box, common), self._samples(layer, common), where=(weight > 0)[..., None])
-                continue
-            _part(total, box, common)[...] += self._samples(layer, common) * spread(weight, self.channels)
-            _part(weights, box, common)[...] += weight
-        if self.options.blend == "feather":
-            total /= spread(np.where(weights > 0, weights, np.float32(1.0)), self.channels)
-        return total
+    def _contact_zone(self, layers: Sequence[Layer], box: Box) -> Box | None:
+        """The part of a box in which blending can mix pictures; elsewhere it would give back the one that is there."""
+        felt = [self._felt(layer) for layer in layers]
+        shared = [common for pair in combinations(felt, 2) if (common := intersection(*pair)) is not None]
+        parts = [part for common in shared if (part := intersection(common, box)) is not None]
+        if not parts:
+            return None
+        x0, y0, x1, y1 = zip(*parts, strict=True)
+        return min(x0), min(y0), max(x1), max(y1)
 
-    def _multiband(self, layers: Sequence[Layer], outer: Box, box: Box) -> Float32Array:
-        """Blend in bands on the outer box; the inner one is right."""
+    def _felt(self, layer: Layer) -> Box:
+        """Where multi-band blending feels a layer's weight."""
+        return aligned(grown(layer.box, margin(self.bands)), self.bands)
+
+    def _lay(self, layers: Sequence[Layer], box: Box, pixels: NDArray[Any]) -> None:
+        """Fill ``pixels``, which are those of ``box``, with the layers, or with their weighted mean."""
+        parts = [part for layer in layers if (part := layer.weighted_part(box)) is not None]
+        if self.options.blend != "feather":
+            # One owner per px: a product and a quotient would cost the last bit.
+            for part in parts:
+                cv2.copyTo(self._samples(part, part.box), _as_mask(part.weight > 0), _part(pixels, box, part.box))
+            return
+        total, weights = np.zeros(pixels.shape, dtype=np.float32), np.zeros(pixels.shape[:2], dtype=np.float32)
+        for part in parts:
+            _part(total, box, part.box)[...] += self._samples(part, part.box) * spread(part.weight, self.channels)
+            _part(weights, box, part.box)[...] += part.weight
+        total /= spread(np.where(weights > 0, weights, np.float32(1.0)), self.channels)
+        pixels[...] = self._as_samples(total)
+
+    def _multiband(self, layers: Sequence[Layer], box: Box) -> NDArray[Any]:
+        """Blend in bands, with the margin around the box that they need."""
+        outer = aligned(grown(box, margin(self.bands)), self.bands)
         blender = MultibandBlender(outer, self.bands, self.channels, self._rounding)
         for layer in layers:
-            felt = aligned(grown(layer.bounds(), margin(self.bands)), self.bands)
-            part = intersection(felt, outer)
-            assert part is not None
+            part, common = intersection(self._felt(layer), outer), intersection(layer.box, outer)
+            if part is None or common is None:
+                continue
             weight = np.zeros((part[3] - part[1], part[2] - part[0]), dtype=np.float32)
-            common = intersection(part, layer.box)
-            assert common is not None
             _part(weight, part, common)[...] = _part(layer.weight, layer.box, common)
-            blender.add(part, self._samples(layer, part), weight)
-        return np.ascontiguousarray(_part(blender.result(), outer, box))
+            blender.add(part, self._samples(layer, part).astype(np.float32), weight)
+        return self._as_samples(_part(blender.result(), outer, box))
+
+    def _as_samples(self, values: Float32Array) -> NDArray[Any]:
+        """Values in the output's type, rounded where it is whole numbers."""
+        if self.dtype.kind != "u":
+            return values.astype(self.dtype)
+        return np.clip(np.rint(values), 0, np.float32(full_scale(self.dtype))).astype(self.dtype)
 
     @property
     def _rounding(self) -> np.float32:
         """See :func:`rdstitch.compositing.multiband.rounding_constant`."""
         return rounding_constant(full_scale(self.dtype), self.dtype.kind == "u")
 
-    def _samples(self, layer: Layer, box: Box) -> Float32Array:
+    def _samples(self, layer: Layer, box: Box) -> NDArray[Any]:
         """Resampled and exposure-corrected samples (h, w, C) of one picture; mirrored content outside of it."""
         index, warp = layer.index, self.warps[layer.index]
-        known = intersection(layer.box, box) == box
-        geometry = layer.geometry.part(box) if known else locate(warp, box)
-        pixels = sample(warp, self.pictures[index], geometry, self.options.interpolation)
-        values = self.exposure.correct(index, warp, box, pixels.reshape(*geometry.inside.shape, self.channels))
-        return rounded(values, self._rounding) if self.options.blend == "multiband" else values
+        known = layer.geometry is not None and intersection(layer.box, box) == box
+        geometry = layer.geometry.part(box) if known and layer.geometry is not None else locate(warp, box)
+        picture = self.pictures.get(index, read_part(warp, geometry))
+        pixels = sample(warp, picture, geometry, self.options.interpolation)
+        return self.exposure.correct(index, warp, box, pixels.reshape(*geometry.inside.shape, self.channels))
 
     def _layers(self, box: Box) -> list[Layer]:
         """Weights of all pictures that have a say in a box."""
@@ -168,13 +189,14 @@ class Renderer:
             if geometry.inside.any():
                 weight = border_weight(warp, geometry)
                 opacity = self._opacity(index, geometry)
-                yield Layer(index, geometry, weight if opacity is None else weight * opacity)
+                yield Layer(index, part, weight if opacity is None else weight * opacity, geometry)
 
     def _opacity(self, index: int, geometry: Geometry) -> Float32Array | None:
         """Opacity of a picture that has a mask."""
         if not self.pictures.masked(index):
             return None
-        return sample_opacity(self.warps[index], self.pictures[index], geometry)
+        warp = self.warps[index]
+        return sample_opacity(warp, self.pictures.get(index, read_part(warp, geometry)), geometry)
 
     def _owned(self, box: Box) -> list[Layer]:
         """Layers where each px has one owner, or, for feathering along a seam, shares of its owners.
@@ -183,37 +205,39 @@ class Renderer:
         being coarse, has none of them, the one whose border is farthest.
         """
         shape = (box[3] - box[1], box[2] - box[0])
-        owner, best = np.full(shape, _NOBODY, dtype=np.int32), np.zeros(shape, dtype=np.float32)
         layers = list(self._shared(box))
+        if len(layers) == 1 and layers[0].box == box and (layers[0].weight == 1).all():
+            return layers
+        owner, best = np.full(shape, NOBODY, dtype=np.int32), np.zeros(shape, dtype=np.float32)
         for layer in layers:
             _claim(owner, best, box, layer)
         soft = layers if self.options.blend == "feather" else []
-        missing = owner == _NOBODY
-        if missing.any():
+        missing = owner == NOBODY
+        if (bounds := _bounds(missing, box)) is not None:
             best[...] = 0.0
-            for layer in self._bordered(_bounds(missing, box)):
+            for layer in self._bordered(bounds):
                 layer.weight[~_part(missing, box, layer.box)] = 0.0
                 _claim(owner, best, box, layer)
                 layers.append(layer)
         if self.options.blend == "feather":
-            owner[~missing] = _NOBODY
-        return soft + [piece for layer in layers if (piece := _won(owner, box, layer)) is not None]
+            owner[~missing] = NOBODY
+        return soft + [_won(owner, box, layer) for layer in layers]
 
     def _shared(self, box: Box) -> Iterator[Layer]:
         """Pictures that own part of a box in the seam map, with their shares where they cover it."""
-        if self.seams is None:
-            return
-        for index in self.seams.owners(box):
-            part = intersection(self.warps[index].box, box)
-            if part is None:
+        for index in [] if self.seams is None else self.seams.owners(box):
+            part = intersection(self.warps[index].box, box) if index != NOBODY else None
+            if part is None or self.seams is None:
+                continue
+            share = self.seams.share(index, part)
+            if self.warps[index].fills(part) and not self.pictures.masked(index):
+                yield Layer(index, part, share)
                 continue
             geometry = locate(self.warps[index], part)
-            share = self.seams.share(index, part)
             share[~geometry.inside] = 0.0
             if (opacity := self._opacity(index, geometry)) is not None:
                 share[opacity == 0] = 0.0
-            if share.any():
-                yield Layer(index, geometry, share)
+            yield Layer(index, part, share, geometry)
 
 
 def _claim(owner: NDArray[np.int32], best: Float32Array, box: Box, layer: Layer) -> None:
@@ -224,22 +248,35 @@ def _claim(owner: NDArray[np.int32], best: Float32Array, box: Box, layer: Layer)
     np.copyto(_part(owner, box, layer.box), layer.index, where=better)
 
 
-def _won(owner: NDArray[np.int32], box: Box, layer: Layer) -> Layer | None:
-    """The layer with weight 1 where its picture owns the px, and 0 elsewhere; None where it owns nothing."""
+def _won(owner: NDArray[np.int32], box: Box, layer: Layer) -> Layer:
+    """The layer with weight 1 where its picture owns the px, and 0 elsewhere."""
     owned = _part(owner, box, layer.box) == layer.index
     # A picture may have a layer from the seam map and one for what the map left over: each gets its own px.
     owned &= layer.weight > 0
-    if not owned.any():
-        return None
-    bounds = _bounds(owned, layer.box)
-    return Layer(layer.index, layer.geometry.part(bounds), _part(owned, layer.box, bounds).astype(np.float32))
+    return replace(layer, weight=owned.astype(np.float32))
 
 
-def _bounds(values: NDArray[Any], box: Box) -> Box:
-    """Smallest box that holds all values on ``box`` that are not 0."""
+def _bounds(values: NDArray[Any], box: Box) -> Box | None:
+    """Smallest box that holds all values on ``box`` that are not 0; None where there are none."""
     rows, columns = (np.flatnonzero(values.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return None
     x, y = box[:2]
     return int(x + columns[0]), int(y + rows[0]), int(x + columns[-1] + 1), int(y + rows[-1] + 1)
+
+
+def _without(box: Box, hole: Box | None) -> list[Box]:
+    """What is left of a box: above, left, right and below of a hole in it."""
+    if hole is None:
+        return [box]
+    (x0, y0, x1, y1), (left, top, right, bottom) = box, hole
+    parts = [(x0, y0, x1, top), (x0, top, left, bottom), (right, top, x1, bottom), (x0, bottom, x1, y1)]
+    return [part for part in parts if part[0] < part[2] and part[1] < part[3]]
+
+
+def _as_mask(chosen: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Not 0 where chosen, as OpenCV takes it."""
+    return chosen.view(np.uint8)
 
 
 def _part(values: NDArray[Any], box: Box, part: Box) -> NDArray[Any]:

@@ -17,15 +17,16 @@ from numpy.typing import NDArray
 from rdstitch.compositing.exposure import Exposure, full_scale
 from rdstitch.compositing.survey import Survey, SurveyTile
 from rdstitch.compositing.warp import Box, Float32Array
+from rdstitch.io.reduction import block_mean
 
 NOBODY = -1
-
-# Index before and after each px, and the share of the second.
-_Neighbours = tuple[NDArray[np.intp], NDArray[np.intp], Float32Array]
 
 # Band in which a seam may wander: the new picture's share of both border weights.
 _LEAST_SHARE, _LARGEST_SHARE = 0.2, 0.8
 _AROUND_FREE = 2
+# px from which on a cut is found at half the size first, and by how much it may then move.
+_LARGEST_CUT = 30_000
+_MOVED = 3
 
 
 @dataclass(frozen=True)
@@ -47,50 +48,35 @@ class SeamMap:
     softness: int = 0
 
     def owners(self, box: Box) -> list[int]:
-        """Pictures that own anything on a box (canvas px), ascending."""
-        window = self._window(*self._neighbours(box))[0]
-        return [int(owner) for owner in np.unique(window) if owner != NOBODY]
+        """Pictures that own anything on a box (canvas px), ascending; -1 first where nobody owns a part of it."""
+        return [int(owner) for owner in np.unique(self._window(box))]
 
     def share(self, owner: int, box: Box) -> Float32Array:
         """How much of each px of a box (canvas px) a picture owns: labels interpolated linearly, (h, w).
 
-        Every value depends on the labels around it alone, bit for bit, whatever the box.
+        Every value depends on the labels around it alone, bit for bit, whatever the box: sums of ones and of shares of
+        an even number of px are exact.
         """
-        x, y = self._neighbours(box)
-        window, left, top = self._window(x, y)
-        owned = (window == owner).astype(np.float32)
+        owned = (self._window(box) == owner).astype(np.float32)
         if owned.all():
-            return np.ones((len(y[0]), len(x[0])), dtype=np.float32)
-        if self.softness:
-            # Sums of ones are exact, in any order.
-            side = 2 * self.softness + 1
+            return np.ones((box[3] - box[1], box[2] - box[0]), dtype=np.float32)
+        side = 2 * self.softness + 1
+        if side > 1:
             owned = cv2.boxFilter(owned, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
-            owned *= np.float32(1.0 / side**2)
-        rows = owned[y[0] - top] * (1 - y[2])[:, None] + owned[y[1] - top] * y[2][:, None]
-        share: Float32Array = rows[:, x[0] - left] * (1 - x[2]) + rows[:, x[1] - left] * x[2]
-        return share
+        size = (owned.shape[1] * self.factor, owned.shape[0] * self.factor)
+        share = np.asarray(cv2.resize(owned, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+        x, y = (edge % self.factor + (1 + self.softness) * self.factor for edge in box[:2])
+        share = share[y : y + box[3] - box[1], x : x + box[2] - box[0]]
+        return share * np.float32(1.0 / side**2)
 
-    def _window(self, x: _Neighbours, y: _Neighbours) -> tuple[NDArray[np.int32], int, int]:
-        """The labels that have a say in a box, and the indices of the first column and row."""
-        left, top = (max(0, int(axis[0].min()) - self.softness) for axis in (x, y))
-        right, bottom = (int(axis[1].max()) + 1 + self.softness for axis in (x, y))
-        return self.labels[top:bottom, left:right], left, top
-
-    def _neighbours(self, box: Box) -> tuple[_Neighbours, _Neighbours]:
-        """Labels before and after the px of a box, along x and along y."""
-        height, width = self.labels.shape
-        return (
-            _neighbours(box[0], box[2], self.factor, width),
-            _neighbours(box[1], box[3], self.factor, height),
+    def _window(self, box: Box) -> NDArray[np.int32]:
+        """The labels that have a say in a box, one and the softness more on each side; the border repeats itself."""
+        around = 1 + self.softness
+        columns, rows = (
+            np.clip(np.arange(start // self.factor - around, -(-stop // self.factor) + around), 0, count - 1)
+            for start, stop, count in zip(box[:2], box[2:], self.labels.shape[::-1], strict=True)
         )
-
-
-def _neighbours(start: int, stop: int, factor: int, count: int) -> _Neighbours:
-    """Labels before and after each canvas px, and the share of the second; the border repeats itself."""
-    place = (np.arange(start, stop) + 0.5) / factor - 0.5
-    before = np.floor(place).astype(np.intp)
-    share = (place - before).astype(np.float32)
-    return np.clip(before, 0, count - 1), np.clip(before + 1, 0, count - 1), share
+        return self.labels[np.ix_(rows, columns)]
 
 
 def find_seams(
@@ -120,8 +106,8 @@ def find_seams(
             if composite is None:
                 won = tile.inside & (tile.weight > weights[cut])
             else:
-                pixels = exposure.correct(index, survey.warps[index], tile.box, tile.pixels)
-                pixels *= np.float32(1.0 / full_scale(tile.pixels.dtype))
+                corrected = exposure.correct(index, survey.warps[index], tile.box, tile.pixels)
+                pixels = corrected * np.float32(1.0 / full_scale(corrected.dtype))
                 won = _cut(tile, pixels, composite[cut], labels[cut] != NOBODY, weights[cut])
                 composite[cut][won] = pixels[won]
             labels[cut][won] = index
@@ -164,12 +150,35 @@ def _reach(present: NDArray[np.bool_]) -> tuple[int, int]:
 
 
 def _graph_cut(images: list[Float32Array], masks: list[NDArray[np.uint8]]) -> NDArray[np.bool_]:
-    """Where the second of two images wins; the px that one mask alone has are what the cut must separate."""
+    """Where the second of two images wins; the px that one mask alone has are what the cut must separate.
+
+    A large cut is found at half the size first, and then only moved by a few px.
+    """
+    if masks[0].size > _LARGEST_CUT:
+        masks = _near_cut(_graph_cut([_halved(i) for i in images], [m[::2, ::2] for m in masks]), masks)
     # The stubs know neither the class nor a UMat made of an array.
     detail: Any = cv2
     finder = detail.detail_GraphCutSeamFinder("COST_COLOR_GRAD")
     result = finder.find([detail.UMat(i) for i in images], [(0, 0), (0, 0)], [detail.UMat(m) for m in masks])
     return np.asarray(result[1].get() > 0)
+
+
+def _halved(image: Float32Array) -> Float32Array:
+    """Half the size, rounded up."""
+    return np.asarray(block_mean(image, 2), dtype=np.float32)
+
+
+def _near_cut(won: NDArray[np.bool_], masks: list[NDArray[np.uint8]]) -> list[NDArray[np.uint8]]:
+    """Masks that leave free only what is near a cut found at half the size."""
+    height, width = masks[0].shape
+    above = np.repeat(np.repeat(won, 2, axis=0), 2, axis=1)[:height, :width].astype(np.uint8)
+    kernel = np.ones((2 * _MOVED + 1,) * 2, np.uint8)
+    surely_new, surely_old = cv2.erode(above, kernel) > 0, cv2.dilate(above, kernel) == 0
+    free = (masks[0] > 0) & (masks[1] > 0)
+    return [
+        np.where(free & settled, np.uint8(0), mask)
+        for mask, settled in zip(masks, (surely_new, surely_old), strict=True)
+    ]
 
 
 def _three_channels(pixels: Float32Array) -> Float32Array:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.pictures import PictureReader, prepare_picture
+from rdstitch.compositing.pictures import PictureReader
 from rdstitch.compositing.warp import (
     Box,
     Float32Array,
@@ -103,7 +103,7 @@ def survey_pictures(
 def _survey_tile(reader: PictureReader, index: int, warp: Warp) -> SurveyTile | None:
     """One picture, small."""
     geometry = locate(warp, warp.box)
-    picture = prepare_picture(reader(index), warp.shrink)
+    picture = reader.prepared(index, warp.shrink)
     inside, weight = geometry.inside, border_weight(warp, geometry)
     opacity = sample_opacity(warp, picture, geometry)
     if opacity is not None:

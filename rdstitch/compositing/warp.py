@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.pictures import LoadedPicture
+from rdstitch.compositing.pictures import KERNEL_MARGIN, LoadedPicture, Part
 from rdstitch.radial_homography import to_plane
 
 Box = tuple[int, int, int, int]
@@ -24,8 +24,8 @@ INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos"
 _LATTICE_ERROR = 0.01
 _LATTICE_STEPS = (32, 16, 8, 4, 2)
 _NOWHERE = np.float32(-1e6)
-# Room around a piece of a picture for the kernel of the resampling, px.
-_KERNEL_MARGIN = 8
+# OpenCV resamples from no side as long as this, px.
+_TOO_LONG = 32767
 _PROBES = 16
 _LEAST_WEIGHT = np.float32(1e-6)
 
@@ -68,6 +68,17 @@ class Warp:
         The lattice is anchored to the canvas, so that every box gives the same coordinates, bit for bit.
         """
         return lattice_maps(self.source_points, box, self.step)
+
+    def contains(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
+        """Which measured px lie in the picture; NaN does not."""
+        width, height = self.camera.image_size
+        return (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
+
+    def fills(self, box: Box) -> bool:
+        """Whether the picture is on all of a box, beyond doubt: it holds all nodes of the lattice, with half a px."""
+        points = self.source_points(*lattice_nodes(box, self.step))
+        limit = np.array(self.camera.image_size) - 1.0
+        return bool(((points >= 0.0) & (points <= limit)).all())
 
 
 @dataclass(frozen=True)
@@ -113,9 +124,16 @@ def plan_warp(camera: Camera, homography: FloatArray, canvas: Canvas, index: int
 def locate(warp: Warp, box: Box) -> Geometry:
     """Where the px of a box come from, and which of them lie in the picture."""
     map_x, map_y = warp.maps(box)
-    width, height = warp.camera.image_size
-    inside = (map_x >= -0.5) & (map_x < width - 0.5) & (map_y >= -0.5) & (map_y < height - 0.5)
+    inside = np.ones(map_x.shape, dtype=np.bool_) if warp.fills(box) else warp.contains(map_x, map_y)
     return Geometry(box, map_x, map_y, inside)
+
+
+def read_part(warp: Warp, geometry: Geometry) -> Part:
+    """The part of the picture that :func:`sample` takes px from."""
+    width, height = warp.camera.image_size
+    left, right = _mirrored_extent(geometry.map_x, width)
+    top, bottom = _mirrored_extent(geometry.map_y, height)
+    return left, top, right, bottom
 
 
 def border_weight(warp: Warp, geometry: Geometry) -> Float32Array:
@@ -139,7 +157,7 @@ def sample(warp: Warp, picture: LoadedPicture, geometry: Geometry, interpolation
     ----------
     warp : Warp
     picture : LoadedPicture
-        Prepared for ``warp.shrink``.
+        Prepared for ``warp.shrink``; it holds what :func:`read_part` says.
     geometry : Geometry
         From :func:`locate`.
     interpolation : str
@@ -151,7 +169,7 @@ def sample(warp: Warp, picture: LoadedPicture, geometry: Geometry, interpolation
         In the picture's sample type.
     """
     map_x, map_y = _mirrored(warp, picture, geometry)
-    return _remap_piece(picture.pixels, map_x, map_y, INTERPOLATION[interpolation])
+    return _remap_from(picture.pixels, picture.origin, map_x, map_y, INTERPOLATION[interpolation])
 
 
 def sample_opacity(warp: Warp, picture: LoadedPicture, geometry: Geometry) -> Float32Array | None:
@@ -159,7 +177,7 @@ def sample_opacity(warp: Warp, picture: LoadedPicture, geometry: Geometry) -> Fl
     if picture.opacity is None:
         return None
     map_x, map_y = _mirrored(warp, picture, geometry)
-    opacity = _remap_piece(picture.opacity, map_x, map_y, cv2.INTER_LINEAR)
+    opacity = _remap_from(picture.opacity, picture.origin, map_x, map_y, cv2.INTER_LINEAR)
     # The outer half of the last opaque px is outside.
     return np.where(opacity >= 0.5 * picture.opacity_step, opacity, 0.0).astype(np.float32)
 
@@ -189,15 +207,28 @@ def _mirrored(warp: Warp, picture: LoadedPicture, geometry: Geometry) -> tuple[F
     return map_x, map_y
 
 
-def _remap_piece(pixels: NDArray[Any], map_x: Float32Array, map_y: Float32Array, interpolation: int) -> NDArray[Any]:
-    """``cv2.remap`` from the smallest piece of a picture that is needed; it takes no side above 32767 px."""
-    height, width = pixels.shape[:2]
-    left, top = (max(0, int(m.min()) - _KERNEL_MARGIN) for m in (map_x, map_y))
-    right = min(width, int(map_x.max()) + 2 + _KERNEL_MARGIN)
-    bottom = min(height, int(map_y.max()) + 2 + _KERNEL_MARGIN)
+def _mirrored_extent(values: Float32Array, length: int) -> tuple[int, int]:
+    """First and last but one px that coordinates come to lie on when they are mirrored at both borders."""
+    low, high = float(values.min()), float(values.max())
+    start, stop = min(low, 2.0 * length - high), max(high, -low) + 2.0
+    return (0 if low < 0.0 else max(0, int(start))), (length if high > length else min(length, int(stop)))
+
+
+def _remap_from(
+    pixels: NDArray[Any], origin: tuple[int, int], map_x: Float32Array, map_y: Float32Array, interpolation: int
+) -> NDArray[Any]:
+    """``cv2.remap`` from a picture whose first px is at ``origin``; of a very long one, from the piece that counts."""
+    left, top = origin
+    if max(pixels.shape[:2]) >= _TOO_LONG:
+        x, y = (max(0, int(m.min()) - o - KERNEL_MARGIN) for m, o in zip((map_x, map_y), origin, strict=True))
+        right, bottom = (int(m.max()) - o + 2 + KERNEL_MARGIN for m, o in zip((map_x, map_y), origin, strict=True))
+        pixels, left, top = pixels[y:bottom, x:right], left + x, top + y
     # Whole px are subtracted exactly, so the piece does not change the result.
-    map_x, map_y = map_x - np.float32(left), map_y - np.float32(top)
-    return _remap(pixels[top:bottom, left:right], map_x, map_y, interpolation)
+    if left:
+        map_x = map_x - np.float32(left)
+    if top:
+        map_y = map_y - np.float32(top)
+    return _remap(pixels, map_x, map_y, interpolation)
 
 
 def _remap(piece: NDArray[Any], map_x: Float32Array, map_y: Float32Array, interpolation: int) -> NDArray[Any]:

@@ -1,5 +1,6 @@
 """Options of feature detection."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,3 +53,9 @@ class FeatureOptions:
             raise ArgumentError("surf_octaves and surf_layers must be at least 1")
         if not 0 < self.spread_cell <= 1:
             raise ArgumentError(f"spread_cell must be in (0, 1], not {self.spread_cell}")
+
+    def shrink(self, image_size: tuple[int, int]) -> float:
+        """Px of a picture of this width and height per px that detection works at; 1 at least."""
+        if self.work_megapixels is None:
+            return 1.0
+        return max(1.0, math.sqrt(image_size[0] * image_size[1] / (self.work_megapixels * 1e6)))

@@ -35,12 +35,12 @@ def jpeg_pieces(layout: Layout, strips: Iterable[Strip]) -> Iterator[bytes | mem
 def _encoded(layout: Layout, samples: NDArray[np.generic], alpha: NDArray[np.uint8] | None) -> bytes:
     """One strip as a JPEG file of its own, with a restart marker after each row of blocks."""
     eight = as_eight_bit(samples)
-    if alpha is not None and not alpha.all():
-        eight = np.where((alpha > 0)[..., None], eight, np.uint8(layout.background))
     if layout.channels == 1:
-        block, picture = _BLOCK_GREY, np.ascontiguousarray(eight[..., 0])
+        block, picture = _BLOCK_GREY, eight[..., 0].copy()
     else:
-        block, picture = _BLOCK_COLOUR, np.ascontiguousarray(eight[..., ::-1])
+        block, picture = _BLOCK_COLOUR, np.asarray(cv2.cvtColor(eight, cv2.COLOR_RGB2BGR))
+    if alpha is not None and not alpha.all():
+        picture[alpha == 0] = layout.background
     options = [
         *(cv2.IMWRITE_JPEG_QUALITY, layout.quality),
         *(cv2.IMWRITE_JPEG_RST_INTERVAL, -(-layout.size[0] // block)),

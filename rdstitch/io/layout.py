@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -100,7 +101,9 @@ def as_eight_bit(samples: NDArray[Any]) -> NDArray[np.uint8]:
 def with_alpha(samples: NDArray[Any], alpha: NDArray[np.uint8] | None) -> NDArray[Any]:
     """Samples (h, W, C) with alpha as one channel more, in the samples' type."""
     full = np.iinfo(samples.dtype).max if samples.dtype.kind == "u" else 1.0
-    joined = np.empty((*samples.shape[:2], samples.shape[2] + 1), dtype=samples.dtype)
-    joined[..., :-1] = samples
-    joined[..., -1] = full if alpha is None else alpha * samples.dtype.type(full / 255)
-    return joined
+    if alpha is None:
+        opacity = np.full(samples.shape[:2], full, dtype=samples.dtype)
+    else:
+        opacity = alpha * samples.dtype.type(full / 255)
+    # numpy is slow along an axis of three.
+    return np.asarray(cv2.merge([samples, opacity]))

@@ -24,6 +24,9 @@ from rdstitch.pipeline.georeference import Georeference, georeference
 from rdstitch.pipeline.progress import Progress
 from rdstitch.pipeline.sources import Source, readers
 
+# Reduction of a picture of which only the kind of its samples is wanted.
+_SMALLEST = 8
+
 
 @dataclass(frozen=True)
 class Composed:
@@ -88,7 +91,7 @@ def compose_pictures(
     options = replace(options, workers=threads)
     read = readers(sources)
     if dry_run:
-        pixels = read[0]().pixels
+        pixels = read[0](_SMALLEST).pixels
         channels = 1 if pixels.ndim == 2 else pixels.shape[2]
         return Composed(canvas, plan=plan_composite(cameras, canvas, options, channels, pixels.dtype.itemsize))
 
@@ -96,7 +99,7 @@ def compose_pictures(
         progress("compositing", round(100 * share), 100)
 
     if output is None:
-        composite = compose(read, cameras, homographies, canvas, options, told)
+        composite = compose(read, cameras, homographies, canvas, options, told, read)
         return Composed(composite.canvas, composite, notes=composite.notes)
     matrices = np.asarray(homographies, dtype=np.float64)
     placed: list[tuple[Georeference | None, str]] = []
@@ -105,7 +108,7 @@ def compose_pictures(
         placed.append(georeference([source.metadata.gps for source in sources], cameras, final.matrix @ matrices))
         return placed[0][0].tiff_tags() if placed[0][0] is not None else []
 
-    written = compose_to_file(output, read, cameras, matrices, canvas, options, sources[0].metadata, told, tags)
+    written = compose_to_file(output, read, cameras, matrices, canvas, options, sources[0].metadata, told, tags, read)
     place, note = placed[0]
     if place is not None and Path(output).suffix.lower() not in (".tif", ".tiff"):
         place.write_beside(output)

@@ -8,8 +8,9 @@ from itertools import chain
 
 import numpy as np
 
-from rdstitch.compositing.agreement import Agreement, PlacedPicture, overlap_agreement
+from rdstitch.compositing.agreement import COMPARED_SIDE, Agreement, PlacedPicture, overlap_agreement
 from rdstitch.compositing.ambiguity import Ambiguity, draw, drawing_scale, placement_ambiguity
+from rdstitch.io.reduction import fitting_reduction
 from rdstitch.pipeline.cache import NO_CACHE, Cache
 from rdstitch.pipeline.register import Registration
 from rdstitch.registration.alignment import LinkFit
@@ -74,7 +75,8 @@ def _compare(
     alignment = registration.alignment
 
     def place(index: int) -> PlacedPicture:
-        picture = registration.sources[index].read()
+        source = registration.sources[index]
+        picture = source.read(fitting_reduction(max(source.camera.image_size) / COMPARED_SIDE))
         return PlacedPicture.of(picture, alignment.cameras[index], alignment.homographies[index])
 
     def compare(fit: LinkFit, scale: float) -> CheckedLink:

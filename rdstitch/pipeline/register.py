@@ -10,6 +10,7 @@ from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError, RegistrationError
 from rdstitch.features import Features, LightGlue, Matcher, detect_all, match
 from rdstitch.io.read import Pixels
+from rdstitch.io.reduction import fitting_reduction
 from rdstitch.pipeline.cache import Cache
 from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.pairing import Pairing
@@ -179,9 +180,11 @@ def _detect(
     """Features of every picture, and which pictures turned out to be damaged; these have no features."""
     damaged: dict[int, str] = {}
 
+    reductions = [fitting_reduction(options.features.shrink(source.camera.image_size)) for source in sources]
+
     def load(index: int) -> tuple[Pixels, Pixels | None]:
         try:
-            picture = sources[index].read()
+            picture = sources[index].read(reductions[index])
         except InputError as error:
             if not skip_bad:
                 raise
@@ -195,8 +198,12 @@ def _detect(
     def recall(index: int, compute: Callable[[], Features]) -> Features:
         source = sources[index]
         inputs = (cache.file(source.path), cache.file(source.mask), source.camera.image_size, wanted, network)
+
+        def find() -> Features:
+            return compute().enlarged(reductions[index], source.camera.image_size)
+
         # A damaged picture has no features, but that must be said again the next time.
-        return cache.recall("features", (Features,), inputs, compute, unless=lambda: index in damaged)
+        return cache.recall("features", (Features,), inputs, find, unless=lambda: index in damaged)
 
     loaders = [partial(load, index) for index in range(len(sources))]
     progress_of = partial(progress, "detecting features")

@@ -12,6 +12,7 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.io.mask import read_mask
 from rdstitch.io.metadata import Metadata, read_metadata
 from rdstitch.io.read import Picture, read_image
+from rdstitch.io.reduction import block_minimum, reduced_size
 
 
 @dataclass(frozen=True)
@@ -41,29 +42,29 @@ class Source:
         """File name, for messages and reports."""
         return self.path.name
 
-    def read(self) -> Picture:
-        """The pixels; what the mask excludes is transparent.
+    def read(self, reduction: int = 1) -> Picture:
+        """The pixels, reduced as by :func:`rdstitch.io.read_image`; what the mask excludes is transparent.
 
         Raises
         ------
         InputError
             When the file cannot be read, or is no longer what it was.
         """
-        picture = read_image(self.path)
-        height, width = picture.pixels.shape[:2]
-        if (width, height) != self.camera.image_size:
-            before = "{} x {}".format(*self.camera.image_size)
-            raise InputError(f"{self.path}: has {width} x {height} px now, but had {before} before; run again")
+        picture = read_image(self.path, reduction)
+        expected = self.camera.image_size
+        if picture.pixels.shape[1::-1] != reduced_size(expected, reduction):
+            now, before = ("{} x {}".format(*size) for size in (picture.metadata.size, expected))
+            raise InputError(f"{self.path}: has {now} px now, but had {before} before; run again")
         if self.mask is None:
             return picture
-        alpha = read_mask(self.mask, (width, height))
+        alpha = block_minimum(read_mask(self.mask, expected), reduction)
         if picture.alpha is not None:
             alpha = np.minimum(alpha, picture.alpha)
         return replace(picture, alpha=alpha)
 
 
-def readers(sources: Sequence[Source]) -> list[Callable[[], Picture]]:
-    """What reads the pictures for the compositor; those whose samples cannot be mixed are named.
+def readers(sources: Sequence[Source]) -> list[Callable[..., Picture]]:
+    """What reads the pictures for the compositor, whole or reduced; those whose samples cannot be mixed are named.
 
     Raises
     ------
@@ -72,8 +73,8 @@ def readers(sources: Sequence[Source]) -> list[Callable[[], Picture]]:
     """
     first: list[tuple[Source, str]] = []
 
-    def read(source: Source) -> Picture:
-        picture = source.read()
+    def read(source: Source, reduction: int = 1) -> Picture:
+        picture = source.read(reduction)
         bands = 1 if picture.pixels.ndim == 2 else picture.pixels.shape[2]
         # Grey becomes colour where it must.
         kind = f"{picture.pixels.dtype} samples" + ("" if bands in (1, 3) else f" in {bands} bands")

@@ -96,7 +96,9 @@ def composite_files(paths: list[Path], homographies: FloatArray, output: Path, *
     cameras = [LENS] * len(paths)
     sources = [partial(read_image, path) for path in paths]
     canvas = plan_canvas(cameras, homographies)
-    done = compose_to_file(output, sources, cameras, homographies, canvas, CompositeOptions(**options))
+    done = compose_to_file(
+        output, sources, cameras, homographies, canvas, CompositeOptions(**options), previews=sources
+    )
     return done.canvas.size
 
 

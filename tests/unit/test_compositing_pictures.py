@@ -1,0 +1,101 @@
+"""The cache of pictures: bounded, no more than is needed, and right all the same."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from rdstitch.compositing.parts import shown_parts
+from rdstitch.compositing.pictures import NOTHING, PictureCache, PictureReader, prepare_picture
+from rdstitch.compositing.seams import SeamMap
+from rdstitch.compositing.warp import plan_warp
+from rdstitch.io import Picture
+from tests.compositing_scenes import as_picture, render
+
+WHOLE = (0, 0, 200, 100)
+
+
+class Shelf:
+    """Four pictures, and how often each was read."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(0)
+        self.frames = [rng.integers(0, 256, (100, 200), dtype=np.uint8) for _ in range(4)]
+        self.reads: Counter[int] = Counter()
+
+    def read(self, index: int) -> Picture:
+        """One picture."""
+        self.reads[index] += 1
+        return as_picture(self.frames[index])
+
+    def cache(self, limit: int) -> PictureCache:
+        """All pictures, as they are."""
+        reader = PictureReader([lambda k=k: self.read(k) for k in range(4)], [(200, 100)] * 4)  # type: ignore[misc]
+        return PictureCache(reader, [1.0] * 4, limit)
+
+
+def test_those_used_last_are_held() -> None:
+    shelf = Shelf()
+    cache = shelf.cache(limit=2 * 20_000)
+    for index in (0, 1, 0, 1, 2, 1, 0):
+        np.testing.assert_array_equal(cache.get(index, WHOLE).pixels, shelf.frames[index])
+    assert shelf.reads == {0: 2, 1: 1, 2: 1}
+
+
+def test_parts_take_less_room() -> None:
+    shelf = Shelf()
+    cache = shelf.cache(limit=20_000)
+    cache.expect([(50, 10, 100, 30)] * 4)
+    for index in (0, 1, 2, 3, 0, 1, 2, 3):
+        held = cache.get(index, (60, 10, 90, 30))
+        x, y = held.origin
+        np.testing.assert_array_equal(held.pixels[12 - y, 61 - x], shelf.frames[index][12, 61])
+    assert max(shelf.reads.values()) == 1
+
+
+def test_more_than_expected_is_read_once_more_and_kept() -> None:
+    shelf = Shelf()
+    cache = shelf.cache(limit=80_000)
+    cache.expect([(50, 10, 100, 30), NOTHING, WHOLE, WHOLE])
+    for part in ((60, 10, 90, 30), (0, 0, 90, 30), (90, 10, 200, 100)):
+        assert cache.get(0, part).holds(part)
+        assert cache.get(1, part).holds(part)
+    cache.expect([NOTHING] * 4)
+    assert cache.get(0, WHOLE).holds(WHOLE)
+    assert shelf.reads == {0: 2, 1: 1}
+
+
+@pytest.mark.parametrize("shrink", [1.0, 5.0])
+def test_a_cut_holds_what_was_asked_for(shrink: float) -> None:
+    frame = np.random.default_rng(1).integers(0, 256, (300, 400, 3), dtype=np.uint8)
+    whole = prepare_picture(as_picture(frame), shrink)
+    part = whole.cut((101, 53, 222, 177))
+    again = part.cut((150, 100, 160, 110))
+    for smaller, box in ((part, (101, 53, 222, 177)), (again, (150, 100, 160, 110))):
+        assert smaller.holds(box)
+        assert not smaller.holds((0, 0, 400, 300))
+        assert smaller.nbytes < 0.5 * whole.nbytes
+        x, y = smaller.origin
+        rows, columns = smaller.pixels.shape[:2]
+        np.testing.assert_array_equal(smaller.pixels, whole.pixels[y : y + rows, x : x + columns])
+
+
+def test_shown_parts_hold_all_that_a_picture_owns() -> None:
+    scene = render(2, 2, distortion=-0.3)
+    warps = [
+        plan_warp(c, g, scene.canvas, k) for k, (c, g) in enumerate(zip(scene.cameras, scene.homographies, strict=True))
+    ]
+    width, height = scene.canvas.size
+    labels = np.full((height // 4 + 1, width // 4 + 1), -1, np.int32)
+    labels[20:60, 30:70] = 0
+    labels[70:90, 100:130] = 3
+    parts = shown_parts(warps, SeamMap(labels, 4), around=10)
+    assert parts[1].from_row(0) == NOTHING
+    for index, (rows, columns) in {0: ((80, 240), (120, 280)), 3: ((280, 360), (400, 520))}.items():
+        y, x = (np.arange(*limits, dtype=float) for limits in (rows, columns))
+        for first in (0, (rows[0] + rows[1]) // 2):
+            points = warps[index].source_points(*np.meshgrid(x, y[y >= first])).reshape(-1, 2)
+            points = points[warps[index].contains(*points.T)]
+            x0, y0, x1, y1 = parts[index].from_row(first)
+            assert ((points >= (x0, y0)) & (points <= (x1, y1))).all()
+        assert parts[index].from_row(rows[1]) == NOTHING

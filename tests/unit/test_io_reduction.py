@@ -1,0 +1,86 @@
+"""Pictures read smaller: px stand for whole blocks, whatever the format, the orientation and the mask."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from rdstitch.features import FeatureOptions, detect
+from rdstitch.io import Metadata, read_image, write_image
+from rdstitch.io.reduction import block_mean, block_minimum, fitting_reduction
+from rdstitch.synthetic import ground
+
+WIDTH, HEIGHT = 203, 150
+
+
+@pytest.fixture(scope="module")
+def pixels() -> NDArray[np.uint8]:
+    """Ground, as sharp as a lens leaves it."""
+    colour = np.asarray(cv2.GaussianBlur(ground((WIDTH, HEIGHT), 3, 3).region(0, 0, WIDTH, HEIGHT), (0, 0), 1.5))
+    return np.asarray(np.clip(np.rint(colour * 255), 0, 255), np.uint8)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 8])
+def test_blocks_become_px(tmp_path: Path, pixels: NDArray[np.uint8], factor: int) -> None:
+    alpha = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    alpha[40:50, 60:90] = 0
+    write_image(tmp_path / "a.png", pixels, alpha)
+    picture = read_image(tmp_path / "a.png", factor)
+    rows, columns = -(-HEIGHT // factor), -(-WIDTH // factor)
+    assert picture.pixels.shape == (rows, columns, 3)
+    assert picture.metadata.size == (WIDTH, HEIGHT)
+    assert picture.alpha is not None
+    for y, x in ((0, 0), (45 // factor, 75 // factor), (rows - 1, columns - 1)):
+        block = np.s_[y * factor : (y + 1) * factor, x * factor : (x + 1) * factor]
+        assert picture.alpha[y, x] == alpha[block].min()
+        if picture.alpha[y, x] and (y + 1) * factor <= HEIGHT and (x + 1) * factor <= WIDTH:
+            np.testing.assert_allclose(picture.pixels[y, x], pixels[block].mean(axis=(0, 1)), atol=0.51)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("factor", [2, 4, 6, 8])
+def test_jpeg_is_reduced_where_it_lies(
+    tmp_path: Path, pixels: NDArray[np.uint8], orientation: int, factor: int
+) -> None:
+    """The decoder's own reduction is no other picture than the mean of blocks; half a px of shift would show."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    write_image(tmp_path / "a.jpg", pixels, None, Metadata((WIDTH, HEIGHT), exif=exif.tobytes()), quality=98)
+    whole, small = (read_image(tmp_path / "a.jpg", k).pixels for k in (1, factor))
+    expected = block_mean(whole, factor).astype(float)
+    inner = np.s_[1:-1, 1:-1]
+    error = np.abs(small - expected)[inner].mean()
+    assert small.shape == expected.shape
+    for axis in (0, 1):
+        shifted = 0.5 * (expected + np.roll(expected, 1, axis))
+        assert error < 0.5 * np.abs(shifted - expected)[inner].mean()
+
+
+def test_grey_jpeg_stays_grey(tmp_path: Path, pixels: NDArray[np.uint8]) -> None:
+    write_image(tmp_path / "a.jpg", pixels[..., 0])
+    assert read_image(tmp_path / "a.jpg", 4).pixels.shape == (38, 51)
+
+
+def test_reductions_that_fit() -> None:
+    assert [fitting_reduction(shrink) for shrink in (0.3, 1.9, 2.0, 3.99, 7.0, 8.0, 100.0)] == [1, 1, 2, 2, 4, 8, 8]
+
+
+def test_one_transparent_px_makes_its_block_transparent() -> None:
+    alpha = np.full((5, 7), 255, np.uint8)
+    alpha[4, 6] = 0
+    np.testing.assert_array_equal(block_minimum(alpha, 4), [[255, 255], [255, 0]])
+
+
+def test_features_of_a_reduced_picture_lie_where_they_are_in_the_whole(pixels: NDArray[Any]) -> None:
+    large = np.asarray(cv2.resize(pixels, (4 * WIDTH, 4 * HEIGHT), interpolation=cv2.INTER_CUBIC))
+    options = FeatureOptions(work_megapixels=WIDTH * HEIGHT / 1e6)
+    whole = detect(large, options)
+    small = detect(block_mean(large, 2), options).enlarged(2, (4 * WIDTH, 4 * HEIGHT))
+    assert small.image_size == whole.image_size
+    assert options.shrink((4 * WIDTH, 4 * HEIGHT)) == pytest.approx(4.0)
+    distance = np.linalg.norm(whole.points[:50, None] - small.points[None], axis=2).min(axis=1)
+    assert np.median(distance) < 0.2
