@@ -226,13 +226,15 @@ def test_scenes_in_the_format_of_hpatches_are_read_and_distorted(tmp_path: Path)
     assert judge(own, replace(pair, grid1=pair.grid2, grid2=pair.grid1)).error > 5.0
 
 
-def test_programs_are_measured_and_ended_in_time(tmp_path: Path) -> None:
+def test_programs_are_measured_and_kept_within_limits(tmp_path: Path) -> None:
     python = [sys.executable, "-c"]
     failed = run_all([[*python, "import sys; sys.exit('no overlap')"], [*python, "never"]], tmp_path, 30.0)
     assert (failed.status, failed.said) == (1, "no overlap")
     large = run_all([[*python, "a = bytearray(300_000_000)"], [*python, "pass"]], tmp_path, 30.0)
     assert large.ok
     assert 300.0 < large.megabytes < 400.0
+    runaway = run_all([[*python, "a = bytearray(9 << 30)"]], tmp_path, 30.0)
+    assert (runaway.status, runaway.said) == (1, "MemoryError")
     begun = time.perf_counter()
     late = run_all([[*python, "import time; time.sleep(60)"]], tmp_path, 0.5)
     assert late.status is None

@@ -1,4 +1,4 @@
-"""Run one command with a time limit and tell how it went: ``python launcher.py SECONDS COMMAND …``.
+"""Run one command within limits and tell how it went: ``python launcher.py SECONDS BYTES COMMAND …``.
 
 It is a script of its own because the kernel counts the memory of the process that forks a command as the command's:
 this one is small. It prints as JSON the exit status, null when the time was up, the peak memory in kB, and
@@ -7,6 +7,7 @@ the processor time of the command and all that it has waited for.
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -18,7 +19,9 @@ _POLL = 0.02  # s
 
 def main() -> None:
     """Run the command that the arguments give."""
-    seconds, command = float(sys.argv[1]), sys.argv[2:]
+    seconds, memory, command = float(sys.argv[1]), int(sys.argv[2]), sys.argv[3:]
+    # What a command starts in turn has the same limit.
+    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stdin=subprocess.DEVNULL)
     end = time.perf_counter() + seconds
     code: int | None = None
