@@ -25,22 +25,30 @@ def chebyshev_from_values(degree: int) -> FloatArray:
     return np.asarray(matrix)
 
 
-def chebyshev_value_and_slope(coefficients: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Value and derivative of Chebyshev series (degree + 1, N) at t (N,), by Clenshaw's recurrence."""
+@lru_cache
+def value_and_slope_from_values(degree: int) -> FloatArray:
+    """Matrices from values at the Chebyshev nodes to the Chebyshev series of a polynomial and of its derivative.
+
+    Returns
+    -------
+    ndarray of shape (2, degree + 1, degree + 1)
+        Value and slope, coefficient, node.
+    """
+    series = chebyshev_from_values(degree)
+    slope = np.polynomial.chebyshev.chebder(series)
+    return np.stack([series, np.pad(slope, ((0, len(series) - len(slope)), (0, 0)))])
+
+
+def chebyshev_values(series: FloatArray, t: FloatArray) -> FloatArray:
+    """Values at t (N,) of Chebyshev series (S, degree + 1, N), S at each place; shape (S, N)."""
+    basis = np.empty(series.shape[1:])
+    basis[0], basis[1:2] = 1.0, t
     twice = 2.0 * t
-    value, before, spare = coefficients[-1].copy(), np.zeros_like(t), np.empty_like(t)
-    half_slope, half_before = np.zeros_like(t), np.zeros_like(t)
     # In place, for this is the innermost loop of all solvers.
-    for c in coefficients[-2:0:-1]:
-        np.multiply(twice, half_slope, out=spare)
-        spare -= half_before
-        spare += value
-        half_slope, half_before, spare = spare, half_slope, half_before
-        np.multiply(twice, value, out=spare)
-        spare -= before
-        spare += c
-        value, before, spare = spare, value, before
-    return coefficients[0] + t * value - before, value + 2.0 * (t * half_slope - half_before)
+    for k in range(2, len(basis)):
+        np.multiply(twice, basis[k - 1], out=basis[k])
+        basis[k] -= basis[k - 2]
+    return np.asarray(np.einsum("skn,kn->sn", series, basis))
 
 
 @lru_cache

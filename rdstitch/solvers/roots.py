@@ -20,9 +20,9 @@ from rdstitch.solvers.polynomials import (
     bernstein_from_values,
     bernstein_subdivision,
     bernstein_value,
-    chebyshev_from_values,
     chebyshev_nodes,
-    chebyshev_value_and_slope,
+    chebyshev_values,
+    value_and_slope_from_values,
 )
 
 _VALUES_IN_CACHE = 20480
@@ -72,19 +72,19 @@ def real_roots(equation: Equation, degree: int, low: FloatArray, high: FloatArra
     middle = low + half
     # With all nodes of all samples at once the intermediate values of an equation would not stay in cache.
     size = max(1, _VALUES_IN_CACHE // (degree + 1))
-    series, found = np.empty((degree + 1, len(half))), []
+    series, found = np.empty((2, degree + 1, len(half))), []
     for start in range(0, len(half), size):
         part = np.arange(start, min(start + size, len(half)))
         some = equation.take(part) if len(part) < len(half) else equation
         values = some.polynomial(middle[part] + chebyshev_nodes(degree)[:, None] * half[part])
         values[:, ~((half[part] > 0.0) & np.isfinite(values).all(axis=0))] = 1.0
-        series[:, part] = chebyshev_from_values(degree) @ values
+        np.matmul(value_and_slope_from_values(degree), values, out=series[..., start : start + size])
         found.append(isolate(values, start))
     if not found:
         return np.empty(0, dtype=np.intp), np.empty(0)
     brackets = Brackets.joined(found)
     sample = brackets.sample
-    t, slope = bracketed_newton(series[:, sample], brackets)
+    t, slope = bracketed_newton(np.take(series, sample, axis=-1), brackets)
     half = half[sample]
     return sample, polish(equation.take(sample), middle[sample] + t * half, slope / half, half)
 
@@ -214,10 +214,16 @@ def _close_pairs(
     return Brackets.joined([Brackets(sample[mask], *(column[mask] for column in columns)) for mask, *columns in parts])
 
 
-def bracketed_newton(coefficients: FloatArray, brackets: Brackets) -> tuple[FloatArray, FloatArray]:
-    """The root of each Chebyshev series (degree + 1, M) in its bracket, and the derivative there; shape (M,).
+def bracketed_newton(series: FloatArray, brackets: Brackets) -> tuple[FloatArray, FloatArray]:
+    """The root of each Chebyshev series in its bracket, and the derivative there; shape (M,).
 
     Newton's method from where the chord crosses zero; a step that leaves the bracket is replaced by its middle.
+
+    Parameters
+    ----------
+    series : ndarray of shape (2, degree + 1, M)
+        Of each polynomial and of its derivative.
+    brackets : Brackets
     """
     left, right = brackets.left, brackets.right
     change = brackets.value_right - brackets.value_left
@@ -226,7 +232,7 @@ def bracketed_newton(coefficients: FloatArray, brackets: Brackets) -> tuple[Floa
     roots, slopes = t.copy(), np.empty_like(t)
     active = np.arange(len(t))
     for _ in range(_NEWTON_STEPS):
-        value, slope = chebyshev_value_and_slope(coefficients, t)
+        value, slope = chebyshev_values(series, t)
         above = (value > 0.0) == rising
         right = np.where(above, t, right)
         left = np.where(above, left, t)
@@ -237,7 +243,7 @@ def bracketed_newton(coefficients: FloatArray, brackets: Brackets) -> tuple[Floa
         if not len(going):
             break
         if len(going) < 0.7 * len(t):
-            active, coefficients = active[going], coefficients[:, going]
+            active, series = active[going], np.take(series, going, axis=-1)
             left, right, rising, following = left[going], right[going], rising[going], following[going]
         t = following
     return roots, slopes

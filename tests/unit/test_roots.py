@@ -11,9 +11,9 @@ from rdstitch.solvers.batch import IndexArray
 from rdstitch.solvers.polynomials import (
     bernstein_from_values,
     bernstein_subdivision,
-    chebyshev_from_values,
     chebyshev_nodes,
-    chebyshev_value_and_slope,
+    chebyshev_values,
+    value_and_slope_from_values,
 )
 from rdstitch.solvers.roots import real_roots
 
@@ -135,8 +135,8 @@ def test_matrices_agree_with_the_polynomial(degree: int) -> None:
     expected = np.polynomial.polynomial.polyval(t, monomials)
     slopes = np.polynomial.polynomial.polyval(t, np.polynomial.polynomial.polyder(monomials))
 
-    series = chebyshev_from_values(degree) @ values
-    value, slope = chebyshev_value_and_slope(np.repeat(series[:, None], len(t), axis=1), t)
+    series = value_and_slope_from_values(degree) @ values
+    value, slope = chebyshev_values(np.repeat(series[:, :, None], len(t), axis=2), t)
     assert value == pytest.approx(expected, abs=1e-12)
     assert slope == pytest.approx(slopes, abs=1e-10)
 
