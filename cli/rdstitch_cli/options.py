@@ -125,7 +125,7 @@ every = click.option(
 )
 
 output = click.option(
-    "-o", "--output", type=PICTURE, required=True, help="Picture to write: .jpg, .png, .tif or .webp."
+    "-o", "--output", type=PICTURE, required=True, help="Picture to write: .jpg, .png, .tif, .webp or .dzi."
 )
 
 overwrite = click.option("--overwrite", is_flag=True, help="Replace existing output files.")
@@ -281,7 +281,7 @@ compositing = together(
         default=0,
         show_default=True,
         metavar="GREY",
-        help="What no picture covers, in JPEG: 0 black to 255 white.",
+        help="What no picture covers, in JPEG and .dzi: 0 black to 255 white.",
     ),
     click.option("--max-memory", type=Bytes(), help="Memory that compositing may take; otherwise what suits the size."),
     click.option(

@@ -148,7 +148,8 @@ def compose_to_file(
     Parameters
     ----------
     path
-        ``.tif`` (tiled, with overviews, BigTIFF where needed), ``.png``, ``.jpg`` or ``.webp`` (held in memory whole).
+        ``.tif`` (tiled, with overviews, BigTIFF where needed), ``.dzi`` (Deep Zoom), ``.png``, ``.jpg``, or ``.webp``
+        (held in memory whole).
     sources, cameras, homographies, canvas, options, progress, previews
         As for :func:`compose`.
     metadata : Metadata, optional

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from rdstitch.errors import OutputError
+from rdstitch.io.deepzoom import check_tiles_folder
 
-PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
+PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".dzi")
 
 
 def check_output(
@@ -47,6 +48,8 @@ def check_output(
             raise OutputError(f"{file}: is a folder; name a file in it")
         if not folder.is_dir():
             raise OutputError(f"{file}: the folder {folder} does not exist; create it first")
+        if file.suffix.lower() == ".dzi":
+            check_tiles_folder(file, overwrite)
         if file.exists():
             if any(_same_file(file, Path(other)) for other in inputs):
                 raise OutputError(f"{file}: is one of the input pictures; choose another name")

@@ -17,7 +17,7 @@ from PIL import ExifTags, Image
 
 from rdstitch.io.layout import STRIP_ROWS, Layout, Strip, with_alpha
 from rdstitch.io.metadata import Metadata
-from rdstitch.io.reduction import block_mean
+from rdstitch.io.reduction import halved
 
 _TILE = 256
 # Smaller pictures need no overview.
@@ -112,7 +112,7 @@ def _spilling(strips: Iterable[NDArray[Any]], spill: IO[bytes] | None, transpare
         # Before it is passed on: the writer does not come back after the last tile.
         if spill is not None:
             for top in range(0, len(strip), _HALVED_ROWS):
-                spill.write(_halved(strip[top : top + _HALVED_ROWS], transparent).data)
+                spill.write(halved(strip[top : top + _HALVED_ROWS], transparent).data)
         yield strip
 
 
@@ -126,20 +126,6 @@ def _reread(spill: IO[bytes], size: tuple[int, int], layout: Layout) -> Iterator
         samples = np.frombuffer(spill.read(rows * row), dtype=layout.dtype)
         yield samples.reshape(rows, width, layout.samples_per_pixel)
     spill.close()
-
-
-def _halved(strip: NDArray[Any], transparent: bool) -> NDArray[Any]:
-    """Mean of 2 x 2 px, weighted by the alpha that the last channel is; an odd border repeats itself."""
-    if not transparent or (strip[..., -1] == strip[0, 0, -1]).all():
-        return np.ascontiguousarray(block_mean(strip, 2))
-    even = np.pad(strip, [(0, strip.shape[0] % 2), (0, strip.shape[1] % 2), (0, 0)], mode="edge")
-    corners = np.stack([even[y::2, x::2] for y in (0, 1) for x in (0, 1)]).astype(np.float32)
-    mean = corners.mean(axis=0)
-    opacity = np.maximum(corners[..., -1:].sum(axis=0), np.float32(1e-6))
-    mean[..., :-1] = (corners[..., :-1] * corners[..., -1:]).sum(axis=0) / opacity
-    if strip.dtype.kind == "u":
-        np.rint(mean, out=mean)
-    return np.ascontiguousarray(mean.astype(strip.dtype))
 
 
 def _copied_tags(metadata: Metadata) -> Iterator[ExtraTag]:

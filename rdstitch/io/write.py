@@ -1,4 +1,4 @@
-"""Writing a picture: JPEG, PNG, TIFF or WebP by the suffix, whole or not at all, with profile and EXIF.
+"""Writing a picture: JPEG, PNG, TIFF, WebP or Deep Zoom by the suffix, whole or not at all, with profile and EXIF.
 
 A picture may come as an array or in strips from top to bottom; strips need only the memory of one of them, except for
 WebP. The same picture gives the same bytes either way.
@@ -15,6 +15,7 @@ from PIL import Image
 
 from rdstitch.errors import ArgumentError, LimitError, OutputError
 from rdstitch.io.atomic import PICTURE_SUFFIXES, atomic_output
+from rdstitch.io.deepzoom import check_tiles_folder, replaced_folder, tiles_folder, write_deep_zoom
 from rdstitch.io.jpeg import jpeg_pieces
 from rdstitch.io.layout import STRIP_ROWS, Layout, Strip, as_eight_bit, check_strips, with_alpha
 from rdstitch.io.metadata import Metadata
@@ -46,7 +47,7 @@ def write_image(
     Parameters
     ----------
     path
-        ``.jpg``, ``.jpeg``, ``.png``, ``.tif``, ``.tiff`` or ``.webp``.
+        ``.jpg``, ``.jpeg``, ``.png``, ``.tif``, ``.tiff``, ``.webp`` or ``.dzi``.
     pixels : ndarray of shape (H, W) or (H, W, C), uint8, uint16 or float32
         Colour in RGB order. Floating-point samples and other than one or three channels need TIFF.
     alpha : ndarray of shape (H, W), uint8, optional
@@ -98,6 +99,11 @@ def write_strips(
     with atomic_output(file) as temporary:
         if suffix in _TIFF:
             write_tiff(temporary, layout, checked, extra_tags)
+            return
+        if suffix == ".dzi":
+            check_tiles_folder(file, overwrite=True)
+            with replaced_folder(tiles_folder(file)) as folder:
+                write_deep_zoom(temporary, folder, layout, checked)
             return
         pieces: Iterable[bytes | memoryview]
         if suffix in _JPEG:

@@ -110,6 +110,6 @@ def compose_pictures(
 
     written = compose_to_file(output, read, cameras, matrices, canvas, options, sources[0].metadata, told, tags, read)
     place, note = placed[0]
-    if place is not None and Path(output).suffix.lower() not in (".tif", ".tiff"):
+    if place is not None and Path(output).suffix.lower() not in (".tif", ".tiff", ".dzi"):
         place.write_beside(output)
     return Composed(written.canvas, notes=(*written.notes, *([note] if note else [])))

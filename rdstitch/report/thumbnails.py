@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.errors import InputError
+from rdstitch.io.deepzoom import read_deep_zoom
 from rdstitch.io.read import read_image
+from rdstitch.io.reduction import fitting_reduction
 from rdstitch.pipeline.result import StitchResult
 from rdstitch.pipeline.sources import Source
 
@@ -22,7 +24,8 @@ _LARGE = 60_000_000  # px; of larger TIFF files an overview is read
 def of_source(source: Source, side: int) -> str | None:
     """A thumbnail of an input picture; None where it is gone, as frames of videos are."""
     try:
-        return data_address(source.read().pixels, side)
+        reduction = fitting_reduction(max(source.camera.image_size) / (2 * side))
+        return data_address(source.read(reduction).pixels, side)
     except InputError:
         return None
 
@@ -34,6 +37,8 @@ def of_mosaic(result: StitchResult, side: int) -> str | None:
     if result.output is None or not result.output.exists():
         return None
     width, height = result.canvas.size
+    if result.output.suffix.lower() == ".dzi":
+        return data_address(read_deep_zoom(result.output, (width, height), side), side)
     if width * height > _LARGE and result.output.suffix.lower() in (".tif", ".tiff"):
         return data_address(_overview(result.output, side), side)
     return data_address(read_image(result.output).pixels, side)

@@ -3,12 +3,14 @@
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from rdstitch_cli.main import cli
 
 from rdstitch.compositing import CompositeOptions
 from rdstitch.io import read_image
+from rdstitch.io.deepzoom import read_deep_zoom
 from rdstitch.pipeline import StitchOptions, mosaic
 from tests.cli.running import FAST, Run
 
@@ -123,3 +125,30 @@ def test_file_and_memory_hold_the_same_picture(frames: list[Path], tmp_path: Pat
     back = read_image(tmp_path / "a.tif")
     np.testing.assert_array_equal(back.pixels, held.pixels)
     np.testing.assert_array_equal(back.alpha, held.alpha)
+
+
+def test_deep_zoom_is_the_same_picture(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    output, report = tmp_path / "a.dzi", tmp_path / "report.html"
+    command = ("mosaic", *frames, "-o", output, "--report", report, *FAST)
+    assert rdstitch(*command, "--dry-run").status == 0
+    assert not list(tmp_path.iterdir())
+    assert rdstitch(*command).status == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"a.dzi", "a_files", "a.dzi.json", "report.html"}
+    assert rdstitch("mosaic", *frames, "-o", tmp_path / "a.png", *FAST).status == 0
+    whole = read_image(tmp_path / "a.png")
+    assert whole.alpha is not None
+    height, width = whole.alpha.shape
+    tiles = read_deep_zoom(output, (width, height), max(width, height)).astype(int)
+    sure = cv2.erode(whole.alpha, np.ones((33, 33), np.uint8)) == 255
+    assert np.abs(tiles - whole.pixels)[sure].mean() < 0.5 * np.abs(np.roll(tiles, 1, 1) - whole.pixels)[sure].mean()
+
+
+def test_deep_zoom_is_replaced_only_when_told(rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path) -> None:
+    command = ("apply", sidecar, "--images", frames[0].parent, "-o", tmp_path / "a.dzi", "--scale", "0.3")
+    assert rdstitch(*command).status == 0
+    (tmp_path / "a.dzi").unlink()
+    (tmp_path / "a.dzi.json").unlink()
+    done = rdstitch(*command)
+    assert done.status == 6
+    assert "a_files: exists already" in done.line
+    assert rdstitch(*command, "--overwrite").status == 0

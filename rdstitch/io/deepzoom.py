@@ -1,0 +1,198 @@
+"""Deep Zoom (``.dzi``) from strips: JPEG tiles of every size of a picture, for viewers in the browser.
+
+A picture's levels, each half as large as the next, are cut into tiles while the strips pass; memory is that of a few
+strips. Beside ``name.dzi``, which tells the size, the folder ``name_files`` holds ``LEVEL/COLUMN_ROW.jpg``.
+"""
+
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.errors import OutputError
+from rdstitch.io.jpeg import jpeg_pieces
+from rdstitch.io.layout import Layout, Strip, as_eight_bit, with_alpha
+from rdstitch.io.metadata import Metadata
+from rdstitch.io.read import read_image
+from rdstitch.io.reduction import halved, reduced_size
+
+_TILE, _OVERLAP = 254, 1
+_DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
+<Image xmlns="http://schemas.microsoft.com/deepzoom/2008" Format="jpg" Overlap="{overlap}" TileSize="{tile}">
+  <Size Width="{width}" Height="{height}"/>
+</Image>
+"""
+
+
+def tiles_folder(path: Path) -> Path:
+    """The folder of the tiles that belong to a ``.dzi`` file."""
+    return path.with_name(f"{path.stem}_files")
+
+
+def check_tiles_folder(path: Path, overwrite: bool) -> None:
+    """Refuse to replace a folder that is not wanted replaced, or that is no folder of tiles.
+
+    Raises
+    ------
+    OutputError
+        With what to do about it.
+    """
+    folder = tiles_folder(path)
+    if not folder.exists():
+        return
+    if not overwrite:
+        raise OutputError(f"{folder}: exists already; choose another name or use --overwrite")
+    if not folder.is_dir() or not all(entry.name.isdecimal() and entry.is_dir() for entry in folder.iterdir()):
+        raise OutputError(f"{folder}: is no folder of Deep Zoom tiles; choose another name")
+
+
+def write_deep_zoom(description: Path, folder: Path, layout: Layout, strips: Iterable[Strip]) -> None:
+    """Write the description and the tiles of a picture; transparency becomes the background, 16 bits become 8.
+
+    Parameters
+    ----------
+    description : Path
+        The ``.dzi`` file.
+    folder : Path
+        Empty folder for the tiles.
+    layout : Layout
+    strips : iterable of (samples, alpha)
+    """
+    width, height = layout.size
+    # The profile belongs to the pixels, and so into every tile; EXIF does not.
+    profile = Metadata(layout.size, icc_profile=layout.metadata.icc_profile)
+    eight = replace(layout, dtype=np.dtype(np.uint8), transparent=True, metadata=profile)
+    largest = _levels(folder, eight)
+    for samples, alpha in strips:
+        largest.take(with_alpha(as_eight_bit(samples), alpha))
+    description.write_text(
+        _DESCRIPTION.format(overlap=_OVERLAP, tile=_TILE, width=width, height=height), encoding="utf-8"
+    )
+
+
+@contextmanager
+def replaced_folder(folder: Path) -> Iterator[Path]:
+    """A temporary folder beside ``folder`` that takes its place when the block ends without an error."""
+    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name[:100]}.", suffix=".part", dir=folder.parent))
+    try:
+        new, old = temporary / "new", temporary / "old"
+        new.mkdir()
+        yield new
+        if folder.exists():
+            folder.replace(old)
+        try:
+            new.replace(folder)
+        except OSError:
+            if old.exists():
+                old.replace(folder)
+            raise
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def read_deep_zoom(path: Path, size: tuple[int, int], side: int) -> NDArray[np.uint8]:
+    """Read the smallest level whose longer side has ``side`` px, or else the largest, of a picture of ``size``.
+
+    Raises
+    ------
+    InputError
+        When tiles cannot be read.
+    """
+    sizes = _sizes(size)
+    level = next((k for k, level_size in enumerate(sizes) if max(level_size) >= side), len(sizes) - 1)
+    columns, rows = (range(-(-n // _TILE)) for n in sizes[level])
+    folder = tiles_folder(path) / str(level)
+
+    def tile(column: int, row: int) -> NDArray[np.uint8]:
+        pixels: NDArray[np.uint8] = read_image(folder / f"{column}_{row}.jpg").pixels
+        return pixels[_OVERLAP if row else 0 :][:_TILE, _OVERLAP if column else 0 :][:, :_TILE]
+
+    return np.concatenate([np.concatenate([tile(c, r) for c in columns], axis=1) for r in rows])
+
+
+def _sizes(size: tuple[int, int]) -> list[tuple[int, int]]:
+    """Width and height of every level, from a single px up."""
+    sizes = [size]
+    while max(sizes[-1]) > 1:
+        sizes.append(reduced_size(sizes[-1], 2))
+    return sizes[::-1]
+
+
+def _levels(folder: Path, layout: Layout) -> "_Level":
+    """The largest level, each with the next smaller one, down to a single px."""
+    level = None
+    for number, size in enumerate(_sizes(layout.size)):
+        place = folder / str(number)
+        place.mkdir()
+        level = _Level(place, replace(layout, size=size), level)
+    assert level is not None
+    return level
+
+
+@dataclass
+class _Level:
+    """One size of the picture, which is cut into tiles as its rows come.
+
+    Parameters
+    ----------
+    folder : Path
+    layout : Layout
+    smaller : _Level or None
+        The level of half the size.
+    """
+
+    folder: Path
+    layout: Layout
+    smaller: "_Level | None"
+    _rows: list[NDArray[np.uint8]] = field(default_factory=list)
+    _top: int = 0
+    _received: int = 0
+    _tile_row: int = 0
+    _odd: NDArray[np.uint8] | None = None
+
+    def take(self, rows: NDArray[np.uint8]) -> None:
+        """The next rows (h, w, C + 1), with alpha, from top to bottom."""
+        self._received += len(rows)
+        self._rows.append(rows)
+        height = self.layout.size[1]
+        while self._tile_row * _TILE < height:
+            top, bottom = _tile_span(self._tile_row, height)
+            if bottom > self._received:
+                break
+            held = np.concatenate(self._rows)
+            self._write_tiles(held[top - self._top : bottom - self._top])
+            self._tile_row += 1
+            next_top = max(0, self._tile_row * _TILE - _OVERLAP)
+            self._rows, self._top = [held[next_top - self._top :]], next_top
+        if self.smaller is not None:
+            self._pass_on(self.smaller, rows)
+
+    def _pass_on(self, smaller: "_Level", rows: NDArray[np.uint8]) -> None:
+        """Half as large, in pairs of rows; the last row of an odd number is its own pair."""
+        if self._odd is not None:
+            rows = np.concatenate([self._odd, rows])
+        pairs = len(rows) if self._received == self.layout.size[1] else len(rows) // 2 * 2
+        self._odd = rows[pairs:].copy() if pairs < len(rows) else None
+        if pairs:
+            smaller.take(halved(rows[:pairs], transparent=True))
+
+    def _write_tiles(self, rows: NDArray[np.uint8]) -> None:
+        """One row of tiles."""
+        width = self.layout.size[0]
+        for column in range(-(-width // _TILE)):
+            left, right = _tile_span(column, width)
+            tile: NDArray[Any] = rows[:, left:right]
+            layout = replace(self.layout, size=(right - left, len(rows)))
+            with (self.folder / f"{column}_{self._tile_row}.jpg").open("wb") as stream:
+                stream.writelines(jpeg_pieces(layout, [(np.ascontiguousarray(tile[..., :-1]), tile[..., -1])]))
+
+
+def _tile_span(number: int, length: int) -> tuple[int, int]:
+    """First and last but one px of a tile with its overlap, along one axis of a level."""
+    return max(0, number * _TILE - _OVERLAP), min(length, (number + 1) * _TILE + _OVERLAP)
