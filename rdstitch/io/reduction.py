@@ -49,14 +49,14 @@ def halved(strip: NDArray[Any], transparent: bool) -> NDArray[Any]:
     four = [even[y::2, x::2] for y in (0, 1) for x in (0, 1)]
     if strip.dtype.kind == "u" and (not transparent or (strip[..., -1] == full).all()):
         wide = np.uint16 if strip.dtype == np.uint8 else np.uint32
-        total = np.add(four[0], four[1], dtype=wide)
+        total: NDArray[Any] = np.add(four[0], four[1], dtype=wide)
         total += four[2]
         total += four[3]
         total += wide(2)
         total >>= wide(2)
         return total.astype(strip.dtype)
     corners = np.stack(four).astype(np.float32)
-    mean = corners.mean(axis=0)
+    mean: NDArray[Any] = corners.mean(axis=0)
     if not transparent:
         return mean.astype(strip.dtype)
     share = corners[..., -1:] / np.float32(full)
