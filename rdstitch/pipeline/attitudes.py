@@ -16,6 +16,7 @@ XMP = "xmp"
 
 _COLUMNS = ("name", "psi", "theta")
 _NAMED = 3  # pictures in a message
+_LARGEST_TILT = math.radians(80.0)  # beyond, hardly a picture shows ground, and more likely angles mean something else
 
 
 def with_attitudes(sources: Sequence[Source], wanted: str | Path | None) -> list[Source]:
@@ -33,7 +34,7 @@ def with_attitudes(sources: Sequence[Source], wanted: str | Path | None) -> list
     ------
     InputError
         When the file cannot be read, is no such table, or has no line for a picture; when a picture's XMP has no
-        attitude of the camera, or one in which it does not look down.
+        attitude of the camera, or one that is far from looking down.
     """
     if wanted is None:
         return list(sources)
@@ -49,9 +50,13 @@ def _of_pictures(sources: Sequence[Source]) -> list[tuple[float, float]]:
         if nadir is None:
             lacking.append(source.name)
             continue
+        away = math.acos(nadir[2])
+        if away > _LARGEST_TILT:
+            raise InputError(
+                f"{source.path}: by its XMP the camera looks {math.degrees(away):.0f} degrees away from straight down; "
+                "give a CSV file if that is wrong"
+            )
         psi, theta = tilt_from_normal(nadir).tolist()
-        if not _plausible(psi, theta):
-            raise InputError(f"{source.path}: by the attitude in its XMP the camera does not look down at the ground")
         tilts.append((psi, theta))
     if lacking:
         more = f" and {len(lacking) - _NAMED} more" if len(lacking) > _NAMED else ""
@@ -82,14 +87,9 @@ def _read_table(file: str | Path) -> dict[str, tuple[float, float]]:
             psi, theta = (math.radians(float(row[column])) for column in _COLUMNS[1:])
         except (TypeError, ValueError):
             raise InputError(f"{file}: line {rows.line_num}: psi and theta must be numbers, in degrees") from None
-        if not _plausible(psi, theta):
+        if not (abs(psi) < math.pi / 2 and abs(theta) < math.pi / 2):
             raise InputError(f"{file}: line {rows.line_num}: psi and theta must lie between -90 and 90 degrees")
         if name in attitudes:
             raise InputError(f"{file}: line {rows.line_num}: {name} is here twice; remove one")
         attitudes[name] = psi, theta
     return attitudes
-
-
-def _plausible(psi: float, theta: float) -> bool:
-    """Whether the camera looks at the plane at all."""
-    return abs(psi) < math.pi / 2 and abs(theta) < math.pi / 2

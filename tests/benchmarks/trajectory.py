@@ -3,7 +3,7 @@
 python -m tests.benchmarks.trajectory [--frames 80 160 320] [--path line] [--seed 5]
 
 The frames are slices of a robot's paths (paper §5.5), through a lens of λ = -0.25. Translations and rotations are those
-between consecutive frames; translations are compared after the best similarity, since frames without a known focal
+between consecutive frames; translations are compared after the best scaling, since frames without a known focal
 length do not tell the height. Times and memory are those of the command's process; the ratio is of processor time per
 frame to that of the fewest frames of the path.
 """

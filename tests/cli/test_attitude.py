@@ -91,11 +91,11 @@ def test_pictures_without_attitude_are_named(
 
 def test_cameras_that_look_at_the_horizon_are_refused(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     for frame in frames:
-        xmp = xmp_of("dji-gimbal", 10.0, 0.5, 0.0).encode()
+        xmp = xmp_of("dji-gimbal", 10.0, -4.0, 0.0).encode()
         Image.open(frame).save(tmp_path / f"{frame.stem}.jpg", xmp=xmp)
     done = rdstitch("calibrate", tmp_path, "--attitude", "xmp", "-o", tmp_path / "camera.json")
     assert done.status == 3
-    assert "does not look down" in done.line
+    assert "86 degrees away from straight down" in done.line
 
 
 def test_a_file_may_be_named_like_the_word(
