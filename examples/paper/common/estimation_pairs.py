@@ -48,7 +48,7 @@ class JudgedPair:
 
 
 def rendered_pairs(count: int, distortion: float, *, free: bool, seed: int) -> Iterator[JudgedPair]:
-    """Pairs of a floor; λ is uniform from ``distortion`` to 0.
+    """Pairs of a floor; λ is uniform from ``distortion`` to 0. Those that show nothing in common are left out.
 
     Parameters
     ----------
@@ -70,7 +70,9 @@ def rendered_pairs(count: int, distortion: float, *, free: bool, seed: int) -> I
             poses = poses.shaken(seed=number, height=0.15, tilt=0.15)
         photometry = Photometry(gain=np.array([1.0, 0.85]), vignetting=0.2, blur=0.5, noise=0.01)
         sequence = sequence_over(partial(ground, seed=seed + number), lens, poses, photometry=photometry, seed=number)
-        yield _judged(sequence.frame(0), sequence.frame(1), lens, partial(_over_the_plane, sequence))
+        pair = _judged(sequence.frame(0), sequence.frame(1), lens, partial(_over_the_plane, sequence))
+        if len(pair.grid1):
+            yield pair
 
 
 def _over_the_plane(sequence: RenderedSequence, points: FloatArray) -> FloatArray:
