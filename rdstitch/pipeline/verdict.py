@@ -83,6 +83,7 @@ def judge(
     given, kept = sum(fit.count for fit in used), sum(fit.inliers for fit in used)
     if kept < _LEAST_INLIERS * given:
         failures.append(f"only {kept} of {given} matches of the pairs agree with the whole")
+    failures.extend(_mixed(names, registration))
     disagreeing = _disagreeing(names, used)
     checked: list[CheckedLink] = []
     if not registration.resting:
@@ -105,6 +106,17 @@ def _outvoted(names: Sequence[str], pairs: Sequence[Pair]) -> list[str]:
         return []
     named = ", ".join(f"{names[i]} and {names[j]}" for i, j in pairs[:_MOST_NAMED]) + ", …" * (len(pairs) > _MOST_NAMED)
     return [f"{len(pairs)} of the pairs fit badly, and little depends on them: {named}; look at the seams between them"]
+
+
+def _mixed(names: Sequence[str], registration: Registration) -> list[str]:
+    """Two lenses, of which it is not clear which pictures belong to which."""
+    mixed = registration.mixed
+    if mixed is None or mixed.certain:
+        return []
+    fewer = mixed.second if 2 * mixed.second.sum() <= len(names) else ~mixed.second
+    listed = [name for name, other in zip(names, fewer, strict=True) if other]
+    named = ", ".join(listed[:_MOST_NAMED]) + ", …" * (len(listed) > _MOST_NAMED)
+    return [f"two lenses or zoom settings are mixed, perhaps that of {named} and that of the others; part them first"]
 
 
 def _misfits(names: Sequence[str], used: Sequence[LinkFit]) -> list[str]:

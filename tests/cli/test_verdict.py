@@ -1,13 +1,18 @@
 """What a run says of its own result reaches the user, whichever command runs."""
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from rdstitch.camera import Camera
 from rdstitch.pipeline import recipes
 from rdstitch.pipeline.verdict import Verdict
-from tests.cli.running import FAST, Run
+from tests.cli.running import DISTORTION, FAST, Run, flight
 
+# Without a focal length, a path says that its lengths are guessed.
+GIVEN = (*FAST, "--focal", "380")
 OUTPUTS = {"pano": "out.png", "mosaic": "out.png", "calibrate": "camera.json", "trajectory": "path.csv"}
 
 
@@ -20,7 +25,7 @@ def test_doubts_are_told(
     rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
     _pretend(monkeypatch, Verdict(True, (), ("look at that seam",)))
-    done = rdstitch(command, *frames, "-o", tmp_path / OUTPUTS[command], *FAST)
+    done = rdstitch(command, *frames, "-o", tmp_path / OUTPUTS[command], *GIVEN)
     assert done.status == 0
     assert done.line == "rdstitch: warning: look at that seam"
 
@@ -31,11 +36,28 @@ def test_what_fails_is_not_written_unless_forced_and_then_told(
 ) -> None:
     _pretend(monkeypatch, Verdict(False, ("the pictures disagree",), ()))
     output = tmp_path / OUTPUTS[command]
-    refused = rdstitch(command, *frames, "-o", output, *FAST)
+    refused = rdstitch(command, *frames, "-o", output, *GIVEN)
     assert refused.status == 4
     assert "the pictures disagree" in refused.line
     assert not output.exists()
-    forced = rdstitch(command, *frames, "-o", output, *FAST, "--force")
+    forced = rdstitch(command, *frames, "-o", output, *GIVEN, "--force")
     assert forced.status == 0
     assert forced.line == "rdstitch: warning: not reliable: the pictures disagree"
     assert output.exists()
+
+
+@pytest.mark.parametrize("strict", [False, True])
+def test_pictures_of_two_lenses_are_parted(rdstitch: Run, frames: list[Path], tmp_path: Path, strict: bool) -> None:
+    sequence = flight(3, 5)
+    assert isinstance(sequence.lens, Camera)
+    zoomed = replace(sequence, lens=replace(sequence.lens, distortion=-0.12))
+    own, others = sequence.write(tmp_path, "own_{:04d}.png")[:3], zoomed.write(tmp_path, "other_{:04d}.png")[3:]
+    extra = ("--strict",) if strict else ()
+    done = rdstitch("mosaic", *own, *others, "-o", tmp_path / "out.png", *extra, *FAST)
+    assert done.status == (5 if strict else 0)
+    assert all(path.name in done.err for path in others)
+    assert not any(path.name in done.err for path in own)
+    assert re.search(
+        r"another lens or zoom setting \(λ about -0\.1[12]\d, that of the others -0\.(19|20)\d\)", done.err
+    )
+    assert strict or abs(float(done.out) - DISTORTION) < 0.002
