@@ -1,7 +1,8 @@
 """What the stitching commands share: from flags to options, from a result to lines."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,6 +82,20 @@ class Report:
             from rdstitch.io.atomic import check_output
 
             check_output(file, overwrite, inputs, suffixes=(".html", ".htm"))
+
+    @contextmanager
+    def explaining(self) -> Iterator[None]:
+        """Run a recipe; a result that is refused is shown, so that one can see why."""
+        from rdstitch.pipeline.verdict import RefusedError
+
+        try:
+            yield
+        except RefusedError as refused:
+            if self._file is not None:
+                from rdstitch.report import write_report
+
+                write_report(self._file, refused.registration, self.progress.stages, refused.verdict)
+            raise
 
     def write(self, result: "StitchResult | Registration") -> None:
         """Write the file, if one is wanted; a dry run writes nothing."""

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from rdstitch.camera_files import CAMERA_SUFFIXES, save_camera
-from rdstitch.errors import ArgumentError, InputError, PartialResultError, RegistrationError
+from rdstitch.errors import ArgumentError, InputError, PartialResultError
 from rdstitch.io.atomic import check_distinct, check_output, write_json_atomic, write_text_atomic
 from rdstitch.pipeline.attitudes import with_attitudes
 from rdstitch.pipeline.cache import Cache
@@ -24,7 +24,7 @@ from rdstitch.pipeline.register import Registration, in_frame_of_reference, regi
 from rdstitch.pipeline.result import StitchResult
 from rdstitch.pipeline.sidecar import sidecar
 from rdstitch.pipeline.sources import LeftOut, Source, read_sources
-from rdstitch.pipeline.verdict import Verdict, judge
+from rdstitch.pipeline.verdict import RefusedError, Verdict, judge
 from rdstitch.registration import Alignment
 from rdstitch.registration.trajectory import Trajectory
 
@@ -250,8 +250,7 @@ def _accept(registration: Registration, options: StitchOptions, *, lens_only: bo
     """Judge a registration; what cannot be relied on goes no further, unless forced."""
     verdict = judge(registration, options.threshold, options.threads, Cache(options.cache), lens_only=lens_only)
     if not verdict.ok and not options.force:
-        reasons = "; ".join(verdict.failures)
-        raise RegistrationError(f"no reliable result: {reasons} (--force writes it all the same)")
+        raise RefusedError(registration, verdict)
     if options.strict and registration.left_out:
         raise PartialResultError("; ".join(f"left out {m.path}: {m.reason}" for m in registration.left_out))
     return verdict

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rdstitch.errors import RegistrationError
 from rdstitch.pipeline.cache import NO_CACHE, Cache
 from rdstitch.pipeline.overlap_check import CheckedLink, check_overlaps
 from rdstitch.pipeline.register import Registration
@@ -47,6 +48,21 @@ class Verdict:
     def complaints(self) -> tuple[str, ...]:
         """Everything that the user must be told: failures, which a forced result has, and doubts."""
         return (*(f"not reliable: {failure}" for failure in self.failures), *self.doubts)
+
+
+class RefusedError(RegistrationError):
+    """A registration failed its checks; it is kept for those who want to see why.
+
+    Attributes
+    ----------
+    registration : Registration
+    verdict : Verdict
+    """
+
+    def __init__(self, registration: Registration, verdict: Verdict) -> None:
+        reasons = "; ".join(verdict.failures)
+        super().__init__(f"no reliable result: {reasons} (--force writes it all the same)")
+        self.registration, self.verdict = registration, verdict
 
 
 def judge(

@@ -86,7 +86,7 @@ def two_lenses(count: int, votes: Votes) -> TwoLenses | None:
     scatter = 1.25 * missed / (number - 2) * float(np.median(votes.std))
     gain = float(votes.missed(_weighted_median(votes.distortion, 1.0 / votes.std)).sum()) / missed
     told = [(kinds < 2).sum() >= 2, (kinds > 0).sum() >= 2, gap >= max(_LEAST_GAP, _LEAST_GAP_IN_SCATTERS * scatter)]
-    if not all(told) or gain < 5.0 + 60.0 / number:
+    if not all(told) or gain < 4.0 + 44.0 / number:
         return None
     return TwoLenses(second, (float(lenses[0]), float(lenses[1])), bool((kinds == 0).any() and (kinds == 2).any()))
 

@@ -26,7 +26,7 @@ def match_graph(registration: Registration) -> str:
     links = [fit for fit in alignment.links if fit.used]
     for fit in sorted(links, key=lambda fit: fit.rms):
         (x1, y1), (x2, y2) = ((centers[k] + shift) * scale for k in (fit.image1, fit.image2))
-        share = float(np.clip(fit.rms / alignment.rms - 0.75, 0.0, 1.0))
+        share = float(np.nan_to_num(np.clip(fit.rms / alignment.rms - 0.75, 0.0, 1.0)))
         names = " and ".join(registration.sources[k].name for k in (fit.image1, fit.image2))
         parts.append(
             element(

@@ -8,6 +8,7 @@ from pathlib import Path
 from rdstitch.io.atomic import write_bytes_atomic
 from rdstitch.pipeline.register import Registration
 from rdstitch.pipeline.result import StitchResult
+from rdstitch.pipeline.verdict import Verdict
 from rdstitch.report.camera_path import path_over_plane
 from rdstitch.report.grid import grid
 from rdstitch.report.match_graph import match_graph
@@ -33,7 +34,10 @@ img, svg { display: block; width: 100%; height: auto; } .beside { display: flex;
 
 
 def write_report(
-    path: str | Path, result: StitchResult | Registration, stages: Sequence[tuple[str, float]] = ()
+    path: str | Path,
+    result: StitchResult | Registration,
+    stages: Sequence[tuple[str, float]] = (),
+    verdict: Verdict | None = None,
 ) -> None:
     """Write the report of a result: one HTML file without anything outside of it.
 
@@ -43,6 +47,8 @@ def write_report(
     result : StitchResult or Registration
     stages : sequence of (str, float)
         Name and seconds of each stage; see :class:`rdstitch.pipeline.timing.StageTimer`.
+    verdict : Verdict, optional
+        On a registration that was refused.
 
     Raises
     ------
@@ -50,17 +56,19 @@ def write_report(
         When the file cannot be written.
     """
     # Names of files need not be UTF-8.
-    write_bytes_atomic(path, report_page(result, stages).encode("utf-8", "backslashreplace"))
+    write_bytes_atomic(path, report_page(result, stages, verdict).encode("utf-8", "backslashreplace"))
 
 
-def report_page(result: StitchResult | Registration, stages: Sequence[tuple[str, float]] = ()) -> str:
+def report_page(
+    result: StitchResult | Registration, stages: Sequence[tuple[str, float]] = (), verdict: Verdict | None = None
+) -> str:
     """The report as HTML; see :func:`write_report`."""
     stitched = result if isinstance(result, StitchResult) else None
     registration = result.registration if isinstance(result, StitchResult) else result
     title = "rdstitch report" if stitched is None or stitched.output is None else stitched.output.name
     body = [
-        summary(registration, stitched),
-        notices(registration, stitched),
+        summary(registration, stitched, verdict),
+        notices(registration, stitched, verdict),
         "" if stitched is None else mosaic(stitched),
         match_graph(registration),
         votes(registration),

@@ -8,10 +8,11 @@ import numpy as np
 
 from rdstitch.pipeline.register import Registration
 from rdstitch.pipeline.result import StitchResult
+from rdstitch.pipeline.verdict import Verdict
 from rdstitch.report.svg import element, section, table
 
 
-def summary(registration: Registration, result: StitchResult | None) -> str:
+def summary(registration: Registration, result: StitchResult | None, verdict: Verdict | None = None) -> str:
     """λ and everything else of which there is one number, with the verdict where there is one."""
     alignment, camera = registration.alignment, registration.camera
     rows = [
@@ -30,12 +31,13 @@ def summary(registration: Registration, result: StitchResult | None) -> str:
         rows.append(("focal length", f"{camera.focal:.1f} px ({camera.focal_source})"))
     if result is not None:
         rows.append(("output", "{} x {} px".format(*result.canvas.size)))
-    return section("Summary", "", _verdict(result), table((), rows))
+    return section("Summary", "", _verdict(verdict if result is None else result.verdict), table((), rows))
 
 
-def notices(registration: Registration, result: StitchResult | None) -> str:
+def notices(registration: Registration, result: StitchResult | None, verdict: Verdict | None = None) -> str:
     """Warnings, and pictures that were left out, each with the reason."""
-    warnings = registration.alignment.warnings if result is None else result.warnings
+    doubts = () if verdict is None else verdict.doubts
+    warnings = (*registration.alignment.warnings, *doubts) if result is None else result.warnings
     missing = [f"{item.path}: {item.reason}" for item in registration.left_out]
     return section(
         "Warnings and left-out pictures",
@@ -45,12 +47,12 @@ def notices(registration: Registration, result: StitchResult | None) -> str:
     )
 
 
-def _verdict(result: StitchResult | None) -> str:
-    if result is None:
+def _verdict(verdict: Verdict | None) -> str:
+    if verdict is None:
         return ""
-    if result.verdict.ok:
+    if verdict.ok:
         return element("p", "The result passed its own checks.", class_="good")
-    return element("p", escape("Not to be relied on: " + "; ".join(result.verdict.failures)), class_="bad")
+    return element("p", escape("Not to be relied on: " + "; ".join(verdict.failures)), class_="bad")
 
 
 def _lambda(registration: Registration) -> str:

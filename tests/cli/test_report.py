@@ -15,9 +15,10 @@ from PIL import Image
 
 from rdstitch.compositing import CompositeOptions
 from rdstitch.io import read_image
-from rdstitch.pipeline import calibrate, pano
+from rdstitch.pipeline import calibrate, pano, recipes
 from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.timing import StageTimer
+from rdstitch.pipeline.verdict import Verdict
 from rdstitch.report import report_page, thumbnails, write_report
 from tests.cli.running import FAST, Run
 
@@ -123,6 +124,28 @@ def test_calibrate_has_no_mosaic(rdstitch: Run, frames: list[Path], tmp_path: Pa
     wrong = rdstitch("calibrate", *frames, "-o", tmp_path / "b.json", "--report", tmp_path / "report.pdf", *FAST)
     assert (wrong.status, ".html" in wrong.line) == (6, True)
     assert not (tmp_path / "b.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "output"), [("pano", "out.png"), ("mosaic", "out.png"), ("calibrate", "lens.json")]
+)
+def test_what_is_refused_is_shown(
+    rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, output: str
+) -> None:
+    verdict = Verdict(False, ("the pictures <disagree>",), ("look at that seam",))
+    monkeypatch.setattr(recipes, "judge", lambda *arguments, **options: verdict)
+    report = tmp_path / "report.html"
+    arguments = (command, *frames[:2], "-o", tmp_path / output, "--report", report, *FAST)
+    assert rdstitch(*arguments).status == 4
+    assert not (tmp_path / output).exists()
+    refused = _checked(report.read_text(encoding="utf-8"))
+    assert refused.headings == [heading for heading in _SECTIONS if heading != "Mosaic"]
+    assert "Not to be relied on: the pictures <disagree>" in refused.text
+    assert "look at that seam" in refused.text
+    assert rdstitch(*arguments, "--force", "--overwrite").status == 0
+    forced = _checked(report.read_text(encoding="utf-8"))
+    assert ("Mosaic" in forced.headings) == (command != "calibrate")
+    assert "the pictures <disagree>" in forced.text
 
 
 def test_names_are_escaped_and_vanished_pictures_do_not_matter(frames: list[Path], tmp_path: Path) -> None:

@@ -55,6 +55,7 @@ def calibrate(
         wanted = stitch_options(reporter, save_camera=output, **given)
         paths = options.resolve(inputs)
         told = Report(report, reporter, paths, given["overwrite"])
-        registration = recipe(paths, wanted, every=every, progress=told.progress)
+        with told.explaining():
+            registration = recipe(paths, wanted, every=every, progress=told.progress)
         report_registration(registration, reporter, as_json=as_json)
         told.write(registration)

@@ -57,6 +57,7 @@ def mosaic(
     with Reporter(-quiet + verbose) as reporter:
         paths = options.resolve(inputs)
         told = Report(report, reporter, paths, given["overwrite"])
-        result = recipe(paths, output, stitch_options(reporter, **given), every=every, progress=told.progress)
+        with told.explaining():
+            result = recipe(paths, output, stitch_options(reporter, **given), every=every, progress=told.progress)
         summarize(result, reporter, as_json=as_json)
         told.write(result)

@@ -53,6 +53,7 @@ def pano(
 
     with Reporter(-quiet + verbose) as reporter:
         told = Report(report, reporter, pictures, given["overwrite"])
-        result = recipe(pictures, output, stitch_options(reporter, **given), progress=told.progress)
+        with told.explaining():
+            result = recipe(pictures, output, stitch_options(reporter, **given), progress=told.progress)
         summarize(result, reporter, as_json=as_json)
         told.write(result)
