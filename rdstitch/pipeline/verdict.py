@@ -1,6 +1,5 @@
 """Every run judges itself: can the result be relied on?"""
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -23,7 +22,7 @@ _LEAST_OF_A_PICTURE = 0.6
 # (low sun, parallax, blur) have been seen to have 20 %.
 _LEAST_AGREEMENT, _DOUBTFUL_AGREEMENT = 0.10, 0.15
 _LEAST_CELLS = 8  # below, the overlap has too little texture to say anything
-_MOST_NAMED = 3  # pairs in one message
+_MOST_NAMED = 3  # pairs, pictures or cameras in one message
 _FOCAL_SPREAD = 1.03  # ratio of focal lengths in EXIF from which on the lens was zoomed
 
 
@@ -120,7 +119,7 @@ def _outvoted(names: Sequence[str], pairs: Sequence[Pair]) -> list[str]:
     """Suspicious pairs that decide nothing, in one clause."""
     if not pairs:
         return []
-    named = ", ".join(f"{names[i]} and {names[j]}" for i, j in pairs[:_MOST_NAMED]) + ", …" * (len(pairs) > _MOST_NAMED)
+    named = _few([f"{names[i]} and {names[j]}" for i, j in pairs])
     return [f"{len(pairs)} of the pairs fit badly, and little depends on them: {named}; look at the seams between them"]
 
 
@@ -131,8 +130,7 @@ def _mixed(names: Sequence[str], registration: Registration) -> list[str]:
         return []
     fewer = mixed.second if 2 * mixed.second.sum() <= len(names) else ~mixed.second
     listed = [name for name, other in zip(names, fewer, strict=True) if other]
-    named = ", ".join(listed[:_MOST_NAMED]) + ", …" * (len(listed) > _MOST_NAMED)
-    return [f"two lenses or zoom settings are mixed, perhaps that of {named} and that of the others; part them first"]
+    return [f"two lenses or zooms are mixed, perhaps that of {_few(listed)} and that of the others; part them first"]
 
 
 def _misfits(names: Sequence[str], used: Sequence[LinkFit]) -> list[str]:
@@ -206,21 +204,30 @@ def _unmasked(registration: Registration) -> list[str]:
     without = [source.name for source in registration.sources if source.mask is None]
     if not 0 < len(without) < len(registration.sources):
         return []
-    named = ", ".join(without[:3]) + ", …" * (len(without) > 3)
-    return [f"{len(without)} of {len(registration.sources)} pictures have no mask: {named}"]
+    return [f"{len(without)} of {len(registration.sources)} pictures have no mask: {_few(without)}"]
 
 
 def _several_cameras(registration: Registration) -> list[str]:
     """Pictures that say of themselves that they come from another camera, or were zoomed."""
-    known = [source.metadata for source in registration.sources if source.metadata.model or source.metadata.serial]
-    bodies = Counter(" ".join(filter(None, (m.make, m.model, m.serial))) for m in known)
+    known = [source for source in registration.sources if source.metadata.model or source.metadata.serial]
+    bodies: dict[str, list[str]] = {}
+    for source in known:
+        m = source.metadata
+        bodies.setdefault(" ".join(filter(None, (m.make, m.model, m.serial))), []).append(source.name)
     if len(bodies) > 1:
-        listed = ", ".join(f"{body} ({count})" for body, count in bodies.most_common(3))
+        commonest = sorted(bodies.items(), key=lambda body: -len(body[1]))[:_MOST_NAMED]
+        listed = "; ".join(f"{body} ({len(names)}: {_few(names)})" for body, names in commonest)
         return [f"the pictures come from {len(bodies)} cameras: {listed}; stitch those of each on their own"]
-    focal = [m.focal_px / max(m.size) for m in known if m.focal_px is not None]
-    if focal and max(focal) > _FOCAL_SPREAD * min(focal):
-        ratio = max(focal) / min(focal)
+    focal = {s.name: s.metadata.focal_px / max(s.metadata.size) for s in known if s.metadata.focal_px is not None}
+    if focal and max(focal.values()) > _FOCAL_SPREAD * min(focal.values()):
+        near, far = min(focal, key=lambda name: focal[name]), max(focal, key=lambda name: focal[name])
         return [
-            f"the lens was zoomed between the pictures, by up to {ratio:.2f}; stitch those of one zoom on their own"
+            f"the lens was zoomed between the pictures, by up to {focal[far] / focal[near]:.2f} "
+            f"(between {near} and {far}); stitch those of one zoom on their own"
         ]
     return []
+
+
+def _few(names: Sequence[str]) -> str:
+    """Names, or the first of them where they are many."""
+    return ", ".join(names[:_MOST_NAMED]) + ", …" * (len(names) > _MOST_NAMED)

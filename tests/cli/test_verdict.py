@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from PIL import ExifTags, Image
 
 from rdstitch.camera import Camera
 from rdstitch.pipeline import recipes
@@ -61,3 +62,28 @@ def test_pictures_of_two_lenses_are_parted(rdstitch: Run, frames: list[Path], tm
         r"another lens or zoom setting \(λ about -0\.1[12]\d, that of the others -0\.(19|20)\d\)", done.err
     )
     assert strict or abs(float(done.out) - DISTORTION) < 0.002
+
+
+@pytest.mark.parametrize(
+    ("models", "lengths", "told"),
+    [
+        (("One", "One", "Two"), (35, 35, 35), "come from 2 cameras: One (2: 0.jpg, 1.jpg); Two (1: 2.jpg)"),
+        (
+            ("One", "One", "One"),
+            (28, 28, 35),
+            "was zoomed between the pictures, by up to 1.25 (between 0.jpg and 2.jpg)",
+        ),
+    ],
+)
+def test_what_pictures_say_of_their_cameras_is_told(
+    rdstitch: Run, frames: list[Path], tmp_path: Path, models: tuple[str], lengths: tuple[int], told: str
+) -> None:
+    for number, (frame, model, length) in enumerate(zip(frames, models, lengths, strict=True)):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Model] = model
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = length
+        with Image.open(frame) as image:
+            image.save(tmp_path / f"{number}.jpg", exif=exif, quality=95)
+    done = rdstitch("mosaic", tmp_path, "-o", tmp_path / "out.png", *FAST)
+    assert done.status == 0
+    assert told in done.line
