@@ -10,6 +10,7 @@ from rdstitch.features.keypoints import Features
 from rdstitch.features.learned import AlikedDetection
 from rdstitch.features.opencv import OpenCVDetection
 from rdstitch.features.options import FeatureOptions
+from rdstitch.features.strips import LARGE, StripsDetection
 from rdstitch.features.surf.detection import SurfDetection
 
 
@@ -42,4 +43,6 @@ def find(grey: NDArray[np.uint8], options: FeatureOptions) -> Detection:
         return SurfDetection.find(grey, options)
     if options.kind == "aliked":
         return AlikedDetection.find(grey, options)
+    if options.kind in ("sift", "rootsift") and grey.size > LARGE:
+        return StripsDetection.find(grey, options)
     return OpenCVDetection.find(grey, options)

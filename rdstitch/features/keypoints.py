@@ -1,5 +1,6 @@
 """What feature detection hands on: keypoints and descriptors of one picture."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -90,6 +91,18 @@ class Features:
             angle=self.angle[index],
             response=self.response[index],
             laplacian_sign=None if self.laplacian_sign is None else self.laplacian_sign[index],
+        )
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """All keypoints of at least one part; parts are of one kind, and have no signs."""
+        return replace(
+            parts[0],
+            points=np.concatenate([part.points for part in parts]),
+            descriptors=np.concatenate([part.descriptors for part in parts]),
+            scale=np.concatenate([part.scale for part in parts]),
+            angle=np.concatenate([part.angle for part in parts]),
+            response=np.concatenate([part.response for part in parts]),
         )
 
     @property

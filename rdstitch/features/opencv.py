@@ -1,7 +1,7 @@
 """The detectors that OpenCV brings, in the steps that all detectors take: find, choose, describe."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self, cast
 
 import cv2
@@ -50,6 +50,16 @@ class OpenCVDetection:
             scale=table[:, 2],
             response=_strength(options.kind, table[:, 5], table[:, 2]),
             kind=options.kind,
+        )
+
+    def take(self, index: NDArray[np.intp]) -> Self:
+        """The keypoints of the given indices, in their order."""
+        return replace(
+            self,
+            keypoints=[self.keypoints[i] for i in index],
+            points=self.points[index],
+            scale=self.scale[index],
+            response=self.response[index],
         )
 
     def describe(self, chosen: NDArray[np.intp]) -> Features:
