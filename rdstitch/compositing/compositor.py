@@ -28,6 +28,8 @@ from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_format, write_strips
 
+# Samples (h, W, C) and alpha (h, W).
+_Filled = tuple[NDArray[Any], NDArray[np.uint8]]
 # Called with the share of the work done, 0 to 1.
 Progress = Callable[[float], None]
 
@@ -227,39 +229,39 @@ class Prepared:
         self, run: Callable[..., Iterator[Any]], progress: Progress | None
     ) -> Iterator[tuple[NDArray[Any], NDArray[np.uint8]]]:
         """The same, with tiles computed by ``run``, which works like ``map`` and may work ahead."""
-        (width, height), (x, _), side = self.canvas.size, self.origin, self.plan.tile_size
-        rows = [self._row_of_tiles(top) for top in range(0, height, side)]
-        done, coming = 0, self._start(rows[0], run)
-        for number, boxes in enumerate(rows):
-            top, bottom = boxes[0][1], boxes[0][3]
-            samples = np.zeros((bottom - top, width, self.renderer.channels), dtype=self.renderer.dtype)
-            alpha = np.zeros((bottom - top, width), dtype=np.uint8)
-            for box, (pixels, covered) in zip(boxes, coming, strict=True):
-                samples[:, box[0] - x : box[2] - x] = pixels
-                alpha[:, box[0] - x : box[2] - x][covered] = 255
+        (width, height), side = self.canvas.size, self.plan.tile_size
+        done, coming = 0, self._start(0, run)
+        for top in range(0, height, side):
+            (samples, alpha), tiles = coming
+            for box in tiles:
                 if progress is not None:
-                    done += covered.size
+                    done += (box[2] - box[0]) * (box[3] - box[1])
                     progress(done / (width * height))
-            if number + 1 < len(rows):
+            if top + side < height:
                 # Computed while this strip is written.
-                coming = self._start(rows[number + 1], run)
-            for start in range(0, bottom - top, STRIP_ROWS):
+                coming = self._start(top + side, run)
+            for start in range(0, len(samples), STRIP_ROWS):
                 yield samples[start : start + STRIP_ROWS], alpha[start : start + STRIP_ROWS]
 
-    def _row_of_tiles(self, top: int) -> list[Box]:
-        """The tiles whose first row is ``top``, in the order of work."""
+    def _start(self, top: int, run: Callable[..., Iterator[Any]]) -> tuple[_Filled, Iterator[Box]]:
+        """Begin with a row of tiles, when those above are done: the strip that they fill, and each that has done so."""
         (width, height), (x, y), side = self.canvas.size, self.origin, self.plan.tile_size
+        if self.shown:
+            row = y + top - self.around
+            self.renderer.pictures.expect([part.from_row(row) for part in self.shown])
         bottom = min(top + side, height)
         boxes = [(x + k, y + top, x + min(k + side, width), y + bottom) for k in range(0, width, side)]
-        # To and fro, so that the pictures used last are the ones needed next.
-        return boxes[::-1] if top // side % 2 else boxes
+        samples = np.zeros((bottom - top, width, self.renderer.channels), dtype=self.renderer.dtype)
+        alpha = np.zeros((bottom - top, width), dtype=np.uint8)
 
-    def _start(self, boxes: Sequence[Box], run: Callable[..., Iterator[Any]]) -> Iterator[Any]:
-        """Begin with a row of tiles, when all above it are done."""
-        if self.shown:
-            row = boxes[0][1] - self.around
-            self.renderer.pictures.expect([part.from_row(row) for part in self.shown])
-        return run(self.renderer.tile, boxes)
+        def fill(box: Box) -> Box:
+            columns = slice(box[0] - x, box[2] - x)
+            samples[:, columns], covered = self.renderer.tile(box)
+            alpha[:, columns][covered] = 255
+            return box
+
+        # To and fro, so that the pictures used last are the ones needed next.
+        return (samples, alpha), run(fill, boxes[::-1] if top // side % 2 else boxes)
 
 
 def prepare(

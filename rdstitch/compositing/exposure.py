@@ -22,7 +22,7 @@ from scipy.sparse.linalg import spsolve
 
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.compositing.survey import Survey, SurveyTile
-from rdstitch.compositing.warp import Box, Warp, interpolate_lattice, intersection, lattice_nodes
+from rdstitch.compositing.warp import Box, Float32Array, Warp, interpolate_lattice, intersection, lattice_nodes
 
 _SRGB_OFFSET = 0.055
 # Samples outside this part of the range are clipped or mostly noise.
@@ -40,6 +40,7 @@ _ROUNDS = 6
 _WORTHWHILE = 0.02
 # The correction is smooth: it is computed at this spacing, canvas px, and interpolated.
 _LATTICE = 32
+_ROWS = 32  # that are corrected at a time
 _DEPTHS = {"uint8": cv2.CV_8U, "uint16": cv2.CV_16U, "float32": cv2.CV_32F}
 
 
@@ -82,28 +83,39 @@ class Exposure:
 
         In the type of the pixels. Depends, px by px, on nothing but the px: every box gives the same, bit for bit.
         """
-        level = np.exp(-self.log_gain[index]).astype(np.float32)
-        smooth = bool(self.vignetting.any() or self.blocks.size)
-        if not smooth and not self.log_gain[index].any():
+        gain = np.exp(-self.log_gain[index]).astype(np.float32)
+        smooth = self._smooth_level(index, warp, box) if self.vignetting.any() or self.blocks.size else None
+        if smooth is None and (gain == 1).all():
             return pixels
-        if smooth:
-            x, y = np.broadcast_arrays(*lattice_nodes(box, _LATTICE))
-            points = warp.source_points(x, y)
-            width, height = warp.camera.image_size
-            # Outside the picture only mirrored content is corrected; the model must not run away there.
-            points = np.clip(np.nan_to_num(points), -0.5, (width - 0.5, height - 0.5))
-            nodes = np.exp(-self.smooth_part(index, warp.camera, points)).astype(np.float32)
-            plane = interpolate_lattice(nodes, box, _LATTICE)
-            # Planes are joined by OpenCV: numpy is slow along an axis of three.
-            level = np.asarray(cv2.merge([plane * factor for factor in level])).reshape(pixels.shape)
-        flat = (pixels.shape[0], -1)
-        level = np.broadcast_to(level, pixels.shape).reshape(flat)
         offset = np.float32(self.offset * full_scale(pixels.dtype))
-        values: Any = pixels.reshape(flat) + offset
-        values *= level
-        # Rounded and clipped to the type; the stubs know no scalars.
-        done = cv2.subtract(values, float(offset), dtype=_DEPTHS[pixels.dtype.name])  # type: ignore[call-overload]
-        return np.asarray(done).reshape(pixels.shape)
+        done = np.empty_like(pixels)
+        # A few rows at a time: what is computed in between stays in the processor's cache.
+        for top in range(0, len(pixels), _ROWS):
+            rows = slice(top, top + _ROWS)
+            values: Any = pixels[rows] + offset
+            # Planes are joined by OpenCV: numpy is slow along an axis of three.
+            values *= gain if smooth is None else _joined([smooth[rows] * factor for factor in gain])
+            # Rounded and clipped to the type; the stubs know no scalars.
+            flat = values.reshape(len(values), -1)
+            corrected = cv2.subtract(flat, float(offset), dtype=_DEPTHS[pixels.dtype.name])  # type: ignore[call-overload]
+            done[rows] = np.asarray(corrected).reshape(values.shape)
+        return done
+
+    def _smooth_level(self, index: int, warp: Warp, box: Box) -> Float32Array:
+        """What vignetting and block field are made up for by, on a box (h, w)."""
+        x, y = np.broadcast_arrays(*lattice_nodes(box, _LATTICE))
+        points = warp.source_points(x, y)
+        width, height = warp.camera.image_size
+        # Outside the picture only mirrored content is corrected; the model must not run away there.
+        points = np.clip(np.nan_to_num(points), -0.5, (width - 0.5, height - 0.5))
+        nodes = np.exp(-self.smooth_part(index, warp.camera, points)).astype(np.float32)
+        return interpolate_lattice(nodes, box, _LATTICE)
+
+
+def _joined(planes: list[Float32Array]) -> Float32Array:
+    """Planes (h, w) as one array (h, w, C)."""
+    joined = np.asarray(cv2.merge(planes), dtype=np.float32)
+    return joined.reshape(*planes[0].shape, len(planes))
 
 
 def full_scale(dtype: np.dtype[Any]) -> float:

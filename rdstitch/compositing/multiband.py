@@ -96,7 +96,8 @@ class MultibandBlender:
             band_pixels = level
             if band < self.bands:
                 coarser = rounded(_down(level), self.constant)
-                band_pixels = level - rounded(_up(coarser), self.constant)
+                band_pixels = rounded(_up(coarser), self.constant)
+                np.subtract(level, band_pixels, out=band_pixels)
                 level = coarser
             height, width = share.shape
             cut = np.s_[y >> band : (y >> band) + height, x >> band : (x >> band) + width]

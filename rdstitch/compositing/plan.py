@@ -13,7 +13,7 @@ from rdstitch.compositing.options import CompositeOptions
 from rdstitch.errors import LimitError
 
 # What the compositor takes without being told; more memory means that fewer pictures are read twice.
-DEFAULT_MEMORY = 380 * 2**20
+DEFAULT_MEMORY = 320 * 2**20
 _TILE_SIZES = (512, 256)
 _MOST_WORKERS = 4
 _MOST_BANDS = 5
@@ -21,7 +21,7 @@ _MOST_BANDS = 5
 # channel, and coordinates, weights, owners.
 _LIVE_PER_CHANNEL, _LIVE_PLANES = 5.0, 12.0
 # Seconds per megapixel of output, per megapixel of input, on one core of a machine of 2020; for an estimate only.
-_SECONDS_OUT, _SECONDS_IN = 0.25, 0.06
+_SECONDS_OUT, _SECONDS_IN = 0.15, 0.03
 
 
 @dataclass(frozen=True)

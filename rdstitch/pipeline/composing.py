@@ -21,6 +21,7 @@ from rdstitch.compositing import (
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_size
 from rdstitch.pipeline.georeference import Georeference, georeference
+from rdstitch.pipeline.memory import give_back
 from rdstitch.pipeline.progress import Progress
 from rdstitch.pipeline.sources import Source, readers
 
@@ -81,6 +82,7 @@ def compose_pictures(
     dry_run : bool
         Only plan.
     """
+    give_back()
     names = [source.name for source in sources]
     canvas = plan_canvas(
         cameras, homographies, scale=options.scale, rotate=options.rotate, reference=reference, names=names

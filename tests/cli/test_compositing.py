@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import ExifTags, Image
 from rdstitch_cli.main import cli
 
 from rdstitch.compositing import CompositeOptions
@@ -152,3 +153,27 @@ def test_deep_zoom_is_replaced_only_when_told(rdstitch: Run, sidecar: Path, fram
     assert done.status == 6
     assert "a_files: exists already" in done.line
     assert rdstitch(*command, "--overwrite").status == 0
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
+def test_profile_and_exif_are_kept_and_the_picture_is_upright(
+    rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path, suffix: str
+) -> None:
+    profile, folder = bytes(range(256)) * 2, tmp_path / "turned"
+    folder.mkdir()
+    for frame in frames:
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation], exif[ExifTags.Base.Make] = 6, "Maker"
+        with Image.open(frame) as image:
+            turned = image.transpose(Image.Transpose.ROTATE_90)
+        turned.save(folder / frame.name, exif=exif, icc_profile=profile)
+    pictures = {"upright": frames[0].parent, "turned": folder}
+    for name, images in pictures.items():
+        done = rdstitch("apply", sidecar, "--images", images, "-o", tmp_path / f"{name}.{suffix}", "--scale", "0.3")
+        assert done.status == 0
+    upright, turned_output = (read_image(tmp_path / f"{name}.{suffix}") for name in pictures)
+    np.testing.assert_array_equal(turned_output.pixels, upright.pixels)
+    assert (upright.metadata.icc_profile, upright.metadata.make) == (b"", "")
+    assert (turned_output.metadata.icc_profile, turned_output.metadata.make) == (profile, "Maker")
+    with Image.open(tmp_path / f"turned.{suffix}") as written:
+        assert written.getexif().get(ExifTags.Base.Orientation, 1) == 1

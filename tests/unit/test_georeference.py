@@ -11,9 +11,10 @@ from PIL import ExifTags, Image
 
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.compositing import CompositeOptions
+from rdstitch.io import Layout, write_strips
 from rdstitch.io.metadata import GpsPosition
 from rdstitch.pipeline import StitchOptions, mosaic
-from rdstitch.pipeline.georeference import georeference, utm
+from rdstitch.pipeline.georeference import Georeference, georeference, utm
 from tests.cli.running import flight, transfers
 
 
@@ -107,3 +108,19 @@ def test_pictures_without_positions_leave_no_world_file(tmp_path: Path) -> None:
     mosaic(flight(4, 2).write(tmp_path), tmp_path / "a.png", StitchOptions(workers=1))
     assert not list(tmp_path.glob("*.pgw"))
     assert not list(tmp_path.glob("*.prj"))
+
+
+def test_gdal_sees_what_was_meant(tmp_path: Path) -> None:
+    """Runs where rasterio is installed."""
+    rasterio = pytest.importorskip("rasterio")
+    place = Georeference(-34, 0.05 * np.exp(0.3j), complex(268_832.3, 6_246_117.8), 0.1)
+    alpha = np.full((600, 900), 255, np.uint8)
+    alpha[:100] = 0
+    layout = Layout((900, 600), 3, np.dtype(np.uint8), transparent=True)
+    write_strips(tmp_path / "a.tif", layout, [(np.full((600, 900, 3), 9, np.uint8), alpha)], place.tiff_tags())
+    with rasterio.open(tmp_path / "a.tif") as opened:
+        assert opened.crs.to_epsg() == place.epsg
+        for x, y in ((0, 0), (899, 599), (300, 20)):
+            np.testing.assert_allclose(opened.transform * (x + 0.5, y + 0.5), place.to_utm([(x, y)])[0], atol=1e-6)
+        assert opened.overviews(1) == [2, 4]
+        np.testing.assert_array_equal(opened.dataset_mask(), alpha)
