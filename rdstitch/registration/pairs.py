@@ -97,13 +97,7 @@ def match_pairs(
         compute = partial(matcher, features[image1], features[image2])
         return compute() if recall is None else recall(index, compute)
 
-    matched = []
-    with ThreadPoolExecutor(workers) as pool:
-        for found in pool.map(work, range(len(pairs))):
-            matched.append(found)
-            if progress is not None:
-                progress(len(matched), len(pairs))
-    return matched
+    return _side_by_side(work, len(pairs), workers, progress)
 
 
 def estimate_pairs(
@@ -164,10 +158,15 @@ def estimate_pairs(
         relation = compute() if recall is None else recall(index, compute)
         return PairRegistration(*pairs[index], matched[index], relation)
 
-    registered = []
+    return _side_by_side(work, len(pairs), workers, progress)
+
+
+def _side_by_side(work: Callable[[int], Value], count: int, workers: int, progress: Progress | None) -> list[Value]:
+    """What ``work`` gives for each number below ``count``, in that order, several at a time."""
+    done = []
     with ThreadPoolExecutor(workers) as pool:
-        for registration in pool.map(work, range(len(pairs))):
-            registered.append(registration)
+        for value in pool.map(work, range(count)):
+            done.append(value)
             if progress is not None:
-                progress(len(registered), len(pairs))
-    return registered
+                progress(len(done), count)
+    return done
