@@ -70,13 +70,16 @@ def drawing_scale(picture: PlacedPicture) -> float:
     height, width = picture.grey.shape
     around = np.array([[width / 2 + dx, height / 2 + dy] for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1))])
     left, right, top, bottom = to_plane(picture.camera, picture.homography, around)
-    area = abs(np.linalg.det(np.stack([right - left, bottom - top]) / 2.0))
+    (ax, ay), (bx, by) = right - left, bottom - top
+    area = abs(ax * by - ay * bx) / 4.0
     return float(min(1.0, _LONGEST_SIDE / max(height, width)) / np.sqrt(area))
 
 
 def draw(picture: PlacedPicture, scale: float) -> Drawing:
     """Draw a picture on the plane with so many px a unit."""
     outline = to_plane(picture.camera, picture.homography, picture.camera.outline(16)) * scale
+    if not np.isfinite(outline).any():  # all of it behind the horizon
+        return Drawing(np.full((1, 1), np.nan, dtype=np.float32), np.zeros(2))
     middle = np.nanmedian(outline, axis=0)
     reach = _MOST_PX / 2.0 * _LONGEST_SIDE
     low, high = (

@@ -87,6 +87,8 @@ def neighbours(cameras: Sequence[Camera], homographies: FloatArray, tried: set[t
     """
     footprints = np.array([_footprint(*placed) for placed in zip(cameras, homographies, strict=True)])
     known = np.flatnonzero(np.isfinite(footprints).all(axis=(1, 2))).tolist()
+    if len(known) < 2:
+        return []
     boxes = footprints[known]
     centres = boxes.mean(axis=1)
     nearest = KDTree(centres).query(centres, k=min(_NEIGHBOURS + 1, len(known)))[1].reshape(len(known), -1)

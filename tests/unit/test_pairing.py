@@ -12,6 +12,7 @@ from rdstitch.pipeline.pairing import Pairing
 from rdstitch.pipeline.progress import silent
 from rdstitch.registration import AlignmentOptions, align
 from rdstitch.registration.resting import rests
+from rdstitch.registration.selection import neighbours
 
 LENS = Camera((640, 480), distortion=-0.2, focal=520.0)
 PICTURES = 4
@@ -109,3 +110,10 @@ def test_pictures_that_share_nothing_are_told_at_a_glance() -> None:
     one, other = _pairing(0, 400), _pairing(0, 400, seed=1)
     together = replace(one, features=[*one.features[:2], *other.features[:2]])
     assert together.promising(ALL) == [(0, 1), (2, 3)]
+
+
+def test_pictures_behind_the_horizon_have_no_neighbours() -> None:
+    beyond = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [3.0, 0.0, 1.0]])
+    assert neighbours([LENS] * 3, np.stack([beyond] * 3), set()) == []
+    assert neighbours([LENS] * 3, np.stack([np.eye(3), beyond, beyond]), set()) == []
+    assert neighbours([LENS] * 3, np.stack([np.eye(3), np.eye(3), beyond]), set()) == [(0, 1)]
