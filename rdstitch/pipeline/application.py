@@ -106,6 +106,7 @@ def apply(
             options,
             threads,
             progress,
+            overwrite=overwrite,
             dry_run=dry_run,
         )
         result = Recomposition(

@@ -18,9 +18,10 @@ from rdstitch.compositing import (
     plan_canvas,
     plan_composite,
 )
+from rdstitch.io.atomic import check_output
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_size
-from rdstitch.pipeline.georeference import Georeference, georeference
+from rdstitch.pipeline.georeference import Georeference, files_beside, georeference, has_place
 from rdstitch.pipeline.memory import give_back
 from rdstitch.pipeline.progress import Progress
 from rdstitch.pipeline.sources import Source, readers
@@ -61,6 +62,7 @@ def compose_pictures(
     threads: int,
     progress: Progress,
     *,
+    overwrite: bool,
     dry_run: bool = False,
 ) -> Composed:
     """Plan the canvas, see whether a file can hold it, and put the pictures on it.
@@ -79,10 +81,21 @@ def compose_pictures(
     options : CompositeOptions
     threads : int
     progress : callable
+    overwrite : bool
+        Replace an existing world file.
     dry_run : bool
         Only plan.
+
+    Raises
+    ------
+    OutputError
+        When a file beside the output exists already.
     """
     give_back()
+    positions = [source.metadata.gps for source in sources]
+    beside = files_beside(output) if output is not None and has_place(positions) else ()
+    for file in beside:
+        check_output(file, overwrite, suffixes=())
     names = [source.name for source in sources]
     canvas = plan_canvas(
         cameras, homographies, scale=options.scale, rotate=options.rotate, reference=reference, names=names
@@ -107,11 +120,11 @@ def compose_pictures(
     placed: list[tuple[Georeference | None, str]] = []
 
     def tags(final: Canvas) -> list[ExtraTag]:
-        placed.append(georeference([source.metadata.gps for source in sources], cameras, final.matrix @ matrices))
+        placed.append(georeference(positions, cameras, final.matrix @ matrices))
         return placed[0][0].tiff_tags() if placed[0][0] is not None else []
 
     written = compose_to_file(output, read, cameras, matrices, canvas, options, sources[0].metadata, told, tags, read)
     place, note = placed[0]
-    if place is not None and Path(output).suffix.lower() not in (".tif", ".tiff", ".dzi"):
+    if place is not None and beside:
         place.write_beside(output)
     return Composed(written.canvas, notes=(*written.notes, *([note] if note else [])))

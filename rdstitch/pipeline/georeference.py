@@ -74,14 +74,12 @@ class Georeference:
         ]
 
     def write_beside(self, picture: str | Path) -> None:
-        """Write a world file, and the coordinate system as .prj, beside a picture that has no place for them."""
-        file = Path(picture)
+        """Write :func:`files_beside` a picture that has no place for them."""
+        world, system = files_beside(picture)
         a, b = self.scale.real, self.scale.imag
-        kind = file.suffix.lower()
         numbers = (a, b, b, -a, self.origin.real, self.origin.imag)
-        text = "".join(f"{number:.10f}\n" for number in numbers)
-        write_text_atomic(file.with_suffix(f"{kind[:2]}{kind[-1]}w"), text)
-        write_text_atomic(file.with_suffix(".prj"), self._well_known_text() + "\n")
+        write_text_atomic(world, "".join(f"{number:.10f}\n" for number in numbers))
+        write_text_atomic(system, self._well_known_text() + "\n")
 
     def _well_known_text(self) -> str:
         zone, south = abs(self.zone), self.zone < 0
@@ -93,6 +91,23 @@ class Georeference:
             f'PARAMETER["Central_Meridian",{_central_meridian(zone):.1f}],PARAMETER["Scale_Factor",{_SCALE}],'
             'PARAMETER["Latitude_Of_Origin",0.0],UNIT["Meter",1.0]]'
         )
+
+
+def files_beside(picture: str | Path) -> tuple[Path, ...]:
+    """The world file, and the coordinate system as .prj, of a picture; none where its own format has a place for both.
+
+    A Deep Zoom picture has none either: nothing that shows it would read them.
+    """
+    file = Path(picture)
+    kind = file.suffix.lower()
+    if kind in (".tif", ".tiff", ".dzi"):
+        return ()
+    return file.with_suffix(f"{kind[:2]}{kind[-1]}w"), file.with_suffix(".prj")
+
+
+def has_place(positions: Sequence[GpsPosition | None]) -> bool:
+    """Whether enough pictures have a position for a place to be expected."""
+    return sum(position is not None for position in positions) >= _FEWEST_POSITIONS
 
 
 def georeference(
@@ -113,9 +128,9 @@ def georeference(
     Georeference or None, str
         The reason is empty where too few pictures have a position: nobody expects a place then.
     """
-    known = [k for k, position in enumerate(positions) if position is not None]
-    if len(known) < _FEWEST_POSITIONS:
+    if not has_place(positions):
         return None, ""
+    known = [k for k, position in enumerate(positions) if position is not None]
     degrees = np.array([(p.latitude, p.longitude) for p in positions if p is not None])
     latitude, longitude = np.median(degrees, axis=0)
     number = int(np.clip((longitude + 180) // 6 + 1, 1, 60))

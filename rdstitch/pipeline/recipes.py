@@ -226,6 +226,7 @@ def _composite(
         options.composite,
         options.threads,
         progress,
+        overwrite=options.overwrite,
         dry_run=options.dry_run,
     )
     result = StitchResult(

@@ -11,6 +11,7 @@ from PIL import ExifTags, Image
 
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.compositing import CompositeOptions
+from rdstitch.errors import OutputError
 from rdstitch.io import Layout, write_strips
 from rdstitch.io.metadata import GpsPosition
 from rdstitch.pipeline import StitchOptions, mosaic
@@ -88,6 +89,17 @@ def test_other_formats_get_a_world_file(located: tuple[list[Path], FloatArray], 
     place = np.column_stack([a * px[:, 0] + b * px[:, 1] + c, d * px[:, 0] + e * px[:, 1] + f])
     assert np.hypot(*(place - truth).T).max() < 4 * METRES_PER_TEXEL
     assert "UTM_Zone_34S" in (tmp_path / "a.prj").read_text(encoding="ascii")
+
+
+def test_files_beside_are_not_replaced_unasked(located: tuple[list[Path], FloatArray], tmp_path: Path) -> None:
+    somebodys = tmp_path / "a.prj"
+    somebodys.write_text("mine", encoding="ascii")
+    with pytest.raises(OutputError, match=r"a\.prj: exists already"):
+        mosaic(located[0], tmp_path / "a.jpg", StitchOptions(workers=1))
+    assert somebodys.read_text(encoding="ascii") == "mine"
+    assert sorted(tmp_path.iterdir()) == [somebodys]
+    mosaic(located[0], tmp_path / "a.jpg", StitchOptions(workers=1, overwrite=True))
+    assert "UTM_Zone_34S" in somebodys.read_text(encoding="ascii")
 
 
 def test_positions_that_do_not_fit_are_refused() -> None:
