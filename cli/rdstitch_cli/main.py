@@ -1,5 +1,6 @@
 """The command group, and the edge where errors become one line and an exit status."""
 
+import ctypes
 import errno
 import os
 import signal
@@ -46,6 +47,7 @@ Examples:
 
 _UNEXPECTED, _INTERRUPTED, _BROKEN_PIPE = 1, 130, 141
 _ASKED_TO_END = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+_M_ARENA_MAX = -8
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -73,6 +75,7 @@ def main() -> None:
     # Pictures and pairs are worked on side by side; threads within each matrix product would only be in the way.
     # NumPy reads this when it is loaded, which is later.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    _share_memory()
     for number in _ASKED_TO_END:
         signal.signal(number, _end)
     sys.exit(run(sys.argv[1:]))
@@ -87,6 +90,15 @@ def _open_standard_streams() -> None:
                 os.dup2(nowhere, number)
                 os.close(nowhere)
             setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8"))  # noqa: PTH123, SIM115
+
+
+def _share_memory() -> None:
+    """Let all threads take memory from one pool, where the C library would give each its own (glibc).
+
+    Large arrays are freed by one stage's threads and wanted by the next one's; pools of their own would keep them.
+    """
+    with suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1)
 
 
 def run(arguments: list[str]) -> int:

@@ -20,7 +20,7 @@ from rdstitch.features.options import FeatureOptions
 LARGE = 1_500_000
 """Px from which on a picture is taken in strips."""
 
-_STRIP = 500_000  # px of a strip without its overlap, about
+_STRIP = 400_000  # px of a strip without its overlap, about
 # How far the descriptors of the two finest octaves see, px: 4 px of sigma times 3 a cell, 2.5 cells, across the corner,
 # and what is smoothed there.
 _OVERLAP = 64
