@@ -12,13 +12,11 @@ from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.pair_models import HomographyModel, PairModel, PlanarModel, Tilts
 from rdstitch.robust.ransac import Hypothesis, RansacOptions, Search, ransac
-from rdstitch.robust.scoring import transfer_errors2
 from rdstitch.robust.selection import Selection, rms_of, select_model
 from rdstitch.robust.verification import LEAST_PLACES, doubts, places
 
 SOLVERS = ("auto", "two_point", "three_point", "three_point_similarity", "four_point", "five_point")
 
-_HOPEFUL = 2.0  # thresholds within which matches must agree with a hypothesis for it to be worth refining
 _AUTO_LEAVES_OUT = "four_point"  # finds what three points find, from more samples
 
 
@@ -107,11 +105,6 @@ def estimate_radial_homography(
     if search.best is None:
         reason = f"no plausible model in {search.iterations} samples of {len(data)} matches"
         return RadialHomography.failed(reason, camera1, camera2, len(data), search.iterations)
-    # Refinement does not turn chance into agreement; most pairs that do not overlap end here.
-    wide = _HOPEFUL * threshold
-    near = transfer_errors2(search.best.homography[None], np.array([search.best.distortion]), data)[0] < wide**2
-    if (doubt := doubts(p1, p2, near, camera2.image_size, wide)) is not None:
-        return RadialHomography.failed(doubt, camera1, camera2, len(data), search.iterations)
     chosen = select_model(
         _models(camera1, tilts), search.best.homography, search.best.distortion, data, threshold,
         fixed_distortion=distortion is not None,
