@@ -283,7 +283,11 @@ compositing = together(
         metavar="GREY",
         help="What no picture covers, in JPEG and .dzi: 0 black to 255 white.",
     ),
-    click.option("--max-memory", type=Bytes(), help="Memory that compositing may take; otherwise what suits the size."),
+    click.option(
+        "--max-memory",
+        type=Bytes(),
+        help="Memory that compositing may take, as 800M; otherwise 320M, or more for a large canvas.",
+    ),
     click.option(
         "--scale",
         type=float,

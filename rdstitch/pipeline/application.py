@@ -13,6 +13,7 @@ from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, InputError, OutputError, PartialResultError
 from rdstitch.io.atomic import check_output, write_json_atomic
+from rdstitch.io.decoding import check_readable
 from rdstitch.pipeline.composing import compose_pictures
 from rdstitch.pipeline.inputs import find_pictures
 from rdstitch.pipeline.masks import with_masks
@@ -173,6 +174,8 @@ def _by_order(saved: SavedRegistration, paths: Sequence[Path]) -> Sequence[Path]
             "names"
         )
     if len(paths) != len(saved.pictures):
+        for path in paths:
+            check_readable(path)
         raise InputError(
             f"{saved.path}: has {len(saved.pictures)} pictures, but {len(paths)} others were given; give pictures of "
             "the same names, or equally many"

@@ -56,9 +56,8 @@ def find_pictures(
 
 def _entry(path: Path) -> Path:
     """Where a name stands, links to folders followed but the last link not."""
-    return (
-        Path(os.path.realpath(path.parent)) / path.name
-    )  # which, unlike Path.resolve, makes do with links in a circle
+    # Path.resolve would stumble over links in a circle.
+    return Path(os.path.realpath(path.parent)) / path.name
 
 
 def natural_key(path: Path) -> list[tuple[int, str | int]]:

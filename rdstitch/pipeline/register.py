@@ -18,7 +18,7 @@ from rdstitch.pipeline.progress import Progress, silent
 from rdstitch.pipeline.sources import LeftOut, Source
 from rdstitch.registration import Alignment, AlignmentOptions, Link, align
 from rdstitch.registration.alignment import LinkFit, Poses, Relief
-from rdstitch.registration.lenses import TwoLenses, Votes, two_lenses
+from rdstitch.registration.lenses import TwoLenses, Votes, pictures_of_the_other, two_lenses
 from rdstitch.registration.pairs import PairRegistration
 from rdstitch.registration.selection import first_pairs, neighbours
 
@@ -104,9 +104,9 @@ def register(
     if not any(pair.relation for pair in pairs):
         pairs = pairing.estimate(candidates)
     pairing, pairs = pairing.look_past_rest(pairs)
-    mixed, strangers = _mixed_lenses(pairing, pairs), {}
-    if mixed is not None and mixed.certain:
-        strangers = _strangers(mixed, pairs)
+    mixed = None if options.known_distortion is not None else two_lenses(len(sources), Votes.of(pairs))
+    strangers = {} if mixed is None else pictures_of_the_other(mixed, pairs)
+    if strangers:
         pairs = [pair for pair in pairs if not {pair.image1, pair.image2} & strangers.keys()]
         candidates = [pair for pair in candidates if not {*pair} & strangers.keys()]
     pairs = pairing.rescue(pairs)
@@ -143,33 +143,6 @@ def in_frame_of_reference(registration: Registration) -> Registration:
     alignment = registration.alignment
     homographies = np.linalg.inv(alignment.homographies[alignment.reference]) @ alignment.homographies
     return replace(registration, alignment=replace(alignment, homographies=homographies))
-
-
-def _mixed_lenses(pairing: Pairing, pairs: Sequence[PairRegistration]) -> TwoLenses | None:
-    """The two lenses that pictures come from, by what each pair sees of λ; None where there is one, or λ is known."""
-    seen = [pair for pair in pairs if pair.relation and np.isfinite(pair.relation.distortion_std)]
-    if pairing.options.known_distortion is not None:
-        return None
-    ends = np.array([(pair.image1, pair.image2) for pair in seen], dtype=np.intp).reshape(-1, 2)
-    votes = np.array([(pair.relation.distortion, pair.relation.distortion_std) for pair in seen]).reshape(-1, 2)
-    return two_lenses(len(pairing.features), Votes(*ends.T, *votes.T))
-
-
-def _strangers(mixed: TwoLenses, pairs: Sequence[PairRegistration]) -> dict[int, str]:
-    """Pictures of the lens that took fewer, or has fewer matches, with why they are left out."""
-    linked = [pair for pair in pairs if pair.relation]
-    sizes = []
-    for second in (False, True):
-        own = [pair for pair in linked if mixed.second[[pair.image1, pair.image2]].tolist() == [second] * 2]
-        members = {picture for pair in own for picture in (pair.image1, pair.image2)}
-        sizes.append((len(members), sum(int(pair.relation.inliers.sum()) for pair in own)))
-    kept = sizes[1] > sizes[0]
-    there, here = mixed.distortion[not kept], mixed.distortion[kept]
-    reason = (
-        f"comes from another lens or zoom setting (λ about {there:.3f}, that of the others {here:.3f}); "
-        "stitch those of each on their own"
-    )
-    return {int(k): reason for k in np.flatnonzero(mixed.second != kept)}
 
 
 def _links(sources: Sequence[Source], pairs: Sequence[PairRegistration]) -> list[Link]:

@@ -5,13 +5,16 @@ the mean of both. So a division of the pictures into two lenses predicts what ev
 """
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.camera import FloatArray
 from rdstitch.registration.observations import IntArray
+from rdstitch.registration.pairs import PairRegistration
 
 BoolArray = NDArray[np.bool_]
 
@@ -22,6 +25,10 @@ _MOVES = 12
 _LEAST_STD = 2e-4  # λ; no pair knows it better than that the division model holds
 _LEAST_GAP = 0.01  # λ; what is nearer is one lens that one λ does not quite describe
 _LEAST_GAP_IN_SCATTERS = 8.0
+_LEAST_MISS = 0.5  # standard deviations on average; less is luck
+_STD_PER_MEAN_MISS = 1.25  # of a normal distribution
+# How many times better two lenses must explain the votes than one: at least, and times one over the number of votes.
+_LEAST_GAIN, _GAIN_OF_FEW = 4.0, 44.0
 
 
 @dataclass(frozen=True)
@@ -40,6 +47,14 @@ class Votes:
     image2: IntArray
     distortion: FloatArray
     std: FloatArray
+
+    @classmethod
+    def of(cls, pairs: Sequence[PairRegistration]) -> Self:
+        """The votes of the pairs that see λ."""
+        seen = [pair for pair in pairs if pair.relation and np.isfinite(pair.relation.distortion_std)]
+        ends = np.array([(pair.image1, pair.image2) for pair in seen], dtype=np.intp).reshape(-1, 2)
+        votes = np.array([(pair.relation.distortion, pair.relation.distortion_std) for pair in seen]).reshape(-1, 2)
+        return cls(*ends.T, *votes.T)
 
     def missed(self, expected: FloatArray | float) -> FloatArray:
         """How far each vote is from what is expected, in its standard deviations."""
@@ -81,14 +96,32 @@ def two_lenses(count: int, votes: Votes) -> TwoLenses | None:
     second, lenses = min(divisions, key=lambda division: votes.missed(_expected(votes, *division)).sum())
     kinds = _kinds(votes, second)
     gap = float(abs(lenses[1] - lenses[0]))
-    # Less than half a standard deviation on average is luck.
-    missed = max(float(votes.missed(_expected(votes, second, lenses)).sum()), 0.5 * number)
-    scatter = 1.25 * missed / (number - 2) * float(np.median(votes.std))
+    missed = max(float(votes.missed(_expected(votes, second, lenses)).sum()), _LEAST_MISS * number)
+    scatter = _STD_PER_MEAN_MISS * missed / (number - 2) * float(np.median(votes.std))
     gain = float(votes.missed(_weighted_median(votes.distortion, 1.0 / votes.std)).sum()) / missed
     told = [(kinds < 2).sum() >= 2, (kinds > 0).sum() >= 2, gap >= max(_LEAST_GAP, _LEAST_GAP_IN_SCATTERS * scatter)]
-    if not all(told) or gain < 4.0 + 44.0 / number:
+    if not all(told) or gain < _LEAST_GAIN + _GAIN_OF_FEW / number:
         return None
     return TwoLenses(second, (float(lenses[0]), float(lenses[1])), bool((kinds == 0).any() and (kinds == 2).any()))
+
+
+def pictures_of_the_other(mixed: TwoLenses, pairs: Sequence[PairRegistration]) -> dict[int, str]:
+    """Pictures of the lens that took fewer, or has fewer matches, with why they are left out; none if in doubt."""
+    if not mixed.certain:
+        return {}
+    linked = [pair for pair in pairs if pair.relation]
+    sizes = []
+    for second in (False, True):
+        own = [pair for pair in linked if mixed.second[[pair.image1, pair.image2]].tolist() == [second] * 2]
+        members = {picture for pair in own for picture in (pair.image1, pair.image2)}
+        sizes.append((len(members), sum(int(pair.relation.inliers.sum()) for pair in own)))
+    kept = sizes[1] > sizes[0]
+    there, here = mixed.distortion[not kept], mixed.distortion[kept]
+    reason = (
+        f"comes from another lens or zoom setting (λ about {there:.3f}, that of the others {here:.3f}); "
+        "stitch those of each on their own"
+    )
+    return {int(k): reason for k in np.flatnonzero(mixed.second != kept)}
 
 
 def _divide(count: int, votes: Votes, lenses: FloatArray) -> tuple[BoolArray, FloatArray]:

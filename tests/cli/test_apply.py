@@ -129,6 +129,8 @@ def test_what_does_not_fit_is_refused(rdstitch: Run, frames: list[Path], stitche
     fewer = _written(frames[:2], tmp_path / "fewer", ["x.png", "y.png"])
     done = _apply(rdstitch, sidecar, fewer, tmp_path / "out.tif")
     assert (done.status, str(sidecar) in done.line) == (3, True)
+    done = _apply(rdstitch, sidecar, tmp_path / "nowhere", tmp_path / "out.tif")
+    assert (done.status, f"{tmp_path / 'nowhere'}: no such file" in done.line) == (3, True)
     cut = tmp_path / "cut"
     cut.mkdir()
     for frame in frames:
