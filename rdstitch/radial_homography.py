@@ -15,6 +15,8 @@ from rdstitch.camera import Camera, FloatArray, distort
 from rdstitch.planar_motion import PlanarMotion
 
 LENS_PARAMETERS = ("distortion", "distortion2", "center_x", "center_y")
+LENS_STD = np.array([0.5, 0.05, 0.03, 0.03])
+"""How far these can be expected from 0 before anything is known, in the half-diagonal frame."""
 
 
 def lift(points: ArrayLike, distortion: ArrayLike, distortion2: float = 0.0) -> FloatArray:
@@ -91,6 +93,8 @@ class TransferJacobian:
         By the entries of H, row by row.
     by_lens : ndarray of shape (N, 2, 4)
         By :data:`LENS_PARAMETERS`: λ, μ, and the distortion centre (a shift of both pictures' centre).
+    by_own_distortion : ndarray of shape (N, 2)
+        By the λ of picture 2 alone, a part of ``by_lens``.
     by_point : ndarray of shape (N, 2, 2)
         By the point in picture 1.
     """
@@ -98,11 +102,17 @@ class TransferJacobian:
     points: FloatArray
     by_homography: FloatArray
     by_lens: FloatArray
+    by_own_distortion: FloatArray
     by_point: FloatArray
 
 
 def transfer_jacobian(
-    homography: FloatArray, distortion: float, points: FloatArray, distortion2: float = 0.0
+    homography: FloatArray,
+    distortion: float,
+    points: FloatArray,
+    distortion2: float = 0.0,
+    *,
+    own_distortion: float | None = None,
 ) -> TransferJacobian:
     """:func:`transfer` with its analytic derivatives.
 
@@ -118,16 +128,19 @@ def transfer_jacobian(
         λ and μ in the frame of the points.
     points : ndarray of shape (N, 2)
         Points of picture 1, normalized. Points that cannot be transferred give NaN everywhere.
+    own_distortion : float, optional
+        λ of picture 2, where it is another.
     """
+    own_distortion = distortion if own_distortion is None else own_distortion
     r2 = np.einsum("ni,ni->n", points, points)
     lifted = lift(points, distortion, distortion2)
     z = lifted @ homography.T if homography.ndim == 2 else np.einsum("nij,nj->ni", homography, lifted)
     w = np.where(z[:, 2] > 0.0, z[:, 2], np.nan)
-    d = distort(z[:, :2] / w[:, None], distortion, distortion2)
+    d = distort(z[:, :2] / w[:, None], own_distortion, distortion2)
 
     rho2 = np.einsum("ni,ni->n", d, d)
-    g = 1.0 + distortion * rho2 + distortion2 * rho2**2
-    alpha = (2.0 * distortion + 4.0 * distortion2 * rho2) / g
+    g = 1.0 + own_distortion * rho2 + distortion2 * rho2**2
+    alpha = (2.0 * own_distortion + 4.0 * distortion2 * rho2) / g
     stretch = 1.0 - alpha * rho2
     # d by z: that by u, over w, for the first two; and -u / w, of which "d by u" makes -d / (stretch w), for the third.
     scale = g / w
@@ -148,7 +161,7 @@ def transfer_jacobian(
     by_lens[:, :, 0] = along_third * r2[:, None] + own
     by_lens[:, :, 1] = along_third * (r2**2)[:, None] + own * rho2[:, None]
     by_lens[:, :, 2:] = np.eye(2) - by_point
-    return TransferJacobian(d, by_homography, by_lens, by_point)
+    return TransferJacobian(d, by_homography, by_lens, own, by_point)
 
 
 def measurement_whitening(by_point: FloatArray) -> FloatArray:

@@ -30,7 +30,12 @@ from rdstitch.synthetic import (
 )
 
 SOLVABLE = ("pair", "chain", "grid")
-HOPELESS = ("apart", "textureless", "repeated", "turning", "mixed lenses", "little overlap", "mixed ground")
+HOPELESS = (
+    "apart", "textureless", "repeated", "turning", "mixed lenses", "mixed by one", "little overlap", "mixed ground"
+)  # fmt: skip
+
+OTHERS = ((1.15, 0.0), (1.4, 0.0), (1.0, 0.05), (1.0, 0.1), (1.0, 0.2))
+"""Other lenses: their focal length in units of the first lens's, and how far λ differs beyond what the zoom does."""
 
 LARGEST_MEDIAN, LARGEST_OF_A_PICTURE = 1.5, 4.0
 """px of the pictures: more is a wrong registration."""
@@ -147,6 +152,8 @@ def _poses(kind: str, lens: Camera, tilt: tuple[float, float], rng: np.random.Ge
     columns, rows = (4, 1) if kind == "chain" else (2, 2) if kind == "grid" else (3, 1)
     if kind == "mixed lenses":
         columns, rows = 5, 1
+    elif kind == "mixed by one":
+        columns, rows = 2 + seed % 4, 1
     return grid_poses(lens, columns, rows, overlap=overlap, yaw=0.2, shift=0.05, tilt=tilt, seed=seed)
 
 
@@ -160,6 +167,14 @@ def _mixed(kind: str, sequence: Sequence, rng: np.random.Generator, seed: int) -
         other = replace(sequence, lens=zoomed)
         # A camera that is zoomed in sees the plane from as high as before.
         taken = frozenset(range(3, 5))
+    elif kind == "mixed by one":
+        assert isinstance(lens, Camera)
+        assert lens.focal is not None
+        zoom, bend = OTHERS[int(rng.integers(len(OTHERS)))]
+        bend = -bend if lens.distortion < -0.1 else bend
+        changed = replace(lens, distortion=lens.distortion / zoom**2 - bend, focal=zoom * lens.focal)
+        other = replace(sequence, lens=changed)
+        taken = frozenset({int(rng.choice([0, len(sequence) // 2, len(sequence) - 1]))})
     else:
         other, taken = replace(sequence, texture=ground(sequence.texture.size, seed + 1)), frozenset({2})
     return MixedSequence(

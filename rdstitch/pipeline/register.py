@@ -98,19 +98,19 @@ def register(
     features, damaged = _detect(sources, options, cache, skip_bad, progress)
     aligning = _alignment_options(sources, options, reference)
     tilts = aligning.exact_tilts(len(sources))
+    cameras = [source.camera.with_focal() for source in sources]
     pairing = Pairing(features, [source.camera for source in sources], matcher, options, progress, cache, tilts)
     candidates = first_pairs(features, options.seed)
     pairs = pairing.estimate(pairing.promising(candidates))
     if not any(pair.relation for pair in pairs):
         pairs = pairing.estimate(candidates)
     pairing, pairs = pairing.look_past_rest(pairs)
-    mixed = None if options.known_distortion is not None else two_lenses(len(sources), Votes.of(pairs))
+    mixed = None if options.known_distortion is not None else two_lenses(cameras, Votes.of(pairs, options.threshold))
     strangers = {} if mixed is None else pictures_of_the_other(mixed, pairs)
     if strangers:
         pairs = [pair for pair in pairs if not {pair.image1, pair.image2} & strangers.keys()]
         candidates = [pair for pair in candidates if not {*pair} & strangers.keys()]
     pairs = pairing.rescue(pairs)
-    cameras = [source.camera.with_focal() for source in sources]
     alignment = _align(cache, cameras, _links(sources, pairs), aligning)
     for _ in range(_CLOSURE_ROUNDS):
         tried = {(pair.image1, pair.image2) for pair in pairs}

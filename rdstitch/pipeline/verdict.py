@@ -124,13 +124,15 @@ def _outvoted(names: Sequence[str], pairs: Sequence[Pair]) -> list[str]:
 
 
 def _mixed(names: Sequence[str], registration: Registration) -> list[str]:
-    """Two lenses, of which it is not clear which pictures belong to which."""
+    """Two lenses whose pictures were not parted: it is not clear which are whose, or each has one picture only."""
     mixed = registration.mixed
     if mixed is None or mixed.certain:
         return []
-    fewer = mixed.second if 2 * mixed.second.sum() <= len(names) else ~mixed.second
-    listed = [name for name, other in zip(names, fewer, strict=True) if other]
-    return [f"two lenses or zooms are mixed, perhaps that of {_few(listed)} and that of the others; part them first"]
+    own, others = ([name for name, s in zip(names, mixed.second, strict=True) if s == k] for k in (True, False))
+    return [
+        f"two lenses or zooms are mixed: {_few(own)} (λ about {mixed.distortion[1]:.3f}) and {_few(others)} "
+        f"({mixed.distortion[0]:.3f}); stitch those of each on their own"
+    ]
 
 
 def _misfits(names: Sequence[str], used: Sequence[LinkFit]) -> list[str]:

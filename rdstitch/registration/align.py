@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.errors import ArgumentError, RegistrationError
+from rdstitch.radial_homography import LENS_STD
 from rdstitch.registration.alignment import Alignment
 from rdstitch.registration.bundle_adjustment import Adjusted
 from rdstitch.registration.consistency import judge_in_triangles, misfitting_links
@@ -26,9 +27,6 @@ from rdstitch.registration.problem import (
     thin_for_selection,
 )
 from rdstitch.registration.voting import Consensus, vote
-
-_LENS_STD = np.array([0.5, 0.05, 0.03, 0.03])
-"""How far λ, μ and the distortion centre can be expected from 0 before anything is known."""
 
 _OBSERVABLE = 0.1
 """Standard deviation of λ from which on it counts as not observable."""
@@ -111,7 +109,7 @@ class AlignmentOptions:
             attitudes=attitudes,
             attitudes_std=None if self.attitudes is None else self.attitudes_std,
             lens=np.zeros(4),
-            lens_std=_LENS_STD,
+            lens_std=LENS_STD,
         )
 
     @property

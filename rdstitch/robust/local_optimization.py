@@ -5,17 +5,22 @@ Levenberg-Marquardt on the parameters of a pair model and λ, with the Geman-McC
 their influence without ever being decided upon.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from rdstitch.camera import FloatArray
-from rdstitch.radial_homography import measurement_whitening, transfer_jacobian, whiten
+from rdstitch.radial_homography import TransferJacobian, measurement_whitening, transfer_jacobian, whiten
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import PairModel
 
 _LEAST_GAIN = 1e-5  # expected relative fall of the loss that is worth another step: a hundredth of the noise
-_LARGEST_BEND = 0.98  # |λ| in the half-diagonal frame; beyond, the lens model folds at the corner
+LARGEST_BEND = 0.98  # |λ| in the half-diagonal frame; beyond, the lens model folds at the corner
+
+State = TypeVar("State")
+_State = tuple[FloatArray, float]  # of the model, and λ
 
 
 @dataclass(frozen=True)
@@ -54,7 +59,19 @@ class Refined:
 
 
 @dataclass(frozen=True)
-class _Linearized:
+class Linearized:
+    """The loss at some parameters, and what a step from there takes.
+
+    Attributes
+    ----------
+    cost : float
+    errors : ndarray of shape (N,)
+    information : ndarray of shape (P, P)
+    gradient : ndarray of shape (P,)
+    influence : ndarray of shape (N, P)
+        As in :class:`Refined`.
+    """
+
     cost: float
     errors: FloatArray
     information: FloatArray
@@ -89,10 +106,36 @@ def refine(
     iterations : int
         At most so many steps.
     """
-    state = model.initialize(homography)
-    current = _linearize(model, state, distortion, data, scale, fixed_distortion, noise)
-    damping = 1e-4
     first = 0 if fixed_distortion else 1
+
+    def evaluate(state: _State) -> Linearized:
+        return _linearize(model, *state, data, scale, fixed_distortion, noise)
+
+    def move(state: _State, step: FloatArray) -> _State | None:
+        moved = model.retract(state[0], step[first:]), state[1] if fixed_distortion else float(state[1] + step[0])
+        return moved if abs(moved[1]) < LARGEST_BEND and np.isfinite(moved[0]).all() else None
+
+    (state, distortion), found = descend(evaluate, move, (model.initialize(homography), distortion), iterations)
+    return Refined(model, state, distortion, found.errors, found.cost, found.information, found.influence)
+
+
+def descend(
+    evaluate: Callable[[State], Linearized],
+    move: Callable[[State, FloatArray], State | None],
+    start: State,
+    iterations: int,
+) -> tuple[State, Linearized]:
+    """Levenberg-Marquardt: where at most so many steps lead to, and the loss there.
+
+    Parameters
+    ----------
+    evaluate : callable
+        The loss at a state.
+    move : callable
+        The state after a step of shape (P,), or None where there is no such state.
+    """
+    state, current = start, evaluate(start)
+    damping = 1e-4
     for _ in range(iterations):
         diagonal = np.diag(current.information)
         damped = current.information + np.diag(damping * diagonal + 1e-12 * diagonal.max(initial=1e-300))
@@ -102,18 +145,17 @@ def refine(
             break
         if -(step @ current.gradient) <= _LEAST_GAIN * current.cost:
             break
-        moved_distortion = distortion if fixed_distortion else float(distortion + step[0])
-        moved_state = model.retract(state, step[first:])
-        if abs(moved_distortion) < _LARGEST_BEND and np.isfinite(moved_state).all():
-            moved = _linearize(model, moved_state, moved_distortion, data, scale, fixed_distortion, noise)
-            if moved.cost < current.cost:
-                state, distortion, current = moved_state, moved_distortion, moved
+        moved = move(state, step)
+        if moved is not None:
+            there = evaluate(moved)
+            if there.cost < current.cost:
+                state, current = moved, there
                 damping = max(damping / 10.0, 1e-9)
                 continue
         damping *= 20.0
         if damping > 1e4:
             break
-    return Refined(model, state, distortion, current.errors, current.cost, current.information, current.influence)
+    return state, current
 
 
 def _linearize(
@@ -124,12 +166,50 @@ def _linearize(
     scale: float,
     fixed_distortion: bool,
     noise: float,
-) -> _Linearized:
+) -> Linearized:
     """Loss, normal matrix and gradient at a state."""
     transfer = transfer_jacobian(model.homography(state), distortion, data.x1)
+    lens = transfer.by_lens[:, :, :0] if fixed_distortion else transfer.by_lens[:, :, :1]
+    by_state = model.jacobian(state)
+    chain = np.zeros((lens.shape[2] + 9, lens.shape[2] + by_state.shape[1]))
+    chain[: lens.shape[2], : lens.shape[2]] = np.eye(lens.shape[2])
+    chain[lens.shape[2] :, lens.shape[2] :] = by_state
+    prior, by_prior = model.prior(state)
+    if len(prior):
+        by_prior = np.hstack([np.zeros((len(prior), lens.shape[2])), by_prior])
+    return linearized(
+        transfer, np.concatenate([lens, transfer.by_homography], axis=2), chain, (prior, by_prior), data, scale, noise
+    )
+
+
+def linearized(
+    transfer: TransferJacobian,
+    columns: FloatArray,
+    chain: FloatArray,
+    prior: tuple[FloatArray, FloatArray],
+    data: Measurements,
+    scale: float,
+    noise: float,
+) -> Linearized:
+    """The loss of transferred points and what is known beforehand.
+
+    Parameters
+    ----------
+    transfer : TransferJacobian
+    columns : ndarray of shape (N, 2, K)
+        Derivatives of the transferred points by what the parameters change.
+    chain : ndarray of shape (K, P)
+        Derivatives of that by the parameters.
+    prior : pair of ndarray of shape (R,) and (R, P)
+        Residuals in standard deviations, and their derivatives by the parameters.
+    data : Measurements
+    scale : float
+        ``c`` of the loss, px.
+    noise : float
+        Standard deviation of the measurements, px.
+    """
     residuals = (transfer.points - data.x2) * data.px
     lost = ~np.isfinite(residuals).all(axis=1)
-    lens = transfer.by_lens[:, :, :0] if fixed_distortion else transfer.by_lens[:, :, :1]
     whitening = measurement_whitening(transfer.by_point * data.px_ratio)
     residuals = whiten(whitening, residuals[:, :, None])[:, :, 0]
     residuals[lost] = 0.0
@@ -138,25 +218,18 @@ def _linearize(
     relative[lost] = 0.0
 
     # The normal matrix is formed by the entries of H, whatever the model, and only then by the model's parameters.
-    columns = np.concatenate([lens, transfer.by_homography], axis=2)
     columns = whiten(whitening * (data.px * relative)[:, None, None], columns)
     columns[lost] = 0.0
     flat = columns.reshape(-1, columns.shape[2])
-    by_state = model.jacobian(state)
-    chain = np.zeros((columns.shape[2], lens.shape[2] + by_state.shape[1]))
-    chain[: lens.shape[2], : lens.shape[2]] = np.eye(lens.shape[2])
-    chain[lens.shape[2] :, lens.shape[2] :] = by_state
     information = chain.T @ (flat.T @ flat) @ chain
     influence = np.einsum("nip,ni->np", columns, residuals * relative[:, None]) @ chain
     gradient = influence.sum(axis=0)
     cost = float(errors2 @ relative) + scale**2 * int(lost.sum())
-
-    prior, by_prior = model.prior(state)
-    if len(prior):
-        by_prior = np.hstack([np.zeros((len(prior), lens.shape[2])), by_prior])
-        information = information + noise**2 * by_prior.T @ by_prior
-        gradient = gradient + noise**2 * by_prior.T @ prior
-        cost += noise**2 * float(prior @ prior)
+    residual, by_parameters = prior
+    if len(residual):
+        information = information + noise**2 * by_parameters.T @ by_parameters
+        gradient = gradient + noise**2 * by_parameters.T @ residual
+        cost += noise**2 * float(residual @ residual)
     errors = np.sqrt(errors2)
     errors[lost] = np.inf
-    return _Linearized(cost, errors, information, gradient, influence)
+    return Linearized(cost, errors, information, gradient, influence)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.camera import FloatArray
-from rdstitch.robust.local_optimization import Refined, refine
+from rdstitch.robust.local_optimization import Linearized, Refined, refine
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyModel, PairModel
 
@@ -85,13 +85,12 @@ def select_model(
 
     def fit(model: PairModel, start: Refined, distortion: float, fixed: bool, iterations: int = 15) -> Refined:
         points = near if iterations else data
-        scale = min(threshold, _LOSS_WIDTH * noise)
         return refine(
             model,
             start.homography,
             distortion,
             points,
-            scale,
+            loss_width(noise, threshold),
             fixed_distortion=fixed,
             noise=noise,
             iterations=iterations,
@@ -103,14 +102,14 @@ def select_model(
     reason = _explain(fits, chosen, threshold)
     noise = noise_of(chosen.errors, threshold)
     chosen = fit(chosen.model, chosen, chosen.distortion, fixed_distortion, iterations=0)
-    covariance = _covariance(chosen, noise, data)
+    covariance = covariance_of(chosen, noise, data)
     std = 0.0 if fixed_distortion else float(np.sqrt(covariance[0, 0]))
     if std < _LARGEST_STD:
         return Selection(chosen, noise, covariance, std, reason)
     straight = fit(chosen.model, chosen, 0.0, True)
     straight = fit(chosen.model, straight, 0.0, True, iterations=0)
     reason += f"; λ is not observable (standard deviation {std:.2g}) and was set to 0"
-    return Selection(straight, noise, _covariance(straight, noise, data), np.inf, reason)
+    return Selection(straight, noise, covariance_of(straight, noise, data), np.inf, reason)
 
 
 def noise_of(errors: FloatArray, threshold: float) -> float:
@@ -119,7 +118,12 @@ def noise_of(errors: FloatArray, threshold: float) -> float:
     return _LEAST_NOISE if not len(inside) else max(float(np.median(inside)) / _RAYLEIGH_MEDIAN, _LEAST_NOISE)
 
 
-def _covariance(fit: Refined, noise: float, data: Measurements) -> FloatArray:
+def loss_width(noise: float, threshold: float) -> float:
+    """Scale of the loss, px, for errors of this standard deviation per axis."""
+    return min(threshold, _LOSS_WIDTH * noise)
+
+
+def covariance_of(fit: Refined | Linearized, noise: float, data: Measurements) -> FloatArray:
     """Covariance that holds also where neighbouring errors are alike, as parallax and lens misfit make them.
 
     ``A⁻¹ (Σ_c g_c g_c') A⁻¹`` over the cells c of a grid, ``A`` the normal matrix and ``g_c`` the gradient of the

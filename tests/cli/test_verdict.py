@@ -47,6 +47,33 @@ def test_what_fails_is_not_written_unless_forced_and_then_told(
     assert output.exists()
 
 
+def test_two_pictures_of_two_lenses_are_noticed(rdstitch: Run, tmp_path: Path) -> None:
+    sequence = flight(3, 2)
+    assert isinstance(sequence.lens, Camera)
+    other = replace(sequence, lens=replace(sequence.lens, distortion=-0.12))
+    pictures = [sequence.write(tmp_path, "own_{}.png")[0], other.write(tmp_path, "other_{}.png")[1]]
+    done = rdstitch("pano", *pictures, "-o", tmp_path / "out.png", *FAST)
+    assert done.status == 4
+    found = re.search(
+        r"two lenses or zooms are mixed: (\w+\.png) \(λ about (-0\.\d+)\) and (\w+\.png) \((-0\.\d+)\)", done.line
+    )
+    assert found is not None
+    seen = {found[1]: float(found[2]), found[3]: float(found[4])}
+    assert seen == {"own_0.png": pytest.approx(-0.2, abs=0.02), "other_1.png": pytest.approx(-0.12, abs=0.02)}
+    assert not (tmp_path / "out.png").exists()
+
+
+def test_the_last_picture_through_another_lens_is_left_out(rdstitch: Run, tmp_path: Path) -> None:
+    sequence = flight(3, 3)
+    assert isinstance(sequence.lens, Camera)
+    other = replace(sequence, lens=replace(sequence.lens, distortion=-0.12))
+    pictures = [*sequence.write(tmp_path, "own_{}.png")[:2], other.write(tmp_path, "other_{}.png")[2]]
+    done = rdstitch("mosaic", *pictures, "-o", tmp_path / "out.png", *FAST)
+    assert done.status == 0
+    assert "other_2.png: comes from another lens or zoom setting (λ about -0.1" in done.line
+    assert abs(float(done.out) - DISTORTION) < 0.01
+
+
 @pytest.mark.parametrize("strict", [False, True])
 def test_pictures_of_two_lenses_are_parted(rdstitch: Run, frames: list[Path], tmp_path: Path, strict: bool) -> None:
     sequence = flight(3, 5)

@@ -17,7 +17,7 @@ def test_never_silently_wrong(kind: str, tmp_path: Path) -> None:
         assert judged.complete, judged.text
     if kind in ("apart", "textureless", "repeated"):
         assert judged.status == 4, judged.text
-    if kind in ("apart", "textureless", "repeated", "mixed lenses"):
+    if kind in ("apart", "textureless", "repeated", "mixed lenses", "mixed by one"):
         assert not judged.complete or judged.status == 4
         assert "frame_" in judged.text
     if kind == "mixed ground" and judged.status == 0:
