@@ -23,7 +23,7 @@ from rdstitch.records import Record, read_json
 
 FloatArray = NDArray[np.float64]
 
-_NEWTON_STEPS = 12
+_NEWTON_STEPS, _NEWTON_TOLERANCE = 12, 1e-14
 
 FOCAL_LOG_STD = {"option": 0.01, "file": 0.01, "estimate": 0.05, "exif": 0.05, "guess": 0.3}
 """Standard deviation of the logarithm of a focal length, by where it comes from."""
@@ -92,7 +92,10 @@ def _two_coefficient_ratio(
     for _ in range(_NEWTON_STEPS):
         value = 1.0 - ratio + distortion * ratio**2 * radius2 + distortion2 * ratio**4 * radius2**2
         slope = -1.0 + 2.0 * distortion * ratio * radius2 + 4.0 * distortion2 * ratio**3 * radius2**2
-        ratio = ratio - value / np.where(slope < 0.0, slope, -1.0)
+        step = value / np.where(slope < 0.0, slope, -1.0)
+        ratio = ratio - step
+        if not (np.abs(step) > _NEWTON_TOLERANCE).any():
+            break
     value = 1.0 - ratio + distortion * ratio**2 * radius2 + distortion2 * ratio**4 * radius2**2
     slope = -1.0 + 2.0 * distortion * ratio * radius2 + 4.0 * distortion2 * ratio**3 * radius2**2
     solved = (np.abs(value) <= 1e-9 * np.abs(ratio)) & (ratio > 0.0) & (slope < 0.0)
