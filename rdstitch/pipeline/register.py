@@ -18,7 +18,8 @@ from rdstitch.pipeline.progress import Progress, silent
 from rdstitch.pipeline.sources import LeftOut, Source
 from rdstitch.registration import Alignment, AlignmentOptions, Link, align
 from rdstitch.registration.alignment import LinkFit, Poses, Relief
-from rdstitch.registration.lenses import TwoLenses, Votes, pictures_of_the_other, two_lenses
+from rdstitch.registration.lens_votes import Votes
+from rdstitch.registration.lenses import TwoLenses, pictures_of_the_other, two_lenses
 from rdstitch.registration.pairs import PairRegistration
 from rdstitch.registration.selection import first_pairs, neighbours
 

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 from rdstitch.camera import Camera
-from rdstitch.registration.lenses import TwoLenses, Votes, two_lenses
+from rdstitch.registration.lens_votes import Votes
+from rdstitch.registration.lenses import TwoLenses, two_lenses
 
 _CHAIN = [(0, 1), (1, 2), (2, 3), (3, 4)]
 _ALL = list(itertools.combinations(range(6), 2))
+_ROW = list(itertools.pairwise(range(40)))
+_FIELD = [(k, k + step) for k in range(90) for step in (1, 10) if (k % 10, step) != (9, 1)]  # 10 rows of 10
 
 
 def _divided(
@@ -41,6 +44,10 @@ def _divided(
         (_CHAIN[:3], [-0.2, -0.2, -0.2, -0.25]),
         (_CHAIN[:2], [-0.15, -0.2, -0.2]),
         (_ALL, [-0.2, -0.1, -0.2, -0.1, -0.2, -0.1]),
+        (_ROW, [-0.2] * 39 + [-0.15]),
+        (_ROW, [-0.2] * 26 + [-0.15] * 14),
+        (_FIELD, [-0.15] + [-0.2] * 99),
+        (_FIELD, [-0.15] * 40 + [-0.2] * 60),
     ],
 )
 def test_two_lenses_are_told_apart(pairs: list[tuple[int, int]], lenses: list[float]) -> None:
