@@ -15,6 +15,8 @@ from rdstitch.features import FeatureOptions
 from rdstitch.pipeline import Registration, StitchOptions, mosaic
 from rdstitch.radial_homography import to_plane
 from rdstitch.synthetic import (
+    BrownLens,
+    Lens,
     Photometry,
     Poses,
     Sequence,
@@ -30,6 +32,9 @@ from rdstitch.synthetic import (
 )
 
 SOLVABLE = ("pair", "chain", "grid")
+ODD = ("odd lens",)
+"""Solvable too, but only where asked for: the pictures of one lens that is no division model about their centre."""
+
 HOPELESS = (
     "apart", "textureless", "repeated", "turning", "mixed lenses", "mixed by one", "little overlap", "mixed ground"
 )  # fmt: skip
@@ -80,7 +85,7 @@ class TrustSet:
     Attributes
     ----------
     kind : str
-        One of :data:`SOLVABLE` or :data:`HOPELESS`.
+        One of :data:`SOLVABLE`, :data:`ODD` or :data:`HOPELESS`.
     sequence : Sequence
     """
 
@@ -124,19 +129,35 @@ def trust_set(seed: int, kind: str | None = None) -> TrustSet:
     lens = Camera(size, distortion=float(rng.uniform(-0.35, 0.05)), focal=float(rng.uniform(0.8, 1.6) * size[0]))
     tilt = (float(rng.uniform(-0.12, 0.12)), float(rng.uniform(-0.12, 0.12)))
     photometry = Photometry(float(rng.uniform(0.8, 1.1)), float(rng.uniform(0.0, 0.3)), noise=0.012)
-    poses = _poses(kind, lens, tilt, rng, seed)
+    taken_with = _odd_lens(lens, rng) if kind in ODD else lens
+    poses = _poses(kind, taken_with, tilt, rng, seed)
     plane: Callable[[tuple[int, int]], Texture] = partial(ground, seed=seed)
     if kind == "textureless":
         plane = gradient
     elif kind == "repeated":
         plane = partial(repeated, seed=seed, period=int(rng.integers(48, 140)))
-    sequence = sequence_over(plane, lens, poses, photometry=photometry, seed=seed, margin=60)
+    sequence = sequence_over(plane, taken_with, poses, photometry=photometry, seed=seed, margin=60)
     if kind.startswith("mixed"):
         sequence = _mixed(kind, sequence, rng, seed)
     return TrustSet(kind, sequence)
 
 
-def _poses(kind: str, lens: Camera, tilt: tuple[float, float], rng: np.random.Generator, seed: int) -> Poses:
+def _odd_lens(lens: Camera, rng: np.random.Generator) -> Lens:
+    """Much the same lens, with its axis off the centre of the picture, or with a profile of another kind."""
+    assert lens.focal is not None
+    kind = int(rng.integers(3))
+    if kind == 0:
+        x, y = np.array(lens.center) + lens.half_diagonal * rng.normal(0.0, 0.02, 2)
+        return replace(lens, center=(float(x), float(y)))
+    if kind == 1:
+        return replace(lens, distortion2=float(rng.uniform(-0.08, 0.08)))
+    square = (lens.focal / lens.half_diagonal) ** 2
+    k2 = float(rng.uniform(-0.01, 0.03)) * square**2
+    p1, p2 = rng.uniform(-0.002, 0.002, 2).tolist()
+    return BrownLens(lens.image_size, lens.focal, k1=0.4 * lens.distortion * square, k2=k2, p1=p1, p2=p2)
+
+
+def _poses(kind: str, lens: Lens, tilt: tuple[float, float], rng: np.random.Generator, seed: int) -> Poses:
     turn, direction = float(rng.uniform(-0.6, 0.6)), float(rng.uniform(0.0, 2.0 * np.pi))
     overlap = float(rng.uniform(0.35, 0.65))
     if kind in ("pair", "textureless"):
@@ -152,7 +173,7 @@ def _poses(kind: str, lens: Camera, tilt: tuple[float, float], rng: np.random.Ge
     columns, rows = (4, 1) if kind == "chain" else (2, 2) if kind == "grid" else (3, 1)
     if kind == "mixed lenses":
         columns, rows = 5, 1
-    elif kind == "mixed by one":
+    elif kind in ("mixed by one", *ODD):
         columns, rows = 2 + seed % 4, 1
     return grid_poses(lens, columns, rows, overlap=overlap, yaw=0.2, shift=0.05, tilt=tilt, seed=seed)
 

@@ -67,6 +67,7 @@ def _moved(state: _State, step: FloatArray) -> _State | None:
     return (_HOMOGRAPHY.retract(state[0], step[_LENS:]), lens) if np.abs(lens[:2]).max() < LARGEST_BEND else None
 
 
+@np.errstate(all="ignore")  # a wild step may leave the lens model
 def _linearize(state: _State, data: Measurements, scale: float, noise: float) -> Linearized:
     """Loss, normal matrix and gradient at a state."""
     homography, lens = state
