@@ -22,7 +22,7 @@ _STARTS = 5  # divisions that are begun with
 _ROUNDS = 6
 _MOVES = 12
 _LEAST_GAP = 0.01  # λ; what is nearer is one lens that one λ does not quite describe
-_LEAST_GAP_PX = 8.0  # the same at a corner, px; with one λ, pictures are then off by a tenth of that
+_LEAST_GAP_PX = 4.0  # the same at a corner, px; with one λ, pictures are off by a tenth of that, rows of them by half
 _MEAN_MISS = 1.25  # standard deviations that a vote, two numbers, is off on average; less is luck
 # How many times better two lenses must explain the votes of pairs of both: at least, and times one over their number.
 _LEAST_GAIN, _GAIN_OF_FEW = 4.0, 2.8
