@@ -1,8 +1,10 @@
 """The compositor: pictures, cameras and homographies in, one picture out, in memory or in a file."""
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -230,24 +232,26 @@ class Prepared:
     ) -> Iterator[tuple[NDArray[Any], NDArray[np.uint8]]]:
         """The same, with tiles computed by ``run``, which works like ``map`` and may work ahead."""
         (width, height), side = self.canvas.size, self.plan.tile_size
-        done, coming = 0, self._start(0, run)
-        for top in range(0, height, side):
-            (samples, alpha), tiles = coming
+        tops = iter(range(0, height, side))
+        # Two rows at a time: nobody waits for the last tile of a row.
+        under_way = deque(self._start(top, run) for top in islice(tops, 2))
+        done = 0
+        while under_way:
+            (samples, alpha), tiles = under_way.popleft()
             for box in tiles:
                 if progress is not None:
                     done += (box[2] - box[0]) * (box[3] - box[1])
                     progress(done / (width * height))
-            if top + side < height:
-                # Computed while this strip is written.
-                coming = self._start(top + side, run)
+            # Computed while this strip is written.
+            under_way.extend(self._start(top, run) for top in islice(tops, 1))
             for start in range(0, len(samples), STRIP_ROWS):
                 yield samples[start : start + STRIP_ROWS], alpha[start : start + STRIP_ROWS]
 
     def _start(self, top: int, run: Callable[..., Iterator[Any]]) -> tuple[_Filled, Iterator[Box]]:
-        """Begin with a row of tiles, when those above are done: the strip that they fill, and each that has done so."""
+        """Begin with a row of tiles, when all but one above are done: the strip they fill, and each once it is done."""
         (width, height), (x, y), side = self.canvas.size, self.origin, self.plan.tile_size
         if self.shown:
-            row = y + top - self.around
+            row = y + top - side - self.around
             self.renderer.pictures.expect([part.from_row(row) for part in self.shown])
         bottom = min(top + side, height)
         boxes = [(x + k, y + top, x + min(k + side, width), y + bottom) for k in range(0, width, side)]

@@ -16,7 +16,7 @@ from rdstitch.errors import LimitError
 DEFAULT_MEMORY = 320 * 2**20
 _TILE_SIZES = (512, 256)
 _MOST_WORKERS = 4
-_MOST_BANDS = 5
+_MOST_BANDS = 4
 # Arrays of the size of a tile with its margin that live at one time (float32): samples and sums of the pyramids in each
 # channel, and coordinates, weights, owners.
 _LIVE_PER_CHANNEL, _LIVE_PLANES = 5.0, 12.0
@@ -126,8 +126,8 @@ def _sides(options: CompositeOptions) -> tuple[int, ...]:
 def _working_set(
     canvas: Canvas, side: int, workers: int, bands: int, options: CompositeOptions, channels: int, itemsize: int
 ) -> int:
-    """Bytes of the tiles at work, and of the strip that they belong to, which is there twice for a moment."""
+    """Bytes of the tiles at work, and of strips: two of them are filled while a third is written."""
     outer = side + 2 * (margin(bands) if options.blend == "multiband" else 0)
     tile = 4.0 * outer**2 * (_LIVE_PER_CHANNEL * channels + _LIVE_PLANES)
-    strip = 2.0 * canvas.size[0] * min(side, canvas.size[1]) * (channels * itemsize + 1)
-    return int(workers * tile + strip)
+    strips = 3.0 * canvas.size[0] * min(side, canvas.size[1]) * (channels * itemsize + 1)
+    return int(workers * tile + strips)

@@ -44,23 +44,29 @@ def halved(strip: NDArray[Any], transparent: bool) -> NDArray[Any]:
 
     An odd border repeats itself. Halves are rounded up, in every strip alike.
     """
-    full = np.iinfo(strip.dtype).max if strip.dtype.kind == "u" else 1.0
     even = np.pad(strip, [(0, strip.shape[0] % 2), (0, strip.shape[1] % 2), (0, 0)], mode="edge")
     four = [even[y::2, x::2] for y in (0, 1) for x in (0, 1)]
-    if strip.dtype.kind == "u" and (not transparent or (strip[..., -1] == full).all()):
-        wide = np.uint16 if strip.dtype == np.uint8 else np.uint32
-        total: NDArray[Any] = np.add(four[0], four[1], dtype=wide)
-        total += four[2]
-        total += four[3]
-        total += wide(2)
-        total >>= wide(2)
-        return total.astype(strip.dtype)
-    corners = np.stack(four).astype(np.float32)
-    mean: NDArray[Any] = corners.mean(axis=0)
-    if not transparent:
-        return mean.astype(strip.dtype)
-    share = corners[..., -1:] / np.float32(full)
-    mean[..., :-1] = (corners[..., :-1] * share).sum(axis=0) / np.maximum(share.sum(axis=0), np.float32(1e-6))
-    if strip.dtype.kind == "u":
+    if strip.dtype.kind == "f":
+        return _weighted_mean(np.stack(four), transparent)
+    # OpenCV rounds halves up only with 1, 3 or 4 channels.
+    channels = strip.shape[2]
+    whole = (slice(None),) if channels in (1, 3, 4) else tuple(slice(k, k + 1) for k in range(channels))
+    mean = np.concatenate([block_mean(np.ascontiguousarray(even[..., part]), 2) for part in whole], axis=2)
+    if transparent and not (mean[..., -1] == np.iinfo(strip.dtype).max).all():
+        partly = (mean[..., -1] != 0) & (mean[..., -1] != np.iinfo(strip.dtype).max)
+        mean[partly] = _weighted_mean(np.stack([corner[partly] for corner in four]), transparent)
+        mean[mean[..., -1] == 0] = 0
+    return mean
+
+
+def _weighted_mean(corners: NDArray[Any], transparent: bool) -> NDArray[Any]:
+    """Mean over the first axis of samples (4, ..., C), weighted by the last channel where that is alpha."""
+    integer = corners.dtype.kind == "u"
+    values = corners.astype(np.float32)
+    mean: NDArray[Any] = values.mean(axis=0)
+    if transparent:
+        share = values[..., -1:] / np.float32(np.iinfo(corners.dtype).max if integer else 1.0)
+        mean[..., :-1] = (values[..., :-1] * share).sum(axis=0) / np.maximum(share.sum(axis=0), np.float32(1e-6))
+    if integer:
         np.floor(mean + np.float32(0.5), out=mean)
-    return np.ascontiguousarray(mean.astype(strip.dtype))
+    return np.ascontiguousarray(mean.astype(corners.dtype))

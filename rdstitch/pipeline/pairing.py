@@ -20,6 +20,7 @@ from rdstitch.registration.voting import vote
 
 _GLANCE = 1000  # strongest features of a picture, by which it is told whether a pair is worth a closer look
 _PROMISING = 8  # matches among these; pictures that share nothing have three to six by chance
+_WORTHWHILE = 0.05  # share of the matches that a picture has with the one most like it; less adds nothing
 _ENOUGH_MATCHES = 200  # of a picture with all others, from which on it needs no more
 _SEARCH_RADIUS = 3.0  # thresholds around the place where a match is expected
 
@@ -54,8 +55,15 @@ class Pairing:
         A pair that is passed over may overlap nevertheless, by little: the others then tell its place.
         """
         strongest = replace(self, features=[found.take(np.arange(min(len(found), _GLANCE))) for found in self.features])
-        matched = strongest._match(pairs, "comparing pictures")
-        return [pair for pair, found in zip(pairs, matched, strict=True) if len(found) >= _PROMISING]
+        shared = [len(found) for found in strongest._match(pairs, "comparing pictures")]
+        most = np.zeros(len(self.features), dtype=np.intp)
+        for pair, count in zip(pairs, shared, strict=True):
+            most[[*pair]] = np.maximum(most[[*pair]], count)
+        return [
+            pair
+            for pair, count in zip(pairs, shared, strict=True)
+            if count >= max(_PROMISING, _WORTHWHILE * most[[*pair]].min())
+        ]
 
     def estimate(self, pairs: Sequence[tuple[int, int]], distortion: float | None = None) -> list[PairRegistration]:
         """Match and estimate pairs (i, j), with λ free, or as the user or the other pairs say."""
