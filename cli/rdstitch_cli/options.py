@@ -201,7 +201,7 @@ estimation = together(
     click.option(
         "--work-megapixels",
         type=click.FloatRange(0.0),
-        default=1.0,
+        default=0.75,
         show_default=True,
         metavar="MP",
         help="Size at most that features are detected at, megapixels; 0 is full size.",

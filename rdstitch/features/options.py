@@ -21,7 +21,7 @@ class FeatureOptions:
 
     kind: str = "rootsift"  # one of KINDS
     max_features: int = 4000  # keypoints kept per picture
-    work_megapixels: float | None = 1.0  # size at most that detection works at, 10⁶ px; None: full size
+    work_megapixels: float | None = 0.75  # size at most that detection works at, 10⁶ px; None: full size
     spread: bool = True  # the strongest of each cell of a grid in turn, rather than the strongest of the picture
     spread_cell: float = 0.05  # side of a cell of that grid, fraction of the picture's diagonal
     sift_contrast: float = 0.02  # SIFT's contrast threshold; 0.04 is OpenCV's, too high for hazy pictures
