@@ -201,10 +201,11 @@ estimation = together(
     click.option(
         "--work-megapixels",
         type=click.FloatRange(0.0),
-        default=0.75,
+        default=0.5,
         show_default=True,
         metavar="MP",
-        help="Size at most that features are detected at, megapixels; 0 is full size.",
+        help="Size at most that features are detected at, megapixels, and four times that in pictures that show too "
+        "few; 0 is full size.",
     ),
     click.option(
         "--solver", type=click.Choice(SOLVERS), default="auto", show_default=True, help="Minimal solver of the pairs."

@@ -8,12 +8,13 @@ from functools import partial
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from rdstitch.errors import ArgumentError
-from rdstitch.features.detection import find
+from rdstitch.features.detection import Detection, find
 from rdstitch.features.keypoints import Features
-from rdstitch.features.options import KINDS, FeatureOptions
-from rdstitch.features.picture import Image, Mask, prepare
+from rdstitch.features.options import CLOSER, KINDS, FeatureOptions
+from rdstitch.features.picture import Image, Mask, Picture, prepare
 from rdstitch.features.spread import spread, strongest
 
 __all__ = ["KINDS", "FeatureOptions", "Features", "Recall", "Source", "detect", "detect_all"]
@@ -23,6 +24,8 @@ Recall = Callable[[int, Callable[[], Features]], Features]
 
 Source = Callable[[], tuple[Image, Mask | None]]
 """Loads one picture and its mask (True or non-zero: use it; None: use all) when it is called."""
+
+_FEW = 0.5  # of the keypoints wanted: where a reduced picture shows fewer, it is looked at more closely
 
 
 def detect(image: Image, options: FeatureOptions | None = None, mask: Mask | None = None) -> Features:
@@ -49,9 +52,9 @@ def detect(image: Image, options: FeatureOptions | None = None, mask: Mask | Non
         When the picture or the mask has the wrong shape or type, or when this OpenCV lacks the detector.
     """
     options = options or FeatureOptions()
-    picture = prepare(image, mask, options.work_megapixels)
-    detection = find(picture.grey, options)
-    usable = np.flatnonzero(picture.covers(detection.points, detection.scale / 2))
+    picture, detection, usable = _look(image, mask, options, options.work_megapixels)
+    if options.work_megapixels is not None and picture.reduced and len(usable) < _FEW * options.max_features:
+        picture, detection, usable = _look(image, mask, options, CLOSER * options.work_megapixels)
     points, response = detection.points[usable], detection.response[usable]
     if options.spread:
         cell = options.spread_cell * float(np.hypot(*picture.grey.shape))
@@ -64,6 +67,15 @@ def detect(image: Image, options: FeatureOptions | None = None, mask: Mask | Non
     scale = features.scale * float(np.sqrt(picture.factor.prod()))
     size = (image.shape[1], image.shape[0])
     return replace(features, points=picture.to_full_size(features.points), scale=scale, image_size=size)
+
+
+def _look(
+    image: Image, mask: Mask | None, options: FeatureOptions, megapixels: float | None
+) -> tuple[Picture, Detection, NDArray[np.intp]]:
+    """A picture at most so large, what is found in it, and which of that lies where it may."""
+    picture = prepare(image, mask, megapixels)
+    detection = find(picture.grey, options)
+    return picture, detection, np.flatnonzero(picture.covers(detection.points, detection.scale / 2))
 
 
 def detect_all(

@@ -7,6 +7,8 @@ from pathlib import Path
 from rdstitch.errors import ArgumentError
 
 KINDS = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk", "aliked")
+CLOSER = 4.0
+"""Times as many px are looked at where the working size shows too little."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +23,7 @@ class FeatureOptions:
 
     kind: str = "rootsift"  # one of KINDS
     max_features: int = 4000  # keypoints kept per picture
-    work_megapixels: float | None = 0.75  # size at most that detection works at, 10⁶ px; None: full size
+    work_megapixels: float | None = 0.5  # size at most that detection begins at, 10⁶ px; None: full size
     spread: bool = True  # the strongest of each cell of a grid in turn, rather than the strongest of the picture
     spread_cell: float = 0.05  # side of a cell of that grid, fraction of the picture's diagonal
     sift_contrast: float = 0.02  # SIFT's contrast threshold; 0.04 is OpenCV's, too high for hazy pictures
@@ -55,7 +57,7 @@ class FeatureOptions:
             raise ArgumentError(f"spread_cell must be in (0, 1], not {self.spread_cell}")
 
     def shrink(self, image_size: tuple[int, int]) -> float:
-        """Px of a picture of this width and height per px that detection works at; 1 at least."""
+        """Px of a picture of this width and height per px that detection can make use of; 1 at least."""
         if self.work_megapixels is None:
             return 1.0
-        return max(1.0, math.sqrt(image_size[0] * image_size[1] / (self.work_megapixels * 1e6)))
+        return max(1.0, math.sqrt(image_size[0] * image_size[1] / (CLOSER * self.work_megapixels * 1e6)))

@@ -37,6 +37,11 @@ class Picture:
     clearance: NDArray[np.float32] | None
     factor: FloatArray
 
+    @property
+    def reduced(self) -> bool:
+        """Whether the working size is less than the full one."""
+        return bool(self.factor.max() > 1.0)
+
     def covers(self, points: FloatArray, radius: FloatArray) -> NDArray[np.bool_]:
         """Whether discs (N, 2), (N,) keep clear of the mask; px of ``grey``."""
         if self.clearance is None:

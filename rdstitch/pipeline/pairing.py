@@ -168,7 +168,6 @@ class Pairing:
             matched,
             options,
             tilts=self.tilts,
-            workers=self.options.threads,
             progress=None if stage is None else partial(self.progress, stage),
             recall=recall,
         )

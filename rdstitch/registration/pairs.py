@@ -97,7 +97,13 @@ def match_pairs(
         compute = partial(matcher, features[image1], features[image2])
         return compute() if recall is None else recall(index, compute)
 
-    return _side_by_side(work, len(pairs), workers, progress)
+    done = []
+    with ThreadPoolExecutor(workers) as pool:
+        for found in pool.map(work, range(len(pairs))):
+            done.append(found)
+            if progress is not None:
+                progress(len(done), len(pairs))
+    return done
 
 
 def estimate_pairs(
@@ -107,11 +113,12 @@ def estimate_pairs(
     options: PairOptions,
     *,
     tilts: Sequence[tuple[float, float] | None] | None = None,
-    workers: int = 1,
     progress: Progress | None = None,
     recall: Recall[RadialHomography] | None = None,
 ) -> list[PairRegistration]:
-    """Estimate the relation of every pair, several at a time.
+    """Estimate the relation of every pair, one after the other.
+
+    Several at a time would take half as long again: small arrays keep the interpreter busy, for which threads wait.
 
     Parameters
     ----------
@@ -123,12 +130,10 @@ def estimate_pairs(
     options : PairOptions
     tilts : sequence of (float, float) or None, optional
         Known tilt (ψ, θ), radians, of each picture, None where unknown.
-    workers : int
-        Threads.
     progress : callable, optional
         Called with the number of pairs done and their total.
     recall : callable, optional
-        Stands between this function and the estimation of each pair; see :data:`Recall`. Called in other threads.
+        Stands between this function and the estimation of each pair; see :data:`Recall`.
     """
 
     def relate(index: int) -> RadialHomography:
@@ -153,20 +158,11 @@ def estimate_pairs(
             seed=options.seed,
         )
 
-    def work(index: int) -> PairRegistration:
+    done = []
+    for index, pair in enumerate(pairs):
         compute = partial(relate, index)
         relation = compute() if recall is None else recall(index, compute)
-        return PairRegistration(*pairs[index], matched[index], relation)
-
-    return _side_by_side(work, len(pairs), workers, progress)
-
-
-def _side_by_side(work: Callable[[int], Value], count: int, workers: int, progress: Progress | None) -> list[Value]:
-    """What ``work`` gives for each number below ``count``, in that order, several at a time."""
-    done = []
-    with ThreadPoolExecutor(workers) as pool:
-        for value in pool.map(work, range(count)):
-            done.append(value)
-            if progress is not None:
-                progress(len(done), count)
+        done.append(PairRegistration(*pair, matched[index], relation))
+        if progress is not None:
+            progress(len(done), len(pairs))
     return done
