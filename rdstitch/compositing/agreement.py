@@ -115,30 +115,33 @@ def overlap_agreement(first: PlacedPicture, second: PlacedPicture) -> Agreement:
     margin = _CELL // 2 + _REACH
     rows, columns = (np.arange(margin, n - margin + 1, _CELL) for n in (height, width))
     corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2) - _CELL // 2
-    textured = [(top, left) for top, left in corners.tolist() if _has_texture(_cell(seen, top, left))]
-    step = max(1, -(-len(textured) // _MOST_CELLS))
-    votes = [_vote(seen, second.grey, top, left) for top, left in textured[::step]]
-    return Agreement(sum(vote is not None for vote in votes), votes.count(1), votes.count(-1))
+    textured = corners[_have_texture(_cells(seen, corners))]
+    looked_at = textured[:: max(1, -(-len(textured) // _MOST_CELLS))]
+    windows = _cells(second.grey, looked_at, _REACH)
+    inner = windows[:, _REACH:-_REACH, _REACH:-_REACH]
+    known = np.isfinite(windows).all(axis=(1, 2)) & _have_texture(inner)
+    votes = [_vote(cell, window) for cell, window in zip(_cells(seen, looked_at[known]), windows[known], strict=True)]
+    return Agreement(len(votes), votes.count(1), votes.count(-1))
 
 
-def _cell(picture: Grey, top: int, left: int, margin: int = 0) -> Grey:
-    return picture[top - margin : top + _CELL + margin, left - margin : left + _CELL + margin]
+def _cells(picture: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:
+    """Cells (N, side, side) with these top-left px (N, 2), row and column, and so much around them."""
+    side = _CELL + 2 * margin
+    if not len(corners):
+        return np.zeros((0, side, side), dtype=np.float32)
+    top, left = (corners - margin).T
+    cells: Grey = np.lib.stride_tricks.sliding_window_view(picture, (side, side))[top, left]
+    return cells
 
 
-def _has_texture(cell: Grey) -> bool:
-    return bool(np.isfinite(cell).all() and cell.std() > _LEAST_TEXTURE)
+def _have_texture(cells: Grey) -> NDArray[np.bool_]:
+    """Which cells (N, h, w) can be told from others; not those with transparent px, whose deviation is NaN."""
+    return np.asarray(cells.std(axis=(1, 2)) > _LEAST_TEXTURE)
 
 
-def _vote(seen: Grey, grey2: Grey, top: int, left: int) -> int | None:
-    """1 for, -1 against, 0 neither; None where the second picture has no texture."""
-    window = _cell(grey2, top, left, _REACH)
-    if not (np.isfinite(window).all() and _has_texture(_cell(grey2, top, left))):
-        return None
-    scores = np.asarray(
-        cv2.matchTemplate(
-            np.ascontiguousarray(window), np.ascontiguousarray(_cell(seen, top, left)), cv2.TM_CCOEFF_NORMED
-        )
-    )
+def _vote(cell: Grey, window: Grey) -> int:
+    """1 for, -1 against, 0 neither."""
+    scores = np.asarray(cv2.matchTemplate(window, cell, cv2.TM_CCOEFF_NORMED))
     row, column = np.unravel_index(int(scores.argmax()), scores.shape)
     if scores[row, column] < _ALIKE:
         return 0
