@@ -156,8 +156,12 @@ def estimate_exposure(survey: Survey, cameras: Sequence[Camera], blocks: bool = 
 
 @dataclass(frozen=True)
 class _Samples:
-    """Points that two pictures see: picture, weight, value (share of full), px and r² of either; S of each."""
+    """Points that two pictures see: picture, weight, value (share of full), px and r² of either; S of each.
 
+    They are sorted by pair; ``start`` is where those of each begin.
+    """
+
+    start: NDArray[np.intp]
     first: NDArray[np.intp]
     second: NDArray[np.intp]
     share: FloatArray
@@ -205,7 +209,8 @@ def _collect(survey: Survey, cameras: Sequence[Camera]) -> _Samples | None:
     first, second = (np.repeat([f[k] for f in found], counts) for k in (0, 1))
     # A pair counts as one measurement however many samples it has.
     share = np.repeat([1.0 / n for n in counts], counts)
-    return _Samples(first, second, share, *(np.concatenate([f[k] for f in found]) for k in range(2, 8)))
+    start = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    return _Samples(start, first, second, share, *(np.concatenate([f[k] for f in found]) for k in range(2, 8)))
 
 
 def _cut(tile: SurveyTile, box: Box, values: NDArray[Any]) -> NDArray[Any]:
@@ -265,23 +270,23 @@ def _robust_rms(errors: FloatArray, share: FloatArray) -> float:
 
 def _solve(samples: _Samples, weight: FloatArray, values: FloatArray, radial: FloatArray, count: int) -> FloatArray:
     """Weighted least squares of ``g_first - g_second + radial a = values``; shape (count + K, C)."""
-    rows = np.arange(len(weight))
     extra = radial.shape[1]
-    design = sparse.csr_array(
-        (
-            np.concatenate([np.ones(len(rows)), -np.ones(len(rows)), radial.ravel()]),
-            (
-                np.concatenate([rows, rows, np.repeat(rows, extra)]),
-                np.concatenate([samples.first, samples.second, np.tile(np.arange(count, count + extra), len(rows))]),
-            ),
-        ),
-        shape=(len(rows), count + extra),
+    # All samples of a pair have the same gains: what they say of these is summed first.
+    ends = samples.first[samples.start], samples.second[samples.start]
+    total, gain_radial, gain_value = (
+        np.add.reduceat(weight[:, None] * v, samples.start, axis=0) for v in (np.ones((len(weight), 1)), radial, values)
     )
-    weighted = design.T.multiply(weight).tocsr()
-    prior = np.concatenate([np.full(count, _GAIN_SIGMA**-2), np.full(extra, _VIGNETTING_SIGMA**-2)])
-    normal = (weighted @ design + sparse.diags_array(prior)).tocsc()
-    solution = spsolve(normal, weighted @ values)
-    return np.asarray(solution, dtype=np.float64).reshape(count + extra, -1)
+    between = sparse.csr_array(
+        (np.repeat([1.0, -1.0], len(total)), (np.concatenate(ends), np.tile(np.arange(len(total)), 2))),
+        shape=(count, len(total)),
+    )
+    border = sparse.csr_array(between @ gain_radial)
+    gains = between @ sparse.diags_array(total[:, 0]) @ between.T
+    bends = sparse.csr_array((weight[:, None] * radial).T @ radial)
+    prior = sparse.diags_array([_GAIN_SIGMA**-2] * count + [_VIGNETTING_SIGMA**-2] * extra)
+    normal = sparse.block_array([[gains, border], [border.T, bends]]) + prior
+    right = np.concatenate([between @ gain_value, (weight[:, None] * radial).T @ values])
+    return np.asarray(spsolve(normal.tocsc(), right), dtype=np.float64).reshape(count + extra, -1)
 
 
 def _block_weights(camera: Camera, points: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:

@@ -133,9 +133,7 @@ def _cut(
         return np.asarray(surely_new | free)
     if not surely_new.any():
         return surely_new
-    # A cut runs where it is free to; what is farther off only takes time.
-    y0, y1, x0, x1 = (limit for axis in (1, 0) for limit in _reach(free.any(axis=axis)))
-    part = np.s_[y0:y1, x0:x1]
+    part = _around(free)
     masks = [(free | sure)[part].astype(np.uint8) * np.uint8(255) for sure in (surely_old, surely_new)]
     images = [_three_channels(image[part]) for image in (below, pixels)]
     won = surely_new.copy()
@@ -143,10 +141,13 @@ def _cut(
     return won
 
 
-def _reach(present: NDArray[np.bool_]) -> tuple[int, int]:
-    """Start and stop of what is present along an axis, with room for what surely belongs to either side."""
-    where = np.flatnonzero(present)
-    return max(0, int(where[0]) - _AROUND_FREE), min(len(present), int(where[-1]) + 1 + _AROUND_FREE)
+def _around(free: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Where a cut is free to run, with room for what surely belongs to either side; the rest would only take time."""
+    rows, columns = (np.flatnonzero(free.any(axis=axis)) for axis in (1, 0))
+    return (
+        slice(max(0, int(rows[0]) - _AROUND_FREE), int(rows[-1]) + 1 + _AROUND_FREE),
+        slice(max(0, int(columns[0]) - _AROUND_FREE), int(columns[-1]) + 1 + _AROUND_FREE),
+    )
 
 
 def _graph_cut(images: list[Float32Array], masks: list[NDArray[np.uint8]]) -> NDArray[np.bool_]:
@@ -156,11 +157,17 @@ def _graph_cut(images: list[Float32Array], masks: list[NDArray[np.uint8]]) -> ND
     """
     if masks[0].size > _LARGEST_CUT:
         masks = _near_cut(_graph_cut([_halved(i) for i in images], [m[::2, ::2] for m in masks]), masks)
+    won = masks[1] > 0
+    free = won & (masks[0] > 0)
+    if not free.any():
+        return won
+    part = _around(free)
     # The stubs know neither the class nor a UMat made of an array.
     detail: Any = cv2
     finder = detail.detail_GraphCutSeamFinder("COST_COLOR_GRAD")
-    result = finder.find([detail.UMat(i) for i in images], [(0, 0), (0, 0)], [detail.UMat(m) for m in masks])
-    return np.asarray(result[1].get() > 0)
+    cut_images, cut_masks = ([detail.UMat(np.ascontiguousarray(a[part])) for a in both] for both in (images, masks))
+    won[part] = finder.find(cut_images, [(0, 0), (0, 0)], cut_masks)[1].get() > 0
+    return won
 
 
 def _halved(image: Float32Array) -> Float32Array:
