@@ -16,7 +16,7 @@ import multiprocessing
 import resource
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -29,17 +29,18 @@ from rdstitch.synthetic import ground
 PHOTO = Path(__file__).resolve().parents[2] / "../shared/data/textures_cc0/IMG_161122_163239_0001_RGB.JPG"
 SIZE = (1600, 1200)
 NOISE = 2.0  # standard deviation, grey levels
+FULL_SIZE = FeatureOptions(work_megapixels=None)
 ROWS = {
-    "rootsift": FeatureOptions(),
-    "sift": FeatureOptions(kind="sift"),
-    "surf": FeatureOptions(kind="surf"),
-    "surf, upright": FeatureOptions(kind="surf", surf_upright=True),
-    "surf, extended": FeatureOptions(kind="surf", surf_extended=True),
-    "surf, boxes only": FeatureOptions(kind="surf", surf_refine=False),
-    "orb": FeatureOptions(kind="orb"),
-    "akaze": FeatureOptions(kind="akaze"),
-    "kaze": FeatureOptions(kind="kaze"),
-    "brisk": FeatureOptions(kind="brisk"),
+    "rootsift": FULL_SIZE,
+    "sift": replace(FULL_SIZE, kind="sift"),
+    "surf": replace(FULL_SIZE, kind="surf"),
+    "surf, upright": replace(FULL_SIZE, kind="surf", surf_upright=True),
+    "surf, extended": replace(FULL_SIZE, kind="surf", surf_extended=True),
+    "surf, boxes only": replace(FULL_SIZE, kind="surf", surf_refine=False),
+    "orb": replace(FULL_SIZE, kind="orb"),
+    "akaze": replace(FULL_SIZE, kind="akaze"),
+    "kaze": replace(FULL_SIZE, kind="kaze"),
+    "brisk": replace(FULL_SIZE, kind="brisk"),
 }
 
 Grey = NDArray[np.uint8]

@@ -1,7 +1,8 @@
-"""What spreading keypoints does to λ: python -m tests.benchmarks.spreading [FOLDER LAMBDA] [--kinds K,…].
+"""What spreading keypoints does to λ: python -m tests.benchmarks.spreading [FOLDER LAMBDA] [--kinds K,…] [--sizes].
 
-Features are detected with and without spreading, matched, and λ is estimated for every pair: on rendered pairs of known
-lens (dark and noisy towards the corners, as real ones are), or on consecutive pictures of a folder whose λ is given.
+Features are detected at full size with and without spreading, matched, and λ is estimated for every pair: on rendered
+pairs of known lens (dark and noisy towards the corners, as real ones are), or on consecutive pictures of a folder whose
+λ is given. With --sizes they are spread, and detected in pictures of several sizes.
 Printed for each way: pairs of which λ was estimated, the median number of inliers, median and root mean square of λ's
 error (errors above 0.2 count as 0.2), and the median share of inliers in the outer quarter of the picture.
 """
@@ -80,26 +81,41 @@ def main() -> None:
     parser.add_argument("folder", nargs="?", type=Path)
     parser.add_argument("distortion", nargs="?", type=float)
     parser.add_argument("--kinds", default="rootsift,orb", help="kinds of features, separated by commas")
+    parser.add_argument("--sizes", action="store_true", help="compare working sizes instead of choices")
     arguments = parser.parse_args()
+    kinds = arguments.kinds.split(",")
     if arguments.folder is None:
         pictures, pairs, truth = rendered()
     else:
         pictures, pairs, truth = photographed(arguments.folder, arguments.distortion)
+    choices = at_sizes(kinds) if arguments.sizes else with_and_without(kinds)
     print("| features | choice | pairs | inliers | median error of λ | rms | in the outer quarter |")
     print("| --- | --- | --: | --: | --: | --: | --: |")
-    for kind in arguments.kinds.split(","):
+    for choice, options in choices:
+        rows = list(errors([detect(picture, options) for picture in pictures], pairs, truth))
+        error, inliers, outer = np.array(rows).reshape(-1, 3).T
+        rms = np.sqrt(np.mean(np.minimum(error, LARGEST_ERROR) ** 2))
+        print(
+            f"| {options.kind}, {options.max_features} | {choice} | {len(rows)} of {len(pairs)} "
+            f"| {np.median(inliers):.0f} | {np.median(error):.4f} | {rms:.4f} | {np.median(outer):.2f} |",
+            flush=True,
+        )
+
+
+def with_and_without(kinds: list[str]) -> Iterator[tuple[str, FeatureOptions]]:
+    """Few and many keypoints, the strongest and spread."""
+    for kind in kinds:
         for count in (1000, 4000):
             for spread in (False, True):
-                options = FeatureOptions(kind=kind, spread=spread, max_features=count)
-                rows = list(errors([detect(picture, options) for picture in pictures], pairs, truth))
-                error, inliers, outer = np.array(rows).reshape(-1, 3).T
-                rms = np.sqrt(np.mean(np.minimum(error, LARGEST_ERROR) ** 2))
-                choice = "spread" if spread else "strongest"
-                print(
-                    f"| {kind}, {count} | {choice} | {len(rows)} of {len(pairs)} | {np.median(inliers):.0f} "
-                    f"| {np.median(error):.4f} | {rms:.4f} | {np.median(outer):.2f} |",
-                    flush=True,
-                )
+                options = FeatureOptions(kind=kind, spread=spread, max_features=count, work_megapixels=None)
+                yield "spread" if spread else "strongest", options
+
+
+def at_sizes(kinds: list[str]) -> Iterator[tuple[str, FeatureOptions]]:
+    """The pictures at several sizes."""
+    for kind in kinds:
+        for size in (0.25, 0.5, 1.0, None):
+            yield "full size" if size is None else f"{size:g} Mpx", FeatureOptions(kind=kind, work_megapixels=size)
 
 
 if __name__ == "__main__":
