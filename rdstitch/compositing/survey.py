@@ -23,7 +23,7 @@ from rdstitch.compositing.warp import (
     sample_opacity,
 )
 
-_LARGEST_PICTURE = 250_000
+_LARGEST_PICTURE = 150_000
 _LARGEST_TOTAL = 16_000_000
 
 
