@@ -1,7 +1,7 @@
-"""Before and after: python -m examples.seams [PICTURE …] -o FILE.
+"""Before and after: python -m examples.seams [PICTURE …] -o FILE [--at LEFT TOP].
 
 Stitches pictures (by default the bundled pair), once plain, without exposure, seams and blending, and once with the
-defaults, and writes the place where the two differ most, plain on the left, px for px.
+defaults, and writes one place of both, by default that where they differ most, plain on the left, px for px.
 """
 
 import argparse
@@ -46,9 +46,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pictures", nargs="*", type=Path, default=BUNDLED)
     parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--at", nargs=2, type=int, metavar=("LEFT", "TOP"), help="place, px of the output")
     given = parser.parse_args()
     plain, default = (stitched(given.pictures, options) for options in (PLAIN, CompositeOptions()))
-    top, left = largest_difference(plain, default)
+    top, left = given.at[::-1] if given.at else largest_difference(plain, default)
     crops = [picture[top : top + SIDE, left : left + SIDE, :-1] for picture in (plain, default)]
     gap = np.full((SIDE, GAP, crops[0].shape[2]), np.iinfo(plain.dtype).max, plain.dtype)
     write_image(given.output, np.concatenate([crops[0], gap, crops[1]], axis=1), quality=85)
