@@ -1,6 +1,7 @@
 """Features lie where they should, keep clear of masks, and do not depend on threads."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -47,6 +48,15 @@ def test_a_turned_picture_matches(kind: str, picture: NDArray[np.uint8]) -> None
     # Points have no bias: half a pixel would be a wrong convention.
     bias = (found.points1 @ motion[:, :2].T + motion[:, 2] - found.points2)[error < 2].mean(axis=0)
     assert np.abs(bias).max() < 0.12
+
+
+@pytest.mark.parametrize("kind", ["rootsift", "orb"])
+def test_a_picture_that_shows_too_little_is_looked_at_more_closely(picture: NDArray[np.uint8], kind: str) -> None:
+    options = FeatureOptions(kind=kind, work_megapixels=0.02)
+    small = cv2.resize(picture, (155, 129), interpolation=cv2.INTER_AREA)
+    found = len(detect(small, FeatureOptions(kind=kind, work_megapixels=None)))
+    assert len(detect(picture, replace(options, max_features=2 * found))) <= found
+    assert len(detect(picture, replace(options, max_features=2 * found + 2))) > 1.5 * found
 
 
 @pytest.mark.parametrize("kind", ["sift", "surf", "kaze"])

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from rdstitch.camera import Camera, FloatArray
-from rdstitch.features import Features, match
+from rdstitch.features import Correspondences, Features, match
 from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.pairing import Pairing
 from rdstitch.pipeline.progress import silent
@@ -110,6 +110,24 @@ def test_pictures_that_share_nothing_are_told_at_a_glance() -> None:
     one, other = _pairing(0, 400), _pairing(0, 400, seed=1)
     together = replace(one, features=[*one.features[:2], *other.features[:2]])
     assert together.promising(ALL) == [(0, 1), (2, 3)]
+
+
+def test_a_few_matches_beside_hundreds_are_not_worth_a_closer_look() -> None:
+    shared = {(0, 1): 300, (0, 2): 16, (0, 3): 14, (1, 2): 400, (1, 3): 7, (2, 3): 200}
+    pairing = _pairing(0, 400)
+    # Told apart by their number of features.
+    several = [found.take(np.arange(100 + index)) for index, found in enumerate(pairing.features)]
+
+    def matcher(one: Features, two: Features) -> Correspondences:
+        count = shared[len(one) - 100, len(two) - 100]
+        points = np.zeros((count, 2))
+        return Correspondences(points.astype(np.intp), points, points, points[:, 0])
+
+    known = replace(pairing, features=several, matcher=matcher)
+    # The most that they share with another: 300, 400, 400 and 200.
+    assert known.promising(ALL) == [(0, 1), (0, 2), (0, 3), (1, 2), (2, 3)]
+    shared[0, 3], shared[0, 2] = 9, 14
+    assert known.promising(ALL) == [(0, 1), (1, 2), (2, 3)]
 
 
 def test_pictures_behind_the_horizon_have_no_neighbours() -> None:
