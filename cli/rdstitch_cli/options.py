@@ -201,11 +201,11 @@ estimation = together(
     click.option(
         "--work-megapixels",
         type=click.FloatRange(0.0),
-        default=0.5,
+        default=2.0,
         show_default=True,
         metavar="MP",
-        help="Size at most that features are detected at, megapixels, and four times that in pictures that show too "
-        "few; 0 is full size.",
+        help="Pictures are halved until they have no more megapixels before features are detected, once less where "
+        "that shows too few; 0 is full size.",
     ),
     click.option(
         "--solver", type=click.Choice(SOLVERS), default="auto", show_default=True, help="Minimal solver of the pairs."

@@ -1,6 +1,5 @@
 """Options of feature detection."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +8,14 @@ from rdstitch.errors import ArgumentError
 KINDS = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk", "aliked")
 CLOSER = 4.0
 """Times as many px are looked at where the working size shows too little."""
+
+
+def halving(image_size: tuple[int, int], megapixels: float) -> int:
+    """The power of two that width and height are divided by for at most so many 10⁶ px."""
+    factor = 1
+    while image_size[0] * image_size[1] > megapixels * 1e6 * factor**2:
+        factor *= 2
+    return factor
 
 
 @dataclass(frozen=True)
@@ -23,7 +30,7 @@ class FeatureOptions:
 
     kind: str = "rootsift"  # one of KINDS
     max_features: int = 4000  # keypoints kept per picture
-    work_megapixels: float | None = 0.5  # size at most that detection begins at, 10⁶ px; None: full size
+    work_megapixels: float | None = 2.0  # pictures are halved until they have no more, 10⁶ px; None: never
     spread: bool = True  # the strongest of each cell of a grid in turn, rather than the strongest of the picture
     spread_cell: float = 0.05  # side of a cell of that grid, fraction of the picture's diagonal
     sift_contrast: float = 0.02  # SIFT's contrast threshold; 0.04 is OpenCV's, too high for hazy pictures
@@ -60,4 +67,4 @@ class FeatureOptions:
         """Px of a picture of this width and height per px that detection can make use of; 1 at least."""
         if self.work_megapixels is None:
             return 1.0
-        return max(1.0, math.sqrt(image_size[0] * image_size[1] / (CLOSER * self.work_megapixels * 1e6)))
+        return float(halving(image_size, CLOSER * self.work_megapixels))

@@ -1,6 +1,5 @@
 """A picture as detectors want it: grey, 8 bits, of working size, with the distance to what is masked."""
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 
 from rdstitch.camera import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.features.options import halving
 
 Image = NDArray[Any]
 """Of uint8, uint16 or float."""
@@ -62,16 +62,16 @@ def prepare(image: Image, mask: Mask | None, work_megapixels: float | None) -> P
         raise ArgumentError(f"expected a picture of shape (height, width[, 1 to 4]), not {image.shape}")
     usable = _usable(image, mask)
     height, width = image.shape[:2]
-    shrink = 1.0 if work_megapixels is None else math.sqrt(work_megapixels * 1e6 / (width * height))
-    if shrink < 1.0:
-        size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
+    factor = 1 if work_megapixels is None else halving((width, height), work_megapixels)
+    if factor > 1:
+        size = (-(-width // factor), -(-height // factor))
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         if usable is not None:
             # A pixel is usable if all that it was made of is.
             usable = cv2.resize(usable.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
     grey = _eight_bits(_grey(image), usable)
-    factor = np.array([width / grey.shape[1], height / grey.shape[0]])
-    return Picture(grey, None if usable is None else _clearance(usable), factor)
+    shrink = np.array([width / grey.shape[1], height / grey.shape[0]])
+    return Picture(grey, None if usable is None else _clearance(usable), shrink)
 
 
 def _usable(image: Image, mask: Mask | None) -> NDArray[np.bool_] | None:
