@@ -31,6 +31,7 @@ _NEGLIGIBLE_SHRINK = 1.05
 _MASK_FEATHER = 0.125
 # Room around a part of a picture for the kernel of the resampling, px.
 KERNEL_MARGIN = 8
+# Px that are read for one of the output, at least: a Gaussian needs two, or nearly so, to make it smooth.
 _PX_PER_OUTPUT_PX = 1.9
 # Largest reduction at which previews are asked for, a power of two.
 _LARGEST_PREVIEW = 8
@@ -170,7 +171,7 @@ class PictureReader:
 
     def prepared(self, index: int, shrink: float) -> LoadedPicture:
         """Read picture ``index``, no larger than needed, for an output that shrinks it so much."""
-        # A Gaussian does the rest; it needs two px per output px, or nearly so.
+        # A Gaussian does the rest.
         reduction = 1 if self._previews is None else fitting_reduction(shrink / _PX_PER_OUTPUT_PX)
         return prepare_picture(self(index, reduction), shrink, reduction)
 

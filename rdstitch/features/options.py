@@ -13,7 +13,7 @@ CLOSER = 4.0
 def halving(image_size: tuple[int, int], megapixels: float) -> int:
     """The power of two that width and height are divided by for at most so many 10⁶ px."""
     factor = 1
-    while image_size[0] * image_size[1] > megapixels * 1e6 * factor**2:
+    while factor < max(image_size) and image_size[0] * image_size[1] > megapixels * 1e6 * factor**2:
         factor *= 2
     return factor
 

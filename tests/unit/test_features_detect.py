@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.features import FeatureOptions, Features, detect, detect_all, match
 from rdstitch.features.opencv import root
+from rdstitch.features.options import halving
 from rdstitch.features.spread import spread, strongest
 from rdstitch.synthetic import ground
 
@@ -48,6 +49,12 @@ def test_a_turned_picture_matches(kind: str, picture: NDArray[np.uint8]) -> None
     # Points have no bias: half a pixel would be a wrong convention.
     bias = (found.points1 @ motion[:, :2].T + motion[:, 2] - found.points2)[error < 2].mean(axis=0)
     assert np.abs(bias).max() < 0.12
+
+
+def test_pictures_are_halved_until_they_are_small_enough() -> None:
+    sizes = [(1280, 960), (2000, 1000), (2001, 1000), (3880, 2850), (8000, 6000)]
+    assert [halving(size, 2.0) for size in sizes] == [1, 1, 2, 4, 8]
+    assert halving((640, 480), 5e-324) == 1024
 
 
 @pytest.mark.parametrize("kind", ["rootsift", "orb"])
