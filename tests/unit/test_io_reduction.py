@@ -11,7 +11,7 @@ from PIL import Image
 
 from rdstitch.features import FeatureOptions, detect
 from rdstitch.io import Metadata, read_image, write_image
-from rdstitch.io.reduction import block_mean, block_minimum, fitting_reduction
+from rdstitch.io.reduction import block_mean, block_minimum, fitting_reduction, halved
 from rdstitch.synthetic import ground
 
 WIDTH, HEIGHT = 203, 150
@@ -73,6 +73,21 @@ def test_one_transparent_px_makes_its_block_transparent() -> None:
     alpha = np.full((5, 7), 255, np.uint8)
     alpha[4, 6] = 0
     np.testing.assert_array_equal(block_minimum(alpha, 4), [[255, 255], [255, 0]])
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_halved_px_are_means_of_what_is_opaque(dtype: type, channels: int) -> None:
+    rng, full = np.random.default_rng(channels), np.iinfo(dtype).max
+    strip = rng.integers(0, full + 1, (6, 8, channels + 1)).astype(dtype)
+    strip[..., -1] = full * (rng.random((6, 8)) < 0.6)
+    strip[:2, :2, -1], strip[2:4, :2, -1] = 0, full
+    found = halved(strip, transparent=True)
+    blocks = strip.reshape(3, 2, 4, 2, channels + 1).astype(np.float64)
+    share = blocks[..., -1:] / full
+    total = np.maximum(share.sum(axis=(1, 3)), 1e-9)
+    np.testing.assert_array_equal(found[..., :-1], np.floor((blocks * share).sum(axis=(1, 3)) / total + 0.5)[..., :-1])
+    np.testing.assert_array_equal(found[..., -1], np.floor(blocks[..., -1].mean(axis=(1, 3)) + 0.5))
 
 
 def test_features_of_a_reduced_picture_lie_where_they_are_in_the_whole(pixels: NDArray[Any]) -> None:
