@@ -77,7 +77,7 @@ def test_one_transparent_px_makes_its_block_transparent() -> None:
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
-def test_halved_px_are_means_of_what_is_opaque(dtype: type, channels: int) -> None:
+def test_halved_px_are_means_of_what_is_opaque(dtype: type[np.uint8 | np.uint16], channels: int) -> None:
     rng, full = np.random.default_rng(channels), np.iinfo(dtype).max
     strip = rng.integers(0, full + 1, (6, 8, channels + 1)).astype(dtype)
     strip[..., -1] = full * (rng.random((6, 8)) < 0.6)
