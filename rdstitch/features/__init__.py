@@ -6,6 +6,7 @@ from rdstitch.features.keypoints import Features
 from rdstitch.features.learned import LightGlue
 from rdstitch.features.match import Correspondences, Matcher, match
 from rdstitch.features.options import KINDS, FeatureOptions
+from rdstitch.features.overlap import match_overlap
 
 __all__ = [
     "KINDS",
@@ -18,4 +19,5 @@ __all__ = [
     "detect_all",
     "match",
     "match_near",
+    "match_overlap",
 ]

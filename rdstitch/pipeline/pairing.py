@@ -1,6 +1,6 @@
 """Pairs of pictures through all rounds: matched once, estimated alone, then with what the others know."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -17,6 +17,8 @@ from rdstitch.registration import Alignment
 from rdstitch.registration.pairs import PairOptions, PairRegistration, estimate_pairs, match_pairs
 from rdstitch.registration.resting import most_rest, moving_features, show_motion
 from rdstitch.registration.voting import vote
+
+Pair = tuple[int, int]
 
 _GLANCE = 1000  # strongest features of a picture, by which it is told whether a pair is worth a closer look
 _PROMISING = 8  # matches among these; pictures that share nothing have three to six by chance
@@ -49,29 +51,38 @@ class Pairing:
     cache: Cache = NO_CACHE
     tilts: Sequence[tuple[float, float]] | None = None
 
-    def promising(self, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-        """The pairs that share something at a glance, which costs a sixteenth of a closer look.
+    def promising(self, pairs: Sequence[Pair]) -> dict[Pair, Correspondences]:
+        """The pairs that share something at a glance, and what; that costs a sixteenth of a closer look.
 
         A pair that is passed over may overlap nevertheless, by little: the others then tell its place.
         """
         strongest = replace(self, features=[found.take(np.arange(min(len(found), _GLANCE))) for found in self.features])
-        shared = [len(found) for found in strongest._match(pairs, "comparing pictures")]
+        shared = dict(zip(pairs, strongest._match(pairs, "comparing pictures"), strict=True))
         most = np.zeros(len(self.features), dtype=np.intp)
-        for pair, count in zip(pairs, shared, strict=True):
-            most[[*pair]] = np.maximum(most[[*pair]], count)
-        return [
-            pair
-            for pair, count in zip(pairs, shared, strict=True)
-            if count >= max(_PROMISING, _WORTHWHILE * most[[*pair]].min())
-        ]
+        for pair, matches in shared.items():
+            most[[*pair]] = np.maximum(most[[*pair]], len(matches))
+        return {
+            pair: matches
+            for pair, matches in shared.items()
+            if len(matches) >= max(_PROMISING, _WORTHWHILE * most[[*pair]].min())
+        }
 
-    def estimate(self, pairs: Sequence[tuple[int, int]], distortion: float | None = None) -> list[PairRegistration]:
-        """Match and estimate pairs (i, j), with λ free, or as the user or the other pairs say."""
-        if not pairs:
+    def estimate(
+        self,
+        pairs: Iterable[Pair],
+        distortion: float | None = None,
+        shared: Mapping[Pair, Correspondences] | None = None,
+    ) -> list[PairRegistration]:
+        """Match and estimate pairs (i, j), with λ free, or as the user or the other pairs say.
+
+        Where it is known what pictures share at a glance, only the parts in which they overlap are matched.
+        """
+        chosen = list(pairs)
+        if not chosen:
             return []
         known = self.options.known_distortion
         lens = distortion if known is None else known
-        found = self._relate(pairs, self._match(pairs, "matching"), lens, "registering pairs")
+        found = self._relate(chosen, self._match(chosen, "matching", shared or {}), lens, "registering pairs")
         return found if known is not None or distortion is None else [_without_vote(pair) for pair in found]
 
     def look_past_rest(self, pairs: list[PairRegistration]) -> "tuple[Pairing, list[PairRegistration]]":
@@ -135,21 +146,27 @@ class Pairing:
             self.options.ratio,
         )
 
-    def _match(self, pairs: Sequence[tuple[int, int]], stage: str) -> list[Correspondences]:
+    def _match(
+        self, pairs: Sequence[Pair], stage: str, shared: Mapping[Pair, Correspondences] | None = None
+    ) -> list[Correspondences]:
         """Matches of every pair, from an earlier run where the cache has them."""
+        # What a network finds depends on all that it is shown.
+        network = self.options.lightglue_model is not None
+        glimpses = [None if shared is None or network else shared.get(pair) for pair in pairs]
 
         def recall(index: int, compute: Callable[[], Correspondences]) -> Correspondences:
-            i, j = pairs[index]
-            inputs = (self._digests[i], self._digests[j], self._matching)
+            (i, j), glimpse = pairs[index], glimpses[index]
+            told = None if glimpse is None else self.cache.digest(glimpse)
+            inputs = (self._digests[i], self._digests[j], self._matching, told)
             return self.cache.recall("matches", (Correspondences,), inputs, compute)
 
         # A network is no function: only one thread may use it.
-        workers = 1 if self.options.lightglue_model is not None else self.options.threads
-        return match_pairs(self.features, pairs, self.matcher, partial(self.progress, stage), recall, workers)
+        workers = 1 if network else self.options.threads
+        return match_pairs(self.features, pairs, self.matcher, glimpses, partial(self.progress, stage), recall, workers)
 
     def _relate(
         self,
-        pairs: Sequence[tuple[int, int]],
+        pairs: Sequence[Pair],
         matched: Sequence[Correspondences],
         distortion: float | None,
         stage: str | None = None,

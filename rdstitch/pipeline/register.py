@@ -102,7 +102,8 @@ def register(
     cameras = [source.camera.with_focal() for source in sources]
     pairing = Pairing(features, [source.camera for source in sources], matcher, options, progress, cache, tilts)
     candidates = first_pairs(features, options.seed)
-    pairs = pairing.estimate(pairing.promising(candidates))
+    promising = pairing.promising(candidates)
+    pairs = pairing.estimate(promising, shared=promising)
     if not any(pair.relation for pair in pairs):
         pairs = pairing.estimate(candidates)
     pairing, pairs = pairing.look_past_rest(pairs)

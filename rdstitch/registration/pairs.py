@@ -10,7 +10,7 @@ import numpy as np
 
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
-from rdstitch.features import Correspondences, Features, Matcher
+from rdstitch.features import Correspondences, Features, Matcher, match_overlap
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.registration.links import Link
 from rdstitch.robust import SOLVERS, estimate_radial_homography
@@ -70,6 +70,7 @@ def match_pairs(
     features: Sequence[Features],
     pairs: Sequence[tuple[int, int]],
     matcher: Matcher,
+    glimpses: Sequence[Correspondences | None] | None = None,
     progress: Progress | None = None,
     recall: Recall[Correspondences] | None = None,
     workers: int = 1,
@@ -84,6 +85,9 @@ def match_pairs(
         Indices of the pictures of each pair.
     matcher : callable
         Matches the features of two pictures.
+    glimpses : sequence of Correspondences or None, optional
+        Some matches of each pair, where they are known: they tell where the pictures overlap, and only there the rest
+        is looked for.
     progress : callable, optional
         Called with the number of pairs done and their total.
     recall : callable, optional
@@ -94,7 +98,11 @@ def match_pairs(
 
     def work(index: int) -> Correspondences:
         image1, image2 = pairs[index]
-        compute = partial(matcher, features[image1], features[image2])
+        glimpse = None if glimpses is None else glimpses[index]
+        if glimpse is None:
+            compute = partial(matcher, features[image1], features[image2])
+        else:
+            compute = partial(match_overlap, matcher, features[image1], features[image2], glimpse)
         return compute() if recall is None else recall(index, compute)
 
     done = []

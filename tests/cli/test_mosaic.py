@@ -73,7 +73,11 @@ def test_a_camera_that_stands_still_for_a_while(rdstitch: Run, frames: list[Path
 
 @pytest.mark.parametrize(
     "glance",
-    [lambda _, pairs: list(pairs), lambda _, pairs: [], lambda _, pairs: [pair for pair in pairs if 2 not in pair]],
+    [
+        lambda _, pairs: dict.fromkeys(pairs),
+        lambda _, pairs: {},
+        lambda _, pairs: dict.fromkeys(pair for pair in pairs if 2 not in pair),
+    ],
     ids=["everything looks promising", "nothing does", "one picture does not"],
 )
 def test_whatever_a_glance_says_every_picture_finds_its_place(
@@ -81,7 +85,7 @@ def test_whatever_a_glance_says_every_picture_finds_its_place(
     frames: list[Path],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    glance: Callable[[Pairing, list[tuple[int, int]]], list[tuple[int, int]]],
+    glance: Callable[[Pairing, list[tuple[int, int]]], dict[tuple[int, int], None]],
 ) -> None:
     monkeypatch.setattr(Pairing, "promising", glance)
     assert rdstitch("mosaic", *frames, "-o", tmp_path / "out.png", "--strict", *FAST).status == 0

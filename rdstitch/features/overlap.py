@@ -1,0 +1,79 @@
+"""Where two pictures overlap, told by a few of their matches, so that no more than that need be compared."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.camera import FloatArray
+from rdstitch.features.correspondences import Correspondences
+from rdstitch.features.keypoints import Features
+from rdstitch.features.match import Matcher
+
+_ENOUGH, _MOST = 50, 300  # matches that tell an overlap, and that are asked
+_COMPANY = 6  # other matches that a right one has near it, in both pictures
+_NEAR = 0.2  # how near, diagonals of a picture
+_STRAY = 8  # matches without such company that chance explains; more may be of a part with little texture
+_LEAST_REACH, _REACH = 0.12, 2.0  # how far an overlap goes on beside a match: diagonals, times the way to its company
+_CELLS = 24  # a side, by which places are told apart
+
+Part = NDArray[np.intp]
+"""Indices of the features in one part of a picture, ascending."""
+
+
+def overlapping(features1: Features, features2: Features, matches: Correspondences) -> tuple[Part, Part] | None:
+    """The features of two pictures that lie where these overlap, generously.
+
+    An overlap is what lies around the matches, twice as far as these are apart there: where texture is poor and matches
+    are few, it goes on for longer.
+
+    Parameters
+    ----------
+    features1, features2 : Features
+    matches : Correspondences
+        Some matches of the two, such as those of their strongest features, the most distinctive first.
+
+    Returns
+    -------
+    (ndarray of shape (N1,), ndarray of shape (N2,)), intp, or None
+        None where the matches are too few or too scattered to tell.
+    """
+    size1, size2 = features1.image_size, features2.image_size
+    if len(matches) < _ENOUGH or size1 is None or size2 is None:
+        return None
+    points1, points2 = matches.points1[:_MOST], matches.points2[:_MOST]
+    apart = np.maximum(_distances(points1, points1, size1), _distances(points2, points2, size2))
+    # Each is the first in its own company.
+    company = np.partition(apart, _COMPANY, axis=1)[:, _COMPANY]
+    right = company <= _NEAR
+    if np.count_nonzero(~right) > _STRAY:
+        return None
+    reach = np.maximum(_LEAST_REACH, _REACH * company[right])
+    return _around(features1, size1, points1[right], reach), _around(features2, size2, points2[right], reach)
+
+
+def match_overlap(
+    matcher: Matcher, features1: Features, features2: Features, matches: Correspondences
+) -> Correspondences:
+    """Match the features of two pictures in the parts that ``matches`` tell overlap; everywhere if they do not tell."""
+    parts = overlapping(features1, features2, matches)
+    if parts is None:
+        return matcher(features1, features2)
+    found = matcher(features1.take(parts[0]), features2.take(parts[1]))
+    indices = np.column_stack([part[found.indices[:, k]] for k, part in enumerate(parts)])
+    return replace(found, indices=indices)
+
+
+def _around(features: Features, size: tuple[int, int], points: FloatArray, reach: FloatArray) -> Part:
+    """The features in the cells of a picture whose centre is within reach of one of the points."""
+    middle = (np.arange(_CELLS) + 0.5) / _CELLS
+    centres = np.stack(np.meshgrid(middle * size[0], middle * size[1]), axis=-1).reshape(-1, 2)
+    covered = np.logical_or.reduce(_distances(centres, points, size) < reach, axis=1)
+    column, row = np.clip(features.points / size * _CELLS, 0, _CELLS - 1).astype(np.intp).T
+    return np.flatnonzero(covered[row * _CELLS + column])
+
+
+def _distances(points: FloatArray, others: FloatArray, size: tuple[int, int]) -> FloatArray:
+    """Between all points (N, 2) and all others (M, 2), diagonals of the picture, (N, M)."""
+    x, y = (points[:, None, k] - others[:, k] for k in (0, 1))
+    return np.asarray(np.hypot(x, y) / np.hypot(*size))
