@@ -7,6 +7,7 @@ from rdstitch.features.learned import LightGlue
 from rdstitch.features.match import Correspondences, Matcher, match
 from rdstitch.features.options import KINDS, FeatureOptions
 from rdstitch.features.overlap import match_overlap
+from rdstitch.features.picture import View
 
 __all__ = [
     "KINDS",
@@ -15,6 +16,7 @@ __all__ = [
     "Features",
     "LightGlue",
     "Matcher",
+    "View",
     "detect",
     "detect_all",
     "match",

@@ -14,16 +14,16 @@ from rdstitch.errors import ArgumentError
 from rdstitch.features.detection import Detection, find
 from rdstitch.features.keypoints import Features
 from rdstitch.features.options import CLOSER, KINDS, FeatureOptions
-from rdstitch.features.picture import Image, Mask, Picture, prepare
+from rdstitch.features.picture import Image, Mask, Picture, View, prepare
 from rdstitch.features.spread import spread, strongest
 
-__all__ = ["KINDS", "FeatureOptions", "Features", "Recall", "Source", "detect", "detect_all"]
+__all__ = ["KINDS", "FeatureOptions", "Features", "Recall", "Source", "View", "detect", "detect_all"]
 
 Recall = Callable[[int, Callable[[], Features]], Features]
 """Called with a picture's index and what detects its features; gives these, perhaps from an earlier run."""
 
-Source = Callable[[], tuple[Image, Mask | None]]
-"""Loads one picture and its mask (True or non-zero: use it; None: use all) when it is called."""
+Source = Callable[[float | None], View]
+"""Loads one picture when it is called with the 10⁶ px that are needed of it; None: all. More px may come."""
 
 _FEW = 0.5  # of the keypoints wanted: where a reduced picture shows fewer, it is looked at more closely
 
@@ -51,10 +51,14 @@ def detect(image: Image, options: FeatureOptions | None = None, mask: Mask | Non
     ArgumentError
         When the picture or the mask has the wrong shape or type, or when this OpenCV lacks the detector.
     """
-    options = options or FeatureOptions()
-    picture, detection, usable = _look(image, mask, options, options.work_megapixels)
+    return _detect(lambda _: View(image, mask), options or FeatureOptions())
+
+
+def _detect(source: Source, options: FeatureOptions) -> Features:
+    """The same for a picture that is loaded as large as it is needed."""
+    size, picture, detection, usable = _look(source, options, options.work_megapixels)
     if options.work_megapixels is not None and picture.reduced and len(usable) < _FEW * options.max_features:
-        picture, detection, usable = _look(image, mask, options, CLOSER * options.work_megapixels)
+        size, picture, detection, usable = _look(source, options, CLOSER * options.work_megapixels)
     points, response = detection.points[usable], detection.response[usable]
     if options.spread:
         cell = options.spread_cell * float(np.hypot(*picture.grey.shape))
@@ -65,17 +69,18 @@ def detect(image: Image, options: FeatureOptions | None = None, mask: Mask | Non
     # Some detectors return them in an order of their own.
     features = features.take(strongest(features.response, len(features)))
     scale = features.scale * float(np.sqrt(picture.factor.prod()))
-    size = (image.shape[1], image.shape[0])
     return replace(features, points=picture.to_full_size(features.points), scale=scale, image_size=size)
 
 
 def _look(
-    image: Image, mask: Mask | None, options: FeatureOptions, megapixels: float | None
-) -> tuple[Picture, Detection, NDArray[np.intp]]:
-    """A picture at most so large, what is found in it, and which of that lies where it may."""
-    picture = prepare(image, mask, megapixels)
+    source: Source, options: FeatureOptions, megapixels: float | None
+) -> tuple[tuple[int, int], Picture, Detection, NDArray[np.intp]]:
+    """The whole picture's size, the picture at most so large, what is found in it, and which of that may count."""
+    view = source(megapixels)
+    picture = prepare(view, megapixels)
     detection = find(picture.grey, options)
-    return picture, detection, np.flatnonzero(picture.covers(detection.points, detection.scale / 2))
+    usable = np.flatnonzero(picture.covers(detection.points, detection.scale / 2))
+    return view.whole_size, picture, detection, usable
 
 
 def detect_all(
@@ -90,7 +95,7 @@ def detect_all(
     Parameters
     ----------
     sources : sequence of callable
-        Each loads one picture and its mask.
+        Each loads one picture; see :data:`Source`.
     options : FeatureOptions, optional
     workers : int
         Pictures to work on at the same time, each in one thread.
@@ -115,12 +120,8 @@ def detect_all(
     if workers < 1:
         raise ArgumentError(f"workers must be at least 1, not {workers}")
 
-    def find_features(source: Source) -> Features:
-        image, mask = source()
-        return detect(image, options, mask)
-
     def work(index: int) -> Features:
-        compute = partial(find_features, sources[index])
+        compute = partial(_detect, sources[index], options)
         return compute() if recall is None else recall(index, compute)
 
     results: list[Features] = []

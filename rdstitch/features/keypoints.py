@@ -76,11 +76,6 @@ class Features:
         """Number of keypoints."""
         return len(self.points)
 
-    def enlarged(self, factor: int, image_size: tuple[int, int]) -> Self:
-        """The same in px of the whole picture, of which they were found in one that is reduced by ``factor``."""
-        points = (self.points + 0.5) * factor - 0.5
-        return replace(self, points=points, scale=self.scale * factor, image_size=image_size)
-
     def take(self, index: NDArray[np.intp]) -> Self:
         """The keypoints of the given indices, in their order."""
         return replace(

@@ -10,14 +10,6 @@ CLOSER = 4.0
 """Times as many px are looked at where the working size shows too little."""
 
 
-def halving(image_size: tuple[int, int], megapixels: float) -> int:
-    """The power of two that width and height are divided by for at most so many 10⁶ px."""
-    factor = 1
-    while factor < max(image_size) and image_size[0] * image_size[1] > megapixels * 1e6 * factor**2:
-        factor *= 2
-    return factor
-
-
 @dataclass(frozen=True)
 class FeatureOptions:
     """Which features to detect, and how many.
@@ -62,9 +54,3 @@ class FeatureOptions:
             raise ArgumentError("surf_octaves and surf_layers must be at least 1")
         if not 0 < self.spread_cell <= 1:
             raise ArgumentError(f"spread_cell must be in (0, 1], not {self.spread_cell}")
-
-    def shrink(self, image_size: tuple[int, int]) -> float:
-        """Px of a picture of this width and height per px that detection can make use of; 1 at least."""
-        if self.work_megapixels is None:
-            return 1.0
-        return float(halving(image_size, CLOSER * self.work_megapixels))

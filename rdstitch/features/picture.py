@@ -9,13 +9,39 @@ from numpy.typing import NDArray
 
 from rdstitch.camera import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.features.options import halving
 
 Image = NDArray[Any]
 """Of uint8, uint16 or float."""
 
 Mask = NDArray[Any]
 """Of bool or uint8."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A picture as it was loaded, whole or smaller.
+
+    Attributes
+    ----------
+    image : ndarray of shape (height, width) or (height, width, 1 to 4)
+    mask : ndarray of shape (height, width), bool or uint8, or None
+        True or not zero where the picture counts; None for everywhere.
+    reduction : int
+        Blocks of so many px a side of the whole picture are one px.
+    image_size : (int, int), optional
+        Width and height of the whole picture, px; where it is not given, this is the whole.
+    """
+
+    image: Image
+    mask: Mask | None = None
+    reduction: int = 1
+    image_size: tuple[int, int] | None = None
+
+    @property
+    def whole_size(self) -> tuple[int, int]:
+        """Width and height of the whole picture, px."""
+        return self.image_size or (self.image.shape[1], self.image.shape[0])
+
 
 _STRETCH_PERCENTILES = (0.1, 99.9)
 
@@ -56,8 +82,17 @@ class Picture:
         return (points + 0.5) * self.factor - 0.5
 
 
-def prepare(image: Image, mask: Mask | None, work_megapixels: float | None) -> Picture:
-    """Make a picture ready for detection; see :func:`rdstitch.features.detect.detect` for the arguments."""
+def halving(image_size: tuple[int, int], megapixels: float) -> int:
+    """The power of two that width and height are divided by for at most so many 10⁶ px."""
+    factor = 1
+    while factor < max(image_size) and image_size[0] * image_size[1] > megapixels * 1e6 * factor**2:
+        factor *= 2
+    return factor
+
+
+def prepare(view: View, work_megapixels: float | None) -> Picture:
+    """Make a picture ready for detection; see :func:`rdstitch.features.detect.detect` for what it may be."""
+    image, mask = view.image, view.mask
     if image.ndim not in (2, 3) or image.size == 0 or (image.ndim == 3 and image.shape[2] > 4):
         raise ArgumentError(f"expected a picture of shape (height, width[, 1 to 4]), not {image.shape}")
     usable = _usable(image, mask)
@@ -70,7 +105,7 @@ def prepare(image: Image, mask: Mask | None, work_megapixels: float | None) -> P
             # A pixel is usable if all that it was made of is.
             usable = cv2.resize(usable.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
     grey = _eight_bits(_grey(image), usable)
-    shrink = np.array([width / grey.shape[1], height / grey.shape[0]])
+    shrink = view.reduction * np.array([width / grey.shape[1], height / grey.shape[0]])
     return Picture(grey, None if usable is None else _clearance(usable), shrink)
 
 

@@ -73,7 +73,7 @@ def read_image(path: str | Path, reduction: int = 1) -> Picture:
         with file.open("rb") as stream:
             magic = stream.read(8)
         if magic[:4] in _TIFF_MAGIC:
-            return _reduced(_finish(file, *_read_tiff(file), read_metadata(file)), reduction)
+            return reduced(_finish(file, *_read_tiff(file), read_metadata(file)), reduction)
         with Image.open(file) as image:
             metadata = metadata_of(image)
             if magic == _PNG_MAGIC and metadata.bit_depth == 16 and image.mode not in _GREY_16:
@@ -81,8 +81,16 @@ def read_image(path: str | Path, reduction: int = 1) -> Picture:
             else:
                 rest = reduction // _decoded_smaller(image, metadata, reduction)
                 samples, alpha = _from_pillow(image)
-                return _reduced(_finish(file, samples, alpha, metadata), rest)
-        return _reduced(_finish(file, samples, alpha, metadata), reduction)
+                return reduced(_finish(file, samples, alpha, metadata), rest)
+        return reduced(_finish(file, samples, alpha, metadata), reduction)
+
+
+def reduced(picture: Picture, factor: int) -> Picture:
+    """Blocks of ``factor`` px a side become one px, transparent where any of them is; the metadata stay."""
+    if factor == 1:
+        return picture
+    alpha = None if picture.alpha is None else block_minimum(picture.alpha, factor)
+    return Picture(block_mean(picture.pixels, factor), alpha, picture.metadata)
 
 
 def _decoded_smaller(image: Image.Image, metadata: Metadata, reduction: int) -> int:
@@ -94,14 +102,6 @@ def _decoded_smaller(image: Image.Image, metadata: Metadata, reduction: int) -> 
         return 1
     image.draft(None, (whole[0] // factor, whole[1] // factor))
     return factor if image.size == reduced_size(whole, factor) else 1
-
-
-def _reduced(picture: Picture, factor: int) -> Picture:
-    """Blocks of px become one px, transparent where any of them is."""
-    if factor == 1:
-        return picture
-    alpha = None if picture.alpha is None else block_minimum(picture.alpha, factor)
-    return Picture(block_mean(picture.pixels, factor), alpha, picture.metadata)
 
 
 def _from_pillow(image: Image.Image) -> tuple[Pixels, Pixels | None]:

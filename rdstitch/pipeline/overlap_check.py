@@ -76,7 +76,7 @@ def _compare(
 
     def place(index: int) -> PlacedPicture:
         source = registration.sources[index]
-        picture = source.read(fitting_reduction(max(source.camera.image_size) / COMPARED_SIDE))
+        picture = source.read(fitting_reduction(max(source.camera.image_size) / COMPARED_SIDE), keep=True)
         return PlacedPicture.of(picture, alignment.cameras[index], alignment.homographies[index])
 
     def compare(fit: LinkFit, scale: float) -> CheckedLink:

@@ -8,9 +8,7 @@ import numpy as np
 
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError, RegistrationError
-from rdstitch.features import Features, LightGlue, Matcher, detect_all, match
-from rdstitch.io.read import Pixels
-from rdstitch.io.reduction import fitting_reduction
+from rdstitch.features import Features, LightGlue, Matcher, View, detect_all, match
 from rdstitch.pipeline.cache import Cache
 from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.pairing import Pairing
@@ -192,17 +190,17 @@ def _detect(
     """Features of every picture, and which pictures turned out to be damaged; these have no features."""
     damaged: dict[int, str] = {}
 
-    reductions = [fitting_reduction(options.features.shrink(source.camera.image_size)) for source in sources]
-
-    def load(index: int) -> tuple[Pixels, Pixels | None]:
+    def load(index: int, megapixels: float | None) -> View:
+        source = sources[index]
+        reduction = source.reduction(megapixels)
         try:
-            picture = sources[index].read(reductions[index])
+            picture = source.read(reduction, keep=True)
         except InputError as error:
             if not skip_bad:
                 raise
             damaged[index] = str(error)
-            return np.zeros((1, 1), dtype=np.uint8), None
-        return picture.pixels, picture.alpha
+            return View(np.zeros((1, 1), dtype=np.uint8), image_size=source.camera.image_size)
+        return View(picture.pixels, picture.alpha, reduction, source.camera.image_size)
 
     network = cache.file(options.features.aliked_model)
     wanted = replace(options.features, aliked_model=None) if network else options.features
@@ -210,12 +208,8 @@ def _detect(
     def recall(index: int, compute: Callable[[], Features]) -> Features:
         source = sources[index]
         inputs = (cache.file(source.path), cache.file(source.mask), source.camera.image_size, wanted, network)
-
-        def find() -> Features:
-            return compute().enlarged(reductions[index], source.camera.image_size)
-
         # A damaged picture has no features, but that must be said again the next time.
-        return cache.recall("features", (Features,), inputs, find, unless=lambda: index in damaged)
+        return cache.recall("features", (Features,), inputs, compute, unless=lambda: index in damaged)
 
     loaders = [partial(load, index) for index in range(len(sources))]
     progress_of = partial(progress, "detecting features")

@@ -1,7 +1,7 @@
 """The input pictures: which files, what their headers say, and the camera each was taken with."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -9,10 +9,15 @@ import numpy as np
 
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError
+from rdstitch.features.picture import halving
 from rdstitch.io.mask import read_mask
 from rdstitch.io.metadata import Metadata, read_metadata
-from rdstitch.io.read import Picture, read_image
-from rdstitch.io.reduction import block_minimum, reduced_size
+from rdstitch.io.read import Picture, read_image, reduced
+from rdstitch.io.reduction import block_minimum, fitting_reduction, reduced_size
+from rdstitch.pipeline.shelf import NO_SHELF, Shelf
+
+_LOOKED_AT = 2.0
+"""10⁶ px to which a picture is halved before more than one stage looks at it."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +34,8 @@ class Source:
         Picture that is dark where this one does not count.
     attitude : (float, float) or None
         (ψ, θ), radians, as a gimbal or an IMU has measured it.
+    shelf : Shelf
+        Where it is kept between two stages that both look at it.
     """
 
     path: Path
@@ -36,20 +43,43 @@ class Source:
     camera: Camera
     mask: Path | None = None
     attitude: tuple[float, float] | None = None
+    shelf: Shelf = field(default=NO_SHELF, compare=False, repr=False)
 
     @property
     def name(self) -> str:
         """File name, for messages and reports."""
         return self.path.name
 
-    def read(self, reduction: int = 1) -> Picture:
+    def reduction(self, megapixels: float | None) -> int:
+        """By how much it can be read smaller and has no fewer px than a picture that is halved to so many 10⁶ px."""
+        return 1 if megapixels is None else fitting_reduction(halving(self.camera.image_size, megapixels))
+
+    def read(self, reduction: int = 1, *, keep: bool = False) -> Picture:
         """The pixels, reduced as by :func:`rdstitch.io.read_image`; what the mask excludes is transparent.
+
+        Parameters
+        ----------
+        reduction : int
+        keep : bool
+            It will be looked at again, so that the file need not be decoded once more.
 
         Raises
         ------
         InputError
             When the file cannot be read, or is no longer what it was.
         """
+        # Smaller ones are made from one size, whether that is at hand or not: the same comes out.
+        usual = self.reduction(_LOOKED_AT)
+        if reduction % usual:
+            return self._load(reduction)
+        key = (self.path, self.mask)
+        picture = self.shelf.take(key) or self._load(usual)
+        if keep:
+            self.shelf.put(key, picture)
+        return reduced(picture, reduction // usual)
+
+    def _load(self, reduction: int) -> Picture:
+        """The pixels from the file, masked."""
         picture = read_image(self.path, reduction)
         expected = self.camera.image_size
         if picture.pixels.shape[1::-1] != reduced_size(expected, reduction):
@@ -127,6 +157,7 @@ def read_sources(
     sources: list[Source] = []
     left_out: list[LeftOut] = []
     seen: set[Path] = set()
+    shelf = Shelf()
     for path in map(Path, paths):
         try:
             key = path.resolve()
@@ -139,7 +170,7 @@ def read_sources(
             continue
         if key not in seen:
             seen.add(key)
-            sources.append(Source(path, metadata, _camera(metadata, camera, focal, distortion)))
+            sources.append(Source(path, metadata, _camera(metadata, camera, focal, distortion), shelf=shelf))
     return sources, left_out
 
 

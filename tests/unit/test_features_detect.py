@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.features import FeatureOptions, Features, detect, detect_all, match
+from rdstitch.features import FeatureOptions, Features, View, detect, detect_all, match
 from rdstitch.features.opencv import root
-from rdstitch.features.options import halving
+from rdstitch.features.picture import halving
 from rdstitch.features.spread import spread, strongest
 from rdstitch.synthetic import ground
 
@@ -137,7 +137,7 @@ def test_grey_layouts_agree(picture: NDArray[np.uint8]) -> None:
 @pytest.mark.parametrize("kind", ["rootsift", "surf", "orb", "brisk"])
 def test_threads_change_nothing(kind: str, picture: NDArray[np.uint8]) -> None:
     options = FeatureOptions(kind=kind, max_features=700)
-    sources = [lambda i=i: (np.rot90(picture, i).copy(), None) for i in range(4)]
+    sources = [lambda _, i=i: View(np.rot90(picture, i).copy()) for i in range(4)]
     seen: list[tuple[int, int]] = []
     one = detect_all(sources, options, 1, lambda done, total: seen.append((done, total)))
     several = detect_all(sources, options, 3)
@@ -152,12 +152,12 @@ def test_threads_change_nothing(kind: str, picture: NDArray[np.uint8]) -> None:
 
 
 def test_what_a_source_raises_is_raised(picture: NDArray[np.uint8]) -> None:
-    def broken() -> tuple[NDArray[np.uint8], None]:
+    def broken(_: float | None) -> View:
         raise InputError("cannot read")
 
     before = cv2.getNumThreads()
     with pytest.raises(InputError, match="cannot read"):
-        detect_all([lambda: (picture, None), broken], workers=2)
+        detect_all([lambda _: View(picture), broken], workers=2)
     assert cv2.getNumThreads() == before
 
 

@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from rdstitch.features import FeatureOptions, detect
+from rdstitch.features import FeatureOptions, View, detect, detect_all
+from rdstitch.features.options import CLOSER
 from rdstitch.io import Metadata, read_image, write_image
 from rdstitch.io.reduction import block_mean, block_minimum, fitting_reduction, halved
 from rdstitch.synthetic import ground
@@ -94,8 +95,14 @@ def test_features_of_a_reduced_picture_lie_where_they_are_in_the_whole(pixels: N
     large = np.asarray(cv2.resize(pixels, (4 * WIDTH, 4 * HEIGHT), interpolation=cv2.INTER_CUBIC))
     options = FeatureOptions(work_megapixels=WIDTH * HEIGHT / 1e6)
     whole = detect(large, options)
-    small = detect(block_mean(large, 2), options).enlarged(2, (4 * WIDTH, 4 * HEIGHT))
+    asked: list[float | None] = []
+
+    def load(megapixels: float | None) -> View:
+        asked.append(megapixels)
+        return View(block_mean(large, 2), reduction=2, image_size=(4 * WIDTH, 4 * HEIGHT))
+
+    (small,) = detect_all([load], options)
     assert small.image_size == whole.image_size
-    assert options.shrink((4 * WIDTH, 4 * HEIGHT)) == pytest.approx(2.0)  # for a closer look
+    assert asked == [options.work_megapixels, CLOSER * WIDTH * HEIGHT / 1e6]  # for a closer look
     distance = np.linalg.norm(whole.points[:50, None] - small.points[None], axis=2).min(axis=1)
     assert np.median(distance) < 0.2

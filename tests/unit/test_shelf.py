@@ -1,0 +1,93 @@
+"""Pictures between stages: decoded once where there is room, and the same whether there is or not."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rdstitch.camera import Camera
+from rdstitch.io import Metadata, write_image
+from rdstitch.io.read import Picture, read_image
+from rdstitch.pipeline import sources
+from rdstitch.pipeline.shelf import Shelf
+from rdstitch.pipeline.sources import Source
+
+SIZE = (1900, 1300)  # halved once for a look at it
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Source:
+    pixels = np.random.default_rng(0).integers(0, 256, (SIZE[1], SIZE[0], 3)).astype(np.uint8)
+    write_image(tmp_path / "a.jpg", pixels)
+    return Source(tmp_path / "a.jpg", Metadata(SIZE), Camera(SIZE))
+
+
+@pytest.fixture
+def read(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The reductions at which files are decoded."""
+    seen: list[int] = []
+
+    def noted(path: Path, reduction: int = 1) -> Picture:
+        seen.append(reduction)
+        return read_image(path, reduction)
+
+    monkeypatch.setattr(sources, "read_image", noted)
+    return seen
+
+
+def _picture(values: NDArray[np.uint8]) -> Picture:
+    return Picture(values, None, Metadata(values.shape[::-1]))
+
+
+def test_a_picture_is_decoded_once_for_all_who_look_at_it(source: Source, read: list[int]) -> None:
+    shelved = replace(source, shelf=Shelf())
+    looks = [shelved.read(reduction, keep=True).pixels for reduction in (2, 4, 8)]
+    last = shelved.read(8).pixels
+    assert read == [2]
+    np.testing.assert_array_equal(last, looks[2])
+    shelved.read(8)
+    assert read == [2, 2]
+
+
+def test_what_is_on_the_shelf_changes_no_px(source: Source) -> None:
+    shelved = replace(source, shelf=Shelf())
+    shelved.read(2, keep=True)
+    for reduction in (1, 2, 4, 8):
+        with_shelf, without = (s.read(reduction, keep=True).pixels for s in (shelved, source))
+        np.testing.assert_array_equal(with_shelf, without)
+
+
+def test_a_look_at_more_px_is_at_the_file(source: Source, read: list[int]) -> None:
+    shelved = replace(source, shelf=Shelf())
+    shelved.read(2, keep=True)
+    assert shelved.read().pixels.shape == (SIZE[1], SIZE[0], 3)
+    assert read == [2, 1]
+
+
+def test_masks_are_kept_apart(source: Source, tmp_path: Path) -> None:
+    mask = np.full((SIZE[1], SIZE[0]), 255, np.uint8)
+    mask[:600] = 0
+    write_image(tmp_path / "mask.png", mask)
+    shelved = replace(source, shelf=Shelf())
+    masked = replace(shelved, mask=tmp_path / "mask.png")
+    assert shelved.read(2, keep=True).alpha is None
+    alpha = masked.read(4, keep=True).alpha
+    assert alpha is not None
+    np.testing.assert_array_equal(alpha, np.repeat([0, 255], [150, 175])[:, None].repeat(475, axis=1))
+    assert shelved.read(2).alpha is None
+
+
+def test_pictures_for_which_there_is_no_room_are_not_kept() -> None:
+    shelf = Shelf(room=250)
+    large, small = (_picture(np.zeros((10, n), np.uint8)) for n in (20, 5))
+    shelf.put("large", large)
+    shelf.put("other", large)
+    shelf.put("small", small)
+    assert shelf.take("other") is None
+    assert shelf.take("large") is large
+    assert shelf.take("large") is None
+    shelf.put("other", large)
+    assert shelf.take("other") is large
+    assert shelf.take("small") is small
