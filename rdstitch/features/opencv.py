@@ -1,6 +1,6 @@
 """The detectors that OpenCV brings, in the steps that all detectors take: find, choose, describe."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self, cast
 
@@ -37,8 +37,7 @@ class OpenCVDetection:
         """Find keypoints; see :func:`create_detector` for errors."""
         detector = create_detector(options)
         keypoints = detector.detect(grey, None) if min(grey.shape) >= _SMALLEST_PICTURE else ()
-        rows = [(*k.pt, k.size, k.angle, k.octave, k.response) for k in keypoints]
-        table = np.array(rows, dtype=np.float64).reshape(-1, 6)
+        table = _table(keypoints, "size", "angle", "octave", "response")
         # OpenCV promises no order: sort, so that the choice among equals is the same everywhere.
         order = np.lexsort(table.T)
         table = table[order]
@@ -69,8 +68,7 @@ class OpenCVDetection:
         if descriptors is None:
             dtype = np.float32 if self.detector.descriptorType() == cv2.CV_32F else np.uint8
             descriptors = np.zeros((0, self.detector.descriptorSize()), dtype)
-        rows = [(*k.pt, k.size, k.angle, k.response) for k in described]
-        u, v, size, degrees, response = np.array(rows, dtype=np.float64).reshape(-1, 5).T
+        u, v, size, degrees, response = _table(described, "size", "angle", "response").T
         return Features(
             points=np.column_stack([u, v]),
             descriptors=root(descriptors) if self.kind == "rootsift" else cast(Descriptors, descriptors),
@@ -81,6 +79,16 @@ class OpenCVDetection:
             laplacian_sign=None,
             kind=self.kind,
         )
+
+
+def _table(keypoints: Sequence[cv2.KeyPoint], *names: str) -> FloatArray:
+    """Places and attributes of keypoints, (N, 2 + number of names)."""
+    table = np.empty((len(keypoints), 2 + len(names)))
+    if len(keypoints):
+        table[:, :2] = cv2.KeyPoint.convert(keypoints)
+    for column, name in enumerate(names, start=2):
+        table[:, column] = [getattr(keypoint, name) for keypoint in keypoints]
+    return table
 
 
 def create_detector(options: FeatureOptions) -> Any:
