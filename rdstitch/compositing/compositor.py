@@ -29,6 +29,7 @@ from rdstitch.io.layout import STRIP_ROWS, Layout
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_format, write_strips
+from rdstitch.opencv_threads import one_opencv_thread
 
 # Samples (h, W, C) and alpha (h, W).
 _Filled = tuple[NDArray[Any], NDArray[np.uint8]]
@@ -224,7 +225,7 @@ class Prepared:
         if self.plan.workers == 1:
             yield from self._strips(map, progress)
             return
-        with ThreadPoolExecutor(self.plan.workers) as pool:
+        with one_opencv_thread(), ThreadPoolExecutor(self.plan.workers) as pool:
             yield from self._strips(pool.map, progress)
 
     def _strips(

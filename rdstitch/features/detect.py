@@ -1,12 +1,10 @@
 """Feature detection: pictures in, keypoints with descriptors out."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +14,7 @@ from rdstitch.features.keypoints import Features
 from rdstitch.features.options import CLOSER, KINDS, FeatureOptions
 from rdstitch.features.picture import Image, Mask, Picture, View, prepare
 from rdstitch.features.spread import spread, strongest
+from rdstitch.opencv_threads import one_opencv_thread
 
 __all__ = ["KINDS", "FeatureOptions", "Features", "Recall", "Source", "View", "detect", "detect_all"]
 
@@ -125,20 +124,9 @@ def detect_all(
         return compute() if recall is None else recall(index, compute)
 
     results: list[Features] = []
-    with _one_opencv_thread(), ThreadPoolExecutor(workers) as pool:
+    with one_opencv_thread(), ThreadPoolExecutor(workers) as pool:
         for features in pool.map(work, range(len(sources))):
             results.append(features)
             if progress is not None:
                 progress(len(results), len(sources))
     return results
-
-
-@contextmanager
-def _one_opencv_thread() -> Iterator[None]:
-    """Keep OpenCV from starting threads of its own while we run several pictures at a time."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)
