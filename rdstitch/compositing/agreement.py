@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.camera import Camera, FloatArray
-from rdstitch.compositing.warp import Box, lattice_maps
+from rdstitch.compositing.lattice import Box, Lattice
 from rdstitch.io.read import Picture
 from rdstitch.radial_homography import from_plane, to_plane
 
@@ -87,7 +87,7 @@ class PlacedPicture:
             grid = np.stack(np.broadcast_arrays(x, y), axis=-1)
             return from_plane(self.camera, self.homography, plane(grid.reshape(-1, 2))).reshape(grid.shape)
 
-        x, y = lattice_maps(places, box, _LATTICE)
+        x, y = Lattice.over(box, _LATTICE, places).maps(box)
         found = cv2.remap(
             self.grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(float("nan"),)
         )

@@ -15,6 +15,7 @@ from rdstitch.camera import Camera
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.crop import coverage_map, crop_box
 from rdstitch.compositing.exposure import Exposure, estimate_exposure, no_exposure
+from rdstitch.compositing.lattice import Box
 from rdstitch.compositing.multiband import margin
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.parts import ShownPart, shown_parts
@@ -23,7 +24,7 @@ from rdstitch.compositing.plan import CompositePlan, plan_composite
 from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seams import find_seams
 from rdstitch.compositing.survey import survey_pictures
-from rdstitch.compositing.warp import Box, plan_warp
+from rdstitch.compositing.warp import plan_warp
 from rdstitch.errors import ArgumentError
 from rdstitch.io.layout import STRIP_ROWS, Layout
 from rdstitch.io.metadata import Metadata

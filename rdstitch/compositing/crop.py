@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.compositing.canvas import Canvas
+from rdstitch.compositing.lattice import Box
 from rdstitch.compositing.survey import Survey
-from rdstitch.compositing.warp import Box, locate, plan_warp
+from rdstitch.compositing.warp import locate, plan_warp
 
 # Coverage is looked at with this many px along the longer side of the canvas.
 _RESOLUTION = 1500

@@ -21,8 +21,9 @@ from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
 from rdstitch.camera import Camera, FloatArray
+from rdstitch.compositing.lattice import LATTICE_STEPS, Box, Float32Array, interpolated
 from rdstitch.compositing.survey import Survey, SurveyTile
-from rdstitch.compositing.warp import Box, Float32Array, Warp, interpolate_lattice, intersection, lattice_nodes
+from rdstitch.compositing.warp import Geometry, intersection
 
 _SRGB_OFFSET = 0.055
 # Samples outside this part of the range are clipped or mostly noise.
@@ -39,8 +40,8 @@ _ROUNDS = 6
 # A model with more freedom must explain the data better by this share to be taken.
 _WORTHWHILE = 0.02
 # The correction is smooth: it is computed at this spacing, canvas px, and interpolated.
-_LATTICE = 32
-_ROWS = 32  # that are corrected at a time
+_LATTICE = LATTICE_STEPS[0]
+_ROWS = 64  # that are corrected at a time
 _DEPTHS = {"uint8": cv2.CV_8U, "uint16": cv2.CV_16U, "float32": cv2.CV_32F}
 
 
@@ -78,17 +79,19 @@ class Exposure:
             log = log + (self.blocks[index].ravel()[nodes] * shares).sum(axis=-1)
         return np.asarray(log, dtype=np.float64)
 
-    def correct(self, index: int, warp: Warp, box: Box, pixels: NDArray[Any]) -> NDArray[Any]:
-        """Resampled pixels (h, w, C) of picture ``index`` on ``box``, as if all were exposed alike.
+    def correct(self, index: int, geometry: Geometry, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Resampled pixels (h, w, C) of picture ``index``, as if all were exposed alike.
 
         In the type of the pixels. Depends, px by px, on nothing but the px: every box gives the same, bit for bit.
         """
         gain = np.exp(-self.log_gain[index]).astype(np.float32)
-        smooth = self._smooth_level(index, warp, box) if self.vignetting.any() or self.blocks.size else None
+        smooth = self._smooth_level(index, geometry) if self.vignetting.any() or self.blocks.size else None
         if smooth is None and (gain == 1).all():
             return pixels
         offset = np.float32(self.offset * full_scale(pixels.dtype))
+        depth = _DEPTHS[pixels.dtype.name]
         done = np.empty_like(pixels)
+        flat = done.reshape(len(done), -1)
         # A few rows at a time: what is computed in between stays in the processor's cache.
         for top in range(0, len(pixels), _ROWS):
             rows = slice(top, top + _ROWS)
@@ -96,20 +99,18 @@ class Exposure:
             # Planes are joined by OpenCV: numpy is slow along an axis of three.
             values *= gain if smooth is None else _joined([smooth[rows] * factor for factor in gain])
             # Rounded and clipped to the type; the stubs know no scalars.
-            flat = values.reshape(len(values), -1)
-            corrected = cv2.subtract(flat, float(offset), dtype=_DEPTHS[pixels.dtype.name])  # type: ignore[call-overload]
-            done[rows] = np.asarray(corrected).reshape(values.shape)
+            cv2.subtract(values.reshape(len(values), -1), float(offset), flat[rows], dtype=depth)  # type: ignore[call-overload]
         return done
 
-    def _smooth_level(self, index: int, warp: Warp, box: Box) -> Float32Array:
+    def _smooth_level(self, index: int, geometry: Geometry) -> Float32Array:
         """What vignetting and block field are made up for by, on a box (h, w)."""
-        x, y = np.broadcast_arrays(*lattice_nodes(box, _LATTICE))
-        points = warp.source_points(x, y)
-        width, height = warp.camera.image_size
+        camera = geometry.warp.camera
+        width, height = camera.image_size
+        points = geometry.lattice.nodes(geometry.box, _LATTICE).astype(np.float64)
         # Outside the picture only mirrored content is corrected; the model must not run away there.
-        points = np.clip(np.nan_to_num(points), -0.5, (width - 0.5, height - 0.5))
-        nodes = np.exp(-self.smooth_part(index, warp.camera, points)).astype(np.float32)
-        return interpolate_lattice(nodes, box, _LATTICE)
+        points = np.clip(points, -0.5, (width - 0.5, height - 0.5))
+        nodes = np.exp(-self.smooth_part(index, camera, points)).astype(np.float32)
+        return interpolated(nodes, geometry.box, _LATTICE)
 
 
 def _joined(planes: list[Float32Array]) -> Float32Array:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from rdstitch.compositing.warp import Box, Float32Array
+from rdstitch.compositing.lattice import Box, Float32Array
 
 _WEIGHT_STEPS = np.float32(4096.0)
 

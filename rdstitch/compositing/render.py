@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.compositing.exposure import Exposure, full_scale
+from rdstitch.compositing.lattice import Box, Float32Array
 from rdstitch.compositing.multiband import MultibandBlender, aligned, grown, margin, rounding_constant, spread
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.pictures import PictureCache
 from rdstitch.compositing.seams import NOBODY, SeamMap
 from rdstitch.compositing.warp import (
-    Box,
-    Float32Array,
     Geometry,
     Warp,
     border_weight,
@@ -40,19 +39,18 @@ class Layer:
         Part of the canvas: x0, y0, x1, y1, px, end exclusive.
     weight : ndarray of shape (h, w), float32
         0 where the picture has no say.
-    geometry : Geometry or None
-        Of the same part, where it was needed already.
+    geometry : Geometry
+        Of the same part.
     """
 
     index: int
     box: Box
     weight: Float32Array
-    geometry: Geometry | None = None
+    geometry: Geometry
 
     def part(self, box: Box) -> "Layer":
         """The same for a box within this one."""
-        geometry = None if self.geometry is None else self.geometry.part(box)
-        return Layer(self.index, box, _part(self.weight, self.box, box), geometry)
+        return Layer(self.index, box, _part(self.weight, self.box, box), self.geometry.on(box))
 
     def weighted_part(self, box: Box) -> "Layer | None":
         """The smallest part that holds all of the weight on ``box``; None where there is none."""
@@ -96,7 +94,7 @@ class Renderer:
         What a px gets does not depend on the box.
         """
         blended = self.options.blend == "multiband"
-        around = aligned(grown(box, margin(self.bands)), self.bands) if blended else box
+        around = self._felt(box) if blended else box
         layers = [part for layer in self._layers(around) if (part := layer.weighted_part(around)) is not None]
         covered = np.zeros((box[3] - box[1], box[2] - box[0]), dtype=np.bool_)
         for layer in layers:
@@ -107,14 +105,12 @@ class Renderer:
         for rest in _without(box, zone):
             self._lay(layers, rest, _part(pixels, box, rest))
         if zone is not None:
-            _part(pixels, box, zone)[...] = self._multiband(layers, zone)
-        if not covered.all():
-            pixels[~covered] = 0
+            cv2.copyTo(self._multiband(layers, zone), _as_mask(_part(covered, box, zone)), _part(pixels, box, zone))
         return pixels, covered
 
     def _contact_zone(self, layers: Sequence[Layer], box: Box) -> Box | None:
         """The part of a box in which blending can mix pictures; elsewhere it would give back the one that is there."""
-        felt = [self._felt(layer) for layer in layers]
+        felt = [self._felt(layer.box) for layer in layers]
         shared = [common for pair in combinations(felt, 2) if (common := intersection(*pair)) is not None]
         parts = [part for common in shared if (part := intersection(common, box)) is not None]
         if not parts:
@@ -122,9 +118,9 @@ class Renderer:
         x0, y0, x1, y1 = zip(*parts, strict=True)
         return min(x0), min(y0), max(x1), max(y1)
 
-    def _felt(self, layer: Layer) -> Box:
-        """Where multi-band blending feels a layer's weight."""
-        return aligned(grown(layer.box, margin(self.bands)), self.bands)
+    def _felt(self, box: Box) -> Box:
+        """Where multi-band blending feels weights on a box."""
+        return aligned(grown(box, margin(self.bands)), self.bands)
 
     def _lay(self, layers: Sequence[Layer], box: Box, pixels: NDArray[Any]) -> None:
         """Fill ``pixels``, which are those of ``box``, with the layers, or with their weighted mean."""
@@ -143,10 +139,10 @@ class Renderer:
 
     def _multiband(self, layers: Sequence[Layer], box: Box) -> NDArray[Any]:
         """Blend in bands, with the margin around the box that they need."""
-        outer = aligned(grown(box, margin(self.bands)), self.bands)
+        outer = self._felt(box)
         blender = MultibandBlender(outer, self.bands, self.channels, self._rounding)
         for layer in layers:
-            part, common = intersection(self._felt(layer), outer), intersection(layer.box, outer)
+            part, common = intersection(self._felt(layer.box), outer), intersection(layer.box, outer)
             if part is None or common is None:
                 continue
             weight = np.zeros((part[3] - part[1], part[2] - part[0]), dtype=np.float32)
@@ -167,12 +163,10 @@ class Renderer:
 
     def _samples(self, layer: Layer, box: Box) -> NDArray[Any]:
         """Resampled and exposure-corrected samples (h, w, C) of one picture; mirrored content outside of it."""
-        index, warp = layer.index, self.warps[layer.index]
-        known = layer.geometry is not None and intersection(layer.box, box) == box
-        geometry = layer.geometry.part(box) if known and layer.geometry is not None else locate(warp, box)
-        picture = self.pictures.get(index, read_part(warp, geometry))
-        pixels = sample(warp, picture, geometry, self.options.interpolation)
-        return self.exposure.correct(index, warp, box, pixels.reshape(*geometry.inside.shape, self.channels))
+        geometry = layer.geometry.on(box)
+        picture = self.pictures.get(layer.index, read_part(geometry))
+        pixels = sample(picture, geometry, self.options.interpolation)
+        return self.exposure.correct(layer.index, geometry, pixels.reshape(*geometry.shape, self.channels))
 
     def _layers(self, box: Box) -> list[Layer]:
         """Weights of all pictures that have a say in a box."""
@@ -185,18 +179,22 @@ class Renderer:
         for index, warp in enumerate(self.warps):
             if (part := intersection(warp.box, box)) is None:
                 continue
-            geometry = locate(warp, part)
+            geometry = self._placed(index, part, box)
             if geometry.inside.any():
-                weight = border_weight(warp, geometry)
+                weight = border_weight(geometry)
                 opacity = self._opacity(index, geometry)
                 yield Layer(index, part, weight if opacity is None else weight * opacity, geometry)
+
+    def _placed(self, index: int, part: Box, box: Box) -> Geometry:
+        """The geometry of a picture on its part of a box, with a lattice for all that blending can ask of it there."""
+        asked = intersection(self._felt(part), box) if self.options.blend == "multiband" else part
+        return locate(self.warps[index], asked or part).on(part)
 
     def _opacity(self, index: int, geometry: Geometry) -> Float32Array | None:
         """Opacity of a picture that has a mask."""
         if not self.pictures.masked(index):
             return None
-        warp = self.warps[index]
-        return sample_opacity(warp, self.pictures.get(index, read_part(warp, geometry)), geometry)
+        return sample_opacity(self.pictures.get(index, read_part(geometry)), geometry)
 
     def _owned(self, box: Box) -> list[Layer]:
         """Layers where each px has one owner, or, for feathering along a seam, shares of its owners.
@@ -229,12 +227,9 @@ class Renderer:
             part = intersection(self.warps[index].box, box) if index != NOBODY else None
             if part is None or self.seams is None:
                 continue
-            share = self.seams.share(index, part)
-            if self.warps[index].fills(part) and not self.pictures.masked(index):
-                yield Layer(index, part, share)
-                continue
-            geometry = locate(self.warps[index], part)
-            share[~geometry.inside] = 0.0
+            share, geometry = self.seams.share(index, part), self._placed(index, part, box)
+            if not geometry.filled:
+                share[~geometry.inside] = 0.0
             if (opacity := self._opacity(index, geometry)) is not None:
                 share[opacity == 0] = 0.0
             yield Layer(index, part, share, geometry)

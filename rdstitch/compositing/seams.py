@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.compositing.exposure import Exposure, full_scale
+from rdstitch.compositing.lattice import Box, Float32Array
 from rdstitch.compositing.survey import Survey, SurveyTile
-from rdstitch.compositing.warp import Box, Float32Array
+from rdstitch.compositing.warp import locate
 from rdstitch.io.reduction import block_mean
 
 NOBODY = -1
@@ -106,7 +107,7 @@ def find_seams(
             if composite is None:
                 won = tile.inside & (tile.weight > weights[cut])
             else:
-                corrected = exposure.correct(index, survey.warps[index], tile.box, tile.pixels)
+                corrected = exposure.correct(index, locate(survey.warps[index], tile.box), tile.pixels)
                 pixels = corrected * np.float32(1.0 / full_scale(corrected.dtype))
                 won = _cut(tile, pixels, composite[cut], labels[cut] != NOBODY, weights[cut])
                 composite[cut][won] = pixels[won]

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.compositing.canvas import Canvas
+from rdstitch.compositing.lattice import Box, Float32Array
 from rdstitch.compositing.pictures import PictureReader
 from rdstitch.compositing.warp import (
-    Box,
-    Float32Array,
     Warp,
     border_weight,
     locate,
@@ -104,11 +103,11 @@ def _survey_tile(reader: PictureReader, index: int, warp: Warp) -> SurveyTile | 
     """One picture, small."""
     geometry = locate(warp, warp.box)
     picture = reader.prepared(index, warp.shrink)
-    inside, weight = geometry.inside, border_weight(warp, geometry)
-    opacity = sample_opacity(warp, picture, geometry)
+    inside, weight = geometry.inside, border_weight(geometry)
+    opacity = sample_opacity(picture, geometry)
     if opacity is not None:
         inside, weight = inside & (opacity > 0), weight * opacity
     if not inside.any():
         return None
-    pixels = sample(warp, picture, geometry, "linear")
+    pixels = sample(picture, geometry, "linear")
     return SurveyTile(warp.box, pixels.reshape(*inside.shape, -1), inside, weight)

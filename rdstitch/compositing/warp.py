@@ -1,8 +1,8 @@
 """One resampling from the original: canvas px → plane → undistorted → measured px of one picture."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -11,19 +11,15 @@ from numpy.typing import NDArray
 
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.compositing.canvas import Canvas
+from rdstitch.compositing.lattice import LATTICE_STEPS, Box, Float32Array, Lattice
 from rdstitch.compositing.pictures import KERNEL_MARGIN, LoadedPicture, Part
 from rdstitch.radial_homography import to_plane
-
-Box = tuple[int, int, int, int]
-Float32Array = NDArray[np.float32]
 
 INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos": cv2.INTER_LANCZOS4}
 
 # Coordinates are computed on a lattice of the canvas and interpolated linearly, to this many px of the picture.
 # OpenCV rounds them to 1/32 px afterwards.
 _LATTICE_ERROR = 0.01
-_LATTICE_STEPS = (32, 16, 8, 4, 2)
-_NOWHERE = np.float32(-1e6)
 # OpenCV resamples from no side as long as this, px.
 _TOO_LONG = 32767
 _PROBES = 16
@@ -62,49 +58,64 @@ class Warp:
         v = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) / z
         return self.camera.distort(self.camera.denormalize(np.stack([u, v], axis=-1)))
 
-    def maps(self, box: Box) -> tuple[Float32Array, Float32Array]:
-        """Measured px of every canvas px of ``box``: two arrays (h, w), far outside where there are none.
-
-        The lattice is anchored to the canvas, so that every box gives the same coordinates, bit for bit.
-        """
-        return lattice_maps(self.source_points, box, self.step)
-
     def contains(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
         """Which measured px lie in the picture; NaN does not."""
         width, height = self.camera.image_size
         return (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
 
-    def fills(self, box: Box) -> bool:
-        """Whether the picture is on all of a box, beyond doubt: it holds all nodes of the lattice, with half a px."""
-        points = self.source_points(*lattice_nodes(box, self.step))
-        limit = np.array(self.camera.image_size) - 1.0
-        return bool(((points >= 0.0) & (points <= limit)).all())
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Geometry:
-    """Where the px of one box of the canvas come from in one picture.
+    """Where the px of one box of the canvas come from in one picture; computed when it is asked for.
 
     Attributes
     ----------
+    warp : Warp
     box : (int, int, int, int)
         x0, y0, x1, y1 on the canvas, px, end exclusive; it may reach beyond the canvas.
-    map_x, map_y : ndarray of shape (h, w), float32
-        Px of the picture as measured.
-    inside : ndarray of shape (h, w), bool
-        Where they lie in the picture.
+    lattice : Lattice
+        Of this box or of a larger one.
     """
 
+    warp: Warp
     box: Box
-    map_x: Float32Array
-    map_y: Float32Array
-    inside: NDArray[np.bool_]
+    lattice: Lattice
 
-    def part(self, box: Box) -> "Geometry":
-        """The same for a box within this one."""
-        x0, y0, x1, y1 = box
-        cut = np.s_[y0 - self.box[1] : y1 - self.box[1], x0 - self.box[0] : x1 - self.box[0]]
-        return Geometry(box, self.map_x[cut], self.map_y[cut], self.inside[cut])
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of the box."""
+        return self.box[3] - self.box[1], self.box[2] - self.box[0]
+
+    @cached_property
+    def maps(self) -> tuple[Float32Array, Float32Array]:
+        """Measured px x and y, (h, w) each, far outside where there are none."""
+        return self.lattice.maps(self.box)
+
+    @cached_property
+    def filled(self) -> bool:
+        """Whether the picture is on all of the box, beyond doubt: it holds all nodes of the lattice, with half a px."""
+        points = self.lattice.nodes(self.box, self.lattice.step)
+        limit = np.array(self.warp.camera.image_size, dtype=np.float32) - 1
+        return bool((points >= 0).all() and (points <= limit).all())
+
+    @cached_property
+    def inside(self) -> NDArray[np.bool_]:
+        """Which px (h, w) lie in the picture."""
+        return np.ones(self.shape, dtype=np.bool_) if self.filled else self.warp.contains(*self.maps)
+
+    def on(self, box: Box) -> "Geometry":
+        """The same for another box; what is known of that already is not computed again."""
+        if not self.lattice.covers(box):
+            return locate(self.warp, box)
+        other, known = Geometry(self.warp, box, self.lattice), vars(self)
+        if intersection(self.box, box) == box:
+            x0, y0, x1, y1 = box
+            cut = np.s_[y0 - self.box[1] : y1 - self.box[1], x0 - self.box[0] : x1 - self.box[0]]
+            if "maps" in known:
+                vars(other)["maps"] = self.maps[0][cut], self.maps[1][cut]
+            if "inside" in known:
+                vars(other)["inside"] = self.inside[cut]
+        return other
 
 
 def plan_warp(camera: Camera, homography: FloatArray, canvas: Canvas, index: int) -> Warp:
@@ -123,26 +134,24 @@ def plan_warp(camera: Camera, homography: FloatArray, canvas: Canvas, index: int
 
 def locate(warp: Warp, box: Box) -> Geometry:
     """Where the px of a box come from, and which of them lie in the picture."""
-    map_x, map_y = warp.maps(box)
-    inside = np.ones(map_x.shape, dtype=np.bool_) if warp.fills(box) else warp.contains(map_x, map_y)
-    return Geometry(box, map_x, map_y, inside)
+    return Geometry(warp, box, Lattice.over(box, warp.step, warp.source_points))
 
 
-def read_part(warp: Warp, geometry: Geometry) -> Part:
+def read_part(geometry: Geometry) -> Part:
     """The part of the picture that :func:`sample` takes px from."""
-    width, height = warp.camera.image_size
-    left, right = _mirrored_extent(geometry.map_x, width)
-    top, bottom = _mirrored_extent(geometry.map_y, height)
+    (map_x, map_y), (width, height) = geometry.maps, geometry.warp.camera.image_size
+    left, right = _mirrored_extent(map_x, width)
+    top, bottom = _mirrored_extent(map_y, height)
     return left, top, right, bottom
 
 
-def border_weight(warp: Warp, geometry: Geometry) -> Float32Array:
+def border_weight(geometry: Geometry) -> Float32Array:
     """1 at the picture's centre, falling to 0 at its border (measured in the picture) and outside."""
-    width, height = warp.camera.image_size
+    (map_x, map_y), (width, height) = geometry.maps, geometry.warp.camera.image_size
     one, half = np.float32(1.0), np.float32(0.5)
-    weight: Float32Array = (geometry.map_x + half) * np.float32(2.0 / width) - one
+    weight: Float32Array = (map_x + half) * np.float32(2.0 / width) - one
     weight = one - np.abs(weight, out=weight)
-    down = (geometry.map_y + half) * np.float32(2.0 / height) - one
+    down = (map_y + half) * np.float32(2.0 / height) - one
     weight *= one - np.abs(down, out=down)
     # Never 0 inside: a border px that one picture alone covers must not get lost.
     np.maximum(weight, _LEAST_WEIGHT, out=weight)
@@ -150,14 +159,13 @@ def border_weight(warp: Warp, geometry: Geometry) -> Float32Array:
     return weight
 
 
-def sample(warp: Warp, picture: LoadedPicture, geometry: Geometry, interpolation: str = "cubic") -> NDArray[Any]:
+def sample(picture: LoadedPicture, geometry: Geometry, interpolation: str = "cubic") -> NDArray[Any]:
     """Resample a picture; content is mirrored outside of it, so that filters find no edge there.
 
     Parameters
     ----------
-    warp : Warp
     picture : LoadedPicture
-        Prepared for ``warp.shrink``; it holds what :func:`read_part` says.
+        Prepared for ``geometry.warp.shrink``; it holds what :func:`read_part` says.
     geometry : Geometry
         From :func:`locate`.
     interpolation : str
@@ -168,15 +176,15 @@ def sample(warp: Warp, picture: LoadedPicture, geometry: Geometry, interpolation
     ndarray of shape (h, w) or (h, w, C)
         In the picture's sample type.
     """
-    map_x, map_y = _mirrored(warp, picture, geometry)
+    map_x, map_y = _mirrored(picture, geometry)
     return _remap_from(picture.pixels, picture.origin, map_x, map_y, INTERPOLATION[interpolation])
 
 
-def sample_opacity(warp: Warp, picture: LoadedPicture, geometry: Geometry) -> Float32Array | None:
+def sample_opacity(picture: LoadedPicture, geometry: Geometry) -> Float32Array | None:
     """Opacity (h, w), 0 where the picture is masked out; None for a picture without a mask."""
     if picture.opacity is None:
         return None
-    map_x, map_y = _mirrored(warp, picture, geometry)
+    map_x, map_y = _mirrored(picture, geometry)
     opacity = _remap_from(picture.opacity, picture.origin, map_x, map_y, cv2.INTER_LINEAR)
     # The outer half of the last opaque px is outside.
     return np.where(opacity >= 0.5 * picture.opacity_step, opacity, 0.0).astype(np.float32)
@@ -193,12 +201,12 @@ def intersection(first: Box, second: Box) -> Box | None:
     return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
 
 
-def _mirrored(warp: Warp, picture: LoadedPicture, geometry: Geometry) -> tuple[Float32Array, Float32Array]:
+def _mirrored(picture: LoadedPicture, geometry: Geometry) -> tuple[Float32Array, Float32Array]:
     """Px of the (reduced) picture, all inside it."""
-    map_x, map_y = geometry.map_x, geometry.map_y
+    map_x, map_y = geometry.maps
     if not geometry.inside.all():
         # Mirroring rounds: what is inside keeps its coordinates, whatever else the box holds.
-        mirrored = [_mirror(m, n) for m, n in zip((map_x, map_y), warp.camera.image_size, strict=True)]
+        mirrored = [_mirror(m, n) for m, n in zip((map_x, map_y), geometry.warp.camera.image_size, strict=True)]
         for values, own in zip(mirrored, (map_x, map_y), strict=True):
             np.copyto(values, own, where=geometry.inside)
         map_x, map_y = mirrored
@@ -257,45 +265,6 @@ def _reduce(values: Float32Array, reduction: int) -> Float32Array:
     return (values + np.float32(0.5)) / np.float32(reduction) - np.float32(0.5)
 
 
-def lattice_nodes(box: Box, step: int) -> tuple[FloatArray, FloatArray]:
-    """Canvas px x (1, n) and y (m, 1) of the lattice nodes that enclose a box."""
-    x, y = (
-        np.arange(start // step, -(-(stop - 1) // step) + 2, dtype=np.float64) * step
-        for start, stop in ((box[0], box[2]), (box[1], box[3]))
-    )
-    return x[None, :], y[:, None]
-
-
-def interpolate_lattice(nodes: Float32Array, box: Box, step: int) -> Float32Array:
-    """Linear interpolation of node values (m, n) to the px (h, w) of the box that they enclose.
-
-    Every value depends on its four nodes alone, bit for bit, whatever the box.
-    """
-    x0, y0, x1, y1 = box
-    left, top = x0 % step, y0 % step
-    share = np.arange(step, dtype=np.float32) / np.float32(step)
-    columns = np.empty((len(nodes), (nodes.shape[1] - 1) * step), dtype=np.float32)
-    rise = nodes[:, 1:] - nodes[:, :-1]
-    for k in range(step):
-        columns[:, k::step] = nodes[:, :-1] + rise * share[k]
-    columns = columns[:, left : left + x1 - x0]
-    values: Float32Array = (columns[1:] - columns[:-1])[:, None, :] * share[:, None]
-    values += columns[:-1, None, :]
-    return np.asarray(values.reshape(-1, x1 - x0)[top : top + y1 - y0])
-
-
-def lattice_maps(
-    places: Callable[[FloatArray, FloatArray], FloatArray], box: Box, step: int
-) -> tuple[Float32Array, Float32Array]:
-    """What maps x (1, w) and y (h, 1) to px (h, w, 2) of a picture, computed on the lattice and interpolated.
-
-    Returns two arrays (h, w), far outside of any picture where there are no px.
-    """
-    nodes = places(*lattice_nodes(box, step)).astype(np.float32)
-    nodes[~np.isfinite(nodes).all(axis=-1)] = _NOWHERE
-    return interpolate_lattice(nodes[..., 0], box, step), interpolate_lattice(nodes[..., 1], box, step)
-
-
 def _probes(camera: Camera, to_canvas: FloatArray, outline: FloatArray) -> FloatArray:
     """Canvas px (K, 2) spread over the picture, its outline included."""
     width, height = camera.image_size
@@ -308,7 +277,7 @@ def _lattice_step(warp: Warp, probes: FloatArray) -> int:
     corners = np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
     truth = warp.source_points(probes[:, 0], probes[:, 1])
     known = np.isfinite(truth).all(axis=1)
-    for step in _LATTICE_STEPS:
+    for step in LATTICE_STEPS[:-1]:
         around = probes[:, None] + corners * step
         reach = warp.source_points(around[..., 0], around[..., 1])
         around = probes[:, None] + corners * (step / 2)

@@ -43,7 +43,7 @@ def test_coordinates_are_exact_to_a_fiftieth(distortion: float) -> None:
     truth = warp.source_points(
         np.arange(x0, x1, dtype=np.float64)[None, :], np.arange(y0, y1, dtype=np.float64)[:, None]
     )
-    error = np.hypot(geometry.map_x - truth[..., 0], geometry.map_y - truth[..., 1])[geometry.inside]
+    error = np.hypot(geometry.maps[0] - truth[..., 0], geometry.maps[1] - truth[..., 1])[geometry.inside]
     assert np.nanmax(error) < 0.02
     if distortion == 0.0:
         assert warp.step > 4
@@ -65,8 +65,14 @@ def test_a_box_anywhere_gives_the_same_coordinates() -> None:
     warp = plan_warp(lens, np.eye(3), canvas, 0)
     whole = locate(warp, (-40, -40, 700, 600))
     part = locate(warp, (33, 57, 201, 190))
-    np.testing.assert_array_equal(part.map_x, whole.part(part.box).map_x)
-    np.testing.assert_array_equal(part.map_y, whole.part(part.box).map_y)
+    cut = whole.on(part.box)
+    np.testing.assert_array_equal(part.maps, cut.maps)
+    np.testing.assert_array_equal(part.inside, whole.inside[97:230, 73:241])
+    np.testing.assert_array_equal(part.maps, [axis[97:230, 73:241] for axis in whole.maps])
+    np.testing.assert_array_equal(whole.on(part.box).maps, part.maps)
+    assert cut.lattice is whole.lattice
+    beyond = part.on((0, 0, 300, 200))
+    np.testing.assert_array_equal(beyond.maps, whole.on(beyond.box).maps)
 
 
 def test_coverage_ends_half_a_pixel_outside() -> None:
@@ -139,6 +145,6 @@ def test_sampling_a_reduced_picture_is_centred() -> None:
     warp = plan_warp(lens, np.eye(3), canvas, 0)
     picture = prepare_picture(as_picture(ramp), warp.shrink)
     assert picture.reduction == 3
-    values = sample(warp, picture, locate(warp, (0, 0, *canvas.size)))
+    values = sample(picture, locate(warp, (0, 0, *canvas.size)))
     # The middle of six px; the Gaussian leaves a ramp alone, away from its ends.
     np.testing.assert_allclose(values[5, 5:-5], 6 * np.arange(60)[5:-5] + 2.5, atol=0.05)
