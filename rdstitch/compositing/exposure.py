@@ -41,7 +41,7 @@ _ROUNDS = 6
 _WORTHWHILE = 0.02
 # The correction is smooth: it is computed at this spacing, canvas px, and interpolated.
 _LATTICE = LATTICE_STEPS[0]
-_ROWS = 64  # that are corrected at a time
+_ROWS = 128  # that are corrected at a time
 _DEPTHS = {"uint8": cv2.CV_8U, "uint16": cv2.CV_16U, "float32": cv2.CV_32F}
 
 

@@ -53,11 +53,12 @@ def _encoded(layout: Layout, samples: NDArray[np.generic], alpha: NDArray[np.uin
 
 
 def _on_background(picture: NDArray[np.uint8], alpha: NDArray[np.uint8], background: int) -> NDArray[np.uint8]:
-    """A picture (h, w) or (h, w, 3), grey where alpha is 0; three times as fast as an index by alpha."""
+    """A picture (h, w) or (h, w, 3), grey where alpha is 0."""
     shown = cv2.bitwise_and(picture, picture, mask=alpha)
     if background:
+        outside = (alpha == 0).view(np.uint8)
         # The stubs know no scalars.
-        shown = cv2.add(shown, (background,) * 3, mask=(alpha == 0).view(np.uint8))  # type: ignore[call-overload]
+        cv2.add(shown, (background,) * 3, dst=shown, mask=outside)  # type: ignore[call-overload]
     return np.asarray(shown, dtype=np.uint8)
 
 

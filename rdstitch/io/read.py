@@ -15,6 +15,7 @@ from PIL import Image
 
 from rdstitch.errors import InputError
 from rdstitch.io.decoding import check_readable, decoding
+from rdstitch.io.jpeg_decoding import decoded_jpeg
 from rdstitch.io.metadata import Metadata, metadata_of, read_metadata
 from rdstitch.io.orientation import turned
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
@@ -27,6 +28,7 @@ _ROWS_AT_A_TIME = 128
 _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _PNG_PIXEL_CHUNKS = (b"IHDR", b"tRNS", b"IDAT", b"IEND")
+_JPEG = ("JPEG", "MPO")
 _GREY_16 = ("I;16", "I;16B", "I;16L", "I;16N", "I")
 
 
@@ -79,9 +81,9 @@ def read_image(path: str | Path, reduction: int = 1) -> Picture:
             if magic == _PNG_MAGIC and metadata.bit_depth == 16 and image.mode not in _GREY_16:
                 samples, alpha = _split(_read_16_bit_png(file))
             else:
-                rest = reduction // _decoded_smaller(image, metadata, reduction)
-                samples, alpha = _from_pillow(image)
-                return reduced(_finish(file, samples, alpha, metadata), rest)
+                factor = _decoders_share(image, metadata, reduction)
+                samples, alpha = _from_jpeg(file, image, factor) or _from_pillow(image, factor)
+                return reduced(_finish(file, samples, alpha, metadata), reduction // factor)
         return reduced(_finish(file, samples, alpha, metadata), reduction)
 
 
@@ -93,19 +95,29 @@ def reduced(picture: Picture, factor: int) -> Picture:
     return Picture(block_mean(picture.pixels, factor), alpha, picture.metadata)
 
 
-def _decoded_smaller(image: Image.Image, metadata: Metadata, reduction: int) -> int:
-    """Tell the decoder of a JPEG file to reduce the picture; the factor by which it will, 1 for none."""
+def _decoders_share(image: Image.Image, metadata: Metadata, reduction: int) -> int:
+    """By how much of a reduction the decoder can make the picture smaller; 1 for nothing."""
     factor = math.gcd(reduction, _LARGEST_DECODED_REDUCTION)
-    whole = image.size
     # Blocks begin at the stored picture's first px; in one that is to be mirrored they must end at its last.
-    if factor == 1 or min(whole) < factor or (metadata.orientation != 1 and any(n % factor for n in whole)):
-        return 1
-    image.draft(None, (whole[0] // factor, whole[1] // factor))
-    return factor if image.size == reduced_size(whole, factor) else 1
+    crosswise = metadata.orientation != 1 and any(n % factor for n in image.size)
+    return 1 if image.format not in _JPEG or min(image.size) < factor or crosswise else factor
 
 
-def _from_pillow(image: Image.Image) -> tuple[Pixels, Pixels | None]:
-    """Samples and alpha of any mode of Pillow's."""
+def _from_jpeg(file: Path, image: Image.Image, factor: int) -> tuple[Pixels, None] | None:
+    """Samples of an opened JPEG file in grey or colour; None for others, and where Pillow must say what is wrong."""
+    if image.format not in _JPEG or image.mode not in ("L", "RGB"):
+        return None
+    samples = decoded_jpeg(file, image.size, factor, grey=image.mode == "L")
+    return None if samples is None else (samples, None)
+
+
+def _from_pillow(image: Image.Image, factor: int) -> tuple[Pixels, Pixels | None]:
+    """Samples and alpha of any mode of Pillow's, by such a share of the decoder smaller."""
+    if factor > 1:
+        wanted = reduced_size(image.size, factor)
+        image.draft(None, (image.size[0] // factor, image.size[1] // factor))
+        if image.size != wanted:
+            raise ValueError(f"cannot be decoded at 1/{factor} of its size")
     if image.mode in _GREY_16:
         return _samples(image).astype(np.uint16), None
     if image.mode == "F":

@@ -21,7 +21,7 @@ from rdstitch.io.packing import digest, pack, unpack
 Value = TypeVar("Value")
 
 _FORMAT = 1
-_PACKAGES = ("rdstitch", "numpy", "scipy", "opencv-contrib-python-headless", "pillow", "tifffile")
+_PACKAGES = ("rdstitch", "numpy", "scipy", "opencv-contrib-python-headless", "pillow", "simplejpeg", "tifffile")
 
 
 @dataclass(frozen=True)
