@@ -9,7 +9,6 @@ import math
 import re
 
 import numpy as np
-from scipy.optimize import brentq
 
 from rdstitch.camera import Camera, FloatArray
 from rdstitch.camera_files.division import CameraFile, fitted_camera, own_node
@@ -77,6 +76,9 @@ def read_hugin(text: str, file: str) -> CameraFile:
 
 def hugin_project(camera: Camera) -> str:
     """A project with one image of this lens, for "load lens" or as a template."""
+    # Imported late: no other command should wait for SciPy's optimizers.
+    from scipy.optimize import brentq
+
     (width, height), unit = camera.image_size, min(camera.image_size) / 2
     found, fit = fit_polynomial(camera, unit, _POWERS)
     # The scale moves from the centre to r = 1: r = s u, where s (1 - a - b - c) = 1 and a = found / s⁴ and so on.

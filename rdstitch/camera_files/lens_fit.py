@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from rdstitch.camera import Camera, FloatArray, distort
 from rdstitch.errors import ArgumentError
@@ -89,6 +88,8 @@ def fit_division(forward: Forward, camera: Camera) -> tuple[float, LensFit]:
     farthest = float(np.einsum("ij,ij->i", flat, flat).max())
     corner = float(np.square(camera.normalize(camera.outline(1))).sum(axis=1).max())
     low, high = -_LARGEST_DISTORTION / corner, 0.25 * _LARGEST_DISTORTION / farthest
+    # Imported late: whoever converts no lens should not wait for SciPy's optimizers.
+    from scipy.optimize import minimize_scalar
 
     def cost(distortion: float) -> float:
         return float(weights @ np.square(distort(flat, distortion) - bent).sum(axis=1))

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
 from scipy.spatial import KDTree
 
 from rdstitch.camera import Camera, FloatArray
@@ -64,6 +63,9 @@ def lookalikes(features: Sequence[Features], seed: int) -> set[tuple[int, int]]:
     training = np.concatenate(
         [_describing(found)[part - start] for found, part, start in zip(features, own, starts, strict=True)]
     )
+    # Imported late: only large sets need it.
+    from scipy.cluster.vq import kmeans2
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a word that no descriptor is nearest to does no harm
         words, _ = kmeans2(training, _WORDS, iter=8, minit="points", rng=random)
