@@ -83,7 +83,7 @@ def transfer(homography: ArrayLike, distortion: ArrayLike, points: ArrayLike, di
 
 @dataclass(frozen=True)
 class TransferJacobian:
-    """Transferred points and their derivatives, for N points; all in normalized coordinates.
+    """Transferred points and their derivatives, for N points; all in normalized coordinates, and points last in memory.
 
     Attributes
     ----------
@@ -132,36 +132,49 @@ def transfer_jacobian(
         λ of picture 2, where it is another.
     """
     own_distortion = distortion if own_distortion is None else own_distortion
-    r2 = np.einsum("ni,ni->n", points, points)
-    lifted = lift(points, distortion, distortion2)
-    z = lifted @ homography.T if homography.ndim == 2 else np.einsum("nij,nj->ni", homography, lifted)
-    w = np.where(z[:, 2] > 0.0, z[:, 2], np.nan)
-    d = distort(z[:, :2] / w[:, None], own_distortion, distortion2)
+    # Coordinates first, points last: so every operation runs along the points, which are many.
+    lifted = np.ascontiguousarray(np.moveaxis(lift(points, distortion, distortion2), -1, 0))
+    r2 = (lifted[:2] ** 2).sum(axis=0)
+    each = "" if homography.ndim == 2 else "n"
+    h = np.ascontiguousarray(np.moveaxis(homography, 0, -1)) if each else homography
+    z = np.einsum(f"ij{each},jn->in", h, lifted)
+    w = np.where(z[2] > 0.0, z[2], np.nan)
+    d = np.ascontiguousarray(distort((z[:2] / w).T, own_distortion, distortion2).T)
 
-    rho2 = np.einsum("ni,ni->n", d, d)
+    rho2 = (d**2).sum(axis=0)
     g = 1.0 + own_distortion * rho2 + distortion2 * rho2**2
     alpha = (2.0 * own_distortion + 4.0 * distortion2 * rho2) / g
     stretch = 1.0 - alpha * rho2
     # d by z: that by u, over w, for the first two; and -u / w, of which "d by u" makes -d / (stretch w), for the third.
     scale = g / w
-    d_by_z = np.empty((len(points), 2, 3))
-    d_by_z[:, :, :2] = (d * (scale * alpha / stretch)[:, None])[:, :, None] * d[:, None, :]
-    d_by_z[:, 0, 0] += scale
-    d_by_z[:, 1, 1] += scale
-    d_by_z[:, :, 2] = d * (-1.0 / (stretch * w))[:, None]
-    by_homography = (d_by_z[:, :, :, None] * lifted[:, None, None, :]).reshape(-1, 2, 9)
+    d_by_z = np.empty((2, 3, len(points)))
+    np.multiply((d * (scale * alpha / stretch))[:, None], d, out=d_by_z[:, :2])
+    d_by_z[0, 0] += scale
+    d_by_z[1, 1] += scale
+    np.multiply(d, -1.0 / (stretch * w), out=d_by_z[:, 2])
+    by_homography = (d_by_z[:, :, None] * lifted).reshape(2, 9, -1)
 
-    by_lifted = d_by_z @ homography
-    along_third = by_lifted[:, :, 2]
-    slope = points * (2.0 * distortion + 4.0 * distortion2 * r2)[:, None]
-    by_point = by_lifted[:, :, :2] + along_third[:, :, None] * slope[:, None, :]
+    by_lifted = np.einsum(f"ikn,kj{each}->ijn", d_by_z, h)
+    along_third = by_lifted[:, 2]
+    slope = lifted[:2] * (2.0 * distortion + 4.0 * distortion2 * r2)
+    by_point = by_lifted[:, :2] + along_third[:, None] * slope
 
-    own = d * (rho2 / (g * stretch))[:, None]
-    by_lens = np.empty((len(points), 2, 4))
-    by_lens[:, :, 0] = along_third * r2[:, None] + own
-    by_lens[:, :, 1] = along_third * (r2**2)[:, None] + own * rho2[:, None]
-    by_lens[:, :, 2:] = np.eye(2) - by_point
-    return TransferJacobian(d, by_homography, by_lens, own, by_point)
+    own = d * (rho2 / (g * stretch))
+    by_lens = np.empty((2, 4, len(points)))
+    by_lens[:, 0] = along_third * r2 + own
+    by_lens[:, 1] = along_third * r2**2 + own * rho2
+    by_lens[:, 2:] = np.eye(2)[:, :, None] - by_point
+    return TransferJacobian(*(np.moveaxis(found, -1, 0) for found in (d, by_homography, by_lens, own, by_point)))
+
+
+def side_by_side(*derivatives: FloatArray) -> FloatArray:
+    """Derivatives (N, 2, K) by several things as those by all of them, with the points last in memory."""
+    return np.moveaxis(np.concatenate([np.moveaxis(part, 0, -1) for part in derivatives], axis=1), -1, 0)
+
+
+def points_last(values: FloatArray) -> FloatArray:
+    """Values (N, 2, K) as contiguous (2, K, N): no copy of what was made in that order."""
+    return np.ascontiguousarray(np.moveaxis(values, 0, -1))
 
 
 def measurement_whitening(by_point: FloatArray) -> FloatArray:

@@ -15,7 +15,15 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from rdstitch.camera import FloatArray, distort
-from rdstitch.radial_homography import lift, measurement_whitening, project, transfer_jacobian, whiten
+from rdstitch.radial_homography import (
+    lift,
+    measurement_whitening,
+    points_last,
+    project,
+    side_by_side,
+    transfer_jacobian,
+    whiten,
+)
 from rdstitch.registration.models import BoolArray, ModelMatrices, inverses
 from rdstitch.registration.observations import Observations
 
@@ -86,10 +94,11 @@ def link_equations(
         jacobian *= root[:, None, None]
         error *= root[:, None]
         edges = observations.start[first : last + 1] - observations.start[first]
+        columns = points_last(jacobian)
         for link, (a, b) in enumerate(itertools.pairwise(edges), start=first):
-            own = jacobian[a:b].reshape(-1, 13)
-            gram[link] = own.T @ own
-            gradient[link] = own.T @ error[a:b].reshape(-1)
+            across, down = columns[:, :, a:b]
+            gram[link] = across @ across.T + down @ down.T
+            gradient[link] = across @ error[a:b, 0] + down @ error[a:b, 1]
     return LinkEquations(gram, gradient, squared, whitening)
 
 
@@ -138,7 +147,7 @@ def _whitened(
     homography = np.repeat(homographies[first:last], counts, axis=0)
     result = transfer_jacobian(homography, float(lens[0]), observations.points1[rows] - lens[2:], float(lens[1]))
     whitening = measurement_whitening(result.by_point * (scale2 / scale1)) * scale2
-    jacobian = np.concatenate([result.by_homography, result.by_lens], axis=2)
+    jacobian = side_by_side(result.by_homography, result.by_lens)
     error = result.points - (observations.points2[rows] - lens[2:])
     return whiten(whitening, jacobian), whiten(whitening, error[:, :, None])[:, :, 0], whitening
 

@@ -12,7 +12,14 @@ from typing import TypeVar
 import numpy as np
 
 from rdstitch.camera import FloatArray
-from rdstitch.radial_homography import TransferJacobian, measurement_whitening, transfer_jacobian, whiten
+from rdstitch.radial_homography import (
+    TransferJacobian,
+    measurement_whitening,
+    points_last,
+    side_by_side,
+    transfer_jacobian,
+    whiten,
+)
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import PairModel
 
@@ -178,7 +185,7 @@ def _linearize(
     if len(prior):
         by_prior = np.hstack([np.zeros((len(prior), lens.shape[2])), by_prior])
     return linearized(
-        transfer, np.concatenate([lens, transfer.by_homography], axis=2), chain, (prior, by_prior), data, scale, noise
+        transfer, side_by_side(lens, transfer.by_homography), chain, (prior, by_prior), data, scale, noise
     )
 
 
@@ -220,9 +227,10 @@ def linearized(
     # The normal matrix is formed by the entries of H, whatever the model, and only then by the model's parameters.
     columns = whiten(whitening * (data.px * relative)[:, None, None], columns)
     columns[lost] = 0.0
-    flat = columns.reshape(-1, columns.shape[2])
-    information = chain.T @ (flat.T @ flat) @ chain
-    influence = np.einsum("nip,ni->np", columns, residuals * relative[:, None]) @ chain
+    across, down = points_last(columns)
+    information = chain.T @ (across @ across.T + down @ down.T) @ chain
+    weighted = residuals * relative[:, None]
+    influence = (across * weighted[:, 0] + down * weighted[:, 1]).T @ chain
     gradient = influence.sum(axis=0)
     cost = float(errors2 @ relative) + scale**2 * int(lost.sum())
     residual, by_parameters = prior

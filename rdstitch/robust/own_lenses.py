@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from rdstitch.camera import FloatArray
-from rdstitch.radial_homography import LENS_STD, RadialHomography, transfer_jacobian
+from rdstitch.radial_homography import LENS_STD, RadialHomography, side_by_side, transfer_jacobian
 from rdstitch.robust.local_optimization import LARGEST_BEND, Linearized, descend, linearized
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyModel
@@ -74,9 +74,8 @@ def _linearize(state: _State, data: Measurements, scale: float, noise: float) ->
     (first, second, mu), center = lens[:3].tolist(), lens[3:]
     transfer = transfer_jacobian(_HOMOGRAPHY.homography(homography), first, data.x1 - center, mu, own_distortion=second)
     own = transfer.by_own_distortion[:, :, None]
-    columns = np.concatenate(
-        [transfer.by_lens[:, :, :1] - own, own, transfer.by_lens[:, :, 1:], transfer.by_homography], axis=2
-    )
+    lenses = transfer.by_lens
+    columns = side_by_side(lenses[:, :, :1] - own, own, lenses[:, :, 1:], transfer.by_homography)
     chain = np.zeros((_LENS + 9, _LENS + 8))
     chain[:_LENS, :_LENS] = np.eye(_LENS)
     chain[_LENS:, _LENS:] = _HOMOGRAPHY.jacobian(homography)
