@@ -133,10 +133,10 @@ def transfer_jacobian(
     """
     own_distortion = distortion if own_distortion is None else own_distortion
     # Coordinates first, points last: so every operation runs along the points, which are many.
-    lifted = np.ascontiguousarray(np.moveaxis(lift(points, distortion, distortion2), -1, 0))
+    lifted = np.ascontiguousarray(lift(points, distortion, distortion2).T)
     r2 = (lifted[:2] ** 2).sum(axis=0)
     each = "" if homography.ndim == 2 else "n"
-    h = np.ascontiguousarray(np.moveaxis(homography, 0, -1)) if each else homography
+    h = np.ascontiguousarray(homography.transpose(1, 2, 0)) if each else homography
     z = np.einsum(f"ij{each},jn->in", h, lifted)
     w = np.where(z[2] > 0.0, z[2], np.nan)
     d = np.ascontiguousarray(distort((z[:2] / w).T, own_distortion, distortion2).T)
@@ -164,17 +164,18 @@ def transfer_jacobian(
     by_lens[:, 0] = along_third * r2 + own
     by_lens[:, 1] = along_third * r2**2 + own * rho2
     by_lens[:, 2:] = np.eye(2)[:, :, None] - by_point
-    return TransferJacobian(*(np.moveaxis(found, -1, 0) for found in (d, by_homography, by_lens, own, by_point)))
+    by_homography, by_lens, by_point = (found.transpose(2, 0, 1) for found in (by_homography, by_lens, by_point))
+    return TransferJacobian(d.T, by_homography, by_lens, own.T, by_point)
 
 
 def side_by_side(*derivatives: FloatArray) -> FloatArray:
     """Derivatives (N, 2, K) by several things as those by all of them, with the points last in memory."""
-    return np.moveaxis(np.concatenate([np.moveaxis(part, 0, -1) for part in derivatives], axis=1), -1, 0)
+    return np.concatenate([part.transpose(1, 2, 0) for part in derivatives], axis=1).transpose(2, 0, 1)
 
 
 def points_last(values: FloatArray) -> FloatArray:
     """Values (N, 2, K) as contiguous (2, K, N): no copy of what was made in that order."""
-    return np.ascontiguousarray(np.moveaxis(values, 0, -1))
+    return np.ascontiguousarray(values.transpose(1, 2, 0))
 
 
 def measurement_whitening(by_point: FloatArray) -> FloatArray:
