@@ -75,5 +75,5 @@ def _around(features: Features, size: tuple[int, int], points: FloatArray, reach
 
 def _distances(points: FloatArray, others: FloatArray, size: tuple[int, int]) -> FloatArray:
     """Between all points (N, 2) and all others (M, 2), diagonals of the picture, (N, M)."""
-    x, y = (points[:, None, k] - others[:, k] for k in (0, 1))
-    return np.asarray(np.hypot(x, y) / np.hypot(*size))
+    x, y = ((points[:, None, k] - others[:, k]) / np.hypot(*size) for k in (0, 1))
+    return np.sqrt(x**2 + y**2)
