@@ -75,5 +75,7 @@ def _around(features: Features, size: tuple[int, int], points: FloatArray, reach
 
 def _distances(points: FloatArray, others: FloatArray, size: tuple[int, int]) -> FloatArray:
     """Between all points (N, 2) and all others (M, 2), diagonals of the picture, (N, M)."""
-    x, y = ((points[:, None, k] - others[:, k]) / np.hypot(*size) for k in (0, 1))
-    return np.sqrt(x**2 + y**2)
+    first, second = ((values / np.hypot(*size)).T for values in (points, others))
+    squared: FloatArray = (first[0, :, None] - second[0]) ** 2
+    squared += (first[1, :, None] - second[1]) ** 2
+    return np.sqrt(squared, out=squared)
