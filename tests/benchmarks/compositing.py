@@ -2,8 +2,9 @@
 
 mosaic
     12 rendered colour pictures of 11 Mpx, as JPEG files: rdstitch's compositing alone with the true homographies, the
-    whole of ``rdstitch mosaic``, and OpenCV's Stitcher in SCANS mode, each a process of its own with one picture after
-    the other. Printed are processor and wall time, their ratio to OpenCV's, and peak memory.
+    whole of ``rdstitch mosaic``, OpenCV's Stitcher in SCANS mode and, where it is installed beside ``--peer-python``,
+    ``stitch --affine`` of the package stitching, each a process of its own, with output as ``.jpg`` and as ``.tif``.
+    Printed are processor and wall time, their ratio to those of SCANS for the same format, and peak memory.
 gigapixel
     Mosaics of pictures that are made on the fly, a quarter of ``--megapixels`` and all of it: time per output px,
     peak memory, and what tifffile sees in the file.
@@ -128,22 +129,32 @@ def opencv_scans(python: str, paths: list[Path], output: Path) -> str:
     return done.stdout or f"fails: {done.stderr.strip().splitlines()[-1]}"
 
 
+def stitch_affine(command: Path, paths: list[Path], output: Path) -> str:
+    """The command of the package stitching."""
+    names = [str(command), "--affine", *map(str, paths), "--output", str(output)]
+    done = subprocess.run(names, capture_output=True, text=True, check=False)
+    return "" if done.returncode == 0 else f"fails: {done.stderr.strip().splitlines()[-1]}"
+
+
 def section_mosaic(peer_python: str) -> None:
     """12 pictures of 11 Mpx."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         homographies = render(folder)
         paths = sorted(folder.glob("*.jpg"))
-        peer = measured(opencv_scans, peer_python, paths, folder / "opencv.tif")
-        ours = measured(composite_files, paths, homographies, folder / "composite.tif")
-        print(f"12 pictures of {LENS.image_size[0]} x {LENS.image_size[1]}, output {ours.result[0]} x {ours.result[1]}")
+        print(f"12 pictures of {LENS.image_size[0]} x {LENS.image_size[1]}")
         print(HEAD)
-        print(peer.row("OpenCV Stitcher, SCANS"), peer.result)
-        print(ours.row("rdstitch, compositing to .tif", peer))
-        jpeg = measured(composite_files, paths, homographies, folder / "composite.jpg")
-        print(jpeg.row("rdstitch, compositing to .jpg", peer))
-        whole = measured(whole_run, paths, folder / "mosaic.jpg")
-        print(whole.row("rdstitch mosaic, the whole, .jpg", peer), whole.result)
+        stitching = Path(peer_python).with_name("stitch")
+        for kind in (".jpg", ".tif"):
+            peer = measured(opencv_scans, peer_python, paths, folder / f"opencv{kind}")
+            print(peer.row(f"OpenCV Stitcher, SCANS, {kind}", peer), peer.result)
+            if stitching.exists():
+                other = measured(stitch_affine, stitching, paths, folder / f"stitching{kind}")
+                print(other.row(f"stitch --affine, {kind}", peer), other.result)
+            whole = measured(whole_run, paths, folder / f"mosaic{kind}")
+            print(whole.row(f"rdstitch mosaic, {kind}", peer), whole.result)
+            ours = measured(composite_files, paths, homographies, folder / f"composite{kind}")
+            print(ours.row(f"rdstitch, compositing alone, {kind}", peer), "{} x {} px".format(*ours.result))
 
 
 def made_frame(index: int, tile: NDArray[np.uint8]) -> Picture:
