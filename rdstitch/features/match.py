@@ -17,7 +17,7 @@ Matcher = Callable[[Features, Features], Correspondences]
 """What matches the features of two pictures: :func:`match`, or a network's."""
 
 _DEFAULT_RATIO = 0.85
-_BLOCK_BYTES = 2**21  # two threads have room for it in the caches; smaller ones repeat more of the products' preparation
+_BLOCK_BYTES = 2**21  # two threads have room for it in the caches; the products of smaller ones take longer
 
 
 def match(
