@@ -8,6 +8,7 @@ from rdstitch.camera import FloatArray
 from rdstitch.robust.local_optimization import Linearized, Refined, refine
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyModel, PairModel
+from rdstitch.robust.verification import numbered_cells
 
 _LEAST_NOISE = 0.02  # px; below, noise-free data would reject every model over rounding
 _RAYLEIGH_MEDIAN = 1.1774  # median length of a two-dimensional normal vector of standard deviation 1
@@ -139,7 +140,7 @@ def covariance_of(fit: Refined | Linearized, noise: float, data: Measurements) -
         return np.full((size, size), np.inf)
     # In the basis where noise² A⁻¹ is the identity, the larger of the two is a matter of eigenvalues.
     root = (vectors / np.sqrt(values)) / scale[:, None]
-    cells = np.unique(np.floor(data.x1 * _CELLS_PER_HALF_DIAGONAL), axis=0, return_inverse=True)[1].ravel()
+    cells = np.unique(numbered_cells(data.x1 * _CELLS_PER_HALF_DIAGONAL), return_inverse=True)[1]
     influence = np.zeros((int(cells.max()) + 1, size))
     np.add.at(influence, cells, fit.influence @ root)
     spread, directions = np.linalg.eigh(influence.T @ influence / noise**2)

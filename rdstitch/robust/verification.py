@@ -7,6 +7,7 @@ from scipy.special import betainc
 from rdstitch.camera import FloatArray
 
 _CELLS_PER_DIAGONAL = 32
+_CELLS_APART = 2.0**20
 LEAST_PLACES = 8
 _LARGEST_CHANCE = 1e-4
 
@@ -14,7 +15,14 @@ _LARGEST_CHANCE = 1e-4
 def places(points1: FloatArray, points2: FloatArray, image_size: tuple[int, int]) -> int:
     """In how many different places of the pictures correspondences (N, 2), px, lie: cells of a grid, in the lesser."""
     cell = float(np.hypot(*image_size)) / _CELLS_PER_DIAGONAL
-    return min(len(np.unique(np.floor(points / cell), axis=0)) for points in (points1, points2))
+    return min(len(np.unique(numbered_cells(points / cell))) for points in (points1, points2))
+
+
+def numbered_cells(points: FloatArray) -> FloatArray:
+    """A number for the cell of the unit grid that each point (N, 2) lies in, of points within half a million cells."""
+    column, row = np.floor(points).T
+    numbers: FloatArray = column * _CELLS_APART + row
+    return numbers
 
 
 def doubts(
