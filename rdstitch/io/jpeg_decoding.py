@@ -13,7 +13,7 @@ from rdstitch.io.reduction import reduced_size
 def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) -> NDArray[Any] | None:
     """Samples (h, w) or (h, w, 3) in RGB order as stored, not turned upright.
 
-    What Pillow would decode, bit for bit, in less time and half the memory. It has the last word on files about which
+    What Pillow would decode, bit for bit, in less time and memory. Pillow has the last word on files about which
     the decoder has any complaint.
 
     Parameters

@@ -120,6 +120,7 @@ def calibrate(
         _check_outputs(None, options, paths)
         registration = _register_all(paths, options, progress)
         verdict = _accept(registration, options, lens_only=True)
+    _put_away(registration)
     _save_camera(registration, options)
     return _warned(registration, verdict.complaints)
 
@@ -163,6 +164,7 @@ def trajectory(
         check_distinct(files)
         registration = _register_all(paths, options, progress, metric=True)
         verdict = _accept(registration, options)
+    _put_away(registration)
     registration = _warned(registration, (*verdict.complaints, *_unsure_of_lengths(registration.alignment)))
     path = Trajectory.from_alignment(registration.alignment, height)
     if output is not None:
@@ -229,6 +231,7 @@ def _composite(
         overwrite=options.overwrite,
         dry_run=options.dry_run,
     )
+    _put_away(registration)
     result = StitchResult(
         registration,
         composed.canvas,
@@ -255,6 +258,12 @@ def _accept(registration: Registration, options: StitchOptions, *, lens_only: bo
     if options.strict and registration.left_out:
         raise PartialResultError("; ".join(f"left out {m.path}: {m.reason}" for m in registration.left_out))
     return verdict
+
+
+def _put_away(registration: Registration) -> None:
+    """Let go of pictures that were kept for stages that will not come."""
+    for source in registration.sources:
+        source.shelf.clear()
 
 
 def _warned(registration: Registration, complaints: Iterable[str]) -> Registration:

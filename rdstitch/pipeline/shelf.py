@@ -39,6 +39,12 @@ class Shelf:
                 self._room += _bytes(picture)
             return picture
 
+    def clear(self) -> None:
+        """Let go of all that is left."""
+        with self._lock:
+            self._room += sum(map(_bytes, self._held.values()))
+            self._held.clear()
+
 
 NO_SHELF = Shelf(room=0)
 """Keeps nothing."""

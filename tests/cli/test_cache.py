@@ -48,7 +48,7 @@ def work(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         monkeypatch.setattr(module, name, wrapped)
 
     # The package has a function of the module's name.
-    watch(import_module("rdstitch.features.detect"), "detect")
+    watch(import_module("rdstitch.features.detect"), "_detect")
     watch(pairs, "estimate_radial_homography")
     watch(register, "align")
     watch(overlap_check, "overlap_agreement")
@@ -60,7 +60,7 @@ def test_only_what_depends_on_a_changed_option_is_done_again(
 ) -> None:
     output = tmp_path / "out.png"
     arguments = ("mosaic", *frames, "-o", output, "--overwrite", "--cache", tmp_path / "new" / "cache", *FAST)
-    for expected in ({"detect", "estimate_radial_homography", "align", "overlap_agreement"}, set()):
+    for expected in ({"_detect", "estimate_radial_homography", "align", "overlap_agreement"}, set()):
         work.clear()
         first = rdstitch(*arguments)
         assert (first.status, set(work)) == (0, expected)
@@ -68,7 +68,7 @@ def test_only_what_depends_on_a_changed_option_is_done_again(
     for options, expected in (
         (("--blend", "feather", "--scale", "0.5"), set()),
         (("--seed", "1"), {"estimate_radial_homography", "align", "overlap_agreement"}),
-        (("--features", "orb"), {"detect", "estimate_radial_homography", "align", "overlap_agreement"}),
+        (("--features", "orb"), {"_detect", "estimate_radial_homography", "align", "overlap_agreement"}),
     ):
         work.clear()
         assert rdstitch(*arguments, *options).status == 0
@@ -87,7 +87,7 @@ def test_a_picture_more_needs_only_its_own(
     assert rdstitch("calibrate", *frames[:2], "-o", tmp_path / "camera.json", *cached).status == 0
     work.clear()
     assert rdstitch("mosaic", *frames, "-o", tmp_path / "out.png", *cached).status == 0
-    assert work.count("detect") == 1
+    assert work.count("_detect") == 1
     assert _result(tmp_path / "out.png") == plain
 
 

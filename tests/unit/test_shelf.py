@@ -91,3 +91,12 @@ def test_pictures_for_which_there_is_no_room_are_not_kept() -> None:
     shelf.put("other", large)
     assert shelf.take("other") is large
     assert shelf.take("small") is small
+
+
+def test_a_shelf_that_was_cleared_has_room_again() -> None:
+    shelf, picture = Shelf(room=250), _picture(np.zeros((10, 20), np.uint8))
+    shelf.put("one", picture)
+    shelf.clear()
+    assert shelf.take("one") is None
+    shelf.put("two", picture)
+    assert shelf.take("two") is picture
