@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.camera import Camera, FloatArray
-from rdstitch.compositing.lattice import Box, Lattice
+from rdstitch.compositing.boxes import Box
+from rdstitch.compositing.lattice import Lattice
 from rdstitch.io.read import Picture
 from rdstitch.radial_homography import from_plane, to_plane
 

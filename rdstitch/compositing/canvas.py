@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.camera import Camera, FloatArray
+from rdstitch.compositing.boxes import Box
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.radial_homography import to_plane
 
@@ -39,7 +40,7 @@ class Canvas:
     matrix: FloatArray
     footprints: tuple[FloatArray, ...]
 
-    def boxes(self) -> list[tuple[int, int, int, int]]:
+    def boxes(self) -> list[Box]:
         """Bounds (x0, y0, x1, y1) of every picture, whole px inside the canvas, end exclusive."""
         width, height = self.size
         boxes = []
@@ -49,7 +50,7 @@ class Canvas:
             boxes.append((x0, y0, min(width, int(high[0])), min(height, int(high[1]))))
         return boxes
 
-    def cropped(self, box: tuple[int, int, int, int]) -> "Canvas":
+    def cropped(self, box: Box) -> "Canvas":
         """The part (x0, y0, x1, y1) of this canvas as a canvas of its own."""
         x0, y0, x1, y1 = box
         shift = np.array([[1.0, 0.0, -x0], [0.0, 1.0, -y0], [0.0, 0.0, 1.0]])

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.camera import Camera
+from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.crop import coverage_map, crop_box
 from rdstitch.compositing.exposure import Exposure, estimate_exposure, no_exposure
-from rdstitch.compositing.lattice import Box
 from rdstitch.compositing.multiband import margin
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.parts import ShownPart, shown_parts

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.camera import Camera, FloatArray
+from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.lattice import Box
 from rdstitch.compositing.survey import Survey
 from rdstitch.compositing.warp import locate, plan_warp
 

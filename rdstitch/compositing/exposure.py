@@ -21,9 +21,10 @@ from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
 from rdstitch.camera import Camera, FloatArray
-from rdstitch.compositing.lattice import LATTICE_STEPS, Box, Float32Array, interpolated
+from rdstitch.compositing.boxes import Box, Float32Array, cut, intersection
+from rdstitch.compositing.lattice import LATTICE_STEPS, interpolated
 from rdstitch.compositing.survey import Survey, SurveyTile
-from rdstitch.compositing.warp import Geometry, intersection
+from rdstitch.compositing.warp import Geometry
 
 _SRGB_OFFSET = 0.055
 # Samples outside this part of the range are clipped or mostly noise.
@@ -189,7 +190,7 @@ def _collect(survey: Survey, cameras: Sequence[Camera]) -> _Samples | None:
         a, b = survey.tiles[i], survey.tiles[j]
         assert a is not None
         assert b is not None
-        inside = _cut(a, box, a.inside) & _cut(b, box, b.inside)
+        inside = cut(a.inside, a.box, box) & cut(b.inside, b.box, box)
         where = np.flatnonzero(inside)
         if len(where) < _FEWEST_SAMPLES:
             continue
@@ -214,16 +215,10 @@ def _collect(survey: Survey, cameras: Sequence[Camera]) -> _Samples | None:
     return _Samples(start, first, second, share, *(np.concatenate([f[k] for f in found]) for k in range(2, 8)))
 
 
-def _cut(tile: SurveyTile, box: Box, values: NDArray[Any]) -> NDArray[Any]:
-    """The part of a tile's array that lies on ``box``."""
-    x, y = box[0] - tile.box[0], box[1] - tile.box[1]
-    return values[y : y + box[3] - box[1], x : x + box[2] - box[0]]
-
-
 def _values(tile: SurveyTile, box: Box, where: NDArray[np.intp]) -> FloatArray:
     """Samples as share of the full range, (S, C)."""
-    cut = _cut(tile, box, tile.pixels).reshape(-1, tile.pixels.shape[2])
-    return cut[where].astype(np.float64) / full_scale(tile.pixels.dtype)
+    pixels = cut(tile.pixels, tile.box, box).reshape(-1, tile.pixels.shape[2])
+    return pixels[where].astype(np.float64) / full_scale(tile.pixels.dtype)
 
 
 def _radius2(camera: Camera, points: FloatArray) -> FloatArray:

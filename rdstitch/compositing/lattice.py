@@ -5,12 +5,9 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rdstitch.camera import FloatArray
-
-Box = tuple[int, int, int, int]
-Float32Array = NDArray[np.float32]
+from rdstitch.compositing.boxes import Box, Float32Array
 
 LATTICE_STEPS = (32, 16, 8, 4, 2, 1)
 """Spacings of lattices, canvas px; all have the nodes of the first."""
@@ -46,11 +43,6 @@ class Lattice:
         points = places(x[None, :], y[:, None]).astype(np.float32)
         points[~np.isfinite(points).all(axis=-1)] = _NOWHERE
         return cls(box, step, points)
-
-    def covers(self, box: Box) -> bool:
-        """Whether a box lies in this one's."""
-        x0, y0, x1, y1 = self.box
-        return x0 <= box[0] and y0 <= box[1] and box[2] <= x1 and box[3] <= y1
 
     def nodes(self, box: Box, step: int) -> Float32Array:
         """Px at the nodes that enclose a box within this one's, (m, n, 2), at this spacing or a wider one."""

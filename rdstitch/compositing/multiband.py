@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from rdstitch.compositing.lattice import Box, Float32Array
+from rdstitch.compositing.boxes import Box, Float32Array
 
 _WEIGHT_STEPS = np.float32(4096.0)
 
@@ -22,18 +22,6 @@ def margin(bands: int) -> int:
     A px of band l reaches, up and down the pyramid, 2 (2^l - 1) px; the Laplacian adds as much of the next band.
     """
     return 4 << bands
-
-
-def aligned(box: Box, bands: int) -> Box:
-    """The smallest box of whole px of the coarsest band that holds ``box``."""
-    unit = 1 << bands
-    x0, y0, x1, y1 = box
-    return x0 // unit * unit, y0 // unit * unit, -(-x1 // unit) * unit, -(-y1 // unit) * unit
-
-
-def grown(box: Box, by: int) -> Box:
-    """``box`` with ``by`` px more on each side."""
-    return box[0] - by, box[1] - by, box[2] + by, box[3] + by
 
 
 def rounding_constant(full: float, integer: bool) -> np.float32:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.camera import FloatArray
-from rdstitch.compositing.pictures import NOTHING, Part
+from rdstitch.compositing.boxes import Box
+from rdstitch.compositing.pictures import NOTHING
 from rdstitch.compositing.seams import SeamMap
 from rdstitch.compositing.warp import Warp
 
@@ -36,7 +37,7 @@ class ShownPart:
     room: int
     size: tuple[int, int]
 
-    def from_row(self, row: float) -> Part:
+    def from_row(self, row: float) -> Box:
         """The part that is needed for the canvas from a row on."""
         points = self.points[self.rows >= row]
         if not len(points):

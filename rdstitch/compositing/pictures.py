@@ -14,15 +14,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rdstitch.compositing.boxes import Box, encloses
 from rdstitch.errors import InputError
 from rdstitch.io.read import Picture
 from rdstitch.io.reduction import block_mean, fitting_reduction, reduced_size
 
 Source = Callable[[], Picture]
 Preview = Callable[[int], Picture]
-# Of the original: x0, y0, x1, y1, px, end exclusive.
-Part = tuple[int, int, int, int]
-NOTHING: Part = (0, 0, 0, 0)
+NOTHING: Box = (0, 0, 0, 0)
 
 _OPAQUE_FROM = 128
 # A picture that gets smaller by less than this keeps its pixels as they are.
@@ -61,7 +60,7 @@ class LoadedPicture:
     opacity: NDArray[np.float32] | None = None
     opacity_step: float = 1.0
     reduction: int = 1
-    part: Part | None = None
+    part: Box | None = None
 
     @property
     def nbytes(self) -> int:
@@ -73,11 +72,11 @@ class LoadedPicture:
         """Where its first px lies in the whole reduced picture."""
         return (0, 0) if self.part is None else (self.part[0] // self.reduction, self.part[1] // self.reduction)
 
-    def holds(self, part: Part) -> bool:
+    def holds(self, part: Box) -> bool:
         """Whether a part of the original can be resampled from it."""
-        return self.part is None or _within(part, self.part)
+        return self.part is None or encloses(self.part, part)
 
-    def cut(self, part: Part) -> "LoadedPicture":
+    def cut(self, part: Box) -> "LoadedPicture":
         """A part of the original, with what the kernel of the resampling needs around it, in memory of its own.
 
         The whole where the part is not much less: the copy would not be worth its time.
@@ -244,7 +243,7 @@ class PictureCache:
     def __init__(self, reader: PictureReader, shrinks: Sequence[float], limit: int) -> None:
         self._reader, self._shrinks, self._limit = reader, shrinks, limit
         self._held: OrderedDict[int, LoadedPicture] = OrderedDict()
-        self._expected: list[Part | None] = [None] * len(shrinks)
+        self._expected: list[Box | None] = [None] * len(shrinks)
         self._surprising: set[int] = set()
         # One picture is read at a time; meanwhile those that are held can be had.
         self._lock, self._reading = Lock(), Lock()
@@ -253,7 +252,7 @@ class PictureCache:
         """Whether a picture has transparent parts."""
         return self._reader.masked(index)
 
-    def expect(self, parts: Sequence[Part]) -> None:
+    def expect(self, parts: Sequence[Box]) -> None:
         """Keep no more of each picture than the part that will be asked for from now on.
 
         It is a guess: a picture that more is asked of is read again, and from then on kept whole.
@@ -270,7 +269,7 @@ class PictureCache:
                 else:
                     self._held[index] = held.cut(part)
 
-    def get(self, index: int, part: Part) -> LoadedPicture:
+    def get(self, index: int, part: Box) -> LoadedPicture:
         """A part of picture ``index``, read unless it is held; may be asked for from several threads."""
         if (held := self._find(index, part)) is not None:
             return held
@@ -279,7 +278,7 @@ class PictureCache:
             if (held := self._find(index, part)) is not None:
                 return held
             expected = self._expected[index]
-            if expected is not None and not _within(part, expected):
+            if expected is not None and not encloses(expected, part):
                 self._surprising.add(index)
                 self._expected[index] = expected = None
             with self._lock:
@@ -293,7 +292,7 @@ class PictureCache:
                 self._held[index] = loaded
             return loaded
 
-    def _find(self, index: int, part: Part) -> LoadedPicture | None:
+    def _find(self, index: int, part: Box) -> LoadedPicture | None:
         """A picture that is held."""
         with self._lock:
             held = self._held.get(index)
@@ -301,8 +300,3 @@ class PictureCache:
                 return None
             self._held.move_to_end(index)
             return held
-
-
-def _within(part: Part, other: Part) -> bool:
-    """Whether a part lies in another."""
-    return part[0] >= other[0] and part[1] >= other[1] and part[2] <= other[2] and part[3] <= other[3]

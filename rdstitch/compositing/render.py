@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rdstitch.compositing.boxes import Box, Float32Array, aligned, bounds, cut, grown, intersection, without
 from rdstitch.compositing.exposure import Exposure, full_scale
-from rdstitch.compositing.lattice import Box, Float32Array
-from rdstitch.compositing.multiband import MultibandBlender, aligned, grown, margin, rounding_constant, spread
+from rdstitch.compositing.multiband import MultibandBlender, margin, rounding_constant, spread
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.pictures import PictureCache
 from rdstitch.compositing.seams import NOBODY, SeamMap
@@ -19,7 +19,6 @@ from rdstitch.compositing.warp import (
     Geometry,
     Warp,
     border_weight,
-    intersection,
     locate,
     read_part,
     sample,
@@ -50,15 +49,15 @@ class Layer:
 
     def part(self, box: Box) -> "Layer":
         """The same for a box within this one."""
-        return Layer(self.index, box, _part(self.weight, self.box, box), self.geometry.on(box))
+        return Layer(self.index, box, cut(self.weight, self.box, box), self.geometry.on(box))
 
     def weighted_part(self, box: Box) -> "Layer | None":
         """The smallest part that holds all of the weight on ``box``; None where there is none."""
         common = intersection(self.box, box)
         if common is None:
             return None
-        bounds = _bounds(_part(self.weight, self.box, common), common)
-        return None if bounds is None else self.part(bounds)
+        held = bounds(cut(self.weight, self.box, common), common)
+        return None if held is None else self.part(held)
 
 
 @dataclass(frozen=True)
@@ -99,13 +98,13 @@ class Renderer:
         covered = np.zeros((box[3] - box[1], box[2] - box[0]), dtype=np.bool_)
         for layer in layers:
             if (common := intersection(layer.box, box)) is not None:
-                _part(covered, box, common)[...] |= _part(layer.weight, layer.box, common) > 0
+                cut(covered, box, common)[...] |= cut(layer.weight, layer.box, common) > 0
         pixels = np.zeros((*covered.shape, self.channels), dtype=self.dtype)
         zone = self._contact_zone(layers, box) if blended else None
-        for rest in _without(box, zone):
-            self._lay(layers, rest, _part(pixels, box, rest))
+        for rest in without(box, zone):
+            self._lay(layers, rest, cut(pixels, box, rest))
         if zone is not None:
-            cv2.copyTo(self._multiband(layers, zone), _as_mask(_part(covered, box, zone)), _part(pixels, box, zone))
+            cv2.copyTo(self._multiband(layers, zone), _as_mask(cut(covered, box, zone)), cut(pixels, box, zone))
         return pixels, covered
 
     def _contact_zone(self, layers: Sequence[Layer], box: Box) -> Box | None:
@@ -120,7 +119,7 @@ class Renderer:
 
     def _felt(self, box: Box) -> Box:
         """Where multi-band blending feels weights on a box."""
-        return aligned(grown(box, margin(self.bands)), self.bands)
+        return aligned(grown(box, margin(self.bands)), 1 << self.bands)
 
     def _lay(self, layers: Sequence[Layer], box: Box, pixels: NDArray[Any]) -> None:
         """Fill ``pixels``, which are those of ``box``, with the layers, or with their weighted mean."""
@@ -128,12 +127,12 @@ class Renderer:
         if self.options.blend != "feather":
             # One owner per px: a product and a quotient would cost the last bit.
             for part in parts:
-                cv2.copyTo(self._samples(part, part.box), _as_mask(part.weight > 0), _part(pixels, box, part.box))
+                cv2.copyTo(self._samples(part, part.box), _as_mask(part.weight > 0), cut(pixels, box, part.box))
             return
         total, weights = np.zeros(pixels.shape, dtype=np.float32), np.zeros(pixels.shape[:2], dtype=np.float32)
         for part in parts:
-            _part(total, box, part.box)[...] += self._samples(part, part.box) * spread(part.weight, self.channels)
-            _part(weights, box, part.box)[...] += part.weight
+            cut(total, box, part.box)[...] += self._samples(part, part.box) * spread(part.weight, self.channels)
+            cut(weights, box, part.box)[...] += part.weight
         total /= spread(np.where(weights > 0, weights, np.float32(1.0)), self.channels)
         pixels[...] = self._as_samples(total)
 
@@ -146,9 +145,9 @@ class Renderer:
             if part is None or common is None:
                 continue
             weight = np.zeros((part[3] - part[1], part[2] - part[0]), dtype=np.float32)
-            _part(weight, part, common)[...] = _part(layer.weight, layer.box, common)
+            cut(weight, part, common)[...] = cut(layer.weight, layer.box, common)
             blender.add(part, self._samples(layer, part).astype(np.float32), weight)
-        return self._as_samples(_part(blender.result(), outer, box))
+        return self._as_samples(cut(blender.result(), outer, box))
 
     def _as_samples(self, values: Float32Array) -> NDArray[Any]:
         """Values in the output's type, rounded where it is whole numbers."""
@@ -211,10 +210,10 @@ class Renderer:
             _claim(owner, best, box, layer)
         soft = layers if self.options.blend == "feather" else []
         missing = owner == NOBODY
-        if (bounds := _bounds(missing, box)) is not None:
+        if (left_over := bounds(missing, box)) is not None:
             best[...] = 0.0
-            for layer in self._bordered(bounds):
-                layer.weight[~_part(missing, box, layer.box)] = 0.0
+            for layer in self._bordered(left_over):
+                layer.weight[~cut(missing, box, layer.box)] = 0.0
                 _claim(owner, best, box, layer)
                 layers.append(layer)
         if self.options.blend == "feather":
@@ -237,44 +236,20 @@ class Renderer:
 
 def _claim(owner: NDArray[np.int32], best: Float32Array, box: Box, layer: Layer) -> None:
     """Give a layer's picture the px where its weight is the largest so far."""
-    previous = _part(best, box, layer.box)
+    previous = cut(best, box, layer.box)
     better = layer.weight > previous
     np.copyto(previous, layer.weight, where=better)
-    np.copyto(_part(owner, box, layer.box), layer.index, where=better)
+    np.copyto(cut(owner, box, layer.box), layer.index, where=better)
 
 
 def _won(owner: NDArray[np.int32], box: Box, layer: Layer) -> Layer:
     """The layer with weight 1 where its picture owns the px, and 0 elsewhere."""
-    owned = _part(owner, box, layer.box) == layer.index
+    owned = cut(owner, box, layer.box) == layer.index
     # A picture may have a layer from the seam map and one for what the map left over: each gets its own px.
     owned &= layer.weight > 0
     return replace(layer, weight=owned.astype(np.float32))
 
 
-def _bounds(values: NDArray[Any], box: Box) -> Box | None:
-    """Smallest box that holds all values on ``box`` that are not 0; None where there are none."""
-    rows, columns = (np.flatnonzero(values.any(axis=axis)) for axis in (1, 0))
-    if not len(rows):
-        return None
-    x, y = box[:2]
-    return int(x + columns[0]), int(y + rows[0]), int(x + columns[-1] + 1), int(y + rows[-1] + 1)
-
-
-def _without(box: Box, hole: Box | None) -> list[Box]:
-    """What is left of a box: above, left, right and below of a hole in it."""
-    if hole is None:
-        return [box]
-    (x0, y0, x1, y1), (left, top, right, bottom) = box, hole
-    parts = [(x0, y0, x1, top), (x0, top, left, bottom), (right, top, x1, bottom), (x0, bottom, x1, y1)]
-    return [part for part in parts if part[0] < part[2] and part[1] < part[3]]
-
-
 def _as_mask(chosen: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """Not 0 where chosen, as OpenCV takes it."""
     return chosen.view(np.uint8)
-
-
-def _part(values: NDArray[Any], box: Box, part: Box) -> NDArray[Any]:
-    """View of the values on ``box`` that lie on ``part``."""
-    x, y = part[0] - box[0], part[1] - box[1]
-    return values[y : y + part[3] - part[1], x : x + part[2] - part[0]]

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.compositing.exposure import Exposure, full_scale
-from rdstitch.compositing.lattice import Box, Float32Array
 from rdstitch.compositing.survey import Survey, SurveyTile
 from rdstitch.compositing.warp import locate
 from rdstitch.io.reduction import block_mean

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.camera import Camera, FloatArray
+from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.lattice import Box, Float32Array
 from rdstitch.compositing.pictures import PictureReader
 from rdstitch.compositing.warp import (
     Warp,

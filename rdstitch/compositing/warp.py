@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.camera import Camera, FloatArray
+from rdstitch.compositing.boxes import Box, Float32Array, encloses
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.lattice import LATTICE_STEPS, Box, Float32Array, Lattice
-from rdstitch.compositing.pictures import KERNEL_MARGIN, LoadedPicture, Part
+from rdstitch.compositing.lattice import LATTICE_STEPS, Lattice
+from rdstitch.compositing.pictures import KERNEL_MARGIN, LoadedPicture
 from rdstitch.radial_homography import to_plane
 
 INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos": cv2.INTER_LANCZOS4}
@@ -104,18 +105,10 @@ class Geometry:
         return np.ones(self.shape, dtype=np.bool_) if self.filled else self.warp.contains(*self.maps)
 
     def on(self, box: Box) -> "Geometry":
-        """The same for another box; what is known of that already is not computed again."""
-        if not self.lattice.covers(box):
-            return locate(self.warp, box)
-        other, known = Geometry(self.warp, box, self.lattice), vars(self)
-        if intersection(self.box, box) == box:
-            x0, y0, x1, y1 = box
-            cut = np.s_[y0 - self.box[1] : y1 - self.box[1], x0 - self.box[0] : x1 - self.box[0]]
-            if "maps" in known:
-                vars(other)["maps"] = self.maps[0][cut], self.maps[1][cut]
-            if "inside" in known:
-                vars(other)["inside"] = self.inside[cut]
-        return other
+        """The same for another box."""
+        if encloses(self.lattice.box, box):
+            return Geometry(self.warp, box, self.lattice)
+        return locate(self.warp, box)
 
 
 def plan_warp(camera: Camera, homography: FloatArray, canvas: Canvas, index: int) -> Warp:
@@ -137,7 +130,7 @@ def locate(warp: Warp, box: Box) -> Geometry:
     return Geometry(warp, box, Lattice.over(box, warp.step, warp.source_points))
 
 
-def read_part(geometry: Geometry) -> Part:
+def read_part(geometry: Geometry) -> Box:
     """The part of the picture that :func:`sample` takes px from."""
     (map_x, map_y), (width, height) = geometry.maps, geometry.warp.camera.image_size
     left, right = _mirrored_extent(map_x, width)
@@ -188,17 +181,6 @@ def sample_opacity(picture: LoadedPicture, geometry: Geometry) -> Float32Array |
     opacity = _remap_from(picture.opacity, picture.origin, map_x, map_y, cv2.INTER_LINEAR)
     # The outer half of the last opaque px is outside.
     return np.where(opacity >= 0.5 * picture.opacity_step, opacity, 0.0).astype(np.float32)
-
-
-def intersection(first: Box, second: Box) -> Box | None:
-    """The common part of two boxes; None where there is none."""
-    x0, y0, x1, y1 = (
-        max(first[0], second[0]),
-        max(first[1], second[1]),
-        min(first[2], second[2]),
-        min(first[3], second[3]),
-    )
-    return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
 
 
 def _mirrored(picture: LoadedPicture, geometry: Geometry) -> tuple[Float32Array, Float32Array]:

@@ -55,9 +55,9 @@ def detect(image: Image, options: FeatureOptions | None = None, mask: Mask | Non
 
 def _detect(source: Source, options: FeatureOptions) -> Features:
     """The same for a picture that is loaded as large as it is needed."""
-    size, picture, detection, usable = _look(source, options, options.work_megapixels)
+    picture, detection, usable = _look(source, options, options.work_megapixels)
     if options.work_megapixels is not None and picture.reduced and len(usable) < _FEW * options.max_features:
-        size, picture, detection, usable = _look(source, options, CLOSER * options.work_megapixels)
+        picture, detection, usable = _look(source, options, CLOSER * options.work_megapixels)
     points, response = detection.points[usable], detection.response[usable]
     if options.spread:
         cell = options.spread_cell * float(np.hypot(*picture.grey.shape))
@@ -68,18 +68,17 @@ def _detect(source: Source, options: FeatureOptions) -> Features:
     # Some detectors return them in an order of their own.
     features = features.take(strongest(features.response, len(features)))
     scale = features.scale * float(np.sqrt(picture.factor.prod()))
-    return replace(features, points=picture.to_full_size(features.points), scale=scale, image_size=size)
+    return replace(features, points=picture.to_full_size(features.points), scale=scale, image_size=picture.full_size)
 
 
 def _look(
     source: Source, options: FeatureOptions, megapixels: float | None
-) -> tuple[tuple[int, int], Picture, Detection, NDArray[np.intp]]:
-    """The whole picture's size, the picture at most so large, what is found in it, and which of that may count."""
-    view = source(megapixels)
-    picture = prepare(view, megapixels)
+) -> tuple[Picture, Detection, NDArray[np.intp]]:
+    """The picture at most so large, what is found in it, and which of that may count."""
+    picture = prepare(source(megapixels), megapixels)
     detection = find(picture.grey, options)
     usable = np.flatnonzero(picture.covers(detection.points, detection.scale / 2))
-    return view.whole_size, picture, detection, usable
+    return picture, detection, usable
 
 
 def detect_all(

@@ -6,6 +6,8 @@ from pathlib import Path
 from rdstitch.errors import ArgumentError
 
 KINDS = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk", "aliked")
+WORK_MEGAPIXELS = 2.0
+"""10⁶ px to which pictures are halved unless it is said otherwise."""
 CLOSER = 4.0
 """Times as many px are looked at where the working size shows too little."""
 
@@ -22,7 +24,7 @@ class FeatureOptions:
 
     kind: str = "rootsift"  # one of KINDS
     max_features: int = 4000  # keypoints kept per picture
-    work_megapixels: float | None = 2.0  # pictures are halved until they have no more, 10⁶ px; None: never
+    work_megapixels: float | None = WORK_MEGAPIXELS  # pictures are halved until they have no more, 10⁶ px; None: never
     spread: bool = True  # the strongest of each cell of a grid in turn, rather than the strongest of the picture
     spread_cell: float = 0.05  # side of a cell of that grid, fraction of the picture's diagonal
     sift_contrast: float = 0.02  # SIFT's contrast threshold; 0.04 is OpenCV's, too high for hazy pictures

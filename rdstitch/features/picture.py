@@ -16,6 +16,8 @@ Image = NDArray[Any]
 Mask = NDArray[Any]
 """Of bool or uint8."""
 
+_STRETCH_PERCENTILES = (0.1, 99.9)
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -38,12 +40,9 @@ class View:
     image_size: tuple[int, int] | None = None
 
     @property
-    def whole_size(self) -> tuple[int, int]:
+    def full_size(self) -> tuple[int, int]:
         """Width and height of the whole picture, px."""
         return self.image_size or (self.image.shape[1], self.image.shape[0])
-
-
-_STRETCH_PERCENTILES = (0.1, 99.9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +56,14 @@ class Picture:
         Distance to the nearest masked pixel, px of ``grey``, zero if masked; None without mask.
     factor : ndarray of shape (2,)
         Full size divided by working size, horizontally and vertically.
+    full_size : (int, int)
+        Width and height, px.
     """
 
     grey: NDArray[np.uint8]
     clearance: NDArray[np.float32] | None
     factor: FloatArray
+    full_size: tuple[int, int]
 
     @property
     def reduced(self) -> bool:
@@ -106,7 +108,7 @@ def prepare(view: View, work_megapixels: float | None) -> Picture:
             usable = cv2.resize(usable.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
     grey = _eight_bits(_grey(image), usable)
     shrink = view.reduction * np.array([width / grey.shape[1], height / grey.shape[0]])
-    return Picture(grey, None if usable is None else _clearance(usable), shrink)
+    return Picture(grey, None if usable is None else _clearance(usable), shrink, view.full_size)
 
 
 def _usable(image: Image, mask: Mask | None) -> NDArray[np.bool_] | None:

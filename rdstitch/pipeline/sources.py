@@ -9,15 +9,13 @@ import numpy as np
 
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError
+from rdstitch.features.options import WORK_MEGAPIXELS
 from rdstitch.features.picture import halving
 from rdstitch.io.mask import read_mask
 from rdstitch.io.metadata import Metadata, read_metadata
 from rdstitch.io.read import Picture, read_image, reduced
 from rdstitch.io.reduction import block_minimum, fitting_reduction, reduced_size
 from rdstitch.pipeline.shelf import NO_SHELF, Shelf
-
-_LOOKED_AT = 2.0
-"""10⁶ px to which a picture is halved before more than one stage looks at it."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,7 @@ class Source:
             When the file cannot be read, or is no longer what it was.
         """
         # Smaller ones are made from one size, whether that is at hand or not: the same comes out.
-        usual = self.reduction(_LOOKED_AT)
+        usual = self.reduction(WORK_MEGAPIXELS)
         if reduction % usual:
             return self._load(reduction)
         key = (self.path, self.mask)

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from rdstitch.compositing import CompositeOptions
+from rdstitch.compositing.boxes import aligned, grown
 from rdstitch.compositing.compositor import Prepared, prepare
-from rdstitch.compositing.multiband import MultibandBlender, aligned, grown, margin, rounding_constant
+from rdstitch.compositing.multiband import MultibandBlender, margin, rounding_constant
 from rdstitch.synthetic.rendering import Photometry
 from tests.compositing_scenes import Scene, render
 
@@ -66,7 +67,7 @@ def test_strips_are_the_whole(workers: int) -> None:
 def test_one_picture_is_not_changed_by_blending(bands: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     constant = rounding_constant(255.0, True)
-    box = aligned(grown((0, 0, 48, 32), margin(bands)), bands)
+    box = aligned(grown((0, 0, 48, 32), margin(bands)), 1 << bands)
     pixels = rng.integers(0, 256, (box[3] - box[1], box[2] - box[0], 3)).astype(np.float32)
     weight = np.zeros(pixels.shape[:2], np.float32)
     inner = np.s_[-box[1] : 32 - box[1], -box[0] : 48 - box[0]]
