@@ -252,10 +252,15 @@ class Prepared:
     def _start(self, top: int, run: Callable[..., Iterator[Any]]) -> tuple[_Filled, Iterator[Box]]:
         """Begin with a row of tiles, when all but one above are done: the strip they fill, and each once it is done."""
         (width, height), (x, y), side = self.canvas.size, self.origin, self.plan.tile_size
-        if self.shown:
-            row = y + top - side - self.around
-            self.renderer.pictures.expect([part.from_row(row) for part in self.shown])
         bottom = min(top + side, height)
+        # To and fro, so that the pictures used last are the ones needed next.
+        backwards = top // side % 2 == 1
+        if self.shown:
+            pictures, warps = self.renderer.pictures, self.renderer.warps
+            pictures.expect([part.from_row(y + top - side - self.around) for part in self.shown])
+            rows = y + top - self.around, y + bottom + self.around
+            due = [index for index, part in enumerate(self.shown) if part.on_rows(*rows)]
+            pictures.foresee(sorted(due, key=lambda index: warps[index].box, reverse=backwards))
         boxes = [(x + k, y + top, x + min(k + side, width), y + bottom) for k in range(0, width, side)]
         samples = np.zeros((bottom - top, width, self.renderer.channels), dtype=self.renderer.dtype)
         alpha = np.zeros((bottom - top, width), dtype=np.uint8)
@@ -266,8 +271,7 @@ class Prepared:
             alpha[:, columns][covered] = 255
             return box
 
-        # To and fro, so that the pictures used last are the ones needed next.
-        return (samples, alpha), run(fill, boxes[::-1] if top // side % 2 else boxes)
+        return (samples, alpha), run(fill, boxes[::-1] if backwards else boxes)
 
 
 def prepare(
@@ -287,11 +291,16 @@ def prepare(
     reader = PictureReader(sources, [c.image_size for c in cameras], previews)
     channels, dtype = reader.samples
     plan = plan_composite(cameras, canvas, options, channels, dtype.itemsize)
+    warps = [plan_warp(c, g, canvas, k) for k, (c, g) in enumerate(zip(cameras, matrices, strict=True))]
+    cache = PictureCache(reader, [w.shrink for w in warps], plan.cache_bytes, ahead=plan.workers > 1)
     exposure, seams, survey = no_exposure(len(cameras), channels), None, None
     if len(cameras) > 1 and (options.exposure != "none" or options.seam != "none"):
         survey = survey_pictures(
             reader, cameras, matrices, canvas, min(plan.workers, _READERS), _part_of(progress, 0.0, 0.7)
         )
+        # The first tiles will ask for them, whatever is cropped and however the seams run.
+        topmost = [index for index, warp in enumerate(warps) if warp.box[1] < plan.tile_size]
+        cache.foresee(sorted(topmost, key=lambda index: warps[index].box))
         if options.exposure != "none":
             exposure = estimate_exposure(survey, cameras, blocks=options.exposure == "blocks")
         if options.seam != "none":
@@ -301,8 +310,6 @@ def prepare(
     box, note = None, ""
     if options.crop == "auto":
         box, note = crop_box(*coverage_map(cameras, matrices, canvas, survey), canvas.size)
-    warps = [plan_warp(c, g, canvas, k) for k, (c, g) in enumerate(zip(cameras, matrices, strict=True))]
-    cache = PictureCache(reader, [w.shrink for w in warps], plan.cache_bytes)
     renderer = Renderer(warps, cache, exposure, seams, options, plan.bands, channels, dtype)
     cropped = canvas if box is None else canvas.cropped(box)
     # What a tile's blending feels is aligned to the coarsest band.

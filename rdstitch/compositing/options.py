@@ -38,7 +38,7 @@ class CompositeOptions:
     scale: float = 1.0
     # Degrees that the output is turned clockwise.
     rotate: float = 0.0
-    # Bytes that the compositor may hold in pictures and tiles; None: 320 MB, or more where the canvas needs it.
+    # Bytes that the compositor may hold in pictures and tiles; None: 352 MB, or more where the canvas needs it.
     max_memory: int | None = None
     # Kernel of the one resampling.
     interpolation: Interpolation = "cubic"

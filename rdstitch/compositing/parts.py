@@ -37,6 +37,10 @@ class ShownPart:
     room: int
     size: tuple[int, int]
 
+    def on_rows(self, first: float, last: float) -> bool:
+        """Whether it shows on any of these rows of the canvas."""
+        return bool(((self.rows >= first) & (self.rows <= last)).any())
+
     def from_row(self, row: float) -> Box:
         """The part that is needed for the canvas from a row on."""
         points = self.points[self.rows >= row]

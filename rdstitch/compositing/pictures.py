@@ -5,7 +5,8 @@ Most of a picture is often hidden by its neighbours: only the part that is asked
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from threading import Lock
 from typing import Any
@@ -174,6 +175,12 @@ class PictureReader:
         reduction = 1 if self._previews is None else fitting_reduction(shrink / _PX_PER_OUTPUT_PX)
         return prepare_picture(self(index, reduction), shrink, reduction)
 
+    def nbytes(self, index: int, shrink: float) -> int:
+        """Memory that picture ``index`` takes when it is prepared for such an output."""
+        channels, dtype = self.samples
+        width, height = reduced_size(self._sizes[index], fitting_reduction(shrink / _PX_PER_OUTPUT_PX))
+        return width * height * channels * dtype.itemsize
+
     def __call__(self, index: int, reduction: int = 1) -> Picture:
         """Read picture ``index``; a grey picture among coloured ones becomes coloured.
 
@@ -238,10 +245,13 @@ class PictureCache:
         Picture px per output px.
     limit : int
         Bytes.
+    ahead : bool
+        Read pictures in a thread of its own before they are asked for.
     """
 
-    def __init__(self, reader: PictureReader, shrinks: Sequence[float], limit: int) -> None:
+    def __init__(self, reader: PictureReader, shrinks: Sequence[float], limit: int, *, ahead: bool = False) -> None:
         self._reader, self._shrinks, self._limit = reader, shrinks, limit
+        self._ahead = ThreadPoolExecutor(1) if ahead else None
         self._held: OrderedDict[int, LoadedPicture] = OrderedDict()
         self._expected: list[Box | None] = [None] * len(shrinks)
         self._surprising: set[int] = set()
@@ -253,21 +263,16 @@ class PictureCache:
         return self._reader.masked(index)
 
     def expect(self, parts: Sequence[Box]) -> None:
-        """Keep no more of each picture than the part that will be asked for from now on.
+        """Keep no more of each picture than the part that will be asked for from now on, where room is short.
 
         It is a guess: a picture that more is asked of is read again, and from then on kept whole.
         """
         with self._lock:
             for index, part in enumerate(parts):
-                if index in self._surprising:
-                    continue
-                self._expected[index] = part
-                if (held := self._held.get(index)) is None:
-                    continue
-                if part == NOTHING:
-                    del self._held[index]
-                else:
-                    self._held[index] = held.cut(part)
+                if index not in self._surprising:
+                    self._expected[index] = part
+                    if part == NOTHING:
+                        self._held.pop(index, None)
 
     def get(self, index: int, part: Box) -> LoadedPicture:
         """A part of picture ``index``, read unless it is held; may be asked for from several threads."""
@@ -283,14 +288,63 @@ class PictureCache:
                 self._expected[index] = expected = None
             with self._lock:
                 self._held.pop(index, None)
-            loaded = self._reader.prepared(index, self._shrinks[index])
-            if expected is not None:
-                loaded = loaded.cut(expected)
-            with self._lock:
-                while self._held and sum(p.nbytes for p in self._held.values()) + loaded.nbytes > self._limit:
-                    self._held.popitem(last=False)
-                self._held[index] = loaded
-            return loaded
+            return self._read(index, expected)
+
+    def foresee(self, indices: Iterable[int]) -> None:
+        """Be told which pictures will be asked for next, in this order; those for which there is room are read."""
+        if self._ahead is None:
+            return
+        for index in indices:
+            # What cannot be read is told to who asks for it.
+            self._ahead.submit(self._read_ahead, index)
+
+    def _read_ahead(self, index: int) -> None:
+        """Read a picture, unless it is held or others would have to go for it."""
+        with self._reading:
+            expected = self._expected[index]
+            if index in self._held or expected == NOTHING:
+                return
+            if self._fits(self._reader.nbytes(index, self._shrinks[index])):
+                self._read(index, expected)
+
+    def _read(self, index: int, part: Box | None) -> LoadedPicture:
+        """Read a part of a picture and hold it; those used longest ago go where there is no room."""
+        loaded = self._reader.prepared(index, self._shrinks[index])
+        if part is not None:
+            loaded = loaded.cut(part)
+        self._fits(loaded.nbytes)
+        with self._lock:
+            while self._held and self._nbytes() + loaded.nbytes > self._limit:
+                self._held.popitem(last=False)
+            self._held[index] = loaded
+        return loaded
+
+    def _fits(self, nbytes: int) -> bool:
+        """Whether there is room for so much, if need be without what will not be asked for of the pictures held."""
+        with self._lock:
+            room, indices = self._limit - self._nbytes(), list(self._held)
+        for index in indices if nbytes > room else ():
+            self._cut(index)
+        with self._lock:
+            return nbytes <= self._limit - self._nbytes()
+
+    def _cut(self, index: int) -> None:
+        """Drop what will not be asked for of a picture that is held."""
+        with self._lock:
+            picture, expected = self._held.get(index), self._expected[index]
+        if picture is None or expected is None:
+            return
+        # No part at all is expected of one that was being read when it was done with.
+        picture = None if expected == NOTHING else picture.cut(expected)
+        with self._lock:
+            if picture is None:
+                self._held.pop(index, None)
+            elif index in self._held:
+                self._held[index] = picture
+
+    def _nbytes(self) -> int:
+        """Memory that is taken; asked with the lock held."""
+        return sum(picture.nbytes for picture in self._held.values())
 
     def _find(self, index: int, part: Box) -> LoadedPicture | None:
         """A picture that is held."""

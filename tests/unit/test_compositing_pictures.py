@@ -1,6 +1,8 @@
 """The cache of pictures: bounded, no more than is needed, and right all the same."""
 
 from collections import Counter
+from collections.abc import Callable
+from time import monotonic, sleep
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from rdstitch.compositing.parts import shown_parts
 from rdstitch.compositing.pictures import NOTHING, PictureCache, PictureReader, prepare_picture
 from rdstitch.compositing.seams import SeamMap
 from rdstitch.compositing.warp import plan_warp
+from rdstitch.errors import InputError
 from rdstitch.io import Picture
 from tests.compositing_scenes import as_picture, render
 
@@ -28,10 +31,12 @@ class Shelf:
         self.reads[index] += 1
         return as_picture(self.frames[index])
 
-    def cache(self, limit: int) -> PictureCache:
+    def cache(self, limit: int, *, ahead: bool = False) -> PictureCache:
         """All pictures, as they are."""
         reader = PictureReader([lambda k=k: self.read(k) for k in range(4)], [(200, 100)] * 4)  # type: ignore[misc]
-        return PictureCache(reader, [1.0] * 4, limit)
+        assert reader.samples == (1, np.uint8)
+        self.reads.clear()
+        return PictureCache(reader, [1.0] * 4, limit, ahead=ahead)
 
 
 def test_those_used_last_are_held() -> None:
@@ -63,6 +68,53 @@ def test_more_than_expected_is_read_once_more_and_kept() -> None:
     cache.expect([NOTHING] * 4)
     assert cache.get(0, WHOLE).holds(WHOLE)
     assert shelf.reads == {0: 2, 1: 1}
+
+
+def test_parts_that_are_done_with_go_before_pictures_do() -> None:
+    shelf = Shelf()
+    cache = shelf.cache(limit=50_000)
+    for index in (0, 1):
+        cache.get(index, WHOLE)
+    cache.expect([(0, 0, 100, 40), (0, 50, 200, 100), WHOLE, WHOLE])
+    assert cache.get(0, (0, 0, 10, 10)).holds(WHOLE), "there is room for all of it"
+    cache.get(2, WHOLE)
+    assert not cache.get(0, (0, 0, 100, 40)).holds(WHOLE)
+    np.testing.assert_array_equal(cache.get(1, (0, 50, 200, 100)).pixels[-1], shelf.frames[1][-1])
+    assert shelf.reads == {0: 1, 1: 1, 2: 1}
+
+
+def _until(told: Callable[[], bool]) -> None:
+    """Wait for another thread."""
+    end = monotonic() + 30.0
+    while not told():
+        assert monotonic() < end
+        sleep(0.001)
+
+
+def test_pictures_are_read_ahead_where_there_is_room() -> None:
+    shelf = Shelf()
+    cache = shelf.cache(limit=45_000, ahead=True)
+    cache.expect([WHOLE, WHOLE, WHOLE, NOTHING])
+    cache.foresee([3, 1, 0, 2, 1])
+    _until(lambda: shelf.reads.total() == 2)
+    np.testing.assert_array_equal(cache.get(0, WHOLE).pixels, shelf.frames[0])
+    np.testing.assert_array_equal(cache.get(1, WHOLE).pixels, shelf.frames[1])
+    assert shelf.reads == {0: 1, 1: 1}
+    cache.expect([NOTHING, WHOLE, WHOLE, NOTHING])
+    cache.foresee([2])
+    _until(lambda: shelf.reads[2] == 1)
+    np.testing.assert_array_equal(cache.get(2, WHOLE).pixels, shelf.frames[2])
+    assert shelf.reads == {0: 1, 1: 1, 2: 1}
+
+
+def test_what_cannot_be_read_ahead_is_told_to_who_asks_for_it() -> None:
+    shelf = Shelf()
+    cache = shelf.cache(limit=80_000, ahead=True)
+    shelf.frames[1] = shelf.frames[1][:50]
+    cache.foresee([1, 2])
+    _until(lambda: shelf.reads[2] == 1)
+    with pytest.raises(InputError, match="picture 2 has 200 x 50 px"):
+        cache.get(1, WHOLE)
 
 
 @pytest.mark.parametrize("shrink", [1.0, 5.0])
