@@ -34,7 +34,7 @@ class Shelf:
     def cache(self, limit: int, *, ahead: bool = False) -> PictureCache:
         """All pictures, as they are."""
         reader = PictureReader([lambda k=k: self.read(k) for k in range(4)], [(200, 100)] * 4)  # type: ignore[misc]
-        assert reader.samples == (1, np.uint8)
+        assert reader.samples[0] == 1
         self.reads.clear()
         return PictureCache(reader, [1.0] * 4, limit, ahead=ahead)
 
@@ -150,4 +150,8 @@ def test_shown_parts_hold_all_that_a_picture_owns() -> None:
             points = points[warps[index].contains(*points.T)]
             x0, y0, x1, y1 = parts[index].from_row(first)
             assert ((points >= (x0, y0)) & (points <= (x1, y1))).all()
+        assert parts[index].on_rows(rows[0] - 50, rows[0] + 4)
+        assert parts[index].on_rows(rows[1] - 4, rows[1] + 50)
+        assert not parts[index].on_rows(rows[0] - 50, rows[0] - 4)
+        assert not parts[index].on_rows(rows[1] + 4, rows[1] + 50)
         assert parts[index].from_row(rows[1]) == NOTHING

@@ -102,7 +102,7 @@ def test_features_of_a_reduced_picture_lie_where_they_are_in_the_whole(pixels: N
         return View(block_mean(large, 2), reduction=2, image_size=(4 * WIDTH, 4 * HEIGHT))
 
     (small,) = detect_all([load], options)
-    assert small.image_size == whole.image_size
+    assert small.image_size == whole.image_size == (4 * WIDTH, 4 * HEIGHT)
     assert asked == [options.work_megapixels, CLOSER * WIDTH * HEIGHT / 1e6]  # for a closer look
     distance = np.linalg.norm(whole.points[:50, None] - small.points[None], axis=2).min(axis=1)
     assert np.median(distance) < 0.2
