@@ -1,8 +1,9 @@
 """The compositor: pictures, cameras and homographies in, one picture out, in memory or in a file."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rdstitch.camera import Camera
+from rdstitch.camera import Camera, FloatArray
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.crop import coverage_map, crop_box
@@ -99,7 +100,8 @@ def compose(
     Parameters
     ----------
     sources : sequence of callables
-        Each reads one picture (:func:`rdstitch.io.read_image`); called when its tiles come, perhaps again later.
+        Each reads one picture (:func:`rdstitch.io.read_image`); called in other threads, before its tiles come, and
+        perhaps again later.
     cameras : sequence of Camera
     homographies : array_like of shape (N, 3, 3)
         Normalized undistorted coordinates of each picture to plane coordinates.
@@ -125,14 +127,16 @@ def compose(
     LimitError
         When the memory limit is too low.
     """
-    prepared = prepare(sources, cameras, homographies, canvas, options, _part_of(progress, 0.0, _PREPARATION), previews)
-    renderer, (width, height) = prepared.renderer, prepared.canvas.size
-    pixels = np.zeros((height, width, renderer.channels), dtype=renderer.dtype)
-    alpha = np.zeros((height, width), dtype=np.uint8)
-    top = 0
-    for samples, opaque in prepared.strips(_part_of(progress, _PREPARATION, 1.0)):
-        pixels[top : top + len(samples)], alpha[top : top + len(samples)] = samples, opaque
-        top += len(samples)
+    steps = _part_of(progress, 0.0, _PREPARATION), _part_of(progress, _PREPARATION, 1.0)
+    with prepare(sources, cameras, homographies, canvas, options, steps[0], previews) as prepared:
+        renderer, (width, height) = prepared.renderer, prepared.canvas.size
+        pixels = np.zeros((height, width, renderer.channels), dtype=renderer.dtype)
+        alpha = np.zeros((height, width), dtype=np.uint8)
+        top = 0
+        with closing(prepared.strips(steps[1])) as strips:
+            for samples, opaque in strips:
+                pixels[top : top + len(samples)], alpha[top : top + len(samples)] = samples, opaque
+                top += len(samples)
     shaped = pixels if renderer.channels > 1 else pixels[..., 0]
     return Composite(shaped, alpha, prepared.canvas, renderer.exposure, prepared.notes)
 
@@ -170,26 +174,30 @@ def compose_to_file(
     OutputError
         When the file cannot be written; nothing is left behind.
     """
-    prepared = prepare(sources, cameras, homographies, canvas, options, _part_of(progress, 0.0, _PREPARATION), previews)
-    renderer, size = prepared.renderer, prepared.canvas.size
-    layout = Layout(
-        size,
-        renderer.channels,
-        renderer.dtype,
-        transparent=True,
-        metadata=metadata or Metadata(size),
-        background=renderer.options.background,
-    )
-    check_format(path, layout)
     covered = 0
 
-    def counted() -> Iterator[tuple[NDArray[Any], NDArray[np.uint8]]]:
+    def counted(strips: Iterable[_Filled]) -> Iterator[_Filled]:
         nonlocal covered
-        for samples, alpha in prepared.strips(_part_of(progress, _PREPARATION, 1.0)):
+        for samples, alpha in strips:
             covered += int(np.count_nonzero(alpha))
             yield samples, alpha
 
-    write_strips(path, layout, counted(), () if extra_tags is None else extra_tags(prepared.canvas))
+    steps = _part_of(progress, 0.0, _PREPARATION), _part_of(progress, _PREPARATION, 1.0)
+    with prepare(sources, cameras, homographies, canvas, options, steps[0], previews) as prepared:
+        renderer, size = prepared.renderer, prepared.canvas.size
+        layout = Layout(
+            size,
+            renderer.channels,
+            renderer.dtype,
+            transparent=True,
+            metadata=metadata or Metadata(size),
+            background=renderer.options.background,
+        )
+        check_format(path, layout)
+        tags = () if extra_tags is None else extra_tags(prepared.canvas)
+        # Nothing goes on behind a writer that fails.
+        with closing(prepared.strips(steps[1])) as strips:
+            write_strips(path, layout, counted(strips), tags)
     share = covered / (size[0] * size[1])
     return FileComposite(Path(path), prepared.canvas, renderer.exposure, share, prepared.notes)
 
@@ -221,7 +229,7 @@ class Prepared:
     shown: Sequence[ShownPart]
     around: int
 
-    def strips(self, progress: Progress | None = None) -> Iterator[tuple[NDArray[Any], NDArray[np.uint8]]]:
+    def strips(self, progress: Progress | None = None) -> Generator[_Filled]:
         """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
         if self.plan.workers == 1:
             yield from self._strips(map, progress)
@@ -229,9 +237,7 @@ class Prepared:
         with one_opencv_thread(), ThreadPoolExecutor(self.plan.workers) as pool:
             yield from self._strips(pool.map, progress)
 
-    def _strips(
-        self, run: Callable[..., Iterator[Any]], progress: Progress | None
-    ) -> Iterator[tuple[NDArray[Any], NDArray[np.uint8]]]:
+    def _strips(self, run: Callable[..., Iterator[Any]], progress: Progress | None) -> Iterator[_Filled]:
         """The same, with tiles computed by ``run``, which works like ``map`` and may work ahead."""
         (width, height), side = self.canvas.size, self.plan.tile_size
         tops = iter(range(0, height, side))
@@ -274,6 +280,7 @@ class Prepared:
         return (samples, alpha), run(fill, boxes[::-1] if backwards else boxes)
 
 
+@contextmanager
 def prepare(
     sources: Sequence[Source],
     cameras: Sequence[Camera],
@@ -282,8 +289,11 @@ def prepare(
     options: CompositeOptions | None = None,
     progress: Progress | None = None,
     previews: Sequence[Preview] | None = None,
-) -> Prepared:
-    """Decide on exposure, seams and cropping, from one small look at each picture; see :func:`compose`."""
+) -> Iterator[Prepared]:
+    """Decide on exposure, seams and cropping, from one small look at each picture; see :func:`compose`.
+
+    Pictures are read ahead as long as it lasts.
+    """
     options = options or CompositeOptions()
     matrices = np.asarray(homographies, dtype=np.float64)
     if not len(sources) == len(cameras) == len(matrices) == len(canvas.footprints):
@@ -292,15 +302,32 @@ def prepare(
     channels, dtype = reader.samples
     plan = plan_composite(cameras, canvas, options, channels, dtype.itemsize)
     warps = [plan_warp(c, g, canvas, k) for k, (c, g) in enumerate(zip(cameras, matrices, strict=True))]
-    cache = PictureCache(reader, [w.shrink for w in warps], plan.cache_bytes, ahead=plan.workers > 1)
-    exposure, seams, survey = no_exposure(len(cameras), channels), None, None
+    pictures = PictureCache(reader, [w.shrink for w in warps], plan.cache_bytes, ahead=plan.workers > 1)
+    with closing(pictures):
+        same = no_exposure(len(cameras), channels)
+        renderer = Renderer(warps, pictures, same, None, options, plan.bands, channels, dtype)
+        yield _decided(renderer, reader, cameras, matrices, canvas, plan, progress)
+
+
+def _decided(
+    renderer: Renderer,
+    reader: PictureReader,
+    cameras: Sequence[Camera],
+    homographies: FloatArray,
+    canvas: Canvas,
+    plan: CompositePlan,
+    progress: Progress | None,
+) -> Prepared:
+    """Decide for a renderer that knows of no exposure and no seams yet."""
+    options, warps, exposure = renderer.options, renderer.warps, renderer.exposure
+    seams = survey = None
     if len(cameras) > 1 and (options.exposure != "none" or options.seam != "none"):
         survey = survey_pictures(
-            reader, cameras, matrices, canvas, min(plan.workers, _READERS), _part_of(progress, 0.0, 0.7)
+            reader, cameras, homographies, canvas, min(plan.workers, _READERS), _part_of(progress, 0.0, 0.7)
         )
-        # The first tiles will ask for them, whatever is cropped and however the seams run.
+        # The first tiles will ask for most of them, however the seams run.
         topmost = [index for index, warp in enumerate(warps) if warp.box[1] < plan.tile_size]
-        cache.foresee(sorted(topmost, key=lambda index: warps[index].box))
+        renderer.pictures.foresee(sorted(topmost, key=lambda index: warps[index].box))
         if options.exposure != "none":
             exposure = estimate_exposure(survey, cameras, blocks=options.exposure == "blocks")
         if options.seam != "none":
@@ -309,13 +336,14 @@ def prepare(
                 seams = replace(seams, softness=max(1, (1 << plan.bands) // (2 * seams.factor)))
     box, note = None, ""
     if options.crop == "auto":
-        box, note = crop_box(*coverage_map(cameras, matrices, canvas, survey), canvas.size)
-    renderer = Renderer(warps, cache, exposure, seams, options, plan.bands, channels, dtype)
+        box, note = crop_box(*coverage_map(cameras, homographies, canvas, survey), canvas.size)
     cropped = canvas if box is None else canvas.cropped(box)
     # What a tile's blending feels is aligned to the coarsest band.
     around = margin(plan.bands) + (2 << plan.bands)
     shown = [] if seams is None else shown_parts(warps, seams, around)
-    return Prepared(renderer, cropped, (0, 0) if box is None else box[:2], plan, (note,) if note else (), shown, around)
+    origin, notes = (0, 0) if box is None else box[:2], (note,) if note else ()
+    renderer = replace(renderer, exposure=exposure, seams=seams)
+    return Prepared(renderer, cropped, origin, plan, notes, shown, around)
 
 
 def _part_of(progress: Progress | None, start: float, stop: float) -> Progress | None:

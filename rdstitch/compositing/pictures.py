@@ -1,6 +1,6 @@
-"""Pictures read when their tiles come, smoothed for the output's resolution, in a cache of bounded size.
+"""Pictures read for the tiles that need them, smoothed for the output's resolution, in a cache of bounded size.
 
-Most of a picture is often hidden by its neighbours: only the part that is asked for is kept.
+Most of a picture is often hidden by its neighbours: where room is short, only the part that is asked for is kept.
 """
 
 import math
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.compositing.boxes import Box, encloses
+from rdstitch.compositing.boxes import Box, encloses, intersection
 from rdstitch.errors import InputError
 from rdstitch.io.read import Picture
 from rdstitch.io.reduction import block_mean, fitting_reduction, reduced_size
@@ -54,7 +54,9 @@ class LoadedPicture:
     reduction : int
         The picture is smaller than the original by this factor.
     part : (int, int, int, int) or None
-        What it holds of the original; None for all of it.
+        What can be resampled from it, px of the original; None for all of it. It holds more, for the kernel.
+    origin : (int, int)
+        Where its first px lies in the whole reduced picture.
     """
 
     pixels: NDArray[Any]
@@ -62,16 +64,12 @@ class LoadedPicture:
     opacity_step: float = 1.0
     reduction: int = 1
     part: Box | None = None
+    origin: tuple[int, int] = (0, 0)
 
     @property
     def nbytes(self) -> int:
         """Memory that it takes, bytes."""
         return self.pixels.nbytes + (0 if self.opacity is None else self.opacity.nbytes)
-
-    @property
-    def origin(self) -> tuple[int, int]:
-        """Where its first px lies in the whole reduced picture."""
-        return (0, 0) if self.part is None else (self.part[0] // self.reduction, self.part[1] // self.reduction)
 
     def holds(self, part: Box) -> bool:
         """Whether a part of the original can be resampled from it."""
@@ -91,8 +89,9 @@ class LoadedPicture:
             return self
         rows, columns = slice(top, bottom), slice(left, right)
         opacity = None if self.opacity is None else self.opacity[rows, columns].copy()
-        held = ((left + x) * unit, (top + y) * unit, (right + x) * unit, (bottom + y) * unit)
-        return replace(self, pixels=self.pixels[rows, columns].copy(), opacity=opacity, part=held)
+        left_part = part if self.part is None else intersection(part, self.part) or NOTHING
+        pixels, origin = self.pixels[rows, columns].copy(), (left + x, top + y)
+        return replace(self, pixels=pixels, opacity=opacity, part=left_part, origin=origin)
 
 
 def prepare_picture(picture: Picture, shrink: float, reduction: int = 1) -> LoadedPicture:
@@ -171,15 +170,19 @@ class PictureReader:
 
     def prepared(self, index: int, shrink: float) -> LoadedPicture:
         """Read picture ``index``, no larger than needed, for an output that shrinks it so much."""
-        # A Gaussian does the rest.
-        reduction = 1 if self._previews is None else fitting_reduction(shrink / _PX_PER_OUTPUT_PX)
+        reduction = self._reduction(shrink)
         return prepare_picture(self(index, reduction), shrink, reduction)
 
     def nbytes(self, index: int, shrink: float) -> int:
-        """Memory that picture ``index`` takes when it is prepared for such an output."""
+        """Memory that picture ``index`` takes at most when it is prepared for such an output, if it was read before."""
         channels, dtype = self.samples
-        width, height = reduced_size(self._sizes[index], fitting_reduction(shrink / _PX_PER_OUTPUT_PX))
-        return width * height * channels * dtype.itemsize
+        width, height = reduced_size(self._sizes[index], self._reduction(shrink))
+        opacity = np.dtype(np.float32).itemsize if self._masked.get(index, False) else 0
+        return width * height * (channels * dtype.itemsize + opacity)
+
+    def _reduction(self, shrink: float) -> int:
+        """What a picture is read smaller by for an output that shrinks it so much; a Gaussian does the rest."""
+        return 1 if self._previews is None else fitting_reduction(shrink / _PX_PER_OUTPUT_PX)
 
     def __call__(self, index: int, reduction: int = 1) -> Picture:
         """Read picture ``index``; a grey picture among coloured ones becomes coloured.
@@ -282,11 +285,11 @@ class PictureCache:
             # Another thread may have read it in the meantime.
             if (held := self._find(index, part)) is not None:
                 return held
-            expected = self._expected[index]
-            if expected is not None and not encloses(expected, part):
-                self._surprising.add(index)
-                self._expected[index] = expected = None
             with self._lock:
+                expected = self._expected[index]
+                if expected is not None and not encloses(expected, part):
+                    self._surprising.add(index)
+                    self._expected[index] = expected = None
                 self._held.pop(index, None)
             return self._read(index, expected)
 
@@ -298,13 +301,19 @@ class PictureCache:
             # What cannot be read is told to who asks for it.
             self._ahead.submit(self._read_ahead, index)
 
+    def close(self) -> None:
+        """Read nothing ahead any more."""
+        if self._ahead is not None:
+            self._ahead.shutdown(cancel_futures=True)
+            self._ahead = None
+
     def _read_ahead(self, index: int) -> None:
         """Read a picture, unless it is held or others would have to go for it."""
         with self._reading:
             expected = self._expected[index]
             if index in self._held or expected == NOTHING:
                 return
-            if self._fits(self._reader.nbytes(index, self._shrinks[index])):
+            if self._make_room(self._reader.nbytes(index, self._shrinks[index])):
                 self._read(index, expected)
 
     def _read(self, index: int, part: Box | None) -> LoadedPicture:
@@ -312,15 +321,15 @@ class PictureCache:
         loaded = self._reader.prepared(index, self._shrinks[index])
         if part is not None:
             loaded = loaded.cut(part)
-        self._fits(loaded.nbytes)
+        self._make_room(loaded.nbytes)
         with self._lock:
             while self._held and self._nbytes() + loaded.nbytes > self._limit:
                 self._held.popitem(last=False)
             self._held[index] = loaded
         return loaded
 
-    def _fits(self, nbytes: int) -> bool:
-        """Whether there is room for so much, if need be without what will not be asked for of the pictures held."""
+    def _make_room(self, nbytes: int) -> bool:
+        """Drop what will not be asked for of the pictures held, if need be; whether there is room for so much then."""
         with self._lock:
             room, indices = self._limit - self._nbytes(), list(self._held)
         for index in indices if nbytes > room else ():

@@ -55,7 +55,7 @@ class Picture:
     clearance : ndarray of shape (height, width), float32, or None
         Distance to the nearest masked pixel, px of ``grey``, zero if masked; None without mask.
     factor : ndarray of shape (2,)
-        Full size divided by working size, horizontally and vertically.
+        Px of the whole picture for one of this, horizontally and vertically.
     full_size : (int, int)
         Width and height, px.
     """
@@ -86,8 +86,9 @@ class Picture:
 
 def halving(image_size: tuple[int, int], megapixels: float) -> int:
     """The power of two that width and height are divided by for at most so many 10⁶ px."""
-    factor = 1
-    while factor < max(image_size) and image_size[0] * image_size[1] > megapixels * 1e6 * factor**2:
+    (width, height), factor = image_size, 1
+    # Sizes are rounded up, so that halving twice is dividing by four.
+    while factor < max(image_size) and -(-width // factor) * -(-height // factor) > megapixels * 1e6:
         factor *= 2
     return factor
 

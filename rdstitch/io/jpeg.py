@@ -56,9 +56,7 @@ def _on_background(picture: NDArray[np.uint8], alpha: NDArray[np.uint8], backgro
     """A picture (h, w) or (h, w, 3), grey where alpha is 0."""
     shown = cv2.bitwise_and(picture, picture, mask=alpha)
     if background:
-        outside = (alpha == 0).view(np.uint8)
-        # The stubs know no scalars.
-        cv2.add(shown, (background,) * 3, dst=shown, mask=outside)  # type: ignore[call-overload]
+        shown[alpha == 0] = background
     return np.asarray(shown, dtype=np.uint8)
 
 

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 from rdstitch.io.reduction import reduced_size
 
+_SMALLEST = 8  # px a side; below, different reductions give pictures of the same size
+
 
 def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) -> NDArray[Any] | None:
     """Samples (h, w) or (h, w, 3) in RGB order as stored, not turned upright.
@@ -28,8 +30,10 @@ def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) 
     Returns
     -------
     ndarray or None
-        None where something is not as it should be, or the file has no such reduction.
+        None where something is not as it should be, or the file has no such reduction or is tiny.
     """
+    if min(size) < _SMALLEST:
+        return None
     width, height = reduced_size(size, factor)
     try:
         samples = simplejpeg.decode_jpeg(

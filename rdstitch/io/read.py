@@ -49,6 +49,11 @@ class Picture:
     alpha: NDArray[np.uint8] | None
     metadata: Metadata
 
+    @property
+    def nbytes(self) -> int:
+        """Memory that its samples take, bytes."""
+        return self.pixels.nbytes + (0 if self.alpha is None else self.alpha.nbytes)
+
 
 def read_image(path: str | Path, reduction: int = 1) -> Picture:
     """Read a picture file.

@@ -162,7 +162,15 @@ class Pairing:
 
         # A network is no function: only one thread may use it.
         workers = 1 if network else self.options.threads
-        return match_pairs(self.features, pairs, self.matcher, glimpses, partial(self.progress, stage), recall, workers)
+        return match_pairs(
+            self.features,
+            pairs,
+            self.matcher,
+            glimpses=glimpses,
+            progress=partial(self.progress, stage),
+            recall=recall,
+            workers=workers,
+        )
 
     def _relate(
         self,

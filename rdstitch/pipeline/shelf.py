@@ -27,8 +27,8 @@ class Shelf:
     def put(self, key: Hashable, picture: Picture) -> None:
         """Keep a picture if there is room for it."""
         with self._lock:
-            if key not in self._held and _bytes(picture) <= self._room:
-                self._room -= _bytes(picture)
+            if key not in self._held and picture.nbytes <= self._room:
+                self._room -= picture.nbytes
                 self._held[key] = picture
 
     def take(self, key: Hashable) -> Picture | None:
@@ -36,20 +36,15 @@ class Shelf:
         with self._lock:
             picture = self._held.pop(key, None)
             if picture is not None:
-                self._room += _bytes(picture)
+                self._room += picture.nbytes
             return picture
 
     def clear(self) -> None:
         """Let go of all that is left."""
         with self._lock:
-            self._room += sum(map(_bytes, self._held.values()))
+            self._room += sum(picture.nbytes for picture in self._held.values())
             self._held.clear()
 
-
-NO_SHELF = Shelf(room=0)
-"""Keeps nothing."""
-
-
-def _bytes(picture: Picture) -> int:
-    """Memory that a picture takes."""
-    return picture.pixels.nbytes + (0 if picture.alpha is None else picture.alpha.nbytes)
+    def __reduce__(self) -> tuple[type["Shelf"], tuple[int]]:
+        """Copies and other processes get an empty one."""
+        return Shelf, (self._room,)

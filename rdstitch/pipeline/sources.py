@@ -15,7 +15,7 @@ from rdstitch.io.mask import read_mask
 from rdstitch.io.metadata import Metadata, read_metadata
 from rdstitch.io.read import Picture, read_image, reduced
 from rdstitch.io.reduction import block_minimum, fitting_reduction, reduced_size
-from rdstitch.pipeline.shelf import NO_SHELF, Shelf
+from rdstitch.pipeline.shelf import Shelf
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Source:
     camera: Camera
     mask: Path | None = None
     attitude: tuple[float, float] | None = None
-    shelf: Shelf = field(default=NO_SHELF, compare=False, repr=False)
+    shelf: Shelf = field(default_factory=partial(Shelf, room=0), compare=False, repr=False)
 
     @property
     def name(self) -> str:
@@ -53,7 +53,7 @@ class Source:
         return 1 if megapixels is None else fitting_reduction(halving(self.camera.image_size, megapixels))
 
     def read(self, reduction: int = 1, *, keep: bool = False) -> Picture:
-        """The pixels, reduced as by :func:`rdstitch.io.read_image`; what the mask excludes is transparent.
+        """The pixels, of blocks of so many px a side; what the mask excludes is transparent.
 
         Parameters
         ----------

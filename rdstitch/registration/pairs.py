@@ -70,6 +70,7 @@ def match_pairs(
     features: Sequence[Features],
     pairs: Sequence[tuple[int, int]],
     matcher: Matcher,
+    *,
     glimpses: Sequence[Correspondences | None] | None = None,
     progress: Progress | None = None,
     recall: Recall[Correspondences] | None = None,

@@ -32,8 +32,8 @@ def _prepared(blend: str, seam: str, bits: int) -> tuple[Prepared, NDArray[Any],
     """A composite, and all of it as one tile."""
     scene = _scene(bits)
     options = CompositeOptions(blend=blend, seam=seam, max_memory=2**28)  # type: ignore[arg-type]
-    ready = prepare(scene.sources, scene.cameras, scene.homographies, scene.canvas, options)
-    return ready, *ready.renderer.tile((0, 0, *scene.canvas.size))
+    with prepare(scene.sources, scene.cameras, scene.homographies, scene.canvas, options) as ready:
+        return ready, *ready.renderer.tile((0, 0, *scene.canvas.size))
 
 
 @pytest.mark.parametrize("bits", [8, 16])
@@ -55,8 +55,8 @@ def test_any_box_is_a_part_of_the_whole(blend: str, seam: str, bits: int, data: 
 def test_strips_are_the_whole(workers: int) -> None:
     scene = _scene(8)
     options = CompositeOptions(tile_size=256, workers=workers)
-    ready = prepare(scene.sources, scene.cameras, scene.homographies, scene.canvas, options)
-    pixels, alpha = (np.concatenate(parts) for parts in zip(*ready.strips(), strict=True))
+    with prepare(scene.sources, scene.cameras, scene.homographies, scene.canvas, options) as ready:
+        pixels, alpha = (np.concatenate(parts) for parts in zip(*ready.strips(), strict=True))
     _, whole, covered = _prepared("multiband", "graphcut", 8)
     np.testing.assert_array_equal(pixels, whole)
     np.testing.assert_array_equal(alpha > 0, covered)

@@ -2,6 +2,9 @@
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from threading import Event, Timer
 from time import monotonic, sleep
 
 import numpy as np
@@ -13,6 +16,7 @@ from rdstitch.compositing.seams import SeamMap
 from rdstitch.compositing.warp import plan_warp
 from rdstitch.errors import InputError
 from rdstitch.io import Picture
+from rdstitch.io.read import reduced
 from tests.compositing_scenes import as_picture, render
 
 WHOLE = (0, 0, 200, 100)
@@ -107,6 +111,38 @@ def test_pictures_are_read_ahead_where_there_is_room() -> None:
     assert shelf.reads == {0: 1, 1: 1, 2: 1}
 
 
+def test_nothing_is_read_ahead_once_it_is_closed() -> None:
+    shelf = Shelf()
+    cache = shelf.cache(limit=80_000, ahead=True)
+    reading, go_on = Event(), Event()
+
+    def slow(index: int) -> Picture:
+        reading.set()
+        assert go_on.wait(30)
+        return Shelf.read(shelf, index)
+
+    shelf.read = slow  # type: ignore[method-assign]
+    cache.foresee(range(4))
+    assert reading.wait(30)
+    Timer(0.05, go_on.set).start()
+    cache.close()
+    cache.foresee(range(4))
+    assert shelf.reads == {0: 1}
+    np.testing.assert_array_equal(cache.get(3, WHOLE).pixels, shelf.frames[3])
+
+
+@pytest.mark.parametrize("shrink", [1.0, 3.9, 5.0])
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_room_for_a_picture_is_known_before(shrink: float, masked: bool) -> None:
+    picture = as_picture(np.zeros((300, 400), dtype=np.uint8))
+    if masked:
+        picture = replace(picture, alpha=np.eye(300, 400, dtype=np.uint8) * 255)
+    for previews in (None, [partial(reduced, picture)]):
+        reader = PictureReader([lambda: picture], [(400, 300)], previews)
+        assert reader.masked(0) is masked
+        assert reader.nbytes(0, shrink) >= reader.prepared(0, shrink).nbytes
+
+
 def test_what_cannot_be_read_ahead_is_told_to_who_asks_for_it() -> None:
     shelf = Shelf()
     cache = shelf.cache(limit=80_000, ahead=True)
@@ -126,6 +162,7 @@ def test_a_cut_holds_what_was_asked_for(shrink: float) -> None:
     for smaller, box in ((part, (101, 53, 222, 177)), (again, (150, 100, 160, 110))):
         assert smaller.holds(box)
         assert not smaller.holds((0, 0, 400, 300))
+        assert not smaller.holds((box[0] - 1, box[1], box[2], box[3])), "the kernel needs what is around"
         assert smaller.nbytes < 0.5 * whole.nbytes
         x, y = smaller.origin
         rows, columns = smaller.pixels.shape[:2]

@@ -28,7 +28,8 @@ def _compose(scene: Scene, **options: Any) -> Any:
 
 def _seams(scene: Scene, options: CompositeOptions) -> NDArray[np.bool_]:
     """Px within two of a seam."""
-    seams = prepare(scene.sources, scene.cameras, scene.homographies, scene.canvas, options).renderer.seams
+    with prepare(scene.sources, scene.cameras, scene.homographies, scene.canvas, options) as ready:
+        seams = ready.renderer.seams
     assert seams is not None
     box = (0, 0, *scene.canvas.size)
     shares = np.stack([seams.share(k, box) for k in range(len(scene.frames))])

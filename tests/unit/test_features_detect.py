@@ -57,6 +57,15 @@ def test_pictures_are_halved_until_they_are_small_enough() -> None:
     assert halving((640, 480), 5e-324) == 1024
 
 
+@pytest.mark.parametrize("size", [(3265, 2449), (6532, 4898), (4001, 1999), (2001, 1000)])
+def test_a_picture_that_was_read_smaller_is_worked_on_at_the_same_size(size: tuple[int, int]) -> None:
+    factor = halving(size, 2.0)
+    width, height = (-(-n // factor) for n in size)
+    assert width * height <= 2e6
+    for read in (2**k for k in range(factor.bit_length())):
+        assert read * halving((-(-size[0] // read), -(-size[1] // read)), 2.0) == factor
+
+
 @pytest.mark.parametrize("kind", ["rootsift", "orb"])
 def test_a_picture_that_shows_too_little_is_looked_at_more_closely(picture: NDArray[np.uint8], kind: str) -> None:
     options = FeatureOptions(kind=kind, work_megapixels=0.02)

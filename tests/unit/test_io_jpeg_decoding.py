@@ -45,6 +45,13 @@ def test_it_decodes_what_pillow_does(
     np.testing.assert_array_equal(read_image(file, factor).pixels, found)
 
 
+def test_tiny_pictures_are_left_to_pillow(tmp_path: Path, pixels: NDArray[np.uint8]) -> None:
+    for side, factor in ((3, 2), (5, 4), (7, 1)):
+        Image.fromarray(pixels[:side, :side]).save(tmp_path / "a.jpg")
+        assert decoded_jpeg(tmp_path / "a.jpg", (side, side), factor, grey=False) is None
+        assert read_image(tmp_path / "a.jpg", factor).pixels.shape[1::-1] == reduced_size((side, side), factor)
+
+
 def test_complaints_are_left_to_pillow(tmp_path: Path, pixels: NDArray[np.uint8]) -> None:
     file, cut, padded = (tmp_path / name for name in ("a.jpg", "cut.jpg", "padded.jpg"))
     Image.fromarray(pixels).save(file)

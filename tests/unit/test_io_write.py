@@ -152,6 +152,8 @@ def test_background_of_jpeg(tmp_path: Path) -> None:
         back = read_image(tmp_path / "a.jpg").pixels
         assert abs(int(back[32, 60, 0]) - grey) < 4
         assert abs(int(back[32, 4, 0]) - 128) < 4
+    write_image(tmp_path / "a.jpg", np.zeros((4, 1), np.uint8), np.zeros((4, 1), np.uint8), background=200)
+    assert (abs(read_image(tmp_path / "a.jpg").pixels.astype(int) - 200) < 4).all()
 
 
 def test_too_large_for_the_format(tmp_path: Path) -> None:

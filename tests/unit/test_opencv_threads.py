@@ -6,6 +6,21 @@ import pytest
 from rdstitch.opencv_threads import one_opencv_thread
 
 
+def test_the_last_to_leave_gives_the_threads_back() -> None:
+    before = cv2.getNumThreads()
+    first, second = one_opencv_thread(), one_opencv_thread()
+    try:
+        cv2.setNumThreads(3)
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        assert cv2.getNumThreads() == 1
+        second.__exit__(None, None, None)
+        assert cv2.getNumThreads() == 3
+    finally:
+        cv2.setNumThreads(before)
+
+
 def _fail_inside() -> None:
     with one_opencv_thread():
         assert cv2.getNumThreads() == 1

@@ -1,5 +1,7 @@
 """Pictures between stages: decoded once where there is room, and the same whether there is or not."""
 
+import pickle
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +24,14 @@ def source(tmp_path: Path) -> Source:
     pixels = np.random.default_rng(0).integers(0, 256, (SIZE[1], SIZE[0], 3)).astype(np.uint8)
     write_image(tmp_path / "a.jpg", pixels)
     return Source(tmp_path / "a.jpg", Metadata(SIZE), Camera(SIZE))
+
+
+def test_a_source_can_be_sent_elsewhere(source: Source) -> None:
+    kept = replace(source, shelf=Shelf())
+    kept.read(keep=True)
+    for other in (pickle.loads(pickle.dumps(kept)), deepcopy(kept)):
+        assert other == kept
+        np.testing.assert_array_equal(other.read().pixels, kept.read().pixels)
 
 
 @pytest.fixture
