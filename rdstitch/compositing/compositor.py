@@ -1,46 +1,24 @@
 """The compositor: pictures, cameras and homographies in, one picture out, in memory or in a file."""
 
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
-from itertools import islice
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rdstitch.camera import Camera, FloatArray
-from rdstitch.compositing.boxes import Box
+from rdstitch.camera import Camera
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.crop import coverage_map, crop_box
-from rdstitch.compositing.exposure import Exposure, estimate_exposure, no_exposure
-from rdstitch.compositing.multiband import margin
+from rdstitch.compositing.exposure import Exposure
 from rdstitch.compositing.options import CompositeOptions
-from rdstitch.compositing.parts import ShownPart, shown_parts
-from rdstitch.compositing.pictures import PictureCache, PictureReader, Preview, Source
-from rdstitch.compositing.plan import CompositePlan, plan_composite
-from rdstitch.compositing.render import Renderer
-from rdstitch.compositing.seams import find_seams
-from rdstitch.compositing.survey import survey_pictures
-from rdstitch.compositing.warp import plan_warp
-from rdstitch.errors import ArgumentError
-from rdstitch.io.layout import STRIP_ROWS, Layout
+from rdstitch.compositing.pictures import Preview, Source
+from rdstitch.compositing.preparation import Filled, Progress, prepare
+from rdstitch.io.layout import Layout
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_format, write_strips
-from rdstitch.opencv_threads import one_opencv_thread
-
-# Samples (h, W, C) and alpha (h, W).
-_Filled = tuple[NDArray[Any], NDArray[np.uint8]]
-# Called with the share of the work done, 0 to 1.
-Progress = Callable[[float], None]
-
-_PREPARATION = 0.25
-# Pictures that the survey reads at one time: what the tiles need is not there yet.
-_READERS = 2
 
 
 @dataclass(frozen=True)
@@ -127,13 +105,12 @@ def compose(
     LimitError
         When the memory limit is too low.
     """
-    steps = _part_of(progress, 0.0, _PREPARATION), _part_of(progress, _PREPARATION, 1.0)
-    with prepare(sources, cameras, homographies, canvas, options, steps[0], previews) as prepared:
+    with prepare(sources, cameras, homographies, canvas, options, progress, previews) as prepared:
         renderer, (width, height) = prepared.renderer, prepared.canvas.size
         pixels = np.zeros((height, width, renderer.channels), dtype=renderer.dtype)
         alpha = np.zeros((height, width), dtype=np.uint8)
         top = 0
-        with closing(prepared.strips(steps[1])) as strips:
+        with closing(prepared.strips(progress)) as strips:
             for samples, opaque in strips:
                 pixels[top : top + len(samples)], alpha[top : top + len(samples)] = samples, opaque
                 top += len(samples)
@@ -176,14 +153,13 @@ def compose_to_file(
     """
     covered = 0
 
-    def counted(strips: Iterable[_Filled]) -> Iterator[_Filled]:
+    def counted(strips: Iterable[Filled]) -> Iterator[Filled]:
         nonlocal covered
         for samples, alpha in strips:
             covered += int(np.count_nonzero(alpha))
             yield samples, alpha
 
-    steps = _part_of(progress, 0.0, _PREPARATION), _part_of(progress, _PREPARATION, 1.0)
-    with prepare(sources, cameras, homographies, canvas, options, steps[0], previews) as prepared:
+    with prepare(sources, cameras, homographies, canvas, options, progress, previews) as prepared:
         renderer, size = prepared.renderer, prepared.canvas.size
         layout = Layout(
             size,
@@ -196,158 +172,7 @@ def compose_to_file(
         check_format(path, layout)
         tags = () if extra_tags is None else extra_tags(prepared.canvas)
         # Nothing goes on behind a writer that fails.
-        with closing(prepared.strips(steps[1])) as strips:
+        with closing(prepared.strips(progress)) as strips:
             write_strips(path, layout, counted(strips), tags)
     share = covered / (size[0] * size[1])
     return FileComposite(Path(path), prepared.canvas, renderer.exposure, share, prepared.notes)
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A composite that is decided on, and not yet computed.
-
-    Attributes
-    ----------
-    renderer : Renderer
-    canvas : Canvas
-        After cropping.
-    origin : (int, int)
-        Its top-left px on the canvas that the renderer knows.
-    plan : CompositePlan
-    notes : tuple of str
-    shown : sequence of ShownPart
-        Which part of each picture shows, where that is known before; else empty.
-    around : int
-        How far from there pictures are asked for too, canvas px.
-    """
-
-    renderer: Renderer
-    canvas: Canvas
-    origin: tuple[int, int]
-    plan: CompositePlan
-    notes: tuple[str, ...]
-    shown: Sequence[ShownPart]
-    around: int
-
-    def strips(self, progress: Progress | None = None) -> Generator[_Filled]:
-        """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
-        if self.plan.workers == 1:
-            yield from self._strips(map, progress)
-            return
-        with one_opencv_thread(), ThreadPoolExecutor(self.plan.workers) as pool:
-            yield from self._strips(pool.map, progress)
-
-    def _strips(self, run: Callable[..., Iterator[Any]], progress: Progress | None) -> Iterator[_Filled]:
-        """The same, with tiles computed by ``run``, which works like ``map`` and may work ahead."""
-        (width, height), side = self.canvas.size, self.plan.tile_size
-        tops = iter(range(0, height, side))
-        # Two rows at a time: nobody waits for the last tile of a row.
-        under_way = deque(self._start(top, run) for top in islice(tops, 2))
-        done = 0
-        while under_way:
-            (samples, alpha), tiles = under_way.popleft()
-            for box in tiles:
-                if progress is not None:
-                    done += (box[2] - box[0]) * (box[3] - box[1])
-                    progress(done / (width * height))
-            # Computed while this strip is written.
-            under_way.extend(self._start(top, run) for top in islice(tops, 1))
-            for start in range(0, len(samples), STRIP_ROWS):
-                yield samples[start : start + STRIP_ROWS], alpha[start : start + STRIP_ROWS]
-
-    def _start(self, top: int, run: Callable[..., Iterator[Any]]) -> tuple[_Filled, Iterator[Box]]:
-        """Begin with a row of tiles, when all but one above are done: the strip they fill, and each once it is done."""
-        (width, height), (x, y), side = self.canvas.size, self.origin, self.plan.tile_size
-        bottom = min(top + side, height)
-        # To and fro, so that the pictures used last are the ones needed next.
-        backwards = top // side % 2 == 1
-        if self.shown:
-            pictures, warps = self.renderer.pictures, self.renderer.warps
-            pictures.expect([part.from_row(y + top - side - self.around) for part in self.shown])
-            rows = y + top - self.around, y + bottom + self.around
-            due = [index for index, part in enumerate(self.shown) if part.on_rows(*rows)]
-            pictures.foresee(sorted(due, key=lambda index: warps[index].box, reverse=backwards))
-        boxes = [(x + k, y + top, x + min(k + side, width), y + bottom) for k in range(0, width, side)]
-        samples = np.zeros((bottom - top, width, self.renderer.channels), dtype=self.renderer.dtype)
-        alpha = np.zeros((bottom - top, width), dtype=np.uint8)
-
-        def fill(box: Box) -> Box:
-            columns = slice(box[0] - x, box[2] - x)
-            samples[:, columns], covered = self.renderer.tile(box)
-            alpha[:, columns][covered] = 255
-            return box
-
-        return (samples, alpha), run(fill, boxes[::-1] if backwards else boxes)
-
-
-@contextmanager
-def prepare(
-    sources: Sequence[Source],
-    cameras: Sequence[Camera],
-    homographies: ArrayLike,
-    canvas: Canvas,
-    options: CompositeOptions | None = None,
-    progress: Progress | None = None,
-    previews: Sequence[Preview] | None = None,
-) -> Iterator[Prepared]:
-    """Decide on exposure, seams and cropping, from one small look at each picture; see :func:`compose`.
-
-    Pictures are read ahead as long as it lasts.
-    """
-    options = options or CompositeOptions()
-    matrices = np.asarray(homographies, dtype=np.float64)
-    if not len(sources) == len(cameras) == len(matrices) == len(canvas.footprints):
-        raise ArgumentError("sources, cameras, homographies and footprints must be equally many")
-    reader = PictureReader(sources, [c.image_size for c in cameras], previews)
-    channels, dtype = reader.samples
-    plan = plan_composite(cameras, canvas, options, channels, dtype.itemsize)
-    warps = [plan_warp(c, g, canvas, k) for k, (c, g) in enumerate(zip(cameras, matrices, strict=True))]
-    pictures = PictureCache(reader, [w.shrink for w in warps], plan.cache_bytes, ahead=plan.workers > 1)
-    with closing(pictures):
-        same = no_exposure(len(cameras), channels)
-        renderer = Renderer(warps, pictures, same, None, options, plan.bands, channels, dtype)
-        yield _decided(renderer, reader, cameras, matrices, canvas, plan, progress)
-
-
-def _decided(
-    renderer: Renderer,
-    reader: PictureReader,
-    cameras: Sequence[Camera],
-    homographies: FloatArray,
-    canvas: Canvas,
-    plan: CompositePlan,
-    progress: Progress | None,
-) -> Prepared:
-    """Decide for a renderer that knows of no exposure and no seams yet."""
-    options, warps, exposure = renderer.options, renderer.warps, renderer.exposure
-    seams = survey = None
-    if len(cameras) > 1 and (options.exposure != "none" or options.seam != "none"):
-        survey = survey_pictures(
-            reader, cameras, homographies, canvas, min(plan.workers, _READERS), _part_of(progress, 0.0, 0.7)
-        )
-        # The first tiles will ask for most of them, however the seams run.
-        topmost = [index for index, warp in enumerate(warps) if warp.box[1] < plan.tile_size]
-        renderer.pictures.foresee(sorted(topmost, key=lambda index: warps[index].box))
-        if options.exposure != "none":
-            exposure = estimate_exposure(survey, cameras, blocks=options.exposure == "blocks")
-        if options.seam != "none":
-            seams = find_seams(survey, exposure, options.seam == "graphcut", _part_of(progress, 0.7, 1.0))
-            if options.blend == "feather":
-                seams = replace(seams, softness=max(1, (1 << plan.bands) // (2 * seams.factor)))
-    box, note = None, ""
-    if options.crop == "auto":
-        box, note = crop_box(*coverage_map(cameras, homographies, canvas, survey), canvas.size)
-    cropped = canvas if box is None else canvas.cropped(box)
-    # What a tile's blending feels is aligned to the coarsest band.
-    around = margin(plan.bands) + (2 << plan.bands)
-    shown = [] if seams is None else shown_parts(warps, seams, around)
-    origin, notes = (0, 0) if box is None else box[:2], (note,) if note else ()
-    renderer = replace(renderer, exposure=exposure, seams=seams)
-    return Prepared(renderer, cropped, origin, plan, notes, shown, around)
-
-
-def _part_of(progress: Progress | None, start: float, stop: float) -> Progress | None:
-    """A progress that fills a part of another."""
-    if progress is None:
-        return None
-    return lambda share: progress(start + (stop - start) * share)

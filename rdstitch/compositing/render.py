@@ -13,7 +13,7 @@ from rdstitch.compositing.boxes import Box, Float32Array, aligned, bounds, cut, 
 from rdstitch.compositing.exposure import Exposure, full_scale
 from rdstitch.compositing.multiband import MultibandBlender, margin, rounding_constant, spread
 from rdstitch.compositing.options import CompositeOptions
-from rdstitch.compositing.pictures import PictureCache
+from rdstitch.compositing.picture_cache import PictureCache
 from rdstitch.compositing.seams import NOBODY, SeamMap
 from rdstitch.compositing.warp import (
     Geometry,

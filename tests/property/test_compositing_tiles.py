@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing import CompositeOptions
 from rdstitch.compositing.boxes import aligned, grown
-from rdstitch.compositing.compositor import Prepared, prepare
 from rdstitch.compositing.multiband import MultibandBlender, margin, rounding_constant
+from rdstitch.compositing.preparation import Prepared, prepare
 from rdstitch.synthetic.rendering import Photometry
 from tests.compositing_scenes import Scene, render
 

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from rdstitch.compositing.parts import shown_parts
-from rdstitch.compositing.pictures import NOTHING, PictureCache, PictureReader, prepare_picture
+from rdstitch.compositing.picture_cache import PictureCache
+from rdstitch.compositing.pictures import NOTHING, PictureReader, prepare_picture
 from rdstitch.compositing.seams import SeamMap
 from rdstitch.compositing.warp import plan_warp
 from rdstitch.errors import InputError
