@@ -22,7 +22,13 @@ SIDECAR_SCHEMA = Draft202012Validator(
     json.loads(files("rdstitch.pipeline").joinpath("sidecar.schema.json").read_text(encoding="utf-8"))
 )
 
-_PROGRAM = "from rdstitch_cli.main import main; main()"
+# A shell ignores interrupts for what it runs in the background, these tests for one, and children inherit that.
+_PROGRAM = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from rdstitch_cli.main import main
+main()
+"""
 
 DISTORTION = -0.2
 
