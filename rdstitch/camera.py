@@ -18,10 +18,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.records import Record, read_json
-
-FloatArray = NDArray[np.float64]
 
 _NEWTON_STEPS, _NEWTON_TOLERANCE = 12, 1e-14
 

@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 
 
 def rotation_from_tilt(tilt: ArrayLike) -> FloatArray:

@@ -11,7 +11,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rdstitch.camera import Camera, FloatArray, distort
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera, distort
 from rdstitch.planar_motion import PlanarMotion
 
 LENS_PARAMETERS = ("distortion", "distortion2", "center_x", "center_y")

@@ -4,10 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.camera import Camera, FloatArray, distort
+from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, TILTING, YAW, X, Y
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera, distort
+from rdstitch.matching.links import Link
 from rdstitch.radial_homography import RadialHomography
-from rdstitch.registration.links import Link
-from rdstitch.registration.models import LOG_HEIGHT, PSI, THETA, TILTING, YAW, X, Y
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, plan_canvas
 from rdstitch.io import Metadata, Picture
 from rdstitch.synthetic.comparison import plane_under

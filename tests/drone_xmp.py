@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 
 # By source: the properties of yaw, pitch and roll; and the axes of the body (ahead, right, below) in those of the
 # camera (right in the picture, down in it, ahead), as columns.

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from rdstitch.alignment.result import Poses
+from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.camera import Camera
-from rdstitch.registration.alignment import Poses
-from rdstitch.registration.trajectory import Trajectory
 from rdstitch.synthetic import Photometry, Sequence, ground, line_poses, parking_poses, sequence_over, turn_poses
 
 DISTORTION = -0.25

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.errors import RdstitchError
 from rdstitch.features import FeatureOptions
 from rdstitch.pipeline import Registration, StitchOptions, mosaic

@@ -98,7 +98,7 @@ class Angle(click.ParamType[float]):
 
 def resolve(inputs: tuple[Path, ...]) -> list[Path]:
     """The inputs, with - replaced by the names on standard input, one a line or separated by NUL."""
-    from rdstitch.pipeline.inputs import names_in
+    from rdstitch.inputs.find import names_in
 
     named: list[Path] = []
     for item in inputs:

@@ -86,7 +86,7 @@ class Report:
     @contextmanager
     def explaining(self) -> Iterator[None]:
         """Run a recipe; a result that is refused is shown, so that one can see why."""
-        from rdstitch.pipeline.verdict import RefusedError
+        from rdstitch.verification.verdict import RefusedError
 
         try:
             yield
@@ -111,7 +111,7 @@ def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = Fal
         reporter.warn(complaint)
     _warn_of(result.registration, reporter)
     if as_json:
-        from rdstitch.pipeline.sidecar import sidecar
+        from rdstitch.sidecar.write import sidecar
 
         _echo_json(sidecar(result))
         return
@@ -144,7 +144,7 @@ def report_registration(registration: "Registration", reporter: Reporter, *, as_
     """λ, or the camera, to standard output; pictures left out to standard error."""
     _warn_of(registration, reporter)
     if as_json:
-        from rdstitch.pipeline.sidecar import plain
+        from rdstitch.sidecar.write import plain
 
         _echo_json(plain(registration.camera.as_dict()))
     else:

@@ -24,10 +24,10 @@ from examples.paper.common.aerial import (
 from examples.paper.common.report import Report, Table
 from examples.paper.common.settings import Effort, Settings
 from examples.paper.common.stitched import register_files, registration_error
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.features import FeatureOptions
 from rdstitch.pipeline import StitchOptions
-from rdstitch.pipeline.register import Registration
+from rdstitch.registration import Registration
 
 DISTORTION = -0.05
 """λ of the rendered surveys: a compact camera."""

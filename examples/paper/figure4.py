@@ -8,7 +8,7 @@ from examples.paper.common.peers import absent
 from examples.paper.common.report import Report
 from examples.paper.common.settings import Settings
 from rdstitch import solvers
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.solvers import Solutions
 from rdstitch.synthetic import PlanarInstances, planar_instances
 

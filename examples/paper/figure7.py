@@ -12,7 +12,8 @@ from examples.paper.common.plain_ransac import THRESHOLD, all_solvers, draw_samp
 from examples.paper.common.plots import curves
 from examples.paper.common.report import Report, Table
 from examples.paper.common.settings import Effort, Settings
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
 

@@ -26,11 +26,11 @@ from examples.paper.common.drives import Drive, FramePair, drive, estimated_link
 from examples.paper.common.plain_ransac import all_solvers, best_of
 from examples.paper.common.report import Pixels, Report, Table
 from examples.paper.common.settings import Settings
-from rdstitch.camera import FloatArray
+from rdstitch.alignment import Alignment, AlignmentOptions, Link, align
+from rdstitch.arrays import FloatArray
+from rdstitch.matching.distortion_consensus import Consensus, vote
 from rdstitch.planar_motion import rotation_from_tilt
 from rdstitch.radial_homography import project
-from rdstitch.registration import Alignment, AlignmentOptions, Link, align
-from rdstitch.registration.voting import Consensus, vote
 from rdstitch.robust.measurements import Measurements
 from rdstitch.synthetic import fit_homography, fit_similarity
 

@@ -13,16 +13,22 @@ from examples.paper.common.drives import PATHS, Drive, drive, estimated_links
 from examples.paper.common.plain_ransac import all_solvers, best_of
 from examples.paper.common.report import Report, Table
 from examples.paper.common.settings import Settings
-from rdstitch.camera import FloatArray
+from rdstitch.alignment import align
+from rdstitch.alignment.bundle_adjustment import (
+    BundleAdjuster,
+    BundleAdjustmentResult,
+    FreeParameters,
+    Parameters,
+    Priors,
+)
+from rdstitch.alignment.motion_models import RIGID, YAW, X, Y
+from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.result import Poses
+from rdstitch.alignment.trajectory import Trajectory, compare
+from rdstitch.arrays import FloatArray
+from rdstitch.matching.links import Link
 from rdstitch.planar_motion import PlanarMotion, rotation_from_tilt
 from rdstitch.radial_homography import RadialHomography
-from rdstitch.registration import align
-from rdstitch.registration.alignment import Poses
-from rdstitch.registration.bundle_adjustment import Adjusted, Adjuster, Freedom, Parameters, Priors
-from rdstitch.registration.links import Link
-from rdstitch.registration.models import RIGID, YAW, X, Y
-from rdstitch.registration.observations import Observations
-from rdstitch.registration.trajectory import Trajectory, compare
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
 
@@ -118,7 +124,7 @@ def _chained(homographies: FloatArray, tilt: tuple[float, float]) -> Trajectory:
     return Trajectory(np.arange(count), np.array(position), np.array(yaw), np.ones(count))
 
 
-def _adjusted(d: Drive, start: Trajectory, tilt: tuple[float, float], distortion: float) -> Adjusted:
+def _adjusted(d: Drive, start: Trajectory, tilt: tuple[float, float], distortion: float) -> BundleAdjustmentResult:
     """All frames adjusted with the rigid model from a trajectory, a tilt and a λ."""
     cameras, count = d.blank_cameras, len(start)
     assert d.camera.focal is not None
@@ -130,8 +136,8 @@ def _adjusted(d: Drive, start: Trajectory, tilt: tuple[float, float], distortion
     none = Priors.none(RIGID, count)
     focal_prior = np.array([0.0, 0.0, _FOCAL_STD**-2.0])
     known = Priors(natural, focal_prior, none.lens, none.lens_precision, none.poses, none.poses_precision)
-    free = Freedom.fixing(RIGID, count, [0], np.array([True, False, False, False]))
-    adjuster = Adjuster(RIGID, Observations.from_links(links, cameras), free, known)
+    free = FreeParameters.fixing(RIGID, count, [0], np.array([True, False, False, False]))
+    adjuster = BundleAdjuster(RIGID, Observations.from_links(links, cameras), free, known)
     lens = np.array([distortion, 0.0, 0.0, 0.0])
     return adjuster.run(Parameters(poses, RIGID.shared_from(natural), lens))
 
@@ -147,7 +153,7 @@ def _plane_poses(poses: FloatArray, log_focal: float) -> Poses:
 
 
 def _recipe(d: Drive) -> _Path:
-    """Pairs by :func:`rdstitch.estimate_radial_homography`, all frames by :func:`rdstitch.registration.align`."""
+    """Pairs by :func:`rdstitch.estimate_radial_homography`, all frames by :func:`rdstitch.alignment.align`."""
     links = estimated_links(d.pairs, d.blank_cameras[0])
     consecutive = [link.relation for link in links if link.image2 - link.image1 == 1]
     alignment = align(d.blank_cameras, links)

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.camera_files.lens_fit import LensFit, fit_polynomial
 
 _POWERS = (3, 5, 7)

@@ -10,7 +10,8 @@ import re
 
 import numpy as np
 
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.camera_files.division import CameraFile, fitted_camera, own_node
 from rdstitch.camera_files.lens_fit import fit_polynomial
 from rdstitch.errors import ArgumentError, InputError

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.camera import Camera, FloatArray, distort
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera, distort
 from rdstitch.errors import ArgumentError
 
 Forward = Callable[[FloatArray], FloatArray]

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.radial_homography import to_plane

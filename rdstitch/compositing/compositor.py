@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.camera import Camera
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.exposure import Exposure
+from rdstitch.compositing.gain_compensation import Exposure
 from rdstitch.compositing.options import CompositeOptions
-from rdstitch.compositing.pictures import Preview, Source
-from rdstitch.compositing.preparation import Filled, Progress, prepare
+from rdstitch.compositing.preparation import OutputStrip, Progress, prepare
+from rdstitch.compositing.source_images import Preview, Source
 from rdstitch.io.layout import Layout
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
@@ -153,7 +153,7 @@ def compose_to_file(
     """
     covered = 0
 
-    def counted(strips: Iterable[Filled]) -> Iterator[Filled]:
+    def counted(strips: Iterable[OutputStrip]) -> Iterator[OutputStrip]:
         nonlocal covered
         for samples, alpha in strips:
             covered += int(np.count_nonzero(alpha))

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.survey import Survey

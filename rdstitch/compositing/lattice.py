@@ -6,7 +6,7 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import Box, Float32Array
 
 LATTICE_STEPS = (32, 16, 8, 4, 2, 1)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.camera import Camera
+from rdstitch.compositing.blender import margin
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.multiband import margin
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.errors import LimitError
 

@@ -11,19 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
+from rdstitch.compositing.blender import margin
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.crop import coverage_map, crop_box
-from rdstitch.compositing.exposure import estimate_exposure, no_exposure
-from rdstitch.compositing.multiband import margin
+from rdstitch.compositing.gain_compensation import estimate_exposure, no_exposure
+from rdstitch.compositing.image_cache import PictureCache
+from rdstitch.compositing.image_parts import ShownPart, shown_parts
 from rdstitch.compositing.options import CompositeOptions
-from rdstitch.compositing.parts import ShownPart, shown_parts
-from rdstitch.compositing.picture_cache import PictureCache
-from rdstitch.compositing.pictures import PictureReader, Preview, Source
 from rdstitch.compositing.plan import CompositePlan, plan_composite
 from rdstitch.compositing.render import Renderer
-from rdstitch.compositing.seams import find_seams
+from rdstitch.compositing.seam_finder import find_seams
+from rdstitch.compositing.source_images import PictureReader, Preview, Source
 from rdstitch.compositing.survey import survey_pictures
 from rdstitch.compositing.warp import plan_warp
 from rdstitch.errors import ArgumentError
@@ -31,7 +32,7 @@ from rdstitch.io.layout import STRIP_ROWS
 from rdstitch.opencv_threads import one_opencv_thread
 
 # Samples (h, W, C) and alpha (h, W).
-Filled = tuple[NDArray[Any], NDArray[np.uint8]]
+OutputStrip = tuple[NDArray[Any], NDArray[np.uint8]]
 # Called with the share of the work done, 0 to 1.
 Progress = Callable[[float], None]
 
@@ -67,7 +68,7 @@ class Prepared:
     shown: Sequence[ShownPart]
     around: int
 
-    def strips(self, progress: Progress | None = None) -> Generator[Filled]:
+    def strips(self, progress: Progress | None = None) -> Generator[OutputStrip]:
         """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
         progress = _part_of(progress, _PREPARATION, 1.0)
         if self.plan.workers == 1:
@@ -76,7 +77,7 @@ class Prepared:
         with one_opencv_thread(), ThreadPoolExecutor(self.plan.workers) as pool:
             yield from self._strips(pool.map, progress)
 
-    def _strips(self, run: Callable[..., Iterator[Any]], progress: Progress | None) -> Iterator[Filled]:
+    def _strips(self, run: Callable[..., Iterator[Any]], progress: Progress | None) -> Iterator[OutputStrip]:
         """The same, with tiles computed by ``run``, which works like ``map`` and may work ahead."""
         (width, height), side = self.canvas.size, self.plan.tile_size
         tops = iter(range(0, height, side))
@@ -94,7 +95,7 @@ class Prepared:
             for start in range(0, len(samples), STRIP_ROWS):
                 yield samples[start : start + STRIP_ROWS], alpha[start : start + STRIP_ROWS]
 
-    def _start(self, top: int, run: Callable[..., Iterator[Any]]) -> tuple[Filled, Iterator[Box]]:
+    def _start(self, top: int, run: Callable[..., Iterator[Any]]) -> tuple[OutputStrip, Iterator[Box]]:
         """Begin with a row of tiles, when all but one above are done: the strip they fill, and each once it is done."""
         (width, height), (x, y), side = self.canvas.size, self.origin, self.plan.tile_size
         bottom = min(top + side, height)
@@ -105,7 +106,7 @@ class Prepared:
             pictures.expect([part.from_row(y + top - side - self.around) for part in self.shown])
             rows = y + top - self.around, y + bottom + self.around
             due = [index for index, part in enumerate(self.shown) if part.on_rows(*rows)]
-            pictures.foresee(sorted(due, key=lambda index: warps[index].box, reverse=backwards))
+            pictures.prefetch(sorted(due, key=lambda index: warps[index].box, reverse=backwards))
         boxes = [(x + k, y + top, x + min(k + side, width), y + bottom) for k in range(0, width, side)]
         samples = np.zeros((bottom - top, width, self.renderer.channels), dtype=self.renderer.dtype)
         alpha = np.zeros((bottom - top, width), dtype=np.uint8)
@@ -166,7 +167,7 @@ def _decided(
         )
         # The first tiles will ask for most of them, however the seams run.
         topmost = [index for index, warp in enumerate(warps) if warp.box[1] < plan.tile_size]
-        renderer.pictures.foresee(sorted(topmost, key=lambda index: warps[index].box))
+        renderer.pictures.prefetch(sorted(topmost, key=lambda index: warps[index].box))
         if options.exposure != "none":
             exposure = estimate_exposure(survey, cameras, blocks=options.exposure == "blocks")
         if options.seam != "none":

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rdstitch.compositing.blender import MultibandBlender, margin, rounding_constant, spread
 from rdstitch.compositing.boxes import Box, Float32Array, aligned, bounds, cut, grown, intersection, without
-from rdstitch.compositing.exposure import Exposure, full_scale
-from rdstitch.compositing.multiband import MultibandBlender, margin, rounding_constant, spread
+from rdstitch.compositing.gain_compensation import Exposure, full_scale
+from rdstitch.compositing.image_cache import PictureCache
 from rdstitch.compositing.options import CompositeOptions
-from rdstitch.compositing.picture_cache import PictureCache
-from rdstitch.compositing.seams import NOBODY, SeamMap
+from rdstitch.compositing.seam_finder import NOBODY, SeamMap
 from rdstitch.compositing.warp import (
     Geometry,
     Warp,
@@ -93,7 +93,7 @@ class Renderer:
         What a px gets does not depend on the box.
         """
         blended = self.options.blend == "multiband"
-        around = self._felt(box) if blended else box
+        around = self._blend_support(box) if blended else box
         layers = [part for layer in self._layers(around) if (part := layer.weighted_part(around)) is not None]
         covered = np.zeros((box[3] - box[1], box[2] - box[0]), dtype=np.bool_)
         for layer in layers:
@@ -109,7 +109,7 @@ class Renderer:
 
     def _contact_zone(self, layers: Sequence[Layer], box: Box) -> Box | None:
         """The part of a box in which blending can mix pictures; elsewhere it would give back the one that is there."""
-        felt = [self._felt(layer.box) for layer in layers]
+        felt = [self._blend_support(layer.box) for layer in layers]
         shared = [common for pair in combinations(felt, 2) if (common := intersection(*pair)) is not None]
         parts = [part for common in shared if (part := intersection(common, box)) is not None]
         if not parts:
@@ -117,7 +117,7 @@ class Renderer:
         x0, y0, x1, y1 = zip(*parts, strict=True)
         return min(x0), min(y0), max(x1), max(y1)
 
-    def _felt(self, box: Box) -> Box:
+    def _blend_support(self, box: Box) -> Box:
         """Where multi-band blending feels weights on a box."""
         return aligned(grown(box, margin(self.bands)), 1 << self.bands)
 
@@ -138,10 +138,10 @@ class Renderer:
 
     def _multiband(self, layers: Sequence[Layer], box: Box) -> NDArray[Any]:
         """Blend in bands, with the margin around the box that they need."""
-        outer = self._felt(box)
+        outer = self._blend_support(box)
         blender = MultibandBlender(outer, self.bands, self.channels, self._rounding)
         for layer in layers:
-            part, common = intersection(self._felt(layer.box), outer), intersection(layer.box, outer)
+            part, common = intersection(self._blend_support(layer.box), outer), intersection(layer.box, outer)
             if part is None or common is None:
                 continue
             weight = np.zeros((part[3] - part[1], part[2] - part[0]), dtype=np.float32)
@@ -157,7 +157,7 @@ class Renderer:
 
     @property
     def _rounding(self) -> np.float32:
-        """See :func:`rdstitch.compositing.multiband.rounding_constant`."""
+        """See :func:`rdstitch.compositing.blender.rounding_constant`."""
         return rounding_constant(full_scale(self.dtype), self.dtype.kind == "u")
 
     def _samples(self, layer: Layer, box: Box) -> NDArray[Any]:
@@ -186,7 +186,7 @@ class Renderer:
 
     def _placed(self, index: int, part: Box, box: Box) -> Geometry:
         """The geometry of a picture on its part of a box, with a lattice for all that blending can ask of it there."""
-        asked = intersection(self._felt(part), box) if self.options.blend == "multiband" else part
+        asked = intersection(self._blend_support(part), box) if self.options.blend == "multiband" else part
         return locate(self.warps[index], asked or part).on(part)
 
     def _opacity(self, index: int, geometry: Geometry) -> Float32Array | None:

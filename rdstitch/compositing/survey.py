@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.pictures import PictureReader
+from rdstitch.compositing.source_images import PictureReader
 from rdstitch.compositing.warp import (
     Warp,
     border_weight,

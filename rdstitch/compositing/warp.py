@@ -9,11 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box, Float32Array, encloses
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.lattice import LATTICE_STEPS, Lattice
-from rdstitch.compositing.pictures import KERNEL_MARGIN, LoadedPicture
+from rdstitch.compositing.source_images import KERNEL_MARGIN, LoadedPicture
 from rdstitch.radial_homography import to_plane
 
 INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos": cv2.INTER_LANCZOS4}

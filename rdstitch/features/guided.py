@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.features.correspondences import Correspondences
 from rdstitch.features.keypoints import Features
 from rdstitch.features.match import check_ratio

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.features.correspondences import Correspondences
 from rdstitch.features.keypoints import Features

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.features.correspondences import Correspondences
 from rdstitch.features.keypoints import Features

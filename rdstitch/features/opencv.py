@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.features.keypoints import Descriptors, Features
 from rdstitch.features.options import FeatureOptions

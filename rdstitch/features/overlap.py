@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.features.correspondences import Correspondences
 from rdstitch.features.keypoints import Features
 from rdstitch.features.match import Matcher
 
 _ENOUGH, _MOST = 50, 300  # matches that tell an overlap, and that are asked
-_COMPANY = 6  # other matches that a right one has near it, in both pictures
+_SUPPORTING_NEIGHBOURS = 6  # other matches that a right one has near it, in both pictures
 _NEAR = 0.2  # how near, diagonals of a picture
 _STRAY = 8  # matches without such company that chance explains; more may be of a part with little texture
 _LEAST_REACH, _REACH = 0.12, 2.0  # how far an overlap goes on beside a match: diagonals, times the way to its company
@@ -44,7 +44,7 @@ def overlapping(features1: Features, features2: Features, matches: Correspondenc
     points1, points2 = matches.points1[:_MOST], matches.points2[:_MOST]
     apart = np.maximum(_distances(points1, points1, size1), _distances(points2, points2, size2))
     # Each is the first in its own company.
-    company = np.partition(apart, _COMPANY, axis=1)[:, _COMPANY]
+    company = np.partition(apart, _SUPPORTING_NEIGHBOURS, axis=1)[:, _SUPPORTING_NEIGHBOURS]
     right = company <= _NEAR
     if np.count_nonzero(~right) > _STRAY:
         return None

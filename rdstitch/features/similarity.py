@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.features.keypoints import Descriptors
 
 # |a|² + |b|² and 2 a·b then stay below 2²³, where float32 still knows halves.

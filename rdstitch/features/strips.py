@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.features.keypoints import Features
 from rdstitch.features.opencv import Grey, OpenCVDetection
 from rdstitch.features.options import FeatureOptions

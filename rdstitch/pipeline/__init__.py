@@ -1,12 +1,12 @@
 """The recipes that make a picture, a camera or a trajectory out of pictures."""
 
-from rdstitch.pipeline.application import apply
-from rdstitch.pipeline.options import StitchOptions
+from rdstitch.options import StitchOptions
+from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.recipes import calibrate, mosaic, pano, trajectory
 from rdstitch.pipeline.recomposition import Recomposition
-from rdstitch.pipeline.register import Registration
-from rdstitch.pipeline.result import StitchResult
-from rdstitch.pipeline.undistortion import undistort
+from rdstitch.pipeline.undistort_images import undistort
+from rdstitch.registration import Registration
+from rdstitch.stitch_result import StitchResult
 
 __all__ = [
     "Recomposition",

@@ -9,29 +9,30 @@ from typing import Literal
 
 import numpy as np
 
+from rdstitch.alignment import Alignment
+from rdstitch.alignment.trajectory import Trajectory
+from rdstitch.cache import Cache
 from rdstitch.camera_files import CAMERA_SUFFIXES, save_camera
 from rdstitch.errors import ArgumentError, InputError, PartialResultError
+from rdstitch.export.path_plot import path_as_svg
+from rdstitch.inputs.attitudes import with_attitudes
+from rdstitch.inputs.find import find_pictures
+from rdstitch.inputs.masks import with_masks
+from rdstitch.inputs.source import LeftOut, Source, read_sources
 from rdstitch.io.atomic import check_distinct, check_output, write_json_atomic, write_text_atomic
-from rdstitch.pipeline.attitudes import with_attitudes
-from rdstitch.pipeline.cache import Cache
-from rdstitch.pipeline.composing import compose_pictures
-from rdstitch.pipeline.inputs import find_pictures
-from rdstitch.pipeline.masks import with_masks
-from rdstitch.pipeline.options import StitchOptions
-from rdstitch.pipeline.path_plot import path_as_svg
-from rdstitch.pipeline.progress import Progress, silent
-from rdstitch.pipeline.register import Registration, in_frame_of_reference, register
-from rdstitch.pipeline.result import StitchResult
-from rdstitch.pipeline.sidecar import sidecar
-from rdstitch.pipeline.sources import LeftOut, Source, read_sources
-from rdstitch.pipeline.verdict import RefusedError, Verdict, judge
-from rdstitch.registration import Alignment
-from rdstitch.registration.trajectory import Trajectory
+from rdstitch.options import StitchOptions
+from rdstitch.pipeline.compose import compose_pictures
+from rdstitch.pipeline.register import in_frame_of_reference, register
+from rdstitch.progress import Progress, silent
+from rdstitch.registration import Registration
+from rdstitch.sidecar.write import sidecar
+from rdstitch.stitch_result import StitchResult
+from rdstitch.verification.verdict import RefusedError, Verdict, judge
 
 Inputs = Iterable[str | Path]
 Layout = Literal["csv", "tum"]
 
-_SURE_LENGTHS = 0.05  # share that lengths may be off by, as far as the focal length is, without a word
+_MAX_SCALE_UNCERTAINTY = 0.05  # share that lengths may be off by, as far as the focal length is, without a word
 
 
 def pano(
@@ -85,7 +86,7 @@ def mosaic(
         As for :func:`pano`.
     options : StitchOptions, optional
     every : int
-        Of a video, every so manieth frame.
+        Use every n-th video frame.
     progress : callable
 
     Raises
@@ -120,7 +121,7 @@ def calibrate(
         _check_outputs(None, options, paths)
         registration = _register_all(paths, options, progress)
         verdict = _accept(registration, options, lens_only=True)
-    _put_away(registration)
+    _release_decoded_images(registration)
     _save_camera(registration, options)
     return _warned(registration, verdict.complaints)
 
@@ -164,8 +165,8 @@ def trajectory(
         check_distinct(files)
         registration = _register_all(paths, options, progress, metric=True)
         verdict = _accept(registration, options)
-    _put_away(registration)
-    registration = _warned(registration, (*verdict.complaints, *_unsure_of_lengths(registration.alignment)))
+    _release_decoded_images(registration)
+    registration = _warned(registration, (*verdict.complaints, *_scale_uncertainty_warning(registration.alignment)))
     path = Trajectory.from_alignment(registration.alignment, height)
     if output is not None:
         write_text_atomic(output, path.as_csv() if layout == "csv" else path.as_tum())
@@ -231,7 +232,7 @@ def _composite(
         overwrite=options.overwrite,
         dry_run=options.dry_run,
     )
-    _put_away(registration)
+    _release_decoded_images(registration)
     result = StitchResult(
         registration,
         composed.canvas,
@@ -260,10 +261,10 @@ def _accept(registration: Registration, options: StitchOptions, *, lens_only: bo
     return verdict
 
 
-def _put_away(registration: Registration) -> None:
+def _release_decoded_images(registration: Registration) -> None:
     """Let go of pictures that were kept for stages that will not come."""
     for source in registration.sources:
-        source.shelf.clear()
+        source.decoded_images.clear()
 
 
 def _warned(registration: Registration, complaints: Iterable[str]) -> Registration:
@@ -273,10 +274,10 @@ def _warned(registration: Registration, complaints: Iterable[str]) -> Registrati
     return replace(registration, alignment=warned)
 
 
-def _unsure_of_lengths(alignment: Alignment) -> list[str]:
+def _scale_uncertainty_warning(alignment: Alignment) -> list[str]:
     """What to say where the focal length, and with it the length of every step, is hardly known."""
     unsure = 0.0 if alignment.focal is None or alignment.focal_std is None else alignment.focal_std / alignment.focal
-    if unsure <= _SURE_LENGTHS:
+    if unsure <= _MAX_SCALE_UNCERTAINTY:
         return []
     return [f"all lengths may be off together by {unsure:.0%}: the pictures hardly tell the focal length; give --focal"]
 

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, CompositePlan
-from rdstitch.pipeline.saved import SavedRegistration
-from rdstitch.pipeline.sidecar import lens_fields, plain, versions
-from rdstitch.pipeline.sources import LeftOut, Source
+from rdstitch.inputs.source import LeftOut, Source
+from rdstitch.sidecar.read import SavedRegistration
+from rdstitch.sidecar.write import lens_fields, plain, versions
 
 
 @dataclass(frozen=True)

@@ -1,65 +1,32 @@
 """The registration that pano, mosaic, calibrate and trajectory share: features, pairs, one alignment."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
+from rdstitch.alignment import Alignment, AlignmentOptions, Link, align
+from rdstitch.alignment.result import LinkFit, Poses, Relief
+from rdstitch.cache import Cache
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError, RegistrationError
 from rdstitch.features import Features, LightGlue, Matcher, View, detect_all, match
-from rdstitch.pipeline.cache import Cache
-from rdstitch.pipeline.options import StitchOptions
-from rdstitch.pipeline.pairing import Pairing
-from rdstitch.pipeline.progress import Progress, silent
-from rdstitch.pipeline.sources import LeftOut, Source
-from rdstitch.registration import Alignment, AlignmentOptions, Link, align
-from rdstitch.registration.alignment import LinkFit, Poses, Relief
-from rdstitch.registration.lens_votes import Votes
-from rdstitch.registration.lenses import TwoLenses, pictures_of_the_other, two_lenses
-from rdstitch.registration.pairs import PairRegistration
-from rdstitch.registration.selection import first_pairs, neighbours
+from rdstitch.inputs.source import LeftOut, Source
+from rdstitch.matching.candidate_pairs import first_pairs, neighbours
+from rdstitch.matching.lens_votes import Votes
+from rdstitch.matching.mixed_lenses import pictures_of_the_other, two_lenses
+from rdstitch.matching.two_view import PairRegistration
+from rdstitch.matching.two_view_rounds import Pairing
+from rdstitch.options import StitchOptions
+from rdstitch.progress import Progress, silent
+from rdstitch.registration import Registration
 
 _CLOSURE_ROUNDS = 2
-_PAST_REST = (
+_STATIC_BACKGROUND_WARNING = (
     "most of what the pictures show stays where it is in them (a background, dirt, a date); "
     "only what moves was registered"
 )
-
-
-@dataclass(frozen=True)
-class Registration:
-    """Pictures registered as one.
-
-    Attributes
-    ----------
-    sources : tuple of Source
-    keypoints : tuple of int
-        Number of features of each picture.
-    pairs : tuple of PairRegistration
-        Every pair that was looked at.
-    alignment : Alignment
-    left_out : tuple of LeftOut
-        Every file that is not in the result, with the reason.
-    resting : bool
-        Whether most of what the pictures show stays where it is in them, and only what moves was registered.
-    mixed : TwoLenses or None
-        Where pictures of two lenses are mixed. If it is clear which belong together, the others are left out.
-    """
-
-    sources: tuple[Source, ...]
-    keypoints: tuple[int, ...]
-    pairs: tuple[PairRegistration, ...]
-    alignment: Alignment
-    left_out: tuple[LeftOut, ...]
-    resting: bool = False
-    mixed: TwoLenses | None = None
-
-    @property
-    def camera(self) -> Camera:
-        """The camera of the reference picture, with everything that was found of it."""
-        return self.alignment.cameras[self.alignment.reference]
 
 
 def register(
@@ -98,39 +65,41 @@ def register(
     aligning = _alignment_options(sources, options, reference)
     tilts = aligning.exact_tilts(len(sources))
     cameras = [source.camera.with_focal() for source in sources]
-    pairing = Pairing(features, [source.camera for source in sources], matcher, options, progress, cache, tilts)
+    pairing = Pairing(
+        features, [source.camera for source in sources], matcher, options.matching, progress, cache, tilts
+    )
     candidates = first_pairs(features, options.seed)
-    promising = pairing.promising(candidates)
-    pairs = pairing.estimate(promising, shared=promising)
+    prescreened = pairing.prescreen_pairs(candidates)
+    pairs = pairing.estimate(prescreened, shared=prescreened)
     if not any(pair.relation for pair in pairs):
         pairs = pairing.estimate(candidates)
-    pairing, pairs = pairing.look_past_rest(pairs)
+    pairing, pairs = pairing.remove_static_background(pairs)
     mixed = None if options.known_distortion is not None else two_lenses(cameras, Votes.of(pairs, options.threshold))
-    strangers = {} if mixed is None else pictures_of_the_other(mixed, pairs)
-    if strangers:
-        pairs = [pair for pair in pairs if not {pair.image1, pair.image2} & strangers.keys()]
-        candidates = [pair for pair in candidates if not {*pair} & strangers.keys()]
-    pairs = pairing.rescue(pairs)
+    other_lens_images = {} if mixed is None else pictures_of_the_other(mixed, pairs)
+    if other_lens_images:
+        pairs = [pair for pair in pairs if not {pair.image1, pair.image2} & other_lens_images.keys()]
+        candidates = [pair for pair in candidates if not {*pair} & other_lens_images.keys()]
+    pairs = pairing.retry_with_consensus_distortion(pairs)
     alignment = _align(cache, cameras, _links(sources, pairs), aligning)
     for _ in range(_CLOSURE_ROUNDS):
         tried = {(pair.image1, pair.image2) for pair in pairs}
         beside = neighbours(alignment.cameras, alignment.homographies, tried)
-        astray = {(i, j) for i, j in candidates if not (alignment.used[i] and alignment.used[j])} - tried
-        closures = pairing.estimate(sorted(astray.union(beside)), distortion=alignment.distortion)
+        unaligned_pairs = {(i, j) for i, j in candidates if not (alignment.used[i] and alignment.used[j])} - tried
+        closures = pairing.estimate(sorted(unaligned_pairs.union(beside)), distortion=alignment.distortion)
         pairs = sorted([*pairs, *closures], key=lambda pair: (pair.image1, pair.image2))
         if not any(pair.relation for pair in closures):
             break
         alignment = _align(cache, cameras, _links(sources, pairs), aligning)
-    stronger = pairing.strengthen(pairs, alignment)
+    stronger = pairing.guided_rematch(pairs, alignment.support, alignment.transfer)
     if any(new is not old for new, old in zip(stronger, pairs, strict=True)):
         pairs, alignment = stronger, _align(cache, cameras, _links(sources, stronger), aligning)
     if metric and alignment.poses is None and options.model == "auto":
         alignment = _align(cache, cameras, _links(sources, pairs), replace(aligning, model="tilting"))
     resting = pairing.features is not features
     if resting:
-        alignment = replace(alignment, warnings=(*alignment.warnings, _PAST_REST))
+        alignment = replace(alignment, warnings=(*alignment.warnings, _STATIC_BACKGROUND_WARNING))
     left_out = [
-        LeftOut(source.path, damaged.get(index, strangers.get(index, alignment.reasons[index])))
+        LeftOut(source.path, damaged.get(index, other_lens_images.get(index, alignment.reasons[index])))
         for index, source in enumerate(sources)
         if not alignment.used[index]
     ]

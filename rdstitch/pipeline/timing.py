@@ -2,7 +2,7 @@
 
 import time
 
-from rdstitch.pipeline.progress import Progress, silent
+from rdstitch.progress import Progress, silent
 
 
 class StageTimer:

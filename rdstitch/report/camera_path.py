@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from rdstitch.pipeline.path_plot import path_as_svg
-from rdstitch.pipeline.register import Registration
-from rdstitch.registration.trajectory import Trajectory
+from rdstitch.alignment.trajectory import Trajectory
+from rdstitch.export.path_plot import path_as_svg
+from rdstitch.registration import Registration
 from rdstitch.report.svg import section
 
 

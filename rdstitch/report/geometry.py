@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from rdstitch.camera import FloatArray
-from rdstitch.pipeline.register import Registration
+from rdstitch.alignment.result import LinkFit
+from rdstitch.arrays import FloatArray
+from rdstitch.matching.two_view import PairRegistration
 from rdstitch.radial_homography import to_plane
-from rdstitch.registration.alignment import LinkFit
-from rdstitch.registration.pairs import PairRegistration
+from rdstitch.registration import Registration
 
 _POINTS_PER_SIDE = 16
 

@@ -3,8 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import Camera, FloatArray
-from rdstitch.pipeline.register import Registration
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
+from rdstitch.registration import Registration
 from rdstitch.report.svg import BLUE, RED, YELLOW, drawing, element, fit_into, path, section
 from rdstitch.report.thumbnails import of_source
 

@@ -4,7 +4,7 @@ from html import escape
 
 import numpy as np
 
-from rdstitch.pipeline.register import Registration
+from rdstitch.registration import Registration
 from rdstitch.report.geometry import footprint, middle
 from rdstitch.report.svg import BLUE, GREEN, GREY, RED, drawing, element, fit_into, label, path, section
 

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from rdstitch.camera import FloatArray
-from rdstitch.pipeline.register import Registration
-from rdstitch.registration.alignment import LinkFit
+from rdstitch.alignment.result import LinkFit
+from rdstitch.arrays import FloatArray
+from rdstitch.registration import Registration
 from rdstitch.report.geometry import pairs_of
 from rdstitch.report.svg import GREEN, RED, drawing, element, section
 from rdstitch.report.thumbnails import of_source

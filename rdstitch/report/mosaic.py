@@ -1,8 +1,8 @@
 """The picture that came out."""
 
-from rdstitch.pipeline.result import StitchResult
 from rdstitch.report.svg import element, section
 from rdstitch.report.thumbnails import of_mosaic
+from rdstitch.stitch_result import StitchResult
 
 _SIDE = 1200
 

@@ -6,9 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from rdstitch.io.atomic import write_bytes_atomic
-from rdstitch.pipeline.register import Registration
-from rdstitch.pipeline.result import StitchResult
-from rdstitch.pipeline.verdict import Verdict
+from rdstitch.registration import Registration
 from rdstitch.report.camera_path import path_over_plane
 from rdstitch.report.grid import grid
 from rdstitch.report.match_graph import match_graph
@@ -18,6 +16,8 @@ from rdstitch.report.residual_map import residual_map
 from rdstitch.report.summary import notices, summary
 from rdstitch.report.timings import timings
 from rdstitch.report.votes import votes
+from rdstitch.stitch_result import StitchResult
+from rdstitch.verification.verdict import Verdict
 
 REPORT_SUFFIXES = (".html", ".htm")
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rdstitch.pipeline.register import Registration
+from rdstitch.registration import Registration
 from rdstitch.report.geometry import residuals
 from rdstitch.report.svg import RED, drawing, element, label, section
 

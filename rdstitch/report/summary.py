@@ -6,10 +6,10 @@ from html import escape
 
 import numpy as np
 
-from rdstitch.pipeline.register import Registration
-from rdstitch.pipeline.result import StitchResult
-from rdstitch.pipeline.verdict import Verdict
+from rdstitch.registration import Registration
 from rdstitch.report.svg import element, section, table
+from rdstitch.stitch_result import StitchResult
+from rdstitch.verification.verdict import Verdict
 
 
 def summary(registration: Registration, result: StitchResult | None, verdict: Verdict | None = None) -> str:

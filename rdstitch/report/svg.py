@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 
 _VOID = ("img",)
 BLUE, GREEN, RED, GREY, YELLOW = "#2463a8", "#2a9d4a", "#c8352b", "#8a8f98", "#ffd92f"

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.errors import InputError
+from rdstitch.inputs.source import Source
 from rdstitch.io.deepzoom import read_deep_zoom
 from rdstitch.io.read import read_image
 from rdstitch.io.reduction import fitting_reduction
-from rdstitch.pipeline.result import StitchResult
-from rdstitch.pipeline.sources import Source
+from rdstitch.stitch_result import StitchResult
 
 _JPEG_QUALITY = 80
 _LARGE = 60_000_000  # px; of larger TIFF files an overview is read

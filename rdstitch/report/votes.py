@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from rdstitch.pipeline.register import Registration
-from rdstitch.registration.voting import Consensus, vote
+from rdstitch.matching.distortion_consensus import Consensus, vote
+from rdstitch.registration import Registration
 from rdstitch.report.svg import BLUE, GREY, RED, drawing, element, label, section
 
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 720.0, 280.0, 50.0, 40.0, 20.0

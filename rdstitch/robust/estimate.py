@@ -10,10 +10,10 @@ from rdstitch.errors import ArgumentError
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
+from rdstitch.robust.model_selection import Selection, rms_of, select_model
 from rdstitch.robust.pair_models import HomographyModel, PairModel, PlanarModel, Tilts
 from rdstitch.robust.ransac import Hypothesis, RansacOptions, Search, ransac
-from rdstitch.robust.selection import Selection, rms_of, select_model
-from rdstitch.robust.verification import LEAST_PLACES, doubts, places
+from rdstitch.robust.verification import LEAST_PLACES, places, rejection_reason
 
 SOLVERS = ("auto", "two_point", "three_point", "three_point_similarity", "four_point", "five_point")
 
@@ -109,7 +109,7 @@ def estimate_radial_homography(
         _models(camera1, tilts), search.best.homography, search.best.distortion, data, threshold,
         fixed_distortion=distortion is not None,
     )  # fmt: skip
-    doubt = doubts(p1, p2, chosen.fit.errors < threshold, camera2.image_size, threshold)
+    doubt = rejection_reason(p1, p2, chosen.fit.errors < threshold, camera2.image_size, threshold)
     if doubt is not None:
         return RadialHomography.failed(doubt, camera1, camera2, len(data), search.iterations)
     return _result(chosen, search, search.best, camera1, camera2, threshold)

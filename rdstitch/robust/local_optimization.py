@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.radial_homography import (
     TransferJacobian,
     measurement_whitening,
@@ -24,7 +24,7 @@ from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import PairModel
 
 _LEAST_GAIN = 1e-5  # expected relative fall of the loss that is worth another step: a hundredth of the noise
-LARGEST_BEND = 0.98  # |λ| in the half-diagonal frame; beyond, the lens model folds at the corner
+MAX_ABS_DISTORTION = 0.98  # |λ| in the half-diagonal frame; beyond, the lens model folds at the corner
 
 State = TypeVar("State")
 _State = tuple[FloatArray, float]  # of the model, and λ
@@ -120,7 +120,7 @@ def refine(
 
     def move(state: _State, step: FloatArray) -> _State | None:
         moved = model.retract(state[0], step[first:]), state[1] if fixed_distortion else float(state[1] + step[0])
-        return moved if abs(moved[1]) < LARGEST_BEND and np.isfinite(moved[0]).all() else None
+        return moved if abs(moved[1]) < MAX_ABS_DISTORTION and np.isfinite(moved[0]).all() else None
 
     (state, distortion), found = descend(evaluate, move, (model.initialize(homography), distortion), iterations)
     return Refined(model, state, distortion, found.errors, found.cost, found.information, found.influence)

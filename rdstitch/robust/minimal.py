@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from rdstitch import solvers
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.robust.pair_models import HomographyModel, PairModel, PlanarModel, Tilts
 from rdstitch.solvers.solutions import Solutions
 

@@ -10,12 +10,12 @@ from functools import partial
 
 import numpy as np
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.radial_homography import LENS_STD, RadialHomography, side_by_side, transfer_jacobian
-from rdstitch.robust.local_optimization import LARGEST_BEND, Linearized, descend, linearized
+from rdstitch.robust.local_optimization import MAX_ABS_DISTORTION, Linearized, descend, linearized
 from rdstitch.robust.measurements import Measurements
+from rdstitch.robust.model_selection import covariance_of, loss_width, noise_of
 from rdstitch.robust.pair_models import HomographyModel
-from rdstitch.robust.selection import covariance_of, loss_width, noise_of
 
 _HOMOGRAPHY = HomographyModel()
 _OWN_STD = LENS_STD[[0, 0, 1, 2, 3]]  # of λ of picture 1, λ of picture 2, μ, and the distortion centre
@@ -64,7 +64,7 @@ def own_lenses(relation: RadialHomography, data: Measurements, threshold: float)
 def _moved(state: _State, step: FloatArray) -> _State | None:
     """The state after a step; None where a lens would fold."""
     lens = state[1] + step[:_LENS]
-    return (_HOMOGRAPHY.retract(state[0], step[_LENS:]), lens) if np.abs(lens[:2]).max() < LARGEST_BEND else None
+    return (_HOMOGRAPHY.retract(state[0], step[_LENS:]), lens) if np.abs(lens[:2]).max() < MAX_ABS_DISTORTION else None
 
 
 @np.errstate(all="ignore")  # a wild step may leave the lens model

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
 
 Tilts = tuple[tuple[float, float], tuple[float, float]]

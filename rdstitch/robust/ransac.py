@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.robust.local_optimization import refine
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver

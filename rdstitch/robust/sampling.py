@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 
 IndexArray = NDArray[np.intp]
 

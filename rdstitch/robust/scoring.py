@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.robust.measurements import Measurements
 from rdstitch.solvers.solutions import Solutions
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import betainc
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 
 _CELLS_PER_DIAGONAL = 32
 _CELLS_APART = 2.0**20
@@ -25,7 +25,7 @@ def numbered_cells(points: FloatArray) -> FloatArray:
     return numbers
 
 
-def doubts(
+def rejection_reason(
     points1: FloatArray, points2: FloatArray, inliers: NDArray[np.bool_], image_size: tuple[int, int], threshold: float
 ) -> str | None:
     """Why the inliers could be chance, or None.

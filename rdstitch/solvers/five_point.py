@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.homography import Quadrangles
 from rdstitch.solvers.lines import determinants, squared_radii

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.solvers.batch import IndexArray, solve_in_blocks
 from rdstitch.solvers.plane import lens_range
 from rdstitch.solvers.solutions import Solutions

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.solvers.batch import SampleArrays
 from rdstitch.solvers.lines import Lines, squared_radii, triangle_determinants
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.solvers.batch import SampleArrays
 
 _RING = [1, 2, 0, 1]

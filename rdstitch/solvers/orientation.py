@@ -8,7 +8,7 @@ triangle: the determinants of both pictures have the same sign.
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 
 
 def oriented_samples(

@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.planar_motion import rotation_from_tilt
 from rdstitch.solvers.batch import IndexArray, SampleArrays

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 
 
 @lru_cache

@@ -14,7 +14,7 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.solvers.batch import IndexArray
 from rdstitch.solvers.polynomials import (
     bernstein_from_values,

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.lines import Lines, squared_radii, triangle_determinants
@@ -14,7 +14,6 @@ from rdstitch.solvers.orientation import mirrored, oriented_samples
 from rdstitch.solvers.plane import TiltRotations, lens_range, motion_homography
 from rdstitch.solvers.solutions import Solutions
 
-BoolArray = NDArray[np.bool_]
 RealArray = NDArray[np.floating[Any]]
 
 DEFAULT_STARTS: FloatArray = np.array(

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.synthetic.fitting import FITS, apply, fit_similarity, quantile
 from rdstitch.synthetic.patches import patch_displacements

@@ -11,7 +11,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.synthetic.lenses import Lens, focal_length
 from rdstitch.synthetic.poses import Poses, to_plane

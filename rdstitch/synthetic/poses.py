@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
 from rdstitch.radial_homography import project

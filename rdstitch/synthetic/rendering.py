@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.synthetic.lenses import Lens
 from rdstitch.synthetic.poses import Poses, fit_to_plane, plane_outline, to_picture, to_plane

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import rdstitch
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.errors import RdstitchError
 from rdstitch.io.read import read_image
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import rdstitch
-from rdstitch.registration.trajectory import compare
+from rdstitch.alignment.trajectory import compare
 from tests.cli.running import FAST, finished, start
 from tests.floor_drives import DISTORTION, PATHS, floor_drive, read_path, true_path
 

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rdstitch.registration.align import AlignmentOptions, align
-from rdstitch.registration.alignment import Poses
-from rdstitch.registration.models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
-from rdstitch.registration.trajectory import Trajectory, compare
+from rdstitch.alignment.align import AlignmentOptions, align
+from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
+from rdstitch.alignment.result import Poses
+from rdstitch.alignment.trajectory import Trajectory, compare
 from tests.alignment_scenes import robot_path, scene
 
 

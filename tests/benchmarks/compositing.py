@@ -30,7 +30,8 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, compose_to_file, plan_canvas
 from rdstitch.io import Metadata, Picture, read_image
 from rdstitch.synthetic import Photometry, grid_poses, ground, sequence_over

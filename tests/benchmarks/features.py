@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rdstitch.arrays import FloatArray
 from rdstitch.features import FeatureOptions, Features, detect, match
 from rdstitch.synthetic import ground
 
@@ -44,7 +45,6 @@ ROWS = {
 }
 
 Grey = NDArray[np.uint8]
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,18 +33,18 @@ from rdstitch_cli.config import read_config
 from rdstitch_cli.main import cli
 from rdstitch_cli.progress import one_line
 
+from rdstitch.alignment.result import Poses, Relief
 from rdstitch.camera import Camera
 from rdstitch.camera_files import load_camera
 from rdstitch.errors import RdstitchError
 from rdstitch.features import Features
+from rdstitch.inputs.attitudes import with_attitudes
+from rdstitch.inputs.find import find_pictures
+from rdstitch.inputs.source import Source
 from rdstitch.io import packing, read_image, read_metadata
 from rdstitch.io.mask import read_mask
 from rdstitch.io.metadata import Metadata
-from rdstitch.pipeline.attitudes import with_attitudes
-from rdstitch.pipeline.inputs import find_pictures
-from rdstitch.pipeline.saved import read_sidecar
-from rdstitch.pipeline.sources import Source
-from rdstitch.registration.alignment import Poses, Relief
+from rdstitch.sidecar.read import read_sidecar
 from tests.damage import damaged
 from tests.property.test_camera_file_reading import TEXTS as CAMERA_FILES
 from tests.property.test_picture_reading import FILES as PICTURES
@@ -146,7 +146,7 @@ def _by_name(file: Path, read: Callable[[], Any]) -> Any:
         raise type(error)(one_line(f"{file}: {error}")) from error
 
 
-def _own_work(file: Path) -> Any:
+def _is_rdstitch_output(file: Path) -> Any:
     """A folder with one picture beside which this file lies as its sidecar."""
     (file.parent / "a.png").write_bytes(PICTURES["png"])
     return find_pictures([file.parent])
@@ -167,7 +167,7 @@ PARSERS = (
     Parser("cache entry", _entries(), _entry),
     Parser("attitude table", _TABLES, _attitudes),
     Parser("list", _LISTS, _list),
-    Parser("sidecar beside a picture", (json.dumps(SIDECAR).encode(),), _own_work, "a.png.json"),
+    Parser("sidecar beside a picture", (json.dumps(SIDECAR).encode(),), _is_rdstitch_output, "a.png.json"),
     Parser("picture", _pictures(), _picture),
     Parser("mask", tuple(_encoded("PNG", mode) for mode in ("1", "L", "RGBA", "I;16")), _mask),
 )

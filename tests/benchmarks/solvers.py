@@ -16,7 +16,7 @@ import numpy as np
 import scipy.linalg
 
 from rdstitch import solvers
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.solvers import Solutions
 from rdstitch.synthetic import Instances, PlanarInstances, general_instances, planar_instances
 

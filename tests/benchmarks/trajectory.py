@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from rdstitch.registration.trajectory import Trajectory, compare
+from rdstitch.alignment.trajectory import Trajectory, compare
 from tests.floor_drives import DISTORTION, PATHS, floor_drive, read_path, true_path
 
 _PROGRAM = "from rdstitch_cli.main import main; main()"

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 from jsonschema import Draft202012Validator
 
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.radial_homography import project
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
 
 SIDECAR_SCHEMA = Draft202012Validator(
-    json.loads(files("rdstitch.pipeline").joinpath("sidecar.schema.json").read_text(encoding="utf-8"))
+    json.loads(files("rdstitch.sidecar").joinpath("sidecar.schema.json").read_text(encoding="utf-8"))
 )
 
 # A shell ignores interrupts for what it runs in the background, these tests for one, and children inherit that.

@@ -13,8 +13,9 @@ from typing import Any
 import pytest
 from rdstitch_cli.main import run
 
-from rdstitch.pipeline import overlap_check, register
-from rdstitch.registration import pairs
+from rdstitch.matching import two_view
+from rdstitch.pipeline import register
+from rdstitch.verification import overlap_check
 from tests.cli.running import FAST, Run, finished, start
 
 
@@ -49,7 +50,7 @@ def work(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     # The package has a function of the module's name.
     watch(import_module("rdstitch.features.detect"), "_detect")
-    watch(pairs, "estimate_radial_homography")
+    watch(two_view, "estimate_radial_homography")
     watch(register, "align")
     watch(overlap_check, "overlap_agreement")
     return called

@@ -18,9 +18,10 @@ import tifffile
 from PIL import Image
 from rdstitch_cli.main import run
 
+from rdstitch.inputs import source as sources
 from rdstitch.io import Metadata, read_image, read_metadata
-from rdstitch.pipeline import recipes, sources
-from rdstitch.pipeline.verdict import judge
+from rdstitch.pipeline import recipes
+from rdstitch.verification.verdict import judge
 from tests.cli.faulty import UNREADABLE, UNUSABLE, Make
 from tests.cli.running import DISTORTION, FAST, Outcome, Run, finished, start
 

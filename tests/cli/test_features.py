@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from rdstitch_cli.options import FEATURES
 
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.features import KINDS
 from tests.cli.running import Run, transfers
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rdstitch.pipeline.pairing import Pairing
+from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.synthetic import Sequence, alignment_error
 from tests.cli.running import DISTORTION, FAST, Run, finished, start, transfers
 
@@ -87,5 +87,5 @@ def test_whatever_a_glance_says_every_picture_finds_its_place(
     monkeypatch: pytest.MonkeyPatch,
     glance: Callable[[Pairing, list[tuple[int, int]]], dict[tuple[int, int], None]],
 ) -> None:
-    monkeypatch.setattr(Pairing, "promising", glance)
+    monkeypatch.setattr(Pairing, "prescreen_pairs", glance)
     assert rdstitch("mosaic", *frames, "-o", tmp_path / "out.png", "--strict", *FAST).status == 0

@@ -15,11 +15,11 @@ from PIL import Image
 
 from rdstitch.compositing import CompositeOptions
 from rdstitch.io import read_image
+from rdstitch.options import StitchOptions
 from rdstitch.pipeline import calibrate, pano, recipes
-from rdstitch.pipeline.options import StitchOptions
 from rdstitch.pipeline.timing import StageTimer
-from rdstitch.pipeline.verdict import Verdict
 from rdstitch.report import report_page, thumbnails, write_report
+from rdstitch.verification.verdict import Verdict
 from tests.cli.running import FAST, Run
 
 _VOID = {"meta", "img"}

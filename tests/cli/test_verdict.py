@@ -9,7 +9,7 @@ from PIL import ExifTags, Image
 
 from rdstitch.camera import Camera
 from rdstitch.pipeline import recipes
-from rdstitch.pipeline.verdict import Verdict
+from rdstitch.verification.verdict import Verdict
 from tests.cli.running import DISTORTION, FAST, Run, flight
 
 # Without a focal length, a path says that its lengths are guessed.

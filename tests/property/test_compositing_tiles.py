@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from rdstitch.compositing import CompositeOptions
+from rdstitch.compositing.blender import MultibandBlender, margin, rounding_constant
 from rdstitch.compositing.boxes import aligned, grown
-from rdstitch.compositing.multiband import MultibandBlender, margin, rounding_constant
 from rdstitch.compositing.preparation import Prepared, prepare
 from rdstitch.synthetic.rendering import Photometry
 from tests.compositing_scenes import Scene, render

@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from rdstitch.registration.models import _TRACELESS, HOMOGRAPHY, SIMILARITY, TILTING, inverses
-from rdstitch.registration.observations import spread_choice
+from rdstitch.alignment.motion_models import _TRACELESS, HOMOGRAPHY, SIMILARITY, TILTING, inverses
+from rdstitch.matching.thinning import spread_choice
 
 
 def _numbers(low: float, high: float) -> st.SearchStrategy[float]:

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rdstitch.errors import InputError
-from rdstitch.pipeline.options import StitchOptions
-from rdstitch.pipeline.saved import read_sidecar
-from rdstitch.pipeline.sidecar import plain
+from rdstitch.options import StitchOptions
+from rdstitch.sidecar.read import read_sidecar
+from rdstitch.sidecar.write import plain
 from tests.mutations import damaged, damaged_text
 
 _IMAGE = {

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rdstitch import solvers
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.planar_motion import constraint_residuals, rotation_from_tilt, tilt_from_normal
 from rdstitch.solvers import Solutions
 from rdstitch.synthetic import planar_instances

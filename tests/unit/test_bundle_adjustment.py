@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from rdstitch.registration.bundle_adjustment import Adjuster, Freedom, Parameters, Priors, sigma_of
-from rdstitch.registration.models import HOMOGRAPHY, MODELS, RIGID, TILTING, Model
-from rdstitch.registration.normal_equations import chain, link_equations, squared_errors
-from rdstitch.registration.observations import Observations, spread_choice
+from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters, Priors, sigma_of
+from rdstitch.alignment.motion_models import HOMOGRAPHY, MODELS, RIGID, TILTING, Model
+from rdstitch.alignment.normal_equations import chain, link_equations, squared_errors
+from rdstitch.alignment.observations import Observations
+from rdstitch.matching.thinning import spread_choice
 from tests.alignment_scenes import Scene, grid, jittered, scene
 
 FREE_LENS = np.array([True, True, True, True])
@@ -81,8 +82,8 @@ def test_information_on_shared_parameters_is_what_elimination_leaves() -> None:
 def _adjust(model: Model, truth: Scene, seen: Observations) -> tuple[float, float]:
     start = _start(model, truth)
     start = Parameters(start.poses, start.shared, np.array([-0.2, 0.0, 0.0, 0.0]))
-    freedom = Freedom.fixing(model, len(truth.cameras), [0], ONE_LENS)
-    found = Adjuster(model, seen, freedom, Priors.none(model, len(truth.cameras))).run(start)
+    freedom = FreeParameters.fixing(model, len(truth.cameras), [0], ONE_LENS)
+    found = BundleAdjuster(model, seen, freedom, Priors.none(model, len(truth.cameras))).run(start)
     assert found.converged
     return float(found.parameters.lens[0]), float(np.sqrt(found.covariance[-1, -1]))
 

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.camera_files import load_camera, read_camera_file, save_camera
 from rdstitch.camera_files.brown import Brown
 from rdstitch.errors import InputError, OutputError

@@ -7,7 +7,7 @@ import pytest
 
 from rdstitch.camera import Camera
 from rdstitch.compositing.canvas import plan_canvas
-from rdstitch.compositing.exposure import Exposure, full_scale, no_exposure
+from rdstitch.compositing.gain_compensation import Exposure, full_scale, no_exposure
 from rdstitch.compositing.warp import locate, plan_warp
 
 OFFSET, LOG_GAIN, VIGNETTING = 0.04, np.array([[0.0, 0.0, 0.0], [0.2, -0.1, 0.05]]), np.array([-0.3, 0.1, -0.05])

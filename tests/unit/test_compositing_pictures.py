@@ -10,10 +10,10 @@ from time import monotonic, sleep
 import numpy as np
 import pytest
 
-from rdstitch.compositing.parts import shown_parts
-from rdstitch.compositing.picture_cache import PictureCache
-from rdstitch.compositing.pictures import NOTHING, PictureReader, prepare_picture
-from rdstitch.compositing.seams import SeamMap
+from rdstitch.compositing.image_cache import PictureCache
+from rdstitch.compositing.image_parts import shown_parts
+from rdstitch.compositing.seam_finder import SeamMap
+from rdstitch.compositing.source_images import NOTHING, PictureReader, prepare_picture
 from rdstitch.compositing.warp import plan_warp
 from rdstitch.errors import InputError
 from rdstitch.io import Picture
@@ -23,7 +23,7 @@ from tests.compositing_scenes import as_picture, render
 WHOLE = (0, 0, 200, 100)
 
 
-class Shelf:
+class DecodedImageCache:
     """Four pictures, and how often each was read."""
 
     def __init__(self) -> None:
@@ -45,47 +45,47 @@ class Shelf:
 
 
 def test_those_used_last_are_held() -> None:
-    shelf = Shelf()
-    cache = shelf.cache(limit=2 * 20_000)
+    decoded_images = DecodedImageCache()
+    cache = decoded_images.cache(limit=2 * 20_000)
     for index in (0, 1, 0, 1, 2, 1, 0):
-        np.testing.assert_array_equal(cache.get(index, WHOLE).pixels, shelf.frames[index])
-    assert shelf.reads == {0: 2, 1: 1, 2: 1}
+        np.testing.assert_array_equal(cache.get(index, WHOLE).pixels, decoded_images.frames[index])
+    assert decoded_images.reads == {0: 2, 1: 1, 2: 1}
 
 
 def test_parts_take_less_room() -> None:
-    shelf = Shelf()
-    cache = shelf.cache(limit=20_000)
+    decoded_images = DecodedImageCache()
+    cache = decoded_images.cache(limit=20_000)
     cache.expect([(50, 10, 100, 30)] * 4)
     for index in (0, 1, 2, 3, 0, 1, 2, 3):
         held = cache.get(index, (60, 10, 90, 30))
         x, y = held.origin
-        np.testing.assert_array_equal(held.pixels[12 - y, 61 - x], shelf.frames[index][12, 61])
-    assert max(shelf.reads.values()) == 1
+        np.testing.assert_array_equal(held.pixels[12 - y, 61 - x], decoded_images.frames[index][12, 61])
+    assert max(decoded_images.reads.values()) == 1
 
 
 def test_more_than_expected_is_read_once_more_and_kept() -> None:
-    shelf = Shelf()
-    cache = shelf.cache(limit=80_000)
+    decoded_images = DecodedImageCache()
+    cache = decoded_images.cache(limit=80_000)
     cache.expect([(50, 10, 100, 30), NOTHING, WHOLE, WHOLE])
     for part in ((60, 10, 90, 30), (0, 0, 90, 30), (90, 10, 200, 100)):
         assert cache.get(0, part).holds(part)
         assert cache.get(1, part).holds(part)
     cache.expect([NOTHING] * 4)
     assert cache.get(0, WHOLE).holds(WHOLE)
-    assert shelf.reads == {0: 2, 1: 1}
+    assert decoded_images.reads == {0: 2, 1: 1}
 
 
 def test_parts_that_are_done_with_go_before_pictures_do() -> None:
-    shelf = Shelf()
-    cache = shelf.cache(limit=50_000)
+    decoded_images = DecodedImageCache()
+    cache = decoded_images.cache(limit=50_000)
     for index in (0, 1):
         cache.get(index, WHOLE)
     cache.expect([(0, 0, 100, 40), (0, 50, 200, 100), WHOLE, WHOLE])
     assert cache.get(0, (0, 0, 10, 10)).holds(WHOLE), "there is room for all of it"
     cache.get(2, WHOLE)
     assert not cache.get(0, (0, 0, 100, 40)).holds(WHOLE)
-    np.testing.assert_array_equal(cache.get(1, (0, 50, 200, 100)).pixels[-1], shelf.frames[1][-1])
-    assert shelf.reads == {0: 1, 1: 1, 2: 1}
+    np.testing.assert_array_equal(cache.get(1, (0, 50, 200, 100)).pixels[-1], decoded_images.frames[1][-1])
+    assert decoded_images.reads == {0: 1, 1: 1, 2: 1}
 
 
 def _until(told: Callable[[], bool]) -> None:
@@ -97,39 +97,39 @@ def _until(told: Callable[[], bool]) -> None:
 
 
 def test_pictures_are_read_ahead_where_there_is_room() -> None:
-    shelf = Shelf()
-    cache = shelf.cache(limit=45_000, ahead=True)
+    decoded_images = DecodedImageCache()
+    cache = decoded_images.cache(limit=45_000, ahead=True)
     cache.expect([WHOLE, WHOLE, WHOLE, NOTHING])
-    cache.foresee([3, 1, 0, 2, 1])
-    _until(lambda: shelf.reads.total() == 2)
-    np.testing.assert_array_equal(cache.get(0, WHOLE).pixels, shelf.frames[0])
-    np.testing.assert_array_equal(cache.get(1, WHOLE).pixels, shelf.frames[1])
-    assert shelf.reads == {0: 1, 1: 1}
+    cache.prefetch([3, 1, 0, 2, 1])
+    _until(lambda: decoded_images.reads.total() == 2)
+    np.testing.assert_array_equal(cache.get(0, WHOLE).pixels, decoded_images.frames[0])
+    np.testing.assert_array_equal(cache.get(1, WHOLE).pixels, decoded_images.frames[1])
+    assert decoded_images.reads == {0: 1, 1: 1}
     cache.expect([NOTHING, WHOLE, WHOLE, NOTHING])
-    cache.foresee([2])
-    _until(lambda: shelf.reads[2] == 1)
-    np.testing.assert_array_equal(cache.get(2, WHOLE).pixels, shelf.frames[2])
-    assert shelf.reads == {0: 1, 1: 1, 2: 1}
+    cache.prefetch([2])
+    _until(lambda: decoded_images.reads[2] == 1)
+    np.testing.assert_array_equal(cache.get(2, WHOLE).pixels, decoded_images.frames[2])
+    assert decoded_images.reads == {0: 1, 1: 1, 2: 1}
 
 
 def test_nothing_is_read_ahead_once_it_is_closed() -> None:
-    shelf = Shelf()
-    cache = shelf.cache(limit=80_000, ahead=True)
+    decoded_images = DecodedImageCache()
+    cache = decoded_images.cache(limit=80_000, ahead=True)
     reading, go_on = Event(), Event()
 
     def slow(index: int) -> Picture:
         reading.set()
         assert go_on.wait(30)
-        return Shelf.read(shelf, index)
+        return DecodedImageCache.read(decoded_images, index)
 
-    shelf.read = slow  # type: ignore[method-assign]
-    cache.foresee(range(4))
+    decoded_images.read = slow  # type: ignore[method-assign]
+    cache.prefetch(range(4))
     assert reading.wait(30)
     Timer(0.05, go_on.set).start()
     cache.close()
-    cache.foresee(range(4))
-    assert shelf.reads == {0: 1}
-    np.testing.assert_array_equal(cache.get(3, WHOLE).pixels, shelf.frames[3])
+    cache.prefetch(range(4))
+    assert decoded_images.reads == {0: 1}
+    np.testing.assert_array_equal(cache.get(3, WHOLE).pixels, decoded_images.frames[3])
 
 
 @pytest.mark.parametrize("shrink", [1.0, 3.9, 5.0])
@@ -145,11 +145,11 @@ def test_the_room_for_a_picture_is_known_before(shrink: float, masked: bool) -> 
 
 
 def test_what_cannot_be_read_ahead_is_told_to_who_asks_for_it() -> None:
-    shelf = Shelf()
-    cache = shelf.cache(limit=80_000, ahead=True)
-    shelf.frames[1] = shelf.frames[1][:50]
-    cache.foresee([1, 2])
-    _until(lambda: shelf.reads[2] == 1)
+    decoded_images = DecodedImageCache()
+    cache = decoded_images.cache(limit=80_000, ahead=True)
+    decoded_images.frames[1] = decoded_images.frames[1][:50]
+    cache.prefetch([1, 2])
+    _until(lambda: decoded_images.reads[2] == 1)
     with pytest.raises(InputError, match="picture 2 has 200 x 50 px"):
         cache.get(1, WHOLE)
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, compose, compose_to_file, plan_canvas
 from rdstitch.compositing.crop import largest_rectangle
-from rdstitch.compositing.pictures import Source
 from rdstitch.compositing.preparation import prepare
+from rdstitch.compositing.source_images import Source
 from rdstitch.errors import ArgumentError, InputError, LimitError
 from rdstitch.io import Metadata, read_image
 from rdstitch.synthetic.comparison import sharpness

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, compose, plan_canvas
-from rdstitch.compositing.pictures import prepare_picture
+from rdstitch.compositing.source_images import prepare_picture
 from rdstitch.compositing.warp import locate, plan_warp, sample
 from tests.compositing_scenes import as_picture, grey, inner, render
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.features import Correspondences, Features, match, match_overlap
 from rdstitch.features.overlap import overlapping
 

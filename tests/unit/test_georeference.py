@@ -9,13 +9,14 @@ import pytest
 import tifffile
 from PIL import ExifTags, Image
 
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import OutputError
+from rdstitch.export.georeference import Georeference, georeference, utm
 from rdstitch.io import Layout, write_strips
 from rdstitch.io.metadata import GpsPosition
 from rdstitch.pipeline import StitchOptions, mosaic
-from rdstitch.pipeline.georeference import Georeference, georeference, utm
 from tests.cli.running import flight, transfers
 
 

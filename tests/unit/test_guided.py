@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.features import Features, match, match_near
 

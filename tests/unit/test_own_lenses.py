@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.robust import estimate_radial_homography
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.own_lenses import OwnLenses, own_lenses

@@ -5,14 +5,15 @@ from functools import partial
 
 import numpy as np
 
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.alignment import AlignmentOptions, align
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features, match
-from rdstitch.pipeline.options import StitchOptions
-from rdstitch.pipeline.pairing import Pairing
-from rdstitch.pipeline.progress import silent
-from rdstitch.registration import AlignmentOptions, align
-from rdstitch.registration.resting import rests
-from rdstitch.registration.selection import neighbours
+from rdstitch.matching.candidate_pairs import neighbours
+from rdstitch.matching.options import MatchingOptions
+from rdstitch.matching.static_background import is_static_pair
+from rdstitch.matching.two_view_rounds import Pairing
+from rdstitch.progress import silent
 
 LENS = Camera((640, 480), distortion=-0.2, focal=520.0)
 PICTURES = 4
@@ -52,7 +53,7 @@ def _pairing(resting: int, moving: int, repeated: int = 0, seed: int = 0) -> Pai
         inside = ((points > 0) & (points < (639, 479))).all(axis=1)
         found.append(_features(points[inside], seen_as[inside]))
     matcher = partial(match, ratio=None)
-    return Pairing(found, [LENS.with_focal()] * PICTURES, matcher, StitchOptions(workers=1), silent)
+    return Pairing(found, [LENS.with_focal()] * PICTURES, matcher, MatchingOptions(), silent)
 
 
 ALL = [(i, j) for i in range(PICTURES) for j in range(i + 1, PICTURES)]
@@ -61,10 +62,10 @@ ALL = [(i, j) for i in range(PICTURES) for j in range(i + 1, PICTURES)]
 def test_a_moving_board_is_found_before_a_resting_background() -> None:
     pairing = _pairing(400, 150)
     alone = pairing.estimate(ALL)
-    assert all(rests(pair, 3.0) for pair in alone)
-    moving, again = pairing.look_past_rest(alone)
+    assert all(is_static_pair(pair, 3.0) for pair in alone)
+    moving, again = pairing.remove_static_background(alone)
     assert moving is not pairing
-    assert all(pair.relation and not rests(pair, 3.0) for pair in again)
+    assert all(pair.relation and not is_static_pair(pair, 3.0) for pair in again)
     distortion = np.median([pair.relation.distortion for pair in again])
     assert abs(distortion - LENS.distortion) < 0.02
 
@@ -72,17 +73,17 @@ def test_a_moving_board_is_found_before_a_resting_background() -> None:
 def test_pictures_that_really_rest_stay_together() -> None:
     pairing = _pairing(400, 0)
     alone = pairing.estimate(ALL)
-    same, again = pairing.look_past_rest(alone)
+    same, again = pairing.remove_static_background(alone)
     assert same is pairing
     assert again is alone
-    assert all(rests(pair, 3.0) for pair in again)
+    assert all(is_static_pair(pair, 3.0) for pair in again)
 
 
 def test_a_few_resting_points_change_nothing() -> None:
     pairing = _pairing(40, 300)
     alone = pairing.estimate(ALL)
-    assert not any(rests(pair, 3.0) for pair in alone)
-    assert pairing.look_past_rest(alone) == (pairing, alone)
+    assert not any(is_static_pair(pair, 3.0) for pair in alone)
+    assert pairing.remove_static_background(alone) == (pairing, alone)
 
 
 def test_pictures_that_hang_on_little_find_what_repeats_where_it_must_be() -> None:
@@ -91,7 +92,7 @@ def test_pictures_that_hang_on_little_find_what_repeats_where_it_must_be() -> No
     assert all(pair.relation for pair in alone)
     cameras = [camera.with_focal() for camera in pairing.cameras]
     alignment = align(cameras, [pair.link() for pair in alone], AlignmentOptions(model="homography"))
-    stronger = pairing.strengthen(alone, alignment)
+    stronger = pairing.guided_rematch(alone, alignment.support, alignment.transfer)
     for before, after in zip(alone, stronger, strict=True):
         assert after.relation.inliers.sum() > 1.5 * before.relation.inliers.sum()
     errors = [abs(pair.relation.distortion - LENS.distortion) for pair in stronger]
@@ -103,13 +104,16 @@ def test_pictures_with_many_matches_are_left_as_they_are() -> None:
     alone = pairing.estimate(ALL)
     cameras = [camera.with_focal() for camera in pairing.cameras]
     alignment = align(cameras, [pair.link() for pair in alone], AlignmentOptions(model="homography"))
-    assert all(new is old for new, old in zip(pairing.strengthen(alone, alignment), alone, strict=True))
+    assert all(
+        new is old
+        for new, old in zip(pairing.guided_rematch(alone, alignment.support, alignment.transfer), alone, strict=True)
+    )
 
 
 def test_pictures_that_share_nothing_are_told_at_a_glance() -> None:
     one, other = _pairing(0, 400), _pairing(0, 400, seed=1)
     together = replace(one, features=[*one.features[:2], *other.features[:2]])
-    assert list(together.promising(ALL)) == [(0, 1), (2, 3)]
+    assert list(together.prescreen_pairs(ALL)) == [(0, 1), (2, 3)]
 
 
 def test_a_few_matches_beside_hundreds_are_not_worth_a_closer_look() -> None:
@@ -125,9 +129,9 @@ def test_a_few_matches_beside_hundreds_are_not_worth_a_closer_look() -> None:
 
     known = replace(pairing, features=several, matcher=matcher)
     # The most that they share with another: 300, 400, 400 and 200.
-    assert list(known.promising(ALL)) == [(0, 1), (0, 2), (0, 3), (1, 2), (2, 3)]
+    assert list(known.prescreen_pairs(ALL)) == [(0, 1), (0, 2), (0, 3), (1, 2), (2, 3)]
     shared[0, 3], shared[0, 2] = 9, 14
-    assert list(known.promising(ALL)) == [(0, 1), (1, 2), (2, 3)]
+    assert list(known.prescreen_pairs(ALL)) == [(0, 1), (1, 2), (2, 3)]
 
 
 def test_pictures_behind_the_horizon_have_no_neighbours() -> None:

@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from rdstitch.camera import Camera, FloatArray, distort
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera, distort
 from rdstitch.planar_motion import PlanarMotion
 from rdstitch.radial_homography import (
     RadialHomography,

@@ -6,15 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rdstitch.alignment.align import AlignmentOptions, align
+from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
+from rdstitch.alignment.result import Alignment, Poses
+from rdstitch.alignment.trajectory import Trajectory, compare
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, RegistrationError
+from rdstitch.matching.links import Link
 from rdstitch.planar_motion import PlanarMotion
 from rdstitch.radial_homography import RadialHomography, transfer
-from rdstitch.registration.align import AlignmentOptions, align
-from rdstitch.registration.alignment import Alignment, Poses
-from rdstitch.registration.links import Link
-from rdstitch.registration.models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
-from rdstitch.registration.trajectory import Trajectory, compare
 from tests.alignment_scenes import Scene, grid, jittered, robot_path, scene
 
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from rdstitch.registration.consistency import misfitting_links, triangles
-from rdstitch.registration.graph import connected_components, spanning_tree
-from rdstitch.registration.observations import Observations
+from rdstitch.alignment.cycle_consistency import misfitting_links, triangles
+from rdstitch.alignment.observations import Observations
+from rdstitch.matching.match_graph import connected_components, spanning_tree
 
 
 def test_components_come_largest_first() -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rdstitch.camera import Camera
-from rdstitch.registration.lens_votes import Votes
-from rdstitch.registration.lenses import TwoLenses, two_lenses
+from rdstitch.matching.lens_votes import Votes
+from rdstitch.matching.mixed_lenses import TwoLenses, two_lenses
 
 _CHAIN = [(0, 1), (1, 2), (2, 3), (3, 4)]
 _ALL = list(itertools.combinations(range(6), 2))

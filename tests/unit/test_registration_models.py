@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from rdstitch.planar_motion import PlanarMotion
-from rdstitch.registration.models import (
+from rdstitch.alignment.motion_models import (
     HOMOGRAPHY,
     LOG_HEIGHT,
     MODELS,
@@ -17,6 +16,7 @@ from rdstitch.registration.models import (
     Y,
     metric_poses,
 )
+from rdstitch.planar_motion import PlanarMotion
 
 SIGNS = np.array([[1.0], [-1.0]])
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from rdstitch.alignment.result import Poses
+from rdstitch.alignment.trajectory import Trajectory, compare
 from rdstitch.errors import ArgumentError
-from rdstitch.registration.alignment import Poses
-from rdstitch.registration.trajectory import Trajectory, compare
 
 
 def _poses() -> Poses:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from rdstitch.registration.voting import vote
+from rdstitch.matching.distortion_consensus import vote
 
 
 def test_agreement_of_votes_of_different_weight() -> None:

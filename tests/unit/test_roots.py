@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 import pytest
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.solvers.batch import IndexArray
 from rdstitch.solvers.polynomials import (
     bernstein_from_values,

@@ -5,7 +5,7 @@ import pytest
 
 from rdstitch.features import Features
 from rdstitch.features.keypoints import Descriptors
-from rdstitch.registration.selection import EXHAUSTIVE_UP_TO, first_pairs, lookalikes
+from rdstitch.matching.candidate_pairs import EXHAUSTIVE_UP_TO, first_pairs, lookalikes
 
 
 def _features(descriptors: Descriptors) -> Features:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rdstitch import solvers
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.planar_motion import rotation_from_tilt
 from rdstitch.radial_homography import lift, transfer

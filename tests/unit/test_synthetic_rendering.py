@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.errors import OutputError
 from rdstitch.synthetic import (
     BrownLens,

@@ -65,7 +65,7 @@ def apply(
     shape. Compositing options that are not given are those of the sidecar.
     """
     from rdstitch.pipeline import apply as recipe
-    from rdstitch.pipeline.saved import read_sidecar
+    from rdstitch.sidecar.read import read_sidecar
 
     given = {name: value for name, value in compositing.items() if options.is_given(name)}
     with Reporter(-quiet + verbose) as reporter:

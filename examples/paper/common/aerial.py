@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from rdstitch.camera import Camera, FloatArray
-from rdstitch.pipeline.register import Registration
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.radial_homography import project
+from rdstitch.registration import Registration
 from rdstitch.synthetic import Photometry, Sequence, fit_similarity, ground, sequence_over, survey_poses
 from rdstitch.synthetic.fitting import apply
 

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from examples.paper.common.report import Pixels
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, CompositeOptions, compose
 from rdstitch.io.read import read_image
 from rdstitch.synthetic import PictureTexture, Poses, fit_homography, fit_similarity, sequence_over

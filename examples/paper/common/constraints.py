@@ -6,7 +6,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from examples.paper.common.contenders import Contender
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.planar_motion import PlanarMotion
 from rdstitch.solvers import Solutions, four_point
 from rdstitch.solvers.batch import IndexArray, solve_in_blocks

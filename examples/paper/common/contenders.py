@@ -7,7 +7,7 @@ import numpy as np
 
 from examples.paper.common.peers import homlib_solver
 from rdstitch import solvers
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.solvers import Solutions
 from rdstitch.synthetic import PlanarInstances
 

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.camera import Camera, FloatArray
-from rdstitch.registration import Link
-from rdstitch.registration.alignment import Poses as PlanePoses
-from rdstitch.registration.trajectory import Trajectory
+from rdstitch.alignment import Link
+from rdstitch.alignment.result import Poses as PlanePoses
+from rdstitch.alignment.trajectory import Trajectory
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.robust import estimate_radial_homography
 from rdstitch.synthetic import Poses, line_poses, parking_poses, turn_poses
 from rdstitch.synthetic.poses import to_picture, to_plane

@@ -12,7 +12,8 @@ import numpy as np
 
 from examples.paper.common.planar_scenes import PlanarScene
 from examples.paper.common.report import Pixels
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions, detect, match
 from rdstitch.synthetic import Photometry, ground, pair_poses, sequence_over
 from rdstitch.synthetic import Sequence as RenderedSequence

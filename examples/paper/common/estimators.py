@@ -9,7 +9,8 @@ import numpy as np
 
 from examples.paper.common.estimation_pairs import JudgedPair
 from examples.paper.common.peers import optional_module
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.radial_homography import RadialHomography, transfer
 from rdstitch.robust import estimate_radial_homography
 

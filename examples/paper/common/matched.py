@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions, detect, match
 from rdstitch.io.read import read_image
 from rdstitch.synthetic import Photometry, Sequence, ground, pair_poses, sequence_over

@@ -9,7 +9,7 @@ import numpy as np
 from examples.paper.common.contenders import Contender
 from examples.paper.common.plots import curves
 from examples.paper.common.report import Table
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.radial_homography import lift
 from rdstitch.solvers import Solutions
 from rdstitch.synthetic import PlanarInstances

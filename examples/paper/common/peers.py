@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.solvers import Solutions
 
 

@@ -7,7 +7,8 @@ import numpy as np
 
 from examples.paper.common.contenders import HOMLIB
 from examples.paper.common.peers import homlib_solver
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.pair_models import HomographyModel

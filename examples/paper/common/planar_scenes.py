@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from examples.paper.common.report import Pixels
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.io.read import read_image
 from rdstitch.synthetic import ground
 

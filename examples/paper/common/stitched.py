@@ -7,13 +7,14 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from examples.paper.common.report import Pixels
-from rdstitch.camera import Camera, FloatArray
+from rdstitch.alignment import Alignment
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.errors import RegistrationError
 from rdstitch.io.read import read_image
 from rdstitch.pipeline import StitchOptions, calibrate, mosaic
-from rdstitch.pipeline.register import Registration
 from rdstitch.radial_homography import project
-from rdstitch.registration import Alignment
+from rdstitch.registration import Registration
 from rdstitch.synthetic import AlignmentError, Sequence, alignment_error
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.features.surf.patches import sample_patches
 from rdstitch.features.surf.pyramid import Grey
 

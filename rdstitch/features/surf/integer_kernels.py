@@ -7,7 +7,7 @@ all sums to fit float32's 24 bits give the same result in any order.
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 
 _LARGEST_SUM = 2.0**24 / 255 - 1000  # of the absolute values of one filter, with room for rounding
 

@@ -8,7 +8,7 @@ edge, so that a gradient near it does not decide by being just in or out.
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.features.surf.integer_kernels import apply, integer_kernels
 from rdstitch.features.surf.patches import sample_patches
 from rdstitch.features.surf.pyramid import Grey

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 
 
 def vertex(values: NDArray[np.floating]) -> tuple[FloatArray, NDArray[np.bool_]]:

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.camera import FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.features.surf.hessian import Blobs
 from rdstitch.features.surf.integer_kernels import apply, integer_kernels
 from rdstitch.features.surf.patches import sample_patches

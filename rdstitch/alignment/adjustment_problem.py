@@ -1,0 +1,285 @@
+"""One connected set of pictures, what is known of its camera, and the adjustment of one model to it."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rdstitch.alignment.bundle_adjustment import (
+    WIDTH_PER_SIGMA,
+    BundleAdjuster,
+    BundleAdjustmentResult,
+    FreeParameters,
+    Parameters,
+    Priors,
+)
+from rdstitch.alignment.cycle_consistency import link_medians
+from rdstitch.alignment.initialization import adjust_pairs_independently
+from rdstitch.alignment.motion_models import HOMOGRAPHY, PSI, SIMILARITY, THETA, Model
+from rdstitch.alignment.normal_equations import robust_cost
+from rdstitch.alignment.observations import Observations
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.camera import Camera
+from rdstitch.matching.match_graph import spanning_tree
+
+_FOCAL_STD = {"option": 0.01, "file": 0.01, "estimate": 0.05, "exif": 0.05, "guess": 0.3}
+"""Relative standard deviation of a focal length by its source."""
+
+_USUAL_FOCAL, _USUAL_FOCAL_STD = 1.9, 0.4
+"""Half diagonals: the focal length where nothing is known of it (a field of view of about 55 degrees)."""
+
+_WIDEST_START = 0.05
+"""Half diagonals: errors that a chain may have gathered before the adjustment, beyond which a link is doubted."""
+
+_LONG_CHAIN = 60
+"""Pictures over which chained homographies drift so far that a planar model is the better start."""
+
+_TRIAL_LINKS, _TRIAL_MATCHES = 30, 40
+"""What the tilts to start from are tried on."""
+
+_TILT_SPREAD_START = math.radians(3.0)
+_TILT_SPREAD_LEAST = math.radians(0.05)
+_TILT_SPREAD_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class CameraPriors:
+    """What is known of the camera before anything is measured.
+
+    Attributes
+    ----------
+    log_focal, log_focal_std : float
+        Of the logarithm of the focal length in half diagonals.
+    tilt : (float, float)
+        (ψ, θ), radians.
+    tilt_std : float
+        inf where the tilt is not known.
+    attitudes : ndarray of shape (N, 2)
+        How the tilt of each picture differs from the shared one, radians; zeros where that is not known.
+    attitudes_std : float or None
+        Standard deviation of these, 0 for exact ones; None where they are not known.
+    lens, lens_std : ndarray of shape (4,)
+        λ, μ and the shift of the distortion centre.
+    """
+
+    log_focal: float
+    log_focal_std: float
+    tilt: tuple[float, float]
+    tilt_std: float
+    attitudes: FloatArray
+    attitudes_std: float | None
+    lens: FloatArray
+    lens_std: FloatArray
+
+    def priors(self, model: Model, count: int, tilt_spread: float) -> Priors:
+        """For ``count`` pictures whose tilts scatter by ``tilt_spread`` where nothing else is known of them."""
+        none = Priors.none(model, count)
+        known = replace(none, lens=self.lens, lens_precision=self.lens_std**-2.0)
+        if not model.shared_names:
+            return known
+        tilt_precision = 0.0 if math.isinf(self.tilt_std) else max(self.tilt_std, 1e-6) ** -2.0
+        poses, precision = np.zeros_like(none.poses), np.zeros_like(none.poses)
+        free = list(getattr(model, "free", ()))
+        for axis, column in enumerate((PSI, THETA)):
+            if column in free:
+                poses[:, free.index(column)] = self.attitudes[:, axis]
+                precision[:, free.index(column)] = max(tilt_spread, 1e-6) ** -2.0
+        return replace(
+            known,
+            shared=np.array([*self.tilt, self.log_focal]),
+            shared_precision=np.array([tilt_precision, tilt_precision, self.log_focal_std**-2.0]),
+            poses=poses,
+            poses_precision=precision,
+        )
+
+    def of(self, pictures: IntArray) -> "CameraPriors":
+        """Of some of the pictures only."""
+        return replace(self, attitudes=self.attitudes[pictures])
+
+
+def focal_prior(cameras: Sequence[Camera]) -> tuple[float, float]:
+    """Mean and standard deviation of the logarithm of the focal length in half diagonals."""
+    known = [(c.focal / c.half_diagonal, c.focal_source) for c in cameras if c.focal is not None]
+    if not known:
+        return math.log(_USUAL_FOCAL), _USUAL_FOCAL_STD
+    spread = max(_FOCAL_STD.get(source or "guess", 0.3) for _, source in known)
+    return float(np.log(np.median([ratio for ratio, _ in known]))), spread
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One model adjusted to a problem.
+
+    Attributes
+    ----------
+    model : Model
+    adjusted : BundleAdjustmentResult
+    free_lens : ndarray of shape (4,), bool
+        Lens parameters that were estimated.
+    tilt_spread : float
+        Standard deviation of the pictures' own tilts, radians; 0 where the model has none.
+    """
+
+    model: Model
+    adjusted: BundleAdjustmentResult
+    free_lens: BoolArray
+    tilt_spread: float = 0.0
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Connected pictures to be aligned.
+
+    Attributes
+    ----------
+    observations : Observations
+        Links between the pictures 0 … N-1.
+    homographies : ndarray of shape (L, 3, 3)
+        Of the links, at the ``lens``.
+    trust : ndarray of shape (L,)
+        How much each link can be relied on to start with.
+    count : int
+        N.
+    reference : int
+        The picture that fixes the gauge.
+    lens : ndarray of shape (4,)
+        Where to start.
+    free_lens : ndarray of shape (4,), bool
+    knowledge : CameraPriors
+    overdispersion : float
+        See :class:`BundleAdjuster`.
+    """
+
+    observations: Observations
+    homographies: FloatArray
+    trust: FloatArray
+    count: int
+    reference: int
+    lens: FloatArray
+    free_lens: BoolArray
+    knowledge: CameraPriors
+    overdispersion: float = 1.0
+
+    def fit(self, model: Model, others: Sequence[Fit] = ()) -> Fit:
+        """Adjust a model from the chained links or from the solution of a less free model, whichever is nearer."""
+        if not others and not model.shared_names and self.count > _LONG_CHAIN:
+            others = [self.fit(SIMILARITY)]
+        starts = [self._taken_over(model, other) for other in others]
+        if not (others and self._tilts_are_free(model)):
+            starts.append(self._chained(model, others))
+        return self.refine(model, self._nearest(model, starts))
+
+    def squared(self, model: Model, parameters: Parameters) -> FloatArray:
+        """``|r|²`` of each correspondence (M,) at some parameters, px², whitened."""
+        return self._adjuster(model).squared(parameters)
+
+    def refine(self, model: Model, start: Parameters, tilt_spread: float | None = None) -> Fit:
+        """Adjust a model from a given start."""
+        if not self._tilts_are_free(model) or self.knowledge.attitudes_std is not None:
+            spread = self.knowledge.attitudes_std or 0.0
+            own = spread if self._tilts_are_free(model) else 0.0
+            return Fit(model, self._run(model, start, spread), self.free_lens, own)
+        spread = tilt_spread or _TILT_SPREAD_START
+        adjusted = self._run(model, start, spread)
+        for _ in range(_TILT_SPREAD_ROUNDS):
+            tilts = adjusted.parameters.poses[:, [PSI, THETA]]
+            previous, spread = spread, max(float(np.sqrt(np.mean(tilts**2))), _TILT_SPREAD_LEAST)
+            if abs(spread - previous) <= 0.1 * previous:
+                break
+            adjusted = self._run(model, adjusted.parameters, spread)
+        return Fit(model, adjusted, self.free_lens, spread)
+
+    def extend(self, fit: Fit, lens: BoolArray) -> Fit:
+        """The same model with more of the lens free."""
+        wider = replace(self, free_lens=self.free_lens | lens)
+        return wider.refine(fit.model, fit.adjusted.parameters, fit.tilt_spread)
+
+    @staticmethod
+    def _tilts_are_free(model: Model) -> bool:
+        return PSI in getattr(model, "free", ())
+
+    def _run(self, model: Model, start: Parameters, tilt_spread: float) -> BundleAdjustmentResult:
+        adjuster = self._adjuster(model, tilt_spread)
+        medians = link_medians(adjuster.squared(start), self.observations)
+        widest = _WIDEST_START * float(np.median(self.observations.scale2))
+        width = min(1.5 * float(np.quantile(np.where(np.isfinite(medians), medians, 1e9), 0.95)), widest)
+        return adjuster.run(start, width)
+
+    def _adjuster(self, model: Model, tilt_spread: float = _TILT_SPREAD_START) -> BundleAdjuster:
+        freedom = FreeParameters.fixing(model, self.count, [self.reference], self.free_lens)
+        priors = self.knowledge.priors(model, self.count, tilt_spread)
+        return BundleAdjuster(model, self.observations, freedom, priors, self.overdispersion)
+
+    def _chained(self, model: Model, others: Sequence[Fit]) -> Parameters:
+        """Every link on its own, chained along the tree of the links trusted most."""
+        o, attitudes = self.observations, self.knowledge.attitudes
+        shared, lens, homographies = np.zeros(0), self.lens, self.homographies
+        if model.shared_names:
+            apart = self._planar_apart(SIMILARITY if self._tilts_are_free(model) else model, others)
+            shared, lens, homographies = apart.parameters.shared, apart.parameters.lens, apart.homographies
+        tree = spanning_tree(self.count, o.image1, o.image2, self.trust, self.reference)
+        origin = model.origins(shared, attitudes[[tree.root]])[0]
+        chained = tree.chained(homographies, o.image1, origin)
+        return Parameters(model.poses_from(chained, shared, attitudes), shared, lens)
+
+    def _planar_apart(self, model: Model, others: Sequence[Fit]) -> BundleAdjustmentResult:
+        """Every link on its own, from the tilt of another planar model or the best of several."""
+        priors = self.knowledge.priors(model, self.count, _TILT_SPREAD_START)
+        free, known = self.free_lens, self.knowledge.attitudes
+        planar = [other for other in others if other.model.shared_names]
+        if planar:
+            best = planar[-1].adjusted.parameters.shared
+        else:
+            links = len(self.observations)
+            few = np.linspace(0, links - 1, min(links, _TRIAL_LINKS)).astype(np.intp)
+            sample, own = self.observations.subset(few).thinned(_TRIAL_MATCHES), self.homographies[few]
+            trials = [
+                adjust_pairs_independently(model, sample, own, shared, self.lens, free, priors, known)
+                for shared in self._tilts_to_try(model, priors.shared)
+            ]
+            width = WIDTH_PER_SIGMA * min(trial.sigma for trial in trials)
+            cost = [float(robust_cost(trial.squared, width).sum()) for trial in trials]
+            best = trials[int(np.argmin(cost))].parameters.shared
+        return adjust_pairs_independently(
+            model, self.observations, self.homographies, best, self.lens, free, priors, known
+        )
+
+    def _tilts_to_try(self, model: Model, natural: FloatArray) -> list[FloatArray]:
+        """Shared parameters for the known or zero tilt, and for four around that, 0.2 radians away."""
+        steps = np.array([(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2)])
+        if np.isfinite(self.knowledge.tilt_std):
+            steps = steps[:1]
+        return [model.shared_from(natural + np.array([*step, 0.0])) for step in steps]
+
+    def _taken_over(self, model: Model, other: Fit) -> Parameters:
+        """Another model's solution as this model's start."""
+        parameters = other.adjusted.parameters
+        if model.shared_names and other.model.shared_names:
+            return parameters
+        shared = parameters.shared if model.shared_names else np.empty(0)
+        poses = model.poses_from(other.adjusted.matrices.matrices, shared, self.knowledge.attitudes)
+        return Parameters(poses, shared, parameters.lens)
+
+    def _nearest(self, model: Model, starts: Sequence[Parameters]) -> Parameters:
+        """The start with the smallest errors, those far away counting alike."""
+        if len(starts) == 1:
+            return starts[0]
+        adjuster = self._adjuster(model)
+        width = _WIDEST_START * float(np.median(self.observations.scale2))
+        return min(starts, key=lambda start: float(robust_cost(adjuster.squared(start), width).sum()))
+
+
+def homography_apart(
+    observations: Observations, homographies: FloatArray, lens: FloatArray, free_lens: BoolArray, known: CameraPriors
+) -> BundleAdjustmentResult:
+    """Every link on its own with a homography: what is wrong with a link shows nowhere else."""
+    priors = known.priors(HOMOGRAPHY, 0, 0.0)
+    return adjust_pairs_independently(
+        HOMOGRAPHY, observations, homographies, np.empty(0), lens, free_lens, priors, known.attitudes
+    )
+
+
+def thin_for_selection(links: int) -> int:
+    """Correspondences per link that suffice to choose a model: fewer where there are many links."""
+    return int(np.clip(20_000 // max(links, 1), 40, 150))

@@ -1,0 +1,285 @@
+"""The recipe of the global adjustment: consensus, match graph, choice of the model, adjustment."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rdstitch.alignment.adjustment_problem import (
+    CameraPriors,
+    Problem,
+    focal_prior,
+    homography_apart,
+    thin_for_selection,
+)
+from rdstitch.alignment.build_result import Outcome, build_alignment
+from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
+from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
+from rdstitch.alignment.initialization import relations_at
+from rdstitch.alignment.model_selection import Choice, choose_model
+from rdstitch.alignment.motion_models import MODELS
+from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.result import Alignment
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.camera import Camera
+from rdstitch.errors import ArgumentError, RegistrationError
+from rdstitch.matching.distortion_consensus import Consensus, vote
+from rdstitch.matching.links import Link
+from rdstitch.matching.match_graph import connected_components, spanning_tree
+from rdstitch.radial_homography import LENS_STD
+
+_OBSERVABLE = 0.1
+"""Standard deviation of λ from which on it counts as not observable."""
+
+_PLAUSIBLE = (-1.0, 0.5)
+"""Limits of λ: below, the corners see behind the camera; no lens pulls its corners in as far as above."""
+
+_UNCONFIRMED = 0.1
+"""How much a link without a triangle that closes is relied on, relative to one with."""
+
+_ROUNDS = 3
+"""Times that wrong pairs are looked for."""
+
+
+@dataclass(frozen=True)
+class AlignmentOptions:
+    """What the caller decides or knows.
+
+    Attributes
+    ----------
+    reference : int, optional
+        The picture that defines the plane's frame; the centre of the match graph if not given.
+    model : str
+        "rigid", "similarity", "tilting", "homography", or "auto": the least free one that the data allow.
+    distortion : float, optional
+        λ in the half-diagonal frame, where it is known; estimated otherwise.
+    tilt : (float, float), optional
+        (ψ, θ), radians, where it is known.
+    tilt_std : float
+        Its standard deviation, radians; 0 for an exact one.
+    attitudes : ndarray of shape (N, 2), optional
+        (ψ, θ) of each picture, radians, where an IMU or a gimbal has measured them; ``tilt`` is then how the camera
+        is mounted on that.
+    attitudes_std : float
+        Their standard deviation, radians; 0 for exact ones.
+    center : bool
+        Estimate the distortion centre too, where the data support that.
+    second_coefficient : bool
+        Estimate μ, the coefficient of r⁴, too, where the data support that; λ is then no longer comparable with the
+        λ of a one-parameter lens.
+    most : int
+        Correspondences used of each link.
+    """
+
+    reference: int | None = None
+    model: str = "auto"
+    distortion: float | None = None
+    tilt: tuple[float, float] | None = None
+    tilt_std: float = 0.0
+    attitudes: ArrayLike | None = None
+    attitudes_std: float = 0.0
+    center: bool = True
+    second_coefficient: bool = False
+    most: int = 250
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.model != "auto" and self.model not in MODELS:
+            raise ArgumentError(f"model must be auto, {', '.join(MODELS)}, not {self.model}")
+        if self.tilt_std < 0 or self.attitudes_std < 0:
+            raise ArgumentError("a standard deviation cannot be negative")
+
+    def exact_tilts(self, count: int) -> list[tuple[float, float]] | None:
+        """(ψ, θ), radians, of each of ``count`` pictures, where they are known exactly; None where not."""
+        if self.tilt is None or self.tilt_std > 0.0 or (self.attitudes is not None and self.attitudes_std > 0.0):
+            return None
+        attitudes = np.zeros((count, 2)) if self.attitudes is None else np.asarray(self.attitudes, dtype=np.float64)
+        return [(psi, theta) for psi, theta in (attitudes + self.tilt).tolist()]
+
+    def knowledge(self, cameras: Sequence[Camera]) -> CameraPriors:
+        """As the adjustment needs it."""
+        count = len(cameras)
+        attitudes = np.zeros((count, 2)) if self.attitudes is None else np.asarray(self.attitudes, dtype=np.float64)
+        if attitudes.shape != (count, 2) or not np.isfinite(attitudes).all():
+            raise ArgumentError(f"expected one attitude (psi, theta) for each of the {count} pictures")
+        return CameraPriors(
+            *focal_prior(cameras),
+            tilt=self.tilt or (0.0, 0.0),
+            tilt_std=np.inf if self.tilt is None else self.tilt_std,
+            attitudes=attitudes,
+            attitudes_std=None if self.attitudes is None else self.attitudes_std,
+            lens=np.zeros(4),
+            lens_std=LENS_STD,
+        )
+
+    @property
+    def lenses(self) -> list[BoolArray]:
+        """What else of the lens may be freed, one after the other."""
+        if self.distortion is not None:
+            return []
+        center = [np.array([False, False, True, True])] if self.center else []
+        return center + ([np.array([False, True, False, False])] if self.second_coefficient else [])
+
+    @property
+    def models(self) -> list[str]:
+        """Models to be tried, from the least to the most free."""
+        if self.model != "auto":
+            return [self.model]
+        exact = self.attitudes is not None and self.attitudes_std == 0.0
+        return [name for name in MODELS if not (exact and name == "tilting")]
+
+
+def align(
+    cameras: Sequence[Camera],
+    links: Sequence[Link],
+    options: AlignmentOptions = AlignmentOptions(),
+    *,
+    progress: Callable[[str], None] | None = None,
+) -> Alignment:
+    """Align all pictures over one plane.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        One per picture, of one lens; sizes may differ.
+    links : sequence of Link
+        The pairs that overlap, each once.
+    options : AlignmentOptions
+    progress : callable, optional
+        Called with the name of each stage as it begins.
+
+    Raises
+    ------
+    ArgumentError
+        When an argument is out of range, or two links are between the same pictures.
+    RegistrationError
+        When no two pictures are linked.
+    """
+    say = progress or (lambda stage: None)
+    _check(cameras, links, options)
+    known = options.knowledge(cameras)
+    everything = Observations.from_links(links, cameras, options.most)
+
+    say("consensus of the pairs")
+    votes = vote([k.relation.distortion for k in links], [k.relation.distortion_std for k in links])
+    lens, free_lens = _lens_start(cameras, options, votes)
+    few = everything.thinned(thin_for_selection(len(links)))
+    relations = relations_at(few, [link.relation for link in links], lens)
+    apart = homography_apart(few, relations, lens, free_lens, known)
+    observable = options.distortion is not None or _observable(apart)
+    if observable:
+        lens, relations = apart.parameters.lens, apart.homographies
+    else:
+        lens, free_lens = np.array([cameras[0].distortion, 0.0, 0.0, 0.0]), np.zeros(4, dtype=np.bool_)
+        apart = homography_apart(few, relations_at(few, [k.relation for k in links], lens), lens, free_lens, known)
+        relations = apart.homographies
+
+    say("choice of the model")
+    wrong, confirmed = cycle_consistency(apart, few, len(cameras))
+    trust = few.matches.astype(np.float64) * np.where(confirmed > 0, 1.0, _UNCONFIRMED)
+    graph = _Graph(len(cameras), few, relations, trust, lens, free_lens, known, options)
+    problem, pictures = graph.problem(~wrong)
+    choice = choose_model(problem, options.models, options.lenses if observable else ())
+    graph = replace(graph, free_lens=choice.fit.free_lens)
+    choice, pictures, wrong = _drop_wrong_pairs(graph, problem, pictures, choice, wrong)
+
+    say("adjustment")
+    full = replace(graph, observations=everything)
+    problem, _ = full.problem(~wrong, pictures, choice.overdispersion)
+    fit = problem.refine(choice.fit.model, choice.fit.adjusted.parameters, choice.fit.tilt_spread)
+    outcome = Outcome(cameras, links, pictures, ~wrong, problem, replace(choice, fit=fit), votes, observable)
+    return build_alignment(outcome)
+
+
+def _check(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions) -> None:
+    if not links:
+        raise RegistrationError("nothing to align: no two pictures overlap")
+    pairs = [(min(k.image1, k.image2), max(k.image1, k.image2)) for k in links]
+    if min(pairs)[0] < 0 or max(high for _, high in pairs) >= len(cameras):
+        raise ArgumentError(f"a link names a picture that is none of the {len(cameras)}")
+    if len(set(pairs)) != len(pairs):
+        raise ArgumentError("two links are between the same pictures")
+    if options.reference is not None and not 0 <= options.reference < len(cameras):
+        raise ArgumentError(f"the reference picture {options.reference} is none of the {len(cameras)}")
+
+
+def _lens_start(cameras: Sequence[Camera], options: AlignmentOptions, votes: Consensus) -> tuple[FloatArray, BoolArray]:
+    """Where the lens starts, and which of its parameters are free."""
+    lens = np.array([votes.distortion if votes.votes else 0.0, cameras[0].distortion2, 0.0, 0.0])
+    if options.distortion is not None:
+        lens[0] = options.distortion
+    return lens, np.array([options.distortion is None, False, False, False])
+
+
+def _observable(apart: BundleAdjustmentResult) -> bool:
+    """Whether one homography a pair leaves λ well determined, at a value that a lens can have."""
+    distortion, std = float(apart.parameters.lens[0]), float(np.sqrt(apart.covariance[0, 0]))
+    return std < _OBSERVABLE and _PLAUSIBLE[0] < distortion < _PLAUSIBLE[1]
+
+
+@dataclass(frozen=True)
+class _Graph:
+    """All links; makes the problem of the largest connected part of some of them."""
+
+    count: int
+    observations: Observations
+    homographies: FloatArray
+    trust: FloatArray
+    lens: FloatArray
+    free_lens: BoolArray
+    known: CameraPriors
+    options: AlignmentOptions
+
+    def problem(
+        self, kept: BoolArray, pictures: IntArray | None = None, overdispersion: float = 1.0
+    ) -> tuple[Problem, IntArray]:
+        """The problem, and its pictures (those given, if given)."""
+        o = self.observations
+        if pictures is None:
+            groups = connected_components(self.count, o.image1[kept], o.image2[kept])
+            pictures = np.array(groups[0], dtype=np.intp)
+        number = np.full(self.count, -1, dtype=np.intp)
+        number[pictures] = np.arange(len(pictures))
+        links = np.flatnonzero(kept & (number[o.image1] >= 0) & (number[o.image2] >= 0))
+        own = o.subset(links, number)
+        wanted = self.options.reference
+        if wanted is not None and number[wanted] >= 0:
+            reference = int(number[wanted])
+        else:
+            reference = spanning_tree(len(pictures), own.image1, own.image2, self.trust[links]).root
+        problem = Problem(
+            own,
+            self.homographies[links],
+            self.trust[links],
+            len(pictures),
+            reference,
+            self.lens,
+            self.free_lens,
+            self.known.of(pictures),
+            overdispersion,
+        )
+        return problem, pictures
+
+
+def _drop_wrong_pairs(
+    graph: _Graph, problem: Problem, pictures: IntArray, choice: Choice, wrong: BoolArray
+) -> tuple[Choice, IntArray, BoolArray]:
+    """Judge all links by the adjusted poses, and adjust again without those that do not fit."""
+    for _ in range(_ROUNDS):
+        adjusted, model = choice.fit.adjusted, choice.fit.model
+        everything, _ = graph.problem(np.ones_like(wrong), pictures)
+        inside = np.isin(graph.observations.image1, pictures) & np.isin(graph.observations.image2, pictures)
+        judged = wrong.copy()
+        judged[inside] = misfitting_links(everything.squared(model, adjusted.parameters), everything.observations)
+        if (judged == wrong).all():
+            break
+        wrong = judged
+        problem, kept = graph.problem(~wrong)
+        if np.isin(kept, pictures).all():
+            poses = adjusted.parameters.poses[np.searchsorted(pictures, kept)]
+            fit = problem.refine(model, replace(adjusted.parameters, poses=poses), choice.fit.tilt_spread)
+        else:
+            fit = problem.fit(model)
+        choice, pictures = replace(choice, fit=fit), kept
+    return choice, pictures, wrong

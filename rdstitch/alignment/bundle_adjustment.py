@@ -1,0 +1,340 @@
+"""Global adjustment: all poses, the shared tilt and focal length, and the lens, from all correspondences at once.
+
+Levenberg-Marquardt on a robust loss of the transfer errors in measured px, generic in the motion model. The width of
+the loss follows the scatter of the errors, from wide to narrow, so that good links are not lost to a rough start.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from rdstitch.alignment.motion_models import Model, ModelMatrices, inverses
+from rdstitch.alignment.normal_equations import (
+    LinkEquations,
+    NormalEquations,
+    chain,
+    link_equations,
+    robust_cost,
+    squared_errors,
+)
+from rdstitch.alignment.observations import Observations
+from rdstitch.arrays import BoolArray, FloatArray
+
+WIDTH_PER_SIGMA = 3.5
+"""Width of the robust loss in standard deviations of an error's coordinate."""
+
+_SMALLEST_SIGMA = 1e-3
+"""px; less is not measurable, and zero would divide."""
+
+_MEDIAN_RADIUS = 1.1774
+"""Median length of a two-dimensional normal vector of unit variance."""
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Everything that the adjustment moves.
+
+    Attributes
+    ----------
+    poses : ndarray of shape (N, ...)
+        In the model's own columns.
+    shared : ndarray of shape (S,)
+        The model's shared parameters.
+    lens : ndarray of shape (4,)
+        λ, μ and the shift of the distortion centre, in the half-diagonal frame.
+    """
+
+    poses: FloatArray
+    shared: FloatArray
+    lens: FloatArray
+
+    def moved(self, model: Model, step_poses: FloatArray, step_shared: FloatArray, free_lens: BoolArray) -> Self:
+        """After a step."""
+        lens = self.lens.copy()
+        size = len(self.shared)
+        lens[free_lens] += step_shared[size:]
+        return replace(
+            self,
+            poses=model.moved(self.poses, step_poses),
+            shared=self.shared + step_shared[:size],
+            lens=lens,
+        )
+
+
+@dataclass(frozen=True)
+class Priors:
+    """What is known beforehand, as means and inverse variances; 0 where nothing is known.
+
+    Attributes
+    ----------
+    shared, shared_precision : ndarray of shape (S,)
+        Of what the model names, see :meth:`Model.natural`.
+    lens, lens_precision : ndarray of shape (4,)
+    poses, poses_precision : ndarray of shape (N, D)
+    """
+
+    shared: FloatArray
+    shared_precision: FloatArray
+    lens: FloatArray
+    lens_precision: FloatArray
+    poses: FloatArray
+    poses_precision: FloatArray
+
+    @classmethod
+    def none(cls, model: Model, count: int) -> Self:
+        """Nothing known of ``count`` pictures."""
+        shared, poses = np.zeros(len(model.shared_names)), np.zeros((count, model.pose_size))
+        return cls(shared, shared, np.zeros(4), np.zeros(4), poses, poses)
+
+
+@dataclass(frozen=True)
+class FreeParameters:
+    """Which parameters may move.
+
+    Attributes
+    ----------
+    poses : ndarray of shape (N, D), bool
+    lens : ndarray of shape (4,), bool
+    """
+
+    poses: BoolArray
+    lens: BoolArray
+
+    @classmethod
+    def fixing(cls, model: Model, count: int, references: FloatArray | list[int], lens: BoolArray) -> Self:
+        """All but the gauge of the reference pictures, one for each connected part of the graph."""
+        poses = np.ones((count, model.pose_size), dtype=np.bool_)
+        poses[np.asarray(references, dtype=np.intp)] = ~model.gauge
+        return cls(poses, lens)
+
+
+@dataclass(frozen=True)
+class BundleAdjustmentResult:
+    """Result of an adjustment.
+
+    Attributes
+    ----------
+    parameters : Parameters
+    matrices : ModelMatrices
+    homographies : ndarray of shape (L, 3, 3)
+        Of each link.
+    sigma : float
+        Standard deviation of an error's coordinate, px, from the median.
+    squared : ndarray of shape (M,)
+        ``|r|²`` of each correspondence, px², whitened; inf where it cannot be transferred.
+    equations : LinkEquations
+        At the solution.
+    covariance : ndarray of shape (S', S')
+        Of what the model names and of the free parameters of the lens, priors included.
+    converged : bool
+    iterations : int
+    """
+
+    parameters: Parameters
+    matrices: ModelMatrices
+    homographies: FloatArray
+    sigma: float
+    squared: FloatArray
+    equations: LinkEquations
+    covariance: FloatArray
+    converged: bool
+    iterations: int
+
+
+@dataclass(frozen=True)
+class _State:
+    """Parameters with all that is computed from them."""
+
+    parameters: Parameters
+    matrices: ModelMatrices
+    homographies: FloatArray
+    equations: LinkEquations
+    cost: float
+
+
+@dataclass(frozen=True)
+class BundleAdjuster:
+    """The adjustment of one set of observations with one model.
+
+    Attributes
+    ----------
+    model : Model
+    observations : Observations
+    freedom : FreeParameters
+    priors : Priors
+    overdispersion : float
+        How much less the correspondences say than if their errors were independent; weighs them against the priors.
+    max_iterations : int
+        Linearizations at most.
+    tolerance : float
+        Relative decrease of the cost, as a step promises it, that is not worth the step.
+    """
+
+    model: Model
+    observations: Observations
+    freedom: FreeParameters
+    priors: Priors
+    overdispersion: float = 1.0
+    max_iterations: int = 60
+    tolerance: float = 1e-5
+
+    def run(self, start: Parameters, width: float | None = None) -> BundleAdjustmentResult:
+        """Adjust.
+
+        Parameters
+        ----------
+        start : Parameters
+        width : float, optional
+            Of the robust loss at the start, px; the scatter of the first errors decides if not given. It narrows to
+            what the scatter of the errors asks for.
+        """
+        sigma = self._sigma(self._evaluate(start, 1.0, 1.0))
+        wide = max(width or 0.0, WIDTH_PER_SIGMA * sigma)
+        parameters, used, converged = start, 0, False
+        while used < self.max_iterations:
+            last = wide <= WIDTH_PER_SIGMA * sigma * 1.05
+            state, iterations, converged = self._descend(parameters, sigma, wide, 12 if last else 4)
+            parameters, used = state.parameters, used + iterations
+            sigma, previous = self._sigma(state), sigma
+            wide = max(wide / 3.0, WIDTH_PER_SIGMA * sigma)
+            if last and converged and abs(sigma - previous) <= 0.02 * previous:
+                break
+            converged = False
+        return self._finished(parameters, sigma, used, converged)
+
+    def squared(self, parameters: Parameters) -> FloatArray:
+        """``|r|²`` of each correspondence (M,), px², whitened; inf where it cannot be transferred."""
+        squared: FloatArray = self._evaluate(parameters, 1.0, 1.0).equations.squared
+        return squared
+
+    def _descend(self, parameters: Parameters, sigma: float, width: float, most: int) -> tuple[_State, int, bool]:
+        """Levenberg-Marquardt at one width of the loss; the state reached, linearizations, whether converged."""
+        state = self._evaluate(parameters, sigma, width)
+        damping, used = 1e-5, 1
+        while used < most:
+            normal = self._normal_equations(state, sigma)
+            try:
+                flat, step_shared = normal.solve(damping)
+            except RuntimeError:  # singular: some pictures are held by nothing but lost correspondences
+                return state, used, False
+            step_poses = np.zeros(self.freedom.poses.shape)
+            step_poses[self.freedom.poses] = flat
+            predicted = -(
+                normal.gradient_poses @ flat + normal.gradient_shared @ step_shared
+            )  # of the quadratic model, to first order twice the decrease
+            if not np.isfinite(predicted) or predicted <= self.tolerance * max(state.cost, 1e-12):
+                return state, used, True
+            moved = state.parameters.moved(self.model, step_poses, step_shared, self.freedom.lens)
+            cost = self._cost_at(moved, state.equations.whitening, sigma, width)
+            used += 1
+            if cost < state.cost:
+                gain = (state.cost - cost) / predicted
+                damping = max(damping * (0.1 if gain > 0.5 else 1.0), 1e-9)
+                state = self._evaluate(moved, sigma, width)
+            elif damping > 1e6:
+                return state, used, True
+            else:
+                damping *= 10.0
+        return state, used, False
+
+    def _evaluate(self, parameters: Parameters, sigma: float, width: float) -> _State:
+        """Errors, cost and linearization at some parameters."""
+        matrices = self.model.matrices(parameters.poses, parameters.shared)
+        homographies = self._of_links(matrices)
+        equations = link_equations(self.observations, homographies, parameters.lens, width)
+        cost = float(robust_cost(equations.squared, width).sum()) * self._weight(sigma)
+        return _State(parameters, matrices, homographies, equations, cost + self._prior_cost(parameters))
+
+    def _cost_at(self, parameters: Parameters, whitening: FloatArray, sigma: float, width: float) -> float:
+        """The cost at other parameters, with the whitening held."""
+        homographies = self._of_links(self.model.matrices(parameters.poses, parameters.shared))
+        squared = squared_errors(self.observations, homographies, parameters.lens, whitening)
+        return float(robust_cost(squared, width).sum()) * self._weight(sigma) + self._prior_cost(parameters)
+
+    def _of_links(self, matrices: ModelMatrices) -> FloatArray:
+        """``H_ij = P_j P_i⁻¹`` of each link, shape (L, 3, 3)."""
+        i, j = self.observations.image1, self.observations.image2
+        with np.errstate(all="ignore"):
+            product: FloatArray = matrices.matrices[j] @ inverses(matrices.matrices)[i]
+        return product
+
+    def _sigma(self, state: _State) -> float:
+        return sigma_of(state.equations.squared[self.observations.scale_inliers_mask])
+
+    def _weight(self, sigma: float) -> float:
+        return 1.0 / (sigma**2 * self.overdispersion)
+
+    def _prior_cost(self, parameters: Parameters) -> float:
+        p = self.priors
+        offsets = self.model.offsets(parameters.poses)
+        parts = (
+            p.shared_precision * (self.model.natural(parameters.shared)[0] - p.shared) ** 2,
+            p.lens_precision * (parameters.lens - p.lens) ** 2,
+            p.poses_precision * (offsets - p.poses) ** 2,
+        )
+        return float(sum(part.sum() for part in parts))
+
+    def _normal_equations(self, state: _State, sigma: float) -> NormalEquations:
+        """Of the data at ``state``, and of the priors."""
+        normal = chain(
+            state.equations,
+            self.observations,
+            state.matrices,
+            state.homographies,
+            self.freedom.poses,
+            self.freedom.lens,
+            self._weight(sigma),
+        )
+        p, free, lens = self.priors, self.freedom.poses, self.freedom.lens
+        precision = np.concatenate([p.shared_precision, p.lens_precision[lens]])
+        natural, derivative = self._natural(state.parameters.shared)
+        error = np.concatenate([natural - p.shared, (state.parameters.lens - p.lens)[lens]])
+        poses = self.model.offsets(state.parameters.poses) - p.poses
+        return normal.with_priors(
+            p.poses_precision[free],
+            poses[free],
+            derivative.T @ (precision[:, None] * derivative),
+            derivative.T @ (precision * error),
+        )
+
+    def _natural(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What the shared parameters mean (S,), and its derivatives by them and by the lens (S', S')."""
+        natural, derivative = self.model.natural(shared)
+        size, lens = len(natural), int(self.freedom.lens.sum())
+        whole = np.eye(size + lens)
+        whole[:size, :size] = derivative
+        return natural, whole
+
+    def _finished(self, parameters: Parameters, sigma: float, used: int, converged: bool) -> BundleAdjustmentResult:
+        """The result with its covariance."""
+        state = self._evaluate(parameters, sigma, WIDTH_PER_SIGMA * sigma)
+        derivative = self._natural(parameters.shared)[1]
+        covariance = _covariance(self._normal_equations(state, sigma).shared_information())
+        return BundleAdjustmentResult(
+            parameters,
+            state.matrices,
+            state.homographies,
+            sigma,
+            state.equations.squared,
+            state.equations,
+            derivative @ covariance @ derivative.T,
+            converged,
+            used,
+        )
+
+
+def sigma_of(squared: FloatArray) -> float:
+    """Standard deviation of an error's coordinate, px, from the median of the squared lengths (M,)."""
+    if not len(squared):
+        return _SMALLEST_SIGMA
+    median = float(np.sqrt(np.median(squared)))
+    return max(median / _MEDIAN_RADIUS, _SMALLEST_SIGMA) if np.isfinite(median) else 1e3
+
+
+def _covariance(information: FloatArray) -> FloatArray:
+    """Inverse of an information matrix; large, not infinite, for what it says nothing of."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12))
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    inverse: FloatArray = (vectors / np.maximum(values, 1e-14)) @ vectors.T * np.outer(scale, scale)
+    return inverse

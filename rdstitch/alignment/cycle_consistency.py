@@ -1,0 +1,172 @@
+"""Wrong pairs: links that fit well on their own but contradict the others (repeated structure).
+
+Before the adjustment, links are judged in triangles: going round three pictures must lead back to where one
+started, within what the links' covariances allow. After it, by the errors that the adjustment leaves them.
+"""
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
+from rdstitch.alignment.observations import Observations
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.matching.thinning import spread_choice
+from rdstitch.radial_homography import transfer_jacobian
+
+_PROBES = 6
+"""Points of a link sent round each triangle."""
+
+_MOST_TRIANGLES = 20_000
+
+_LEAST_ERROR = 0.02
+"""Half diagonals: a link that is off by less is no wrong pair."""
+
+
+def triangles(count: int, image1: IntArray, image2: IntArray) -> IntArray:
+    """Links (T, 3) of all triangles i < j < k of the graph, in the order ij, jk, ik.
+
+    Of very many, an evenly spaced part.
+    """
+    low, high = np.minimum(image1, image2), np.maximum(image1, image2)
+    number = sparse.coo_array((np.arange(1, len(low) + 1), (low, high)), shape=(count, count)).tocsr()
+    number.sort_indices()
+    found = []
+    for link in range(len(low)):
+        i, j = int(low[link]), int(high[link])
+        own = number.indices[number.indptr[i] : number.indptr[i + 1]]
+        other = number.indices[number.indptr[j] : number.indptr[j + 1]]
+        third = np.intersect1d(own, other)
+        if len(third):
+            jk = number.data[number.indptr[j] : number.indptr[j + 1]][np.searchsorted(other, third)] - 1
+            ik = number.data[number.indptr[i] : number.indptr[i + 1]][np.searchsorted(own, third)] - 1
+            found.append(np.column_stack([np.full(len(third), link), jk, ik]))
+    result = np.concatenate(found).astype(np.intp) if found else np.empty((0, 3), dtype=np.intp)
+    every = -(-len(result) // _MOST_TRIANGLES) if len(result) else 1
+    return result[::every]
+
+
+def cycle_consistency(
+    apart: BundleAdjustmentResult, observations: Observations, count: int
+) -> tuple[BoolArray, NDArray[np.intp]]:
+    """Which links most of their triangles speak against.
+
+    One after the other, the link with the most contradictions is taken out together with its triangles, until every
+    link left is confirmed at least as often as it is contradicted.
+
+    Parameters
+    ----------
+    apart : BundleAdjustmentResult
+        Every link on its own, with a homography.
+    observations : Observations
+    count : int
+        Number of pictures.
+
+    Returns
+    -------
+    suspect : ndarray of shape (L,), bool
+    confirmed : ndarray of shape (L,), intp
+        Triangles with each link that close, of those left.
+    """
+    suspect = np.zeros(len(observations), dtype=np.bool_)
+    corners = triangles(count, observations.image1, observations.image2)
+    if not len(corners):
+        return suspect, np.zeros(len(observations), dtype=np.intp)
+    bad = _open_triangles(apart, observations, corners)
+    alive = np.isfinite(bad)
+    while True:
+        weight = np.where(alive, np.where(bad > 0, 1.0, -1.0), 0.0)
+        balance = np.bincount(corners.ravel(), np.repeat(weight, 3), len(observations))
+        worst = int(np.lexsort((observations.matches, -balance))[0])
+        if balance[worst] <= 0:
+            closed = corners[alive & (bad == 0)]
+            return suspect, np.bincount(closed.ravel(), minlength=len(observations)).astype(np.intp)
+        suspect[worst] = True
+        alive &= ~(corners == worst).any(axis=1)
+
+
+def _open_triangles(apart: BundleAdjustmentResult, observations: Observations, corners: IntArray) -> FloatArray:
+    """1 for triangles that do not close, 0 for those that do, NaN where the points leave the pictures; shape (T,)."""
+    backward = observations.image1 > observations.image2
+    homographies, covariance = _oriented(apart, backward)
+    lam, mu = float(apart.parameters.lens[0]), float(apart.parameters.lens[1])
+    probes = [
+        _probes(observations, link, bool(backward[link])) for link in range(len(observations))
+    ]  # in the picture of lower index
+    points = np.stack([probes[link] for link in corners[:, 0]]).reshape(-1, 2)
+    ij, jk, ik = (np.repeat(corner, _PROBES) for corner in corners.T)
+    first = transfer_jacobian(homographies[ij], lam, points, mu)
+    second = transfer_jacobian(homographies[jk], lam, first.points, mu)
+    direct = transfer_jacobian(homographies[ik], lam, points, mu)
+    error = second.points - direct.points
+
+    def spread(by: FloatArray, links: IntArray) -> FloatArray:
+        return by @ covariance[links] @ np.swapaxes(by, -1, -2)
+
+    total = (
+        second.by_point @ spread(first.by_homography, ij) @ np.swapaxes(second.by_point, -1, -2)
+        + spread(second.by_homography, jk)
+        + spread(direct.by_homography, ik)
+    )
+    size = np.linalg.norm(error, axis=1).reshape(-1, _PROBES)
+    deviation = np.sqrt(np.einsum("...ii->...", total) / 2.0).reshape(-1, _PROBES) + 1e-9
+    visible = np.isfinite(size) & (np.abs(second.points).max(axis=1).reshape(-1, _PROBES) < 1.5)
+    normalized = np.where(visible, size / deviation, np.nan)
+    seen = visible.sum(axis=1) >= 2
+    result = np.full(len(corners), np.nan)
+    if not seen.any():
+        return result
+    middle = np.nanmedian(normalized[seen], axis=1)
+    absolute = np.nanmedian(np.where(visible, size, np.nan)[seen], axis=1)
+    usual = max(1.0, float(np.quantile(middle, 0.25)))
+    result[seen] = (middle > 8.0 * usual) & (absolute > _LEAST_ERROR)
+    return result
+
+
+def _probes(observations: Observations, link: int, backward: bool) -> FloatArray:
+    """Points of a link in its picture of lower index, shape (:data:`_PROBES`, 2), repeated where there are few."""
+    rows = slice(observations.start[link], observations.start[link + 1])
+    points = (observations.points2 if backward else observations.points1)[rows]
+    return np.resize(points[spread_choice(points, _PROBES)], (_PROBES, 2))
+
+
+def _oriented(apart: BundleAdjustmentResult, backward: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Homographies (L, 3, 3) from the picture of lower index to the other, and their covariances (L, 9, 9)."""
+    values, vectors = np.linalg.eigh(apart.equations.gram[:, :9, :9] / apart.sigma**2)
+    floor = np.maximum(values[:, -1:] * 1e-12, 1e-300)
+    inverse = 1.0 / np.maximum(values, floor)
+    inverse[:, 0] = 0.0  # the scale of H, of which nothing depends
+    covariance = (vectors * inverse[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    inverted = np.linalg.inv(apart.homographies)
+    # d(H⁻¹) = -H⁻¹ dH H⁻¹, row by row
+    change = np.einsum("lia,lbj->lijab", inverted, inverted).reshape(-1, 9, 9)
+    turned = change @ covariance @ np.swapaxes(change, 1, 2)
+    side = backward[:, None, None]
+    return np.where(side, inverted, apart.homographies), np.where(side, turned, covariance)
+
+
+def misfitting_links(squared: FloatArray, observations: Observations) -> BoolArray:
+    """Links whose errors after the adjustment are far beyond those of the others, shape (L,).
+
+    A model that is too rigid leaves larger errors in all links; a wrong pair stands out.
+
+    Parameters
+    ----------
+    squared : ndarray of shape (M,)
+        ``|r|²``, px².
+    """
+    typical = link_medians(squared, observations)
+    finite = typical[np.isfinite(typical)]
+    usual = float(np.median(finite)) if len(finite) else 0.0
+    least = _LEAST_ERROR * np.sqrt(observations.scale1 * observations.scale2)
+    outlying: BoolArray = ~(typical <= np.maximum(8.0 * usual, least))
+    return outlying
+
+
+def link_medians(squared: FloatArray, observations: Observations) -> FloatArray:
+    """Median length of the errors of each link, px, shape (L,)."""
+    edges = observations.start
+    lengths = np.sqrt(squared)
+    return np.array([np.median(lengths[a:b]) if b > a else np.inf for a, b in itertools.pairwise(edges)])

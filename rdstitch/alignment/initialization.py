@@ -1,0 +1,98 @@
+"""Where the global adjustment starts: every link on its own under one camera, then chained along a tree.
+
+The links are first adjusted with the lens and the tilt in common but without any consistency between them: the
+consensus of all pairs, robust because no wrong link can pull at another. Their motions are then chained.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rdstitch.alignment.bundle_adjustment import (
+    BundleAdjuster,
+    BundleAdjustmentResult,
+    FreeParameters,
+    Parameters,
+    Priors,
+)
+from rdstitch.alignment.motion_models import Model
+from rdstitch.alignment.observations import Observations
+from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.camera import undistort
+from rdstitch.radial_homography import RadialHomography, transfer
+
+_MOST_ITERATIONS = 24
+"""A start need not be the minimum."""
+
+
+def relations_at(observations: Observations, relations: Sequence[RadialHomography], lens: FloatArray) -> FloatArray:
+    """Each link's homography (L, 3, 3) expressed with one common lens.
+
+    A pair's homography belongs to the pair's own λ. Where that differs from the common one, the homography is fitted
+    anew (DLT) to the pair's own, outlier-free transfer of its points.
+    """
+    result = np.empty((len(relations), 3, 3))
+    for link, relation in enumerate(relations):
+        result[link] = relation.homography
+        if abs(relation.distortion - lens[0]) < 1e-9 and relation.camera.distortion2 == lens[1]:
+            continue
+        points1 = observations.points1[observations.start[link] : observations.start[link + 1]]
+        own = transfer(relation.homography, relation.distortion, points1, relation.camera.distortion2)
+        x1, x2 = undistort(points1, lens[0], lens[1]), undistort(own, lens[0], lens[1])
+        valid = np.isfinite(x1).all(axis=1) & np.isfinite(x2).all(axis=1)
+        if valid.sum() >= 4:
+            result[link] = _direct_linear(x1[valid], x2[valid])
+    return result
+
+
+def _direct_linear(x1: FloatArray, x2: FloatArray) -> FloatArray:
+    """Homography (3, 3) between undistorted points without outliers, positive in front of the camera."""
+    lifted = np.column_stack([x1, np.ones(len(x1))])
+    zero = np.zeros_like(lifted)
+    first = np.concatenate([lifted, zero, -x2[:, :1] * lifted], axis=1)
+    second = np.concatenate([zero, lifted, -x2[:, 1:] * lifted], axis=1)
+    h: FloatArray = np.linalg.svd(np.concatenate([first, second]), full_matrices=False)[2][-1].reshape(3, 3)
+    return h * float(np.copysign(1.0 / np.linalg.norm(h), np.median(lifted @ h[2])))
+
+
+def adjust_pairs_independently(
+    model: Model,
+    observations: Observations,
+    homographies: FloatArray,
+    shared: FloatArray,
+    lens: FloatArray,
+    free_lens: BoolArray,
+    priors: Priors,
+    attitudes: FloatArray,
+) -> BundleAdjustmentResult:
+    """Adjust every link on its own, with the shared parameters in common.
+
+    Parameters
+    ----------
+    homographies : ndarray of shape (L, 3, 3)
+        Of the links, at ``lens``.
+    shared, lens
+        Where to start.
+    priors : Priors
+        On the shared parameters and the lens; those on the poses are not used.
+    attitudes : ndarray of shape (N, 2)
+        How the tilt of each picture is known to differ from the shared one, radians.
+    """
+    apart = observations.as_independent_pairs()
+    count = 2 * len(apart)
+    matrices = np.empty((count, 3, 3))
+    tilts = np.stack([attitudes[observations.image1], attitudes[observations.image2]], axis=1).reshape(-1, 2)
+    matrices[0::2] = model.origins(shared, tilts[0::2])
+    matrices[1::2] = homographies @ matrices[0::2]
+    start = Parameters(model.poses_from(matrices, shared, tilts), shared, lens)
+    none = Priors.none(model, count)
+    known = Priors(
+        priors.shared,
+        priors.shared_precision,
+        priors.lens,
+        priors.lens_precision,
+        none.poses,
+        none.poses_precision,
+    )
+    freedom = FreeParameters.fixing(model, count, list(range(0, count, 2)), free_lens)
+    return BundleAdjuster(model, apart, freedom, known, max_iterations=_MOST_ITERATIONS).run(start)

@@ -1,0 +1,175 @@
+"""The least free model that the data allow.
+
+Every model is judged by a robust likelihood of its errors, with the scatter that the freest model leaves, and pays
+for each of its parameters (Schwarz's criterion). Two things keep that honest on real pictures: errors of neighbours
+agree, so that there are fewer independent observations than correspondences; and no lens or plane is exact to better
+than about a tenth of a pixel, which therefore counts as noise.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from rdstitch.alignment.adjustment_problem import Fit, Problem
+from rdstitch.alignment.bundle_adjustment import WIDTH_PER_SIGMA, sigma_of
+from rdstitch.alignment.cycle_consistency import misfitting_links
+from rdstitch.alignment.motion_models import LOG_HEIGHT, MODELS, Model
+from rdstitch.alignment.normal_equations import whitened_errors
+from rdstitch.alignment.planarity import coherence
+from rdstitch.arrays import BoolArray, FloatArray
+
+_EXACTNESS = 0.1
+"""px: how exactly a lens and a plane can be described at all."""
+
+_FARTHEST_CENTRE = 0.08
+"""Half diagonals: a distortion centre farther off is no lens, but something else that it takes the blame for."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The model chosen.
+
+    Attributes
+    ----------
+    fit : Fit
+    reason : str
+    overdispersion : float
+        Of the freest model's errors, see :class:`rdstitch.alignment.planarity.Coherence`.
+    """
+
+    fit: Fit
+    reason: str
+    overdispersion: float
+
+
+def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolArray] = ()) -> Choice:
+    """Adjust models from the least to the most free, and take the best.
+
+    The best two are then tried with more of the lens free: an off-centre lens looks like motion that is less regular.
+
+    A homography for every link on its own leaves errors that no model of the family can undercut. Once freer models
+    could not pay for their freedom even with those, they are not tried.
+    """
+    bound = _NoiseModel.of_links_apart(problem)
+    least = bound.misfit(_errors(problem, problem.homographies, problem.lens))
+    fits: list[Fit] = []
+    for name in names:
+        model = MODELS[name]
+        if fits and min(bound.cost(problem, fit) for fit in fits) <= least + bound.price(
+            problem, model, problem.free_lens
+        ):
+            break
+        fits.append(problem.fit(model, fits[-1:]))
+    yardstick = bound if len(fits) < len(names) else _NoiseModel.of_fit(problem, fits[-1])
+    costs = np.array([yardstick.cost(problem, fit) for fit in fits])
+    for lens in lenses:
+        for index in np.argsort(costs, kind="stable")[:2].tolist():
+            wider = problem.extend(fits[index], lens | fits[index].free_lens)
+            cost = yardstick.cost(problem, wider)
+            if cost < costs[index] and _within_reason(wider):
+                fits[index], costs[index] = wider, cost
+    best = int(np.argmin(costs))
+    return Choice(fits[best], _reason(fits, best, list(names)), yardstick.overdispersion)
+
+
+def _within_reason(fit: Fit) -> bool:
+    """Whether the distortion centre is where lenses have it."""
+    return bool(np.abs(fit.adjusted.parameters.lens[2:]).max() < _FARTHEST_CENTRE)
+
+
+@dataclass(frozen=True)
+class _NoiseModel:
+    """What the errors of a model are measured by.
+
+    Attributes
+    ----------
+    noise : float
+        Standard deviation of an error's coordinate when the model is right, px.
+    overdispersion : float
+    counted : ndarray of shape (M,), bool
+        Correspondences of links that fit.
+    effective : float
+        Independent observations.
+    """
+
+    noise: float
+    overdispersion: float
+    counted: BoolArray
+    effective: float
+
+    @classmethod
+    def of_links_apart(cls, problem: Problem) -> Self:
+        """From the errors of every link on its own."""
+        errors = whitened_errors(problem.observations, problem.homographies, problem.lens)
+        matches = len(errors)
+        freedom = max(1.0 - 4.0 * len(problem.observations) / max(matches, 1), 0.1)
+        return cls._from(problem, errors, freedom**-0.5)
+
+    @classmethod
+    def of_fit(cls, problem: Problem, fit: Fit) -> Self:
+        """From the errors of the freest model."""
+        adjusted = fit.adjusted
+        errors = whitened_errors(problem.observations, adjusted.homographies, adjusted.parameters.lens)
+        return cls._from(problem, errors, 1.0)
+
+    @classmethod
+    def _from(cls, problem: Problem, errors: FloatArray, enlarged: float) -> Self:
+        squared = np.nan_to_num(np.einsum("mi,mi->m", errors, errors), nan=np.inf)
+        sigma = sigma_of(squared[problem.observations.scale_inliers_mask])
+        inliers = squared <= (WIDTH_PER_SIGMA * sigma) ** 2
+        overdispersion = coherence(problem.observations, errors, inliers).overdispersion
+        counted = ~misfitting_links(squared, problem.observations)[problem.observations.link]
+        effective = max(2.0 * float((counted & inliers).sum()) / overdispersion, 2.0)
+        return cls(math.hypot(sigma * enlarged, _EXACTNESS), overdispersion, counted, effective)
+
+    def misfit(self, squared: FloatArray) -> float:
+        """Robust sum of squared errors in units of the noise."""
+        ratio = np.minimum(squared[self.counted], 1e12) / self.noise**2
+        return float((WIDTH_PER_SIGMA**2 * np.log1p(ratio / WIDTH_PER_SIGMA**2)).sum()) / self.overdispersion
+
+    def price(self, problem: Problem, model: Model, free_lens: BoolArray) -> float:
+        """What the parameters of a model cost."""
+        poses = problem.count * model.pose_size - int(model.gauge.sum())
+        return (poses + len(model.shared_names) + int(free_lens.sum())) * math.log(self.effective)
+
+    def cost(self, problem: Problem, fit: Fit) -> float:
+        """Misfit and price of a fit."""
+        return self.misfit(fit.adjusted.squared) + self.price(problem, fit.model, fit.free_lens)
+
+
+def _errors(problem: Problem, homographies: FloatArray, lens: FloatArray) -> FloatArray:
+    """``|r|²`` (M,) of the correspondences; inf where there is no transfer."""
+    errors = whitened_errors(problem.observations, homographies, lens)
+    squared: FloatArray = np.nan_to_num(np.einsum("mi,mi->m", errors, errors), nan=np.inf)
+    return squared
+
+
+def _reason(fits: Sequence[Fit], best: int, names: Sequence[str]) -> str:
+    """Why the model was taken, one sentence."""
+    name, own = fits[best].model.name, fits[best].adjusted.sigma
+    what = {
+        "rigid": "height and tilt stay the same",
+        "similarity": f"the tilt stays the same, heights differ by {_height_spread(fits[best]):.0%}",
+        "tilting": f"heights differ by {_height_spread(fits[best]):.0%}, "
+        f"tilts by {math.degrees(fits[best].tilt_spread):.1f} degrees",
+        "homography": "no planar motion of one camera describes the pictures",
+    }[name]
+    if len(names) == 1:
+        return f"{name}: as asked for; it leaves an error of {own:.2f} px"
+    less = ", ".join(f"{fit.model.name} {fit.adjusted.sigma:.2f} px" for fit in fits[:best])
+    more = ", ".join(f"{fit.model.name} {fit.adjusted.sigma:.2f} px" for fit in fits[best + 1 :])
+    return (
+        f"{name}: {what}; it leaves an error of {own:.2f} px"
+        + (f", less free models more ({less})" if less else "")
+        + (f", more freedom gains too little ({more})" if more else "")
+        + (", and nothing is left for more freedom to gain" if len(fits) < len(names) else "")
+    )
+
+
+def _height_spread(fit: Fit) -> float:
+    """Relative standard deviation of the heights; 0 for the general model."""
+    poses = fit.adjusted.parameters.poses
+    return float(np.std(poses[:, LOG_HEIGHT])) if fit.model.shared_names else 0.0

@@ -1,0 +1,299 @@
+"""How a picture's pose and the camera's shared parameters make a homography: the family of motion models.
+
+Every model gives, for each picture i, the homography ``P_i`` from the plane to the picture's undistorted coordinates
+(half diagonals from the distortion centre), and its derivatives; the adjustment knows nothing else of a model. Two
+pictures are related by ``H_ij = P_j P_i⁻¹``.
+
+From the least to the most free:
+
+========== =============================================== ===================================================
+model      per picture                                     picture
+========== =============================================== ===================================================
+rigid      φ, tx, ty                                       robot: tilt and height stay (Valtonen Örnhag et al.)
+similarity φ, tx, ty, log h                                drone that climbs and sinks
+tilting    φ, tx, ty, log h, δψ, δθ                        drone in wind: small tilts of its own
+homography 8                                               any motion, any camera
+========== =============================================== ===================================================
+
+The first three share the tilt (ψ, θ) and the focal length:
+``P_i = diag(f, f, 1) Rx(ψ + δψ_i) Ry(θ + δθ_i) Rz(φ_i) diag(1, 1, h_i) T(t_i)``, ``T = I - t e3'``.
+
+The pictures see ψ/f, θ/f and f t far better than f itself. The adjustment therefore moves those; otherwise it would
+have to follow a curved valley.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.planar_motion import rotation_from_tilt
+
+YAW, X, Y, LOG_HEIGHT, PSI, THETA = range(6)
+"""Columns of a planar model's poses."""
+
+_LARGEST_LOG_HEIGHT = 10.0  # where the motion is none of the model's, heights may run away
+
+_AROUND_X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+_TRACELESS = np.zeros((8, 3, 3))
+_TRACELESS[[0, 1, 2, 3, 4, 5], [0, 0, 1, 1, 2, 2], [1, 2, 0, 2, 0, 1]] = 1.0
+_TRACELESS[6] = np.diag([1.0, -1.0, 0.0]) / np.sqrt(2.0)
+_TRACELESS[7] = np.diag([1.0, 1.0, -2.0]) / np.sqrt(6.0)
+_AROUND_Y = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+
+
+@dataclass(frozen=True)
+class ModelMatrices:
+    """Plane-to-picture homographies of N pictures with their derivatives.
+
+    Attributes
+    ----------
+    matrices : ndarray of shape (N, 3, 3)
+    by_pose : ndarray of shape (N, D, 3, 3)
+        By a step of the D pose parameters, as :meth:`Model.moved` takes it.
+    by_shared : ndarray of shape (N, S, 3, 3)
+        By the S shared parameters.
+    """
+
+    matrices: FloatArray
+    by_pose: FloatArray
+    by_shared: FloatArray
+
+
+class Model(Protocol):
+    """What the adjustment needs to know of a motion model."""
+
+    @property
+    def name(self) -> str:
+        """One word for it."""
+
+    @property
+    def pose_size(self) -> int:
+        """Free parameters per picture, D."""
+
+    @property
+    def shared_names(self) -> tuple[str, ...]:
+        """Parameters that all pictures share, S of them, without those of the lens."""
+
+    @property
+    def gauge(self) -> BoolArray:
+        """Which of the D parameters the choice of the plane's frame takes from the reference picture, shape (D,)."""
+
+    def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
+        """Homographies from the plane to the pictures, with derivatives."""
+
+    def natural(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What :attr:`shared_names` names (S,), and its derivatives by the shared parameters (S, S)."""
+
+    def shared_from(self, natural: FloatArray) -> FloatArray:
+        """The inverse of :meth:`natural`."""
+
+    def moved(self, poses: FloatArray, step: FloatArray) -> FloatArray:
+        """Poses after a step of shape (N, D)."""
+
+    def offsets(self, poses: FloatArray) -> FloatArray:
+        """The D parameters of each picture (N, D) that a prior speaks of; zeros where none can."""
+
+    def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+        """Homographies (N, 3, 3) of pictures at the origin of the plane, with the tilts (N, 2) given."""
+
+    def poses_from(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+        """The poses with these tilts (N, 2) that come nearest to plane-to-picture homographies (N, 3, 3)."""
+
+
+@dataclass(frozen=True)
+class PlanarModel:
+    """Camera that moves over a plane with a tilt that it keeps, or nearly keeps.
+
+    Poses have six columns, :data:`YAW` to :data:`THETA`, of which only the free ones move; positions are multiplied by
+    the focal length. The shared parameters are ψ/f, θ/f and log f.
+
+    Attributes
+    ----------
+    name : str
+    free : tuple of int
+        The free columns.
+    """
+
+    name: str
+    free: tuple[int, ...]
+    shared_names: tuple[str, ...] = ("psi", "theta", "log_focal")
+
+    @property
+    def pose_size(self) -> int:
+        """Free parameters per picture."""
+        return len(self.free)
+
+    @property
+    def gauge(self) -> BoolArray:
+        """A rigid motion of the plane, and its scale where heights are free; tilts are no matter of frame."""
+        return np.array([column not in (PSI, THETA) for column in self.free])
+
+    def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
+        """Homographies from the plane to the pictures, with derivatives."""
+        count = len(poses)
+        focal = np.exp(shared[2])
+        calibration = np.diag([focal, focal, 1.0])
+        rotation = rotation_from_tilt(poses[:, [PSI, THETA]] + shared[:2] * focal)
+        motion, by_motion = _motion_in_plane(poses, focal)
+        left = calibration @ rotation
+        matrices = left @ motion
+
+        by_tilt = np.stack([calibration @ _AROUND_X @ rotation @ motion, left @ _AROUND_Y @ motion], axis=1)
+        by_columns = np.concatenate([left[:, None] @ by_motion, by_tilt], axis=1)
+        by_focal = (
+            matrices * np.array([1.0, 1.0, 0.0])[:, None]
+            + np.einsum("nkij,k->nij", by_tilt, shared[:2] * focal)
+            - np.einsum("nkij,nk->nij", by_columns[:, [X, Y]], poses[:, [X, Y]])
+        )
+        by_shared = np.concatenate([by_tilt * focal, by_focal[:, None]], axis=1)
+        return ModelMatrices(matrices, by_columns[:, list(self.free)].reshape(count, -1, 3, 3), by_shared)
+
+    def natural(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """ψ, θ and log f, with derivatives."""
+        focal = float(np.exp(shared[2]))
+        natural = np.array([shared[0] * focal, shared[1] * focal, shared[2]])
+        derivative = np.diag([focal, focal, 1.0])
+        derivative[:2, 2] = natural[:2]
+        return natural, derivative
+
+    def shared_from(self, natural: FloatArray) -> FloatArray:
+        """ψ/f, θ/f and log f."""
+        return np.append(natural[:2] / np.exp(natural[2]), natural[2])
+
+    def moved(self, poses: FloatArray, step: FloatArray) -> FloatArray:
+        """Poses after a step of shape (N, D)."""
+        result = poses.copy()
+        result[:, list(self.free)] += step
+        result[:, LOG_HEIGHT] = np.clip(result[:, LOG_HEIGHT], -_LARGEST_LOG_HEIGHT, _LARGEST_LOG_HEIGHT)
+        return result
+
+    def offsets(self, poses: FloatArray) -> FloatArray:
+        """The free parameters themselves."""
+        return poses[:, list(self.free)]
+
+    def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+        """``diag(f, f, 1) R_i``."""
+        poses = np.zeros((len(attitudes), 6))
+        poses[:, [PSI, THETA]] = attitudes
+        matrices: FloatArray = self.matrices(poses, shared).matrices
+        return matrices
+
+    def poses_from(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+        """The nearest poses, given how the tilts of the pictures differ from the shared one."""
+        motion = np.linalg.inv(self.origins(shared, attitudes)) @ homographies
+        area = motion[:, 0, 0] * motion[:, 1, 1] - motion[:, 0, 1] * motion[:, 1, 0]
+        scale = np.copysign(np.sqrt(np.maximum(np.abs(area), 1e-12)), motion[:, 2, 2])
+        motion = motion / scale[:, None, None]
+        yaw = np.arctan2(motion[:, 1, 0] - motion[:, 0, 1], motion[:, 0, 0] + motion[:, 1, 1])
+        c, s = np.cos(yaw), np.sin(yaw)
+        poses = np.zeros((len(homographies), 6))
+        poses[:, [PSI, THETA]] = attitudes
+        poses[:, YAW] = yaw
+        focal = np.exp(shared[2])
+        poses[:, X] = -(c * motion[:, 0, 2] + s * motion[:, 1, 2]) * focal
+        poses[:, Y] = -(-s * motion[:, 0, 2] + c * motion[:, 1, 2]) * focal
+        if LOG_HEIGHT in self.free:
+            poses[:, LOG_HEIGHT] = np.log(np.clip(np.abs(motion[:, 2, 2]), 1e-3, 1e3))
+        return poses
+
+
+def metric_poses(poses: FloatArray, shared: FloatArray) -> FloatArray:
+    """Poses (N, 6) of a planar model with positions in units of the height, and with the whole tilt."""
+    focal = np.exp(shared[2])
+    result = poses.copy()
+    result[:, [X, Y]] /= focal
+    result[:, [PSI, THETA]] += shared[:2] * focal
+    return result
+
+
+def _motion_in_plane(poses: FloatArray, focal: float) -> tuple[FloatArray, FloatArray]:
+    """``Rz(φ) diag(1, 1, h) T`` (N, 3, 3) and its derivatives by φ, f tx, f ty, log h (N, 4, 3, 3)."""
+    c, s = np.cos(poses[:, YAW]), np.sin(poses[:, YAW])
+    x, y, height = poses[:, X] / focal, poses[:, Y] / focal, np.exp(poses[:, LOG_HEIGHT])
+    motion = np.zeros((len(poses), 3, 3))
+    motion[:, 0, 0] = motion[:, 1, 1] = c
+    motion[:, 0, 1], motion[:, 1, 0] = -s, s
+    motion[:, 0, 2], motion[:, 1, 2] = -(c * x - s * y), -(s * x + c * y)
+    motion[:, 2, 2] = height
+    derivatives = np.zeros((len(poses), 4, 3, 3))
+    derivatives[:, 0, 0], derivatives[:, 0, 1] = -motion[:, 1], motion[:, 0]
+    derivatives[:, 1, 0, 2], derivatives[:, 1, 1, 2] = -c / focal, -s / focal
+    derivatives[:, 2, 0, 2], derivatives[:, 2, 1, 2] = s / focal, -c / focal
+    derivatives[:, 3, 2, 2] = height
+    return motion, derivatives
+
+
+@dataclass(frozen=True)
+class HomographyModel:
+    """One homography per picture: eight parameters, a step being ``P ← exp(Σ δ_k E_k) P``.
+
+    The step acts in the picture's frame, where coordinates are of order one however far away the picture lies. ``E_k``
+    span the matrices without trace: only so does a change of the plane's frame, ``P M P⁻¹`` in every picture, leave
+    all relations of pictures as they are, to any order. Poses are P, row by row.
+    """
+
+    name: str = "homography"
+    pose_size: int = 8
+    shared_names: tuple[str, ...] = ()
+
+    @property
+    def gauge(self) -> BoolArray:
+        """All of the reference picture: the plane may be mapped by any homography."""
+        return np.ones(8, dtype=np.bool_)
+
+    def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
+        """Homographies from the plane to the pictures, with derivatives."""
+        matrices = poses.reshape(-1, 3, 3)
+        return ModelMatrices(matrices, _TRACELESS @ matrices[:, None], np.zeros((len(poses), 0, 3, 3)))
+
+    def natural(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Nothing."""
+        return np.zeros(0), np.zeros((0, 0))
+
+    def shared_from(self, natural: FloatArray) -> FloatArray:
+        """Nothing."""
+        return np.zeros(0)
+
+    def moved(self, poses: FloatArray, step: FloatArray) -> FloatArray:
+        """Poses after a step of shape (N, 8)."""
+        change = np.einsum("nk,kij->nij", step, _TRACELESS)
+        growth = np.eye(3) + change @ (np.eye(3) + change / 2.0)  # exp to second order
+        return _unit_determinant(growth @ poses.reshape(-1, 3, 3))
+
+    def offsets(self, poses: FloatArray) -> FloatArray:
+        """Zeros: no prior speaks of a homography."""
+        return np.zeros((len(poses), 8))
+
+    def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+        """The identity."""
+        return np.tile(np.eye(3), (len(attitudes), 1, 1))
+
+    def poses_from(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+        """The homographies themselves."""
+        return _unit_determinant(homographies)
+
+
+def inverses(matrices: FloatArray) -> FloatArray:
+    """Inverses of (N, 3, 3) by cofactors; not finite, without complaint, where a wild step made a matrix singular."""
+    a, b, c = matrices[:, 0], matrices[:, 1], matrices[:, 2]
+    with np.errstate(all="ignore"):
+        cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
+        inverse: FloatArray = cofactors / np.einsum("ni,ni->n", a, cofactors[:, :, 0])[:, None, None]
+    return inverse
+
+
+def _unit_determinant(matrices: FloatArray) -> FloatArray:
+    """Scaled to determinant ±1 without changing sign, flattened to (N, 9)."""
+    size = np.cbrt(np.maximum(np.abs(np.linalg.det(matrices)), 1e-300))
+    scaled: FloatArray = matrices / size[:, None, None]
+    return scaled.reshape(-1, 9)
+
+
+RIGID = PlanarModel("rigid", (YAW, X, Y))
+SIMILARITY = PlanarModel("similarity", (YAW, X, Y, LOG_HEIGHT))
+TILTING = PlanarModel("tilting", (YAW, X, Y, LOG_HEIGHT, PSI, THETA))
+HOMOGRAPHY = HomographyModel()
+MODELS: dict[str, Model] = {model.name: model for model in (RIGID, SIMILARITY, TILTING, HOMOGRAPHY)}
+"""The family by name, from the least to the most free."""

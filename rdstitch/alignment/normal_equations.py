@@ -1,0 +1,298 @@
+"""Normal equations of the adjustment: one small Gram matrix per link, chained into sparse blocks.
+
+A correspondence knows the homography of its link (9 entries) and the lens (4 parameters) only. So all it contributes
+is summed up in a 13x13 matrix per link, whatever the motion model; the model's derivatives then turn that matrix
+into the blocks of its two pictures and of the shared parameters.
+"""
+
+import itertools
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from rdstitch.alignment.motion_models import ModelMatrices, inverses
+from rdstitch.alignment.observations import Observations
+from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.camera import distort
+from rdstitch.radial_homography import (
+    lift,
+    measurement_whitening,
+    points_last,
+    project,
+    side_by_side,
+    transfer_jacobian,
+    whiten,
+)
+
+_CHUNK = 8192
+"""Correspondences linearized at a time: what stays in cache."""
+
+
+@dataclass(frozen=True)
+class LinkEquations:
+    """Weighted, linearized transfer errors of all correspondences, summed per link.
+
+    Attributes
+    ----------
+    gram : ndarray of shape (L, 13, 13)
+        ``Σ w J'J`` by the entries of H and the lens parameters.
+    gradient : ndarray of shape (L, 13)
+        ``Σ w J'r``.
+    squared : ndarray of shape (M,)
+        ``|r|²`` of each correspondence, px², whitened; inf where it cannot be transferred.
+    whitening : ndarray of shape (M, 2, 2)
+        What makes r of an error in normalized coordinates.
+    """
+
+    gram: FloatArray
+    gradient: FloatArray
+    squared: FloatArray
+    whitening: FloatArray
+
+
+def robust_weight(squared: FloatArray, width: float) -> FloatArray:
+    """Geman and McClure's weight of an error: 1 for small ones, 1/4 at ``width``, 0 far beyond."""
+    ratio: FloatArray = 1.0 / (1.0 + squared / width**2)
+    return ratio**2
+
+
+def robust_cost(squared: FloatArray, width: float) -> FloatArray:
+    """Geman and McClure's loss: the square for small errors, ``width²`` at most."""
+    return width**2 * (1.0 - 1.0 / (1.0 + squared / width**2))
+
+
+def link_equations(
+    observations: Observations, homographies: FloatArray, lens: FloatArray, width: float
+) -> LinkEquations:
+    """Linearize all transfer errors.
+
+    Parameters
+    ----------
+    observations : Observations
+    homographies : ndarray of shape (L, 3, 3)
+        Of each link, from its first to its second picture.
+    lens : ndarray of shape (4,)
+        λ, μ and the shift of the distortion centre, in the half-diagonal frame.
+    width : float
+        Of :func:`robust_weight`, px.
+    """
+    count = len(observations)
+    gram, gradient = np.zeros((count, 13, 13)), np.zeros((count, 13))
+    squared = np.empty(len(observations.points1))
+    whitening = np.empty((len(observations.points1), 2, 2))
+    for first, last in _chunks(observations.start):
+        rows = slice(observations.start[first], observations.start[last])
+        jacobian, error, whitening[rows] = _whitened(observations, homographies, lens, first, last)
+        squared[rows] = np.einsum("mi,mi->m", error, error)
+        lost = ~np.isfinite(squared[rows])
+        squared[rows][lost] = np.inf
+        jacobian[lost], error[lost] = 0.0, 0.0
+        root = np.sqrt(robust_weight(squared[rows], width))
+        jacobian *= root[:, None, None]
+        error *= root[:, None]
+        edges = observations.start[first : last + 1] - observations.start[first]
+        columns = points_last(jacobian)
+        for link, (a, b) in enumerate(itertools.pairwise(edges), start=first):
+            across, down = columns[:, :, a:b]
+            gram[link] = across @ across.T + down @ down.T
+            gradient[link] = across @ error[a:b, 0] + down @ error[a:b, 1]
+    return LinkEquations(gram, gradient, squared, whitening)
+
+
+@np.errstate(all="ignore")  # a wild step may give homographies that are not finite
+def squared_errors(
+    observations: Observations, homographies: FloatArray, lens: FloatArray, whitening: FloatArray
+) -> FloatArray:
+    """``|r|²`` (M,) with a whitening that was computed before, px²; inf where there is no transfer.
+
+    Between one linearization and the next the whitening must stay what it is: otherwise the errors could be made
+    smaller by a larger derivative, against the gradient, which takes the whitening for constant.
+    """
+    squared = np.empty(len(observations.points1))
+    lam, mu, center = float(lens[0]), float(lens[1]), lens[2:]
+    for first, last in _chunks(observations.start):
+        rows = slice(observations.start[first], observations.start[last])
+        counts = np.diff(observations.start[first : last + 1])
+        lifted = lift(observations.points1[rows] - center, lam, mu)
+        moved = np.einsum("mij,mj->mi", np.repeat(homographies[first:last], counts, axis=0), lifted)
+        error = distort(project(moved), lam, mu) - (observations.points2[rows] - center)
+        squared[rows] = (np.einsum("mij,mj->mi", whitening[rows], error) ** 2).sum(axis=1)
+    return np.where(np.isfinite(squared), squared, np.inf)
+
+
+def whitened_errors(observations: Observations, homographies: FloatArray, lens: FloatArray) -> FloatArray:
+    """Whitened transfer errors of all correspondences, px, shape (M, 2); NaN where there is none."""
+    errors = [_whitened(observations, homographies, lens, *chunk)[1] for chunk in _chunks(observations.start)]
+    return np.concatenate([np.empty((0, 2)), *errors])
+
+
+def _chunks(start: NDArray[np.intp]) -> list[tuple[int, int]]:
+    """Ranges of links with about :data:`_CHUNK` correspondences each."""
+    edges = np.unique(np.searchsorted(start, np.arange(0, start[-1] + _CHUNK, _CHUNK)).clip(max=len(start) - 1))
+    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+
+
+@np.errstate(all="ignore")
+def _whitened(
+    observations: Observations, homographies: FloatArray, lens: FloatArray, first: int, last: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Jacobian (m, 2, 13) and error (m, 2) of the correspondences of some links, whitened, px; the whitening."""
+    rows = slice(observations.start[first], observations.start[last])
+    counts = np.diff(observations.start[first : last + 1])
+    scale1 = np.repeat(observations.scale1[first:last], counts)[:, None, None]
+    scale2 = np.repeat(observations.scale2[first:last], counts)[:, None, None]
+    homography = np.repeat(homographies[first:last], counts, axis=0)
+    result = transfer_jacobian(homography, float(lens[0]), observations.points1[rows] - lens[2:], float(lens[1]))
+    whitening = measurement_whitening(result.by_point * (scale2 / scale1)) * scale2
+    jacobian = side_by_side(result.by_homography, result.by_lens)
+    error = result.points - (observations.points2[rows] - lens[2:])
+    return whiten(whitening, jacobian), whiten(whitening, error[:, :, None])[:, :, 0], whitening
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """``[A B; B' C] step = -gradient`` for poses and shared parameters, in that order.
+
+    Attributes
+    ----------
+    poses : sparse array of shape (F, F)
+        A, of the F free pose parameters.
+    coupling : ndarray of shape (F, S)
+        B.
+    shared : ndarray of shape (S, S)
+        C.
+    gradient_poses, gradient_shared : ndarray of shape (F,) and (S,)
+    """
+
+    poses: sparse.csc_array
+    coupling: FloatArray
+    shared: FloatArray
+    gradient_poses: FloatArray
+    gradient_shared: FloatArray
+
+    def solve(self, damping: float) -> tuple[FloatArray, FloatArray]:
+        """The step of poses and shared parameters, with the diagonal enlarged by ``1 + damping`` (Marquardt)."""
+        reduced, solved = self._eliminate(damping)
+        diagonal = np.diag(np.diag(self.shared)) * damping
+        right = self.coupling.T @ solved[:, -1] - self.gradient_shared
+        step_shared = _solve_scaled(reduced + diagonal, right)
+        return -solved[:, -1] - solved[:, :-1] @ step_shared, step_shared
+
+    def with_priors(
+        self,
+        precision_poses: FloatArray,
+        error_poses: FloatArray,
+        information_shared: FloatArray,
+        gradient_shared: FloatArray,
+    ) -> Self:
+        """With priors added: on the poses as inverse variances and distances from the means, both (F,)."""
+        return replace(
+            self,
+            poses=(self.poses + sparse.diags_array(precision_poses)).tocsc(),
+            shared=self.shared + information_shared,
+            gradient_poses=self.gradient_poses + precision_poses * error_poses,
+            gradient_shared=self.gradient_shared + gradient_shared,
+        )
+
+    def shared_information(self) -> FloatArray:
+        """Information (S, S) on the shared parameters when nothing is known of the poses: ``C - B' A⁻¹ B``.
+
+        Poses that nothing holds are damped as little as makes them solvable; where nothing does, nothing is known.
+        """
+        for damping in (0.0, 1e-12, 1e-8, 1e-4):
+            try:
+                information = self._eliminate(damping)[0]
+            except RuntimeError:  # singular
+                continue
+            if np.isfinite(information).all():
+                return information
+        return np.zeros_like(self.shared)
+
+    def _eliminate(self, damping: float) -> tuple[FloatArray, FloatArray]:
+        """The Schur complement (S, S) and ``A⁻¹ [B, gradient]``."""
+        right = np.column_stack([self.coupling, self.gradient_poses])
+        if self.poses.shape[0] == 0:
+            return self.shared, right
+        diagonal = self.poses.diagonal()
+        floor = max(float(diagonal.max()), 1e-300) * 1e-14
+        damped = (self.poses + sparse.diags_array(damping * diagonal + floor)).tocsc()
+        factor = splu(damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        solved = factor.solve(right)
+        return self.shared - self.coupling.T @ solved[:, :-1], solved
+
+
+def _solve_scaled(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Least-norm solution of a small symmetric system, in units in which its diagonal is one."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
+    kept = values > 1e-12
+    inverse = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
+    solution: FloatArray = scale * (vectors @ (inverse * (vectors.T @ (scale * right))))
+    return solution
+
+
+def chain(
+    equations: LinkEquations,
+    observations: Observations,
+    model: ModelMatrices,
+    homographies: FloatArray,
+    free: BoolArray,
+    free_lens: BoolArray,
+    weight: float,
+) -> NormalEquations:
+    """Chain the equations of the links with the derivatives of the model.
+
+    Parameters
+    ----------
+    equations : LinkEquations
+    observations : Observations
+    model : ModelMatrices
+        Of all N pictures.
+    homographies : ndarray of shape (L, 3, 3)
+        ``P_j P_i⁻¹`` of each link.
+    free : ndarray of shape (N, D), bool
+        Pose parameters that may move.
+    free_lens : ndarray of shape (4,), bool
+        Lens parameters that may move; they follow the model's shared parameters.
+    weight : float
+        Of all equations: one over the variance of the errors.
+    """
+    i, j = observations.image1, observations.image2
+    size, count = model.by_pose.shape[1], len(observations)
+    inverse = inverses(model.matrices)[i][:, None]
+    along = homographies[:, None]
+    blocks = [
+        -along @ model.by_pose[i] @ inverse,
+        model.by_pose[j] @ inverse,
+        model.by_shared[j] @ inverse - along @ model.by_shared[i] @ inverse,
+    ]
+    by_homography = np.concatenate(blocks, axis=1).reshape(count, -1, 9)
+    lens = np.flatnonzero(free_lens)
+    width = by_homography.shape[1]
+    derivative = np.zeros((count, 13, width + len(lens)))
+    derivative[:, :9, :width] = np.swapaxes(by_homography, 1, 2)
+    derivative[:, 9 + lens, width + np.arange(len(lens))] = 1.0
+    local = np.swapaxes(derivative, 1, 2) @ equations.gram @ derivative * weight
+    gradient = np.einsum("lpk,lp->lk", derivative, equations.gradient) * weight
+
+    number = np.where(free, np.cumsum(free.reshape(-1)).reshape(free.shape) - 1, -1)
+    column = np.concatenate([number[i], number[j]], axis=1)
+    total = int(free.sum())
+    pair = 2 * size
+    row_index = np.broadcast_to(column[:, :, None], (count, pair, pair)).reshape(-1)
+    column_index = np.broadcast_to(column[:, None, :], (count, pair, pair)).reshape(-1)
+    kept = (row_index >= 0) & (column_index >= 0)
+    values = local[:, :pair, :pair].reshape(-1)[kept]
+    poses = sparse.coo_array((values, (row_index[kept], column_index[kept])), shape=(total, total)).tocsc()
+
+    coupling = np.zeros((total + 1, width - pair + len(lens)))
+    np.add.at(coupling, column.reshape(-1), local[:, :pair, pair:].reshape(count * pair, -1))
+    gradient_poses = np.zeros(total + 1)
+    np.add.at(gradient_poses, column.reshape(-1), gradient[:, :pair].reshape(-1))
+    return NormalEquations(
+        poses, coupling[:-1], local[:, pair:, pair:].sum(axis=0), gradient_poses[:-1], gradient[:, pair:].sum(axis=0)
+    )

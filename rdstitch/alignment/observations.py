@@ -1,0 +1,124 @@
+"""The correspondences of all links as flat arrays, thinned so that each link costs the same."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.camera import Camera
+from rdstitch.matching.links import Link
+from rdstitch.matching.thinning import spread_choice
+
+_RESTING = 1.0
+"""px that most correspondences of a link stay below where the camera stood still."""
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Correspondences of L links, one after the other.
+
+    Attributes
+    ----------
+    image1, image2 : ndarray of shape (L,), intp
+        Indices of the pictures of each link.
+    start : ndarray of shape (L + 1,), intp
+        Link l has the correspondences ``start[l]:start[l + 1]``.
+    points1, points2 : ndarray of shape (M, 2)
+        Measured, in half diagonals from the camera's distortion centre.
+    scale1, scale2 : ndarray of shape (L,)
+        Half the diagonal of each link's pictures, px.
+    matches : ndarray of shape (L,), intp
+        Correspondences that each link had before thinning.
+    """
+
+    image1: IntArray
+    image2: IntArray
+    start: IntArray
+    points1: FloatArray
+    points2: FloatArray
+    scale1: FloatArray
+    scale2: FloatArray
+    matches: IntArray
+
+    @classmethod
+    def from_links(cls, links: Sequence[Link], cameras: Sequence[Camera], most: int | None = None) -> Self:
+        """Of each link at most about ``most`` correspondences, well spread over its overlap."""
+        kept = [spread_choice(link.points1, most) for link in links]
+        sizes = [camera.half_diagonal for camera in cameras]
+        pairs = [(link.image1, link.image2) for link in links]
+        index1, index2 = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
+        empty = [np.empty((0, 2))]
+        return cls(
+            index1,
+            index2,
+            np.concatenate([[0], np.cumsum([len(k) for k in kept])]).astype(np.intp),
+            np.concatenate(
+                empty
+                + [cameras[i].normalize(link.points1[k]) for (i, _), link, k in zip(pairs, links, kept, strict=True)]
+            ),
+            np.concatenate(
+                empty
+                + [cameras[j].normalize(link.points2[k]) for (_, j), link, k in zip(pairs, links, kept, strict=True)]
+            ),
+            np.array([sizes[i] for i in index1]),
+            np.array([sizes[j] for j in index2]),
+            np.array([len(link) for link in links], dtype=np.intp),
+        )
+
+    def __len__(self) -> int:
+        """Number of links."""
+        return len(self.image1)
+
+    @property
+    def link(self) -> IntArray:
+        """The link of each correspondence, shape (M,)."""
+        return np.repeat(np.arange(len(self)), np.diff(self.start))
+
+    @cached_property
+    def scale_inliers_mask(self) -> NDArray[np.bool_]:
+        """Which correspondences, shape (M,), tell how large errors are: all but those of links that rest, if others do.
+
+        What stays where it is in the picture is found again in the same px, without the errors that a change of view
+        brings: a camera that stands still for a while would make all other links look wrong.
+        """
+        px = np.linalg.norm(self.points2 - self.points1, axis=1) * self.scale1[self.link]
+        moves = [b > a and float(np.median(px[a:b])) > _RESTING for a, b in itertools.pairwise(self.start)]
+        telling = np.repeat(np.array(moves, dtype=np.bool_), np.diff(self.start))
+        return telling if telling.any() else np.ones_like(telling)
+
+    def subset(self, links: IntArray | NDArray[np.bool_], image_index: IntArray | None = None) -> Self:
+        """Only some links; with ``image_index`` (N,) pictures get new numbers."""
+        chosen = np.flatnonzero(links) if np.asarray(links).dtype == np.bool_ else np.asarray(links)
+        counts = np.diff(self.start)[chosen]
+        start = np.concatenate([[0], np.cumsum(counts)]).astype(np.intp)
+        rows = np.arange(start[-1]) + np.repeat(self.start[chosen] - start[:-1], counts)
+        image1, image2 = self.image1[chosen], self.image2[chosen]
+        if image_index is not None:
+            image1, image2 = image_index[image1], image_index[image2]
+        return type(self)(
+            image1,
+            image2,
+            start,
+            self.points1[rows],
+            self.points2[rows],
+            self.scale1[chosen],
+            self.scale2[chosen],
+            self.matches[chosen],
+        )
+
+    def thinned(self, most: int) -> Self:
+        """Of each link at most about ``most`` correspondences, well spread over its overlap."""
+        kept = [spread_choice(self.points1[a:b], most) + a for a, b in itertools.pairwise(self.start)]
+        rows = np.concatenate([np.empty(0, dtype=np.intp), *kept])
+        start = np.concatenate([[0], np.cumsum([len(k) for k in kept])]).astype(np.intp)
+        return replace(self, start=start, points1=self.points1[rows], points2=self.points2[rows])
+
+    def as_independent_pairs(self) -> Self:
+        """Every link on its own: link l is between the pictures 2l and 2l + 1."""
+        first = 2 * np.arange(len(self))
+        return replace(self, image1=first, image2=first + 1)

@@ -1,0 +1,108 @@
+"""Is the scene a plane? Residuals of neighbouring points tell.
+
+Noise differs from point to point; a hill moves all its points together. So residuals that agree between neighbours
+come from something that the model does not describe: relief, a lens of another kind, a moving object. The same
+agreement tells how much less the correspondences say than their number suggests.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.result import Relief
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+
+_CELLS = (2, 3, 4)
+"""Cells per side of a link's overlap within which errors are added up; the worst counts."""
+
+_COHERENT, _LARGE = 0.5, 1.2
+"""Correlation, and px in common, from which on a scene does not count as flat."""
+
+_LEAST_DISTANCE = 0.005
+"""Half diagonals; nearer points are the same feature found twice."""
+
+
+@dataclass(frozen=True)
+class Coherence:
+    """How much the residuals of neighbours agree.
+
+    Attributes
+    ----------
+    correlation : float
+        Mean correlation of the residuals of nearest neighbours within a link.
+    size : float
+        Root mean square of the common part, px.
+    overdispersion : float
+        How many times fewer independent observations there are than correspondences; at least 1. The product of two
+        things: the variance of the sum of the residuals in a part of an overlap, in units of that of independent
+        ones; and the number of links per picture, since every link counts the same measured points again.
+    """
+
+    correlation: float
+    size: float
+    overdispersion: float
+
+
+def coherence(observations: Observations, errors: FloatArray, inliers: BoolArray) -> Coherence:
+    """Agreement of the residuals (M, 2) of neighbouring inliers of the same link."""
+    link, points, residual = observations.link[inliers], observations.points1[inliers], errors[inliers]
+    pictures = len(np.unique(np.concatenate([observations.image1, observations.image2])))
+    if len(points) < 2:
+        return Coherence(0.0, 0.0, 1.0)
+    apart = np.column_stack([points, link * 10.0])
+    nearby = cKDTree(apart).query(apart, k=min(4, len(apart)))
+    distance, neighbour = np.asarray(nearby[0]), np.asarray(nearby[1])
+    pairs = (distance[:, 1:] > _LEAST_DISTANCE) & (distance[:, 1:] < 0.25)
+    nearest = np.argmax(pairs, axis=1)
+    found = pairs.any(axis=1)
+    other = neighbour[np.arange(len(apart)), nearest + 1]
+    products = np.einsum("mi,mi->m", residual, residual[other])[found]
+    power = float(np.einsum("mi,mi->", residual, residual) / len(residual))
+    common = float(products.mean()) if len(products) else 0.0
+    return Coherence(
+        common / power if power > 0.0 else 0.0,
+        float(np.sqrt(max(common, 0.0))),
+        max(_overdispersion(link, points, residual, len(observations), cells) for cells in _CELLS)
+        * max(1.0, len(observations) / max(pictures - 1, 1)),
+    )
+
+
+def _overdispersion(link: IntArray, points: FloatArray, residual: FloatArray, count: int, cells: int) -> float:
+    """Mean over the cells of all links of ``|Σ r|² / Σ |r|²``."""
+    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    np.minimum.at(low, link, points)
+    np.maximum.at(high, link, points)
+    place = (points - low[link]) / np.maximum(high - low, 1e-12)[link]
+    cell = np.minimum((place * cells).astype(np.intp), cells - 1)
+    number = (link * cells + cell[:, 0]) * cells + cell[:, 1]
+    size = count * cells**2
+    sums = np.stack([np.bincount(number, residual[:, axis], size) for axis in range(2)], axis=1)
+    power = np.bincount(number, np.einsum("mi,mi->m", residual, residual), size)
+    several = np.bincount(number, minlength=size) > 1
+    if not several.any() or power[several].sum() == 0.0:
+        return 1.0
+    return max(1.0, float((sums[several] ** 2).sum() / power[several].sum()))
+
+
+def judge_relief(found: Coherence, model: str) -> Relief:
+    """What the agreement of neighbours means for the scene.
+
+    Parameters
+    ----------
+    found : Coherence
+    model : str
+        Name of the model that left the residuals.
+    """
+    agreement = f"errors of neighbours agree (correlation {found.correlation:.2f}, {found.size:.1f} px in common)"
+    relief = found.correlation > _COHERENT and found.size > _LARGE
+    if relief:
+        text = (
+            f"{agreement}: the scene is not one plane, or the {model} model does not describe the camera; λ may be off"
+        )
+    elif found.correlation > _COHERENT:
+        text = f"{agreement}, as over a scene that is nearly flat"
+    else:
+        text = f"errors of neighbours hardly agree (correlation {found.correlation:.2f}): the scene is flat"
+    return Relief(relief, found.correlation, found.size, text)

@@ -1,0 +1,173 @@
+"""What the adjustment gives: the cameras and poses of all pictures over one plane."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
+from rdstitch.radial_homography import from_plane, to_plane
+
+
+@dataclass(frozen=True)
+class LinkFit:
+    """How well one link agrees with the whole.
+
+    Attributes
+    ----------
+    image1, image2 : int
+        Indices of the pictures.
+    count : int
+        Correspondences given.
+    inliers : int
+        Correspondences that agree with the alignment.
+    rms : float
+        Root mean square error of those, px; NaN where the link was not used.
+    used : bool
+    reason : str
+        Why the link was not used; empty otherwise.
+    """
+
+    image1: int
+    image2: int
+    count: int
+    inliers: int
+    rms: float
+    used: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Where the camera was for each picture, in a metric plane.
+
+    Attributes
+    ----------
+    yaw : ndarray of shape (N,)
+        φ, radians.
+    position : ndarray of shape (N, 2)
+        (x, y) in the plane, in units of the reference picture's height above it.
+    height : ndarray of shape (N,)
+        Height above the plane in the same unit.
+    tilt : ndarray of shape (N, 2)
+        (ψ, θ), radians.
+    """
+
+    yaw: FloatArray
+    position: FloatArray
+    height: FloatArray
+    tilt: FloatArray
+
+
+@dataclass(frozen=True)
+class Relief:
+    """Whether the scene is the plane that it is taken for.
+
+    Attributes
+    ----------
+    found : bool
+        The residuals of neighbouring points agree too well to be noise.
+    coherence : float
+        Mean correlation of the residuals of neighbouring points, 0 for noise, 1 for a smooth surface.
+    size : float
+        Root mean square of the coherent part of the residuals, px.
+    explanation : str
+        One sentence; what it means for λ.
+    """
+
+    found: bool
+    coherence: float
+    size: float
+    explanation: str
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """All pictures registered as one.
+
+    Attributes
+    ----------
+    cameras : tuple of Camera
+        The camera of each picture with the estimated λ and, in planar models, focal length.
+    homographies : ndarray of shape (N, 3, 3)
+        From undistorted coordinates of picture i, in half diagonals from its distortion centre, to the plane; the
+        third coordinate is positive in front of the camera. NaN for pictures left out. In planar models the plane is
+        metric, rectified, with its unit the height of the reference picture; in the general model it is the
+        undistorted reference picture.
+    used : ndarray of shape (N,), bool
+    reasons : tuple of str
+        For each picture, why it was left out, with a remedy; empty where it was used.
+    components : tuple of tuple of int
+        The groups of pictures that overlap, largest first; the first is the aligned one.
+    reference : int
+        The picture that defines the plane's frame.
+    model : str
+        "rigid", "similarity", "tilting" or "homography".
+    model_reason : str
+        Why this model was taken.
+    poses : Poses or None
+        None for the general model; NaN for pictures left out.
+    tilt : (float, float) or None
+        (ψ, θ), radians, shared by all pictures (the mean one where the tilt varies).
+    tilt_spread : float
+        Standard deviation of the single pictures' tilts, radians; 0 where the model has none.
+    focal : float or None
+        Focal length in half diagonals; None for the general model.
+    focal_std : float or None
+        Its standard deviation in the same unit.
+    distortion, distortion_std : float
+        λ in the half-diagonal frame and its standard deviation; inf where it is not observable, 0 where it was given.
+    parameters : tuple of str
+        Names of the parameters that ``covariance`` covers, among "psi", "theta", "log_focal", "distortion",
+        "distortion2", "center_x", "center_y".
+    covariance : ndarray of shape (P, P)
+    rms : float
+        Root mean square error of the inliers of all links, px.
+    links : tuple of LinkFit
+        In the order of the links given.
+    relief : Relief
+    warnings : tuple of str
+        One sentence each: λ not observable, two cameras, ….
+    """
+
+    cameras: tuple[Camera, ...]
+    homographies: FloatArray
+    used: NDArray[np.bool_]
+    reasons: tuple[str, ...]
+    components: tuple[tuple[int, ...], ...]
+    reference: int
+    model: str
+    model_reason: str
+    poses: Poses | None
+    tilt: tuple[float, float] | None
+    tilt_spread: float
+    focal: float | None
+    focal_std: float | None
+    distortion: float
+    distortion_std: float
+    parameters: tuple[str, ...]
+    covariance: FloatArray
+    rms: float
+    links: tuple[LinkFit, ...]
+    relief: Relief
+    warnings: tuple[str, ...] = ()
+
+    def worst_links(self, count: int = 5) -> tuple[LinkFit, ...]:
+        """The used links with the largest rms, worst first."""
+        return tuple(sorted((fit for fit in self.links if fit.used), key=lambda fit: -fit.rms)[:count])
+
+    def relation(self, image1: int, image2: int) -> FloatArray:
+        """Homography (3, 3) from undistorted normalized coordinates of one picture to those of another."""
+        product: FloatArray = np.linalg.solve(self.homographies[image2], self.homographies[image1])
+        return product
+
+    @property
+    def support(self) -> dict[tuple[int, int], int]:
+        """Number of inliers of every pair of pictures that the alignment uses."""
+        return {(fit.image1, fit.image2): fit.inliers for fit in self.links if fit.used}
+
+    def transfer(self, image1: int, image2: int, points: FloatArray) -> FloatArray:
+        """Where points (N, 2) of one picture, px, are in another; NaN where its lens cannot see them."""
+        plane = to_plane(self.cameras[image1], self.homographies[image1], points)
+        return from_plane(self.cameras[image2], self.homographies[image2], plane)

@@ -1,0 +1,198 @@
+"""The path of the camera over the plane: poses frame by frame, files, and how far it is from the truth.
+
+Positions are in units of the camera's height above the plane, in the plane's frame: x to the right and y downwards as
+the first frame sees them, yaw φ as in ``H ~ R Rz(φ) T R'``, so that a point X of the plane is seen by a camera at t in
+the direction ``Rz(φ) (X - t)``.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rdstitch.alignment.result import Alignment, Poses
+from rdstitch.arrays import FloatArray
+from rdstitch.errors import ArgumentError
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of the frames of a sequence, in order.
+
+    Attributes
+    ----------
+    frame : ndarray of shape (F,), intp
+        Number of each frame in the sequence; frames left out are missing.
+    position : ndarray of shape (F, 2)
+        (x, y), in units of the first frame's height, or in metres.
+    yaw : ndarray of shape (F,)
+        φ, radians, continuous from frame to frame.
+    height : ndarray of shape (F,)
+        Above the plane, in the unit of the positions.
+    """
+
+    frame: NDArray[np.intp]
+    position: FloatArray
+    yaw: FloatArray
+    height: FloatArray
+
+    @classmethod
+    def from_alignment(cls, alignment: Alignment, height: float = 1.0) -> Self:
+        """The path that an alignment describes, starting at the origin with yaw zero.
+
+        Parameters
+        ----------
+        alignment : Alignment
+        height : float
+            Height of the first frame above the plane, in whatever unit the positions shall have.
+
+        Raises
+        ------
+        ArgumentError
+            When the alignment has no poses (general model), or the height is not positive.
+        """
+        if alignment.poses is None:
+            raise ArgumentError(
+                "one homography per picture has no metric poses; choose a planar model (rigid, similarity or tilting)"
+            )
+        return cls.from_poses(alignment.poses, height)
+
+    @classmethod
+    def from_poses(cls, poses: Poses, height: float = 1.0) -> Self:
+        """The path through the poses that are not NaN; see :meth:`from_alignment`."""
+        if not (math.isfinite(height) and height > 0.0):
+            raise ArgumentError(f"height must be positive, not {height}")
+        frame = np.flatnonzero(np.isfinite(poses.yaw))
+        if not len(frame):
+            raise ArgumentError("a trajectory needs at least one frame")
+        first = frame[0]
+        c, s = np.cos(poses.yaw[first]), np.sin(poses.yaw[first])
+        turned = (poses.position[frame] - poses.position[first]) @ np.array([[c, -s], [s, c]]).T
+        unit = height / poses.height[first]
+        yaw = np.unwrap(poses.yaw[frame] - poses.yaw[first])
+        return cls(frame, turned * unit, yaw, poses.height[frame] * unit)
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.frame)
+
+    @property
+    def length(self) -> float:
+        """Length of the path."""
+        return float(np.linalg.norm(np.diff(self.position, axis=0), axis=1).sum())
+
+    def as_csv(self) -> str:
+        """Lines ``frame,x,y,phi_deg,height`` with a header."""
+        rows = zip(self.frame, self.position, np.degrees(self.yaw), self.height, strict=True)
+        lines = [f"{frame},{x:.9g},{y:.9g},{yaw:.9g},{height:.9g}" for frame, (x, y), yaw, height in rows]
+        return "\n".join(["frame,x,y,phi_deg,height", *lines]) + "\n"
+
+    def as_tum(self, timestamps: ArrayLike | None = None) -> str:
+        """Lines ``timestamp tx ty tz qx qy qz qw`` of the TUM RGB-D benchmark.
+
+        The quaternion turns the frame of the camera, its tilt removed, into the plane's: ``Rz(-φ)``. z points at the
+        plane, which lies at z = 0, so that the camera is at minus its height. Without timestamps the number of the
+        frame stands for it.
+        """
+        times = np.asarray(self.frame if timestamps is None else timestamps, dtype=np.float64)
+        if times.shape != self.frame.shape:
+            raise ArgumentError(f"expected {len(self)} timestamps, not an array of shape {times.shape}")
+        half = -self.yaw / 2
+        rows = zip(times, self.position, self.height, np.sin(half), np.cos(half), strict=True)
+        lines = [
+            f"{time:.6f} {x:.9g} {y:.9g} {-height:.9g} 0 0 {qz:.9g} {qw:.9g}" for time, (x, y), height, qz, qw in rows
+        ]
+        return "\n".join(lines) + "\n"
+
+    def relative(self, step: int = 1) -> tuple[FloatArray, FloatArray]:
+        """Motion from each frame to the ``step``-th after it, as the earlier one sees it.
+
+        Returns
+        -------
+        translation : ndarray of shape (F - step, 2)
+            In units of the earlier frame's height.
+        rotation : ndarray of shape (F - step,)
+            Radians.
+        """
+        move = self.position[step:] - self.position[:-step]
+        c, s = np.cos(self.yaw[:-step]), np.sin(self.yaw[:-step])
+        turned = np.stack([c * move[:, 0] - s * move[:, 1], s * move[:, 0] + c * move[:, 1]], axis=1)
+        return turned / self.height[:-step, None], self.yaw[step:] - self.yaw[:-step]
+
+
+@dataclass(frozen=True)
+class TrajectoryError:
+    """How far a trajectory is from the truth.
+
+    Attributes
+    ----------
+    translation : float
+        Median error of the relative translations, as a share of their length, in heights.
+    translation_rms : float
+        Root mean square error of the relative translations over their root mean square length.
+    translation_in_own_unit : float
+        As ``translation``, after the best scale: the height in px is known only as well as the focal length.
+    rotation : float
+        Median error of the relative rotations, radians.
+    rotation_rms : float
+        Root mean square of the same.
+    drift : float
+        Root mean square distance of the positions from the true ones after the best similarity, as a share of the
+        length of the path.
+    scale : float
+        Length unit of the estimate in that of the truth, of the best similarity.
+    """
+
+    translation: float
+    translation_rms: float
+    translation_in_own_unit: float
+    rotation: float
+    rotation_rms: float
+    drift: float
+    scale: float
+
+
+def compare(estimate: Trajectory, truth: Trajectory, step: int = 1) -> TrajectoryError:
+    """Compare a trajectory with the true one, over the frames that both have.
+
+    Relative motions are compared as the earlier frame sees them, in units of its height, so that neither the frame
+    nor the unit of either trajectory matters.
+
+    Raises
+    ------
+    ArgumentError
+        When fewer than ``step + 1`` frames are in both.
+    """
+    common, own, other = np.intersect1d(estimate.frame, truth.frame, return_indices=True)
+    if len(common) <= step:
+        raise ArgumentError(f"only {len(common)} frames are in both trajectories")
+    a, b = _chosen(estimate, own), _chosen(truth, other)
+    (move_a, turn_a), (move_b, turn_b) = a.relative(step), b.relative(step)
+    off = np.linalg.norm(move_a - move_b, axis=1)
+    size = np.linalg.norm(move_b, axis=1)
+    unit = float(np.vdot(move_a, move_b) / max(float(np.vdot(move_a, move_a)), 1e-300))
+    off_scaled = np.linalg.norm(unit * move_a - move_b, axis=1)
+    moving = size > 1e-9 * max(float(size.max()), 1e-300)
+    turn = np.abs(np.remainder(turn_a - turn_b + np.pi, 2 * np.pi) - np.pi)
+    complex_a, complex_b = (t.position[:, 0] + 1j * t.position[:, 1] for t in (a, b))
+    centred_a, centred_b = complex_a - complex_a.mean(), complex_b - complex_b.mean()
+    power = float(np.vdot(centred_a, centred_a).real)
+    factor = np.vdot(centred_a, centred_b) / power if power > 0.0 else 1.0
+    distance = np.abs(factor * centred_a - centred_b)
+    return TrajectoryError(
+        translation=float(np.median(off[moving] / size[moving])) if moving.any() else 0.0,
+        translation_rms=float(np.sqrt(np.mean(off**2) / max(float(np.mean(size**2)), 1e-300))),
+        translation_in_own_unit=float(np.median(off_scaled[moving] / size[moving])) if moving.any() else 0.0,
+        rotation=float(np.median(turn)),
+        rotation_rms=float(np.sqrt(np.mean(turn**2))),
+        drift=float(np.sqrt(np.mean(distance**2))) / max(b.length, 1e-300),
+        scale=float(np.abs(factor)),
+    )
+
+
+def _chosen(trajectory: Trajectory, rows: NDArray[np.intp]) -> Trajectory:
+    """Some frames of a trajectory."""
+    t = trajectory
+    return Trajectory(t.frame[rows], t.position[rows], t.yaw[rows], t.height[rows])

@@ -1,0 +1,139 @@
+"""Pictures for the tiles, read before they are asked for, in bounded memory.
+
+Most of a picture is often hidden by its neighbours: where room is short, only the part that is asked for is kept.
+"""
+
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from threading import Lock
+
+from rdstitch.compositing.boxes import Box, encloses
+from rdstitch.compositing.source_images import NOTHING, LoadedPicture, PictureReader
+
+
+class PictureCache:
+    """The parts of pictures used last, prepared for resampling, in at most ``limit`` bytes (though always one).
+
+    Parameters
+    ----------
+    reader : PictureReader
+    shrinks : sequence of float
+        Picture px per output px.
+    limit : int
+        Bytes.
+    ahead : bool
+        Read pictures in a thread of its own before they are asked for.
+    """
+
+    def __init__(self, reader: PictureReader, shrinks: Sequence[float], limit: int, *, ahead: bool = False) -> None:
+        self._reader, self._shrinks, self._limit = reader, shrinks, limit
+        self._ahead = ThreadPoolExecutor(1) if ahead else None
+        self._held: OrderedDict[int, LoadedPicture] = OrderedDict()
+        self._expected: list[Box | None] = [None] * len(shrinks)
+        self._surprising: set[int] = set()
+        # One picture is read at a time; meanwhile those that are held can be had.
+        self._lock, self._reading = Lock(), Lock()
+
+    def masked(self, index: int) -> bool:
+        """Whether a picture has transparent parts."""
+        return self._reader.masked(index)
+
+    def expect(self, parts: Sequence[Box]) -> None:
+        """Keep no more of each picture than the part that will be asked for from now on, where room is short.
+
+        It is a guess: a picture that more is asked of is read again, and from then on kept whole.
+        """
+        with self._lock:
+            for index, part in enumerate(parts):
+                if index not in self._surprising:
+                    self._expected[index] = part
+                    if part == NOTHING:
+                        self._held.pop(index, None)
+
+    def get(self, index: int, part: Box) -> LoadedPicture:
+        """A part of picture ``index``, read unless it is held; may be asked for from several threads."""
+        if (held := self._find(index, part)) is not None:
+            return held
+        with self._reading:
+            # Another thread may have read it in the meantime.
+            if (held := self._find(index, part)) is not None:
+                return held
+            with self._lock:
+                expected = self._expected[index]
+                if expected is not None and not encloses(expected, part):
+                    self._surprising.add(index)
+                    self._expected[index] = expected = None
+                self._held.pop(index, None)
+            return self._read(index, expected)
+
+    def prefetch(self, indices: Iterable[int]) -> None:
+        """Be told which pictures will be asked for next, in this order; those for which there is room are read."""
+        if self._ahead is None:
+            return
+        for index in indices:
+            # What cannot be read is told to who asks for it.
+            self._ahead.submit(self._read_ahead, index)
+
+    def close(self) -> None:
+        """Read nothing ahead any more."""
+        if self._ahead is not None:
+            self._ahead.shutdown(cancel_futures=True)
+            self._ahead = None
+
+    def _read_ahead(self, index: int) -> None:
+        """Read a picture, unless it is held or others would have to go for it."""
+        with self._reading:
+            expected = self._expected[index]
+            if index in self._held or expected == NOTHING:
+                return
+            if self._make_room(self._reader.nbytes(index, self._shrinks[index])):
+                self._read(index, expected)
+
+    def _read(self, index: int, part: Box | None) -> LoadedPicture:
+        """Read a part of a picture and hold it; those used longest ago go where there is no room."""
+        loaded = self._reader.prepared(index, self._shrinks[index])
+        if part is not None:
+            loaded = loaded.cut(part)
+        self._make_room(loaded.nbytes)
+        with self._lock:
+            while self._held and self._nbytes() + loaded.nbytes > self._limit:
+                self._held.popitem(last=False)
+            self._held[index] = loaded
+        return loaded
+
+    def _make_room(self, nbytes: int) -> bool:
+        """Drop what will not be asked for of the pictures held, if need be; whether there is room for so much then."""
+        with self._lock:
+            room, indices = self._limit - self._nbytes(), list(self._held)
+        for index in indices if nbytes > room else ():
+            self._cut(index)
+        with self._lock:
+            return nbytes <= self._limit - self._nbytes()
+
+    def _cut(self, index: int) -> None:
+        """Drop what will not be asked for of a picture that is held."""
+        with self._lock:
+            picture, expected = self._held.get(index), self._expected[index]
+        if picture is None or expected is None:
+            return
+        # No part at all is expected of one that was being read when it was done with.
+        picture = None if expected == NOTHING else picture.cut(expected)
+        with self._lock:
+            if picture is None:
+                self._held.pop(index, None)
+            elif index in self._held:
+                self._held[index] = picture
+
+    def _nbytes(self) -> int:
+        """Memory that is taken; asked with the lock held."""
+        return sum(picture.nbytes for picture in self._held.values())
+
+    def _find(self, index: int, part: Box) -> LoadedPicture | None:
+        """A picture that is held."""
+        with self._lock:
+            held = self._held.get(index)
+            if held is None or not held.holds(part):
+                return None
+            self._held.move_to_end(index)
+            return held

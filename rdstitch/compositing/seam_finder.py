@@ -1,0 +1,195 @@
+"""Seams: which picture each px of the output comes from, decided on the reduced canvas.
+
+"voronoi": where the borders of two pictures are equally far, so that each picture gives its middle. "graphcut": round
+that line, within a band, along the path on which the two pictures differ least (Kwatra et al. 2003, with OpenCV's
+cut), so that what moved or stands out of the plane is taken from one of them whole. Pictures are added one after the
+other, so that memory is that of one label per px of the reduced canvas.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.compositing.boxes import Box, Float32Array
+from rdstitch.compositing.gain_compensation import Exposure, full_scale
+from rdstitch.compositing.survey import Survey, SurveyTile
+from rdstitch.compositing.warp import locate
+from rdstitch.io.reduction import block_mean
+
+NOBODY = -1
+
+# Band in which a seam may wander: the new picture's share of both border weights.
+_LEAST_SHARE, _LARGEST_SHARE = 0.2, 0.8
+_AROUND_FREE = 2
+# px from which on a cut is found at half the size first, and by how much it may then move.
+_LARGEST_CUT = 30_000
+_MOVED = 3
+
+
+@dataclass(frozen=True)
+class SeamMap:
+    """Owner of each px of the reduced canvas.
+
+    Attributes
+    ----------
+    labels : ndarray of shape (h, w), int32
+        Index of the picture, or -1 where there is none.
+    factor : int
+        Canvas px per reduced px, even or 1.
+    softness : int
+        Shares pass from one owner to the next over so many reduced px on either side of a seam, for feathering.
+    """
+
+    labels: NDArray[np.int32]
+    factor: int
+    softness: int = 0
+
+    def owners(self, box: Box) -> list[int]:
+        """Pictures that own anything on a box (canvas px), ascending; -1 first where nobody owns a part of it."""
+        return [int(owner) for owner in np.unique(self._window(box))]
+
+    def share(self, owner: int, box: Box) -> Float32Array:
+        """How much of each px of a box (canvas px) a picture owns: labels interpolated linearly, (h, w).
+
+        Every value depends on the labels around it alone, bit for bit, whatever the box: sums of ones and of shares of
+        an even number of px are exact.
+        """
+        owned = (self._window(box) == owner).astype(np.float32)
+        if owned.all():
+            return np.ones((box[3] - box[1], box[2] - box[0]), dtype=np.float32)
+        side = 2 * self.softness + 1
+        if side > 1:
+            owned = cv2.boxFilter(owned, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        size = (owned.shape[1] * self.factor, owned.shape[0] * self.factor)
+        share = np.asarray(cv2.resize(owned, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+        x, y = (edge % self.factor + (1 + self.softness) * self.factor for edge in box[:2])
+        share = share[y : y + box[3] - box[1], x : x + box[2] - box[0]]
+        return share * np.float32(1.0 / side**2)
+
+    def _window(self, box: Box) -> NDArray[np.int32]:
+        """The labels that have a say in a box, one and the softness more on each side; the border repeats itself."""
+        around = 1 + self.softness
+        columns, rows = (
+            np.clip(np.arange(start // self.factor - around, -(-stop // self.factor) + around), 0, count - 1)
+            for start, stop, count in zip(box[:2], box[2:], self.labels.shape[::-1], strict=True)
+        )
+        return self.labels[np.ix_(rows, columns)]
+
+
+def find_seams(
+    survey: Survey, exposure: Exposure, graphcut: bool, progress: Callable[[float], None] | None = None
+) -> SeamMap:
+    """Owner of every px.
+
+    Parameters
+    ----------
+    survey : Survey
+    exposure : Exposure
+        Differences in brightness must not steer the seams.
+    graphcut : bool
+        Whether seams avoid what differs; otherwise they run where borders are equally far.
+    progress : callable, optional
+        Told the share of the work done.
+    """
+    width, height = survey.canvas.size
+    labels = np.full((height, width), NOBODY, dtype=np.int32)
+    weights = np.zeros((height, width), dtype=np.float32)
+    channels = next((t.pixels.shape[2] for t in survey.tiles if t is not None), 1)
+    composite = np.zeros((height, width, channels), dtype=np.float32) if graphcut else None
+    for index, tile in enumerate(survey.tiles):
+        if tile is not None:
+            x0, y0, x1, y1 = tile.box
+            cut = np.s_[y0:y1, x0:x1]
+            if composite is None:
+                won = tile.inside & (tile.weight > weights[cut])
+            else:
+                corrected = exposure.correct(index, locate(survey.warps[index], tile.box), tile.pixels)
+                pixels = corrected * np.float32(1.0 / full_scale(corrected.dtype))
+                won = _cut(tile, pixels, composite[cut], labels[cut] != NOBODY, weights[cut])
+                composite[cut][won] = pixels[won]
+            labels[cut][won] = index
+            weights[cut][won] = tile.weight[won]
+        if progress is not None:
+            progress((index + 1) / len(survey.tiles))
+    return SeamMap(labels, survey.factor)
+
+
+def _cut(
+    tile: SurveyTile, pixels: Float32Array, below: Float32Array, covered: NDArray[np.bool_], weights: Float32Array
+) -> NDArray[np.bool_]:
+    """Where a new picture replaces what lies below it."""
+    both = tile.inside & covered
+    share = tile.weight / np.maximum(tile.weight + weights, np.float32(1e-12))
+    alone: NDArray[np.bool_] = tile.inside & ~covered
+    free = both & (share > _LEAST_SHARE) & (share < _LARGEST_SHARE)
+    surely_new: NDArray[np.bool_] = alone | (both & (share >= _LARGEST_SHARE))
+    surely_old = covered & ~(surely_new | free)
+    if not free.any():
+        return surely_new
+    if not surely_old.any():
+        return np.asarray(surely_new | free)
+    if not surely_new.any():
+        return surely_new
+    part = _around(free)
+    masks = [(free | sure)[part].astype(np.uint8) * np.uint8(255) for sure in (surely_old, surely_new)]
+    images = [_three_channels(image[part]) for image in (below, pixels)]
+    won = surely_new.copy()
+    won[part] |= free[part] & _graph_cut(images, masks)
+    return won
+
+
+def _around(free: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Where a cut is free to run, with room for what surely belongs to either side; the rest would only take time."""
+    rows, columns = (np.flatnonzero(free.any(axis=axis)) for axis in (1, 0))
+    return (
+        slice(max(0, int(rows[0]) - _AROUND_FREE), int(rows[-1]) + 1 + _AROUND_FREE),
+        slice(max(0, int(columns[0]) - _AROUND_FREE), int(columns[-1]) + 1 + _AROUND_FREE),
+    )
+
+
+def _graph_cut(images: list[Float32Array], masks: list[NDArray[np.uint8]]) -> NDArray[np.bool_]:
+    """Where the second of two images wins; the px that one mask alone has are what the cut must separate.
+
+    A large cut is found at half the size first, and then only moved by a few px.
+    """
+    if masks[0].size > _LARGEST_CUT:
+        masks = _near_cut(_graph_cut([_halved(i) for i in images], [m[::2, ::2] for m in masks]), masks)
+    won = masks[1] > 0
+    free = won & (masks[0] > 0)
+    if not free.any():
+        return won
+    part = _around(free)
+    # The stubs know neither the class nor a UMat made of an array.
+    detail: Any = cv2
+    finder = detail.detail_GraphCutSeamFinder("COST_COLOR_GRAD")
+    cut_images, cut_masks = ([detail.UMat(np.ascontiguousarray(a[part])) for a in both] for both in (images, masks))
+    won[part] = finder.find(cut_images, [(0, 0), (0, 0)], cut_masks)[1].get() > 0
+    return won
+
+
+def _halved(image: Float32Array) -> Float32Array:
+    """Half the size, rounded up."""
+    return np.asarray(block_mean(image, 2), dtype=np.float32)
+
+
+def _near_cut(won: NDArray[np.bool_], masks: list[NDArray[np.uint8]]) -> list[NDArray[np.uint8]]:
+    """Masks that leave free only what is near a cut found at half the size."""
+    height, width = masks[0].shape
+    above = np.repeat(np.repeat(won, 2, axis=0), 2, axis=1)[:height, :width].astype(np.uint8)
+    kernel = np.ones((2 * _MOVED + 1,) * 2, np.uint8)
+    surely_new, surely_old = cv2.erode(above, kernel) > 0, cv2.dilate(above, kernel) == 0
+    free = (masks[0] > 0) & (masks[1] > 0)
+    return [
+        np.where(free & settled, np.uint8(0), mask)
+        for mask, settled in zip(masks, (surely_new, surely_old), strict=True)
+    ]
+
+
+def _three_channels(pixels: Float32Array) -> Float32Array:
+    """The finder's cost is made for three channels with values of 0 to 255."""
+    channels = [pixels[..., k] for k in range(3)] if pixels.shape[2] >= 3 else [pixels[..., 0]] * 3
+    return np.stack(channels, axis=-1) * np.float32(255.0)

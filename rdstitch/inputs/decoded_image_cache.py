@@ -1,0 +1,50 @@
+"""Pictures kept between stages that look at them one after the other, as many as fit."""
+
+from collections.abc import Hashable
+from threading import Lock
+
+from rdstitch.io.read import Picture
+
+_ROOM = 64 * 2**20
+
+
+class DecodedImageCache:
+    """Keeps pictures until they are taken; those for which there is no room are not kept.
+
+    It saves time and never changes a result.
+
+    Parameters
+    ----------
+    room : int
+        Bytes.
+    """
+
+    def __init__(self, room: int = _ROOM) -> None:
+        self._room = room
+        self._held: dict[Hashable, Picture] = {}
+        self._lock = Lock()
+
+    def put(self, key: Hashable, picture: Picture) -> None:
+        """Keep a picture if there is room for it."""
+        with self._lock:
+            if key not in self._held and picture.nbytes <= self._room:
+                self._room -= picture.nbytes
+                self._held[key] = picture
+
+    def take(self, key: Hashable) -> Picture | None:
+        """Have a picture back, if it was kept."""
+        with self._lock:
+            picture = self._held.pop(key, None)
+            if picture is not None:
+                self._room += picture.nbytes
+            return picture
+
+    def clear(self) -> None:
+        """Let go of all that is left."""
+        with self._lock:
+            self._room += sum(picture.nbytes for picture in self._held.values())
+            self._held.clear()
+
+    def __reduce__(self) -> tuple[type["DecodedImageCache"], tuple[int]]:
+        """Copies and other processes get an empty one."""
+        return DecodedImageCache, (self._room,)

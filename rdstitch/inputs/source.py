@@ -1,0 +1,199 @@
+"""The input pictures: which files, what their headers say, and the camera each was taken with."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from rdstitch.camera import Camera
+from rdstitch.errors import ArgumentError, InputError
+from rdstitch.features.options import WORK_MEGAPIXELS
+from rdstitch.features.picture import halving
+from rdstitch.inputs.decoded_image_cache import DecodedImageCache
+from rdstitch.io.mask import read_mask
+from rdstitch.io.metadata import Metadata, read_metadata
+from rdstitch.io.read import Picture, read_image, reduced
+from rdstitch.io.reduction import block_minimum, fitting_reduction, reduced_size
+
+
+@dataclass(frozen=True)
+class Source:
+    """One input picture; its pixels are read when they are needed.
+
+    Attributes
+    ----------
+    path : Path
+    metadata : Metadata
+    camera : Camera
+        What is known of the camera before registration: size, centre, focal length, and λ where it was given.
+    mask : Path or None
+        Picture that is dark where this one does not count.
+    attitude : (float, float) or None
+        (ψ, θ), radians, as a gimbal or an IMU has measured it.
+    decoded_images : DecodedImageCache
+        Where it is kept between two stages that both look at it.
+    """
+
+    path: Path
+    metadata: Metadata
+    camera: Camera
+    mask: Path | None = None
+    attitude: tuple[float, float] | None = None
+    decoded_images: DecodedImageCache = field(
+        default_factory=partial(DecodedImageCache, room=0), compare=False, repr=False
+    )
+
+    @property
+    def name(self) -> str:
+        """File name, for messages and reports."""
+        return self.path.name
+
+    def reduction(self, megapixels: float | None) -> int:
+        """By how much it can be read smaller and has no fewer px than a picture that is halved to so many 10⁶ px."""
+        return 1 if megapixels is None else fitting_reduction(halving(self.camera.image_size, megapixels))
+
+    def read(self, reduction: int = 1, *, keep: bool = False) -> Picture:
+        """The pixels, of blocks of so many px a side; what the mask excludes is transparent.
+
+        Parameters
+        ----------
+        reduction : int
+        keep : bool
+            It will be looked at again, so that the file need not be decoded once more.
+
+        Raises
+        ------
+        InputError
+            When the file cannot be read, or is no longer what it was.
+        """
+        # Smaller ones are made from one size, whether that is at hand or not: the same comes out.
+        usual = self.reduction(WORK_MEGAPIXELS)
+        if reduction % usual:
+            return self._load(reduction)
+        key = (self.path, self.mask)
+        picture = self.decoded_images.take(key) or self._load(usual)
+        if keep:
+            self.decoded_images.put(key, picture)
+        return reduced(picture, reduction // usual)
+
+    def _load(self, reduction: int) -> Picture:
+        """The pixels from the file, masked."""
+        picture = read_image(self.path, reduction)
+        expected = self.camera.image_size
+        if picture.pixels.shape[1::-1] != reduced_size(expected, reduction):
+            now, before = ("{} x {}".format(*size) for size in (picture.metadata.size, expected))
+            raise InputError(f"{self.path}: has {now} px now, but had {before} before; run again")
+        if self.mask is None:
+            return picture
+        alpha = block_minimum(read_mask(self.mask, expected), reduction)
+        if picture.alpha is not None:
+            alpha = np.minimum(alpha, picture.alpha)
+        return replace(picture, alpha=alpha)
+
+
+def readers(sources: Sequence[Source]) -> list[Callable[..., Picture]]:
+    """What reads the pictures for the compositor, whole or reduced; those whose samples cannot be mixed are named.
+
+    Raises
+    ------
+    InputError
+        By a reader: see :meth:`Source.read`, and when its samples are unlike those of the picture read first.
+    """
+    first: list[tuple[Source, str]] = []
+
+    def read(source: Source, reduction: int = 1) -> Picture:
+        picture = source.read(reduction)
+        bands = 1 if picture.pixels.ndim == 2 else picture.pixels.shape[2]
+        # Grey becomes colour where it must.
+        kind = f"{picture.pixels.dtype} samples" + ("" if bands in (1, 3) else f" in {bands} bands")
+        first.append((source, kind))
+        if kind != first[0][1]:
+            raise InputError(
+                f"{source.path}: has {kind}, but {first[0][0].name} has {first[0][1]}; convert them to one kind"
+            )
+        return picture
+
+    return [partial(read, source) for source in sources]
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A file that could not be used.
+
+    Attributes
+    ----------
+    path : Path
+    reason : str
+    """
+
+    path: Path
+    reason: str
+
+
+def read_sources(
+    paths: Iterable[str | Path], *, camera: Camera | None, focal: float | None, distortion: float | None, skip_bad: bool
+) -> tuple[list[Source], list[LeftOut]]:
+    """Read the headers of the pictures; a file named twice counts once.
+
+    Parameters
+    ----------
+    paths : iterable of path
+    camera : Camera or None
+        Known camera; adapted to the size of each picture.
+    focal : float or None
+        Known focal length, px.
+    distortion : float or None
+        Known λ, half-diagonal frame.
+    skip_bad : bool
+        Leave out files that cannot be read, with the reason, instead of raising.
+
+    Raises
+    ------
+    InputError
+        When a file cannot be read.
+    """
+    sources: list[Source] = []
+    left_out: list[LeftOut] = []
+    seen: set[Path] = set()
+    decoded_images = DecodedImageCache()
+    for path in map(Path, paths):
+        try:
+            key = path.resolve()
+            metadata = read_metadata(path)
+        except (InputError, OSError, RuntimeError) as error:
+            reason = error if isinstance(error, InputError) else InputError(f"{path}: cannot be read: {error}")
+            if not skip_bad:
+                raise reason from error
+            left_out.append(LeftOut(path, str(reason)))
+            continue
+        if key not in seen:
+            seen.add(key)
+            sources.append(
+                Source(path, metadata, _camera(metadata, camera, focal, distortion), decoded_images=decoded_images)
+            )
+    return sources, left_out
+
+
+def _camera(metadata: Metadata, camera: Camera | None, focal: float | None, distortion: float | None) -> Camera:
+    """The best that is known of one picture's camera: what the user says, then EXIF; the guess comes later."""
+    found = Camera(metadata.size) if camera is None else _fitted(camera, metadata.size)
+    if focal is not None:
+        found = replace(found, focal=focal, focal_source="option")
+    elif found.focal is None and metadata.focal_px is not None:
+        found = replace(found, focal=metadata.focal_px, focal_source="exif")
+    return found if distortion is None else replace(found, distortion=distortion, distortion2=0.0, distortion_std=None)
+
+
+def _fitted(camera: Camera, size: tuple[int, int]) -> Camera:
+    """A known camera for a picture of another size or turned by a quarter."""
+    if size == camera.image_size:
+        return camera
+    ratio, own = size[0] / size[1], camera.image_size[0] / camera.image_size[1]
+    if not any(abs(ratio / shape - 1.0) < 0.02 for shape in (own, 1.0 / own)):
+        raise ArgumentError(
+            f"the camera file is for {camera.image_size[0]} x {camera.image_size[1]} px; "
+            f"a picture of {size[0]} x {size[1]} px was cropped or comes from another camera"
+        )
+    return camera.resized(size)

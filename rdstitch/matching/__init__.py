@@ -1,0 +1,1 @@
+"""Candidate pairs, their matches, and two-view geometry; static backgrounds and mixed lenses."""

@@ -1,0 +1,146 @@
+"""λ by consensus: every pair votes, weighted by what it can know (Valtonen Örnhag et al., §5.5).
+
+The paper takes the peak of a histogram of the pairs' λ. Here the votes are weighted by their covariance, to which
+the scatter between pairs is added that the covariances do not explain; the histogram is kept for the report.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rdstitch.arrays import FloatArray
+
+_BINS = 50
+_ROUNDS = 20
+_LEAST_GROUP = 3
+"""Votes that make a second camera rather than a few bad pairs."""
+
+
+@dataclass(frozen=True)
+class Consensus:
+    """What the pairs agree on.
+
+    Attributes
+    ----------
+    distortion : float
+        λ in the half-diagonal frame; NaN where no pair can see it.
+    std : float
+        Its standard deviation; inf where no pair can see it.
+    scatter : float
+        Standard deviation between pairs that their own uncertainty does not explain.
+    agreeing : int
+        Votes within three standard deviations of the consensus.
+    votes : int
+        Pairs that can see λ.
+    edges : ndarray of shape (B + 1,)
+        Bin edges of the histogram; empty without votes.
+    histogram : ndarray of shape (B,)
+        Weight of the votes in each bin, adding up to one.
+    groups : tuple of (float, int)
+        λ and number of votes of each of two separate groups: two cameras, or a zoom; empty where there is one group.
+    reason : str
+        One sentence.
+    """
+
+    distortion: float
+    std: float
+    scatter: float
+    agreeing: int
+    votes: int
+    edges: FloatArray
+    histogram: FloatArray
+    groups: tuple[tuple[float, int], ...]
+    reason: str
+
+
+def vote(distortion: ArrayLike, std: ArrayLike) -> Consensus:
+    """The λ that the pairs agree on.
+
+    Parameters
+    ----------
+    distortion : array_like of shape (L,)
+        λ of each pair.
+    std : array_like of shape (L,)
+        Its standard deviation; pairs with a value that is not finite have no vote.
+    """
+    values, errors = np.asarray(distortion, dtype=np.float64), np.asarray(std, dtype=np.float64)
+    count = len(values)
+    able = np.isfinite(values) & np.isfinite(errors)
+    values, errors = values[able], np.maximum(errors[able], 1e-6)
+    if not len(values):
+        reason = f"none of {count} pairs can see the distortion: the camera hardly moves, or only turns about its axis"
+        empty = np.empty(0)
+        return Consensus(np.nan, np.inf, 0.0, 0, 0, empty, empty, (), reason)
+    scatter = 0.0
+    center = _weighted_median(values, errors**-2)
+    for _ in range(_ROUNDS):
+        total = np.hypot(errors, scatter)
+        inside = np.abs(values - center) <= 3.0 * total
+        weight = inside / total**2
+        if not inside.any():
+            break
+        center = float(weight @ values / weight.sum())
+        scatter = _scatter(values - center, errors)
+    total = np.hypot(errors, scatter)
+    inside = np.abs(values - center) <= 3.0 * total
+    weight = np.where(inside, total**-2.0, 0.0)
+    uncertainty = float(1.0 / np.sqrt(max(weight.sum(), 1e-300)))
+    low, high = min(values.min(), center - 1e-3), max(values.max(), center + 1e-3)
+    histogram, edges = np.histogram(values, bins=_BINS, range=(low, high), weights=total**-2.0)
+    groups = _groups(values, errors)
+    reason = f"{int(inside.sum())} of {len(values)} pairs agree on {center:+.4f}"
+    return Consensus(
+        center,
+        uncertainty,
+        scatter,
+        int(inside.sum()),
+        len(values),
+        edges,
+        histogram / histogram.sum(),
+        groups,
+        reason,
+    )
+
+
+def _weighted_median(values: FloatArray, weight: FloatArray) -> float:
+    order = np.argsort(values, kind="stable")
+    cumulative = np.cumsum(weight[order])
+    return float(values[order][np.searchsorted(cumulative, cumulative[-1] / 2)])
+
+
+def _scatter(residual: FloatArray, errors: FloatArray) -> float:
+    """The additional standard deviation that makes the median of the normalized residuals what it should be."""
+    if len(residual) < 3:
+        return 0.0
+    low, high = 0.0, float(np.abs(residual).max()) * 2.0
+    for _ in range(50):
+        middle = (low + high) / 2
+        if np.median(np.abs(residual) / np.hypot(errors, middle)) > 0.6745:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def _groups(values: FloatArray, errors: FloatArray) -> tuple[tuple[float, int], ...]:
+    """Two groups of votes far apart, if the votes fall into two.
+
+    Votes that know little are not asked. The sorted votes are cut where that leaves the least scatter within the two
+    parts; they are two groups when each has a fifth of the votes, and their means are farther apart than six times
+    the scatter within either.
+    """
+    certain = np.sort(values[errors <= 2.0 * np.median(errors)])
+    count = len(certain)
+    least = max(_LEAST_GROUP, int(np.ceil(0.2 * count)))
+    if count < 2 * least:
+        return ()
+    cuts = range(least, count - least + 1)
+    cost = [np.var(certain[:cut]) * cut + np.var(certain[cut:]) * (count - cut) for cut in cuts]
+    cut = cuts[int(np.argmin(cost))]
+    parts = certain[:cut], certain[cut:]
+    gap = float(parts[1].mean() - parts[0].mean())
+    within = max(float(np.std(part)) for part in parts)
+    if gap <= 6.0 * max(within, float(np.median(errors))) or gap < 0.01:
+        return ()
+    return tuple((float(np.median(part)), len(part)) for part in parts)

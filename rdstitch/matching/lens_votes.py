@@ -1,0 +1,109 @@
+"""What pairs see of λ, each on its own and for each of its two pictures: the votes on which lens took which picture."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.matching.thinning import spread_choice
+from rdstitch.matching.two_view import PairRegistration
+from rdstitch.robust.measurements import Measurements
+from rdstitch.robust.own_lenses import OwnLenses, own_lenses
+
+_FARTHEST = 10.0  # thresholds from where one λ puts them, within which correspondences may fit with two
+_MOST = 250  # correspondences of a pair that are asked
+_LEAST_STD = 2e-4  # λ; no pair knows it better than that the division model holds
+_COMMON_STD = 0.05  # λ; by so much relief and lenses of another kind change what a pair sees, of both pictures alike
+_ROUNDS = 6
+
+
+@dataclass(frozen=True)
+class Votes:
+    """What pairs see of λ, each on its own.
+
+    Attributes
+    ----------
+    image1, image2 : ndarray of shape (L,), intp
+        The pictures of each pair.
+    distortion : ndarray of shape (L, 2)
+        λ of its first and of its second picture, half-diagonal frame.
+    covariance : ndarray of shape (L, 2, 2)
+    """
+
+    image1: IntArray
+    image2: IntArray
+    distortion: FloatArray
+    covariance: FloatArray
+
+    @classmethod
+    def of(cls, pairs: Sequence[PairRegistration], threshold: float) -> Self:
+        """The votes of the pairs that see λ; ``threshold``, px, as they were estimated with."""
+        asked = [pair for pair in pairs if pair.relation and np.isfinite(pair.relation.distortion_std)]
+        found = [(pair, _vote(pair, threshold)) for pair in asked]
+        seen = [(pair, vote) for pair, vote in found if np.isfinite(vote.covariance).all()]
+        return cls(
+            np.array([pair.image1 for pair, _ in seen], dtype=np.intp),
+            np.array([pair.image2 for pair, _ in seen], dtype=np.intp),
+            np.array([vote.distortion for _, vote in seen]).reshape(-1, 2),
+            np.array([vote.covariance for _, vote in seen]).reshape(-1, 2, 2),
+        )
+
+    def __len__(self) -> int:
+        """Number of pairs."""
+        return len(self.image1)
+
+    def missed(self, expected: FloatArray | float) -> FloatArray:
+        """How far each vote is from what is expected, (L, 2), in its standard deviations."""
+        return np.asarray(np.linalg.norm(self._whitened(self.distortion - expected), axis=1))
+
+    @property
+    def differences(self) -> tuple[FloatArray, FloatArray]:
+        """λ of the second picture of each pair less that of the first, and its standard deviation, both (L,)."""
+        sign = np.array([-1.0, 1.0])
+        return self.distortion @ sign, np.sqrt(sign @ self.covariance @ sign + 2.0 * _LEAST_STD**2)
+
+    def which(self, second: BoolArray) -> IntArray:
+        """From which lens, 0 or 1, the two pictures of each pair come, shape (L, 2)."""
+        return np.stack([second[self.image1], second[self.image2]], axis=1).astype(np.intp)
+
+    def fitted(self, which: IntArray, lenses: FloatArray) -> FloatArray:
+        """λ of the lenses that the votes miss by the least, by reweighted least squares.
+
+        Parameters
+        ----------
+        which : ndarray of shape (L, 2), intp
+            The lens of each picture of each pair.
+        lenses : ndarray of shape (K,)
+            λ to start from; that of a lens without votes stays.
+        """
+        design = self._whitening @ np.eye(len(lenses))[which]
+        seen = np.bincount(which.ravel(), minlength=len(lenses)) > 0
+        for _ in range(_ROUNDS):
+            weight = 1.0 / np.maximum(self.missed(lenses[which]), 0.1)
+            normal = np.einsum("l,lij,lik->jk", weight, design, design)
+            right = np.einsum("l,lij,li->j", weight, design, self._whitened(self.distortion))
+            lenses = np.where(seen, np.linalg.lstsq(normal, right, rcond=None)[0], lenses)
+        return lenses
+
+    @cached_property
+    def _whitening(self) -> FloatArray:
+        """W (L, 2, 2), with W'W the inverse of each covariance."""
+        covariance = self.covariance + _LEAST_STD**2 * np.eye(2) + _COMMON_STD**2
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+
+    def _whitened(self, values: FloatArray) -> FloatArray:
+        return np.asarray(np.einsum("lij,lj->li", self._whitening, values))
+
+
+def _vote(pair: PairRegistration, threshold: float) -> OwnLenses:
+    """λ of both pictures, from what lies not too far from where one λ puts it."""
+    relation, matched = pair.relation, pair.correspondences
+    apart = np.linalg.norm(relation.transfer(matched.points1) - matched.points2, axis=1)
+    near = np.flatnonzero(apart < _FARTHEST * threshold)
+    near = near[spread_choice(matched.points1[near], _MOST)]
+    points1, points2 = matched.points1[near], matched.points2[near]
+    data = Measurements.from_pixels(points1, points2, relation.camera, relation.camera2, None)
+    return own_lenses(relation, data, threshold)

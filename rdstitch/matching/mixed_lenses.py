@@ -1,0 +1,157 @@
+"""Which pictures come from which lens, where those of two lenses or two zoom settings are mixed.
+
+A pair of pictures sees λ of both of them, each on its own: the same one where they come from one lens. So a division of
+the pictures into two lenses predicts what every pair sees.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph
+
+from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.camera import Camera
+from rdstitch.matching.lens_votes import Votes
+from rdstitch.matching.match_graph import connected_components
+from rdstitch.matching.two_view import PairRegistration
+
+_DIFFERENT = 5.0  # standard deviations from which on a pair is taken to see two lenses, until all votes are heard
+_STARTS = 5  # divisions that are begun with
+_ROUNDS = 6
+_MOVES = 12
+_LEAST_GAP = 0.01  # λ; what is nearer is one lens that one λ does not quite describe
+_LEAST_GAP_PX = 4.0  # the same at a corner, px; with one λ, pictures are off by a tenth of that, rows of them by half
+_MEAN_MISS = 1.25  # standard deviations that a vote, two numbers, is off on average; less is luck
+# How many times better two lenses must explain the votes of pairs of both: at least, and times one over their number.
+_LEAST_GAIN, _GAIN_OF_FEW = 4.0, 2.8
+_LEAST_MARGIN = 5.0  # standard deviations by which votes must tell of which of the two lenses a picture is
+
+
+@dataclass(frozen=True)
+class TwoLenses:
+    """Pictures of two lenses.
+
+    Attributes
+    ----------
+    second : ndarray of shape (N,), bool
+        Which pictures come from the second one: the fewer.
+    distortion : (float, float)
+        λ of both, half-diagonal frame.
+    certain : bool
+        Whether it is clear which pictures belong together, and a pair of them can be stitched.
+    """
+
+    second: BoolArray
+    distortion: tuple[float, float]
+    certain: bool
+
+
+def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
+    """The division of pictures into two lenses that the votes speak for; None where one lens will do.
+
+    Relief and lenses that one λ does not describe scatter the votes by many times their standard deviations, and a few
+    scattered votes can always be divided somehow. Two lenses must therefore explain what pairs of both see far better
+    than one lens does, the more so the fewer pairs there are; and they must differ by enough to be seen in the result.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        One a picture; only their sizes are used.
+    votes : Votes
+    """
+    if not len(votes):
+        return None
+    count, gap = len(cameras), max(_LEAST_GAP, _LEAST_GAP_PX / min(camera.half_diagonal for camera in cameras))
+    divisions = [_divide(count, votes, *guess) for guess in _guesses(count, votes)]
+    divisions = [(second, lenses) for second, lenses in divisions if abs(lenses[1] - lenses[0]) >= gap]
+    if not divisions:
+        return None
+    second, lenses = min(divisions, key=lambda division: votes.missed(division[1][votes.which(division[0])]).sum())
+    seen = np.isin(np.arange(count), [votes.image1, votes.image2])
+    if 2 * second[seen].sum() > seen.sum():
+        second, lenses = ~second, lenses[::-1]
+    second &= seen  # of a picture without votes nothing is known that would tell it from most others
+    which = votes.which(second)
+    between = which[:, 0] != which[:, 1]
+    number, missed = int(between.sum()), votes.missed(lenses[which])
+    least = max(float(missed[between].sum()), max(_MEAN_MISS, float(missed.mean())) * number)
+    by_one = votes.missed(votes.fitted(np.zeros_like(which), lenses[:1]))[between].sum()
+    if not number or by_one < (_LEAST_GAIN + _GAIN_OF_FEW / number) * least:
+        return None
+    told = _margins(count, votes, second, lenses)[seen].min() >= _LEAST_MARGIN
+    return TwoLenses(second, (float(lenses[0]), float(lenses[1])), bool(told and not between.all()))
+
+
+def pictures_of_the_other(mixed: TwoLenses, pairs: Sequence[PairRegistration]) -> dict[int, str]:
+    """Pictures of the lens that took fewer, or has fewer matches, with why they are left out; none if in doubt."""
+    if not mixed.certain:
+        return {}
+    linked = [pair for pair in pairs if pair.relation]
+    sizes = []
+    for second in (False, True):
+        own = [pair for pair in linked if mixed.second[[pair.image1, pair.image2]].tolist() == [second] * 2]
+        members = {picture for pair in own for picture in (pair.image1, pair.image2)}
+        sizes.append((len(members), sum(int(pair.relation.inliers.sum()) for pair in own)))
+    kept = sizes[1] > sizes[0]
+    there, here = mixed.distortion[not kept], mixed.distortion[kept]
+    reason = (
+        f"comes from another lens or zoom setting (λ about {there:.3f}, that of the others {here:.3f}); "
+        "stitch those of each on their own"
+    )
+    return {int(k): reason for k in np.flatnonzero(mixed.second != kept)}
+
+
+def _guesses(count: int, votes: Votes) -> list[tuple[BoolArray, FloatArray]]:
+    """Divisions to start from: of the groups that the most telling votes hold together, those with the larger λ."""
+    difference, std = votes.differences
+    telling = np.argsort(std, kind="stable")
+    edges = (np.arange(1, len(votes) + 1), (votes.image1[telling], votes.image2[telling]))
+    tree = csgraph.minimum_spanning_tree(sparse.csr_array(edges, shape=(count, count)))
+    held = telling[tree.data.astype(np.intp) - 1]
+    alike = held[np.abs(difference[held]) < _DIFFERENT * std[held]]
+    group = np.empty(count, dtype=np.intp)
+    for number, pictures in enumerate(connected_components(count, votes.image1[alike], votes.image2[alike])):
+        group[pictures] = number
+    start = np.full(group.max() + 1, np.median(votes.distortion))
+    own = votes.fitted(group[np.stack([votes.image1, votes.image2], axis=1)], start)
+    levels = np.sort(own)
+    widest = np.argsort(levels[:-1] - levels[1:], kind="stable")[:_STARTS]
+    return [(own[group] > levels[cut], levels[[cut, cut + 1]]) for cut in widest]
+
+
+def _divide(count: int, votes: Votes, second: BoolArray, lenses: FloatArray) -> tuple[BoolArray, FloatArray]:
+    """Pictures and λ of two lenses, in turn, from a first guess of which pictures are of the second one."""
+    for _ in range(_ROUNDS):
+        lenses = votes.fitted(votes.which(second), lenses)
+        improved = _improved_division(count, votes, second, lenses)
+        if (improved == second).all():
+            break
+        second = improved
+    return second, lenses
+
+
+def _improved_division(count: int, votes: Votes, second: BoolArray, lenses: FloatArray) -> BoolArray:
+    """The division after moving those pictures to the other lens by which the votes gain most, some at a time."""
+    for _ in range(_MOVES):
+        margin = _margins(count, votes, second, lenses)
+        if margin.min() >= -1e-9:
+            break
+        second = second ^ (margin < min(0.5 * margin.min(), -1e-9))
+    return second
+
+
+def _margins(count: int, votes: Votes, second: BoolArray, lenses: FloatArray) -> FloatArray:
+    """By how much more the votes were missed if a picture came from the other lens, for each picture (N,)."""
+    which = votes.which(second)
+    missed = votes.missed(lenses[which])
+    return _per_picture(count, votes, *(votes.missed(lenses[which ^ other]) - missed for other in np.eye(2, dtype=int)))
+
+
+def _per_picture(count: int, votes: Votes, of_first: FloatArray, of_last: FloatArray) -> FloatArray:
+    """What the votes say of their first and second pictures, added up, shape (N,)."""
+    total: FloatArray = np.zeros(count)
+    np.add.at(total, votes.image1, of_first)
+    np.add.at(total, votes.image2, of_last)
+    return total

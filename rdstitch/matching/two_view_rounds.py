@@ -1,0 +1,234 @@
+"""Pairs of pictures through all rounds: matched once, estimated alone, then with what the others know."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+
+from rdstitch.arrays import FloatArray
+from rdstitch.cache import NO_CACHE, Cache
+from rdstitch.camera import Camera
+from rdstitch.features import Correspondences, Features, Matcher, match_near
+from rdstitch.matching.distortion_consensus import vote
+from rdstitch.matching.options import MatchingOptions, PairOptions
+from rdstitch.matching.static_background import most_rest, moving_features, show_motion
+from rdstitch.matching.two_view import PairRegistration, estimate_pairs, match_pairs
+from rdstitch.planar_motion import PlanarMotion
+from rdstitch.progress import Progress
+from rdstitch.radial_homography import RadialHomography
+
+Pair = tuple[int, int]
+Transfer = Callable[[int, int, FloatArray], FloatArray]
+
+_PRESCREEN_FEATURES = 1000  # strongest features of a picture, by which it is told whether a pair is worth a closer look
+_PROMISING = 8  # matches among these; pictures that share nothing have three to six by chance
+_WORTHWHILE = 0.05  # share of the matches that a picture has with the one most like it; less adds nothing
+_ENOUGH_MATCHES = 200  # of a picture with all others, from which on it needs no more
+_SEARCH_RADIUS = 3.0  # thresholds around the place where a match is expected
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """What it takes to register pairs.
+
+    Attributes
+    ----------
+    features : sequence of Features
+    cameras : sequence of Camera
+    matcher : callable
+    options : MatchingOptions
+    progress : callable
+    cache : Cache
+    tilts : sequence of (float, float), optional
+        (ψ, θ), radians, of each picture, where they are known exactly.
+    """
+
+    features: Sequence[Features]
+    cameras: Sequence[Camera]
+    matcher: Matcher
+    options: MatchingOptions
+    progress: Progress
+    cache: Cache = NO_CACHE
+    tilts: Sequence[tuple[float, float]] | None = None
+
+    def prescreen_pairs(self, pairs: Sequence[Pair]) -> dict[Pair, Correspondences]:
+        """The pairs that share something at a glance, and what; that costs a sixteenth of a closer look.
+
+        A pair that is passed over may overlap nevertheless, by little: the others then tell its place.
+        """
+        strongest = replace(
+            self, features=[found.take(np.arange(min(len(found), _PRESCREEN_FEATURES))) for found in self.features]
+        )
+        shared = dict(zip(pairs, strongest._match(pairs, "comparing pictures"), strict=True))
+        most = np.zeros(len(self.features), dtype=np.intp)
+        for pair, matches in shared.items():
+            most[[*pair]] = np.maximum(most[[*pair]], len(matches))
+        return {
+            pair: matches
+            for pair, matches in shared.items()
+            if len(matches) >= max(_PROMISING, _WORTHWHILE * most[[*pair]].min())
+        }
+
+    def estimate(
+        self,
+        pairs: Iterable[Pair],
+        distortion: float | None = None,
+        shared: Mapping[Pair, Correspondences] | None = None,
+    ) -> list[PairRegistration]:
+        """Match and estimate pairs (i, j), with λ free, or as the user or the other pairs say.
+
+        Where it is known what pictures share at a glance, only the parts in which they overlap are matched.
+        """
+        chosen = list(pairs)
+        if not chosen:
+            return []
+        known = self.options.pair.distortion
+        lens = distortion if known is None else known
+        found = self._relate(chosen, self._match(chosen, "matching", shared or {}), lens, "registering pairs")
+        return found if known is not None or distortion is None else [_without_vote(pair) for pair in found]
+
+    def remove_static_background(self, pairs: list[PairRegistration]) -> "tuple[Pairing, list[PairRegistration]]":
+        """Where most pairs seem to rest, the pairing and pairs of what moves; the same again where nothing does."""
+        threshold = self.options.pair.threshold
+        if not most_rest(pairs, threshold):
+            return self, pairs
+        moving = replace(self, features=moving_features(self.features, pairs, threshold))
+        again = moving.estimate([(pair.image1, pair.image2) for pair in pairs])
+        return (moving, again) if show_motion(again, len(self.features), threshold) else (self, pairs)
+
+    def retry_with_consensus_distortion(self, pairs: list[PairRegistration]) -> list[PairRegistration]:
+        """Estimate the pairs that failed again, with the λ that the others agree on."""
+        relations = [pair.relation for pair in pairs if pair.relation]
+        failed = [index for index, pair in enumerate(pairs) if not pair.relation]
+        if self.options.pair.distortion is not None or not failed or not relations:
+            return pairs
+        consensus = vote([r.distortion for r in relations], [r.distortion_std for r in relations])
+        if not np.isfinite(consensus.distortion):
+            return pairs
+        again = self._relate(
+            [(pairs[index].image1, pairs[index].image2) for index in failed],
+            [pairs[index].correspondences for index in failed],
+            consensus.distortion,
+            "retrying pairs",
+        )
+        rescued = list(pairs)
+        for index, pair in zip(failed, again, strict=True):
+            if pair.relation:
+                rescued[index] = _without_vote(pair)
+        return rescued
+
+    def guided_rematch(
+        self, pairs: list[PairRegistration], support: Mapping[Pair, int], transfer: Transfer
+    ) -> list[PairRegistration]:
+        """Match the pairs of weakly supported pictures again, only near where the alignment expects the matches.
+
+        Parameters
+        ----------
+        pairs : list of PairRegistration
+        support : mapping of (int, int) to int
+            Number of inliers of every pair that the alignment uses.
+        transfer : callable
+            Takes two pictures and points (N, 2) of the first, pixels, to points of the second, pixels.
+        """
+        held = np.zeros(len(self.features), dtype=np.intp)
+        for images, inliers in support.items():
+            held[[*images]] += inliers
+        weak = {images for images in support if held[[*images]].min() < _ENOUGH_MATCHES}
+        chosen = [index for index, pair in enumerate(pairs) if pair.relation and (pair.image1, pair.image2) in weak]
+        again = self._relate(
+            [(pairs[index].image1, pairs[index].image2) for index in chosen],
+            [self._near(pairs[index], transfer) for index in chosen],
+            self.options.pair.distortion,
+        )
+        stronger = list(pairs)
+        for index, pair in zip(chosen, again, strict=True):
+            if pair.relation and pair.relation.inliers.sum() > pairs[index].relation.inliers.sum():
+                stronger[index] = pair
+        return stronger
+
+    def _near(self, pair: PairRegistration, transfer: Transfer) -> Correspondences:
+        """Matches of a pair near the places where the alignment expects them."""
+        features1, features2 = self.features[pair.image1], self.features[pair.image2]
+        return match_near(
+            features1,
+            features2,
+            transfer(pair.image1, pair.image2, features1.points),
+            _SEARCH_RADIUS * self.options.pair.threshold,
+            pair.correspondences.indices[pair.relation.inliers],
+            self.options.ratio,
+        )
+
+    def _match(
+        self, pairs: Sequence[Pair], stage: str, shared: Mapping[Pair, Correspondences] | None = None
+    ) -> list[Correspondences]:
+        """Matches of every pair, from an earlier run where the cache has them."""
+        # What a network finds depends on all that it is shown.
+        network = self.options.lightglue_model is not None
+        glimpses = [None if shared is None or network else shared.get(pair) for pair in pairs]
+
+        def recall(index: int, compute: Callable[[], Correspondences]) -> Correspondences:
+            (i, j), glimpse = pairs[index], glimpses[index]
+            told = None if glimpse is None else self.cache.digest(glimpse)
+            inputs = (self._digests[i], self._digests[j], self._matching, told)
+            return self.cache.recall("matches", (Correspondences,), inputs, compute)
+
+        # A network is no function: only one thread may use it.
+        workers = 1 if network else self.options.workers
+        return match_pairs(
+            self.features,
+            pairs,
+            self.matcher,
+            glimpses=glimpses,
+            progress=partial(self.progress, stage),
+            recall=recall,
+            workers=workers,
+        )
+
+    def _relate(
+        self,
+        pairs: Sequence[Pair],
+        matched: Sequence[Correspondences],
+        distortion: float | None,
+        stage: str | None = None,
+    ) -> list[PairRegistration]:
+        """The relation of every pair, from an earlier run where the cache has it."""
+        options = self._pair_options(distortion)
+
+        def recall(index: int, compute: Callable[[], RadialHomography]) -> RadialHomography:
+            i, j = pairs[index]
+            inputs = (self.cameras[i], self.cameras[j], self.cache.digest(matched[index]), options, *self._tilts(i, j))
+            return self.cache.recall("pairs", (RadialHomography, Camera, PlanarMotion), inputs, compute)
+
+        return estimate_pairs(
+            self.cameras,
+            pairs,
+            matched,
+            options,
+            tilts=self.tilts,
+            progress=None if stage is None else partial(self.progress, stage),
+            recall=recall,
+        )
+
+    @cached_property
+    def _digests(self) -> list[str]:
+        """What stands for the features of each picture."""
+        return [self.cache.digest(found) for found in self.features]
+
+    @cached_property
+    def _matching(self) -> tuple[float | str | None, ...]:
+        """What stands for the way of matching."""
+        model = self.options.lightglue_model
+        return self.options.ratio, None if model is None else self.cache.file(model)
+
+    def _tilts(self, *pictures: int) -> list[tuple[float, float] | None]:
+        return [None if self.tilts is None else self.tilts[picture] for picture in pictures]
+
+    def _pair_options(self, distortion: float | None) -> PairOptions:
+        pair = self.options.pair
+        return replace(pair, solver=pair.solver if distortion is None else "auto", distortion=distortion)
+
+
+def _without_vote(pair: PairRegistration) -> PairRegistration:
+    """A pair whose λ was given by the others says nothing about λ."""
+    return replace(pair, relation=replace(pair.relation, distortion_std=np.inf))

@@ -1,0 +1,92 @@
+"""Options of the recipes: the same names and defaults as on the command line."""
+
+import math
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rdstitch.alignment import MODELS
+from rdstitch.camera import Camera
+from rdstitch.compositing import CompositeOptions
+from rdstitch.errors import ArgumentError
+from rdstitch.features import FeatureOptions
+from rdstitch.matching.options import MatchingOptions, PairOptions
+from rdstitch.robust import SOLVERS
+
+
+@dataclass(frozen=True)
+class StitchOptions:
+    """How pictures are registered and composited.
+
+    Raises
+    ------
+    ArgumentError
+        When a value is out of range, unknown, or contradicts another one.
+    """
+
+    features: FeatureOptions = field(default_factory=FeatureOptions)
+    ratio: float | None = None  # largest ratio of distances of a match; None: what suits the features
+    lightglue_model: str | Path | None = None  # ONNX file of a network that matches the features instead
+    solver: str = "auto"  # minimal solver of the pairs, one of rdstitch.robust.SOLVERS
+    model: str = "auto"  # motion model of the whole, one of rdstitch.alignment.MODELS
+    threshold: float = 3.0  # px, largest transfer error of an inlier
+    confidence: float = 0.999  # probability that no better model of a pair was missed
+    max_iterations: int = 10000  # samples per pair
+    camera: Camera | None = None  # known camera: its λ is kept, its focal length trusted
+    distortion: float | None = None  # known λ, half-diagonal frame; kept
+    focal: float | None = None  # known focal length, px
+    tilt: tuple[float, float] | None = None  # known tilt (psi, theta) of all pictures, radians
+    attitude: str | Path | None = None  # measured tilt of each picture: CSV of name, psi, theta, degrees; or "xmp"
+    attitude_std: float = math.radians(1.0)  # its standard deviation, radians; 0: exact
+    mask: str | Path | None = None  # picture, or folder of them, that is dark where the pictures do not count
+    reference: str | None = None  # name of the picture whose frame is kept; None: the best connected
+    composite: CompositeOptions = field(default_factory=CompositeOptions)
+    cache: Path | None = None  # folder of results of earlier runs, to continue from; made if missing
+    seed: int = 0
+    workers: int = 0  # pictures and pairs worked on at the same time; 0: as many as there are cores
+    overwrite: bool = False  # replace existing outputs
+    strict: bool = False  # fail when a picture is left out
+    force: bool = False  # write the picture even when the result failed its checks
+    save_camera: Path | None = None  # camera file to write; see rdstitch.camera_files for formats
+    dry_run: bool = False  # register, and plan the compositing; write nothing
+
+    def __post_init__(self) -> None:
+        """Check ranges and contradictions."""
+        if self.solver not in SOLVERS:
+            raise ArgumentError(f"unknown solver {self.solver!r}; choose one of {', '.join(SOLVERS)}")
+        if self.model not in ("auto", *MODELS):
+            raise ArgumentError(f"unknown model {self.model!r}; choose one of auto, {', '.join(MODELS)}")
+        if self.solver == "two_point" and self.tilt is None and (self.attitude is None or self.attitude_std > 0.0):
+            raise ArgumentError("the two_point solver needs the tilt, or exact attitudes")
+        if self.solver != "auto" and self.known_distortion is not None:
+            raise ArgumentError("with a known λ there is no solver to choose")
+        if self.distortion is not None and not -1.0 < self.distortion < 1.0:
+            raise ArgumentError(f"λ must lie between -1 and 1, not {self.distortion}")
+        if self.focal is not None and not 0.0 < self.focal < float("inf"):
+            raise ArgumentError(f"the focal length must be positive, not {self.focal}")
+        if not 0.0 <= self.attitude_std < float("inf"):
+            raise ArgumentError(f"the standard deviation of attitudes must not be negative, not {self.attitude_std}")
+        if not self.threshold > 0.0 or not 0.0 < self.confidence < 1.0 or self.max_iterations < 1:
+            raise ArgumentError("threshold and max_iterations must be positive, confidence between 0 and 1")
+        if self.workers < 0 or self.seed < 0:
+            raise ArgumentError("workers and seed must not be negative")
+
+    @property
+    def known_distortion(self) -> float | None:
+        """λ where the user gave it, alone or with the camera."""
+        if self.distortion is not None or self.camera is None:
+            return self.distortion
+        return self.camera.distortion
+
+    @property
+    def matching(self) -> MatchingOptions:
+        """What concerns matching and the estimation of pairs."""
+        pair = PairOptions(
+            self.solver, self.known_distortion, self.threshold, self.confidence, self.max_iterations, self.seed
+        )
+        return MatchingOptions(pair, self.ratio, self.lightglue_model, self.threads)
+
+    @property
+    def threads(self) -> int:
+        """Number of pictures or pairs to work on at the same time."""
+        return self.workers or os.cpu_count() or 1

@@ -1,0 +1,213 @@
+"""Recomposing from a saved registration: other bands of the same flight, other sizes, other compositing options."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Literal
+
+import numpy as np
+
+from rdstitch.camera import Camera
+from rdstitch.compositing import CompositeOptions
+from rdstitch.errors import ArgumentError, InputError, OutputError, PartialResultError
+from rdstitch.inputs.find import find_pictures
+from rdstitch.inputs.masks import with_masks
+from rdstitch.inputs.source import LeftOut, Source, read_sources
+from rdstitch.io.atomic import check_output, write_json_atomic
+from rdstitch.io.decoding import check_readable
+from rdstitch.options import StitchOptions
+from rdstitch.pipeline.compose import compose_pictures
+from rdstitch.pipeline.recomposition import Recomposition, applied_sidecar
+from rdstitch.progress import Progress, silent
+from rdstitch.sidecar.read import SavedRegistration, read_sidecar
+
+Match = Literal["auto", "name", "order"]
+_MATCHES = ("auto", "name", "order")
+
+
+def apply(
+    sidecar: str | Path,
+    images: Iterable[str | Path],
+    output: str | Path | None = None,
+    composite: CompositeOptions | None = None,
+    *,
+    match: Match = "auto",
+    mask: str | Path | None = None,
+    every: int = 1,
+    workers: int = 0,
+    overwrite: bool = False,
+    strict: bool = False,
+    dry_run: bool = False,
+    progress: Progress = silent,
+) -> Recomposition:
+    """Compose pictures by a registration that was found before; nothing is estimated.
+
+    Parameters
+    ----------
+    sidecar : path
+        What :func:`rdstitch.pano` or :func:`rdstitch.mosaic` wrote beside its picture.
+    images : iterable of path
+        The same pictures, or others that were taken by the same lens from the same places: other bands, other sizes of
+        the same shape, masks. Folders, files, patterns, ``@list`` files or videos.
+    output : path, optional
+        Picture to write, with a sidecar of its own beside it; without it the picture is in the result.
+    composite : CompositeOptions, optional
+        Without it, those that the sidecar tells.
+    match : str
+        Which picture takes whose place. "name": the one of the same file name, or of the same name before the suffix.
+        "order": the one at the same position of equally many. "auto": by name, or by order where no name is the same.
+    mask : path, optional
+        Picture, or folder of them, that is dark where the pictures do not count.
+    every : int
+        Use every n-th video frame.
+    workers : int
+        Pictures worked on at the same time; 0: as many as there are cores.
+    overwrite : bool
+        Replace existing outputs.
+    strict : bool
+        Fail when a picture that the registration used is missing or cannot be read.
+    dry_run : bool
+        Only plan; nothing is written.
+    progress : callable
+
+    Raises
+    ------
+    InputError
+        When the sidecar is none, or the pictures do not fit to it.
+    RdstitchError
+        See the tree in :mod:`rdstitch.errors`.
+    """
+    if match not in _MATCHES:
+        raise ArgumentError(f"unknown way to match {match!r}; choose one of {', '.join(_MATCHES)}")
+    threads = StitchOptions(workers=workers).threads
+    saved = read_sidecar(sidecar)
+    options = composite or saved.composite
+    with TemporaryDirectory(prefix="rdstitch-") as folder:
+        exclude = [] if output is None else [output]
+        paths = find_pictures(images, exclude=exclude, frames_folder=Path(folder), every=every)
+        if output is not None:
+            _check_outputs(Path(output), overwrite, paths, saved.path)
+        chosen, matched = _match(saved, paths, match)
+        sources, left_out = _sources(saved, chosen)
+        if strict and left_out:
+            raise PartialResultError("; ".join(f"left out {item.path}: {item.reason}" for item in left_out.values()))
+        used = {index: source for index, source in enumerate(sources) if source is not None}
+        if not used:
+            first = next(iter(left_out.values()))
+            raise InputError(f"{saved.path}: none of its pictures can be used; {first.path}: {first.reason}")
+        used = dict(zip(used, with_masks(list(used.values()), mask), strict=True))
+        composed = compose_pictures(
+            list(used.values()),
+            [source.camera for source in used.values()],
+            np.array([saved.pictures[index].to_plane for index in used]),
+            list(used).index(saved.reference) if saved.reference in used else None,
+            output,
+            options,
+            threads,
+            progress,
+            overwrite=overwrite,
+            dry_run=dry_run,
+        )
+        result = Recomposition(
+            saved,
+            tuple(sources),
+            matched,
+            left_out,
+            composed.canvas,
+            options,
+            None if output is None else Path(output),
+            composed.composite,
+            composed.plan,
+            composed.notes,
+        )
+        if output is not None and not dry_run:
+            write_json_atomic(f"{output}.json", applied_sidecar(result))
+        return result
+
+
+def _check_outputs(output: Path, overwrite: bool, inputs: Sequence[Path], sidecar: Path) -> None:
+    """Find out before long work whether the picture and its sidecar can be written."""
+    beside = Path(f"{output}.json")
+    if beside.exists() and beside.samefile(sidecar):
+        raise OutputError(f"{output}: its sidecar is the one that is applied; choose another name")
+    check_output(output, overwrite, inputs)
+    check_output(beside, overwrite, inputs, suffixes=())
+
+
+def _match(saved: SavedRegistration, paths: Sequence[Path], match: Match) -> tuple[list[Path | None], str]:
+    """For each picture of the registration the file that takes its place, and by what it was found."""
+    if match != "order":
+        for key in (_full_name, _stem):
+            chosen = _by_name(saved, paths, key)
+            if any(path is not None for path in chosen):
+                return chosen, "name"
+    if match == "name":
+        wanted = next(picture.name for picture in saved.pictures if picture.to_plane is not None)
+        raise InputError(f"{saved.path}: none of the given pictures has a name that is in it, such as {wanted}")
+    return list(_by_order(saved, paths)), "order"
+
+
+def _full_name(path: Path) -> str:
+    return path.name
+
+
+def _stem(path: Path) -> str:
+    return path.stem
+
+
+def _by_name(saved: SavedRegistration, paths: Sequence[Path], key: Callable[[Path], str]) -> list[Path | None]:
+    files = {key(path): path for path in paths}
+    given = Counter(map(key, paths))
+    names = [None if picture.to_plane is None else key(Path(picture.name)) for picture in saved.pictures]
+    for name, count in Counter(names).items():
+        if name is not None and name in files and (count > 1 or given[name] > 1):
+            raise InputError(f"{saved.path}: several pictures are called {name}; give all in the old order and say so")
+    return [None if name is None else files.get(name) for name in names]
+
+
+def _by_order(saved: SavedRegistration, paths: Sequence[Path]) -> Sequence[Path]:
+    if any(picture.camera is None for picture in saved.pictures):
+        raise InputError(
+            f"{saved.path}: has pictures that could not be read, so that the order is lost; give pictures of the same "
+            "names"
+        )
+    if len(paths) != len(saved.pictures):
+        for path in paths:
+            check_readable(path)
+        raise InputError(
+            f"{saved.path}: has {len(saved.pictures)} pictures, but {len(paths)} others were given; give pictures of "
+            "the same names, or equally many"
+        )
+    return paths
+
+
+def _sources(saved: SavedRegistration, chosen: Sequence[Path | None]) -> tuple[list[Source | None], dict[int, LeftOut]]:
+    """The pictures with their cameras, and why which of those used then is not among them."""
+    sources: list[Source | None] = []
+    left_out: dict[int, LeftOut] = {}
+    for index, (picture, path) in enumerate(zip(saved.pictures, chosen, strict=True)):
+        sources.append(None)
+        if picture.camera is None or picture.to_plane is None:
+            continue
+        if path is None:
+            left_out[index] = LeftOut(Path(picture.path), "is not among the given pictures")
+            continue
+        found, unread = read_sources([path], camera=None, focal=None, distortion=None, skip_bad=True)
+        if unread:
+            left_out[index] = unread[0]
+        else:
+            sources[-1] = replace(found[0], camera=_resized(picture.camera, found[0]))
+    return sources, left_out
+
+
+def _resized(camera: Camera, source: Source) -> Camera:
+    """The registered camera for a picture that shows the same at perhaps another size."""
+    (w1, h1), (w2, h2) = camera.image_size, source.metadata.size
+    # Sizes are whole px, so that the shape may differ by one px of the picture.
+    if abs(w1 * h2 - h1 * w2) > max(w1, h1):
+        raise InputError(
+            f"{source.path}: has {w2} x {h2} px, which is not the shape of the {w1} x {h1} px that were registered"
+        )
+    return camera.resized((w2, h2))

@@ -1,0 +1,130 @@
+"""The last stage of every picture: from registered pictures to pixels, in memory or in a file."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rdstitch.camera import Camera
+from rdstitch.compositing import (
+    Canvas,
+    Composite,
+    CompositeOptions,
+    CompositePlan,
+    compose,
+    compose_to_file,
+    plan_canvas,
+    plan_composite,
+)
+from rdstitch.export.georeference import Georeference, georeference, has_place, world_file_paths
+from rdstitch.inputs.source import Source, readers
+from rdstitch.io.atomic import check_output
+from rdstitch.io.tiff import ExtraTag
+from rdstitch.io.write import check_size
+from rdstitch.pipeline.memory import release_free_heap
+from rdstitch.progress import Progress
+
+# Reduction of a picture of which only the kind of its samples is wanted.
+_SMALLEST = 8
+
+
+@dataclass(frozen=True)
+class Composed:
+    """Pictures put together, or the plan of doing so.
+
+    Attributes
+    ----------
+    canvas : Canvas
+        Where the pictures lie in the output.
+    composite : Composite or None
+        The picture; None where it went to a file, or was only planned.
+    plan : CompositePlan or None
+        Of a dry run.
+    notes : tuple of str
+        What the user should know, such as why nothing was cropped.
+    """
+
+    canvas: Canvas
+    composite: Composite | None = None
+    plan: CompositePlan | None = None
+    notes: tuple[str, ...] = ()
+
+
+def compose_pictures(
+    sources: Sequence[Source],
+    cameras: Sequence[Camera],
+    homographies: ArrayLike,
+    reference: int | None,
+    output: str | Path | None,
+    options: CompositeOptions,
+    threads: int,
+    progress: Progress,
+    *,
+    overwrite: bool,
+    dry_run: bool = False,
+) -> Composed:
+    """Plan the canvas, see whether a file can hold it, and put the pictures on it.
+
+    Parameters
+    ----------
+    sources, cameras : sequence
+        Of the pictures that are used.
+    homographies : array_like of shape (N, 3, 3)
+        Normalized undistorted coordinates of each picture to the plane.
+    reference : int or None
+        Picture whose resolution the output has; None for the median one's.
+    output : path or None
+        File that the picture is written to, a strip at a time, with colour profile and EXIF of the first picture, and
+        with its place on the Earth where three pictures have a GPS position; without it the picture is made in memory.
+    options : CompositeOptions
+    threads : int
+    progress : callable
+    overwrite : bool
+        Replace an existing world file.
+    dry_run : bool
+        Only plan.
+
+    Raises
+    ------
+    OutputError
+        When a file beside the output exists already.
+    """
+    release_free_heap()
+    positions = [source.metadata.gps for source in sources]
+    beside = world_file_paths(output) if output is not None and has_place(positions) else ()
+    for file in beside:
+        check_output(file, overwrite, suffixes=())
+    names = [source.name for source in sources]
+    canvas = plan_canvas(
+        cameras, homographies, scale=options.scale, rotate=options.rotate, reference=reference, names=names
+    )
+    # A crop may yet make it fit.
+    if output is not None and options.crop == "none":
+        check_size(output, canvas.size)
+    options = replace(options, workers=threads)
+    read = readers(sources)
+    if dry_run:
+        pixels = read[0](_SMALLEST).pixels
+        channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+        return Composed(canvas, plan=plan_composite(cameras, canvas, options, channels, pixels.dtype.itemsize))
+
+    def told(share: float) -> None:
+        progress("compositing", round(100 * share), 100)
+
+    if output is None:
+        composite = compose(read, cameras, homographies, canvas, options, told, read)
+        return Composed(composite.canvas, composite, notes=composite.notes)
+    matrices = np.asarray(homographies, dtype=np.float64)
+    placed: list[tuple[Georeference | None, str]] = []
+
+    def tags(final: Canvas) -> list[ExtraTag]:
+        placed.append(georeference(positions, cameras, final.matrix @ matrices))
+        return placed[0][0].tiff_tags() if placed[0][0] is not None else []
+
+    written = compose_to_file(output, read, cameras, matrices, canvas, options, sources[0].metadata, told, tags, read)
+    place, note = placed[0]
+    if place is not None and beside:
+        place.write_beside(output)
+    return Composed(written.canvas, notes=(*written.notes, *([note] if note else [])))

@@ -1,0 +1,1 @@
+"""The sidecar: everything estimated, as JSON beside the picture."""

@@ -1,0 +1,147 @@
+"""Reading a sidecar: a registration that was found before, checked field by field."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import FOCAL_LOG_STD, Camera
+from rdstitch.compositing import CompositeOptions
+from rdstitch.errors import ArgumentError
+from rdstitch.records import Record, read_json
+from rdstitch.sidecar.write import VERSION
+
+
+@dataclass(frozen=True)
+class SavedPicture:
+    """One picture of a saved registration.
+
+    Attributes
+    ----------
+    name, path : str
+        As they were then.
+    camera : Camera or None
+        With everything that was estimated; None where the picture could not be read.
+    to_plane : ndarray of shape (3, 3), or None
+        From undistorted coordinates, in half diagonals from the distortion centre, to the plane; None where the picture
+        was left out.
+    reason : str
+        Why it was left out; empty where it was used.
+    """
+
+    name: str
+    path: str
+    camera: Camera | None
+    to_plane: FloatArray | None
+    reason: str
+
+
+@dataclass(frozen=True)
+class SavedRegistration:
+    """A registration as its sidecar tells it.
+
+    Attributes
+    ----------
+    path : Path
+        Of the sidecar.
+    pictures : tuple of SavedPicture
+    reference : int
+        The picture whose resolution the output has.
+    distortion : float
+        λ in the half-diagonal frame.
+    composite : CompositeOptions
+        What the picture was composited with.
+    content : dict
+        The whole sidecar.
+    """
+
+    path: Path
+    pictures: tuple[SavedPicture, ...]
+    reference: int
+    distortion: float
+    composite: CompositeOptions
+    content: dict[str, Any]
+
+
+def read_sidecar(path: str | Path) -> SavedRegistration:
+    """Read a sidecar; fields that recomposing does not need are kept but not looked into.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, is no sidecar, or a field is not what it should be; the text names both.
+    """
+    record = read_json(path)
+    if (kind := record["format"]).value != "rdstitch sidecar":
+        kind.expected('"rdstitch sidecar"')
+    if (version := record["version"]).value != VERSION:
+        version.fail(f"this rdstitch reads version {VERSION} of sidecars, not {version.value}")
+    record["verdict"].fields()
+    pictures = tuple(_picture(item) for item in record["images"].items())
+    return SavedRegistration(
+        Path(path),
+        pictures,
+        _reference(record["reference"], pictures),
+        record["lambda"].number(),
+        _composite_options(record["options"]["composite"]),
+        record.value,
+    )
+
+
+def _picture(record: Record) -> SavedPicture:
+    name, path, used = record["name"].text(), record["path"].text(), record["used"].flag()
+    camera = None if record.get("size") is None else _camera(record)
+    if used and camera is None:
+        record["size"].expected("width and height of a picture that was used")
+    to_plane = record["to_plane"].matrix() if used else None
+    return SavedPicture(name, path, camera, to_plane, record["reason"].text())
+
+
+def _camera(record: Record) -> Camera:
+    focal, source = record.get("focal_px"), record.get("focal_source")
+    try:
+        return Camera(
+            record["size"].size(),
+            record["lambda"].number(),
+            record["lambda2"].number(),
+            record["center_px"].pair(),
+            None if focal is None else focal.number(),
+            None if source is None else source.choice(FOCAL_LOG_STD),
+        )
+    except ArgumentError as error:
+        record.fail(str(error))
+
+
+def _reference(record: Record, pictures: Sequence[SavedPicture]) -> int:
+    name = record.text()
+    found = [index for index, picture in enumerate(pictures) if picture.name == name and picture.to_plane is not None]
+    if not found:
+        record.fail(f"there is no used picture {name!r}")
+    return found[0]
+
+
+def _composite_options(record: Record) -> CompositeOptions:
+    """The compositing options; what this version does not know is refused, what it added has its default."""
+    hints, known = get_type_hints(CompositeOptions), {option.name for option in fields(CompositeOptions)}
+    given = {}
+    for name, value in record.fields().items():
+        if name not in known:
+            value.fail("this rdstitch has no such option")
+        given[name] = _option(value, hints[name])
+    try:
+        return CompositeOptions(**given)
+    except ArgumentError as error:
+        record.fail(str(error))
+
+
+def _option(record: Record, hint: Any) -> Any:
+    """A value of the type that an option has."""
+    kinds = get_args(hint) or (hint,)
+    if record.value is None and type(None) in kinds:
+        return None
+    if bool in kinds:
+        return record.flag()
+    if float in kinds:
+        return record.number()
+    return record.integer() if int in kinds else record.text()

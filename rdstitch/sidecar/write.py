@@ -1,0 +1,164 @@
+"""The sidecar: everything that was estimated, as JSON beside the picture."""
+
+import dataclasses
+import math
+import platform
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rdstitch.camera import Camera
+from rdstitch.stitch_result import StitchResult
+
+VERSION = 1
+
+
+def sidecar(result: StitchResult) -> dict[str, Any]:
+    """The sidecar's content; every number that does not exist is null.
+
+    ``lambda`` is for half the image diagonal. ``images[].to_plane`` maps undistorted, half-diagonal-normalized
+    coordinates of a picture to the plane, ``output.plane_to_output`` those to px of the output, ``images[].to_output``
+    is the product; ``pairs[].homography`` maps coordinates of the first picture to those of the second. All fields are
+    described in docs/sidecar.md.
+    """
+    registration, alignment = result.registration, result.registration.alignment
+    camera = registration.camera
+    content = {
+        "format": "rdstitch sidecar",
+        "version": VERSION,
+        "lambda": alignment.distortion,
+        "lambda_std": alignment.distortion_std,
+        "lambda_px": camera.distortion_px,
+        "lambda_focal": camera.distortion_focal,
+        "lambda_known": alignment.distortion_std == 0.0,
+        "camera": camera.as_dict(),
+        "tilt_deg": None if alignment.tilt is None else np.degrees(alignment.tilt),
+        "focal_px": camera.focal,
+        "focal_source": camera.focal_source,
+        "model": alignment.model,
+        "model_reason": alignment.model_reason,
+        "rms_px": alignment.rms,
+        "reference": registration.sources[alignment.reference].name,
+        "output": {
+            "file": None if result.output is None else result.output.name,
+            "size": result.canvas.size,
+            "plane_to_output": result.canvas.matrix,
+        },
+        "images": _images(result),
+        "pairs": _pairs(result),
+        "verdict": {
+            "ok": result.verdict.ok,
+            "failures": result.verdict.failures,
+            "warnings": result.warnings,
+            "relief": alignment.relief,
+        },
+        "options": result.options,
+        "seed": result.options.seed,
+        "versions": versions(),
+    }
+    return {key: plain(value) for key, value in content.items()}
+
+
+def _images(result: StitchResult) -> list[dict[str, Any]]:
+    registration, alignment = result.registration, result.registration.alignment
+    reasons = {missing.path: missing.reason for missing in registration.left_out}
+    entries = []
+    for index, source in enumerate(registration.sources):
+        used, poses = bool(alignment.used[index]), alignment.poses
+        entry: dict[str, Any] = {
+            "name": source.name,
+            "path": str(source.path),
+            "size": source.camera.image_size,
+            "used": used,
+            "reason": reasons.pop(source.path, ""),
+            "features": registration.keypoints[index],
+            **lens_fields(alignment.cameras[index]),
+            "to_plane": alignment.homographies[index] if used else None,
+            "to_output": result.canvas.matrix @ alignment.homographies[index] if used else None,
+            "pose": None,
+        }
+        if used and poses is not None:
+            entry["pose"] = {
+                "x": poses.position[index, 0],
+                "y": poses.position[index, 1],
+                "height": poses.height[index],
+                "yaw_deg": np.degrees(poses.yaw[index]),
+                "tilt_deg": np.degrees(poses.tilt[index]),
+            }
+        entries.append(entry)
+    unread = [
+        {"name": path.name, "path": str(path), "size": None, "used": False, "reason": reason, "pose": None}
+        for path, reason in reasons.items()
+    ]
+    return entries + unread
+
+
+def lens_fields(camera: Camera) -> dict[str, Any]:
+    """What of a picture's camera depends on the size of the picture, and λ with it."""
+    return {
+        "center_px": camera.center,
+        "lambda": camera.distortion,
+        "lambda2": camera.distortion2,
+        "focal_px": camera.focal,
+        "focal_source": camera.focal_source,
+    }
+
+
+def _pairs(result: StitchResult) -> list[dict[str, Any]]:
+    registration = result.registration
+    fits = {(fit.image1, fit.image2): fit for fit in registration.alignment.links}
+    names = [source.name for source in registration.sources]
+    entries = []
+    for pair in registration.pairs:
+        relation, fit = pair.relation, fits.get((pair.image1, pair.image2))
+        entries.append(
+            {
+                "images": [names[pair.image1], names[pair.image2]],
+                "matches": len(pair.correspondences),
+                "inliers": int(relation.inliers.sum()),
+                "rms_px": relation.rms,
+                "lambda": relation.distortion,
+                "lambda_std": relation.distortion_std if relation.ok else None,
+                "model": relation.model or None,
+                "homography": relation.homography if relation.ok else None,
+                "solver": relation.solver or None,
+                "iterations": relation.iterations,
+                "ok": relation.ok,
+                "reason": relation.reason,
+                "used": fit is not None and fit.used,
+                "dropped": fit.reason if fit is not None else "",
+                "inliers_of_whole": fit.inliers if fit is not None else None,
+                "rms_of_whole_px": fit.rms if fit is not None else None,
+            }
+        )
+    return entries
+
+
+def versions() -> dict[str, str]:
+    """Versions of what has a say in the result."""
+    return {
+        "rdstitch": version("rdstitch"),
+        "numpy": version("numpy"),
+        "scipy": version("scipy"),
+        "opencv": version("opencv-contrib-python-headless"),
+        "python": platform.python_version(),
+    }
+
+
+def plain(value: Any) -> Any:
+    """Plain JSON values: arrays to lists, dataclasses to objects, paths to text, what is not finite to null."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {item.name: plain(getattr(value, item.name)) for item in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, (np.ndarray, np.generic)):
+        return plain(value.tolist())
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

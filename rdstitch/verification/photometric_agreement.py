@@ -1,0 +1,150 @@
+"""Do two pictures show the same where they overlap? Asked of the pixels, not of the features that registered them.
+
+One picture is resampled as the other's lens would have seen it. In each small cell of the overlap that has texture,
+the place where the two correlate best is searched around where the registration says it is. Where the registration is
+right nearly all cells find it there; elsewhere they find it anywhere.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
+from rdstitch.compositing.boxes import Box
+from rdstitch.compositing.lattice import Lattice
+from rdstitch.io.read import Picture
+from rdstitch.radial_homography import from_plane, to_plane
+
+Grey = NDArray[np.float32]
+
+COMPARED_SIDE = 512  # px of the longer side of the pictures that are compared
+_CELL = 24  # px
+_REACH = 8  # px
+_LEAST_TEXTURE = 0.012  # standard deviation in a cell, of full range
+_ALIKE = 0.5  # correlation from which on two cells show the same
+_SLACK = 2.5  # px
+_MOST_CELLS = 120
+_OPAQUE = 250
+_LATTICE = 8  # px between the places that are computed; those between are interpolated
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What the cells of an overlap say.
+
+    Attributes
+    ----------
+    cells : int
+        Cells with texture in both pictures.
+    confirming : int
+        Cells that correlate best, and well, where the registration says.
+    contradicting : int
+        Cells that correlate well, but elsewhere.
+    """
+
+    cells: int
+    confirming: int
+    contradicting: int
+
+    @property
+    def share(self) -> float:
+        """Share of the cells that confirm the registration; 1 without cells."""
+        return self.confirming / self.cells if self.cells else 1.0
+
+
+@dataclass(frozen=True)
+class PlacedPicture:
+    """A registered picture as it is compared.
+
+    Attributes
+    ----------
+    grey : ndarray of shape (h, w), float32
+        In [0, 1], small; NaN where transparent.
+    camera : Camera
+        Of the size of ``grey``.
+    homography : ndarray of shape (3, 3)
+        From undistorted normalized coordinates to the plane.
+    """
+
+    grey: Grey
+    camera: Camera
+    homography: FloatArray
+
+    @classmethod
+    def of(cls, picture: Picture, camera: Camera, homography: FloatArray) -> Self:
+        """A picture with its camera and its place, made small."""
+        grey = _reduced_grey(picture)
+        return cls(grey, camera.resized((grey.shape[1], grey.shape[0])), homography)
+
+    def sampled(self, plane: Callable[[FloatArray], FloatArray], box: Box) -> Grey:
+        """The picture where ``plane`` (M, 2) to (M, 2) puts the px x, y of a box on the plane; NaN where it is not."""
+
+        def places(x: FloatArray, y: FloatArray) -> FloatArray:
+            grid = np.stack(np.broadcast_arrays(x, y), axis=-1)
+            return from_plane(self.camera, self.homography, plane(grid.reshape(-1, 2))).reshape(grid.shape)
+
+        x, y = Lattice.over(box, _LATTICE, places).maps(box)
+        found = cv2.remap(
+            self.grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(float("nan"),)
+        )
+        return np.asarray(found, dtype=np.float32)
+
+
+def _reduced_grey(picture: Picture) -> Grey:
+    pixels = picture.pixels
+    full = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else max(float(pixels.max()), 1e-12)
+    height, width = pixels.shape[:2]
+    factor = min(1.0, COMPARED_SIDE / max(height, width))
+    size = max(1, round(width * factor)), max(1, round(height * factor))
+    small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.float32) / np.float32(full)
+    grey: Grey = small if small.ndim == 2 else small.mean(axis=2, dtype=np.float32)
+    if picture.alpha is not None:
+        grey[cv2.resize(picture.alpha, size, interpolation=cv2.INTER_AREA) < _OPAQUE] = np.nan
+    return grey
+
+
+def overlap_agreement(first: PlacedPicture, second: PlacedPicture) -> Agreement:
+    """Compare two registered pictures where they overlap."""
+    height, width = second.grey.shape
+    # The first picture as the second one's lens would have seen it.
+    seen = first.sampled(partial(to_plane, second.camera, second.homography), (0, 0, width, height))
+    margin = _CELL // 2 + _REACH
+    rows, columns = (np.arange(margin, n - margin + 1, _CELL) for n in (height, width))
+    corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2) - _CELL // 2
+    textured = corners[_have_texture(_cells(seen, corners))]
+    looked_at = textured[:: max(1, -(-len(textured) // _MOST_CELLS))]
+    windows = _cells(second.grey, looked_at, _REACH)
+    inner = windows[:, _REACH:-_REACH, _REACH:-_REACH]
+    known = np.isfinite(windows).all(axis=(1, 2)) & _have_texture(inner)
+    votes = [_vote(cell, window) for cell, window in zip(_cells(seen, looked_at[known]), windows[known], strict=True)]
+    return Agreement(len(votes), votes.count(1), votes.count(-1))
+
+
+def _cells(picture: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:
+    """Cells (N, side, side) with these top-left px (N, 2), row and column, and so much around them."""
+    side = _CELL + 2 * margin
+    if not len(corners):
+        return np.zeros((0, side, side), dtype=np.float32)
+    top, left = (corners - margin).T
+    cells: Grey = np.lib.stride_tricks.sliding_window_view(picture, (side, side))[top, left]
+    return cells
+
+
+def _have_texture(cells: Grey) -> NDArray[np.bool_]:
+    """Which cells (N, h, w) can be told from others; not those with transparent px, whose deviation is NaN."""
+    return np.asarray(cells.std(axis=(1, 2)) > _LEAST_TEXTURE)
+
+
+def _vote(cell: Grey, window: Grey) -> int:
+    """1 for, -1 against, 0 neither."""
+    scores = np.asarray(cv2.matchTemplate(window, cell, cv2.TM_CCOEFF_NORMED))
+    row, column = np.unravel_index(int(scores.argmax()), scores.shape)
+    if scores[row, column] < _ALIKE:
+        return 0
+    return 1 if np.hypot(row - _REACH, column - _REACH) <= _SLACK else -1
