@@ -18,9 +18,11 @@ from rdstitch.synthetic.layouts import (
 )
 from rdstitch.synthetic.lenses import BrownLens, FisheyeLens, Lens, best_division_model
 from rdstitch.synthetic.poses import Poses, fit_to_plane
-from rdstitch.synthetic.rendering import Photometry, Relief, Sequence, boxes, sequence_over
+from rdstitch.synthetic.relief import RELIEFS, Relief, boxes, hills, ridges
+from rdstitch.synthetic.rendering import Photometry, Sequence, sequence_over
 from rdstitch.synthetic.textures import (
     EndlessTexture,
+    LinedTexture,
     PictureTexture,
     Texture,
     blank,
@@ -31,12 +33,14 @@ from rdstitch.synthetic.textures import (
 
 __all__ = [
     "HALF_SIZE",
+    "RELIEFS",
     "AlignmentError",
     "BrownLens",
     "EndlessTexture",
     "FisheyeLens",
     "Instances",
     "Lens",
+    "LinedTexture",
     "Photometry",
     "PictureTexture",
     "PlanarInstances",
@@ -61,6 +65,7 @@ __all__ = [
     "gradient",
     "grid_poses",
     "ground",
+    "hills",
     "joined",
     "line_poses",
     "pair_poses",
@@ -68,6 +73,7 @@ __all__ = [
     "planar_instances",
     "plane_under",
     "repeated",
+    "ridges",
     "rotation_poses",
     "sequence_over",
     "sharpness",

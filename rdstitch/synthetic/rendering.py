@@ -18,6 +18,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.synthetic.lenses import Lens
 from rdstitch.synthetic.poses import Poses, fit_to_plane, plane_outline, to_picture, to_plane
+from rdstitch.synthetic.relief import Relief
 from rdstitch.synthetic.textures import Picture, Texture
 
 _PIXELS_PER_STRIP = 400_000
@@ -62,63 +63,6 @@ class Photometry:
 
 
 @dataclass(frozen=True)
-class Relief:
-    """Ground that is not flat: it gives parallax, and no homography describes it.
-
-    Attributes
-    ----------
-    height : ndarray of shape (h, w), float32
-        Height above the plane in texels, for each texel of the texture.
-    steps : int
-        Levels at which rays look for the ground, between the highest point and the plane.
-    """
-
-    height: NDArray[np.float32]
-    steps: int = 16
-
-    def seen_from(self, position: FloatArray, height: float, foot: FloatArray) -> FloatArray:
-        """Texels (..., 2) over which rays meet the ground: at the first level, from the top, that is in it.
-
-        Parameters
-        ----------
-        position, height
-            Of the camera, texels.
-        foot : ndarray of shape (h, w, 2)
-            Where the rays would meet the plane.
-        """
-        place = foot.copy()
-        found = np.zeros(foot.shape[:-1], dtype=np.bool_)
-        for level in np.linspace(float(self.height.max()), 0.0, self.steps, endpoint=False):
-            at_level = position + (foot - position) * (1.0 - level / height)
-            x, y = (np.nan_to_num(at_level[..., k], nan=_NOWHERE).astype(np.float32) for k in (0, 1))
-            ground = cv2.remap(self.height, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
-            hit = ~found & (ground >= level) & (ground > 0.0)
-            place[hit] = at_level[hit]
-            found |= hit
-        return place
-
-
-def boxes(size: tuple[int, int], seed: int, *, count: int, height: float, width: int = 60) -> Relief:
-    """Flat ground with ``count`` boxes up to ``height`` texels high and up to ``width`` texels wide: a town.
-
-    Parameters
-    ----------
-    size : (int, int)
-        Of the texture, texels.
-    seed : int
-        Equal seeds give equal towns.
-    """
-    rng = np.random.default_rng(seed)
-    steps = 16
-    ground = np.zeros((size[1], size[0]), dtype=np.float32)
-    for _ in range(count):
-        x, y = (int(rng.integers(0, max(1, n - width))) for n in size)
-        w, h = (int(n) for n in rng.integers(width // 3, width + 1, 2))
-        ground[y : y + h, x : x + w] = height * rng.integers(steps // 4, steps + 1) / steps
-    return Relief(ground, steps)
-
-
-@dataclass(frozen=True)
 class Sequence:
     """Pictures of a plane, rendered when asked for, and the truth about them.
 
@@ -131,7 +75,7 @@ class Sequence:
     poses : Poses
     photometry : Photometry
     relief : Relief, optional
-        Height of the ground; a plane if not given.
+        Height of the ground above the plane; a plane if not given.
     seed : int
         Of the noise.
     samples : int, optional
@@ -160,11 +104,18 @@ class Sequence:
         return np.asarray(self._from_plane[index])
 
     def to_plane(self, index: int, points: ArrayLike) -> FloatArray:
-        """Measured px (N, 2) of one picture to texels; NaN beyond the horizon or the lens."""
+        """Measured px (N, 2) of one picture to points of the plane, texels; NaN beyond the horizon or the lens."""
         return to_plane(self.lens, self.from_plane(index), points)
 
+    def to_ground(self, index: int, points: ArrayLike) -> FloatArray:
+        """Measured px (N, 2) of one picture to the texels that they show; on a plane the same as :meth:`to_plane`."""
+        return self._on_ground(index, self.to_plane(index, points))
+
     def to_picture(self, index: int, points: ArrayLike) -> FloatArray:
-        """Texels (N, 2) to measured px of one picture, also outside its border; NaN where it cannot see them."""
+        """Points of the plane, texels (N, 2), to measured px of one picture, also outside its border.
+
+        NaN where it cannot see them. Relief does not matter: the points lie on the plane.
+        """
         return to_picture(self.lens, self.from_plane(index), points)
 
     def frame(self, index: int) -> NDArray[Any]:
@@ -273,10 +224,14 @@ class Sequence:
         for dv in offsets:
             for du in offsets:
                 place = foot if count == 1 else foot + du * along + dv * down
-                if self.relief is not None:
-                    place = self.relief.seen_from(self.poses.position[index], self.poses.height[index], place)
-                total += _sample(self.texture, place)
+                total += _sample(self.texture, self._on_ground(index, place))
         return np.divide(total, np.float32(count**2), out=total)
+
+    def _on_ground(self, index: int, foot: FloatArray) -> FloatArray:
+        """Texels (..., 2) that rays of a picture show which would meet the plane at ``foot``."""
+        if self.relief is None:
+            return foot
+        return self.relief.seen_from(self.poses.position[index], float(self.poses.height[index]), foot)
 
 
 def _samples_per_side(along: FloatArray, down: FloatArray) -> int:
@@ -313,6 +268,7 @@ def sequence_over(
     poses: Poses,
     *,
     photometry: Photometry | None = None,
+    relief: Relief | Callable[[tuple[int, int]], Relief] | None = None,
     seed: int = 0,
     margin: int = 16,
 ) -> Sequence:
@@ -325,6 +281,8 @@ def sequence_over(
         the poses are centred.
     lens, poses, photometry, seed
         As in :class:`Sequence`; the poses may lie anywhere and are moved.
+    relief : Relief or callable, optional
+        Heights, or what makes them for the size of the plane, such as ``lambda size: hills(size, 1, height=40.0)``.
     margin : int
         Texels that are left around what the pictures show.
 
@@ -336,8 +294,10 @@ def sequence_over(
     moved, size = fit_to_plane(lens, poses, margin)
     settings = Photometry() if photometry is None else photometry
     if callable(plane):
-        return Sequence(plane(size), lens, moved, settings, seed=seed)
-    spare = np.array(plane.size) - size
-    if (spare < 0).any():
-        raise ArgumentError(f"the texture has {plane.size} texels, the pictures need {size}")
-    return Sequence(plane, lens, moved.moved(spare // 2), settings, seed=seed)
+        texture = plane(size)
+    else:
+        texture, spare = plane, np.array(plane.size) - size
+        if (spare < 0).any():
+            raise ArgumentError(f"the texture has {plane.size} texels, the pictures need {size}")
+        moved = moved.moved(spare // 2)
+    return Sequence(texture, lens, moved, settings, relief(texture.size) if callable(relief) else relief, seed)
