@@ -1,12 +1,15 @@
 """What registering a set of pictures gives."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Self
 
 from rdstitch.alignment import Alignment
 from rdstitch.camera import Camera
-from rdstitch.inputs.source import LeftOut, Source
+from rdstitch.inputs.source import Source
 from rdstitch.matching.mixed_lenses import TwoLenses
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.messages import Message, of_severity
 
 
 @dataclass(frozen=True)
@@ -19,11 +22,11 @@ class Registration:
     keypoints : tuple of int
         Number of features of each picture.
     pairs : tuple of PairRegistration
-        Every pair that was looked at.
+        Every pair that was compared.
     alignment : Alignment
-    left_out : tuple of LeftOut
-        Every file that is not in the result, with the reason.
-    resting : bool
+    messages : tuple of Message
+        What the user should know: failed checks, warnings, and every picture that is not in the result.
+    static_background : bool
         Whether most of what the pictures show stays where it is in them, and only what moves was registered.
     mixed : TwoLenses or None
         Where pictures of two lenses are mixed. If it is clear which belong together, the others are left out.
@@ -33,9 +36,33 @@ class Registration:
     keypoints: tuple[int, ...]
     pairs: tuple[PairRegistration, ...]
     alignment: Alignment
-    left_out: tuple[LeftOut, ...]
-    resting: bool = False
+    messages: tuple[Message, ...]
+    static_background: bool = False
     mixed: TwoLenses | None = None
+
+    def with_messages(self, messages: Iterable[Message]) -> Self:
+        """The same with more to know about it."""
+        return replace(self, messages=(*self.messages, *messages))
+
+    @property
+    def ok(self) -> bool:
+        """Whether it passed its checks."""
+        return not self.failures
+
+    @property
+    def failures(self) -> tuple[Message, ...]:
+        """Why the result cannot be relied on; empty if :attr:`ok`."""
+        return of_severity(self.messages, "failure")
+
+    @property
+    def warnings(self) -> tuple[Message, ...]:
+        """What the user should look at although there is a result."""
+        return of_severity(self.messages, "warning")
+
+    @property
+    def left_out(self) -> tuple[Message, ...]:
+        """Every picture that is not in the result, with the reason."""
+        return of_severity(self.messages, "left out")
 
     @property
     def camera(self) -> Camera:

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rdstitch.compositing import Canvas, Composite, CompositePlan
+from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.registration import Registration
-from rdstitch.verification.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -16,10 +16,9 @@ class StitchResult:
     Attributes
     ----------
     registration : Registration
+        With all that there is to know of the result in its ``messages``.
     canvas : Canvas
         Where the pictures lie in the output.
-    verdict : Verdict
-        Whether the result passed its own checks.
     options : StitchOptions
     output : Path or None
         File that the picture was written to.
@@ -27,18 +26,19 @@ class StitchResult:
         The picture itself; None where it went to a file, or was only planned.
     plan : CompositePlan or None
         Of a dry run.
-    notes : tuple of str
-        What the user should know of the compositing.
     """
 
     registration: Registration
     canvas: Canvas
-    verdict: Verdict
     options: StitchOptions
     output: Path | None = None
     composite: Composite | None = None
     plan: CompositePlan | None = None
-    notes: tuple[str, ...] = ()
+
+    @property
+    def ok(self) -> bool:
+        """Whether the result passed its own checks."""
+        return self.registration.ok
 
     @property
     def distortion(self) -> float:
@@ -46,6 +46,6 @@ class StitchResult:
         return self.registration.alignment.distortion
 
     @property
-    def warnings(self) -> tuple[str, ...]:
-        """What the user should know although there is a result, one sentence each."""
-        return (*self.registration.alignment.warnings, *self.verdict.doubts, *self.notes)
+    def messages(self) -> tuple[Message, ...]:
+        """What the user should know: failed checks, warnings, and every picture that is not in the result."""
+        return self.registration.messages

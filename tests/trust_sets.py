@@ -216,7 +216,7 @@ def judge_set(item: TrustSet, folder: Path, options: StitchOptions | None = None
     # Who is told that λ is not observable is promised pictures that fit, not straight lines.
     measure = registration_error if np.isfinite(alignment.distortion_std) else overlap_error
     error, worst = measure(item.sequence, registration)
-    text = "; ".join((*alignment.warnings, *(f"left out {m.path.name}: {m.reason}" for m in registration.left_out)))
+    text = "; ".join(map(str, registration.messages))
     right = error < LARGEST_MEDIAN and worst < LARGEST_OF_A_PICTURE
     return Judged(item.kind, 0, right, not registration.left_out, error, text)
 

@@ -94,7 +94,7 @@ class Report:
             if self._file is not None:
                 from rdstitch.report import write_report
 
-                write_report(self._file, refused.registration, self.progress.stages, refused.verdict)
+                write_report(self._file, refused.registration, self.progress.stages)
             raise
 
     def write(self, result: "StitchResult | Registration") -> None:
@@ -107,8 +107,6 @@ class Report:
 
 def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = False) -> None:
     """λ and the plan of a dry run, or the sidecar, to standard output; what the user must know to standard error."""
-    for complaint in (*result.verdict.complaints, *result.notes):
-        reporter.warn(complaint)
     _warn_of(result.registration, reporter)
     if as_json:
         from rdstitch.sidecar.write import sidecar
@@ -154,10 +152,8 @@ def report_registration(registration: "Registration", reporter: Reporter, *, as_
 def _warn_of(registration: "Registration", reporter: Reporter) -> None:
     """What the user must know of a registration."""
     alignment = registration.alignment
-    for warning in alignment.warnings:
-        reporter.warn(warning)
-    for missing in registration.left_out:
-        reporter.warn(f"left out {missing.path}: {missing.reason}")
+    for message in (*registration.failures, *registration.warnings, *registration.left_out):
+        reporter.warn(str(message))
     used = int(alignment.used.sum())
     reporter.log(f"{used} of {len(alignment.used)} pictures, rms {alignment.rms:.2f} px; {alignment.model_reason}")
 

@@ -13,7 +13,7 @@ from rdstitch.alignment.adjustment_problem import (
     homography_apart,
     thin_for_selection,
 )
-from rdstitch.alignment.build_result import Outcome, build_alignment
+from rdstitch.alignment.build_result import AdjustedPictures, build_alignment
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.initialization import relations_at
@@ -188,8 +188,8 @@ def align(
     full = replace(graph, observations=everything)
     problem, _ = full.problem(~wrong, pictures, choice.overdispersion)
     fit = problem.refine(choice.fit.model, choice.fit.adjusted.parameters, choice.fit.tilt_spread)
-    outcome = Outcome(cameras, links, pictures, ~wrong, problem, replace(choice, fit=fit), votes, observable)
-    return build_alignment(outcome)
+    found = AdjustedPictures(cameras, links, pictures, ~wrong, problem, replace(choice, fit=fit), votes, observable)
+    return build_alignment(found)
 
 
 def _check(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions) -> None:

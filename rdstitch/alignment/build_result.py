@@ -13,18 +13,19 @@ from rdstitch.alignment.model_selection import Choice
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y, metric_poses
 from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.planarity import coherence, judge_relief
-from rdstitch.alignment.result import Alignment, LinkFit, Poses
+from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, Poses, Relief
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import Camera
 from rdstitch.matching.distortion_consensus import Consensus
 from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import connected_components
+from rdstitch.messages import Message
 from rdstitch.radial_homography import LENS_PARAMETERS
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """All that the recipe found out.
+class AdjustedPictures:
+    """What the adjustment found, and what it was made from.
 
     Attributes
     ----------
@@ -52,34 +53,33 @@ class Outcome:
     observable: bool
 
 
-def build_alignment(outcome: Outcome) -> Alignment:
+def build_alignment(found: AdjustedPictures) -> Alignment:
     """The alignment, in the frame of the reference picture."""
-    problem, fit = outcome.problem, outcome.choice.fit
+    problem, fit = found.problem, found.choice.fit
     adjusted, planar = fit.adjusted, bool(fit.model.shared_names)
     shared, lens = fit.model.natural(adjusted.parameters.shared)[0], adjusted.parameters.lens
     covariance = adjusted.covariance
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     names = (*fit.model.shared_names, *(n for n, free in zip(LENS_PARAMETERS, problem.free_lens, strict=True) if free))
     distortion_std = float(std[names.index("distortion")]) if "distortion" in names else 0.0
-    distortion_std = distortion_std if outcome.observable else math.inf
+    distortion_std = distortion_std if found.observable else math.inf
     focal = float(np.exp(shared[2])) if planar else None
-    groups = _groups(outcome)
+    groups = _groups(found)
     observations = problem.observations
     errors = whitened_errors(observations, adjusted.homographies, lens)
     inliers = adjusted.squared <= (WIDTH_PER_SIGMA * adjusted.sigma) ** 2
     relief = judge_relief(coherence(observations, errors, inliers), fit.model.name)
-    used = np.zeros(len(outcome.cameras), dtype=np.bool_)
-    used[outcome.pictures] = True
-    homographies, poses = _in_frame_of_reference(outcome)
+    used = np.zeros(len(found.cameras), dtype=np.bool_)
+    used[found.pictures] = True
+    homographies, poses = _in_frame_of_reference(found)
     return Alignment(
-        cameras=tuple(_adjusted_camera(camera, lens, distortion_std, focal) for camera in outcome.cameras),
+        cameras=tuple(_adjusted_camera(camera, lens, distortion_std, focal) for camera in found.cameras),
         homographies=homographies,
         used=used,
-        reasons=_reasons(outcome, groups),
         components=groups,
-        reference=int(outcome.pictures[problem.reference]),
+        reference=int(found.pictures[problem.reference]),
         model=fit.model.name,
-        model_reason=outcome.choice.reason,
+        model_reason=found.choice.reason,
         poses=poses,
         tilt=(float(shared[0]), float(shared[1])) if planar else None,
         tilt_spread=fit.tilt_spread,
@@ -90,9 +90,9 @@ def build_alignment(outcome: Outcome) -> Alignment:
         parameters=names,
         covariance=covariance,
         rms=float(np.sqrt(adjusted.squared[inliers].mean())) if inliers.any() else math.nan,
-        links=_link_fits(outcome, inliers),
+        links=_link_fits(found, inliers),
         relief=relief,
-        warnings=_warnings(outcome, relief.explanation if relief.found else ""),
+        messages=_warnings(found, relief),
     )
 
 
@@ -109,17 +109,17 @@ def _adjusted_camera(camera: Camera, lens: FloatArray, distortion_std: float, fo
     return result if focal is None else replace(result, focal=focal * camera.half_diagonal, focal_source="estimate")
 
 
-def _in_frame_of_reference(outcome: Outcome) -> tuple[FloatArray, Poses | None]:
+def _in_frame_of_reference(found: AdjustedPictures) -> tuple[FloatArray, Poses | None]:
     """Picture-to-plane homographies of all pictures, and their poses where the model has them.
 
     The adjustment may have held the reference picture anywhere; here it comes to the origin, with yaw zero and, as
     the unit of length, height one.
     """
-    count, fit, reference = len(outcome.cameras), outcome.choice.fit, outcome.problem.reference
+    count, fit, reference = len(found.cameras), found.choice.fit, found.problem.reference
     matrices = fit.adjusted.matrices.matrices
     homographies = np.full((count, 3, 3), np.nan)
     if not fit.model.shared_names:
-        homographies[outcome.pictures] = matrices[reference] @ np.linalg.inv(matrices)
+        homographies[found.pictures] = matrices[reference] @ np.linalg.inv(matrices)
         return homographies, None
     shared, poses = fit.adjusted.parameters.shared, fit.adjusted.parameters.poses.copy()
     yaw, height = poses[reference, YAW], np.exp(poses[reference, LOG_HEIGHT])
@@ -128,63 +128,36 @@ def _in_frame_of_reference(outcome: Outcome) -> tuple[FloatArray, Poses | None]:
     poses[:, [X, Y]] = (poses[:, [X, Y]] - poses[reference, [X, Y]]) @ rotation.T / height
     poses[:, YAW] = np.remainder(poses[:, YAW] - yaw + np.pi, 2 * np.pi) - np.pi
     poses[:, LOG_HEIGHT] -= np.log(height)
-    homographies[outcome.pictures] = np.linalg.inv(fit.model.matrices(poses, shared).matrices)
+    homographies[found.pictures] = np.linalg.inv(fit.model.matrices(poses, shared).matrices)
     every = np.full((count, 6), np.nan)
-    every[outcome.pictures] = metric_poses(poses, shared)
+    every[found.pictures] = metric_poses(poses, shared)
     return homographies, Poses(every[:, YAW], every[:, [X, Y]], np.exp(every[:, LOG_HEIGHT]), every[:, [PSI, THETA]])
 
 
-def _groups(outcome: Outcome) -> tuple[tuple[int, ...], ...]:
+def _groups(found: AdjustedPictures) -> tuple[tuple[int, ...], ...]:
     """Connected groups of pictures by the links not taken for wrong, the aligned one first."""
-    right = [link for link, right in zip(outcome.links, outcome.right, strict=True) if right]
-    groups = connected_components(len(outcome.cameras), [k.image1 for k in right], [k.image2 for k in right])
-    aligned = set(outcome.pictures.tolist())
+    right = [link for link, right in zip(found.links, found.right, strict=True) if right]
+    groups = connected_components(len(found.cameras), [k.image1 for k in right], [k.image2 for k in right])
+    aligned = set(found.pictures.tolist())
     ordered = sorted(groups, key=lambda group: group[0] not in aligned)
     return tuple(tuple(group) for group in ordered)
 
 
-def _reasons(outcome: Outcome, groups: tuple[tuple[int, ...], ...]) -> tuple[str, ...]:
-    """Why each picture was left out, with a remedy."""
-    aligned = set(outcome.pictures.tolist())
-    doubted: dict[int, list[int]] = {}
-    for link, right in zip(outcome.links, outcome.right, strict=True):
-        if not right:
-            doubted.setdefault(link.image1, []).append(link.image2)
-            doubted.setdefault(link.image2, []).append(link.image1)
-    reasons = [""] * len(outcome.cameras)
-    for group in groups:
-        for picture in set(group) - aligned:
-            if len(group) > 1:
-                reasons[picture] = (
-                    f"one of {len(group)} pictures that overlap with none of the {len(aligned)} aligned ones; "
-                    "add pictures between them, or stitch them on their own"
-                )
-            elif picture in doubted:
-                others = ", ".join(str(other) for other in sorted(doubted[picture]))
-                reasons[picture] = (
-                    f"its overlap with picture {others} contradicts the other pictures (repeated structure?); "
-                    "add pictures with more overlap"
-                )
-            else:
-                reasons[picture] = "no reliable overlap with any other picture; add pictures with more overlap"
-    return tuple(reasons)
-
-
-def _link_fits(outcome: Outcome, inliers: BoolArray) -> tuple[LinkFit, ...]:
+def _link_fits(found: AdjustedPictures, inliers: BoolArray) -> tuple[LinkFit, ...]:
     """How well each link agrees, in the order of the links given."""
-    problem, squared = outcome.problem, outcome.choice.fit.adjusted.squared
+    problem, squared = found.problem, found.choice.fit.adjusted.squared
     observations = problem.observations
     medians = link_medians(squared, observations)
-    pictures = outcome.pictures
+    pictures = found.pictures
     rows = {
         (int(pictures[i]), int(pictures[j])): row
         for row, (i, j) in enumerate(zip(observations.image1, observations.image2, strict=True))
     }
     result = []
-    for link, right in zip(outcome.links, outcome.right, strict=True):
+    for link, right in zip(found.links, found.right, strict=True):
         row = rows.get((link.image1, link.image2))
         if row is None or not right:
-            why = "belongs to another group of pictures" if right else "contradicts the other links"
+            why = "belongs to another group of pictures" if right else CONTRADICTS
             result.append(LinkFit(link.image1, link.image2, len(link), 0, math.nan, False, why))
             continue
         own = slice(observations.start[row], observations.start[row + 1])
@@ -195,20 +168,20 @@ def _link_fits(outcome: Outcome, inliers: BoolArray) -> tuple[LinkFit, ...]:
     return tuple(result)
 
 
-def _warnings(outcome: Outcome, relief: str) -> tuple[str, ...]:
-    """What the user should know, one sentence each."""
-    result = [relief] if relief else []
-    if not outcome.observable:
+def _warnings(found: AdjustedPictures, relief: Relief) -> tuple[Message, ...]:
+    """What the user should know of the whole."""
+    result = [relief.explanation] if relief.found else []
+    if not found.observable:
         result.append(
             "λ is not observable: the pictures hardly move, or only turn about the optical axis; "
             "give λ, a camera file, or pictures that overlap by less"
         )
-    if outcome.votes.groups:
-        (low, few), (high, many) = outcome.votes.groups
+    if found.votes.groups:
+        (low, few), (high, many) = found.votes.groups
         result.append(
             f"{few} pairs see λ = {low:+.3f}, {many} pairs {high:+.3f}: two cameras, or a zoom; "
             "stitch their pictures on their own"
         )
-    if not outcome.choice.fit.adjusted.converged:
+    if not found.choice.fit.adjusted.converged:
         result.append("the adjustment did not converge; judge the result with care")
-    return tuple(result)
+    return tuple(map(Message, result))

@@ -7,7 +7,11 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.messages import Message
 from rdstitch.radial_homography import from_plane, to_plane
+
+CONTRADICTS = "contradicts the other links"
+"""Why a link was not used although it fits well on its own."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +100,6 @@ class Alignment:
         metric, rectified, with its unit the height of the reference picture; in the general model it is the
         undistorted reference picture.
     used : ndarray of shape (N,), bool
-    reasons : tuple of str
-        For each picture, why it was left out, with a remedy; empty where it was used.
     components : tuple of tuple of int
         The groups of pictures that overlap, largest first; the first is the aligned one.
     reference : int
@@ -127,14 +129,13 @@ class Alignment:
     links : tuple of LinkFit
         In the order of the links given.
     relief : Relief
-    warnings : tuple of str
-        One sentence each: λ not observable, two cameras, ….
+    messages : tuple of Message
+        What the user should know of the whole: λ not observable, two cameras, ….
     """
 
     cameras: tuple[Camera, ...]
     homographies: FloatArray
     used: NDArray[np.bool_]
-    reasons: tuple[str, ...]
     components: tuple[tuple[int, ...], ...]
     reference: int
     model: str
@@ -151,11 +152,7 @@ class Alignment:
     rms: float
     links: tuple[LinkFit, ...]
     relief: Relief
-    warnings: tuple[str, ...] = ()
-
-    def worst_links(self, count: int = 5) -> tuple[LinkFit, ...]:
-        """The used links with the largest rms, worst first."""
-        return tuple(sorted((fit for fit in self.links if fit.used), key=lambda fit: -fit.rms)[:count])
+    messages: tuple[Message, ...] = ()
 
     def relation(self, image1: int, image2: int) -> FloatArray:
         """Homography (3, 3) from undistorted normalized coordinates of one picture to those of another."""

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
+from typing import Any, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +19,11 @@ from rdstitch.opencv_threads import one_opencv_thread
 
 __all__ = ["KINDS", "FeatureOptions", "Features", "Recall", "Source", "View", "detect", "detect_all"]
 
-Recall = Callable[[int, Callable[[], Features]], Features]
-"""Called with a picture's index and what detects its features; gives these, perhaps from an earlier run."""
+Found = TypeVar("Found")
+
+Recall = Callable[[int, Callable[[], Features]], Found]
+"""Called with a picture's index and what detects its features; gives these, perhaps from an earlier run, or what
+stands for them where the picture cannot be read."""
 
 Source = Callable[[float | None], View]
 """Loads one picture when it is called with the 10⁶ px that are needed of it; None: all. More px may come."""
@@ -81,13 +85,32 @@ def _look(
     return picture, detection, usable
 
 
+@overload
 def detect_all(
     sources: Sequence[Source],
     options: FeatureOptions | None = None,
     workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
-    recall: Recall | None = None,
-) -> list[Features]:
+) -> list[Features]: ...
+
+
+@overload
+def detect_all(
+    sources: Sequence[Source],
+    options: FeatureOptions | None,
+    workers: int,
+    progress: Callable[[int, int], None] | None,
+    recall: Recall[Found],
+) -> list[Found]: ...
+
+
+def detect_all(
+    sources: Sequence[Source],
+    options: FeatureOptions | None = None,
+    workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+    recall: Recall[Found] | None = None,
+) -> list[Features] | list[Found]:
     """Detect the features of many pictures, several at a time; at most ``workers`` pictures are in memory.
 
     Parameters
@@ -105,7 +128,7 @@ def detect_all(
     Returns
     -------
     list of Features
-        In the order of ``sources``.
+        In the order of ``sources``; or what ``recall`` gave for each.
 
     Raises
     ------
@@ -118,11 +141,11 @@ def detect_all(
     if workers < 1:
         raise ArgumentError(f"workers must be at least 1, not {workers}")
 
-    def work(index: int) -> Features:
+    def work(index: int) -> Features | Found:
         compute = partial(_detect, sources[index], options)
         return compute() if recall is None else recall(index, compute)
 
-    results: list[Features] = []
+    results: list[Any] = []
     with one_opencv_thread(), ThreadPoolExecutor(workers) as pool:
         for features in pool.map(work, range(len(sources))):
             results.append(features)

@@ -16,6 +16,7 @@ from rdstitch.io.mask import read_mask
 from rdstitch.io.metadata import Metadata, read_metadata
 from rdstitch.io.read import Picture, read_image, reduced
 from rdstitch.io.reduction import block_minimum, fitting_reduction, reduced_size
+from rdstitch.messages import Message, left_out
 
 
 @dataclass(frozen=True)
@@ -118,23 +119,9 @@ def readers(sources: Sequence[Source]) -> list[Callable[..., Picture]]:
     return [partial(read, source) for source in sources]
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """A file that could not be used.
-
-    Attributes
-    ----------
-    path : Path
-    reason : str
-    """
-
-    path: Path
-    reason: str
-
-
 def read_sources(
     paths: Iterable[str | Path], *, camera: Camera | None, focal: float | None, distortion: float | None, skip_bad: bool
-) -> tuple[list[Source], list[LeftOut]]:
+) -> tuple[list[Source], list[Message]]:
     """Read the headers of the pictures; a file named twice counts once.
 
     Parameters
@@ -155,7 +142,7 @@ def read_sources(
         When a file cannot be read.
     """
     sources: list[Source] = []
-    left_out: list[LeftOut] = []
+    unread: list[Message] = []
     seen: set[Path] = set()
     decoded_images = DecodedImageCache()
     for path in map(Path, paths):
@@ -166,14 +153,14 @@ def read_sources(
             reason = error if isinstance(error, InputError) else InputError(f"{path}: cannot be read: {error}")
             if not skip_bad:
                 raise reason from error
-            left_out.append(LeftOut(path, str(reason)))
+            unread.append(left_out(path, str(reason)))
             continue
         if key not in seen:
             seen.add(key)
             sources.append(
                 Source(path, metadata, _camera(metadata, camera, focal, distortion), decoded_images=decoded_images)
             )
-    return sources, left_out
+    return sources, unread
 
 
 def _camera(metadata: Metadata, camera: Camera | None, focal: float | None, distortion: float | None) -> Camera:

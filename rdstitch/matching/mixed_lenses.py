@@ -4,7 +4,7 @@ A pair of pictures sees λ of both of them, each on its own: the same one where 
 the pictures into two lenses predicts what every pair sees.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,7 +84,50 @@ def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
     return TwoLenses(second, (float(lenses[0]), float(lenses[1])), bool(told and not between.all()))
 
 
-def pictures_of_the_other(mixed: TwoLenses, pairs: Sequence[PairRegistration]) -> dict[int, str]:
+@dataclass(frozen=True)
+class SeparatedLenses:
+    """Pairs of the pictures of one lens.
+
+    Attributes
+    ----------
+    pairs : list of PairRegistration
+    left_out : mapping of int to str
+        Why a picture was left out, by its index.
+    mixed : TwoLenses or None
+        Both lenses, where there are two.
+    """
+
+    pairs: list[PairRegistration]
+    left_out: Mapping[int, str]
+    mixed: TwoLenses | None
+
+    def of_one_lens(self, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+        """The pairs of pictures that were not left out."""
+        return [pair for pair in pairs if not {*pair} & self.left_out.keys()]
+
+
+def separate_lenses(
+    cameras: Sequence[Camera], pairs: list[PairRegistration], threshold: float, known_distortion: float | None
+) -> SeparatedLenses:
+    """Leave out the pictures of the lens that took fewer; none where one lens will do, λ is known, or in doubt.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+        One a picture.
+    pairs : list of PairRegistration
+    threshold : float
+        Largest transfer error of an inlier, pixels.
+    known_distortion : float or None
+        λ in the half-diagonal frame, where the user gave it.
+    """
+    mixed = None if known_distortion is not None else two_lenses(cameras, Votes.of(pairs, threshold))
+    others = {} if mixed is None else _of_the_other_lens(mixed, pairs)
+    kept = [pair for pair in pairs if not {pair.image1, pair.image2} & others.keys()]
+    return SeparatedLenses(kept, others, mixed)
+
+
+def _of_the_other_lens(mixed: TwoLenses, pairs: Sequence[PairRegistration]) -> dict[int, str]:
     """Pictures of the lens that took fewer, or has fewer matches, with why they are left out; none if in doubt."""
     if not mixed.certain:
         return {}

@@ -88,14 +88,22 @@ class Pairing:
         found = self._relate(chosen, self._match(chosen, "matching", shared or {}), lens, "registering pairs")
         return found if known is not None or distortion is None else [_without_vote(pair) for pair in found]
 
-    def remove_static_background(self, pairs: list[PairRegistration]) -> "tuple[Pairing, list[PairRegistration]]":
+    def estimate_candidates(self, candidates: Sequence[Pair]) -> list[PairRegistration]:
+        """Estimate the candidate pairs that share something at first sight; all of them where none of those holds."""
+        prescreened = self.prescreen_pairs(candidates)
+        pairs = self.estimate(prescreened, shared=prescreened)
+        return pairs if any(pair.relation for pair in pairs) else self.estimate(candidates)
+
+    def remove_static_background(self, pairs: list[PairRegistration]) -> "MovingPairs":
         """Where most pairs seem to rest, the pairing and pairs of what moves; the same again where nothing does."""
         threshold = self.options.pair.threshold
         if not most_rest(pairs, threshold):
-            return self, pairs
+            return MovingPairs(self, pairs, found=False)
         moving = replace(self, features=moving_features(self.features, pairs, threshold))
         again = moving.estimate([(pair.image1, pair.image2) for pair in pairs])
-        return (moving, again) if show_motion(again, len(self.features), threshold) else (self, pairs)
+        if not show_motion(again, len(self.features), threshold):
+            return MovingPairs(self, pairs, found=False)
+        return MovingPairs(moving, again, found=True)
 
     def retry_with_consensus_distortion(self, pairs: list[PairRegistration]) -> list[PairRegistration]:
         """Estimate the pairs that failed again, with the λ that the others agree on."""
@@ -120,7 +128,7 @@ class Pairing:
 
     def guided_rematch(
         self, pairs: list[PairRegistration], support: Mapping[Pair, int], transfer: Transfer
-    ) -> list[PairRegistration]:
+    ) -> dict[int, PairRegistration]:
         """Match the pairs of weakly supported pictures again, only near where the alignment expects the matches.
 
         Parameters
@@ -130,6 +138,11 @@ class Pairing:
             Number of inliers of every pair that the alignment uses.
         transfer : callable
             Takes two pictures and points (N, 2) of the first, pixels, to points of the second, pixels.
+
+        Returns
+        -------
+        dict of int to PairRegistration
+            The pairs that have more inliers now, by their position in ``pairs``.
         """
         held = np.zeros(len(self.features), dtype=np.intp)
         for images, inliers in support.items():
@@ -141,11 +154,11 @@ class Pairing:
             [self._near(pairs[index], transfer) for index in chosen],
             self.options.pair.distortion,
         )
-        stronger = list(pairs)
-        for index, pair in zip(chosen, again, strict=True):
-            if pair.relation and pair.relation.inliers.sum() > pairs[index].relation.inliers.sum():
-                stronger[index] = pair
-        return stronger
+        return {
+            index: pair
+            for index, pair in zip(chosen, again, strict=True)
+            if pair.relation and pair.relation.inliers.sum() > pairs[index].relation.inliers.sum()
+        }
 
     def _near(self, pair: PairRegistration, transfer: Transfer) -> Correspondences:
         """Matches of a pair near the places where the alignment expects them."""
@@ -227,6 +240,24 @@ class Pairing:
     def _pair_options(self, distortion: float | None) -> PairOptions:
         pair = self.options.pair
         return replace(pair, solver=pair.solver if distortion is None else "auto", distortion=distortion)
+
+
+@dataclass(frozen=True)
+class MovingPairs:
+    """Pairs of what moves in the pictures.
+
+    Attributes
+    ----------
+    pairing : Pairing
+        With the features that do not rest in the pictures.
+    pairs : list of PairRegistration
+    found : bool
+        Whether there was a static background, and it was removed.
+    """
+
+    pairing: Pairing
+    pairs: list[PairRegistration]
+    found: bool
 
 
 def _without_vote(pair: PairRegistration) -> PairRegistration:

@@ -14,9 +14,11 @@ from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, InputError, OutputError, PartialResultError
 from rdstitch.inputs.find import find_pictures
 from rdstitch.inputs.masks import with_masks
-from rdstitch.inputs.source import LeftOut, Source, read_sources
+from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.atomic import check_output, write_json_atomic
 from rdstitch.io.decoding import check_readable
+from rdstitch.messages import Message
+from rdstitch.messages import left_out as left_out_message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.compose import compose_pictures
 from rdstitch.pipeline.recomposition import Recomposition, applied_sidecar
@@ -92,11 +94,11 @@ def apply(
         chosen, matched = _match(saved, paths, match)
         sources, left_out = _sources(saved, chosen)
         if strict and left_out:
-            raise PartialResultError("; ".join(f"left out {item.path}: {item.reason}" for item in left_out.values()))
+            raise PartialResultError("; ".join(map(str, left_out.values())))
         used = {index: source for index, source in enumerate(sources) if source is not None}
         if not used:
             first = next(iter(left_out.values()))
-            raise InputError(f"{saved.path}: none of its pictures can be used; {first.path}: {first.reason}")
+            raise InputError(f"{saved.path}: none of its pictures can be used; {first.images[0]}: {first.text}")
         used = dict(zip(used, with_masks(list(used.values()), mask), strict=True))
         composed = compose_pictures(
             list(used.values()),
@@ -183,16 +185,16 @@ def _by_order(saved: SavedRegistration, paths: Sequence[Path]) -> Sequence[Path]
     return paths
 
 
-def _sources(saved: SavedRegistration, chosen: Sequence[Path | None]) -> tuple[list[Source | None], dict[int, LeftOut]]:
+def _sources(saved: SavedRegistration, chosen: Sequence[Path | None]) -> tuple[list[Source | None], dict[int, Message]]:
     """The pictures with their cameras, and why which of those used then is not among them."""
     sources: list[Source | None] = []
-    left_out: dict[int, LeftOut] = {}
+    left_out: dict[int, Message] = {}
     for index, (picture, path) in enumerate(zip(saved.pictures, chosen, strict=True)):
         sources.append(None)
         if picture.camera is None or picture.to_plane is None:
             continue
         if path is None:
-            left_out[index] = LeftOut(Path(picture.path), "is not among the given pictures")
+            left_out[index] = left_out_message(picture.path, "is not among the given pictures")
             continue
         found, unread = read_sources([path], camera=None, focal=None, distortion=None, skip_bad=True)
         if unread:

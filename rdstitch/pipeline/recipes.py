@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal
@@ -18,8 +17,9 @@ from rdstitch.export.path_plot import path_as_svg
 from rdstitch.inputs.attitudes import with_attitudes
 from rdstitch.inputs.find import find_pictures
 from rdstitch.inputs.masks import with_masks
-from rdstitch.inputs.source import LeftOut, Source, read_sources
+from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.atomic import check_distinct, check_output, write_json_atomic, write_text_atomic
+from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.compose import compose_pictures
 from rdstitch.pipeline.register import in_frame_of_reference, register
@@ -27,7 +27,7 @@ from rdstitch.progress import Progress, silent
 from rdstitch.registration import Registration
 from rdstitch.sidecar.write import sidecar
 from rdstitch.stitch_result import StitchResult
-from rdstitch.verification.verdict import RefusedError, Verdict, judge
+from rdstitch.verification.verdict import RefusedError, judge
 
 Inputs = Iterable[str | Path]
 Layout = Literal["csv", "tum"]
@@ -120,10 +120,10 @@ def calibrate(
     with _pictures(inputs, None, every) as paths:
         _check_outputs(None, options, paths)
         registration = _register_all(paths, options, progress)
-        verdict = _accept(registration, options, lens_only=True)
+        registration = _accept(registration, options, lens_only=True)
     _release_decoded_images(registration)
     _save_camera(registration, options)
-    return _warned(registration, verdict.complaints)
+    return registration
 
 
 def trajectory(
@@ -164,9 +164,9 @@ def trajectory(
             check_output(file, options.overwrite, paths, suffixes=())
         check_distinct(files)
         registration = _register_all(paths, options, progress, metric=True)
-        verdict = _accept(registration, options)
+        registration = _accept(registration, options)
     _release_decoded_images(registration)
-    registration = _warned(registration, (*verdict.complaints, *_scale_uncertainty_warning(registration.alignment)))
+    registration = registration.with_messages(_scale_uncertainty(registration.alignment))
     path = Trajectory.from_alignment(registration.alignment, height)
     if output is not None:
         write_text_atomic(output, path.as_csv() if layout == "csv" else path.as_tum())
@@ -188,7 +188,7 @@ def _register_all(
     """Register a sequence, leaving out what cannot be read."""
     sources, unread = _read(paths, options, skip_bad=True)
     registration = register(sources, options, skip_bad=True, metric=metric, progress=progress)
-    return replace(registration, left_out=(*unread, *registration.left_out))
+    return registration.with_messages(unread)
 
 
 def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Sequence[str | Path]) -> None:
@@ -201,13 +201,13 @@ def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Se
         check_distinct([options.save_camera, *([] if output is None else [f"{output}.json"])])
 
 
-def _read(paths: Sequence[str | Path], options: StitchOptions, *, skip_bad: bool) -> tuple[list[Source], list[LeftOut]]:
+def _read(paths: Sequence[str | Path], options: StitchOptions, *, skip_bad: bool) -> tuple[list[Source], list[Message]]:
     sources, unread = read_sources(
         paths, camera=options.camera, focal=options.focal, distortion=options.distortion, skip_bad=skip_bad
     )
     if len(sources) < 2:
         if unread:
-            raise InputError(f"fewer than two pictures can be read; {unread[0].reason}")
+            raise InputError(f"fewer than two pictures can be read; {unread[0].text}")
         raise ArgumentError("stitching needs two different pictures or more; name at least one more")
     return with_attitudes(with_masks(sources, options.mask), options.attitude), unread
 
@@ -216,7 +216,7 @@ def _composite(
     registration: Registration, output: str | Path | None, options: StitchOptions, progress: Progress
 ) -> StitchResult:
     """Judge, compose into the file or into memory, write the sidecar."""
-    verdict = _accept(registration, options)
+    registration = _accept(registration, options)
     alignment = registration.alignment
     used = np.flatnonzero(alignment.used)
     sources = [registration.sources[i] for i in used]
@@ -234,14 +234,12 @@ def _composite(
     )
     _release_decoded_images(registration)
     result = StitchResult(
-        registration,
+        registration.with_messages(map(Message, composed.notes)),
         composed.canvas,
-        verdict,
         options,
         None if output is None else Path(output),
         composed.composite,
         composed.plan,
-        composed.notes,
     )
     if options.dry_run:
         return result
@@ -251,14 +249,15 @@ def _composite(
     return result
 
 
-def _accept(registration: Registration, options: StitchOptions, *, lens_only: bool = False) -> Verdict:
-    """Judge a registration; what cannot be relied on goes no further, unless forced."""
-    verdict = judge(registration, options.threshold, options.threads, Cache(options.cache), lens_only=lens_only)
-    if not verdict.ok and not options.force:
-        raise RefusedError(registration, verdict)
+def _accept(registration: Registration, options: StitchOptions, *, lens_only: bool = False) -> Registration:
+    """The registration with what its checks found; one that cannot be relied on goes no further, unless forced."""
+    found = judge(registration, options.threshold, options.threads, Cache(options.cache), lens_only=lens_only)
+    registration = registration.with_messages(found)
+    if not registration.ok and not options.force:
+        raise RefusedError(registration)
     if options.strict and registration.left_out:
-        raise PartialResultError("; ".join(f"left out {m.path}: {m.reason}" for m in registration.left_out))
-    return verdict
+        raise PartialResultError("; ".join(map(str, registration.left_out)))
+    return registration
 
 
 def _release_decoded_images(registration: Registration) -> None:
@@ -267,19 +266,16 @@ def _release_decoded_images(registration: Registration) -> None:
         source.decoded_images.clear()
 
 
-def _warned(registration: Registration, complaints: Iterable[str]) -> Registration:
-    """The registration with what is wrong or doubtful among its warnings."""
-    alignment = registration.alignment
-    warned = replace(alignment, warnings=(*alignment.warnings, *complaints))
-    return replace(registration, alignment=warned)
-
-
-def _scale_uncertainty_warning(alignment: Alignment) -> list[str]:
-    """What to say where the focal length, and with it the length of every step, is hardly known."""
+def _scale_uncertainty(alignment: Alignment) -> list[Message]:
+    """A warning where the focal length, and with it the length of every step, is hardly known."""
     unsure = 0.0 if alignment.focal is None or alignment.focal_std is None else alignment.focal_std / alignment.focal
     if unsure <= _MAX_SCALE_UNCERTAINTY:
         return []
-    return [f"all lengths may be off together by {unsure:.0%}: the pictures hardly tell the focal length; give --focal"]
+    return [
+        Message(
+            f"all lengths may be off together by {unsure:.0%}: the pictures hardly show the focal length; give --focal"
+        )
+    ]
 
 
 def _save_camera(registration: Registration, options: StitchOptions) -> None:

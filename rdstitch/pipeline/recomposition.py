@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, CompositePlan
-from rdstitch.inputs.source import LeftOut, Source
+from rdstitch.inputs.source import Source
+from rdstitch.messages import Message
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.write import lens_fields, plain, versions
 
@@ -22,7 +23,7 @@ class Recomposition:
         For each picture of the registration the one that took its place, with its camera; None where there is none.
     matched : str
         "name" or "order".
-    left_out : dict of int to LeftOut
+    left_out : dict of int to Message
         Pictures that the registration used and that are not in the output, by their number, with the reason.
     canvas : Canvas
     composite_options : CompositeOptions
@@ -39,7 +40,7 @@ class Recomposition:
     saved: SavedRegistration
     sources: tuple[Source | None, ...]
     matched: str
-    left_out: Mapping[int, LeftOut]
+    left_out: Mapping[int, Message]
     canvas: Canvas
     composite_options: CompositeOptions
     output: Path | None = None
@@ -87,7 +88,7 @@ def _image(result: Recomposition, index: int, entry: dict[str, Any]) -> dict[str
     """One picture's entry, brought up to date."""
     source, picture = result.sources[index], result.saved.pictures[index]
     if source is None or picture.to_plane is None:
-        reason = result.left_out[index].reason if index in result.left_out else picture.reason
+        reason = result.left_out[index].text if index in result.left_out else picture.reason
         return {**entry, "used": False, "reason": reason, "to_plane": None, "to_output": None, "pose": None}
     return {
         **entry,

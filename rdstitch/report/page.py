@@ -17,7 +17,6 @@ from rdstitch.report.summary import notices, summary
 from rdstitch.report.timings import timings
 from rdstitch.report.votes import votes
 from rdstitch.stitch_result import StitchResult
-from rdstitch.verification.verdict import Verdict
 
 REPORT_SUFFIXES = (".html", ".htm")
 
@@ -37,7 +36,6 @@ def write_report(
     path: str | Path,
     result: StitchResult | Registration,
     stages: Sequence[tuple[str, float]] = (),
-    verdict: Verdict | None = None,
 ) -> None:
     """Write the report of a result: one HTML file without anything outside of it.
 
@@ -47,8 +45,6 @@ def write_report(
     result : StitchResult or Registration
     stages : sequence of (str, float)
         Name and seconds of each stage; see :class:`rdstitch.pipeline.timing.StageTimer`.
-    verdict : Verdict, optional
-        On a registration that was refused.
 
     Raises
     ------
@@ -56,19 +52,17 @@ def write_report(
         When the file cannot be written.
     """
     # Names of files need not be UTF-8.
-    write_bytes_atomic(path, report_page(result, stages, verdict).encode("utf-8", "backslashreplace"))
+    write_bytes_atomic(path, report_page(result, stages).encode("utf-8", "backslashreplace"))
 
 
-def report_page(
-    result: StitchResult | Registration, stages: Sequence[tuple[str, float]] = (), verdict: Verdict | None = None
-) -> str:
+def report_page(result: StitchResult | Registration, stages: Sequence[tuple[str, float]] = ()) -> str:
     """The report as HTML; see :func:`write_report`."""
     stitched = result if isinstance(result, StitchResult) else None
     registration = result.registration if isinstance(result, StitchResult) else result
     title = "rdstitch report" if stitched is None or stitched.output is None else stitched.output.name
     body = [
-        summary(registration, stitched, verdict),
-        notices(registration, stitched, verdict),
+        summary(registration, stitched),
+        notices(registration),
         "" if stitched is None else mosaic(stitched),
         match_graph(registration),
         votes(registration),

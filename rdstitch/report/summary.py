@@ -9,11 +9,10 @@ import numpy as np
 from rdstitch.registration import Registration
 from rdstitch.report.svg import element, section, table
 from rdstitch.stitch_result import StitchResult
-from rdstitch.verification.verdict import Verdict
 
 
-def summary(registration: Registration, result: StitchResult | None, verdict: Verdict | None = None) -> str:
-    """λ and everything else of which there is one number, with the verdict where there is one."""
+def summary(registration: Registration, result: StitchResult | None) -> str:
+    """λ and everything else of which there is one number, with the verdict."""
     alignment, camera = registration.alignment, registration.camera
     rows = [
         ("λ (half diagonal)", _lambda(registration)),
@@ -31,14 +30,13 @@ def summary(registration: Registration, result: StitchResult | None, verdict: Ve
         rows.append(("focal length", f"{camera.focal:.1f} px ({camera.focal_source})"))
     if result is not None:
         rows.append(("output", "{} x {} px".format(*result.canvas.size)))
-    return section("Summary", "", _verdict(verdict if result is None else result.verdict), table((), rows))
+    return section("Summary", "", _verdict(registration), table((), rows))
 
 
-def notices(registration: Registration, result: StitchResult | None, verdict: Verdict | None = None) -> str:
+def notices(registration: Registration) -> str:
     """Warnings, and pictures that were left out, each with the reason."""
-    doubts = () if verdict is None else verdict.doubts
-    warnings = (*registration.alignment.warnings, *doubts) if result is None else result.warnings
-    missing = [f"{item.path}: {item.reason}" for item in registration.left_out]
+    warnings = [message.text for message in registration.warnings]
+    missing = [f"{message.images[0]}: {message.text}" for message in registration.left_out]
     return section(
         "Warnings and left-out pictures",
         "",
@@ -47,12 +45,11 @@ def notices(registration: Registration, result: StitchResult | None, verdict: Ve
     )
 
 
-def _verdict(verdict: Verdict | None) -> str:
-    if verdict is None:
-        return ""
-    if verdict.ok:
+def _verdict(registration: Registration) -> str:
+    if registration.ok:
         return element("p", "The result passed its own checks.", class_="good")
-    return element("p", escape("Not to be relied on: " + "; ".join(verdict.failures)), class_="bad")
+    failures = "; ".join(message.text for message in registration.failures)
+    return element("p", escape(f"Not to be relied on: {failures}"), class_="bad")
 
 
 def _lambda(registration: Registration) -> str:
@@ -65,8 +62,8 @@ def _lambda(registration: Registration) -> str:
 
 
 def _unread(registration: Registration) -> int:
-    known = {source.path for source in registration.sources}
-    return sum(item.path not in known for item in registration.left_out)
+    known = {str(source.path) for source in registration.sources}
+    return sum(message.images[0] not in known for message in registration.left_out)
 
 
 def _list(title: str, items: Sequence[str], none: str) -> str:

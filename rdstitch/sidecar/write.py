@@ -49,9 +49,9 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
         "images": _images(result),
         "pairs": _pairs(result),
         "verdict": {
-            "ok": result.verdict.ok,
-            "failures": result.verdict.failures,
-            "warnings": result.warnings,
+            "ok": result.ok,
+            "failures": [message.text for message in registration.failures],
+            "warnings": [message.text for message in registration.warnings],
             "relief": alignment.relief,
         },
         "options": result.options,
@@ -63,7 +63,7 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
 
 def _images(result: StitchResult) -> list[dict[str, Any]]:
     registration, alignment = result.registration, result.registration.alignment
-    reasons = {missing.path: missing.reason for missing in registration.left_out}
+    reasons = {Path(missing.images[0]): missing.text for missing in registration.left_out}
     entries = []
     for index, source in enumerate(registration.sources):
         used, poses = bool(alignment.used[index]), alignment.poses

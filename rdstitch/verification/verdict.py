@@ -1,7 +1,7 @@
 """Every run judges itself: can the result be relied on?"""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -9,7 +9,9 @@ from rdstitch.alignment.result import LinkFit
 from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.errors import RegistrationError
 from rdstitch.matching.match_graph import connected_components
+from rdstitch.messages import Message, Severity, names_of, shortened
 from rdstitch.registration import Registration
+from rdstitch.verification.input_doubts import doubtful_inputs
 from rdstitch.verification.overlap_check import CheckedLink, check_overlaps
 
 Pair = tuple[int, int]
@@ -22,31 +24,6 @@ _LEAST_OF_A_PICTURE = 0.6
 # (low sun, parallax, blur) have been seen to have 20 %.
 _LEAST_AGREEMENT, _DOUBTFUL_AGREEMENT = 0.10, 0.15
 _LEAST_CELLS = 8  # below, the overlap has too little texture to say anything
-_MOST_NAMED = 3  # pairs, pictures or cameras in one message
-_FOCAL_SPREAD = 1.03  # ratio of focal lengths in EXIF from which on the lens was zoomed
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Whether a result passed its checks.
-
-    Attributes
-    ----------
-    ok : bool
-    failures : tuple of str
-        Why the result cannot be relied on, one clause each; empty if ``ok``.
-    doubts : tuple of str
-        What the user should look at although the result passed.
-    """
-
-    ok: bool
-    failures: tuple[str, ...]
-    doubts: tuple[str, ...]
-
-    @property
-    def complaints(self) -> tuple[str, ...]:
-        """Everything that the user must be told: failures, which a forced result has, and doubts."""
-        return (*(f"not reliable: {failure}" for failure in self.failures), *self.doubts)
 
 
 class RefusedError(RegistrationError):
@@ -55,13 +32,12 @@ class RefusedError(RegistrationError):
     Attributes
     ----------
     registration : Registration
-    verdict : Verdict
     """
 
-    def __init__(self, registration: Registration, verdict: Verdict) -> None:
-        reasons = "; ".join(verdict.failures)
+    def __init__(self, registration: Registration) -> None:
+        reasons = "; ".join(message.text for message in registration.failures)
         super().__init__(f"no reliable result: {reasons} (--force writes it all the same)")
-        self.registration, self.verdict = registration, verdict
+        self.registration = registration
 
 
 def judge(
@@ -71,7 +47,7 @@ def judge(
     cache: Cache = NO_CACHE,
     *,
     lens_only: bool = False,
-) -> Verdict:
+) -> tuple[Message, ...]:
     """Check an alignment against the pairs that it was made from, and against the pixels.
 
     What makes the places of pictures doubtful, a repeated pattern for one, leaves the lens as it is: a board shifted by
@@ -88,68 +64,86 @@ def judge(
     cache : Cache
     lens_only : bool
         Only the lens is wanted, so that doubts about the places of pictures do not make the result fail.
+
+    Returns
+    -------
+    tuple of Message
+        Failures, with the pictures that they concern where that is clear, and warnings; none for a good result.
     """
     alignment = registration.alignment
-    names = [source.name for source in registration.sources]
+    paths = [str(source.path) for source in registration.sources]
     used = [fit for fit in alignment.links if fit.used]
-    failures: list[str] = []
-    if not np.isfinite(alignment.rms) or alignment.rms > _LARGEST_RMS * threshold:
-        failures.append(f"the pictures disagree by {alignment.rms:.1f} px, more than the threshold of {threshold:g} px")
+    checked = [] if registration.static_background else check_overlaps(registration, workers, cache)
+    disagreeing = _disagreeing(paths, used)
+    suspicions = {**disagreeing, **_unlike(paths, checked), **_ambiguous(paths, checked)}
+    grave = {} if registration.static_background else disagreeing if lens_only else suspicions
+    decisive = _decisive(grave, used, len(paths))
+    return (
+        *_error_of_the_whole(alignment.rms, threshold, used),
+        *_mixed(paths, registration),
+        *([] if registration.static_background else _misfits(paths, used)),
+        *(suspicions[pair] for pair in decisive),
+        *_outvoted(paths, [pair for pair in suspicions if pair not in decisive]),
+        *_little_alike(paths, checked),
+        *doubtful_inputs(registration.sources),
+    )
+
+
+def _failure(text: str, images: Sequence[str] = ()) -> Message:
+    return Message(text, tuple(images), "failure")
+
+
+def _error_of_the_whole(rms: float, threshold: float, used: Sequence[LinkFit]) -> list[Message]:
+    """Errors of all pairs together."""
+    found = []
+    if not np.isfinite(rms) or rms > _LARGEST_RMS * threshold:
+        found.append(_failure(f"the pictures disagree by {rms:.1f} px, more than the threshold of {threshold:g} px"))
     given, kept = sum(fit.count for fit in used), sum(fit.inliers for fit in used)
     if kept < _LEAST_INLIERS * given:
-        failures.append(f"only {kept} of {given} matches of the pairs agree with the whole")
-    failures.extend(_mixed(names, registration))
-    disagreeing = _disagreeing(names, used)
-    checked: list[CheckedLink] = []
-    if not registration.resting:
-        failures.extend(_misfits(names, used))
-        checked = check_overlaps(registration, workers, cache)
-    misplaced = {**_unlike(names, checked), **_ambiguous(names, checked)}
-    suspicions = {**disagreeing, **misplaced}
-    grave = {} if registration.resting else disagreeing if lens_only else suspicions
-    decisive = _decisive(grave, used, len(names))
-    failures.extend(suspicions[pair] for pair in decisive[:_MOST_NAMED])
-    if len(decisive) > _MOST_NAMED:
-        failures.append(f"{len(decisive) - _MOST_NAMED} more pairs like these")
-    outvoted = _outvoted(names, [pair for pair in suspicions if pair not in decisive])
-    return Verdict(not failures, tuple(failures), (*outvoted, *_little_alike(names, checked), *_inputs(registration)))
+        found.append(_failure(f"only {kept} of {given} matches of the pairs agree with the whole"))
+    return found
 
 
-def _outvoted(names: Sequence[str], pairs: Sequence[Pair]) -> list[str]:
-    """Suspicious pairs that decide nothing, in one clause."""
+def _outvoted(paths: Sequence[str], pairs: Sequence[Pair]) -> list[Message]:
+    """Suspicious pairs on which nothing depends, as one warning."""
     if not pairs:
         return []
-    named = _few([f"{names[i]} and {names[j]}" for i, j in pairs])
-    return [f"{len(pairs)} of the pairs fit badly, and little depends on them: {named}; look at the seams between them"]
+    named = shortened([" and ".join(names_of([paths[i], paths[j]])) for i, j in pairs])
+    text = f"{len(pairs)} of the pairs fit badly, and little depends on them: {named}; look at the seams between them"
+    return [Message(text, tuple(paths[k] for k in sorted({k for pair in pairs for k in pair})))]
 
 
-def _mixed(names: Sequence[str], registration: Registration) -> list[str]:
-    """Two lenses whose pictures were not parted: it is not clear which are whose, or each has one picture only."""
+def _mixed(paths: Sequence[str], registration: Registration) -> list[Message]:
+    """Two lenses whose pictures were not separated: it is not clear which are whose, or each has one picture only."""
     mixed = registration.mixed
     if mixed is None or mixed.certain:
         return []
-    own, others = ([name for name, s in zip(names, mixed.second, strict=True) if s == k] for k in (True, False))
+    own, others = ([path for path, s in zip(paths, mixed.second, strict=True) if s == k] for k in (True, False))
     return [
-        f"two lenses or zooms are mixed: {_few(own)} (λ about {mixed.distortion[1]:.3f}) and {_few(others)} "
-        f"({mixed.distortion[0]:.3f}); stitch those of each on their own"
+        _failure(
+            f"two lenses or zooms are mixed: {shortened(names_of(own))} (λ about {mixed.distortion[1]:.3f}) and "
+            f"{shortened(names_of(others))} ({mixed.distortion[0]:.3f}); stitch those of each on their own"
+        )
     ]
 
 
-def _misfits(names: Sequence[str], used: Sequence[LinkFit]) -> list[str]:
+def _misfits(paths: Sequence[str], used: Sequence[LinkFit]) -> list[Message]:
     """Pictures of whose matches too many, over all their pairs, do not fit into the whole."""
-    given, kept = np.zeros(len(names), dtype=np.intp), np.zeros(len(names), dtype=np.intp)
+    given, kept = np.zeros(len(paths), dtype=np.intp), np.zeros(len(paths), dtype=np.intp)
     for fit in used:
         given[[fit.image1, fit.image2]] += fit.count
         kept[[fit.image1, fit.image2]] += fit.inliers
-    misfits = np.flatnonzero(kept < _LEAST_OF_A_PICTURE * given).tolist()
-    named = [
-        f"{names[k]}: only {kept[k]} of {given[k]} of its matches agree with the whole; another camera or zoom?"
-        for k in misfits[:_MOST_NAMED]
+    return [
+        _failure(
+            f"{Path(paths[k]).name}: only {kept[k]} of {given[k]} of its matches agree with the whole; "
+            "another camera or zoom?",
+            [paths[k]],
+        )
+        for k in np.flatnonzero(kept < _LEAST_OF_A_PICTURE * given).tolist()
     ]
-    return [*named, f"{len(misfits) - _MOST_NAMED} more pictures like these"] if len(misfits) > _MOST_NAMED else named
 
 
-def _decisive(suspicions: Mapping[Pair, str], used: Sequence[LinkFit], count: int) -> list[Pair]:
+def _decisive(suspicions: Mapping[Pair, Message], used: Sequence[LinkFit], count: int) -> list[Pair]:
     """The suspicious pairs without which the pictures fall apart; those of the others are held by better ones."""
     sound = [fit for fit in used if (fit.image1, fit.image2) not in suspicions]
     parts = connected_components(count, [fit.image1 for fit in sound], [fit.image2 for fit in sound])
@@ -157,79 +151,64 @@ def _decisive(suspicions: Mapping[Pair, str], used: Sequence[LinkFit], count: in
     return [(i, j) for i, j in suspicions if part[i] != part[j]]
 
 
-def _disagreeing(names: Sequence[str], used: Sequence[LinkFit]) -> dict[Pair, str]:
+def _of_pair(paths: Sequence[str], link: LinkFit, text: str, severity: Severity = "failure") -> Message:
+    """A message on two pictures; ``text`` follows their names."""
+    both = paths[link.image1], paths[link.image2]
+    return Message(f"{' and '.join(names_of(both))}{text}", both, severity)
+
+
+def _disagreeing(paths: Sequence[str], used: Sequence[LinkFit]) -> dict[Pair, Message]:
     """Pairs whose matches do not fit into the whole."""
     return {
-        (fit.image1, fit.image2): f"{names[fit.image1]} and {names[fit.image2]}: only {fit.inliers} of {fit.count} "
-        "matches agree with the whole; another camera or zoom, or no plane? stitch them on their own"
+        (fit.image1, fit.image2): _of_pair(
+            paths,
+            fit,
+            f": only {fit.inliers} of {fit.count} matches agree with the whole; another camera or zoom, or no plane? "
+            "stitch them on their own",
+        )
         for fit in used
         if fit.inliers < _LEAST_INLIERS * fit.count
     }
 
 
-def _unlike(names: Sequence[str], checked: Sequence[CheckedLink]) -> dict[Pair, str]:
+def _unlike(paths: Sequence[str], checked: Sequence[CheckedLink]) -> dict[Pair, Message]:
     """Pictures that were put together and do not look alike there."""
     return {
-        link.pair: f"{names[link.fit.image1]} and {names[link.fit.image2]} do not look alike where they are put "
-        f"together ({link.agreement.confirming} of {link.agreement.cells} places agree); leave one of them out"
+        link.pair: _of_pair(
+            paths,
+            link.fit,
+            f" do not look alike where they are put together ({link.agreement.confirming} of {link.agreement.cells} "
+            "places agree); leave one of them out",
+        )
         for link in checked
         if link.agreement.cells >= _LEAST_CELLS and link.agreement.share < _LEAST_AGREEMENT
     }
 
 
-def _ambiguous(names: Sequence[str], checked: Sequence[CheckedLink]) -> dict[Pair, str]:
+def _ambiguous(paths: Sequence[str], checked: Sequence[CheckedLink]) -> dict[Pair, Message]:
     """Pictures of a repeated pattern, of which nobody can say by how many periods they are apart."""
     return {
-        link.pair: f"{names[link.fit.image1]} and {names[link.fit.image2]} fit as well elsewhere, "
-        f"{link.ambiguity.shift:.0%} of a picture away (a repeated pattern?); take pictures that share something unique"
+        link.pair: _of_pair(
+            paths,
+            link.fit,
+            f" fit as well elsewhere, {link.ambiguity.shift:.0%} of a picture away (a repeated pattern?); "
+            "take pictures that share something unique",
+        )
         for link in checked
         if link.ambiguity.ambiguous
     }
 
 
-def _little_alike(names: Sequence[str], checked: Sequence[CheckedLink]) -> list[str]:
+def _little_alike(paths: Sequence[str], checked: Sequence[CheckedLink]) -> list[Message]:
+    """Pictures that look less alike than most where they are put together."""
     return [
-        f"{names[link.fit.image1]} and {names[link.fit.image2]}: only {link.agreement.confirming} of "
-        f"{link.agreement.cells} places look alike; look at the seam between them"
+        _of_pair(
+            paths,
+            link.fit,
+            f": only {link.agreement.confirming} of {link.agreement.cells} places look alike; "
+            "look at the seam between them",
+            "warning",
+        )
         for link in checked
         if link.agreement.cells >= _LEAST_CELLS and _LEAST_AGREEMENT <= link.agreement.share < _DOUBTFUL_AGREEMENT
     ]
-
-
-def _inputs(registration: Registration) -> list[str]:
-    """What may be wrong with the pictures themselves."""
-    return [*_several_cameras(registration), *_unmasked(registration)]
-
-
-def _unmasked(registration: Registration) -> list[str]:
-    """Pictures without a mask among others that have one: perhaps a name is misspelt."""
-    without = [source.name for source in registration.sources if source.mask is None]
-    if not 0 < len(without) < len(registration.sources):
-        return []
-    return [f"{len(without)} of {len(registration.sources)} pictures have no mask: {_few(without)}"]
-
-
-def _several_cameras(registration: Registration) -> list[str]:
-    """Pictures that say of themselves that they come from another camera, or were zoomed."""
-    known = [source for source in registration.sources if source.metadata.model or source.metadata.serial]
-    bodies: dict[str, list[str]] = {}
-    for source in known:
-        m = source.metadata
-        bodies.setdefault(" ".join(filter(None, (m.make, m.model, m.serial))), []).append(source.name)
-    if len(bodies) > 1:
-        commonest = sorted(bodies.items(), key=lambda body: -len(body[1]))[:_MOST_NAMED]
-        listed = "; ".join(f"{body} ({len(names)}: {_few(names)})" for body, names in commonest)
-        return [f"the pictures come from {len(bodies)} cameras: {listed}; stitch those of each on their own"]
-    focal = {s.name: s.metadata.focal_px / max(s.metadata.size) for s in known if s.metadata.focal_px is not None}
-    if focal and max(focal.values()) > _FOCAL_SPREAD * min(focal.values()):
-        near, far = min(focal, key=lambda name: focal[name]), max(focal, key=lambda name: focal[name])
-        return [
-            f"the lens was zoomed between the pictures, by up to {focal[far] / focal[near]:.2f} "
-            f"(between {near} and {far}); stitch those of one zoom on their own"
-        ]
-    return []
-
-
-def _few(names: Sequence[str]) -> str:
-    """Names, or the first of them where they are many."""
-    return ", ".join(names[:_MOST_NAMED]) + ", …" * (len(names) > _MOST_NAMED)

@@ -14,7 +14,7 @@ import pytest
 from rdstitch_cli.main import run
 
 from rdstitch.matching import two_view
-from rdstitch.pipeline import register
+from rdstitch.pipeline import aligner
 from rdstitch.verification import overlap_check
 from tests.cli.running import FAST, Run, finished, start
 
@@ -51,7 +51,7 @@ def work(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     # The package has a function of the module's name.
     watch(import_module("rdstitch.features.detect"), "_detect")
     watch(two_view, "estimate_radial_homography")
-    watch(register, "align")
+    watch(aligner, "align")
     watch(overlap_check, "overlap_agreement")
     return called
 

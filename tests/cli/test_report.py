@@ -15,11 +15,11 @@ from PIL import Image
 
 from rdstitch.compositing import CompositeOptions
 from rdstitch.io import read_image
+from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline import calibrate, pano, recipes
 from rdstitch.pipeline.timing import StageTimer
 from rdstitch.report import report_page, thumbnails, write_report
-from rdstitch.verification.verdict import Verdict
 from tests.cli.running import FAST, Run
 
 _VOID = {"meta", "img"}
@@ -132,8 +132,8 @@ def test_calibrate_has_no_mosaic(rdstitch: Run, frames: list[Path], tmp_path: Pa
 def test_what_is_refused_is_shown(
     rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, output: str
 ) -> None:
-    verdict = Verdict(False, ("the pictures <disagree>",), ("look at that seam",))
-    monkeypatch.setattr(recipes, "judge", lambda *arguments, **options: verdict)
+    found = (Message("the pictures <disagree>", severity="failure"), Message("look at that seam"))
+    monkeypatch.setattr(recipes, "judge", lambda *arguments, **options: found)
     report = tmp_path / "report.html"
     arguments = (command, *frames[:2], "-o", tmp_path / output, "--report", report, *FAST)
     assert rdstitch(*arguments).status == 4

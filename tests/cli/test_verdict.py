@@ -8,8 +8,8 @@ import pytest
 from PIL import ExifTags, Image
 
 from rdstitch.camera import Camera
+from rdstitch.messages import Message
 from rdstitch.pipeline import recipes
-from rdstitch.verification.verdict import Verdict
 from tests.cli.running import DISTORTION, FAST, Run, flight
 
 # Without a focal length, a path says that its lengths are guessed.
@@ -17,15 +17,15 @@ GIVEN = (*FAST, "--focal", "380")
 OUTPUTS = {"pano": "out.png", "mosaic": "out.png", "calibrate": "camera.json", "trajectory": "path.csv"}
 
 
-def _pretend(monkeypatch: pytest.MonkeyPatch, verdict: Verdict) -> None:
-    monkeypatch.setattr(recipes, "judge", lambda *arguments, **options: verdict)
+def _pretend(monkeypatch: pytest.MonkeyPatch, *found: Message) -> None:
+    monkeypatch.setattr(recipes, "judge", lambda *arguments, **options: found)
 
 
 @pytest.mark.parametrize("command", OUTPUTS)
 def test_doubts_are_told(
     rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
-    _pretend(monkeypatch, Verdict(True, (), ("look at that seam",)))
+    _pretend(monkeypatch, Message("look at that seam"))
     done = rdstitch(command, *frames, "-o", tmp_path / OUTPUTS[command], *GIVEN)
     assert done.status == 0
     assert done.line == "rdstitch: warning: look at that seam"
@@ -35,7 +35,7 @@ def test_doubts_are_told(
 def test_what_fails_is_not_written_unless_forced_and_then_told(
     rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
-    _pretend(monkeypatch, Verdict(False, ("the pictures disagree",), ()))
+    _pretend(monkeypatch, Message("the pictures disagree", severity="failure"))
     output = tmp_path / OUTPUTS[command]
     refused = rdstitch(command, *frames, "-o", output, *GIVEN)
     assert refused.status == 4

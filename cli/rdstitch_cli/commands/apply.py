@@ -84,7 +84,7 @@ def apply(
             progress=reporter,
         )
         for missing in result.left_out.values():
-            reporter.warn(f"left out {missing.path}: {missing.reason}")
+            reporter.warn(str(missing))
         if result.matched == "order" and match == "auto":
             reporter.warn("no picture has a name of the sidecar; they were taken in order")
         for note in result.notes:

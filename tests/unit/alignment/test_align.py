@@ -8,8 +8,9 @@ import pytest
 
 from rdstitch.alignment.align import AlignmentOptions, align
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
-from rdstitch.alignment.result import Alignment, Poses
+from rdstitch.alignment.result import CONTRADICTS, Alignment, Poses
 from rdstitch.alignment.trajectory import Trajectory, compare
+from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, RegistrationError
 from rdstitch.matching.links import Link
@@ -89,7 +90,7 @@ def test_a_robots_grid_is_rigid(
     assert float(np.quantile(_pair_errors(found, given), 0.95)) < 0.2
     assert compare(Trajectory.from_alignment(found), _true_path(given)).drift < 1e-3
     assert not found.relief.found
-    assert found.warnings == ()
+    assert found.messages == ()
 
 
 @pytest.mark.parametrize(("height", "tilt", "model"), [(0.2, 0.0, "similarity"), (0.2, 3.0, "tilting")])
@@ -155,8 +156,10 @@ def test_pictures_without_connection_are_named() -> None:
     found = _run(scene(poses, rng=rng))
     assert found.used.tolist() == [True] * 6 + [False] * 3
     assert found.components == ((0, 1, 2, 3, 4, 5), (6, 7), (8,))
-    assert "one of 2 pictures" in found.reasons[6]
-    assert "no reliable overlap" in found.reasons[8]
+    reasons = {message.images: message.text for message in explain_unaligned(found, [f"{k}.png" for k in range(9)])}
+    assert list(reasons) == [("6.png",), ("7.png",), ("8.png",)]
+    assert "one of 2 pictures" in reasons["6.png",]
+    assert "no reliable overlap" in reasons["8.png",]
     assert np.isnan(found.homographies[6:]).all()
     assert np.isfinite(found.homographies[:6]).all()
 
@@ -167,7 +170,7 @@ def test_turning_on_the_spot_says_nothing_of_the_lens() -> None:
     poses[:, YAW] = np.linspace(0, 1.5, 5)
     found = _run(scene(poses, distortion=-0.2, rng=rng))
     assert math.isinf(found.distortion_std)
-    assert any("not observable" in warning for warning in found.warnings)
+    assert any("not observable" in message.text for message in found.messages)
 
 
 def test_hills_are_noticed() -> None:
@@ -176,7 +179,7 @@ def test_hills_are_noticed() -> None:
     found = _run(scene(poses, rng=rng, relief=0.05))
     assert found.relief.found
     assert found.relief.coherence > 0.6
-    assert found.relief.explanation in found.warnings
+    assert found.relief.explanation in [message.text for message in found.messages]
 
 
 def test_known_lens_and_tilt_are_kept() -> None:
@@ -237,3 +240,15 @@ def test_mistakes_of_the_caller() -> None:
     failed = RadialHomography.failed("none", Camera((4, 3)), Camera((4, 3)), 0)
     with pytest.raises(ArgumentError, match="failed fit"):
         replace(given.links[0], relation=failed)
+
+
+def test_a_picture_that_contradicts_the_others_names_them() -> None:
+    rng = np.random.default_rng(11)
+    found = _run(scene(grid(2, 1, (0.4, 0.3), 0.2, rng), rng=rng))
+    contradicting = replace(found.links[0], image1=0, image2=2, used=False, reason=CONTRADICTS)
+    whole = replace(
+        found, used=np.array([True, True, False]), components=((0, 1), (2,)), links=(*found.links, contradicting)
+    )
+    (message,) = explain_unaligned(whole, ["left.png", "middle.png", "right.png"])
+    assert message.images == ("right.png",)
+    assert "its overlap with left.png contradicts" in message.text

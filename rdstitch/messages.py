@@ -1,0 +1,57 @@
+"""What a user should know of a result, as one type: what it is, which pictures it concerns, and how grave it is."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+Severity = Literal["warning", "left out", "failure"]
+
+MOST_NAMED = 3
+"""Pictures or pairs that one message names."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """One thing that the user should know.
+
+    Attributes
+    ----------
+    text : str
+        One sentence without its full stop.
+    images : tuple of str
+        Paths of the pictures that it concerns; empty where it concerns all of them.
+    severity : str
+        "warning": there is a result, to be looked at. "left out": the one picture named is not in the result, for the
+        reason that the text gives. "failure": the result cannot be relied on.
+    """
+
+    text: str
+    images: tuple[str, ...] = ()
+    severity: Severity = "warning"
+
+    def __str__(self) -> str:
+        """The line for standard error."""
+        if self.severity == "left out":
+            return f"left out {', '.join(self.images)}: {self.text}"
+        return f"not reliable: {self.text}" if self.severity == "failure" else self.text
+
+
+def left_out(path: str | Path, reason: str) -> Message:
+    """A picture that is not in the result."""
+    return Message(reason, (str(path),), "left out")
+
+
+def of_severity(messages: Iterable[Message], *severities: Severity) -> tuple[Message, ...]:
+    """The messages that are so grave, in their order."""
+    return tuple(message for message in messages if message.severity in severities)
+
+
+def names_of(paths: Iterable[str]) -> list[str]:
+    """File names without their folders, as messages call pictures."""
+    return [Path(path).name for path in paths]
+
+
+def shortened(names: Sequence[str], most: int = MOST_NAMED) -> str:
+    """Names, or the first of them where they are many."""
+    return ", ".join(names[:most]) + ", …" * (len(names) > most)

@@ -1,0 +1,149 @@
+"""Stages: registered pairs become one alignment, which finds more pairs, which make a better alignment."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Self
+
+import numpy as np
+
+from rdstitch.alignment import Alignment, AlignmentOptions, align
+from rdstitch.alignment.result import LinkFit, Poses, Relief
+from rdstitch.cache import Cache
+from rdstitch.camera import Camera
+from rdstitch.errors import ArgumentError, RegistrationError
+from rdstitch.inputs.source import Source
+from rdstitch.matching.candidate_pairs import neighbours
+from rdstitch.matching.two_view import PairRegistration
+from rdstitch.matching.two_view_rounds import Pair, Pairing
+from rdstitch.messages import Message, names_of
+from rdstitch.options import StitchOptions
+
+_CLOSURE_ROUNDS = 2
+
+
+@dataclass(frozen=True)
+class AlignedPairs:
+    """Pairs, and the alignment that was made from them.
+
+    Attributes
+    ----------
+    pairs : tuple of PairRegistration
+        Every pair that was compared, in the order of the pictures.
+    alignment : Alignment
+    """
+
+    pairs: tuple[PairRegistration, ...]
+    alignment: Alignment
+
+
+@dataclass(frozen=True)
+class Aligner:
+    """What the alignment of a set of pictures needs besides their pairs.
+
+    Attributes
+    ----------
+    paths : tuple of str
+        Of the pictures, for messages.
+    cameras : tuple of Camera
+    options : AlignmentOptions
+    cache : Cache
+    """
+
+    paths: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    options: AlignmentOptions
+    cache: Cache
+
+    @classmethod
+    def of(cls, sources: Sequence[Source], options: StitchOptions, cache: Cache) -> Self:
+        """From what the user decided, and what the pictures and their headers say.
+
+        Raises
+        ------
+        ArgumentError
+            When the reference picture is none of the pictures.
+        """
+        paths = tuple(str(source.path) for source in sources)
+        return cls(
+            paths, tuple(source.camera.with_focal() for source in sources), _alignment_options(sources, options), cache
+        )
+
+    def align(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
+        """Align the pictures by the pairs that were registered; from an earlier run where the cache has it.
+
+        Raises
+        ------
+        RegistrationError
+            When no pair was registered.
+        """
+        links = tuple(pair.link() for pair in pairs if pair.relation)
+        if not links:
+            raise RegistrationError(_no_overlap(self.paths, pairs))
+        inputs = (self.cameras, self.cache.digest(links), self.options)
+        compute = partial(align, self.cameras, links, self.options)
+        kinds = (Alignment, Camera, LinkFit, Poses, Relief, Message)
+        return AlignedPairs(tuple(pairs), self.cache.recall("alignment", kinds, inputs, compute))
+
+    def metric(self, aligned: AlignedPairs) -> AlignedPairs:
+        """The same pairs with a model that has metric poses, where the user left the choice of the model open."""
+        if aligned.alignment.poses is not None or self.options.model != "auto":
+            return aligned
+        return replace(self, options=replace(self.options, model="tilting")).align(aligned.pairs)
+
+
+def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candidates: Sequence[Pair]) -> AlignedPairs:
+    """Register pictures that the poses put beside each other, and the candidate pairs of pictures without a pose."""
+    for _ in range(_CLOSURE_ROUNDS):
+        pairs, alignment = aligned.pairs, aligned.alignment
+        tried = {(pair.image1, pair.image2) for pair in pairs}
+        loop_closures = neighbours(alignment.cameras, alignment.homographies, tried)
+        unaligned = {(i, j) for i, j in candidates if not (alignment.used[i] and alignment.used[j])} - tried
+        found = pairing.estimate(sorted(unaligned.union(loop_closures)), distortion=alignment.distortion)
+        pairs = tuple(sorted([*pairs, *found], key=lambda pair: (pair.image1, pair.image2)))
+        if not any(pair.relation for pair in found):
+            return AlignedPairs(pairs, alignment)
+        aligned = aligner.align(pairs)
+    return aligned
+
+
+def rematch_weak_pairs(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs) -> AlignedPairs:
+    """Match pairs of weakly supported pictures again, only near where the alignment expects the matches."""
+    alignment = aligned.alignment
+    stronger = pairing.guided_rematch(list(aligned.pairs), alignment.support, alignment.transfer)
+    return aligner.align([stronger.get(k, pair) for k, pair in enumerate(aligned.pairs)]) if stronger else aligned
+
+
+def _alignment_options(sources: Sequence[Source], options: StitchOptions) -> AlignmentOptions:
+    """What is decided or known beforehand; measured attitudes that are not exact leave the mount's tilt open."""
+    attitudes = [source.attitude for source in sources if source.attitude is not None]
+    exact = bool(attitudes) and options.attitude_std == 0.0
+    return AlignmentOptions(
+        reference=_reference(sources, options.reference),
+        model=options.model,
+        distortion=options.known_distortion,
+        tilt=options.tilt or ((0.0, 0.0) if exact else None),
+        attitudes=np.array(attitudes) if attitudes else None,
+        attitudes_std=options.attitude_std,
+    )
+
+
+def _reference(sources: Sequence[Source], name: str | None) -> int | None:
+    if name is None:
+        return None
+    for index, source in enumerate(sources):
+        if name in (source.name, str(source.path)):
+            return index
+    raise ArgumentError(f"the reference picture {name!r} is not among the input pictures")
+
+
+def _no_overlap(paths: Sequence[str], pairs: Sequence[PairRegistration]) -> str:
+    """Why no pair was registered, by the example of the pair with the most matches."""
+    if not pairs:
+        return "no two pictures could be compared"
+    best = max(pairs, key=lambda pair: len(pair.correspondences))
+    first, second = names_of([paths[best.image1], paths[best.image2]])
+    return (
+        f"no two pictures overlap: of the likeliest pair, {first} and {second}, {best.relation.reason}; "
+        "take pictures that overlap by a third or more"
+    )
