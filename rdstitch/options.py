@@ -10,6 +10,7 @@ from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError
 from rdstitch.features import FeatureOptions
+from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.matching.options import MatchingOptions, PairOptions
 from rdstitch.robust import SOLVERS
 
@@ -39,6 +40,7 @@ class StitchOptions:
     attitude: str | Path | None = None  # measured tilt of each picture: CSV of name, psi, theta, degrees; or "xmp"
     attitude_std: float = math.radians(1.0)  # its standard deviation, radians; 0: exact
     mask: str | Path | None = None  # picture, or folder of them, that is dark where the pictures do not count
+    channel_order: ChannelOrder = "bgr"  # of arrays that come in or go out: "bgr", as OpenCV has it, or "rgb"
     reference: str | None = None  # name of the picture whose frame is kept; None: the best connected
     composite: CompositeOptions = field(default_factory=CompositeOptions)
     cache: Path | None = None  # folder of results of earlier runs, to continue from; made if missing

@@ -1,5 +1,6 @@
 """What registering a set of pictures gives."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Self
@@ -63,6 +64,14 @@ class Registration:
     def left_out(self) -> tuple[Message, ...]:
         """Every picture that is not in the result, with the reason."""
         return of_severity(self.messages, "left out")
+
+    @property
+    def lens(self) -> str:
+        """λ with its standard deviation, in words."""
+        distortion, deviation = self.alignment.distortion, self.alignment.distortion_std
+        if not math.isfinite(deviation):
+            return "λ not observable"
+        return f"λ = {distortion:.4f} " + ("(given)" if deviation == 0.0 else f"± {deviation:.4f}")
 
     @property
     def camera(self) -> Camera:

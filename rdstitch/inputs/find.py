@@ -1,4 +1,4 @@
-"""What the user names as input: folders, files, patterns, lists, videos; in the end a list of picture files."""
+"""What the user names as input: folders, files, patterns, lists, videos; in the end a list of frames."""
 
 import glob
 import json
@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from rdstitch.errors import InputError
+from rdstitch.inputs.frame import Frame, Named
 from rdstitch.io.decoding import FOREIGN_SUFFIXES
 from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames
 from rdstitch.records import read_text
@@ -19,19 +20,19 @@ PICTURE_SUFFIXES = frozenset(
 
 
 def find_pictures(
-    arguments: Iterable[str | Path],
+    arguments: Iterable[Named],
     *,
     exclude: Iterable[str | Path] = (),
     frames_folder: Path | None = None,
     every: int = 1,
-) -> list[Path]:
-    """The picture files that the arguments stand for, in natural order within a folder or pattern.
+) -> list[Frame]:
+    """The frames that the arguments stand for, in natural order within a folder or pattern.
 
     Parameters
     ----------
-    arguments : iterable of path
+    arguments : iterable of path or Frame
         Each a picture file, a folder, a pattern (``*``, ``?``, ``[...]``), ``@FILE`` with one argument a line or
-        separated by NUL, or a video file.
+        separated by NUL, a video file, or a frame, which stays as it is.
     exclude : iterable of path
         Files that are no input, such as the output, where they come from a folder or pattern or are rdstitch's own
         work. Any other picture that is named stays: its user must hear that it would be written over. Pictures in
@@ -48,9 +49,9 @@ def find_pictures(
     """
     unwanted = {_entry(Path(path)) for path in exclude}
     return [
-        path
-        for path, named in _expand(arguments, frames_folder, every)
-        if _entry(path) not in unwanted or (named and not _is_rdstitch_output(path))
+        frame
+        for frame, named in _expand(arguments, frames_folder, every)
+        if _entry(frame.path) not in unwanted or (named and not _is_rdstitch_output(frame.path))
     ]
 
 
@@ -66,10 +67,13 @@ def natural_key(path: Path) -> list[tuple[int, str | int]]:
 
 
 def _expand(
-    arguments: Iterable[str | Path], frames_folder: Path | None, every: int, lists: tuple[Path, ...] = ()
-) -> Iterator[tuple[Path, bool]]:
-    """Every picture, and whether it was named one by one; ``lists`` are those that the arguments come from."""
+    arguments: Iterable[Named], frames_folder: Path | None, every: int, lists: tuple[Path, ...] = ()
+) -> Iterator[tuple[Frame, bool]]:
+    """Every frame, and whether it was named one by one; ``lists`` are those that the arguments come from."""
     for argument in arguments:
+        if isinstance(argument, Frame):
+            yield argument, True
+            continue
         path, text = Path(argument), str(argument)
         if not _exists(path):
             if text.startswith("@"):
@@ -78,17 +82,17 @@ def _expand(
                     raise InputError(f"{file}: the list of pictures names itself")
                 yield from _expand(names_in(read_text(file)), frames_folder, every, (*lists, file))
             elif glob.has_magic(text):
-                yield from ((found, False) for found in _matching(text))
+                yield from ((Frame(found), False) for found in _matching(text))
             else:
-                yield path, True
+                yield Frame(path), True
         elif path.is_dir():
-            yield from ((found, False) for found in _in_folder(path))
+            yield from ((Frame(found), False) for found in _in_folder(path))
         elif path.suffix.lower() in VIDEO_SUFFIXES:
             if frames_folder is None:
                 raise InputError(f"{path}: a video is no picture here; use 'rdstitch mosaic' or extract its frames")
-            yield from ((frame, True) for frame in extract_frames(path, frames_folder, every))
+            yield from ((Frame(*frame), True) for frame in extract_frames(path, frames_folder, every))
         else:
-            yield path, True
+            yield Frame(path), True
 
 
 def _exists(path: Path) -> bool:

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from rdstitch.cache import Cache
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.features.options import WORK_MEGAPIXELS
 from rdstitch.features.picture import halving
 from rdstitch.inputs.decoded_image_cache import DecodedImageCache
+from rdstitch.inputs.frame import Frame, Named
 from rdstitch.io.mask import read_mask
 from rdstitch.io.metadata import Metadata, read_metadata
 from rdstitch.io.read import Picture, read_image, reduced
@@ -33,6 +35,8 @@ class Source:
         Picture that is dark where this one does not count.
     attitude : (float, float) or None
         (ψ, θ), radians, as a gimbal or an IMU has measured it.
+    frame : Frame or None
+        Its number and time in the sequence; the pixels, where they are no file.
     decoded_images : DecodedImageCache
         Where it is kept between two stages that both look at it.
     """
@@ -42,6 +46,7 @@ class Source:
     camera: Camera
     mask: Path | None = None
     attitude: tuple[float, float] | None = None
+    frame: Frame | None = field(default=None, compare=False, repr=False)
     decoded_images: DecodedImageCache = field(
         default_factory=partial(DecodedImageCache, room=0), compare=False, repr=False
     )
@@ -50,6 +55,12 @@ class Source:
     def name(self) -> str:
         """File name, for messages and reports."""
         return self.path.name
+
+    def content(self, cache: Cache) -> str:
+        """Hash of what the image is made from, for keys of the cache."""
+        if self.frame is None or self.frame.picture is None:
+            return cache.file(self.path)
+        return cache.digest((self.frame.picture.pixels, self.frame.picture.alpha))
 
     def reduction(self, megapixels: float | None) -> int:
         """By how much it can be read smaller and has no fewer px than a picture that is halved to so many 10⁶ px."""
@@ -81,7 +92,8 @@ class Source:
 
     def _load(self, reduction: int) -> Picture:
         """The pixels from the file, masked."""
-        picture = read_image(self.path, reduction)
+        array = None if self.frame is None else self.frame.picture
+        picture = read_image(self.path, reduction) if array is None else reduced(array, reduction)
         expected = self.camera.image_size
         if picture.pixels.shape[1::-1] != reduced_size(expected, reduction):
             now, before = ("{} x {}".format(*size) for size in (picture.metadata.size, expected))
@@ -120,13 +132,13 @@ def readers(sources: Sequence[Source]) -> list[Callable[..., Picture]]:
 
 
 def read_sources(
-    paths: Iterable[str | Path], *, camera: Camera | None, focal: float | None, distortion: float | None, skip_bad: bool
+    inputs: Iterable[Named], *, camera: Camera | None, focal: float | None, distortion: float | None, skip_bad: bool
 ) -> tuple[list[Source], list[Message]]:
     """Read the headers of the pictures; a file named twice counts once.
 
     Parameters
     ----------
-    paths : iterable of path
+    inputs : iterable of path or Frame
     camera : Camera or None
         Known camera; adapted to the size of each picture.
     focal : float or None
@@ -145,21 +157,22 @@ def read_sources(
     unread: list[Message] = []
     seen: set[Path] = set()
     decoded_images = DecodedImageCache()
-    for path in map(Path, paths):
+    for item in inputs:
+        frame = item if isinstance(item, Frame) else Frame(Path(item))
+        path = frame.path
         try:
             key = path.resolve()
-            metadata = read_metadata(path)
+            metadata = read_metadata(path) if frame.picture is None else frame.picture.metadata
         except (InputError, OSError, RuntimeError) as error:
             reason = error if isinstance(error, InputError) else InputError(f"{path}: cannot be read: {error}")
             if not skip_bad:
                 raise reason from error
             unread.append(left_out(path, str(reason)))
             continue
-        if key not in seen:
+        if frame.picture is not None or key not in seen:
             seen.add(key)
-            sources.append(
-                Source(path, metadata, _camera(metadata, camera, focal, distortion), decoded_images=decoded_images)
-            )
+            known = _camera(metadata, camera, focal, distortion)
+            sources.append(Source(path, metadata, known, frame=frame, decoded_images=decoded_images))
     return sources, unread
 
 

@@ -80,7 +80,7 @@ def read_image(path: str | Path, reduction: int = 1) -> Picture:
         with file.open("rb") as stream:
             magic = stream.read(8)
         if magic[:4] in _TIFF_MAGIC:
-            return reduced(_finish(file, *_read_tiff(file), read_metadata(file)), reduction)
+            return reduced(as_picture(file, *_read_tiff(file), read_metadata(file)), reduction)
         with Image.open(file) as image:
             metadata = metadata_of(image)
             if magic == _PNG_MAGIC and metadata.bit_depth == 16 and image.mode not in _GREY_16:
@@ -88,8 +88,8 @@ def read_image(path: str | Path, reduction: int = 1) -> Picture:
             else:
                 factor = _decoders_share(image, metadata, reduction)
                 samples, alpha = _from_jpeg(file, image, factor) or _from_pillow(image, factor)
-                return reduced(_finish(file, samples, alpha, metadata), reduction // factor)
-        return reduced(_finish(file, samples, alpha, metadata), reduction)
+                return reduced(as_picture(file, samples, alpha, metadata), reduction // factor)
+        return reduced(as_picture(file, samples, alpha, metadata), reduction)
 
 
 def reduced(picture: Picture, factor: int) -> Picture:
@@ -223,8 +223,24 @@ def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
     return samples, None
 
 
-def _finish(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Metadata) -> Picture:
-    """Upright, in one of the three sample types, contiguous, and without NaN."""
+def as_picture(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Metadata) -> Picture:
+    """A picture from samples as stored: upright, in one of the three sample types, contiguous, and without NaN.
+
+    Parameters
+    ----------
+    file : Path
+        For messages.
+    samples : ndarray of shape (h, w) or (h, w, C)
+        Colour in RGB order.
+    alpha : ndarray of shape (h, w), or None
+        Of any sample type; full where the picture is opaque.
+    metadata : Metadata
+
+    Raises
+    ------
+    InputError
+        When there are no pixels.
+    """
     if samples.size == 0:
         raise InputError(f"{file}: has no pixels")
     opaque = None if alpha is None else _as_uint8(alpha)

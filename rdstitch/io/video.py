@@ -1,6 +1,7 @@
 """Frames of a video, as picture files."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 
@@ -9,7 +10,15 @@ from rdstitch.errors import InputError, OutputError
 VIDEO_SUFFIXES = frozenset((".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"))
 
 
-def extract_frames(path: Path, folder: Path, every: int = 1) -> list[Path]:
+class VideoFrame(NamedTuple):
+    """A frame that was written to a file; ``timestamp`` is its time in the video, s."""
+
+    path: Path
+    number: int
+    timestamp: float
+
+
+def extract_frames(path: Path, folder: Path, every: int = 1) -> list[VideoFrame]:
     """Write every ``every``-th frame of a video to a folder as PNG, named by video and frame number.
 
     Raises
@@ -23,13 +32,15 @@ def extract_frames(path: Path, folder: Path, every: int = 1) -> list[Path]:
     try:
         if not capture.isOpened():
             raise InputError(f"{path}: cannot be read as a video; convert it, or extract its frames with another tool")
-        written: list[Path] = []
+        written: list[VideoFrame] = []
         number = 0
         while capture.grab():
             if number % every == 0:
+                timestamp = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
                 decoded, frame = capture.retrieve()
                 if decoded:
-                    written.append(_write(folder / f"{path.stem}_{number:06d}.png", frame))
+                    file = write_frame(folder / f"{path.stem}_{number:06d}.png", frame)
+                    written.append(VideoFrame(file, number, timestamp))
             number += 1
     finally:
         capture.release()
@@ -38,7 +49,14 @@ def extract_frames(path: Path, folder: Path, every: int = 1) -> list[Path]:
     return written
 
 
-def _write(file: Path, frame: cv2.typing.MatLike) -> Path:
+def write_frame(file: Path, frame: cv2.typing.MatLike) -> Path:
+    """Write a frame in BGR order as PNG, losslessly and quickly.
+
+    Raises
+    ------
+    OutputError
+        When it cannot be written.
+    """
     encoded, data = cv2.imencode(".png", frame, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not encoded:
         raise OutputError(f"{file}: cannot encode the frame")

@@ -1,7 +1,7 @@
 """Recomposing from a saved registration: other bands of the same flight, other sizes, other compositing options."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,6 +13,7 @@ from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, InputError, OutputError, PartialResultError
 from rdstitch.inputs.find import find_pictures
+from rdstitch.inputs.frame import ChannelOrder, Frame, Images, as_inputs, files_of
 from rdstitch.inputs.masks import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.atomic import check_output, write_json_atomic
@@ -31,7 +32,7 @@ _MATCHES = ("auto", "name", "order")
 
 def apply(
     sidecar: str | Path,
-    images: Iterable[str | Path],
+    images: Images,
     output: str | Path | None = None,
     composite: CompositeOptions | None = None,
     *,
@@ -42,6 +43,7 @@ def apply(
     overwrite: bool = False,
     strict: bool = False,
     dry_run: bool = False,
+    channel_order: ChannelOrder = "bgr",
     progress: Progress = silent,
 ) -> Recomposition:
     """Compose pictures by a registration that was found before; nothing is estimated.
@@ -50,9 +52,9 @@ def apply(
     ----------
     sidecar : path
         What :func:`rdstitch.pano` or :func:`rdstitch.mosaic` wrote beside its picture.
-    images : iterable of path
+    images : path, ndarray, or iterable of them
         The same pictures, or others that were taken by the same lens from the same places: other bands, other sizes of
-        the same shape, masks. Folders, files, patterns, ``@list`` files or videos.
+        the same shape, masks. Whatever :func:`rdstitch.mosaic` takes.
     output : path, optional
         Picture to write, with a sidecar of its own beside it; without it the picture is in the result.
     composite : CompositeOptions, optional
@@ -72,6 +74,8 @@ def apply(
         Fail when a picture that the registration used is missing or cannot be read.
     dry_run : bool
         Only plan; nothing is written.
+    channel_order : str
+        Of arrays: "bgr" or "rgb".
     progress : callable
 
     Raises
@@ -88,10 +92,11 @@ def apply(
     options = composite or saved.composite
     with TemporaryDirectory(prefix="rdstitch-") as folder:
         exclude = [] if output is None else [output]
-        paths = find_pictures(images, exclude=exclude, frames_folder=Path(folder), every=every)
+        given = as_inputs(images, channel_order)
+        frames = find_pictures(given, exclude=exclude, frames_folder=Path(folder), every=every)
         if output is not None:
-            _check_outputs(Path(output), overwrite, paths, saved.path)
-        chosen, matched = _match(saved, paths, match)
+            _check_outputs(Path(output), overwrite, files_of(frames), saved.path)
+        chosen, matched = _match(saved, frames, match)
         sources, left_out = _sources(saved, chosen)
         if strict and left_out:
             raise PartialResultError("; ".join(map(str, left_out.values())))
@@ -138,17 +143,18 @@ def _check_outputs(output: Path, overwrite: bool, inputs: Sequence[Path], sideca
     check_output(beside, overwrite, inputs, suffixes=())
 
 
-def _match(saved: SavedRegistration, paths: Sequence[Path], match: Match) -> tuple[list[Path | None], str]:
-    """For each picture of the registration the file that takes its place, and by what it was found."""
-    if match != "order":
+def _match(saved: SavedRegistration, frames: Sequence[Frame], match: Match) -> tuple[list[Frame | None], str]:
+    """For each picture of the registration the frame that takes its place, and by what it was found."""
+    # Arrays have no names of their own.
+    if match != "order" and any(frame.picture is None for frame in frames):
         for key in (_full_name, _stem):
-            chosen = _by_name(saved, paths, key)
-            if any(path is not None for path in chosen):
+            chosen = _by_name(saved, frames, key)
+            if any(frame is not None for frame in chosen):
                 return chosen, "name"
     if match == "name":
         wanted = next(picture.name for picture in saved.pictures if picture.to_plane is not None)
         raise InputError(f"{saved.path}: none of the given pictures has a name that is in it, such as {wanted}")
-    return list(_by_order(saved, paths)), "order"
+    return list(_by_order(saved, frames)), "order"
 
 
 def _full_name(path: Path) -> str:
@@ -159,9 +165,9 @@ def _stem(path: Path) -> str:
     return path.stem
 
 
-def _by_name(saved: SavedRegistration, paths: Sequence[Path], key: Callable[[Path], str]) -> list[Path | None]:
-    files = {key(path): path for path in paths}
-    given = Counter(map(key, paths))
+def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[Path], str]) -> list[Frame | None]:
+    files = {key(frame.path): frame for frame in frames}
+    given = Counter(key(frame.path) for frame in frames)
     names = [None if picture.to_plane is None else key(Path(picture.name)) for picture in saved.pictures]
     for name, count in Counter(names).items():
         if name is not None and name in files and (count > 1 or given[name] > 1):
@@ -169,34 +175,36 @@ def _by_name(saved: SavedRegistration, paths: Sequence[Path], key: Callable[[Pat
     return [None if name is None else files.get(name) for name in names]
 
 
-def _by_order(saved: SavedRegistration, paths: Sequence[Path]) -> Sequence[Path]:
+def _by_order(saved: SavedRegistration, frames: Sequence[Frame]) -> Sequence[Frame]:
     if any(picture.camera is None for picture in saved.pictures):
         raise InputError(
             f"{saved.path}: has pictures that could not be read, so that the order is lost; give pictures of the same "
             "names"
         )
-    if len(paths) != len(saved.pictures):
-        for path in paths:
+    if len(frames) != len(saved.pictures):
+        for path in files_of(frames):
             check_readable(path)
         raise InputError(
-            f"{saved.path}: has {len(saved.pictures)} pictures, but {len(paths)} others were given; give pictures of "
+            f"{saved.path}: has {len(saved.pictures)} pictures, but {len(frames)} others were given; give pictures of "
             "the same names, or equally many"
         )
-    return paths
+    return frames
 
 
-def _sources(saved: SavedRegistration, chosen: Sequence[Path | None]) -> tuple[list[Source | None], dict[int, Message]]:
+def _sources(
+    saved: SavedRegistration, chosen: Sequence[Frame | None]
+) -> tuple[list[Source | None], dict[int, Message]]:
     """The pictures with their cameras, and why which of those used then is not among them."""
     sources: list[Source | None] = []
     left_out: dict[int, Message] = {}
-    for index, (picture, path) in enumerate(zip(saved.pictures, chosen, strict=True)):
+    for index, (picture, frame) in enumerate(zip(saved.pictures, chosen, strict=True)):
         sources.append(None)
         if picture.camera is None or picture.to_plane is None:
             continue
-        if path is None:
+        if frame is None:
             left_out[index] = left_out_message(picture.path, "is not among the given pictures")
             continue
-        found, unread = read_sources([path], camera=None, focal=None, distortion=None, skip_bad=True)
+        found, unread = read_sources([frame], camera=None, focal=None, distortion=None, skip_bad=True)
         if unread:
             left_out[index] = unread[0]
         else:

@@ -61,7 +61,7 @@ def detect_features(
 
     def recall(index: int, compute: Callable[[], Features]) -> Features | InputError:
         source = sources[index]
-        inputs = (cache.file(source.path), cache.file(source.mask), source.camera.image_size, wanted, network)
+        inputs = (source.content(cache), cache.file(source.mask), source.camera.image_size, wanted, network)
         try:
             return cache.recall("features", (Features,), inputs, compute)
         except InputError as error:

@@ -1,6 +1,6 @@
 """The recipes: each reads as the sequence of its stages."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,6 +16,7 @@ from rdstitch.errors import ArgumentError, InputError, PartialResultError
 from rdstitch.export.path_plot import path_as_svg
 from rdstitch.inputs.attitudes import with_attitudes
 from rdstitch.inputs.find import find_pictures
+from rdstitch.inputs.frame import Frame, Images, Named, as_inputs, files_of
 from rdstitch.inputs.masks import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.atomic import check_distinct, check_output, write_json_atomic, write_text_atomic
@@ -29,28 +30,31 @@ from rdstitch.sidecar.write import sidecar
 from rdstitch.stitch_result import StitchResult
 from rdstitch.verification.verdict import RefusedError, judge
 
-Inputs = Iterable[str | Path]
 Layout = Literal["csv", "tum"]
 
 _MAX_SCALE_UNCERTAINTY = 0.05  # share that lengths may be off by, as far as the focal length is, without a word
 
 
 def pano(
-    paths: Inputs,
+    inputs: Images,
     output: str | Path | None = None,
     options: StitchOptions | None = None,
     *,
+    every: int = 1,
     progress: Progress = silent,
 ) -> StitchResult:
     """Stitch a few pictures that overlap, in any order, in the frame of one of them.
 
     Parameters
     ----------
-    paths : iterable of path
-        Two or more pictures; every one must be readable.
+    inputs : path, ndarray, or iterable of them
+        Two or more pictures; every one must be readable. What :func:`mosaic` takes.
     output : path, optional
-        Picture to write, with the sidecar beside it; without it the picture is in the result.
+        Picture to write, with the sidecar beside it; without it nothing is written, and the picture is
+        ``result.image``.
     options : StitchOptions, optional
+    every : int
+        Use every n-th video frame.
     progress : callable
         Called with the name of a stage, the number of steps done, and their total.
 
@@ -60,16 +64,16 @@ def pano(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = options or StitchOptions()
-    paths = list(paths)
-    _check_outputs(output, options, paths)
-    sources, _ = _read(paths, options, skip_bad=False)
-    registration = register(sources, options, skip_bad=False, progress=progress)
-    registration = in_frame_of_reference(registration)
-    return _composite(registration, output, options, progress)
+    with _pictures(inputs, output, options, every) as frames:
+        _check_outputs(output, options, files_of(frames))
+        sources, _ = _read(frames, options, skip_bad=False)
+        registration = register(sources, options, skip_bad=False, progress=progress)
+        registration = in_frame_of_reference(registration)
+        return _composite(registration, output, options, progress)
 
 
 def mosaic(
-    inputs: Inputs,
+    inputs: Images,
     output: str | Path | None = None,
     options: StitchOptions | None = None,
     *,
@@ -80,8 +84,10 @@ def mosaic(
 
     Parameters
     ----------
-    inputs : iterable of path
-        Folders, pictures, patterns, ``@list`` files or videos. Pictures that cannot be read are left out by name.
+    inputs : path, ndarray, or iterable of them
+        Folders, pictures, patterns, ``@list`` files, videos, and arrays of shape (H, W) or (H, W, C), whose channels
+        are in the order of ``options.channel_order``; see :func:`rdstitch.inputs.frame.as_inputs`. Pictures that cannot
+        be read are left out by name.
     output : path, optional
         As for :func:`pano`.
     options : StitchOptions, optional
@@ -95,14 +101,14 @@ def mosaic(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = options or StitchOptions()
-    with _pictures(inputs, output, every) as paths:
-        _check_outputs(output, options, paths)
-        registration = _register_all(paths, options, progress)
+    with _pictures(inputs, output, options, every) as frames:
+        _check_outputs(output, options, files_of(frames))
+        registration = _register_all(frames, options, progress)
         return _composite(registration, output, options, progress)
 
 
 def calibrate(
-    inputs: Inputs, options: StitchOptions | None = None, *, every: int = 1, progress: Progress = silent
+    inputs: Images, options: StitchOptions | None = None, *, every: int = 1, progress: Progress = silent
 ) -> Registration:
     """Find the lens from pictures of a plane; the camera is ``result.camera``.
 
@@ -117,9 +123,9 @@ def calibrate(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = options or StitchOptions()
-    with _pictures(inputs, None, every) as paths:
-        _check_outputs(None, options, paths)
-        registration = _register_all(paths, options, progress)
+    with _pictures(inputs, None, options, every) as frames:
+        _check_outputs(None, options, files_of(frames))
+        registration = _register_all(frames, options, progress)
         registration = _accept(registration, options, lens_only=True)
     _release_decoded_images(registration)
     _save_camera(registration, options)
@@ -127,7 +133,7 @@ def calibrate(
 
 
 def trajectory(
-    inputs: Inputs,
+    inputs: Images,
     output: str | Path | None = None,
     options: StitchOptions | None = None,
     *,
@@ -158,12 +164,12 @@ def trajectory(
         The path, and the registration that it comes from.
     """
     options = options or StitchOptions()
-    with _pictures(inputs, None, every) as paths:
+    with _pictures(inputs, None, options, every) as frames:
         files = [file for file in (output, plot) if file is not None]
         for file in files:
-            check_output(file, options.overwrite, paths, suffixes=())
+            check_output(file, options.overwrite, files_of(frames), suffixes=())
         check_distinct(files)
-        registration = _register_all(paths, options, progress, metric=True)
+        registration = _register_all(frames, options, progress, metric=True)
         registration = _accept(registration, options)
     _release_decoded_images(registration)
     registration = registration.with_messages(_scale_uncertainty(registration.alignment))
@@ -176,17 +182,18 @@ def trajectory(
 
 
 @contextmanager
-def _pictures(inputs: Inputs, output: str | Path | None, every: int) -> Iterator[list[Path]]:
-    """The picture files that the inputs stand for; frames of videos exist only inside the block."""
+def _pictures(inputs: Images, output: str | Path | None, options: StitchOptions, every: int) -> Iterator[list[Frame]]:
+    """The frames that the inputs stand for; those of videos exist only inside the block."""
+    given, exclude = as_inputs(inputs, options.channel_order), [] if output is None else [output]
     with TemporaryDirectory(prefix="rdstitch-") as folder:
-        yield find_pictures(inputs, exclude=[] if output is None else [output], frames_folder=Path(folder), every=every)
+        yield find_pictures(given, exclude=exclude, frames_folder=Path(folder), every=every)
 
 
 def _register_all(
-    paths: Sequence[Path], options: StitchOptions, progress: Progress, *, metric: bool = False
+    frames: Sequence[Frame], options: StitchOptions, progress: Progress, *, metric: bool = False
 ) -> Registration:
     """Register a sequence, leaving out what cannot be read."""
-    sources, unread = _read(paths, options, skip_bad=True)
+    sources, unread = _read(frames, options, skip_bad=True)
     registration = register(sources, options, skip_bad=True, metric=metric, progress=progress)
     return registration.with_messages(unread)
 
@@ -201,9 +208,9 @@ def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Se
         check_distinct([options.save_camera, *([] if output is None else [f"{output}.json"])])
 
 
-def _read(paths: Sequence[str | Path], options: StitchOptions, *, skip_bad: bool) -> tuple[list[Source], list[Message]]:
+def _read(inputs: Sequence[Named], options: StitchOptions, *, skip_bad: bool) -> tuple[list[Source], list[Message]]:
     sources, unread = read_sources(
-        paths, camera=options.camera, focal=options.focal, distortion=options.distortion, skip_bad=skip_bad
+        inputs, camera=options.camera, focal=options.focal, distortion=options.distortion, skip_bad=skip_bad
     )
     if len(sources) < 2:
         if unread:

@@ -1,19 +1,22 @@
 """Undistorting single pictures with a known lens."""
 
-from collections.abc import Iterable
-from functools import partial
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
+from tempfile import TemporaryDirectory
+from typing import Any, Literal, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.compositing import Canvas, CompositeOptions, compose
+from rdstitch.compositing import Canvas, Composite, CompositeOptions, compose
 from rdstitch.errors import ArgumentError, OutputError
-from rdstitch.inputs.source import read_sources
+from rdstitch.inputs.find import find_pictures
+from rdstitch.inputs.frame import ChannelOrder, Images, as_inputs, files_of, in_order
+from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.atomic import check_output
-from rdstitch.io.read import read_image
+from rdstitch.io.read import Picture
 from rdstitch.io.write import write_image
 from rdstitch.progress import Progress, silent
 
@@ -22,23 +25,54 @@ View = Literal["same", "all", "valid"]
 _POINTS_PER_SIDE = 256
 
 
+@overload
 def undistort(
-    paths: Iterable[str | Path],
+    inputs: Images,
     folder: str | Path,
     *,
     camera: Camera | None = None,
     distortion: float | None = None,
     view: View = "same",
     overwrite: bool = False,
+    channel_order: ChannelOrder = "bgr",
     progress: Progress = silent,
-) -> list[Path]:
-    """Undistort pictures, each into a file of the same name in a folder.
+) -> list[Path]: ...
+
+
+@overload
+def undistort(
+    inputs: Images,
+    folder: None = None,
+    *,
+    camera: Camera | None = None,
+    distortion: float | None = None,
+    view: View = "same",
+    overwrite: bool = False,
+    channel_order: ChannelOrder = "bgr",
+    progress: Progress = silent,
+) -> list[NDArray[Any]]: ...
+
+
+def undistort(
+    inputs: Images,
+    folder: str | Path | None = None,
+    *,
+    camera: Camera | None = None,
+    distortion: float | None = None,
+    view: View = "same",
+    overwrite: bool = False,
+    channel_order: ChannelOrder = "bgr",
+    progress: Progress = silent,
+) -> list[Path] | list[NDArray[Any]]:
+    """Undistort pictures, each into a file of the same name in a folder, or into an array.
 
     Parameters
     ----------
-    paths : iterable of path
-    folder : path
-        Made if it does not exist.
+    inputs : path, ndarray, or iterable of them
+        Whatever :func:`rdstitch.mosaic` takes. An array becomes the PNG file ``image_000i.png``, or TIFF where its
+        samples need that.
+    folder : path, optional
+        Made if it does not exist. Without it, nothing is written.
     camera : Camera, optional
         The lens; adapted to the size of each picture.
     distortion : float, optional
@@ -47,38 +81,61 @@ def undistort(
         "same": size and scale at the centre stay. "all": everything that the picture shows, at that scale. "valid":
         the largest upright rectangle around the centre that the picture covers, at that scale.
     overwrite : bool
+    channel_order : str
+        Of arrays that come in or go out: "bgr" or "rgb".
     progress : callable
 
     Returns
     -------
-    list of Path
-        The files written.
+    list of Path, or of ndarray
+        The files written; without a folder the pictures, (H, W) or (H, W, C), 0 where there is nothing to show.
     """
     if (camera is None) == (distortion is None):
         raise ArgumentError("give either a camera or a distortion")
     if view not in ("same", "all", "valid"):
         raise ArgumentError(f"unknown view {view!r}; choose same, all or valid")
-    sources, _ = read_sources(paths, camera=camera, focal=None, distortion=distortion, skip_bad=False)
-    target = Path(folder)
+    given = as_inputs(inputs, channel_order)
+    with TemporaryDirectory(prefix="rdstitch-") as frames_folder:
+        frames = find_pictures(given, frames_folder=Path(frames_folder))
+        sources, _ = read_sources(frames, camera=camera, focal=None, distortion=distortion, skip_bad=False)
+        if folder is None:
+            return [in_order(_undistorted(source, view).pixels, channel_order) for source in sources]
+        outputs = _outputs(sources, Path(folder), files_of(frames), overwrite)
+        for done, (source, output) in enumerate(zip(sources, outputs, strict=True), start=1):
+            picture = _undistorted(source, view)
+            write_image(output, picture.pixels, picture.alpha, metadata=source.metadata)
+            progress("undistorting", done, len(sources))
+        return outputs
+
+
+def _undistorted(source: Source, view: View) -> Composite:
+    plain = CompositeOptions(exposure="none", seam="none", blend="none")
+    canvas = undistorted_canvas(source.camera, view)
+    read: Callable[[], Picture] = source.read
+    return compose([read], [source.camera], np.eye(3)[None], canvas, plain)
+
+
+def _outputs(sources: Sequence[Source], folder: Path, inputs: Sequence[Path], overwrite: bool) -> list[Path]:
+    """The files to write, of different names and none of them an input; the folder is made."""
     try:
-        target.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"{target}: cannot make the folder: {error.strerror}") from error
-    outputs = [target / source.name for source in sources]
+        raise OutputError(f"{folder}: cannot make the folder: {error.strerror}") from error
+    outputs = [folder / _output_name(source) for source in sources]
     twice = {path for path in outputs if outputs.count(path) > 1}
     if twice:
         raise OutputError(f"{min(twice)}: two of the pictures have this name; undistort them into different folders")
-    inputs = [source.path for source in sources]
     for output in outputs:
         check_output(output, overwrite, inputs)
-    plain = CompositeOptions(exposure="none", seam="none", blend="none")
-    for done, (source, output) in enumerate(zip(sources, outputs, strict=True), start=1):
-        canvas = undistorted_canvas(source.camera, view)
-        loader = partial(read_image, source.path)
-        picture = compose([loader], [source.camera], np.eye(3)[None], canvas, plain)
-        write_image(output, picture.pixels, picture.alpha, metadata=source.metadata)
-        progress("undistorting", done, len(sources))
     return outputs
+
+
+def _output_name(source: Source) -> str:
+    if source.frame is None or source.frame.picture is None:
+        return source.name
+    pixels = source.frame.picture.pixels
+    fits_png = pixels.dtype != np.float32 and (pixels.ndim == 2 or pixels.shape[2] == 3)
+    return f"{source.name}.png" if fits_png else f"{source.name}.tif"
 
 
 def undistorted_canvas(camera: Camera, view: View) -> Canvas:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.compositing import CompositeOptions
-from rdstitch.io import read_image
+from rdstitch.io import preview, read_image
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline import calibrate, pano, recipes
@@ -171,8 +171,8 @@ def test_of_a_large_tiff_an_overview_is_read(
 ) -> None:
     result = pano(frames[:2], tmp_path / "large.tif", StitchOptions(workers=1, composite=CompositeOptions(scale=3.0)))
     whole = _decoded(thumbnails.of_mosaic(result, 300))
-    monkeypatch.setattr(thumbnails, "_LARGE", 1000)
-    monkeypatch.setattr(thumbnails, "read_image", None)
+    monkeypatch.setattr(preview, "_LARGE", 1000)
+    monkeypatch.setattr(preview, "read_image", None)
     overview = _decoded(thumbnails.of_mosaic(result, 300))
     assert overview.shape == whole.shape
     assert max(whole.shape[:2]) == 300

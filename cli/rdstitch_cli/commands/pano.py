@@ -18,9 +18,10 @@ Examples:
   rdstitch pano a.jpg b.jpg -o ab.tif --camera camera.json
 """
 )
-@click.argument("pictures", nargs=-1, required=True, type=options.PICTURE, metavar="IMG IMG...")
+@options.inputs
 @options.output
 @options.overwrite
+@options.every
 @click.option("--reference", metavar="NAME", help="Picture whose frame is kept; otherwise the best connected one.")
 @options.known
 @options.estimation
@@ -36,8 +37,9 @@ Examples:
 @options.as_json
 @options.verbosity
 def pano(
-    pictures: tuple[Path, ...],
+    inputs: tuple[Path, ...],
     output: Path,
+    every: int,
     report: Path | None,
     as_json: bool,
     quiet: bool,
@@ -46,14 +48,15 @@ def pano(
 ) -> None:
     """Stitch two or more pictures that overlap, in any order.
 
-    Writes the picture to the output, everything estimated to the output's name with .json added, and λ to standard
-    output.
+    INPUT is what 'rdstitch mosaic' takes, but every picture must be readable. The picture goes to the output,
+    everything estimated to the output's name with .json added, and λ to standard output.
     """
     from rdstitch.pipeline import pano as recipe
 
     with Reporter(-quiet + verbose) as reporter:
-        told = Report(report, reporter, pictures, given["overwrite"])
+        paths = options.resolve(inputs)
+        told = Report(report, reporter, paths, given["overwrite"])
         with told.explaining():
-            result = recipe(pictures, output, stitch_options(reporter, **given), progress=told.progress)
+            result = recipe(paths, output, stitch_options(reporter, **given), every=every, progress=told.progress)
         summarize(result, reporter, as_json=as_json)
         told.write(result)

@@ -17,7 +17,7 @@ Examples:
   rdstitch undistort wall.jpg --lambda -0.25 -o straight/
 """
 )
-@click.argument("pictures", nargs=-1, required=True, type=options.PICTURE, metavar="IMG...")
+@options.inputs
 @options.lens
 @click.option(
     "-o", "--output", type=options.PICTURE, required=True, metavar="DIR", help="Folder to write to; made if missing."
@@ -32,7 +32,7 @@ Examples:
 )
 @options.verbosity
 def undistort(
-    pictures: tuple[Path, ...],
+    inputs: tuple[Path, ...],
     camera: Path | None,
     distortion: float | None,
     output: Path,
@@ -43,8 +43,8 @@ def undistort(
 ) -> None:
     """Undistort pictures with a known lens, each into a file of the same name in a folder.
 
-    The lens comes from a camera file, as 'rdstitch pano --save-camera' and 'rdstitch calibrate' write it, or is given
-    as λ for half the image diagonal.
+    INPUT is what 'rdstitch mosaic' takes. The lens comes from a camera file, as 'rdstitch pano --save-camera' and
+    'rdstitch calibrate' write it, or is given as λ for half the image diagonal.
     """
     from rdstitch.pipeline import undistort as recipe
 
@@ -52,4 +52,12 @@ def undistort(
         raise click.UsageError("give either --camera FILE or --lambda L")
     with Reporter(-quiet + verbose) as reporter:
         lens = read_lens(camera, reporter)
-        recipe(pictures, output, camera=lens, distortion=distortion, view=view, overwrite=overwrite, progress=reporter)
+        recipe(
+            options.resolve(inputs),
+            output,
+            camera=lens,
+            distortion=distortion,
+            view=view,
+            overwrite=overwrite,
+            progress=reporter,
+        )

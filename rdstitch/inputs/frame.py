@@ -1,0 +1,116 @@
+"""One image before anything is known of it: a file, a video frame or an array in memory."""
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.errors import ArgumentError
+from rdstitch.io.metadata import Metadata
+from rdstitch.io.read import Picture, as_picture
+
+ChannelOrder = Literal["bgr", "rgb"]
+"""Order of the colour channels of arrays that come in and go out: OpenCV's, or everybody else's."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One input image.
+
+    Attributes
+    ----------
+    path : Path
+        Its file; for an array in memory the name that stands for it.
+    number : int or None
+        Its number in the video, bag or list of arrays that it comes from, from 0.
+    timestamp : float or None
+        When it was taken, s, where its video or bag knows that.
+    picture : Picture or None
+        The image itself where it is no file.
+    """
+
+    path: Path
+    number: int | None = None
+    timestamp: float | None = None
+    picture: Picture | None = None
+
+
+Image = str | os.PathLike[str] | NDArray[Any]
+"""A file, whatever else stands for files (see :mod:`rdstitch.inputs.find`), or an array."""
+
+Images = Image | Iterable[Image]
+"""One image or any number of them, an iterator for example."""
+
+Named = str | os.PathLike[str] | Frame
+
+
+def as_inputs(images: Images, channel_order: ChannelOrder = "bgr") -> list[Named]:
+    """What the user gave as a list: names stay as they are, arrays become frames.
+
+    Parameters
+    ----------
+    images : path, ndarray, or iterable of them
+        A single path or array is one input. An array is of shape (H, W), (H, W, 1), (H, W, 3), or with alpha as the
+        last channel (H, W, 2) or (H, W, 4), or of more bands; uint8, uint16 or floating point. An array of shape
+        (N, H, W, C) is a sequence of N images. The i-th input, if it is an array, is called ``image_000i``.
+    channel_order : str
+        "bgr" or "rgb": order of the channels of colour arrays.
+
+    Raises
+    ------
+    ArgumentError
+        When an input is neither a path nor such an array.
+    """
+    if channel_order not in get_args(ChannelOrder):
+        raise ArgumentError(f"channel_order must be 'bgr' or 'rgb', not {channel_order!r}")
+    listed: Iterable[Any]
+    if isinstance(images, (str, os.PathLike)) or (isinstance(images, np.ndarray) and images.ndim != 4):
+        listed = [images]
+    elif isinstance(images, Iterable):
+        listed = images
+    else:
+        raise ArgumentError(f"expected paths or arrays, not {type(images).__name__}")
+    return [_as_input(item, index, channel_order) for index, item in enumerate(listed)]
+
+
+def in_order(samples: NDArray[Any], channel_order: ChannelOrder) -> NDArray[Any]:
+    """Samples (H, W), (H, W, C) in RGB order in the order wanted, or the other way round."""
+    if channel_order == "rgb" or samples.ndim == 2 or samples.shape[2] != 3:
+        return samples
+    return np.asarray(cv2.cvtColor(samples, cv2.COLOR_BGR2RGB))
+
+
+def files_of(frames: Iterable[Frame]) -> list[Path]:
+    """The files among the frames, which must not be overwritten."""
+    return [frame.path for frame in frames if frame.picture is None]
+
+
+def _as_input(item: Any, index: int, channel_order: ChannelOrder) -> Named:
+    if isinstance(item, (str, os.PathLike)):
+        return item
+    if not isinstance(item, np.ndarray):
+        kind = type(item).__name__
+        raise ArgumentError(f"image {index}: expected a path or a NumPy array, not {kind}; convert it by numpy.asarray")
+    name = f"image_{index:04d}"
+    return Frame(Path(name), index, picture=_as_picture(name, item, channel_order))
+
+
+def _as_picture(name: str, array: NDArray[Any], channel_order: ChannelOrder) -> Picture:
+    """An array as the readers of files give it: in RGB order, alpha apart, and a copy, since buffers are reused."""
+    if array.ndim not in (2, 3) or array.size == 0:
+        raise ArgumentError(f"{name}: expected an array of shape (H, W) or (H, W, C), not {array.shape}")
+    if array.dtype not in (np.uint8, np.uint16) and array.dtype.kind != "f":
+        raise ArgumentError(f"{name}: expected uint8, uint16 or floating-point samples, not {array.dtype}")
+    channels = 1 if array.ndim == 2 else array.shape[2]
+    alpha = array[..., -1] if array.ndim == 3 and channels in (2, 4) else None
+    samples = array if alpha is None else array[..., :-1]
+    if array.ndim == 3 and channels <= 2:
+        samples = samples[..., 0]
+    samples = in_order(np.array(samples, dtype=np.float32 if array.dtype.kind == "f" else array.dtype), channel_order)
+    metadata = Metadata((array.shape[1], array.shape[0]), bit_depth=8 * array.dtype.itemsize)
+    return as_picture(Path(name), samples, None if alpha is None else alpha.copy(), metadata)

@@ -1,0 +1,72 @@
+"""Small versions of pictures, for pages and notebooks."""
+
+import io
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image
+
+from rdstitch.io.deepzoom import read_deep_zoom
+from rdstitch.io.read import read_image
+
+_JPEG_QUALITY = 80
+_LARGE = 60_000_000  # pixels; of larger TIFF files an overview is read
+
+
+def read_preview(path: Path, size: tuple[int, int], side: int) -> tuple[NDArray[Any], NDArray[np.uint8] | None]:
+    """Samples and alpha of a picture that rdstitch wrote, at least ``side`` pixels long where it is that large.
+
+    Parameters
+    ----------
+    path : Path
+    size : (int, int)
+        Width and height of the picture, pixels.
+    side : int
+        Of pictures that are stored in several sizes, the smallest that is no shorter is read.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".dzi":
+        return read_deep_zoom(path, size, side), None
+    if size[0] * size[1] > _LARGE and suffix in (".tif", ".tiff"):
+        return _overview(path, side), None
+    picture = read_image(path)
+    return picture.pixels, picture.alpha
+
+
+def encode_preview(
+    pixels: NDArray[Any], side: int, alpha: NDArray[np.uint8] | None = None, kind: Literal["JPEG", "PNG"] = "JPEG"
+) -> bytes:
+    """A picture of any sample type as a small file, its longer side at most ``side`` pixels."""
+    # Far too large pictures are thinned out before they are smoothed.
+    step = max(1, max(pixels.shape[:2]) // (4 * side))
+    image = Image.fromarray(_as_bytes(pixels[::step, ::step]))
+    if alpha is not None:
+        image.putalpha(Image.fromarray(np.ascontiguousarray(alpha[::step, ::step])))
+    image.thumbnail((side, side))
+    stream = io.BytesIO()
+    image.save(stream, kind, **({"quality": _JPEG_QUALITY} if kind == "JPEG" else {}))
+    return stream.getvalue()
+
+
+def _as_bytes(pixels: NDArray[Any]) -> NDArray[np.uint8]:
+    """Grey or RGB in 8 bits; deeper samples are stretched between their extremes."""
+    shown = pixels if pixels.ndim == 2 else pixels[..., :3]
+    if shown.ndim == 3 and shown.shape[2] < 3:
+        shown = shown[..., 0]
+    if shown.dtype == np.uint8:
+        return np.ascontiguousarray(shown)
+    values = shown.astype(np.float32)
+    low, high = np.percentile(values, [0.5, 99.5])
+    stretched = (values - low) * (255.0 / max(float(high - low), 1e-12))
+    return np.asarray(np.clip(stretched, 0.0, 255.0), dtype=np.uint8)
+
+
+def _overview(path: Path, side: int) -> NDArray[Any]:
+    """The smallest overview of a TIFF file that is large enough."""
+    with tifffile.TiffFile(path) as file:
+        levels = file.series[0].levels
+        enough = [level for level in levels if max(level.shape[:2]) >= side]
+        return np.asarray((enough or levels)[-1 if enough else 0].asarray())
