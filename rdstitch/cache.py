@@ -1,17 +1,20 @@
 """Results of earlier runs, so that an interrupted run continues and a changed option repeats only what depends on it.
 
 Every result is a file named by everything that it depends on: the content of the pictures, the options that matter to
-it, and the versions of the software. So nothing is ever out of date; what is damaged is computed again.
+it, the sources of this package, and the versions of the packages that it computes with. So nothing is ever out of date,
+whether or not a version number was raised; what is damaged is computed again.
 """
 
 import hashlib
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
+from importlib.resources import files
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,7 +24,8 @@ from rdstitch.io.packing import digest, pack, unpack
 Value = TypeVar("Value")
 
 _FORMAT = 1
-_PACKAGES = ("rdstitch", "numpy", "scipy", "opencv-contrib-python-headless", "pillow", "simplejpeg", "tifffile")
+_OPENCV = tuple(f"opencv-{kind}" for kind in ("contrib-python-headless", "contrib-python", "python-headless", "python"))
+_PACKAGES = ("numpy", "scipy", *_OPENCV, "pillow", "simplejpeg", "tifffile")
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ class Cache:
         """
         if self.folder is None:
             return compute()
-        name = digest((_FORMAT, _versions(), stage, inputs))
+        name = digest((_FORMAT, _software(), stage, inputs))
         file = self.folder / stage / name[:2] / name[2:]
         with suppress(InputError, ArgumentError, OSError):
             # The name once more: an entry that was mistaken for another is no better than a damaged one.
@@ -110,9 +114,29 @@ class Cache:
 
 
 @cache
-def _versions() -> dict[str, str]:
-    """Of everything that results may depend on."""
-    return {package: version(package) for package in _PACKAGES}
+def _software() -> dict[str, str]:
+    """Everything but its inputs that a result may depend on: our sources, and versions of what they compute with."""
+    found = {"rdstitch": sources_digest(files("rdstitch"))}
+    for package in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
+
+
+def sources_digest(folder: Traversable) -> str:
+    """What stands for the names and contents of all Python files in a folder and those below it."""
+    content = hashlib.sha256()
+    for name, source in sorted(_sources(folder, "")):
+        content.update(f"{name} {hashlib.sha256(source).hexdigest()}\n".encode())
+    return content.hexdigest()
+
+
+def _sources(folder: Traversable, prefix: str) -> Iterator[tuple[str, bytes]]:
+    for entry in folder.iterdir():
+        if entry.is_dir():
+            yield from _sources(entry, f"{prefix}{entry.name}/")
+        elif entry.name.endswith(".py"):
+            yield prefix + entry.name, entry.read_bytes()
 
 
 NO_CACHE = Cache()

@@ -2,10 +2,12 @@
 
 import ctypes
 import errno
+import logging
 import os
 import signal
 import sys
 import traceback
+import warnings
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
@@ -48,6 +50,7 @@ Examples:
 _UNEXPECTED, _INTERRUPTED, _BROKEN_PIPE = 1, 130, 141
 _ASKED_TO_END = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 _M_ARENA_MAX = -8
+_DECODERS = ("PIL", "tifffile")
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -76,6 +79,7 @@ def main() -> None:
     # NumPy reads this when it is loaded, which is later.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _share_memory()
+    _silence_decoders()
     for number in _ASKED_TO_END:
         signal.signal(number, _end)
     sys.exit(run(sys.argv[1:]))
@@ -99,6 +103,13 @@ def _share_memory() -> None:
     """
     with suppress(AttributeError, OSError, TypeError):
         ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1)
+
+
+def _silence_decoders() -> None:
+    """Drop what decoders warn and log of odd files: this process is ours, and what matters ends as an error."""
+    for name in _DECODERS:
+        warnings.filterwarnings("ignore", module=rf"{name}\b")
+        logging.getLogger(name).addHandler(logging.NullHandler())
 
 
 def run(arguments: list[str]) -> int:

@@ -29,7 +29,7 @@ from rdstitch.compositing.survey import survey_pictures
 from rdstitch.compositing.warp import plan_warp
 from rdstitch.errors import ArgumentError
 from rdstitch.io.layout import STRIP_ROWS
-from rdstitch.opencv_threads import one_opencv_thread
+from rdstitch.opencv_state import one_opencv_thread
 
 # Samples (h, W, C) and alpha (h, W).
 OutputStrip = tuple[NDArray[Any], NDArray[np.uint8]]

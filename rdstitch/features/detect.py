@@ -15,7 +15,7 @@ from rdstitch.features.keypoints import Features
 from rdstitch.features.options import CLOSER, KINDS, FeatureOptions
 from rdstitch.features.picture import Image, Mask, Picture, View, prepare
 from rdstitch.features.spread import spread, strongest
-from rdstitch.opencv_threads import one_opencv_thread
+from rdstitch.opencv_state import one_opencv_thread
 
 __all__ = ["KINDS", "FeatureOptions", "Features", "Recall", "Source", "View", "detect", "detect_all"]
 

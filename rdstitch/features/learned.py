@@ -6,8 +6,6 @@ OpenCV's own tests use: ALIKED takes ``image`` and gives ``keypoints``, ``descri
 """
 
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -21,6 +19,7 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.features.correspondences import Correspondences
 from rdstitch.features.keypoints import Features
 from rdstitch.features.options import FeatureOptions
+from rdstitch.opencv_state import silent_opencv
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,24 +135,11 @@ def _load(name: str, model: str | Path, *arguments: Any) -> Any:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
-        with _silent_opencv():
+        # OpenCV logs that its new engine has no targets; users cannot do anything about it.
+        with silent_opencv():
             return getattr(cv2, name).create(str(path), *arguments)
     except cv2.error as error:
         raise InputError(f"{path}: not an ONNX file that OpenCV can read") from error
-
-
-_log_level_lock = threading.Lock()
-
-
-@contextmanager
-def _silent_opencv() -> Iterator[None]:
-    """Keep OpenCV from telling users that its new engine has no targets; they cannot do anything about it."""
-    with _log_level_lock:
-        level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        try:
-            yield
-        finally:
-            cv2.utils.logging.setLogLevel(level)
 
 
 def _aliked_parameters(size: int) -> Any:

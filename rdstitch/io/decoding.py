@@ -1,10 +1,12 @@
-"""Guards around the decoders: files that are no pictures end as one InputError, and no warning leaks."""
+"""Guards around the decoders: files that are no pictures end as one InputError.
 
-import logging
+Warnings and log messages of the decoders go where those of any library go: the process that this runs in decides what
+becomes of them, since Python's filters and handlers belong to all of its threads.
+"""
+
 import os
 import stat
 import struct
-import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,12 +22,9 @@ FOREIGN_SUFFIXES = frozenset(
 )
 """Pictures of phones and cameras that nothing here can read; what TIFF readers see in raw files is their thumbnail."""
 
-# What they log is for programs that listen; without anybody, it would go to standard error.
-for _name in ("PIL", "tifffile"):
-    logging.getLogger(_name).addHandler(logging.NullHandler())
-
-# What Pillow, tifffile and OpenCV have been seen to raise on damaged files.
+# What Pillow, tifffile and OpenCV have been seen to raise on damaged files; warnings, where filters make them errors.
 _DAMAGE = (
+    Warning,
     OSError,
     SyntaxError,
     ValueError,
@@ -74,11 +73,9 @@ def check_readable(path: Path) -> None:
 
 @contextmanager
 def decoding(path: Path) -> Iterator[None]:
-    """Run a decoder: its warnings are swallowed, its failures become an InputError that names the file."""
+    """Run a decoder: its failures become an InputError that names the file."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
+        yield
     except MemoryError as error:
         raise InputError(f"{path}: too large to read into memory; make it smaller first") from error
     except Image.DecompressionBombError as error:

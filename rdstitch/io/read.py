@@ -19,6 +19,7 @@ from rdstitch.io.jpeg_decoding import decoded_jpeg
 from rdstitch.io.metadata import Metadata, metadata_of, read_metadata
 from rdstitch.io.orientation import turned
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
+from rdstitch.opencv_state import silent_opencv
 
 Pixels = NDArray[Any]
 
@@ -174,13 +175,9 @@ def _read_16_bit_png(file: Path) -> Pixels:
 
 def _decode_with_opencv(data: bytes) -> Pixels:
     """Samples in RGB(A) order as stored."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
+    with silent_opencv():
         flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
         samples = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
-    finally:
-        cv2.utils.logging.setLogLevel(level)
     if samples is None:
         raise ValueError("the decoder gives up")
     if samples.ndim == 3 and samples.shape[2] in (3, 4):

@@ -1,9 +1,9 @@
-"""OpenCV's threads are as they were, whatever happened meanwhile."""
+"""OpenCV's threads and log level are as they were, whatever happened meanwhile."""
 
 import cv2
 import pytest
 
-from rdstitch.opencv_threads import one_opencv_thread
+from rdstitch.opencv_state import one_opencv_thread, silent_opencv
 
 
 def test_the_last_to_leave_gives_the_threads_back() -> None:
@@ -36,3 +36,19 @@ def test_there_is_one_thread_inside_and_as_many_as_before_afterwards() -> None:
         assert cv2.getNumThreads() == 3
     finally:
         cv2.setNumThreads(before)
+
+
+def test_the_log_level_survives_threads() -> None:
+    logging = cv2.utils.logging
+    before = logging.getLogLevel()
+    first, second = silent_opencv(), silent_opencv()
+    try:
+        logging.setLogLevel(logging.LOG_LEVEL_INFO)
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        assert logging.getLogLevel() == logging.LOG_LEVEL_SILENT
+        second.__exit__(None, None, None)
+        assert logging.getLogLevel() == logging.LOG_LEVEL_INFO
+    finally:
+        logging.setLogLevel(before)

@@ -1,0 +1,53 @@
+"""State that OpenCV keeps for the whole process, changed for a while and left as it was found, whatever threads do."""
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from threading import Lock
+
+import cv2
+
+
+class _SharedSetting:
+    """A number of the process that blocks of code hold at another value: the last block to end restores it.
+
+    Parameters
+    ----------
+    read, write : callable
+    held : int
+        Value inside the blocks.
+    """
+
+    def __init__(self, read: Callable[[], int], write: Callable[[int], object], held: int) -> None:
+        self._read, self._write, self._held = read, write, held
+        self._lock, self._blocks, self._before = Lock(), 0, 0
+
+    @contextmanager
+    def hold(self) -> Iterator[None]:
+        with self._lock:
+            if self._blocks == 0:
+                self._before = self._read()
+                self._write(self._held)
+            self._blocks += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._blocks -= 1
+                if self._blocks == 0:
+                    self._write(self._before)
+
+
+_threads = _SharedSetting(cv2.getNumThreads, cv2.setNumThreads, 1)
+_log_level = _SharedSetting(
+    cv2.utils.logging.getLogLevel, cv2.utils.logging.setLogLevel, cv2.utils.logging.LOG_LEVEL_SILENT
+)
+
+
+def one_opencv_thread() -> AbstractContextManager[None]:
+    """Keep OpenCV from starting threads of its own while we run several: they would wait for each other."""
+    return _threads.hold()
+
+
+def silent_opencv() -> AbstractContextManager[None]:
+    """Keep OpenCV from logging what an exception or a return value says already."""
+    return _log_level.hold()
