@@ -47,7 +47,7 @@ Examples:
   rdstitch calibrate wall/ -o camera.yml
 """
 
-_UNEXPECTED, _INTERRUPTED, _BROKEN_PIPE = 1, 130, 141
+_UNEXPECTED, _USAGE, _INTERRUPTED, _BROKEN_PIPE = 1, 2, 130, 141
 _ASKED_TO_END = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 _M_ARENA_MAX = -8
 _DECODERS = ("PIL", "tifffile")
@@ -121,9 +121,6 @@ def run(arguments: list[str]) -> int:
         return _complain("interrupted", _INTERRUPTED, debug)
     except _AskedToEndError as asked:
         return _complain("interrupted", 128 + asked.number, debug)
-    except click.exceptions.NoArgsIsHelpError as error:
-        error.show()
-        return error.exit_code
     except click.ClickException as error:
         return _complain(_usage(error), error.exit_code, debug)
     except RdstitchError as error:
@@ -147,6 +144,9 @@ def _invoke(arguments: list[str]) -> int:
     """
     if completion := os.environ.get("_RDSTITCH_COMPLETE"):
         return shell_complete(cli, {}, "rdstitch", "_RDSTITCH_COMPLETE", completion)
+    if not arguments:  # click before 8.2 takes this for success
+        click.echo(cli.get_help(click.Context(cli, info_name="rdstitch")), err=True)
+        return _USAGE
     try:
         with cli.make_context("rdstitch", list(arguments)) as context:
             cli.invoke(context)

@@ -33,7 +33,7 @@ def together(*options: Callable[[Any], Any]) -> Decorator[Any]:
     return decorate
 
 
-class Angles(click.ParamType[tuple[float, float]]):
+class Angles(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
     """Two angles in degrees, ``PSI,THETA``; the value is in radians."""
 
     name = "PSI,THETA"
@@ -63,7 +63,7 @@ class FileOr(click.Path):
         return value if value == self.word else super().convert(value, param, ctx)
 
 
-class Bytes(click.ParamType[int]):
+class Bytes(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
     """An amount of memory like ``800M`` or ``1.5G``; the value is in bytes."""
 
     name = "SIZE"
@@ -80,7 +80,7 @@ class Bytes(click.ParamType[int]):
         return amount
 
 
-class Angle(click.ParamType[float]):
+class Angle(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
     """An angle in degrees that is not negative; the value is in radians."""
 
     name = "DEG"

@@ -15,8 +15,7 @@ def connected_components(count: int, image1: ArrayLike, image2: ArrayLike) -> li
 
     Groups of the same size are ordered by their first picture.
     """
-    i, j = np.asarray(image1, dtype=np.intp), np.asarray(image2, dtype=np.intp)
-    edges = sparse.coo_array((np.ones(len(i)), (i, j)), shape=(count, count))
+    edges = _graph(count, image1, image2, np.ones(np.size(image1)))
     number, label = csgraph.connected_components(edges, directed=False)
     groups = [np.flatnonzero(label == k).tolist() for k in range(number)]
     return sorted(groups, key=lambda group: (-len(group), group[0]))
@@ -52,10 +51,26 @@ class SpanningTree:
         return matrices
 
 
+def spanning_forest(count: int, image1: IntArray, image2: IntArray, weight: FloatArray) -> IntArray:
+    """Indices, ascending, of the links of the spanning forest of largest total weight; of equal ones, earlier links."""
+    order = np.argsort(-weight, kind="stable")
+    both = np.sort(np.stack([image1[order], image2[order]], axis=1), axis=1)
+    pairs, first = np.unique(both, axis=0, return_index=True)
+    # Ranks instead of weights: they are distinct, so that the forest is unique, and they name the link.
+    kept = csgraph.minimum_spanning_tree(_graph(count, pairs[:, 0], pairs[:, 1], first.astype(np.float64) + 1.0))
+    return np.sort(order[kept.data.astype(np.intp) - 1])
+
+
+def _graph(count: int, image1: ArrayLike, image2: ArrayLike, value: FloatArray) -> sparse.csr_array:
+    """One edge a link. Indices are 32-bit, the only ones that csgraph takes before SciPy 1.17."""
+    i, j = np.asarray(image1, dtype=np.int32), np.asarray(image2, dtype=np.int32)
+    return sparse.csr_array(sparse.coo_array((value, (i, j)), shape=(count, count)))
+
+
 def spanning_tree(
     count: int, image1: IntArray, image2: IntArray, weight: FloatArray, root: int | None = None
 ) -> SpanningTree:
-    """The spanning tree of largest total weight over ``count`` connected pictures (Kruskal).
+    """The spanning tree of largest total weight over ``count`` connected pictures.
 
     Parameters
     ----------
@@ -66,22 +81,8 @@ def spanning_tree(
     root : int, optional
         The centre of the tree, from where the farthest picture is the fewest steps away, if not given.
     """
-    group = np.arange(count)
-
-    def head(node: int) -> int:
-        while group[node] != node:
-            group[node] = group[group[node]]
-            node = int(group[node])
-        return node
-
-    chosen = []
-    for link in np.argsort(-weight, kind="stable").tolist():
-        a, b = head(int(image1[link])), head(int(image2[link]))
-        if a != b:
-            group[a] = b
-            chosen.append(link)
-    tree = np.sort(np.array(chosen, dtype=np.intp))
-    number = sparse.coo_array((tree + 1.0, (image1[tree], image2[tree])), shape=(count, count)).tocsr()
+    tree = spanning_forest(count, image1, image2, weight)
+    number = _graph(count, image1[tree], image2[tree], tree.astype(np.float64) + 1.0)
     number = (number + number.T).tocsr()
     start = _centre(number) if root is None else root
     order, predecessor = csgraph.breadth_first_order(number, start, directed=False)

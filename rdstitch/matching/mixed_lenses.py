@@ -8,13 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse import csgraph
 
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import Camera
 from rdstitch.matching.lens_votes import Votes
-from rdstitch.matching.match_graph import connected_components
+from rdstitch.matching.match_graph import connected_components, spanning_forest
 from rdstitch.matching.two_view import PairRegistration
 
 _DIFFERENT = 5.0  # standard deviations from which on a pair is taken to see two lenses, until all votes are heard
@@ -149,10 +147,7 @@ def _of_the_other_lens(mixed: TwoLenses, pairs: Sequence[PairRegistration]) -> d
 def _guesses(count: int, votes: Votes) -> list[tuple[BoolArray, FloatArray]]:
     """Divisions to start from: of the groups that the most telling votes hold together, those with the larger λ."""
     difference, std = votes.differences
-    telling = np.argsort(std, kind="stable")
-    edges = (np.arange(1, len(votes) + 1), (votes.image1[telling], votes.image2[telling]))
-    tree = csgraph.minimum_spanning_tree(sparse.csr_array(edges, shape=(count, count)))
-    held = telling[tree.data.astype(np.intp) - 1]
+    held = spanning_forest(count, votes.image1, votes.image2, -std)
     alike = held[np.abs(difference[held]) < _DIFFERENT * std[held]]
     group = np.empty(count, dtype=np.intp)
     for number, pictures in enumerate(connected_components(count, votes.image1[alike], votes.image2[alike])):

@@ -2,11 +2,13 @@
 
 import math
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
 
 from rdstitch.alignment.align import AlignmentOptions, align
+from rdstitch.alignment.build_result import Outcome, build_alignment
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import CONTRADICTS, Alignment, Poses
 from rdstitch.alignment.trajectory import Trajectory, compare
@@ -214,6 +216,28 @@ def test_the_reference_picture_is_the_frame() -> None:
     rigid = _run(given, model="rigid", reference=4)
     assert rigid.poses is not None
     np.testing.assert_allclose([rigid.poses.yaw[4], *rigid.poses.position[4], rigid.poses.height[4]], [0, 0, 0, 1])
+
+
+def test_any_picture_can_become_the_frame_after_the_adjustment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The adjustment may have held another one, turned and at another height: then the frame is changed."""
+    rng = np.random.default_rng(12)
+    poses = jittered(grid(3, 2, (0.4, 0.3), 1.2, rng), 0.2, 0.0, rng)
+    given = scene(poses, tilt=(0.05, -0.04), rng=rng)
+    adjusted: list[Outcome] = []
+    recipe = import_module("rdstitch.alignment.align")  # the package has a function of the module's name
+    monkeypatch.setattr(recipe, "build_alignment", adjusted.append)
+    _run(given, model="similarity", reference=0)
+    for reference in range(len(poses)):
+        found = build_alignment(replace(adjusted[0], problem=replace(adjusted[0].problem, reference=reference)))
+        own, height = poses[reference], np.exp(poses[reference, LOG_HEIGHT])
+        c, s = np.cos(own[YAW]), np.sin(own[YAW])
+        expected = (poses[:, [X, Y]] - own[[X, Y]]) @ np.array([[c, s], [-s, c]]) / height
+        assert found.poses is not None
+        np.testing.assert_allclose(found.poses.position, expected, atol=0.01)
+        np.testing.assert_allclose(found.poses.height, np.exp(poses[:, LOG_HEIGHT]) / height, rtol=0.01)
+        assert found.poses.yaw[reference] == 0.0
+        # Where pictures lie to one another stays as it is.
+        assert float(np.quantile(_pair_errors(found, given), 0.95)) < 0.3
 
 
 def test_the_order_of_links_does_not_matter() -> None:

@@ -5,7 +5,7 @@ import pytest
 
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters, Priors, sigma_of
 from rdstitch.alignment.motion_models import HOMOGRAPHY, MODELS, RIGID, TILTING, Model
-from rdstitch.alignment.normal_equations import chain, link_equations, squared_errors
+from rdstitch.alignment.normal_equations import chain, link_equations, robust_cost, robust_weight, squared_errors
 from rdstitch.alignment.observations import Observations
 from rdstitch.matching.thinning import spread_choice
 from tests.alignment_scenes import Scene, grid, jittered, scene
@@ -26,12 +26,20 @@ def _start(model: Model, truth: Scene) -> Parameters:
     return Parameters(poses, shared, np.array([-0.23, 0.01, 0.004, -0.006]))
 
 
+def test_the_weight_of_an_error_is_the_derivative_of_its_loss() -> None:
+    squared, step = np.array([0.0, 0.5, 4.0, 9.0, 100.0, 1e4]), 1e-5
+    slope = (robust_cost(squared + step, 2.0) - robust_cost(squared - step, 2.0)) / (2 * step)
+    np.testing.assert_allclose(robust_weight(squared, 2.0), slope, rtol=1e-3, atol=1e-9)
+    assert robust_weight(np.array([4.0]), 2.0) == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("width", [2.0, 20.0])  # px; the errors at the start are of some twenty
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
-def test_gradient_and_curvature_of_the_whole_cost(model: Model) -> None:
-    """Against differences of the cost, with the whitening held as the adjustment holds it."""
+def test_gradient_and_curvature_of_the_whole_cost(model: Model, width: float) -> None:
+    """Against differences of the robust cost, with the whitening held as the adjustment holds it."""
     truth = _scene()
     observations = Observations.from_links(truth.links, truth.cameras)
-    start, count, width = _start(model, truth), len(truth.cameras), 1e6
+    start, count = _start(model, truth), len(truth.cameras)
 
     def homographies(parameters: Parameters) -> np.ndarray:
         matrices = model.matrices(parameters.poses, parameters.shared).matrices
@@ -47,7 +55,8 @@ def test_gradient_and_curvature_of_the_whole_cost(model: Model) -> None:
         step = np.zeros((count, model.pose_size))
         step[free] = poses_step
         moved = start.moved(model, step, shared_step, FREE_LENS)
-        return 2.0 * float(squared_errors(observations, homographies(moved), moved.lens, equations.whitening).sum())
+        squared = squared_errors(observations, homographies(moved), moved.lens, equations.whitening)
+        return 2.0 * float(robust_cost(squared, width).sum())
 
     rng = np.random.default_rng(0)
     for _ in range(4):

@@ -1,45 +1,16 @@
-"""The match graph, and links that contradict each other."""
+"""Links that contradict each other."""
+
+from dataclasses import replace
 
 import numpy as np
+import pytest
 
-from rdstitch.alignment.cycle_consistency import misfitting_links, triangles
+from rdstitch.alignment.bundle_adjustment import Priors
+from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links, triangles
+from rdstitch.alignment.initialization import adjust_pairs_independently, relations_at
+from rdstitch.alignment.motion_models import HOMOGRAPHY
 from rdstitch.alignment.observations import Observations
-from rdstitch.matching.match_graph import connected_components, spanning_tree
-
-
-def test_components_come_largest_first() -> None:
-    assert connected_components(7, [5, 1, 2], [6, 2, 4]) == [[1, 2, 4], [5, 6], [0], [3]]
-    assert connected_components(2, [], []) == [[0], [1]]
-
-
-def test_spanning_tree_takes_the_links_of_most_weight() -> None:
-    i, j = np.array([0, 1, 0, 2]), np.array([1, 2, 2, 3])
-    tree = spanning_tree(4, i, j, np.array([5.0, 1.0, 4.0, 3.0]))
-    assert sorted(tree.link.tolist()) == [0, 2, 3]
-    assert sorted([tree.root, *tree.child.tolist()]) == [0, 1, 2, 3]
-    reached = {tree.root}
-    for link, parent, child in zip(tree.link, tree.parent, tree.child, strict=True):
-        assert parent in reached
-        assert {int(i[link]), int(j[link])} == {int(parent), int(child)}
-        reached.add(int(child))
-
-
-def test_the_root_is_the_middle_of_a_chain() -> None:
-    chain = np.arange(8)
-    assert spanning_tree(9, chain, chain + 1, np.ones(8)).root == 4
-    assert spanning_tree(9, chain, chain + 1, np.ones(8), root=0).parent.tolist() == list(range(8))
-
-
-def test_chaining_goes_along_links_in_either_direction() -> None:
-    rng = np.random.default_rng(0)
-    truth = np.eye(3) + 0.2 * rng.normal(size=(4, 3, 3))
-    i, j = np.array([1, 1, 3]), np.array([0, 2, 2])
-    h = truth[j] @ np.linalg.inv(truth[i])
-    tree = spanning_tree(4, i, j, np.ones(3), root=0)
-    chained = tree.chained(h, i, truth[0])
-    unit = np.cbrt(np.abs(np.linalg.det(truth)))[:, None, None]
-    ours = np.cbrt(np.abs(np.linalg.det(chained)))[:, None, None]
-    np.testing.assert_allclose(chained / ours, truth / unit, atol=1e-10)
+from tests.alignment_scenes import grid, scene
 
 
 def test_triangles_of_a_complete_graph() -> None:
@@ -71,3 +42,37 @@ def test_a_link_far_worse_than_the_others_misfits() -> None:
     assert misfitting_links(errors.ravel() ** 2, seen).tolist() == [False, False, False, True, False, True]
     errors[:] = 6.0  # all alike: too rigid a model, not wrong pairs
     assert not misfitting_links(errors.ravel() ** 2, seen).any()
+
+
+@pytest.mark.parametrize(
+    ("shift", "noise", "suspected"),
+    [
+        (0.0, 0.3, False),
+        (0.06, 0.3, True),  # a wrong pair: some twenty standard deviations, as a neighbouring tile gives
+        (0.06, 6.0, False),  # the same where the links are hardly known
+        (0.01, 0.01, False),  # hundreds of standard deviations, but what relief or a rolling shutter does
+    ],
+)
+def test_a_link_is_suspected_by_what_its_covariance_allows(shift: float, noise: float, suspected: bool) -> None:
+    """One of the links of three by three pictures is off by a share of the half diagonal."""
+    rng = np.random.default_rng(4)
+    given = scene(grid(3, 3, (0.3, 0.25), 0.1, rng), noise=noise, outliers=0.0, per_link=40, rng=rng)
+    wrong = next(k for k, link in enumerate(given.links) if (link.image1, link.image2) == (3, 4))
+    link = given.links[wrong]
+    moved = link.points2 + shift * given.cameras[0].half_diagonal * np.array([0.6, 0.8])
+    links = [replace(link, points2=moved) if k == wrong else other for k, other in enumerate(given.links)]
+    observations = Observations.from_links(links, given.cameras)
+    lens = np.array([given.distortion, 0.0, 0.0, 0.0])
+    apart = adjust_pairs_independently(
+        HOMOGRAPHY,
+        observations,
+        relations_at(observations, [link.relation for link in links], lens),
+        np.empty(0),
+        lens,
+        np.array([True, False, False, False]),
+        Priors.none(HOMOGRAPHY, 0),
+        np.zeros((9, 2)),
+    )
+    suspects, confirmed = cycle_consistency(apart, observations, 9)
+    assert np.flatnonzero(suspects).tolist() == [wrong] * suspected
+    assert (np.delete(confirmed, wrong) > 0).all()

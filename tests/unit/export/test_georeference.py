@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
 import tifffile
 from PIL import ExifTags, Image
 
@@ -123,9 +124,16 @@ def test_pictures_without_positions_leave_no_world_file(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*.prj"))
 
 
+def test_geotiff_counts_from_the_corner_of_the_first_pixel() -> None:
+    place = Georeference(33, 0.1 * np.exp(-0.4j), complex(448_251.8, 5_411_935.1), 0.1)
+    tags = {tag[0]: tag[3] for tag in place.tiff_tags()}
+    matrix = np.reshape(tags[34264], (4, 4))
+    pixels = np.array([(0.0, 0.0), (899.0, 0.0), (0.0, 599.0)])
+    corners = np.column_stack([pixels + 0.5, np.zeros(3), np.ones(3)])
+    np.testing.assert_allclose((corners @ matrix.T)[:, :2], place.to_utm(pixels), atol=1e-6)
+
+
 def test_gdal_sees_what_was_meant(tmp_path: Path) -> None:
-    """Runs where rasterio is installed."""
-    rasterio = pytest.importorskip("rasterio")
     place = Georeference(-34, 0.05 * np.exp(0.3j), complex(268_832.3, 6_246_117.8), 0.1)
     alpha = np.full((600, 900), 255, np.uint8)
     alpha[:100] = 0
@@ -134,6 +142,6 @@ def test_gdal_sees_what_was_meant(tmp_path: Path) -> None:
     with rasterio.open(tmp_path / "a.tif") as opened:
         assert opened.crs.to_epsg() == place.epsg
         for x, y in ((0, 0), (899, 599), (300, 20)):
-            np.testing.assert_allclose(opened.transform * (x + 0.5, y + 0.5), place.to_utm([(x, y)])[0], atol=1e-6)
+            np.testing.assert_allclose(opened.xy(y, x), place.to_utm([(x, y)])[0], atol=1e-6)
         assert opened.overviews(1) == [2, 4]
         np.testing.assert_array_equal(opened.dataset_mask(), alpha)

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from rdstitch.camera import Camera
 from rdstitch.features import Features
 from rdstitch.features.keypoints import Descriptors
-from rdstitch.matching.candidate_pairs import EXHAUSTIVE_UP_TO, first_pairs, lookalikes
+from rdstitch.matching.candidate_pairs import EXHAUSTIVE_UP_TO, first_pairs, lookalikes, neighbours
 
 
 def _features(descriptors: Descriptors) -> Features:
@@ -50,3 +51,15 @@ def test_pictures_without_features_look_like_none() -> None:
     nothing = _features(np.zeros((0, 64), dtype=np.float32))
     assert lookalikes([nothing] * 40, seed=1) == set()
     assert len(first_pairs([nothing, *_drive(34)], seed=1)) > 34
+
+
+@pytest.mark.parametrize(("overlap", "found"), [(0.1, []), (0.2, [(0, 1)]), (0.5, [(0, 1)]), (0.9, [(0, 1)])])
+@pytest.mark.parametrize("size", [1.0, 0.4])
+def test_pictures_that_overlap_by_a_fifth_are_neighbours(overlap: float, found: list[object], size: float) -> None:
+    """Of the smaller footprint: the second picture may have been taken from nearer."""
+    lens = Camera((640, 480))
+    width, height = 639 / lens.half_diagonal, 479 / lens.half_diagonal
+    x = (0.5 - size * (overlap - 0.5)) * width
+    shifted = np.array([[size, 0.0, x], [0.0, size, (1 - size) * height / 4], [0.0, 0.0, 1.0]])
+    assert neighbours([lens, lens], np.stack([np.eye(3), shifted]), set()) == found
+    assert neighbours([lens, lens], np.stack([np.eye(3), shifted]), {(0, 1)}) == []

@@ -32,7 +32,7 @@ def test_the_best_come_first_and_all_come_in_the_end() -> None:
     assert np.isin(last, best).mean() < 0.3
 
 
-def test_same_seed_same_samples_whatever_the_batches() -> None:
+def test_same_seed_same_samples() -> None:
     one = Sampler(50, 3, None, 1000, 7).draw(64)
     assert np.array_equal(one, Sampler(50, 3, None, 1000, 7).draw(64))
     assert not np.array_equal(one, Sampler(50, 3, None, 1000, 8).draw(64))

@@ -1,0 +1,37 @@
+"""Seams run where pictures look alike, and each side of one comes from the picture that lies on that side."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from rdstitch.camera import Camera
+from rdstitch.compositing import CompositeOptions, compose, plan_canvas
+from tests.compositing_scenes import as_picture
+
+SIZE = (300, 200)
+SHIFT = 100  # pixels by which the second picture lies further right, or down
+LEFT, ALIKE, RIGHT = 60, 128, 200
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+@pytest.mark.parametrize("place", [180, 200, 220])
+def test_a_seam_runs_where_two_pictures_look_alike(place: int, swapped: bool) -> None:
+    """Two plain pictures of unequal grey that look alike in one column of the overlap alone."""
+    column = np.arange(SIZE[0] + SHIFT)
+    frames = []
+    for grey, start in ((LEFT, 0), (RIGHT, SHIFT)):
+        row = np.where(np.abs(column - place) <= 4, ALIKE, grey)[start : start + SIZE[0]].astype(np.uint8)
+        frames.append(np.tile(row[None, :, None], (SIZE[1], 1, 3)))
+    lens = Camera(SIZE)
+    move = np.eye(3)
+    move[0, 2] = SHIFT / lens.half_diagonal
+    homographies = np.stack([np.eye(3), move])
+    if swapped:  # whichever is added last
+        frames, homographies = frames[::-1], homographies[::-1]
+    canvas = plan_canvas([lens, lens], homographies)
+    options = CompositeOptions(exposure="none", seam="graphcut", blend="none")
+    found = compose([partial(as_picture, frame) for frame in frames], [lens, lens], homographies, canvas, options)
+    assert canvas.size == (SIZE[0] + SHIFT, SIZE[1])
+    assert (found.pixels[:, : place - 6] == LEFT).all()
+    assert (found.pixels[:, place + 7 :] == RIGHT).all()

@@ -1,0 +1,63 @@
+"""The match graph: its connected parts, spanning forest and centre."""
+
+import numpy as np
+
+from rdstitch.matching.match_graph import connected_components, spanning_forest, spanning_tree
+
+
+def test_components_come_largest_first() -> None:
+    assert connected_components(7, [5, 1, 2], [6, 2, 4]) == [[1, 2, 4], [5, 6], [0], [3]]
+    assert connected_components(2, [], []) == [[0], [1]]
+
+
+def test_spanning_tree_takes_the_links_of_most_weight() -> None:
+    i, j = np.array([0, 1, 0, 2]), np.array([1, 2, 2, 3])
+    tree = spanning_tree(4, i, j, np.array([5.0, 1.0, 4.0, 3.0]))
+    assert sorted(tree.link.tolist()) == [0, 2, 3]
+    assert sorted([tree.root, *tree.child.tolist()]) == [0, 1, 2, 3]
+    reached = {tree.root}
+    for link, parent, child in zip(tree.link, tree.parent, tree.child, strict=True):
+        assert parent in reached
+        assert {int(i[link]), int(j[link])} == {int(parent), int(child)}
+        reached.add(int(child))
+
+
+def test_the_root_is_the_middle_of_a_chain() -> None:
+    chain = np.arange(8)
+    assert spanning_tree(9, chain, chain + 1, np.ones(8)).root == 4
+    assert spanning_tree(9, chain, chain + 1, np.ones(8), root=0).parent.tolist() == list(range(8))
+
+
+def test_chaining_goes_along_links_in_either_direction() -> None:
+    rng = np.random.default_rng(0)
+    truth = np.eye(3) + 0.2 * rng.normal(size=(4, 3, 3))
+    i, j = np.array([1, 1, 3]), np.array([0, 2, 2])
+    h = truth[j] @ np.linalg.inv(truth[i])
+    tree = spanning_tree(4, i, j, np.ones(3), root=0)
+    chained = tree.chained(h, i, truth[0])
+    unit = np.cbrt(np.abs(np.linalg.det(truth)))[:, None, None]
+    ours = np.cbrt(np.abs(np.linalg.det(chained)))[:, None, None]
+    np.testing.assert_allclose(chained / ours, truth / unit, atol=1e-10)
+
+
+def test_a_spanning_forest_leaves_the_parts_apart_and_counts_a_pair_once() -> None:
+    i, j = np.array([0, 1, 0, 3, 4, 2, 1]), np.array([1, 2, 2, 4, 3, 0, 0])
+    weight = np.array([1.0, 5.0, 4.0, 1.0, 2.0, 4.0, 1.0])
+    # Of equal links the earlier; of two between the same pictures, in whichever direction, the heavier.
+    assert spanning_forest(6, i, j, weight).tolist() == [1, 2, 4]
+
+
+def test_a_spanning_forest_of_many_links_is_that_of_kruskal() -> None:
+    rng = np.random.default_rng(0)
+    count = 60
+    pairs = np.stack(np.triu_indices(count, 1), axis=1)
+    i, j = pairs[rng.random(len(pairs)) < 0.2].T
+    weight = rng.integers(1, 50, len(i)).astype(float)
+    group = np.arange(count)
+    expected = []
+    for link in np.argsort(-weight, kind="stable"):
+        one, other = group[i[link]], group[j[link]]
+        if one != other:
+            group[group == one] = other
+            expected.append(int(link))
+    assert spanning_forest(count, i, j, weight).tolist() == sorted(expected)

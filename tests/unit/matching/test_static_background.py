@@ -1,0 +1,78 @@
+"""What stays where it is in the picture, and by how little it may move to count as that."""
+
+import numpy as np
+import pytest
+
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
+from rdstitch.features import Correspondences, Features
+from rdstitch.matching.static_background import is_static_pair, most_rest, moving_features, show_motion
+from rdstitch.matching.two_view import PairRegistration
+from rdstitch.radial_homography import RadialHomography
+
+THRESHOLD = 3.0
+LENS = Camera((640, 480))
+
+
+def _pair(moved: FloatArray, image1: int = 0, image2: int = 1) -> PairRegistration:
+    """A registered pair whose matches all agree, each moved to the right by so many pixels."""
+    count = len(moved)
+    points = np.random.default_rng(0).uniform((0.0, 0.0), (600.0, 479.0), (count, 2))
+    indices = np.repeat(np.arange(count)[:, None], 2, axis=1)
+    matched = Correspondences(indices, points, points + np.stack([moved, np.zeros(count)], axis=1), np.ones(count))
+    return PairRegistration(image1, image2, matched, RadialHomography(np.eye(3), LENS, LENS, np.ones(count, np.bool_)))
+
+
+def _failed(image1: int, image2: int) -> PairRegistration:
+    pair = _pair(np.zeros(10), image1, image2)
+    return PairRegistration(image1, image2, pair.correspondences, RadialHomography.failed("no", LENS, LENS, 10))
+
+
+@pytest.mark.parametrize(("moved", "static"), [(0.0, True), (0.9, True), (1.1, False), (2.0, False), (40.0, False)])
+def test_a_pair_is_static_where_most_inliers_move_by_less_than_a_third_of_the_threshold(
+    moved: float, static: bool
+) -> None:
+    assert is_static_pair(_pair(np.full(40, moved)), THRESHOLD) is static
+    # Most decide, not the mean and not all.
+    assert is_static_pair(_pair(np.append(np.full(31, moved), np.full(9, 90.0))), THRESHOLD) is static
+
+
+def test_only_inliers_decide_and_no_failed_pair_is_static() -> None:
+    pair = _pair(np.append(np.full(10, 20.0), np.zeros(30)))
+    pair.relation.inliers[10:] = False
+    assert not is_static_pair(pair, THRESHOLD)
+    assert not is_static_pair(_failed(0, 1), THRESHOLD)
+
+
+def test_what_moves_by_less_than_the_threshold_is_taken_out_of_static_pairs_only() -> None:
+    count = 40
+    features = [
+        Features(np.zeros((count, 2)), np.zeros((count, 8), np.float32), *[np.ones(count)] * 3, None, "made up")
+    ] * 3
+    # Of the static pair, ten matches move by more than the threshold.
+    moved = np.append(np.zeros(28), [2.9, 2.9, *[3.1] * 5, *[50.0] * 5])
+    pairs = [_pair(moved), _pair(np.full(count, 30.0), 1, 2), _failed(0, 2)]
+    assert [len(found) for found in moving_features(features, pairs, THRESHOLD)] == [10, 10, 40]
+
+
+def test_most_pairs_rest_by_their_majority() -> None:
+    rest, move = _pair(np.zeros(40)), _pair(np.full(40, 30.0))
+    assert most_rest([rest, rest, move], THRESHOLD)
+    assert not most_rest([rest, move], THRESHOLD)
+    assert not most_rest([rest, move, _failed(0, 1)], THRESHOLD)
+
+
+@pytest.mark.parametrize(
+    ("links", "count", "shown"),
+    [
+        ([(0, 1), (1, 2)], 3, True),
+        ([(0, 1)], 2, False),  # two pictures may do so by chance
+        ([(0, 1), (1, 2)], 6, True),
+        ([(0, 1), (1, 2)], 7, False),  # less than half
+        ([(0, 1), (2, 3), (4, 5)], 6, False),  # not connected
+    ],
+)
+def test_motion_is_shown_by_a_connected_good_part(links: list[tuple[int, int]], count: int, shown: bool) -> None:
+    pairs = [_pair(np.full(40, 30.0), *link) for link in links]
+    pairs += [_pair(np.zeros(40), 0, other) for other in range(1, count)]
+    assert show_motion(pairs, count, THRESHOLD) is shown

@@ -1,0 +1,66 @@
+"""What two-view estimation decides by: when it stops, which model it takes, what it takes for chance."""
+
+import numpy as np
+import pytest
+
+import rdstitch
+from rdstitch.robust.verification import rejection_reason
+from rdstitch.synthetic import correspondences
+
+
+@pytest.mark.parametrize(("solver", "size"), [("three_point", 3), ("four_point", 4), ("five_point", 5)])
+def test_sampling_goes_on_until_a_sample_without_outliers_is_likely(solver: str, size: int) -> None:
+    """Fischler and Bolles: a share w of inliers needs log(1 - confidence) / log(1 - w^size) samples."""
+    matches = correspondences(300, seed=1, outliers=0.6)
+    found = rdstitch.estimate_radial_homography(
+        matches.points1,
+        matches.points2,
+        matches.truth.camera.image_size,
+        focal=matches.truth.camera.focal,
+        solver=solver,
+    )
+    assert found
+    # Without the exponent, less than a hundred.
+    enough = np.log(1e-3) / np.log1p(-(found.inliers.mean() ** size))
+    assert enough < found.iterations < 8 * enough
+    assert "stopped at its limit" not in found.reason
+
+
+def test_more_confidence_takes_more_samples() -> None:
+    matches = correspondences(300, seed=1, outliers=0.6)
+    drawn = [
+        rdstitch.estimate_radial_homography(
+            matches.points1,
+            matches.points2,
+            matches.truth.camera.image_size,
+            solver="five_point",
+            confidence=confidence,
+        ).iterations
+        for confidence in (0.9, 0.999999)
+    ]
+    assert drawn[1] > 2 * drawn[0]
+
+
+def test_the_least_free_model_is_chosen() -> None:
+    """A freer one always fits a little better; without a price for freedom it would nearly always be chosen."""
+    chosen = []
+    for seed in range(12):
+        for motion in ("rigid", "similarity", "homography"):
+            matches = correspondences(200, seed=seed, outliers=0.2, motion=motion)
+            camera = matches.truth.camera
+            found = rdstitch.estimate_radial_homography(
+                matches.points1, matches.points2, camera.image_size, focal=camera.focal
+            )
+            chosen.append(found.model == motion)
+    assert np.mean(chosen) > 0.9
+
+
+@pytest.mark.parametrize(("agreeing", "chance"), [(16, True), (22, True), (36, False), (300, False)])
+def test_agreement_that_chance_explains_is_rejected(agreeing: int, chance: bool) -> None:
+    """Of a thousand wrong matches ten agree by chance, beside the four that a model is made from."""
+    points = np.random.default_rng(0).uniform((0.0, 0.0), (999.0, 799.0), (1000, 2))
+    reason = rejection_reason(points, points, np.arange(1000) < agreeing, (1000, 800), 3.0)
+    if chance:
+        assert reason == f"{agreeing} of 1000 matches agree, no more than chance allows"
+    else:
+        assert reason is None
