@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
+import tifffile
 from PIL import Image
 
 from rdstitch.errors import InputError
@@ -37,6 +38,7 @@ _DAMAGE = (
     EOFError,
     struct.error,
     zlib.error,
+    tifffile.TiffFileError,  # no ValueError in older versions
     Image.DecompressionBombError,
     cv2.error,
 )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rdstitch.alignment.align import AlignmentOptions, align
-from rdstitch.alignment.build_result import Outcome, build_alignment
+from rdstitch.alignment.build_result import AdjustedPictures, build_alignment
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import CONTRADICTS, Alignment, Poses
 from rdstitch.alignment.trajectory import Trajectory, compare
@@ -223,7 +223,7 @@ def test_any_picture_can_become_the_frame_after_the_adjustment(monkeypatch: pyte
     rng = np.random.default_rng(12)
     poses = jittered(grid(3, 2, (0.4, 0.3), 1.2, rng), 0.2, 0.0, rng)
     given = scene(poses, tilt=(0.05, -0.04), rng=rng)
-    adjusted: list[Outcome] = []
+    adjusted: list[AdjustedPictures] = []
     recipe = import_module("rdstitch.alignment.align")  # the package has a function of the module's name
     monkeypatch.setattr(recipe, "build_alignment", adjusted.append)
     _run(given, model="similarity", reference=0)

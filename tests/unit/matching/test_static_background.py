@@ -46,9 +46,8 @@ def test_only_inliers_decide_and_no_failed_pair_is_static() -> None:
 
 def test_what_moves_by_less_than_the_threshold_is_taken_out_of_static_pairs_only() -> None:
     count = 40
-    features = [
-        Features(np.zeros((count, 2)), np.zeros((count, 8), np.float32), *[np.ones(count)] * 3, None, "made up")
-    ] * 3
+    one = np.ones(count)
+    features = [Features(np.zeros((count, 2)), np.zeros((count, 8), np.float32), one, one, one, None, "made up")] * 3
     # Of the static pair, ten matches move by more than the threshold.
     moved = np.append(np.zeros(28), [2.9, 2.9, *[3.1] * 5, *[50.0] * 5])
     pairs = [_pair(moved), _pair(np.full(count, 30.0), 1, 2), _failed(0, 2)]

@@ -1,0 +1,100 @@
+"""What the verdict fails: a registration that the pixels, the matches or the pictures themselves speak against."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rdstitch.features import FeatureOptions
+from rdstitch.inputs.source import read_sources
+from rdstitch.io import write_image
+from rdstitch.options import StitchOptions
+from rdstitch.pipeline.register import register
+from rdstitch.registration import Registration
+from rdstitch.verification.verdict import judge
+from tests.cli.running import flight
+
+THRESHOLD = 3.0
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Registration:
+    """Three pictures in a chain, rightly registered."""
+    frames = flight(3, 3).write(tmp_path_factory.mktemp("good"))
+    sources, _ = read_sources(frames, camera=None, focal=380.0, distortion=None, skip_bad=False)
+    options = StitchOptions(workers=1, features=FeatureOptions(max_features=600))
+    return register(sources, options, skip_bad=False)
+
+
+def _texts(registration: Registration, *, lens_only: bool = False) -> list[str]:
+    return [m.text for m in judge(registration, THRESHOLD, lens_only=lens_only) if m.severity == "failure"]
+
+
+def test_a_right_registration_passes(good: Registration) -> None:
+    assert judge(good, THRESHOLD) == ()
+
+
+def _moved(good: Registration, picture: int, shift: float) -> Registration:
+    """A picture put elsewhere on the plane, by a share of the half diagonal; its matches say what they said."""
+    homographies = good.alignment.homographies.copy()
+    move = np.eye(3)
+    move[:2, 2] = shift * 0.6, shift * 0.8
+    homographies[picture] = homographies[picture] @ move
+    return replace(good, alignment=replace(good.alignment, homographies=homographies))
+
+
+@pytest.mark.parametrize("shift", [0.03, 0.05])
+def test_pictures_that_do_not_look_alike_where_they_are_put_fail(good: Registration, shift: float) -> None:
+    """However well their matches agree: repeated structure does that."""
+    found = _texts(_moved(good, 2, shift))
+    assert any("do not look alike where they are put together" in text for text in found)
+    # Of the lens it says nothing.
+    assert _texts(_moved(good, 2, shift), lens_only=True) == []
+
+
+def test_a_wrong_pair_beside_enough_right_ones_is_a_warning(good: Registration) -> None:
+    """Here picture 2 is held by a pair that is right, and another is called wrong by its matches."""
+    used = [fit for fit in good.alignment.links if fit.used]
+    closing = replace(used[0], image1=0, image2=2, count=100, inliers=40)
+    doubled = replace(good, alignment=replace(good.alignment, links=(*used, closing)))
+    messages = judge(doubled, THRESHOLD)
+    assert not any(message.severity == "failure" for message in messages)
+    assert any("1 of the pairs fit badly" in message.text for message in messages)
+
+
+@pytest.mark.parametrize(("rms", "fails"), [(2.9, False), (3.1, True), (np.nan, True)])
+def test_errors_beyond_the_threshold_fail(good: Registration, rms: float, fails: bool) -> None:
+    found = _texts(replace(good, alignment=replace(good.alignment, rms=rms)))
+    assert any("the pictures disagree by" in text for text in found) is fails
+
+
+@pytest.mark.parametrize(("share", "fails"), [(0.45, True), (0.55, False)])
+def test_matches_of_which_less_than_half_agree_fail(good: Registration, share: float, fails: bool) -> None:
+    links = tuple(replace(fit, count=1000, inliers=int(1000 * share)) for fit in good.alignment.links)
+    found = _texts(replace(good, alignment=replace(good.alignment, links=links)), lens_only=True)
+    assert any("matches of the pairs agree with the whole" in text for text in found) is fails
+    assert any("another camera or zoom, or no plane" in text for text in found) is fails
+
+
+@pytest.mark.parametrize(("share", "fails"), [(0.55, True), (0.65, False)])
+def test_a_picture_of_whose_matches_many_disagree_fails(good: Registration, share: float, fails: bool) -> None:
+    links = tuple(
+        replace(fit, count=1000, inliers=int(1000 * share) if 2 in (fit.image1, fit.image2) else 1000)
+        for fit in good.alignment.links
+        if fit.used and (fit.image1, fit.image2) != (0, 2)
+    )
+    found = _texts(replace(good, alignment=replace(good.alignment, links=links)))
+    assert any(text.startswith(Path(good.sources[2].path).name) for text in found) is fails
+
+
+def test_pictures_without_texture_are_not_called_unlike(good: Registration, tmp_path: Path) -> None:
+    """Where there is nothing to compare, nothing speaks against the matches."""
+    sources = []
+    for source in good.sources:
+        width, height = source.camera.image_size
+        path = tmp_path / source.name
+        write_image(path, np.full((height, width, 3), 128, np.uint8))
+        sources.append(replace(source, path=path))
+    found = _texts(_moved(replace(good, sources=tuple(sources)), 2, 0.3))
+    assert not any("do not look alike" in text for text in found)
