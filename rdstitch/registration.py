@@ -28,7 +28,7 @@ class Registration:
     messages : tuple of Message
         What the user should know: failed checks, warnings, and every picture that is not in the result.
     static_background : bool
-        Whether most of what the pictures show stays where it is in them, and only what moves was registered.
+        Whether a part of what the pictures show stays where it is in them, and only what moves was registered.
     mixed : TwoLenses or None
         Where pictures of two lenses are mixed. If it is clear which belong together, the others are left out.
     """

@@ -31,6 +31,7 @@ from rdstitch.synthetic import (
     rotation_poses,
     sequence_over,
 )
+from tests.adverse_sets import ADVERSE, adverse_set
 
 SOLVABLE = ("pair", "chain", "grid")
 ODD = ("odd lens",)
@@ -86,7 +87,7 @@ class TrustSet:
     Attributes
     ----------
     kind : str
-        One of :data:`SOLVABLE`, :data:`ODD` or :data:`HOPELESS`.
+        One of :data:`SOLVABLE`, :data:`ODD`, :data:`HOPELESS` or :data:`tests.adverse_sets.ADVERSE`.
     sequence : Sequence
     """
 
@@ -123,6 +124,8 @@ class Judged:
 
 def trust_set(seed: int, kind: str | None = None) -> TrustSet:
     """A random set of a kind; of a random one if not given, half of them solvable."""
+    if kind in ADVERSE:
+        return TrustSet(kind, adverse_set(kind, seed))
     rng = np.random.default_rng((seed, 77))
     if kind is None:
         kind = str(rng.choice(SOLVABLE if rng.random() < 0.5 else HOPELESS))

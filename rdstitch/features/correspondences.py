@@ -48,6 +48,10 @@ class Correspondences:
         """Correspondences between the features of two pictures."""
         return cls(indices, features1.points[indices[:, 0]], features2.points[indices[:, 1]], ratio)
 
+    def take(self, index: NDArray[np.intp]) -> Self:
+        """The correspondences at the given positions."""
+        return type(self)(self.indices[index], self.points1[index], self.points2[index], self.ratio[index])
+
     def __len__(self) -> int:
         """Number of correspondences."""
         return len(self.ratio)

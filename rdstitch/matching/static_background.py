@@ -1,51 +1,130 @@
-"""What rests in the picture while the plane moves: the background of a board carried about, dirt on the lens, a date.
+"""What is static in the pictures while the plane moves: a robot's own body, a background, dirt on the lens, a date.
 
-Matches between such things agree that nothing moved. Where they outnumber the matches of the plane, every pair looks
-as if the camera stood still; without them, the pairs show how the plane moved.
+Matches between such things agree that nothing moved. Where they outnumber the matches of the plane, a pair looks as if
+the camera stood still; pictures far apart, which share nothing else, always do. Without them, the pairs show how the
+plane moved.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from rdstitch.arrays import FloatArray
-from rdstitch.features import Features
+from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.features import Correspondences, Features
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.matching.two_view import PairRegistration
 
 _LEAST_PICTURES = 3
 _LEAST_SHARE = 0.5
 
+_STATIC = 1.0 / 3.0
+"""Motion of a static match at most, in thresholds: its two keypoints are localised to better than that."""
+
+_MIN_STATIC_MATCHES = 8
+"""Of a pair that moves. Wrong matches lie anywhere: of 1,000, less than one ends within a pixel of where it began."""
+
+_MIN_CONFIRMATIONS = 3
+"""Static matches at one place, from which on every static match there counts as one."""
+
+_MIN_OVERLAID_PAIRS, _MIN_OVERLAID_SHARE = 2, 0.2
+"""Pairs with such matches, in number and as a share of the pairs that move; by one pair alone nothing is decided."""
+
 
 def is_static_pair(pair: PairRegistration, threshold: float) -> bool:
     """Whether a pair is registered as if nothing had moved; ``threshold`` is that of its inliers, px."""
-    return bool(pair.relation) and float(np.median(_moved(pair)[pair.relation.inliers])) < threshold / 3
+    return bool(pair.relation) and float(np.median(_moved(pair)[pair.relation.inliers])) < threshold * _STATIC
 
 
-def most_rest(pairs: Sequence[PairRegistration], threshold: float) -> bool:
-    """Whether in most of the registered pairs nothing seems to have moved."""
+def has_static_background(pairs: Sequence[PairRegistration], threshold: float) -> bool:
+    """Whether most of the registered pairs are static, or several that move have static matches besides."""
     registered = [pair for pair in pairs if pair.relation]
-    return 2 * sum(is_static_pair(pair, threshold) for pair in registered) > len(registered)
+    static = sum(is_static_pair(pair, threshold) for pair in registered)
+    overlaid = sum(_is_overlaid(pair, threshold) for pair in registered)
+    moving = len(registered) - static
+    return 2 * static > len(registered) or overlaid >= max(_MIN_OVERLAID_PAIRS, _MIN_OVERLAID_SHARE * moving)
 
 
 def moving_features(
     features: Sequence[Features], pairs: Sequence[PairRegistration], threshold: float
 ) -> list[Features]:
-    """The features of each picture without those that rest, between any two pictures that do."""
+    """The features of each picture without those that have a static match."""
     moving = [np.ones(len(found), dtype=np.bool_) for found in features]
     for pair in pairs:
-        if is_static_pair(pair, threshold):
-            resting = pair.correspondences.indices[_moved(pair) < threshold]
-            moving[pair.image1][resting[:, 0]] = False
-            moving[pair.image2][resting[:, 1]] = False
+        static = pair.correspondences.indices[_static_matches(pair, threshold)]
+        moving[pair.image1][static[:, 0]] = False
+        moving[pair.image2][static[:, 1]] = False
     return [found.take(np.flatnonzero(kept)) for found, kept in zip(features, moving, strict=True)]
+
+
+@dataclass(frozen=True)
+class StaticPlaces:
+    """Where several pairs have static matches.
+
+    A feature there that is matched otherwise at first is left by :func:`moving_features`, and then finds what is static
+    in other pictures.
+
+    Attributes
+    ----------
+    places : cKDTree
+        Of shape (P, 2), pixels.
+    radius : float
+        Around a place, and motion of a static match at most, pixels.
+    """
+
+    places: cKDTree
+    radius: float
+
+    @classmethod
+    def of(cls, pairs: Sequence[PairRegistration], threshold: float) -> Self:
+        """Places where at least three static matches of any pairs begin."""
+        found = np.concatenate(
+            [np.empty((0, 2)), *(pair.correspondences.points1[_static_matches(pair, threshold)] for pair in pairs)]
+        )
+        radius = threshold * _STATIC
+        matches = cKDTree(found).query_ball_point(found, radius, return_length=True)
+        return cls(cKDTree(found[matches >= _MIN_CONFIRMATIONS]), radius)
+
+    def without_static(self, matched: Correspondences) -> Correspondences:
+        """The matches that move, or begin elsewhere."""
+        moved = np.linalg.norm(matched.points2 - matched.points1, axis=1)
+        distance, _ = self.places.query(matched.points1, distance_upper_bound=self.radius)
+        return matched.take(np.flatnonzero((moved > self.radius) | ~np.isfinite(distance)))
+
+
+def _static_matches(pair: PairRegistration, threshold: float) -> BoolArray:
+    """Which matches (M,) of a pair are static: of a static pair all that move little, of others those of an overlay."""
+    if is_static_pair(pair, threshold):
+        return _moved(pair) < threshold
+    return _overlay(pair, threshold) & _is_overlaid(pair, threshold)
+
+
+def _overlay(pair: PairRegistration, threshold: float) -> BoolArray:
+    """Which matches (M,) are static although the rest of the pair moves."""
+    static: BoolArray = (_moved(pair) < threshold * _STATIC) & ~pair.relation.inliers
+    return static
+
+
+def _is_overlaid(pair: PairRegistration, threshold: float) -> bool:
+    """Whether a pair moves, and has more static matches than chance brings."""
+    return (
+        bool(pair.relation)
+        and not is_static_pair(pair, threshold)
+        and int(_overlay(pair, threshold).sum()) >= _MIN_STATIC_MATCHES
+    )
+
+
+def moving_images(pairs: Sequence[PairRegistration], count: int, threshold: float) -> int:
+    """How many of the ``count`` pictures pairs that move connect, at the most."""
+    linked = [pair for pair in pairs if pair.relation and not is_static_pair(pair, threshold)]
+    return len(connected_components(count, [pair.image1 for pair in linked], [pair.image2 for pair in linked])[0])
 
 
 def show_motion(pairs: Sequence[PairRegistration], count: int, threshold: float) -> bool:
     """Whether pairs that do move connect a good part of the ``count`` pictures, so that this is no chance."""
-    linked = [pair for pair in pairs if pair.relation and not is_static_pair(pair, threshold)]
-    largest = connected_components(count, [pair.image1 for pair in linked], [pair.image2 for pair in linked])[0]
-    return len(largest) >= max(_LEAST_PICTURES, _LEAST_SHARE * count)
+    return moving_images(pairs, count, threshold) >= max(_LEAST_PICTURES, _LEAST_SHARE * count)
 
 
 def _moved(pair: PairRegistration) -> FloatArray:

@@ -12,7 +12,13 @@ from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features, Matcher, match_near
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.options import MatchingOptions, PairOptions
-from rdstitch.matching.static_background import most_rest, moving_features, show_motion
+from rdstitch.matching.static_background import (
+    StaticPlaces,
+    has_static_background,
+    moving_features,
+    moving_images,
+    show_motion,
+)
 from rdstitch.matching.two_view import PairRegistration, estimate_pairs, match_pairs
 from rdstitch.planar_motion import PlanarMotion
 from rdstitch.progress import Progress
@@ -42,6 +48,8 @@ class Pairing:
     cache : Cache
     tilts : sequence of (float, float), optional
         (ψ, θ), radians, of each picture, where they are known exactly.
+    static : StaticPlaces, optional
+        Where static matches are no evidence.
     """
 
     features: Sequence[Features]
@@ -51,6 +59,7 @@ class Pairing:
     progress: Progress
     cache: Cache = NO_CACHE
     tilts: Sequence[tuple[float, float]] | None = None
+    static: StaticPlaces | None = None
 
     def prescreen_pairs(self, pairs: Sequence[Pair]) -> dict[Pair, Correspondences]:
         """The pairs that share something at a glance, and what; that costs a sixteenth of a closer look.
@@ -97,11 +106,16 @@ class Pairing:
     def remove_static_background(self, pairs: list[PairRegistration]) -> "MovingPairs":
         """Where most pairs seem to rest, the pairing and pairs of what moves; the same again where nothing does."""
         threshold = self.options.pair.threshold
-        if not most_rest(pairs, threshold):
+        if not has_static_background(pairs, threshold):
             return MovingPairs(self, pairs, found=False)
+        chosen = [(pair.image1, pair.image2) for pair in pairs]
         moving = replace(self, features=moving_features(self.features, pairs, threshold))
-        again = moving.estimate([(pair.image1, pair.image2) for pair in pairs])
-        if not show_motion(again, len(self.features), threshold):
+        strict = replace(moving, static=StaticPlaces.of(pairs, threshold))
+        again, fewer = moving.estimate(chosen), strict.estimate(chosen)
+        count = len(self.features)
+        if moving_images(fewer, count, threshold) >= moving_images(again, count, threshold):
+            moving, again = strict, fewer
+        if not show_motion(again, count, threshold):
             return MovingPairs(self, pairs, found=False)
         return MovingPairs(moving, again, found=True)
 
@@ -207,6 +221,8 @@ class Pairing:
     ) -> list[PairRegistration]:
         """The relation of every pair, from an earlier run where the cache has it."""
         options = self._pair_options(distortion)
+        if self.static is not None:
+            matched = [self.static.without_static(found) for found in matched]
 
         def recall(index: int, compute: Callable[[], RadialHomography]) -> RadialHomography:
             i, j = pairs[index]

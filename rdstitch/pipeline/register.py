@@ -22,7 +22,7 @@ from rdstitch.progress import Progress, silent
 from rdstitch.registration import Registration
 
 _STATIC_BACKGROUND = Message(
-    "most of what the pictures show stays where it is in them (a background, dirt, a date); "
+    "a part of what the pictures show stays where it is in them (a vehicle's body, a background, dirt, a date); "
     "only what moves was registered"
 )
 

@@ -77,11 +77,33 @@ def test_pictures_that_really_rest_stay_together() -> None:
     assert all(is_static_pair(pair, 3.0) for pair in alone)
 
 
-def test_a_few_resting_points_change_nothing() -> None:
+def test_an_overlay_is_removed_though_every_pair_moves() -> None:
     pairing = _pairing(40, 300)
     alone = pairing.estimate(ALL)
     assert not any(is_static_pair(pair, 3.0) for pair in alone)
+    moving = pairing.remove_static_background(alone)
+    assert moving.found
+    for before, after in zip(alone, moving.pairs, strict=True):
+        assert len(after.correspondences) <= len(before.correspondences) - 35
+        assert after.relation.inliers.sum() >= 0.95 * before.relation.inliers.sum()
+
+
+def test_a_few_static_matches_change_nothing() -> None:
+    pairing = _pairing(4, 300)
+    alone = pairing.estimate(ALL)
     assert pairing.remove_static_background(alone) == MovingPairs(pairing, alone, found=False)
+
+
+def test_static_matches_of_features_that_were_matched_otherwise_are_dropped_too() -> None:
+    pairing = _pairing(40, 300)
+    alone = pairing.estimate(ALL)
+    static_places = pairing.remove_static_background(alone).pairing.static
+    assert static_places is not None
+    for before in alone:
+        static = np.linalg.norm(before.correspondences.points2 - before.correspondences.points1, axis=1) < 1.0
+        kept = static_places.without_static(before.correspondences)
+        assert static.sum() >= 35
+        assert len(kept) == (~static).sum()
 
 
 def test_pictures_that_hang_on_little_find_what_repeats_where_it_must_be() -> None:
