@@ -88,7 +88,8 @@ class AlteredSequence(Sequence):
 
     @staticmethod
     def _of(values: FloatArray, index: int) -> FloatArray:
-        return values[index % len(values)]
+        own: FloatArray = values[index % len(values)]
+        return own
 
 
 def adverse_set(kind: str, seed: int) -> Sequence:

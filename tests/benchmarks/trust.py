@@ -11,9 +11,11 @@ from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from tests.adverse_sets import ADVERSE, SOLVABLE_ADVERSE
 from tests.trust_sets import HOPELESS, ODD, SOLVABLE, Judged, judge_set, trust_set
 
-_SOLVABLE = (*SOLVABLE, *ODD)
+_SOLVABLE = (*SOLVABLE, *ODD, *SOLVABLE_ADVERSE)
+_OTHERS = (*HOPELESS, *(kind for kind in ADVERSE if kind not in SOLVABLE_ADVERSE))
 
 
 def main() -> None:
@@ -21,7 +23,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sets", type=int, default=30, help="number of random sets")
     parser.add_argument("--first", type=int, default=0, help="seed of the first one")
-    parser.add_argument("--kind", choices=(*_SOLVABLE, *HOPELESS), help="only sets of this kind")
+    parser.add_argument(
+        "--kind", choices=(*_SOLVABLE, *_OTHERS), help="only sets of this kind; adverse ones only by name"
+    )
     parser.add_argument(
         "--keep", type=Path, help="a line here for each set; those that are here already are not done again"
     )
@@ -48,11 +52,11 @@ def main() -> None:
             )
     columns = ("solved", "in part", "refused", "silently wrong")
     print(f"\n{'kind':16}" + "".join(f"{name:>16}" for name in columns))
-    for kind in (*_SOLVABLE, *HOPELESS):
+    for kind in (*_SOLVABLE, *_OTHERS):
         print(f"{kind:16}" + "".join(f"{counts[kind, name]:16}" for name in columns))
     solvable = sum(count for (kind, _), count in counts.items() if kind in _SOLVABLE)
     share = sum(counts[kind, "solved"] for kind in _SOLVABLE) / max(solvable, 1)
-    wrong = sum(counts[kind, "silently wrong"] for kind in (*_SOLVABLE, *HOPELESS))
+    wrong = sum(counts[kind, "silently wrong"] for kind in (*_SOLVABLE, *_OTHERS))
     print(f"\n{share:.1%} of {solvable} solvable sets solved; {wrong} of {wanted.sets} sets silently wrong; ", end="")
     print(f"{(time.process_time() - start) / max(done, 1):.1f} s of processor time a set")
 
