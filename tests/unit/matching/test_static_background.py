@@ -6,7 +6,7 @@ import pytest
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features
-from rdstitch.matching.static_background import is_static_pair, most_rest, moving_features, show_motion
+from rdstitch.matching.static_background import has_static_background, is_static_pair, moving_features, show_motion
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.radial_homography import RadialHomography
 
@@ -56,9 +56,9 @@ def test_what_moves_by_less_than_the_threshold_is_taken_out_of_static_pairs_only
 
 def test_most_pairs_rest_by_their_majority() -> None:
     rest, move = _pair(np.zeros(40)), _pair(np.full(40, 30.0))
-    assert most_rest([rest, rest, move], THRESHOLD)
-    assert not most_rest([rest, move], THRESHOLD)
-    assert not most_rest([rest, move, _failed(0, 1)], THRESHOLD)
+    assert has_static_background([rest, rest, move], THRESHOLD)
+    assert not has_static_background([rest, move], THRESHOLD)
+    assert not has_static_background([rest, move, _failed(0, 1)], THRESHOLD)
 
 
 @pytest.mark.parametrize(
@@ -75,3 +75,18 @@ def test_motion_is_shown_by_a_connected_good_part(links: list[tuple[int, int]], 
     pairs = [_pair(np.full(40, 30.0), *link) for link in links]
     pairs += [_pair(np.zeros(40), 0, other) for other in range(1, count)]
     assert show_motion(pairs, count, THRESHOLD) is shown
+
+
+def _overlaid(static: int, image1: int = 0, image2: int = 1) -> PairRegistration:
+    """A pair that moves, with some static matches that are no inliers."""
+    pair = _pair(np.append(np.full(40, 30.0), np.zeros(static)), image1, image2)
+    pair.relation.inliers[40:] = False
+    return pair
+
+
+def test_static_matches_besides_motion_are_a_background_where_several_pairs_have_them() -> None:
+    move = _pair(np.full(40, 30.0))
+    assert has_static_background([_overlaid(8), _overlaid(8), move], THRESHOLD)
+    assert not has_static_background([_overlaid(7), _overlaid(7), move], THRESHOLD)
+    assert not has_static_background([_overlaid(8), move, move], THRESHOLD)
+    assert not has_static_background([_overlaid(8), _overlaid(8), *[move] * 9], THRESHOLD)
