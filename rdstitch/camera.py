@@ -5,8 +5,7 @@ Points are in pixels ``(u, v)`` with the centre of the top-left pixel at ``(0, 0
 :class:`Camera` keeps it for ``s`` = half the image diagonal, so that ``1 + λ`` is the factor at the image
 corner.
 
-The division model (Fitzgibbon 2001; Valtonen Örnhag et al., eq. 2) with an optional second coefficient μ is
-``x_u = x_d / (1 + λ r² + μ r⁴)``, ``r = |x_d|``; λ < 0 is barrel distortion.
+The lens is the division model of :mod:`rdstitch.division_model`, with λ alone or with further even coefficients.
 """
 
 import json
@@ -16,89 +15,30 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
+from rdstitch.division_model import distort, is_one_to_one, nearest_distortion, undistort
 from rdstitch.errors import ArgumentError
 from rdstitch.records import Record, read_json
 
-_NEWTON_STEPS, _NEWTON_TOLERANCE = 12, 1e-14
+_FILE_VERSION = 2
+"""Of camera files; version 1 had λ and μ only, as ``lambda`` and ``lambda2``."""
+
+LENS_PARAMETERS = ("distortion", "distortion2", "distortion3", "center_x", "center_y")
+"""The parameters of a lens: λ, μ, ν, and the distortion centre, in the half-diagonal frame."""
+
+LENS_STD = np.array([0.5, 0.1, 0.1, 0.03, 0.03])
+"""Prior standard deviations of :data:`LENS_PARAMETERS` about 0."""
 
 FOCAL_LOG_STD = {"option": 0.01, "file": 0.01, "estimate": 0.05, "exif": 0.05, "guess": 0.3}
 """Standard deviation of the logarithm of a focal length, by where it comes from."""
 
+_GRID = 33  # points along each side of the picture at which lenses are compared
+
 _FOCAL_LIMITS = 0.05, 1e3  # half diagonals; the widest fisheyes have 0.3
 
 _GUESSED_FOCAL = 1.2  # half diagonals: a 26 mm lens on 36 x 24 mm, in the middle of what phones and drones carry
-
-
-def undistort(points: ArrayLike, distortion: ArrayLike, distortion2: float = 0.0) -> FloatArray:
-    """Undistort normalized points.
-
-    Parameters
-    ----------
-    points : array_like of shape (..., 2)
-        Distorted points, normalized with the centre at the origin.
-    distortion : array_like
-        λ in the same frame; its shape broadcasts against ``points.shape[:-1]``.
-    distortion2 : float
-        μ in the same frame.
-
-    Returns
-    -------
-    ndarray of shape (..., 2)
-        Undistorted points; NaN where the model has no meaning (``1 + λ r² + μ r⁴ <= 0``).
-    """
-    x = np.asarray(points, dtype=np.float64)
-    radius2 = np.einsum("...i,...i->...", x, x)
-    denominator = 1.0 + (np.asarray(distortion) + distortion2 * radius2) * radius2
-    return x / np.where(denominator > 0.0, denominator, np.nan)[..., None]
-
-
-def distort(points: ArrayLike, distortion: ArrayLike, distortion2: float = 0.0) -> FloatArray:
-    """Distort normalized points: the inverse of :func:`undistort`.
-
-    For μ = 0 in closed form, ``x_d = 2 x_u / (1 + sqrt(1 - 4 λ |x_u|²))``, which is stable at λ = 0 and at the
-    centre; otherwise Newton's method on the radius starts there.
-
-    Parameters
-    ----------
-    points : array_like of shape (..., 2)
-        Undistorted points, normalized with the centre at the origin.
-    distortion, distortion2
-        As in :func:`undistort`.
-
-    Returns
-    -------
-    ndarray of shape (..., 2)
-        Distorted points; NaN where no distorted point maps to the given one.
-    """
-    x = np.asarray(points, dtype=np.float64)
-    radius2 = np.einsum("...i,...i->...", x, x)
-    discriminant = 1.0 - 4.0 * np.asarray(distortion) * radius2
-    if distortion2 == 0.0:
-        return x * (2.0 / (1.0 + np.sqrt(np.where(discriminant >= 0.0, discriminant, np.nan))))[..., None]
-    with np.errstate(over="ignore", invalid="ignore"):
-        ratio = _two_coefficient_ratio(radius2, np.asarray(distortion), distortion2, discriminant)
-    return x * ratio[..., None]
-
-
-def _two_coefficient_ratio(
-    radius2: FloatArray, distortion: NDArray[Any], distortion2: float, discriminant: FloatArray
-) -> FloatArray:
-    """``r_d / r_u`` for λ and μ: Newton on ``k = 1 + λ k² r² + μ k⁴ r⁴``, from the root for μ = 0."""
-    ratio = 2.0 / (1.0 + np.sqrt(np.maximum(discriminant, 0.0)))
-    for _ in range(_NEWTON_STEPS):
-        value = 1.0 - ratio + distortion * ratio**2 * radius2 + distortion2 * ratio**4 * radius2**2
-        slope = -1.0 + 2.0 * distortion * ratio * radius2 + 4.0 * distortion2 * ratio**3 * radius2**2
-        step = value / np.where(slope < 0.0, slope, -1.0)
-        ratio = ratio - step
-        if not (np.abs(step) > _NEWTON_TOLERANCE).any():
-            break
-    value = 1.0 - ratio + distortion * ratio**2 * radius2 + distortion2 * ratio**4 * radius2**2
-    slope = -1.0 + 2.0 * distortion * ratio * radius2 + 4.0 * distortion2 * ratio**3 * radius2**2
-    solved = (np.abs(value) <= 1e-9 * np.abs(ratio)) & (ratio > 0.0) & (slope < 0.0)
-    return np.where(solved, ratio, np.nan)
 
 
 def is_focal_length(focal: float, image_size: tuple[int, int]) -> bool:
@@ -117,8 +57,8 @@ class Camera:
         Width and height, px.
     distortion : float
         λ of the division model for ``s`` = half the image diagonal; negative is barrel distortion.
-    distortion2 : float
-        μ, coefficient of r⁴, in the same frame; 0 for the one-parameter model.
+    distortion2, distortion3 : float
+        μ and ν, coefficients of r⁴ and r⁶, in the same frame; 0 for the one-parameter model.
     center : (float, float), optional
         Distortion centre and principal point, px; the image centre if not given.
     focal : float or None
@@ -126,12 +66,14 @@ class Camera:
     focal_source : str or None
         Where the focal length comes from, a key of :data:`FOCAL_LOG_STD`.
     distortion_std : float or None
-        Standard deviation of λ; None where it was given and not estimated.
+        Standard deviation of :attr:`nearest_distortion`; None where it was given and not estimated.
+    lens_covariance : tuple of 5 tuples of 5 floats, or None
+        Covariance of :data:`LENS_PARAMETERS`, zero for those that were not estimated; None where nothing was.
 
     Raises
     ------
     ArgumentError
-        When a value is not finite, or when λ folds the picture at a corner.
+        When a value is not finite, or when the lens folds the picture: its model must be one-to-one out to the corners.
     """
 
     image_size: tuple[int, int]
@@ -141,6 +83,8 @@ class Camera:
     focal: float | None = None
     focal_source: str | None = None
     distortion_std: float | None = None
+    distortion3: float = 0.0
+    lens_covariance: tuple[tuple[float, ...], ...] | None = None
 
     def __post_init__(self) -> None:
         """Fill in the image centre and check every value."""
@@ -149,7 +93,7 @@ class Camera:
             raise ArgumentError(f"image size must be at least 1 x 1 pixel, not {width} x {height}")
         if all(math.isnan(value) for value in self.center):
             object.__setattr__(self, "center", ((width - 1) / 2, (height - 1) / 2))
-        numbers = (self.distortion, self.distortion2, *self.center)
+        numbers = (*self.coefficients, *self.center)
         if not all(math.isfinite(value) for value in numbers):
             raise ArgumentError(f"camera has a value that is not finite: {numbers}")
         if self.focal is not None and not is_focal_length(self.focal, self.image_size):
@@ -157,9 +101,50 @@ class Camera:
         if self.focal_source is not None and self.focal_source not in FOCAL_LOG_STD:
             raise ArgumentError(f"unknown source of a focal length: {self.focal_source!r}")
         with np.errstate(all="ignore"):  # absurd values, from a damaged file, overflow
-            corners = undistort(self.normalize(self.outline(1)), self.distortion, self.distortion2)
-        if not np.isfinite(corners).all():
-            raise ArgumentError(f"distortion {self.distortion:g} folds the picture at a corner; it must be above -1")
+            corner = float(np.linalg.norm(self.normalize(self.outline(1)), axis=1).max())
+            if not is_one_to_one(corner, self.coefficients):
+                raise ArgumentError(
+                    f"distortion {', '.join(f'{value:g}' for value in self.coefficients if value)} folds the picture "
+                    "at a corner; λ alone must be above -1"
+                )
+
+    @property
+    def coefficients(self) -> tuple[float, float, float]:
+        """λ, μ and ν in the half-diagonal frame."""
+        return self.distortion, self.distortion2, self.distortion3
+
+    @property
+    def higher(self) -> tuple[float, ...]:
+        """μ and ν in the half-diagonal frame; empty for the one-parameter model."""
+        return self.coefficients[1:] if any(self.coefficients[1:]) else ()
+
+    @property
+    def nearest_distortion(self) -> float:
+        """λ of the one-parameter model that is nearest to this lens over the picture; see :meth:`one_parameter_fit`."""
+        return self.one_parameter_fit()[0]
+
+    def one_parameter_fit(self) -> tuple[float, float, float]:
+        """The one-parameter model nearest to this lens, and how far they are apart.
+
+        Nearest by least squares of the measured places of the same rays, evenly over the picture, up to the scale of
+        the undistorted picture; the distortion centre is the same.
+
+        Returns
+        -------
+        distortion, rms, largest : float
+            λ in the half-diagonal frame, and the distances in pixels. λ itself and 0 for a one-parameter lens.
+        """
+        if not self.higher:
+            return self.distortion, 0.0, 0.0
+        nearest, rms, largest = nearest_distortion(self._radii2(), self.distortion, self.higher)
+        return nearest, rms * self.half_diagonal, largest * self.half_diagonal
+
+    def _radii2(self) -> FloatArray:
+        """Squared radii, half diagonals, of points evenly over the picture."""
+        u, v = (np.linspace(-0.5, side - 0.5, _GRID) for side in self.image_size)
+        x, y = np.meshgrid((u - self.center[0]) / self.half_diagonal, (v - self.center[1]) / self.half_diagonal)
+        squares: FloatArray = (x**2 + y**2).ravel()
+        return squares[squares > 0.0]
 
     @property
     def half_diagonal(self) -> float:
@@ -168,12 +153,12 @@ class Camera:
 
     @property
     def distortion_px(self) -> float:
-        """λ for points in px from the centre: ``λ / s²``, 1/px²."""
-        return self.distortion / self.half_diagonal**2
+        """:attr:`nearest_distortion` for points in pixels from the centre: ``λ / s²``, 1/px²."""
+        return self.nearest_distortion / self.half_diagonal**2
 
     @property
     def distortion_focal(self) -> float | None:
-        """λ for points in focal lengths from the centre, or None without a focal length."""
+        """:attr:`nearest_distortion` for points in focal lengths from the centre, or None without a focal length."""
         return None if self.focal is None else self.distortion_px * self.focal**2
 
     @property
@@ -197,11 +182,11 @@ class Camera:
 
     def undistort(self, points: ArrayLike) -> FloatArray:
         """Measured pixels (..., 2) to the pixels of a lens without distortion; NaN outside the model's domain."""
-        return self.denormalize(undistort(self.normalize(points), self.distortion, self.distortion2))
+        return self.denormalize(undistort(self.normalize(points), self.distortion, self.higher))
 
     def distort(self, points: ArrayLike) -> FloatArray:
         """Pixels (..., 2) of a lens without distortion to measured pixels; NaN outside the model's domain."""
-        return self.denormalize(distort(self.normalize(points), self.distortion, self.distortion2))
+        return self.denormalize(distort(self.normalize(points), self.distortion, self.higher))
 
     def outline(self, points_per_side: int) -> FloatArray:
         """Outer border of the picture, clockwise from the top-left corner, px, shape (4 points_per_side, 2)."""
@@ -223,14 +208,18 @@ class Camera:
 
     def as_dict(self) -> dict[str, Any]:
         """Everything known of the camera as plain values, the content of a camera file."""
+        (nearest, rms, largest), covariance = self.one_parameter_fit(), self.lens_covariance
         return {
             "format": "rdstitch camera",
-            "version": 1,
+            "version": _FILE_VERSION,
             "image_size": list(self.image_size),
             "center_px": list(self.center),
-            "lambda": self.distortion,
+            "lambda": nearest,
             "lambda_std": self.distortion_std,
-            "lambda2": self.distortion2,
+            "lambda_fit_rms_px": rms,
+            "lambda_fit_largest_px": largest,
+            "coefficients": list(self.coefficients),
+            "lens_covariance": None if covariance is None else [list(row) for row in covariance],
             "lambda_px": self.distortion_px,
             "lambda_focal": self.distortion_focal,
             "focal_px": self.focal,
@@ -261,18 +250,48 @@ class Camera:
         InputError
             When the record is something else; the text names the field.
         """
-        if record["format"].value != "rdstitch camera" or record["version"].value != 1:
-            record.fail("is not an rdstitch camera of version 1")
-        focal, std, second = record.get("focal_px"), record.get("lambda_std"), record.get("lambda2")
+        if record["format"].value != "rdstitch camera" or record["version"].value not in range(1, _FILE_VERSION + 1):
+            record.fail(f"is not an rdstitch camera of version 1 to {_FILE_VERSION}")
+        focal, std = record.get("focal_px"), record.get("lambda_std")
+        distortion, second, third = read_coefficients(record)
         try:
             return cls(
                 image_size=record["image_size"].size(),
-                distortion=record["lambda"].number(),
-                distortion2=0.0 if second is None else second.number(),
+                distortion=distortion,
+                distortion2=second,
+                distortion3=third,
                 center=record["center_px"].pair(),
                 focal=None if focal is None else focal.number(),
                 focal_source=None if focal is None else "file",
                 distortion_std=None if std is None else std.number(),
+                lens_covariance=_read_covariance(record.get("lens_covariance")),
             )
         except ArgumentError as error:
             record.fail(str(error))
+
+
+def read_coefficients(record: Record) -> tuple[float, float, float]:
+    """λ, μ and ν of a record: ``coefficients``, or ``lambda`` and ``lambda2`` as version 1 has them.
+
+    Raises
+    ------
+    InputError
+        When a field is missing or wrong.
+    """
+    if (given := record.get("coefficients")) is None:
+        second = record.get("lambda2")
+        return record["lambda"].number(), 0.0 if second is None else second.number(), 0.0
+    values = given.numbers()
+    if len(values) != 3:
+        given.expected("three coefficients")
+    return values[0], values[1], values[2]
+
+
+def _read_covariance(record: Record | None) -> tuple[tuple[float, ...], ...] | None:
+    """Rows of :attr:`Camera.lens_covariance`."""
+    if record is None:
+        return None
+    rows = tuple(row.numbers() for row in record.items())
+    if [len(row) for row in rows] != [len(LENS_PARAMETERS)] * len(LENS_PARAMETERS):
+        record.expected(f"{len(LENS_PARAMETERS)} rows of as many numbers")
+    return rows

@@ -5,7 +5,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rdstitch.alignment import MODELS
+from rdstitch.alignment import LENSES, MODELS
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError
@@ -29,6 +29,7 @@ class StitchOptions:
     ratio: float | None = None  # largest ratio of distances of a match; None: what suits the features
     lightglue_model: str | Path | None = None  # ONNX file of a network that matches the features instead
     solver: str = "auto"  # minimal solver of the pairs, one of rdstitch.robust.SOLVERS
+    lens: str = "auto"  # lens, one of rdstitch.alignment.LENSES; auto: the simplest that the pictures allow
     model: str = "auto"  # motion model of the whole, one of rdstitch.alignment.MODELS
     threshold: float = 3.0  # px, largest transfer error of an inlier
     confidence: float = 0.999  # probability that no better model of a pair was missed
@@ -58,6 +59,10 @@ class StitchOptions:
             raise ArgumentError(f"unknown solver {self.solver!r}; choose one of {', '.join(SOLVERS)}")
         if self.model not in ("auto", *MODELS):
             raise ArgumentError(f"unknown model {self.model!r}; choose one of auto, {', '.join(MODELS)}")
+        if self.lens not in ("auto", *LENSES):
+            raise ArgumentError(f"unknown lens {self.lens!r}; choose one of auto, {', '.join(LENSES)}")
+        if self.lens != "auto" and self.known_distortion is not None:
+            raise ArgumentError("with a known lens there is none to choose; leave out lens, or the known one")
         if self.solver == "two_point" and self.tilt is None and (self.attitude is None or self.attitude_std > 0.0):
             raise ArgumentError("the two_point solver needs the tilt, or exact attitudes")
         if self.solver != "auto" and self.known_distortion is not None:
@@ -75,10 +80,10 @@ class StitchOptions:
 
     @property
     def known_distortion(self) -> float | None:
-        """λ where the user gave it, alone or with the camera."""
+        """λ where the user gave it, alone or with the camera; of a richer lens, the nearest one-parameter λ."""
         if self.distortion is not None or self.camera is None:
             return self.distortion
-        return self.camera.distortion
+        return self.camera.nearest_distortion
 
     @property
     def matching(self) -> MatchingOptions:

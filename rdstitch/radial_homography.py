@@ -5,26 +5,24 @@ measured points; :func:`transfer_jacobian` adds the analytic derivatives that pa
 adjustment are both built on.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera, distort
+from rdstitch.camera import Camera
+from rdstitch.division_model import distort, divisor, divisor_slope
 from rdstitch.planar_motion import PlanarMotion
 
-LENS_PARAMETERS = ("distortion", "distortion2", "center_x", "center_y")
-LENS_STD = np.array([0.5, 0.05, 0.03, 0.03])
-"""How far these can be expected from 0 before anything is known, in the half-diagonal frame."""
 
-
-def lift(points: ArrayLike, distortion: ArrayLike, distortion2: float = 0.0) -> FloatArray:
-    """``(x, y, 1 + λ r² + μ r⁴)`` of normalized points (..., 2); shape (..., 3). λ broadcasts."""
+def lift(points: ArrayLike, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
+    """``(x, y, 1 + λ r² + μ r⁴ + ν r⁶)`` of normalized points (..., 2); shape (..., 3). λ broadcasts."""
     x = np.asarray(points, dtype=np.float64)
-    radius2 = np.einsum("...i,...i->...", x, x)
-    third = 1.0 + (np.asarray(distortion) + distortion2 * radius2) * radius2
+    third = divisor(np.einsum("...i,...i->...", x, x), distortion, higher)
     return np.concatenate([np.broadcast_to(x, (*third.shape, 2)), third[..., None]], axis=-1)
 
 
@@ -57,7 +55,9 @@ def _mapped(homography: FloatArray, points: FloatArray) -> FloatArray:
     return project(points @ homography[:, :2].T + homography[:, 2])
 
 
-def transfer(homography: ArrayLike, distortion: ArrayLike, points: ArrayLike, distortion2: float = 0.0) -> FloatArray:
+def transfer(
+    homography: ArrayLike, distortion: ArrayLike, points: ArrayLike, higher: Sequence[float] = ()
+) -> FloatArray:
     """Where measured points of picture 1 are measured in picture 2: undistort, apply H, distort.
 
     Parameters
@@ -68,8 +68,8 @@ def transfer(homography: ArrayLike, distortion: ArrayLike, points: ArrayLike, di
         λ in the frame of the points.
     points : array_like of shape (N, 2)
         Normalized.
-    distortion2 : float
-        μ in the frame of the points.
+    higher : sequence of float
+        μ and ν in the frame of the points, where λ is one number.
 
     Returns
     -------
@@ -78,8 +78,8 @@ def transfer(homography: ArrayLike, distortion: ArrayLike, points: ArrayLike, di
     """
     h = np.asarray(homography, dtype=np.float64)
     lam = np.asarray(distortion, dtype=np.float64)[..., None]
-    lifted = lift(np.asarray(points, dtype=np.float64), lam, distortion2)
-    return distort(project(lifted @ np.swapaxes(h, -2, -1)), lam, distortion2)
+    lifted = lift(np.asarray(points, dtype=np.float64), lam, higher)
+    return distort(project(lifted @ np.swapaxes(h, -2, -1)), lam, higher)
 
 
 @dataclass(frozen=True)
@@ -92,59 +92,84 @@ class TransferJacobian:
         Where the points of picture 1 are measured in picture 2.
     by_homography : ndarray of shape (N, 2, 9)
         By the entries of H, row by row.
-    by_lens : ndarray of shape (N, 2, 4)
-        By :data:`LENS_PARAMETERS`: λ, μ, and the distortion centre (a shift of both pictures' centre).
-    by_own_distortion : ndarray of shape (N, 2)
-        By the λ of picture 2 alone, a part of ``by_lens``.
     by_point : ndarray of shape (N, 2, 2)
         By the point in picture 1.
+    by_divisor, by_own_divisor : ndarray of shape (N, 2)
+        By ``g`` of the lens at the point in picture 1, and by that at the point in picture 2.
+    radius2, own_radius2 : ndarray of shape (N,)
+        Squared radii of those.
     """
 
     points: FloatArray
     by_homography: FloatArray
-    by_lens: FloatArray
-    by_own_distortion: FloatArray
     by_point: FloatArray
+    by_divisor: FloatArray
+    by_own_divisor: FloatArray
+    radius2: FloatArray
+    own_radius2: FloatArray
+
+    @cached_property
+    def by_distortion(self) -> FloatArray:
+        """By λ, shape (N, 2, 1)."""
+        return self._by_coefficient(1)
+
+    @cached_property
+    def by_own_distortion(self) -> FloatArray:
+        """By the λ of picture 2 alone, a part of :attr:`by_distortion`, shape (N, 2, 1)."""
+        return (self.by_own_divisor.T * self.own_radius2).T[:, :, None]
+
+    @cached_property
+    def by_lens(self) -> FloatArray:
+        """By :data:`rdstitch.camera.LENS_PARAMETERS`, shape (N, 2, 5); the centre shifts in both pictures."""
+        coefficients = [self._by_coefficient(power) for power in (1, 2, 3)]
+        return side_by_side(*coefficients, np.eye(2) - self.by_point)
+
+    def _by_coefficient(self, power: int) -> FloatArray:
+        """By the coefficient of that power of the squared radius, shape (N, 2, 1)."""
+        own = self.by_own_divisor.T * self.own_radius2**power
+        return (self.by_divisor.T * self.radius2**power + own).T[:, :, None]
 
 
 def transfer_jacobian(
     homography: FloatArray,
     distortion: float,
     points: FloatArray,
-    distortion2: float = 0.0,
+    higher: Sequence[float] = (),
     *,
     own_distortion: float | None = None,
 ) -> TransferJacobian:
     """:func:`transfer` with its analytic derivatives.
 
-    With ``z = H p``, ``u = z_xy / z_w`` and d the distorted point, ``g = 1 + λ ρ² + μ ρ⁴``, ``ρ = |d|``: since
-    ``u = d / g``, ``du/dd = (I - α d d') / g`` with ``α = (2λ + 4μρ²)/g``, whose inverse is
-    ``dd/du = g (I + α d d' / (1 - αρ²))``; and at fixed u ``dd/dλ = d ρ² / (g (1 - αρ²))``.
+    With ``z = H p``, ``u = z_xy / z_w`` and d the distorted point, ``g`` of ``q = |d|²``: since ``u = d / g``,
+    ``du/dd = (I - α d d') / g`` with ``α = 2 g'/g``, whose inverse is ``dd/du = g (I + α d d' / (1 - αq))``; and at
+    fixed u ``dd/dλ = d q / (g (1 - αq))``, for μ and ν with the next powers of q.
 
     Parameters
     ----------
     homography : ndarray of shape (3, 3) or (N, 3, 3)
         One for all points, or one a point.
-    distortion, distortion2 : float
-        λ and μ in the frame of the points.
+    distortion : float
+        λ in the frame of the points.
     points : ndarray of shape (N, 2)
         Points of picture 1, normalized. Points that cannot be transferred give NaN everywhere.
+    higher : sequence of float
+        μ and ν in the frame of the points.
     own_distortion : float, optional
         λ of picture 2, where it is another.
     """
     own_distortion = distortion if own_distortion is None else own_distortion
     # Coordinates first, points last: so every operation runs along the points, which are many.
-    lifted = np.ascontiguousarray(lift(points, distortion, distortion2).T)
+    lifted = np.ascontiguousarray(lift(points, distortion, higher).T)
     r2 = (lifted[:2] ** 2).sum(axis=0)
     each = "" if homography.ndim == 2 else "n"
     h = np.ascontiguousarray(homography.transpose(1, 2, 0)) if each else homography
     z = np.einsum(f"ij{each},jn->in", h, lifted)
     w = np.where(z[2] > 0.0, z[2], np.nan)
-    d = np.ascontiguousarray(distort((z[:2] / w).T, own_distortion, distortion2).T)
+    d = np.ascontiguousarray(distort((z[:2] / w).T, own_distortion, higher).T)
 
     rho2 = (d**2).sum(axis=0)
-    g = 1.0 + own_distortion * rho2 + distortion2 * rho2**2
-    alpha = (2.0 * own_distortion + 4.0 * distortion2 * rho2) / g
+    g = divisor(rho2, own_distortion, higher)
+    alpha = 2.0 * divisor_slope(rho2, own_distortion, higher) / g
     stretch = 1.0 - alpha * rho2
     # d by z: that by u, over w, for the first two; and -u / w, of which "d by u" makes -d / (stretch w), for the third.
     scale = g / w
@@ -157,16 +182,10 @@ def transfer_jacobian(
 
     by_lifted = np.einsum(f"ikn,kj{each}->ijn", d_by_z, h)
     along_third = by_lifted[:, 2]
-    slope = lifted[:2] * (2.0 * distortion + 4.0 * distortion2 * r2)
+    slope = lifted[:2] * (2.0 * divisor_slope(r2, distortion, higher))
     by_point = by_lifted[:, :2] + along_third[:, None] * slope
-
-    own = d * (rho2 / (g * stretch))
-    by_lens = np.empty((2, 4, len(points)))
-    by_lens[:, 0] = along_third * r2 + own
-    by_lens[:, 1] = along_third * r2**2 + own * rho2
-    by_lens[:, 2:] = np.eye(2)[:, :, None] - by_point
-    by_homography, by_lens, by_point = (found.transpose(2, 0, 1) for found in (by_homography, by_lens, by_point))
-    return TransferJacobian(d.T, by_homography, by_lens, own.T, by_point)
+    by_homography, by_point = (found.transpose(2, 0, 1) for found in (by_homography, by_point))
+    return TransferJacobian(d.T, by_homography, by_point, along_third.T, (d / (g * stretch)).T, r2, rho2)
 
 
 def side_by_side(*derivatives: FloatArray) -> FloatArray:
@@ -295,7 +314,7 @@ class RadialHomography:
     def transfer(self, points1: ArrayLike) -> FloatArray:
         """Measured px of picture 1 (N, 2) to measured px of picture 2; NaN where there is no such point."""
         normalized = self.camera.normalize(points1)
-        moved = transfer(self.homography, self.camera.distortion, normalized, self.camera.distortion2)
+        moved = transfer(self.homography, self.camera.distortion, normalized, self.camera.higher)
         return self.camera2.denormalize(moved)
 
 

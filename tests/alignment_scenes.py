@@ -6,7 +6,8 @@ import numpy as np
 
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, TILTING, YAW, X, Y
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera, distort
+from rdstitch.camera import Camera
+from rdstitch.division_model import distort
 from rdstitch.matching.links import Link
 from rdstitch.radial_homography import RadialHomography
 

@@ -16,6 +16,7 @@ Decorator = Callable[[Command], Command]
 
 FEATURES = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk", "aliked")
 SOLVERS = ("auto", "two-point", "three-point", "three-point-similarity", "four-point", "five-point")
+LENSES = ("auto", "division", "division-center", "division2", "division3")
 MODELS = ("auto", "rigid", "similarity", "tilting", "homography")
 
 # Whether a file can be read is for the library to say: it knows more, and has a status for it.
@@ -209,6 +210,13 @@ estimation = together(
     ),
     click.option(
         "--solver", type=click.Choice(SOLVERS), default="auto", show_default=True, help="Minimal solver of the pairs."
+    ),
+    click.option(
+        "--lens",
+        type=click.Choice(LENSES),
+        default="auto",
+        show_default=True,
+        help="Lens to estimate: λ; λ and the distortion centre; besides them a second or a third coefficient.",
     ),
     click.option(
         "--model", type=click.Choice(MODELS), default="auto", show_default=True, help="How freely the camera moved."

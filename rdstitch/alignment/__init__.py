@@ -1,8 +1,9 @@
 """From pairs of pictures to all of them registered as one."""
 
 from rdstitch.alignment.align import AlignmentOptions, align
+from rdstitch.alignment.lens_selection import LENSES
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.result import Alignment
 from rdstitch.matching.links import Link
 
-__all__ = ["MODELS", "Alignment", "AlignmentOptions", "Link", "align"]
+__all__ = ["LENSES", "MODELS", "Alignment", "AlignmentOptions", "Link", "align"]

@@ -23,12 +23,6 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import Camera
 from rdstitch.matching.match_graph import spanning_tree
 
-_FOCAL_STD = {"option": 0.01, "file": 0.01, "estimate": 0.05, "exif": 0.05, "guess": 0.3}
-"""Relative standard deviation of a focal length by its source."""
-
-_USUAL_FOCAL, _USUAL_FOCAL_STD = 1.9, 0.4
-"""Half diagonals: the focal length where nothing is known of it (a field of view of about 55 degrees)."""
-
 _WIDEST_START = 0.05
 """Half diagonals: errors that a chain may have gathered before the adjustment, beyond which a link is doubted."""
 
@@ -59,8 +53,8 @@ class CameraPriors:
         How the tilt of each picture differs from the shared one, radians; zeros where that is not known.
     attitudes_std : float or None
         Standard deviation of these, 0 for exact ones; None where they are not known.
-    lens, lens_std : ndarray of shape (4,)
-        λ, μ and the shift of the distortion centre.
+    lens, lens_std : ndarray of shape (5,)
+        λ, μ, ν and the shift of the distortion centre.
     """
 
     log_focal: float
@@ -100,11 +94,9 @@ class CameraPriors:
 
 def focal_prior(cameras: Sequence[Camera]) -> tuple[float, float]:
     """Mean and standard deviation of the logarithm of the focal length in half diagonals."""
-    known = [(c.focal / c.half_diagonal, c.focal_source) for c in cameras if c.focal is not None]
-    if not known:
-        return math.log(_USUAL_FOCAL), _USUAL_FOCAL_STD
-    spread = max(_FOCAL_STD.get(source or "guess", 0.3) for _, source in known)
-    return float(np.log(np.median([ratio for ratio, _ in known]))), spread
+    known = [camera for camera in cameras if camera.focal is not None] or [cameras[0].with_focal()]
+    ratios = [camera.focal / camera.half_diagonal for camera in known if camera.focal is not None]
+    return float(np.log(np.median(ratios))), max(camera.focal_log_std for camera in known)
 
 
 @dataclass(frozen=True)
@@ -115,7 +107,7 @@ class Fit:
     ----------
     model : Model
     adjusted : BundleAdjustmentResult
-    free_lens : ndarray of shape (4,), bool
+    free_lens : ndarray of shape (5,), bool
         Lens parameters that were estimated.
     tilt_spread : float
         Standard deviation of the pictures' own tilts, radians; 0 where the model has none.
@@ -145,7 +137,7 @@ class Problem:
         The picture that fixes the gauge.
     lens : ndarray of shape (4,)
         Where to start.
-    free_lens : ndarray of shape (4,), bool
+    free_lens : ndarray of shape (5,), bool
     knowledge : CameraPriors
     overdispersion : float
         See :class:`BundleAdjuster`.

@@ -17,23 +17,18 @@ from rdstitch.alignment.build_result import AdjustedPictures, build_alignment
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.initialization import relations_at
+from rdstitch.alignment.lens_selection import LENSES, choose_lens
 from rdstitch.alignment.model_selection import Choice, choose_model
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.camera import Camera
+from rdstitch.camera import LENS_STD, Camera
+from rdstitch.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTION
 from rdstitch.errors import ArgumentError, RegistrationError
 from rdstitch.matching.distortion_consensus import Consensus, vote
 from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import connected_components, spanning_tree
-from rdstitch.radial_homography import LENS_STD
-
-_OBSERVABLE = 0.1
-"""Standard deviation of λ from which on it counts as not observable."""
-
-_PLAUSIBLE = (-1.0, 0.5)
-"""Limits of λ: below, the corners see behind the camera; no lens pulls its corners in as far as above."""
 
 _UNCONFIRMED = 0.1
 """How much a link without a triangle that closes is relied on, relative to one with."""
@@ -52,8 +47,8 @@ class AlignmentOptions:
         The picture that defines the plane's frame; the centre of the match graph if not given.
     model : str
         "rigid", "similarity", "tilting", "homography", or "auto": the least free one that the data allow.
-    distortion : float, optional
-        λ in the half-diagonal frame, where it is known; estimated otherwise.
+    lens_known : bool
+        Whether the lens is that of the cameras; estimated otherwise.
     tilt : (float, float), optional
         (ψ, θ), radians, where it is known.
     tilt_std : float
@@ -63,30 +58,28 @@ class AlignmentOptions:
         is mounted on that.
     attitudes_std : float
         Their standard deviation, radians; 0 for exact ones.
-    center : bool
-        Estimate the distortion centre too, where the data support that.
-    second_coefficient : bool
-        Estimate μ, the coefficient of r⁴, too, where the data support that; λ is then no longer comparable with the
-        λ of a one-parameter lens.
+    lens : str
+        One of :data:`rdstitch.alignment.lens_selection.LENSES`, or "auto": the simplest that the data allow.
     most : int
         Correspondences used of each link.
     """
 
     reference: int | None = None
     model: str = "auto"
-    distortion: float | None = None
+    lens_known: bool = False
     tilt: tuple[float, float] | None = None
     tilt_std: float = 0.0
     attitudes: ArrayLike | None = None
     attitudes_std: float = 0.0
-    center: bool = True
-    second_coefficient: bool = False
+    lens: str = "auto"
     most: int = 250
 
     def __post_init__(self) -> None:
         """Check the values."""
         if self.model != "auto" and self.model not in MODELS:
             raise ArgumentError(f"model must be auto, {', '.join(MODELS)}, not {self.model}")
+        if self.lens != "auto" and self.lens not in LENSES:
+            raise ArgumentError(f"lens must be auto, {', '.join(LENSES)}, not {self.lens}")
         if self.tilt_std < 0 or self.attitudes_std < 0:
             raise ArgumentError("a standard deviation cannot be negative")
 
@@ -109,17 +102,16 @@ class AlignmentOptions:
             tilt_std=np.inf if self.tilt is None else self.tilt_std,
             attitudes=attitudes,
             attitudes_std=None if self.attitudes is None else self.attitudes_std,
-            lens=np.zeros(4),
+            lens=np.zeros(len(LENS_STD)),
             lens_std=LENS_STD,
         )
 
     @property
-    def lenses(self) -> list[BoolArray]:
-        """What else of the lens may be freed, one after the other."""
-        if self.distortion is not None:
+    def lenses(self) -> list[str]:
+        """Lenses to be tried, from the simplest; none where the lens is given."""
+        if self.lens_known:
             return []
-        center = [np.array([False, False, True, True])] if self.center else []
-        return center + ([np.array([False, True, False, False])] if self.second_coefficient else [])
+        return list(LENSES) if self.lens == "auto" else [self.lens]
 
     @property
     def models(self) -> list[str]:
@@ -167,11 +159,13 @@ def align(
     few = everything.thinned(thin_for_selection(len(links)))
     relations = relations_at(few, [link.relation for link in links], lens)
     apart = homography_apart(few, relations, lens, free_lens, known)
-    observable = options.distortion is not None or _observable(apart)
+    observable = options.lens_known or _observable(apart)
+    chosen = choose_lens(few, apart, options.lenses if observable else (), known)
     if observable:
+        apart, free_lens = chosen.apart, chosen.free
         lens, relations = apart.parameters.lens, apart.homographies
     else:
-        lens, free_lens = np.array([cameras[0].distortion, 0.0, 0.0, 0.0]), np.zeros(4, dtype=np.bool_)
+        lens, free_lens = _lens_of(cameras[0]), np.zeros(len(LENS_STD), dtype=np.bool_)
         apart = homography_apart(few, relations_at(few, [k.relation for k in links], lens), lens, free_lens, known)
         relations = apart.homographies
 
@@ -180,7 +174,7 @@ def align(
     trust = few.matches.astype(np.float64) * np.where(confirmed > 0, 1.0, _UNCONFIRMED)
     graph = _Graph(len(cameras), few, relations, trust, lens, free_lens, known, options)
     problem, pictures = graph.problem(~wrong)
-    choice = choose_model(problem, options.models, options.lenses if observable else ())
+    choice = choose_model(problem, options.models, chosen.refinements)
     graph = replace(graph, free_lens=choice.fit.free_lens)
     choice, pictures, wrong = _drop_wrong_pairs(graph, problem, pictures, choice, wrong)
 
@@ -188,7 +182,17 @@ def align(
     full = replace(graph, observations=everything)
     problem, _ = full.problem(~wrong, pictures, choice.overdispersion)
     fit = problem.refine(choice.fit.model, choice.fit.adjusted.parameters, choice.fit.tilt_spread)
-    found = AdjustedPictures(cameras, links, pictures, ~wrong, problem, replace(choice, fit=fit), votes, observable)
+    found = AdjustedPictures(
+        cameras,
+        links,
+        pictures,
+        ~wrong,
+        problem,
+        replace(choice, fit=fit),
+        votes,
+        chosen.refined(fit.free_lens),
+        observable,
+    )
     return build_alignment(found)
 
 
@@ -206,16 +210,25 @@ def _check(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentO
 
 def _lens_start(cameras: Sequence[Camera], options: AlignmentOptions, votes: Consensus) -> tuple[FloatArray, BoolArray]:
     """Where the lens starts, and which of its parameters are free."""
-    lens = np.array([votes.distortion if votes.votes else 0.0, cameras[0].distortion2, 0.0, 0.0])
-    if options.distortion is not None:
-        lens[0] = options.distortion
-    return lens, np.array([options.distortion is None, False, False, False])
+    lens = _lens_of(cameras[0])
+    free = np.zeros(len(lens), dtype=np.bool_)
+    if options.lens_known:
+        return lens, free
+    lens[:] = 0.0
+    lens[0] = votes.distortion if votes.votes else 0.0
+    free[0] = True
+    return lens, free
+
+
+def _lens_of(camera: Camera) -> FloatArray:
+    """The lens of a camera; the pictures' points are already relative to its centre."""
+    return np.array([*camera.coefficients, 0.0, 0.0])
 
 
 def _observable(apart: BundleAdjustmentResult) -> bool:
     """Whether one homography a pair leaves λ well determined, at a value that a lens can have."""
     distortion, std = float(apart.parameters.lens[0]), float(np.sqrt(apart.covariance[0, 0]))
-    return std < _OBSERVABLE and _PLAUSIBLE[0] < distortion < _PLAUSIBLE[1]
+    return std < OBSERVABLE_STD and PLAUSIBLE_DISTORTION[0] < distortion < PLAUSIBLE_DISTORTION[1]
 
 
 @dataclass(frozen=True)

@@ -9,18 +9,21 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.bundle_adjustment import WIDTH_PER_SIGMA
 from rdstitch.alignment.cycle_consistency import link_medians
+from rdstitch.alignment.lens_selection import CENTER, LensChoice
 from rdstitch.alignment.model_selection import Choice
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y, metric_poses
 from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.planarity import coherence, judge_relief
 from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, Poses, Relief
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.camera import Camera
+from rdstitch.camera import LENS_PARAMETERS, Camera
 from rdstitch.matching.distortion_consensus import Consensus
 from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.messages import Message
-from rdstitch.radial_homography import LENS_PARAMETERS
+
+_STEP = 1e-5
+"""Of differences of λ, μ and ν."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,8 @@ class AdjustedPictures:
         The final one.
     choice : Choice
     votes : Consensus
+    lens : LensChoice
+        The lens, with the distortion centre if the motion model freed it.
     observable : bool
         Whether the pictures say anything about λ, or it is known.
     """
@@ -50,6 +55,7 @@ class AdjustedPictures:
     problem: Problem
     choice: Choice
     votes: Consensus
+    lens: LensChoice
     observable: bool
 
 
@@ -61,9 +67,10 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
     covariance = adjusted.covariance
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     names = (*fit.model.shared_names, *(n for n, free in zip(LENS_PARAMETERS, problem.free_lens, strict=True) if free))
-    distortion_std = float(std[names.index("distortion")]) if "distortion" in names else 0.0
-    distortion_std = distortion_std if found.observable else math.inf
     focal = float(np.exp(shared[2])) if planar else None
+    lens_covariance = _lens_covariance(names, covariance)
+    cameras = tuple(_adjusted_camera(found, camera, lens, lens_covariance, focal) for camera in found.cameras)
+    own = cameras[int(found.pictures[problem.reference])]
     groups = _groups(found)
     observations = problem.observations
     errors = whitened_errors(observations, adjusted.homographies, lens)
@@ -73,7 +80,7 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
     used[found.pictures] = True
     homographies, poses = _in_frame_of_reference(found)
     return Alignment(
-        cameras=tuple(_adjusted_camera(camera, lens, distortion_std, focal) for camera in found.cameras),
+        cameras=cameras,
         homographies=homographies,
         used=used,
         components=groups,
@@ -85,8 +92,10 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
         tilt_spread=fit.tilt_spread,
         focal=focal,
         focal_std=None if focal is None else float(std[2]) * focal,
-        distortion=float(lens[0]),
-        distortion_std=distortion_std,
+        distortion=own.nearest_distortion,
+        distortion_std=0.0 if own.distortion_std is None else own.distortion_std,
+        lens=found.lens.name,
+        lens_reason=found.lens.reason,
         parameters=names,
         covariance=covariance,
         rms=float(np.sqrt(adjusted.squared[inliers].mean())) if inliers.any() else math.nan,
@@ -96,17 +105,44 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
     )
 
 
-def _adjusted_camera(camera: Camera, lens: FloatArray, distortion_std: float, focal: float | None) -> Camera:
+def _lens_covariance(names: Sequence[str], covariance: FloatArray) -> FloatArray:
+    """Covariance (5, 5) of :data:`LENS_PARAMETERS`, zero for those that were not estimated."""
+    result = np.zeros((len(LENS_PARAMETERS), len(LENS_PARAMETERS)))
+    free = [index for index, name in enumerate(LENS_PARAMETERS) if name in names]
+    rows = [names.index(LENS_PARAMETERS[index]) for index in free]
+    result[np.ix_(free, free)] = covariance[np.ix_(rows, rows)]
+    return result
+
+
+def _adjusted_camera(
+    found: AdjustedPictures, camera: Camera, lens: FloatArray, covariance: FloatArray, focal: float | None
+) -> Camera:
     """The camera of a picture with the lens that was found."""
-    center = np.asarray(camera.center) + lens[2:] * camera.half_diagonal
+    center = np.asarray(camera.center) + lens[CENTER] * camera.half_diagonal
+    estimated = bool(covariance.any())
     result = replace(
         camera,
         distortion=float(lens[0]),
         distortion2=float(lens[1]),
+        distortion3=float(lens[2]),
         center=(float(center[0]), float(center[1])),
-        distortion_std=distortion_std,
+        lens_covariance=tuple(map(tuple, covariance.tolist())) if estimated else None,
     )
+    std = _nearest_distortion_std(result, covariance) if found.observable else math.inf
+    result = replace(result, distortion_std=std)
     return result if focal is None else replace(result, focal=focal * camera.half_diagonal, focal_source="estimate")
+
+
+def _nearest_distortion_std(camera: Camera, covariance: FloatArray) -> float:
+    """Standard deviation of the λ of the nearest one-parameter lens."""
+    if not camera.higher:
+        return math.sqrt(max(float(covariance[0, 0]), 0.0))
+    gradient = np.zeros(len(covariance))
+    for index, name in enumerate(LENS_PARAMETERS[:3]):
+        value = getattr(camera, name)
+        ends = [replace(camera, **{name: value + step}).nearest_distortion for step in (-_STEP, _STEP)]
+        gradient[index] = (ends[1] - ends[0]) / (2.0 * _STEP)
+    return math.sqrt(max(float(gradient @ covariance @ gradient), 0.0))
 
 
 def _in_frame_of_reference(found: AdjustedPictures) -> tuple[FloatArray, Poses | None]:

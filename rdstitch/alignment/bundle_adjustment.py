@@ -20,6 +20,7 @@ from rdstitch.alignment.normal_equations import (
 )
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.camera import LENS_PARAMETERS
 
 WIDTH_PER_SIGMA = 3.5
 """Width of the robust loss in standard deviations of an error's coordinate."""
@@ -41,8 +42,8 @@ class Parameters:
         In the model's own columns.
     shared : ndarray of shape (S,)
         The model's shared parameters.
-    lens : ndarray of shape (4,)
-        λ, μ and the shift of the distortion centre, in the half-diagonal frame.
+    lens : ndarray of shape (5,)
+        λ, μ, ν and the shift of the distortion centre, in the half-diagonal frame.
     """
 
     poses: FloatArray
@@ -70,7 +71,7 @@ class Priors:
     ----------
     shared, shared_precision : ndarray of shape (S,)
         Of what the model names, see :meth:`Model.natural`.
-    lens, lens_precision : ndarray of shape (4,)
+    lens, lens_precision : ndarray of shape (5,)
     poses, poses_precision : ndarray of shape (N, D)
     """
 
@@ -85,7 +86,8 @@ class Priors:
     def none(cls, model: Model, count: int) -> Self:
         """Nothing known of ``count`` pictures."""
         shared, poses = np.zeros(len(model.shared_names)), np.zeros((count, model.pose_size))
-        return cls(shared, shared, np.zeros(4), np.zeros(4), poses, poses)
+        lens = np.zeros(len(LENS_PARAMETERS))
+        return cls(shared, shared, lens, lens, poses, poses)
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ class FreeParameters:
     Attributes
     ----------
     poses : ndarray of shape (N, D), bool
-    lens : ndarray of shape (4,), bool
+    lens : ndarray of shape (5,), bool
     """
 
     poses: BoolArray

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
+from rdstitch.alignment.normal_equations import split_lens
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.matching.thinning import spread_choice
@@ -91,15 +92,15 @@ def _open_triangles(apart: BundleAdjustmentResult, observations: Observations, c
     """1 for triangles that do not close, 0 for those that do, NaN where the points leave the pictures; shape (T,)."""
     backward = observations.image1 > observations.image2
     homographies, covariance = _oriented(apart, backward)
-    lam, mu = float(apart.parameters.lens[0]), float(apart.parameters.lens[1])
+    distortion, higher, center = split_lens(apart.parameters.lens)
     probes = [
         _probes(observations, link, bool(backward[link])) for link in range(len(observations))
     ]  # in the picture of lower index
-    points = np.stack([probes[link] for link in corners[:, 0]]).reshape(-1, 2)
+    points = np.stack([probes[link] for link in corners[:, 0]]).reshape(-1, 2) - center
     ij, jk, ik = (np.repeat(corner, _PROBES) for corner in corners.T)
-    first = transfer_jacobian(homographies[ij], lam, points, mu)
-    second = transfer_jacobian(homographies[jk], lam, first.points, mu)
-    direct = transfer_jacobian(homographies[ik], lam, points, mu)
+    first = transfer_jacobian(homographies[ij], distortion, points, higher)
+    second = transfer_jacobian(homographies[jk], distortion, first.points, higher)
+    direct = transfer_jacobian(homographies[ik], distortion, points, higher)
     error = second.points - direct.points
 
     def spread(by: FloatArray, links: IntArray) -> FloatArray:

@@ -16,9 +16,10 @@ from rdstitch.alignment.bundle_adjustment import (
     Priors,
 )
 from rdstitch.alignment.motion_models import Model
+from rdstitch.alignment.normal_equations import split_lens
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.camera import undistort
+from rdstitch.division_model import undistort
 from rdstitch.radial_homography import RadialHomography, transfer
 
 _MOST_ITERATIONS = 24
@@ -31,14 +32,15 @@ def relations_at(observations: Observations, relations: Sequence[RadialHomograph
     A pair's homography belongs to the pair's own λ. Where that differs from the common one, the homography is fitted
     anew (DLT) to the pair's own, outlier-free transfer of its points.
     """
+    distortion, higher, center = split_lens(lens)
     result = np.empty((len(relations), 3, 3))
     for link, relation in enumerate(relations):
         result[link] = relation.homography
-        if abs(relation.distortion - lens[0]) < 1e-9 and relation.camera.distortion2 == lens[1]:
+        if abs(relation.distortion - distortion) < 1e-9 and not center.any() and relation.camera.higher == higher:
             continue
         points1 = observations.points1[observations.start[link] : observations.start[link + 1]]
-        own = transfer(relation.homography, relation.distortion, points1, relation.camera.distortion2)
-        x1, x2 = undistort(points1, lens[0], lens[1]), undistort(own, lens[0], lens[1])
+        own = transfer(relation.homography, relation.distortion, points1, relation.camera.higher)
+        x1, x2 = (undistort(points - center, distortion, higher) for points in (points1, own))
         valid = np.isfinite(x1).all(axis=1) & np.isfinite(x2).all(axis=1)
         if valid.sum() >= 4:
             result[link] = _direct_linear(x1[valid], x2[valid])

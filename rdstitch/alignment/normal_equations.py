@@ -1,8 +1,8 @@
 """Normal equations of the adjustment: one small Gram matrix per link, chained into sparse blocks.
 
-A correspondence knows the homography of its link (9 entries) and the lens (4 parameters) only. So all it contributes
-is summed up in a 13x13 matrix per link, whatever the motion model; the model's derivatives then turn that matrix
-into the blocks of its two pictures and of the shared parameters.
+A correspondence depends on the homography of its link (9 entries) and the lens (5 parameters) only. So all it
+contributes is summed up in a 14x14 matrix per link, whatever the motion model; the model's derivatives then turn
+that matrix into the blocks of its two pictures and of the shared parameters.
 """
 
 import itertools
@@ -17,7 +17,8 @@ from scipy.sparse.linalg import splu
 from rdstitch.alignment.motion_models import ModelMatrices, inverses
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.camera import distort
+from rdstitch.camera import LENS_PARAMETERS
+from rdstitch.division_model import distort, is_one_to_one
 from rdstitch.radial_homography import (
     lift,
     measurement_whitening,
@@ -32,15 +33,19 @@ _CHUNK = 8192
 """Correspondences linearized at a time: what stays in cache."""
 
 
+_ENTRIES = 9 + len(LENS_PARAMETERS)
+"""Of the homography of a link, and of the lens."""
+
+
 @dataclass(frozen=True)
 class LinkEquations:
     """Weighted, linearized transfer errors of all correspondences, summed per link.
 
     Attributes
     ----------
-    gram : ndarray of shape (L, 13, 13)
+    gram : ndarray of shape (L, 14, 14)
         ``Σ w J'J`` by the entries of H and the lens parameters.
-    gradient : ndarray of shape (L, 13)
+    gradient : ndarray of shape (L, 14)
         ``Σ w J'r``.
     squared : ndarray of shape (M,)
         ``|r|²`` of each correspondence, px², whitened; inf where it cannot be transferred.
@@ -65,6 +70,12 @@ def robust_cost(squared: FloatArray, width: float) -> FloatArray:
     return width**2 * (1.0 - 1.0 / (1.0 + squared / width**2))
 
 
+def split_lens(lens: FloatArray) -> tuple[float, tuple[float, ...], FloatArray]:
+    """λ; μ and ν, nothing where both are 0; and the distortion centre (2,), of :data:`LENS_PARAMETERS` (5,)."""
+    distortion, *higher = lens[:3].tolist()
+    return distortion, tuple(higher) if any(higher) else (), lens[3:]
+
+
 def link_equations(
     observations: Observations, homographies: FloatArray, lens: FloatArray, width: float
 ) -> LinkEquations:
@@ -75,13 +86,13 @@ def link_equations(
     observations : Observations
     homographies : ndarray of shape (L, 3, 3)
         Of each link, from its first to its second picture.
-    lens : ndarray of shape (4,)
-        λ, μ and the shift of the distortion centre, in the half-diagonal frame.
+    lens : ndarray of shape (5,)
+        λ, μ, ν and the shift of the distortion centre, in the half-diagonal frame.
     width : float
         Of :func:`robust_weight`, px.
     """
     count = len(observations)
-    gram, gradient = np.zeros((count, 13, 13)), np.zeros((count, 13))
+    gram, gradient = np.zeros((count, _ENTRIES, _ENTRIES)), np.zeros((count, _ENTRIES))
     squared = np.empty(len(observations.points1))
     whitening = np.empty((len(observations.points1), 2, 2))
     for first, last in _chunks(observations.start):
@@ -113,13 +124,15 @@ def squared_errors(
     smaller by a larger derivative, against the gradient, which takes the whitening for constant.
     """
     squared = np.empty(len(observations.points1))
-    lam, mu, center = float(lens[0]), float(lens[1]), lens[2:]
+    distortion, higher, center = split_lens(lens)
+    if higher and not is_one_to_one(1.0 + float(np.linalg.norm(center)), (distortion, *higher)):
+        return np.full_like(squared, np.inf)  # the lens would fold the picture
     for first, last in _chunks(observations.start):
         rows = slice(observations.start[first], observations.start[last])
         counts = np.diff(observations.start[first : last + 1])
-        lifted = lift(observations.points1[rows] - center, lam, mu)
+        lifted = lift(observations.points1[rows] - center, distortion, higher)
         moved = np.einsum("mij,mj->mi", np.repeat(homographies[first:last], counts, axis=0), lifted)
-        error = distort(project(moved), lam, mu) - (observations.points2[rows] - center)
+        error = distort(project(moved), distortion, higher) - (observations.points2[rows] - center)
         squared[rows] = (np.einsum("mij,mj->mi", whitening[rows], error) ** 2).sum(axis=1)
     return np.where(np.isfinite(squared), squared, np.inf)
 
@@ -140,16 +153,17 @@ def _chunks(start: NDArray[np.intp]) -> list[tuple[int, int]]:
 def _whitened(
     observations: Observations, homographies: FloatArray, lens: FloatArray, first: int, last: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Jacobian (m, 2, 13) and error (m, 2) of the correspondences of some links, whitened, px; the whitening."""
+    """Jacobian (m, 2, 14) and error (m, 2) of the correspondences of some links, whitened, px; the whitening."""
     rows = slice(observations.start[first], observations.start[last])
     counts = np.diff(observations.start[first : last + 1])
     scale1 = np.repeat(observations.scale1[first:last], counts)[:, None, None]
     scale2 = np.repeat(observations.scale2[first:last], counts)[:, None, None]
     homography = np.repeat(homographies[first:last], counts, axis=0)
-    result = transfer_jacobian(homography, float(lens[0]), observations.points1[rows] - lens[2:], float(lens[1]))
+    distortion, higher, center = split_lens(lens)
+    result = transfer_jacobian(homography, distortion, observations.points1[rows] - center, higher)
     whitening = measurement_whitening(result.by_point * (scale2 / scale1)) * scale2
     jacobian = side_by_side(result.by_homography, result.by_lens)
-    error = result.points - (observations.points2[rows] - lens[2:])
+    error = result.points - (observations.points2[rows] - center)
     return whiten(whitening, jacobian), whiten(whitening, error[:, :, None])[:, :, 0], whitening
 
 
@@ -256,7 +270,7 @@ def chain(
         ``P_j P_i⁻¹`` of each link.
     free : ndarray of shape (N, D), bool
         Pose parameters that may move.
-    free_lens : ndarray of shape (4,), bool
+    free_lens : ndarray of shape (5,), bool
         Lens parameters that may move; they follow the model's shared parameters.
     weight : float
         Of all equations: one over the variance of the errors.
@@ -273,7 +287,7 @@ def chain(
     by_homography = np.concatenate(blocks, axis=1).reshape(count, -1, 9)
     lens = np.flatnonzero(free_lens)
     width = by_homography.shape[1]
-    derivative = np.zeros((count, 13, width + len(lens)))
+    derivative = np.zeros((count, _ENTRIES, width + len(lens)))
     derivative[:, :9, :width] = np.swapaxes(by_homography, 1, 2)
     derivative[:, 9 + lens, width + np.arange(len(lens))] = 1.0
     local = np.swapaxes(derivative, 1, 2) @ equations.gram @ derivative * weight

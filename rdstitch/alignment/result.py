@@ -119,10 +119,15 @@ class Alignment:
     focal_std : float or None
         Its standard deviation in the same unit.
     distortion, distortion_std : float
-        λ in the half-diagonal frame and its standard deviation; inf where it is not observable, 0 where it was given.
+        λ of the one-parameter lens nearest to the one found (:attr:`rdstitch.camera.Camera.nearest_distortion`), and
+        its standard deviation; inf where it is not observable, 0 where it was given.
+    lens : str
+        The lens that was found, a key of :data:`rdstitch.alignment.lens_selection.LENSES`.
+    lens_reason : str
+        Why that one.
     parameters : tuple of str
         Names of the parameters that ``covariance`` covers, among "psi", "theta", "log_focal", "distortion",
-        "distortion2", "center_x", "center_y".
+        "distortion2", "distortion3", "center_x", "center_y".
     covariance : ndarray of shape (P, P)
     rms : float
         Root mean square error of the inliers of all links, px.
@@ -147,6 +152,8 @@ class Alignment:
     focal_std: float | None
     distortion: float
     distortion_std: float
+    lens: str
+    lens_reason: str
     parameters: tuple[str, ...]
     covariance: FloatArray
     rms: float

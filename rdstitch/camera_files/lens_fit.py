@@ -11,14 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera, distort
+from rdstitch.camera import Camera
+from rdstitch.division_model import MAX_ABS_DISTORTION, distort
 from rdstitch.errors import ArgumentError
 
 Forward = Callable[[FloatArray], FloatArray]
 
 _GRID = 65  # points along each side of the picture that polynomials are fitted at
 _RAYS, _STEPS, _REACH = 64, 1200, 8.0  # where other models are looked at: directions, steps, half diagonals
-_LARGEST_DISTORTION = 0.98
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def fit_division(forward: Forward, camera: Camera) -> tuple[float, LensFit]:
     flat, bent = camera.normalize(straight), camera.normalize(measured)
     farthest = float(np.einsum("ij,ij->i", flat, flat).max())
     corner = float(np.square(camera.normalize(camera.outline(1))).sum(axis=1).max())
-    low, high = -_LARGEST_DISTORTION / corner, 0.25 * _LARGEST_DISTORTION / farthest
+    low, high = -MAX_ABS_DISTORTION / corner, 0.25 * MAX_ABS_DISTORTION / farthest
     # Imported late: whoever converts no lens should not wait for SciPy's optimizers.
     from scipy.optimize import minimize_scalar
 

@@ -183,7 +183,10 @@ def _camera(metadata: Metadata, camera: Camera | None, focal: float | None, dist
         found = replace(found, focal=focal, focal_source="option")
     elif found.focal is None and metadata.focal_px is not None:
         found = replace(found, focal=metadata.focal_px, focal_source="exif")
-    return found if distortion is None else replace(found, distortion=distortion, distortion2=0.0, distortion_std=None)
+    if distortion is None:
+        return found
+    one_parameter = replace(found, distortion2=0.0, distortion3=0.0, distortion_std=None, lens_covariance=None)
+    return replace(one_parameter, distortion=distortion)
 
 
 def _fitted(camera: Camera, size: tuple[int, int]) -> Camera:

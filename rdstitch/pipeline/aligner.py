@@ -121,7 +121,8 @@ def _alignment_options(sources: Sequence[Source], options: StitchOptions) -> Ali
     return AlignmentOptions(
         reference=_reference(sources, options.reference),
         model=options.model,
-        distortion=options.known_distortion,
+        lens=options.lens,
+        lens_known=options.known_distortion is not None,
         tilt=options.tilt or ((0.0, 0.0) if exact else None),
         attitudes=np.array(attitudes) if attitudes else None,
         attitudes_std=options.attitude_std,

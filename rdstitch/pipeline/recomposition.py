@@ -9,7 +9,7 @@ from rdstitch.compositing import Canvas, Composite, CompositeOptions, CompositeP
 from rdstitch.inputs.source import Source
 from rdstitch.messages import Message
 from rdstitch.sidecar.read import SavedRegistration
-from rdstitch.sidecar.write import lens_fields, plain, versions
+from rdstitch.sidecar.write import VERSION, lens_fields, plain, versions
 
 
 @dataclass(frozen=True)
@@ -65,9 +65,10 @@ def applied_sidecar(result: Recomposition) -> dict[str, Any]:
     camera = source.camera
     content = {
         **then,
+        "version": VERSION,
         "lambda_px": camera.distortion_px,
         "lambda_focal": camera.distortion_focal,
-        "camera": {**camera.as_dict(), "lambda_std": then.get("lambda_std")},
+        "camera": {**camera.as_dict(), **_uncertainty(then)},
         "focal_px": camera.focal,
         "reference": source.name,
         "output": {
@@ -84,12 +85,18 @@ def applied_sidecar(result: Recomposition) -> dict[str, Any]:
     return {key: plain(value) for key, value in content.items()}
 
 
+def _uncertainty(then: dict[str, Any]) -> dict[str, Any]:
+    """How far the lens was determined then."""
+    return {"lambda_std": then.get("lambda_std"), "lens_covariance": then["camera"].get("lens_covariance")}
+
+
 def _image(result: Recomposition, index: int, entry: dict[str, Any]) -> dict[str, Any]:
     """One picture's entry, brought up to date."""
     source, picture = result.sources[index], result.saved.pictures[index]
     if source is None or picture.to_plane is None:
         reason = result.left_out[index].text if index in result.left_out else picture.reason
-        return {**entry, "used": False, "reason": reason, "to_plane": None, "to_output": None, "pose": None}
+        lens = {} if picture.camera is None else lens_fields(picture.camera)
+        return {**entry, **lens, "used": False, "reason": reason, "to_plane": None, "to_output": None, "pose": None}
     return {
         **entry,
         "name": source.name,

@@ -12,6 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from rdstitch.arrays import FloatArray
+from rdstitch.division_model import MAX_ABS_DISTORTION
 from rdstitch.radial_homography import (
     TransferJacobian,
     measurement_whitening,
@@ -24,7 +25,6 @@ from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import PairModel
 
 _LEAST_GAIN = 1e-5  # expected relative fall of the loss that is worth another step: a hundredth of the noise
-MAX_ABS_DISTORTION = 0.98  # |λ| in the half-diagonal frame; beyond, the lens model folds at the corner
 
 State = TypeVar("State")
 _State = tuple[FloatArray, float]  # of the model, and λ
@@ -176,7 +176,7 @@ def _linearize(
 ) -> Linearized:
     """Loss, normal matrix and gradient at a state."""
     transfer = transfer_jacobian(model.homography(state), distortion, data.x1)
-    lens = transfer.by_lens[:, :, :0] if fixed_distortion else transfer.by_lens[:, :, :1]
+    lens = np.empty((len(data.x1), 2, 0)) if fixed_distortion else transfer.by_distortion
     by_state = model.jacobian(state)
     chain = np.zeros((lens.shape[2] + 9, lens.shape[2] + by_state.shape[1]))
     chain[: lens.shape[2], : lens.shape[2]] = np.eye(lens.shape[2])

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.arrays import FloatArray
+from rdstitch.division_model import OBSERVABLE_STD
 from rdstitch.robust.local_optimization import Linearized, Refined, refine
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyModel, PairModel
@@ -17,9 +18,6 @@ _LOSS_WIDTH = 4.0  # scale of the loss in standard deviations of the noise
 _SINGULAR = 1e-13  # eigenvalue of the correlation matrix of the parameters
 _CELLS_PER_HALF_DIAGONAL = 5.0
 _NEAR = 3.0  # errors, in thresholds, beyond which a correspondence has no say in the choice
-
-_LARGEST_STD = 0.1
-"""Standard deviation of λ above which the pictures say nothing useful about it: a tenth of the radius at the corner."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +103,7 @@ def select_model(
     chosen = fit(chosen.model, chosen, chosen.distortion, fixed_distortion, iterations=0)
     covariance = covariance_of(chosen, noise, data)
     std = 0.0 if fixed_distortion else float(np.sqrt(covariance[0, 0]))
-    if std < _LARGEST_STD:
+    if std < OBSERVABLE_STD:
         return Selection(chosen, noise, covariance, std, reason)
     straight = fit(chosen.model, chosen, 0.0, True)
     straight = fit(chosen.model, straight, 0.0, True, iterations=0)

@@ -11,14 +11,16 @@ from functools import partial
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.radial_homography import LENS_STD, RadialHomography, side_by_side, transfer_jacobian
-from rdstitch.robust.local_optimization import MAX_ABS_DISTORTION, Linearized, descend, linearized
+from rdstitch.camera import LENS_STD
+from rdstitch.division_model import MAX_ABS_DISTORTION
+from rdstitch.radial_homography import RadialHomography, side_by_side, transfer_jacobian
+from rdstitch.robust.local_optimization import Linearized, descend, linearized
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.model_selection import covariance_of, loss_width, noise_of
 from rdstitch.robust.pair_models import HomographyModel
 
 _HOMOGRAPHY = HomographyModel()
-_OWN_STD = LENS_STD[[0, 0, 1, 2, 3]]  # of λ of picture 1, λ of picture 2, μ, and the distortion centre
+_OWN_STD = LENS_STD[[0, 0, 1, 3, 4]]  # of λ of picture 1, λ of picture 2, μ, and the distortion centre
 _LENS = len(_OWN_STD)
 _ITERATIONS = 10
 _ROUNDS = 2  # what one λ leaves is no measure of the noise
@@ -72,10 +74,11 @@ def _linearize(state: _State, data: Measurements, scale: float, noise: float) ->
     """Loss, normal matrix and gradient at a state."""
     homography, lens = state
     (first, second, mu), center = lens[:3].tolist(), lens[3:]
-    transfer = transfer_jacobian(_HOMOGRAPHY.homography(homography), first, data.x1 - center, mu, own_distortion=second)
-    own = transfer.by_own_distortion[:, :, None]
-    lenses = transfer.by_lens
-    columns = side_by_side(lenses[:, :, :1] - own, own, lenses[:, :, 1:], transfer.by_homography)
+    transfer = transfer_jacobian(
+        _HOMOGRAPHY.homography(homography), first, data.x1 - center, (mu,), own_distortion=second
+    )
+    own, shared = transfer.by_own_distortion, transfer.by_lens[:, :, [1, 3, 4]]
+    columns = side_by_side(transfer.by_distortion - own, own, shared, transfer.by_homography)
     chain = np.zeros((_LENS + 9, _LENS + 8))
     chain[:_LENS, :_LENS] = np.eye(_LENS)
     chain[_LENS:, _LENS:] = _HOMOGRAPHY.jacobian(homography)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import FOCAL_LOG_STD, Camera
+from rdstitch.camera import FOCAL_LOG_STD, Camera, read_coefficients
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError
 from rdstitch.records import Record, read_json
@@ -75,8 +75,8 @@ def read_sidecar(path: str | Path) -> SavedRegistration:
     record = read_json(path)
     if (kind := record["format"]).value != "rdstitch sidecar":
         kind.expected('"rdstitch sidecar"')
-    if (version := record["version"]).value != VERSION:
-        version.fail(f"this rdstitch reads version {VERSION} of sidecars, not {version.value}")
+    if (version := record["version"]).value not in range(1, VERSION + 1):
+        version.fail(f"this rdstitch reads versions 1 to {VERSION} of sidecars, not {version.value}")
     record["verdict"].fields()
     pictures = tuple(_picture(item) for item in record["images"].items())
     return SavedRegistration(
@@ -101,13 +101,15 @@ def _picture(record: Record) -> SavedPicture:
 def _camera(record: Record) -> Camera:
     focal, source = record.get("focal_px"), record.get("focal_source")
     try:
+        distortion, second, third = read_coefficients(record)
         return Camera(
-            record["size"].size(),
-            record["lambda"].number(),
-            record["lambda2"].number(),
-            record["center_px"].pair(),
-            None if focal is None else focal.number(),
-            None if source is None else source.choice(FOCAL_LOG_STD),
+            image_size=record["size"].size(),
+            distortion=distortion,
+            distortion2=second,
+            distortion3=third,
+            center=record["center_px"].pair(),
+            focal=None if focal is None else focal.number(),
+            focal_source=None if source is None else source.choice(FOCAL_LOG_STD),
         )
     except ArgumentError as error:
         record.fail(str(error))

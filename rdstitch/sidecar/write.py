@@ -12,7 +12,8 @@ import numpy as np
 from rdstitch.camera import Camera
 from rdstitch.stitch_result import StitchResult
 
-VERSION = 1
+VERSION = 2
+"""Version 1 had no more of a lens than λ and μ, as ``lambda`` and ``lambda2``."""
 
 
 def sidecar(result: StitchResult) -> dict[str, Any]:
@@ -33,6 +34,8 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
         "lambda_px": camera.distortion_px,
         "lambda_focal": camera.distortion_focal,
         "lambda_known": alignment.distortion_std == 0.0,
+        "lens": alignment.lens,
+        "lens_reason": alignment.lens_reason,
         "camera": camera.as_dict(),
         "tilt_deg": None if alignment.tilt is None else np.degrees(alignment.tilt),
         "focal_px": camera.focal,
@@ -99,8 +102,8 @@ def lens_fields(camera: Camera) -> dict[str, Any]:
     """What of a picture's camera depends on the size of the picture, and λ with it."""
     return {
         "center_px": camera.center,
-        "lambda": camera.distortion,
-        "lambda2": camera.distortion2,
+        "lambda": camera.nearest_distortion,
+        "coefficients": camera.coefficients,
         "focal_px": camera.focal,
         "focal_source": camera.focal_source,
     }

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import distort
+from rdstitch.division_model import distort
 from rdstitch.errors import ArgumentError
 from rdstitch.planar_motion import PlanarMotion, rotation_from_tilt
 from rdstitch.radial_homography import lift, project

@@ -1,6 +1,6 @@
 """Lenses to render with. :class:`rdstitch.camera.Camera` is one; the others are no division model."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -37,8 +37,8 @@ class Lens(Protocol):
 
 
 @dataclass(frozen=True)
-class _CentredLens:
-    """A lens whose principal point is the image centre.
+class _FixedFocalLens:
+    """A lens with a focal length and a principal point.
 
     Attributes
     ----------
@@ -46,15 +46,18 @@ class _CentredLens:
         Width and height, px.
     focal : float
         Focal length at the centre, px.
+    offset : (float, float)
+        From the image centre to the principal point, px.
     """
 
     image_size: tuple[int, int]
     focal: float
+    offset: tuple[float, float] = field(default=(0.0, 0.0), kw_only=True)
 
     @property
     def center(self) -> tuple[float, float]:
         """Principal point, px."""
-        return (self.image_size[0] - 1) / 2, (self.image_size[1] - 1) / 2
+        return (self.image_size[0] - 1) / 2 + self.offset[0], (self.image_size[1] - 1) / 2 + self.offset[1]
 
     def _normalize(self, points: ArrayLike) -> FloatArray:
         return (np.asarray(points, dtype=np.float64) - self.center) / self.focal
@@ -64,7 +67,7 @@ class _CentredLens:
 
 
 @dataclass(frozen=True)
-class FisheyeLens(_CentredLens):
+class FisheyeLens(_FixedFocalLens):
     """Equidistant fisheye: a ray at angle θ from the axis is measured ``focal * θ`` from the centre."""
 
     def undistort(self, points: ArrayLike) -> FloatArray:
@@ -82,7 +85,7 @@ class FisheyeLens(_CentredLens):
 
 
 @dataclass(frozen=True)
-class BrownLens(_CentredLens):
+class BrownLens(_FixedFocalLens):
     """Brown's polynomial, OpenCV's model: ``x_d = x_u (1 + k1 r² + k2 r⁴ + k3 r⁶) + tangential part``, ``r = |x_u|``.
 
     Attributes

@@ -11,6 +11,7 @@ from rdstitch_cli.options import FEATURES
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.features import KINDS
+from rdstitch.records import Record
 from tests.cli.running import Run, transfers
 
 PAIR = sorted((Path(__file__).resolve().parents[2] / "examples/data/garfield_red").glob("*.jpg"))
@@ -31,7 +32,7 @@ def overlap(record: dict[str, Any]) -> FloatArray:
     """Where a grid over the second picture lies in the first one, px; NaN where it is outside."""
     camera = record["camera"]
     width, height = camera["image_size"]
-    lens = Camera((width, height), camera["lambda"], camera["lambda2"], tuple(camera["center_px"]))
+    lens = Camera.from_record(Record("sidecar", "camera", camera))
     u, v = np.meshgrid(np.linspace(0, width - 1, 40), np.linspace(0, height - 1, 30))
     # The frame is that of the first picture: its undistorted px are only scaled and shifted.
     first = np.array(record["images"][0]["to_output"])

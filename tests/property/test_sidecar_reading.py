@@ -21,7 +21,7 @@ _IMAGE = {
     "size": [400, 300],
     "center_px": [199.5, 149.5],
     "lambda": -0.2,
-    "lambda2": 0.0,
+    "coefficients": [-0.2, 0.0, 0.0],
     "focal_px": 380.0,
     "focal_source": "exif",
     "used": True,
@@ -32,7 +32,7 @@ _LEFT_OUT = {**_IMAGE, "name": "b.jpg", "used": False, "reason": "no overlap", "
 _UNREAD = {"name": "c.jpg", "path": "c.jpg", "size": None, "used": False, "reason": "is damaged"}
 GOOD: dict[str, Any] = {
     "format": "rdstitch sidecar",
-    "version": 1,
+    "version": 2,
     "lambda": -0.2,
     "reference": "a.jpg",
     "images": [_IMAGE, _LEFT_OUT, _UNREAD],
@@ -76,13 +76,13 @@ def test_a_good_one_is_read_whole(tmp_path: Path) -> None:
     ("path", "value", "field"),
     [
         (("format",), "rdstitch camera", "format"),
-        (("version",), 2, "version"),
+        (("version",), 3, "version"),
         (("images", 0, "size"), "wide", "images[0].size"),
         (("images", 0, "size"), [400], "images[0].size"),
         (("images", 0, "size"), [400, 0], "images[0].size[1]"),
         (("images", 0, "size"), None, "images[0].size"),
-        (("images", 0, "lambda"), -5, "images[0]"),
-        (("images", 0, "lambda"), True, "images[0].lambda"),
+        (("images", 0, "coefficients"), [-5, 0, 0], "images[0]"),
+        (("images", 0, "coefficients"), [True, 0, 0], "images[0].coefficients[0]"),
         (("images", 0, "used"), 1, "images[0].used"),
         (("images", 0, "focal_source"), "guesswork", "images[0].focal_source"),
         (("images", 0, "to_plane"), [[1, 0, 0], [0, 1, 0], [1, 1, 0]], "images[0].to_plane"),
@@ -104,6 +104,16 @@ def test_complaints_name_the_field(tmp_path: Path, path: tuple[str | int, ...], 
     with pytest.raises(InputError) as caught:
         read_sidecar(file)
     assert str(caught.value).startswith(f"{file}: {field}: ")
+
+
+def test_version_1_is_still_read(tmp_path: Path) -> None:
+    content = json.loads(json.dumps(GOOD)) | {"version": 1}
+    for image in content["images"][:2]:
+        del image["coefficients"]
+        image["lambda2"] = 0.01
+    camera = read_sidecar(_write(tmp_path, json.dumps(content).encode())).pictures[0].camera
+    assert camera is not None
+    assert camera.coefficients == (-0.2, 0.01, 0.0)
 
 
 @settings(deadline=None)

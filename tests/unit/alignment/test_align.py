@@ -187,7 +187,8 @@ def test_hills_are_noticed() -> None:
 def test_known_lens_and_tilt_are_kept() -> None:
     rng = np.random.default_rng(11)
     given = scene(grid(3, 2, (0.4, 0.3), 0.2, rng), tilt=(0.05, -0.04), rng=rng)
-    found = _run(given, distortion=-0.25, tilt=(0.05, -0.04))
+    cameras = [replace(camera, distortion=-0.25) for camera in given.cameras]
+    found = _run(replace(given, cameras=cameras), lens_known=True, tilt=(0.05, -0.04))
     assert found.distortion == -0.25
     assert found.distortion_std == 0.0
     assert found.tilt == pytest.approx((0.05, -0.04), abs=1e-5)

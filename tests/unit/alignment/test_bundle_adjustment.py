@@ -10,8 +10,8 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.matching.thinning import spread_choice
 from tests.alignment_scenes import Scene, grid, jittered, scene
 
-FREE_LENS = np.array([True, True, True, True])
-ONE_LENS = np.array([True, False, False, False])
+FREE_LENS = np.array([True, True, True, True, True])
+ONE_LENS = np.array([True, False, False, False, False])
 
 
 def _scene() -> Scene:
@@ -23,7 +23,7 @@ def _scene() -> Scene:
 def _start(model: Model, truth: Scene) -> Parameters:
     shared = model.shared_from(np.array([0.05, -0.04, np.log(1.3)])) if model.shared_names else np.zeros(0)
     poses = model.poses_from(truth.truth, shared, np.zeros((len(truth.truth), 2)))
-    return Parameters(poses, shared, np.array([-0.23, 0.01, 0.004, -0.006]))
+    return Parameters(poses, shared, np.array([-0.23, 0.01, -0.02, 0.004, -0.006]))
 
 
 def test_the_weight_of_an_error_is_the_derivative_of_its_loss() -> None:
@@ -60,7 +60,7 @@ def test_gradient_and_curvature_of_the_whole_cost(model: Model, width: float) ->
 
     rng = np.random.default_rng(0)
     for _ in range(4):
-        along = rng.normal(size=int(free.sum())), rng.normal(size=len(start.shared) + 4)
+        along = rng.normal(size=int(free.sum())), rng.normal(size=len(start.shared) + len(FREE_LENS))
         step = 1e-6
         numeric = (cost(step * along[0], step * along[1]) - cost(-step * along[0], -step * along[1])) / (2 * step)
         analytic = 2.0 * float(normal.gradient_poses @ along[0] + normal.gradient_shared @ along[1])
@@ -90,7 +90,7 @@ def test_information_on_shared_parameters_is_what_elimination_leaves() -> None:
 
 def _adjust(model: Model, truth: Scene, seen: Observations) -> tuple[float, float]:
     start = _start(model, truth)
-    start = Parameters(start.poses, start.shared, np.array([-0.2, 0.0, 0.0, 0.0]))
+    start = Parameters(start.poses, start.shared, np.array([-0.2, 0.0, 0.0, 0.0, 0.0]))
     freedom = FreeParameters.fixing(model, len(truth.cameras), [0], ONE_LENS)
     found = BundleAdjuster(model, seen, freedom, Priors.none(model, len(truth.cameras))).run(start)
     assert found.converged

@@ -1,0 +1,225 @@
+"""The simplest lens that the pictures allow: λ; λ and the distortion centre; μ besides; ν besides.
+
+The lenses are compared where nothing else is assumed: every link on its own with a homography, and one lens for all.
+What a richer lens gains there is no irregular motion that it takes the blame for. A lens is preferred when its robust
+likelihood pays for its parameters (Schwarz's criterion, with as many independent observations as the agreement of
+neighbouring residuals leaves), and when the links share the gain: a lens bends every picture alike, whereas relief
+bends each differently.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from rdstitch.alignment.adjustment_problem import CameraPriors, homography_apart
+from rdstitch.alignment.bundle_adjustment import WIDTH_PER_SIGMA, BundleAdjustmentResult, sigma_of
+from rdstitch.alignment.cycle_consistency import misfitting_links
+from rdstitch.alignment.normal_equations import whitened_errors
+from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.planarity import coherence
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.camera import LENS_PARAMETERS
+
+LENSES: dict[str, tuple[str, ...]] = {
+    "division": ("distortion",),
+    "division-center": ("distortion", "center_x", "center_y"),
+    "division2": ("distortion", "distortion2", "center_x", "center_y"),
+    "division3": LENS_PARAMETERS,
+}
+"""Parameters of each lens of the ladder, from the simplest."""
+
+CENTER = np.array([name.startswith("center") for name in LENS_PARAMETERS])
+"""Which of :data:`rdstitch.camera.LENS_PARAMETERS` are the distortion centre, shape (5,)."""
+
+_WORDS = {
+    "division": "λ",
+    "division-center": "λ and the distortion centre",
+    "division2": "λ, μ and the distortion centre",
+    "division3": "λ, μ, ν and the distortion centre",
+}
+
+_EXACTNESS = 0.1
+"""Pixels: how exactly a lens and a plane can be described at all."""
+
+_FARTHEST_CENTER = 0.08
+"""Half diagonals: a distortion centre farther off is no lens, but something else that it takes the blame for."""
+
+_SHARED_GAIN = 2.5
+"""Standard deviations of the mean gain of the parts that the observations fall into, by which it must exceed 0."""
+
+_CELLS = 4
+"""Cells per side of a link's overlap, each of which is a part where there are few links."""
+
+_ENOUGH_LINKS = 8
+"""Links from which on each is a part."""
+
+
+@dataclass(frozen=True)
+class LensChoice:
+    """The lens chosen.
+
+    Attributes
+    ----------
+    name : str
+        A key of :data:`LENSES`.
+    free : ndarray of shape (5,), bool
+        Its parameters among :data:`rdstitch.camera.LENS_PARAMETERS`.
+    apart : BundleAdjustmentResult
+        Every link on its own with this lens.
+    reason : str
+        One sentence.
+    refinable : bool
+        Whether the distortion centre may still be freed, where the motion model shows it.
+    """
+
+    name: str
+    free: BoolArray
+    apart: BundleAdjustmentResult
+    reason: str
+    refinable: bool
+
+    @property
+    def refinements(self) -> list[BoolArray]:
+        """What else may be freed where the motion model shows it: the distortion centre."""
+        return [CENTER] if self.refinable else []
+
+    def refined(self, free: BoolArray) -> Self:
+        """With the parameters that were freed in the end."""
+        if (free == self.free).all():
+            return self
+        reason = f"{_WORDS['division-center']}: the motion is more regular with it"
+        return replace(self, name="division-center", free=free, reason=reason)
+
+
+def free_parameters(name: str) -> BoolArray:
+    """Which of :data:`rdstitch.camera.LENS_PARAMETERS` a lens of the ladder has, shape (5,)."""
+    return np.array([parameter in LENSES[name] for parameter in LENS_PARAMETERS])
+
+
+def choose_lens(
+    observations: Observations, apart: BundleAdjustmentResult, names: Sequence[str], known: CameraPriors
+) -> LensChoice:
+    """Choose a lens.
+
+    Parameters
+    ----------
+    observations : Observations
+    apart : BundleAdjustmentResult
+        Every link on its own with a homography, and λ free unless ``names`` is empty.
+    names : sequence of str
+        The lenses to choose among, keys of :data:`LENSES` from the simplest; none where the lens is given.
+    known : CameraPriors
+    """
+    if not names:
+        return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), apart, "given", refinable=False)
+    fits = [apart] if names[0] == "division" else []
+    for name in names[len(fits) :]:
+        start = fits[-1] if fits else apart
+        fits.append(
+            homography_apart(observations, start.homographies, start.parameters.lens, free_parameters(name), known)
+        )
+    if len(names) == 1:
+        return LensChoice(names[0], free_parameters(names[0]), fits[0], "as requested", refinable=False)
+    judge = _Judge.of(observations, fits[-1])
+    best = 0
+    for index in range(1, len(names)):
+        if judge.prefers(fits[index], names[index], fits[best], names[best]) and is_plausible(fits[index]):
+            best = index
+    name = names[best]
+    reason = _reason(names, fits, judge, best)
+    return LensChoice(name, free_parameters(name), fits[best], reason, refinable=name == "division")
+
+
+def is_plausible(adjusted: BundleAdjustmentResult) -> bool:
+    """Whether the distortion centre is where lenses have it."""
+    return bool(np.abs(adjusted.parameters.lens[CENTER]).max() < _FARTHEST_CENTER)
+
+
+@dataclass(frozen=True)
+class _Judge:
+    """What the lenses are compared by.
+
+    Attributes
+    ----------
+    observations : Observations
+    noise : float
+        Standard deviation of an error's coordinate with the richest lens, pixels.
+    overdispersion : float
+        See :class:`rdstitch.alignment.planarity.Coherence`.
+    counted : ndarray of shape (M,), bool
+        Correspondences of links that fit.
+    effective : float
+        Independent observations.
+    part : ndarray of shape (M,), intp
+        The part of the observations that each correspondence falls into: its link, or a cell of it.
+    """
+
+    observations: Observations
+    noise: float
+    overdispersion: float
+    counted: BoolArray
+    effective: float
+    part: IntArray
+
+    @classmethod
+    def of(cls, observations: Observations, richest: BundleAdjustmentResult) -> "_Judge":
+        """From the errors that the richest lens leaves."""
+        errors = whitened_errors(observations, richest.homographies, richest.parameters.lens)
+        squared = np.nan_to_num(np.einsum("mi,mi->m", errors, errors), nan=np.inf)
+        sigma = sigma_of(squared[observations.scale_inliers_mask])
+        inliers = squared <= (WIDTH_PER_SIGMA * sigma) ** 2
+        overdispersion = coherence(observations, errors, inliers).overdispersion
+        counted = ~misfitting_links(squared, observations)[observations.link]
+        freedom = max(1.0 - 4.0 * len(observations) / max(len(errors), 1), 0.1)
+        effective = max(2.0 * float((counted & inliers).sum()) / overdispersion, 2.0)
+        noise = math.hypot(sigma / math.sqrt(freedom), _EXACTNESS)
+        return cls(observations, noise, overdispersion, counted, effective, _parts(observations))
+
+    def misfit(self, fit: BundleAdjustmentResult) -> FloatArray:
+        """Robust sum of squared errors in units of the noise, of each correspondence that counts."""
+        ratio = np.minimum(fit.squared[self.counted], 1e12) / self.noise**2
+        robust: FloatArray = WIDTH_PER_SIGMA**2 * np.log1p(ratio / WIDTH_PER_SIGMA**2) / self.overdispersion
+        return robust
+
+    def prefers(self, richer: BundleAdjustmentResult, name: str, simpler: BundleAdjustmentResult, other: str) -> bool:
+        """Whether a richer lens gains more than its parameters cost, and all over the pictures."""
+        gain = self.misfit(simpler) - self.misfit(richer)
+        price = (len(LENSES[name]) - len(LENSES[other])) * math.log(self.effective)
+        return float(gain.sum()) > price and self.significance(gain) > _SHARED_GAIN
+
+    def significance(self, gain: FloatArray) -> float:
+        """Mean gain of the parts in its standard deviations."""
+        part = self.part[self.counted]
+        sums = np.bincount(part, gain)[np.unique(part)]
+        if len(sums) < 2:
+            return 0.0
+        return float(sums.mean() / max(sums.std(ddof=1) / math.sqrt(len(sums)), 1e-12))
+
+
+def _parts(observations: Observations) -> IntArray:
+    """Which part each correspondence falls into, shape (M,)."""
+    link = observations.link
+    if len(observations) >= _ENOUGH_LINKS:
+        return link
+    cell = np.zeros(len(link), dtype=np.intp)
+    for number in range(len(observations)):
+        own = slice(observations.start[number], observations.start[number + 1])
+        points = observations.points1[own]
+        for axis in range(2):
+            rank = np.argsort(np.argsort(points[:, axis]))
+            cell[own] = cell[own] * _CELLS + rank * _CELLS // max(len(points), 1)
+    return link * _CELLS**2 + cell
+
+
+def _reason(names: Sequence[str], fits: Sequence[BundleAdjustmentResult], judge: _Judge, best: int) -> str:
+    """Why a lens was chosen, one sentence."""
+    errors = [f"{name} {fit.sigma:.3f} pixels" for name, fit in zip(names, fits, strict=True)]
+    text = f"{_WORDS[names[best]]}: pairs on their own leave an error of {fits[best].sigma:.3f} pixels"
+    if best:
+        text += f", simpler lenses more ({', '.join(errors[:best])})"
+    if best + 1 < len(names):
+        text += f", more parameters gain too little ({', '.join(errors[best + 1 :])})"
+    return text

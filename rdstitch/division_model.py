@@ -1,0 +1,191 @@
+"""The division model of lens distortion: ``x_u = x_d / g(r²)`` with ``g(q) = 1 + λ q + μ q² + ν q³``, ``r = |x_d|``.
+
+With λ alone this is the one-parameter model (Fitzgibbon 2001; Valtonen Örnhag et al., eq. 2); λ < 0 is barrel
+distortion. A stereographic fisheye is exactly that; three coefficients describe equidistant and equisolid fisheyes of
+150 degrees to 0.07 pixels where λ alone leaves 4 to 6 (``tests/benchmarks/lens_models.py``).
+
+Points are normalized: the distortion centre is the origin, the unit is half the image diagonal unless stated.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rdstitch.arrays import FloatArray
+
+MAX_ABS_DISTORTION = 0.98
+"""Largest ``|λ|`` that is estimated, half-diagonal frame; at 1 the model folds at the corner of the picture."""
+
+PLAUSIBLE_DISTORTION = (-1.0, 0.5)
+"""Limits of λ: below, the corners would see behind the camera; no lens pulls its corners in as far as above."""
+
+OBSERVABLE_STD = 0.1
+"""Standard deviation of λ from which on it counts as not observable: a tenth of the radius at the corner."""
+
+_NEWTON_STEPS, _NEWTON_TOLERANCE = 40, 1e-14
+_FARTHEST = 4.0
+"""Half diagonals: with more coefficients than λ the model is not used beyond, where only the highest power counts."""
+
+_NEAREST_STEPS, _NEAREST_TOLERANCE = 20, 1e-13
+
+
+def divisor(radius2: FloatArray, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
+    """``g`` at squared radii of measured points; λ broadcasts, ``higher`` are μ and ν."""
+    tail = _horner(higher, radius2)
+    result: FloatArray = 1.0 + (np.asarray(distortion) + tail) * radius2
+    return result
+
+
+def divisor_slope(radius2: FloatArray, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
+    """Derivative of ``g`` by the squared radius: ``λ + 2 μ q + 3 ν q²``."""
+    result: FloatArray = np.asarray(distortion) + _horner([(k + 2) * c for k, c in enumerate(higher)], radius2)
+    return result
+
+
+def undistort(points: ArrayLike, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
+    """Undistort normalized points.
+
+    Parameters
+    ----------
+    points : array_like of shape (..., 2)
+        Distorted points, normalized with the centre at the origin.
+    distortion : array_like
+        λ in the same frame; its shape broadcasts against ``points.shape[:-1]``. One number where there is ``higher``.
+    higher : sequence of float
+        μ and ν in the same frame; those that are left out are 0.
+
+    Returns
+    -------
+    ndarray of shape (..., 2)
+        Undistorted points; NaN outside the domain: where ``g`` is not positive, and beyond the radius at which the
+        undistorted radius stops growing.
+    """
+    x = np.asarray(points, dtype=np.float64)
+    radius2 = np.einsum("...i,...i->...", x, x)
+    g = divisor(radius2, distortion, higher)
+    if any(higher):
+        inside = radius2 < valid_radius(float(np.asarray(distortion).item()), tuple(higher)) ** 2
+    else:
+        inside = (g > 0.0) & (np.asarray(distortion) * radius2 < 1.0)
+    return x / np.where(inside, g, np.nan)[..., None]
+
+
+def distort(points: ArrayLike, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
+    """Distort normalized points: the inverse of :func:`undistort`.
+
+    For λ alone in closed form, ``x_d = 2 x_u / (1 + sqrt(1 - 4 λ |x_u|²))``, which is stable at λ = 0 and at the
+    centre; otherwise by Newton's method on the radius, with bisection where a step leaves the domain.
+
+    Parameters
+    ----------
+    points : array_like of shape (..., 2)
+        Undistorted points, normalized with the centre at the origin.
+    distortion, higher
+        As in :func:`undistort`.
+
+    Returns
+    -------
+    ndarray of shape (..., 2)
+        Distorted points; NaN where no distorted point of the domain maps to the given one.
+    """
+    x = np.asarray(points, dtype=np.float64)
+    radius2 = np.einsum("...i,...i->...", x, x)
+    if any(higher):
+        radius = np.sqrt(radius2)
+        measured = _distorted_radius(radius, float(np.asarray(distortion).item()), tuple(higher))
+        return x * np.where(radius > 0.0, measured / np.maximum(radius, 1e-300), 1.0)[..., None]
+    discriminant = 1.0 - 4.0 * np.asarray(distortion) * radius2
+    return x * (2.0 / (1.0 + np.sqrt(np.where(discriminant >= 0.0, discriminant, np.nan))))[..., None]
+
+
+@lru_cache(maxsize=256)
+def valid_radius(distortion: float, higher: tuple[float, ...] = ()) -> float:
+    """Largest measured radius up to which the model is one-to-one, in the unit of the coefficients; may be inf.
+
+    That is the first zero of ``g``, where points come from infinity, or of ``g - 2 q g'``, to which the derivative of
+    the undistorted radius is proportional, whichever is nearer.
+    """
+    coefficients = np.array([distortion, *higher])
+    growth = -(2.0 * np.arange(1, len(coefficients) + 1) - 1.0) * coefficients
+    zeros = [_first_zero(values) for values in (coefficients, growth)]
+    return min(*zeros, _FARTHEST) if any(higher) else min(zeros)
+
+
+def nearest_distortion(
+    radius2: FloatArray, distortion: float, higher: Sequence[float] = ()
+) -> tuple[float, float, float]:
+    """The λ of the one-parameter model nearest to a lens, by least squares of measured radii.
+
+    The scale of the undistorted picture is free, as no picture of a plane shows it. So this is the λ that the
+    estimation of one λ would find from points spread like those given.
+
+    Parameters
+    ----------
+    radius2 : ndarray of shape (N,)
+        Squared radii of measured points, normalized; in the domain of the lens.
+    distortion, higher
+        The lens.
+
+    Returns
+    -------
+    distortion, rms, largest : float
+        λ, and how far the two lenses are apart, in the unit of the radii.
+    """
+    # With t the scale, s u = r / (t g): the nearest model measures that at r + r (t g - 1 - λ q) / (t g - 2 λ q) to
+    # first order, which is linear in t and λ but for the denominator.
+    g, radius = divisor(radius2, distortion, higher), np.sqrt(radius2)
+    solution = np.array([1.0, distortion])
+    for _ in range(_NEAREST_STEPS):
+        weight = radius / np.maximum(solution[0] * g - 2.0 * solution[1] * radius2, 1e-3)
+        previous = solution
+        solution = np.linalg.lstsq(weight[:, None] * np.stack([g, -radius2], axis=1), weight, rcond=None)[0]
+        if np.abs(solution - previous).max() < _NEAREST_TOLERANCE:
+            break
+    scale, nearest = solution.tolist()
+    straight = np.stack([radius / (scale * g), np.zeros_like(radius)], axis=-1)
+    error = np.abs(distort(straight, nearest)[..., 0] - radius)
+    return nearest, float(np.sqrt(np.mean(error**2))), float(error.max())
+
+
+def _horner(coefficients: Sequence[float], q: FloatArray) -> FloatArray | float:
+    """``c1 q + c2 q² + …``."""
+    total: FloatArray | float = 0.0
+    for coefficient in reversed(coefficients):
+        total = (total + coefficient) * q
+    return total
+
+
+def _first_zero(coefficients: FloatArray) -> float:
+    """The smallest radius at which ``1 + c1 q + c2 q² + …`` of its square is zero; inf if there is none."""
+    inverse = np.roots([1.0, *coefficients])  # roots in 1 / q, which exist whatever coefficients are zero
+    largest = inverse.real[np.abs(inverse.imag) <= 1e-9 * np.abs(inverse)].max(initial=0.0)
+    return float(1.0 / np.sqrt(largest)) if largest > 0.0 else np.inf
+
+
+def _distorted_radius(radius: FloatArray, distortion: float, higher: tuple[float, ...]) -> FloatArray:
+    """Solve ``r = r_u g(r²)`` for the measured radius within the domain; NaN where there is none."""
+    limit = valid_radius(distortion, higher)
+    with np.errstate(over="ignore", invalid="ignore"):
+        low, high = np.zeros_like(radius), np.full_like(radius, limit)
+        solvable = limit - radius * divisor(high**2, distortion, higher) > 0.0
+        discriminant = np.maximum(1.0 - 4.0 * distortion * radius**2, 0.0)
+        found = np.minimum(2.0 * radius / (1.0 + np.sqrt(discriminant)), limit)
+        for _ in range(_NEWTON_STEPS):
+            q = found**2
+            value = found - radius * divisor(q, distortion, higher)
+            low, high = np.where(value > 0.0, low, found), np.where(value > 0.0, found, high)
+            slope = 1.0 - 2.0 * radius * found * divisor_slope(q, distortion, higher)
+            following = found - value / np.where(slope > 0.0, slope, np.nan)
+            following = np.where((following >= low) & (following <= high), following, (low + high) / 2.0)
+            step = np.abs(following - found)
+            found = following
+            if not (step[solvable] > _NEWTON_TOLERANCE * limit).any():
+                break
+    return np.where(solvable, found, np.nan)
+
+
+def is_one_to_one(radius: float, coefficients: Sequence[float]) -> bool:
+    """Whether the model of λ, μ, … holds out to a radius."""
+    return valid_radius(float(coefficients[0]), tuple(float(value) for value in coefficients[1:])) > radius
