@@ -66,12 +66,14 @@ class Registration:
         return of_severity(self.messages, "left out")
 
     @property
-    def lens(self) -> str:
-        """λ with its standard deviation, in words."""
+    def summary(self) -> str:
+        """How many pictures are in the result, and λ with its standard deviation, in one line."""
+        used = int(self.alignment.used.sum())
+        pictures = f"{used} of {used + len(self.left_out)} pictures"
         distortion, deviation = self.alignment.distortion, self.alignment.distortion_std
         if not math.isfinite(deviation):
-            return "λ not observable"
-        return f"λ = {distortion:.4f} " + ("(given)" if deviation == 0.0 else f"± {deviation:.4f}")
+            return f"{pictures}, λ not observable"
+        return f"{pictures}, λ = {distortion:.4f} " + ("(given)" if deviation == 0.0 else f"± {deviation:.4f}")
 
     @property
     def camera(self) -> Camera:

@@ -2,25 +2,17 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from rdstitch.compositing import Canvas, Composite, CompositePlan
-from rdstitch.errors import ArgumentError
-from rdstitch.inputs.frame import in_order
-from rdstitch.io.preview import encode_preview, read_preview
-from rdstitch.io.read import read_image
+from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
+from rdstitch.output_image import OutputImage
 from rdstitch.registration import Registration
-
-_PREVIEW = 800  # pixels of the longer side
 
 
 @dataclass(frozen=True, repr=False)
-class StitchResult:
+class StitchResult(OutputImage):
     """A stitched picture and everything that was estimated for it.
 
     Attributes
@@ -61,52 +53,12 @@ class StitchResult:
         return self.registration.messages
 
     @property
-    def image(self) -> NDArray[Any]:
-        """The picture (H, W) or (H, W, C), its channels in the order of ``options.channel_order``; 0 outside of it.
-
-        A picture that went to a file is read from there.
-
-        Raises
-        ------
-        ArgumentError
-            When there is none: after a dry run, or where it is a pyramid of Deep Zoom tiles.
-        InputError
-            When the file cannot be read any more.
-        """
-        return in_order(self._samples()[0], self.options.channel_order)
-
-    @property
-    def alpha(self) -> NDArray[np.uint8]:
-        """255 where the picture is, (H, W), elsewhere 0; 255 everywhere where its file holds no alpha, as JPEG."""
-        pixels, alpha = self._samples()
-        return np.full(pixels.shape[:2], 255, np.uint8) if alpha is None else alpha
-
-    def _samples(self) -> tuple[NDArray[Any], NDArray[np.uint8] | None]:
-        """In RGB order."""
-        if self.composite is not None:
-            return self.composite.pixels, self.composite.alpha
-        if self.plan is not None or self.output is None or self.output.suffix.lower() == ".dzi":
-            raise ArgumentError("there is no picture in memory: stitch without an output, or with one of another type")
-        picture = read_image(self.output)
-        return picture.pixels, picture.alpha
-
-    def __repr__(self) -> str:
-        """One line: what was made, of how many pictures, and λ."""
-        return f"<StitchResult {self.summary}>"
-
-    def _repr_png_(self) -> bytes | None:
-        """A preview for notebooks; None where there is no picture."""
-        if self.composite is not None:
-            return encode_preview(self.composite.pixels, _PREVIEW, self.composite.alpha, "PNG")
-        if self.plan is not None or self.output is None or not self.output.is_file():
-            return None
-        pixels, alpha = read_preview(self.output, self.canvas.size, _PREVIEW)
-        return encode_preview(pixels, _PREVIEW, alpha, "PNG")
+    def image_order(self) -> ChannelOrder:
+        """Order of the channels of :attr:`image`."""
+        return self.options.channel_order
 
     @property
     def summary(self) -> str:
         """What was made, of how many pictures, and λ with its standard deviation, in one line."""
-        (width, height), used = self.canvas.size, int(self.registration.alignment.used.sum())
-        total = used + len(self.registration.left_out)
-        name = "" if self.output is None else f"{self.output}: "
-        return f"{name}{width} x {height} pixels, {used} of {total} pictures, {self.registration.lens}"
+        name, (width, height) = "" if self.output is None else f"{self.output}: ", self.canvas.size
+        return f"{name}{width} x {height} pixels, {self.registration.summary}"

@@ -24,7 +24,9 @@ from rdstitch_cli.commands.pano import pano
 from rdstitch_cli.commands.trajectory import trajectory
 from rdstitch_cli.commands.undistort import undistort
 from rdstitch_cli.config import config_option
+from rdstitch_cli.help_pages import help_command
 from rdstitch_cli.progress import one_line
+from rdstitch_cli.terminal import write_whatever_the_encoding
 
 EXIT_STATUSES = """\b
 Exit status:
@@ -58,7 +60,7 @@ _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     epilog=f"{_EXAMPLES}\n\n{EXIT_STATUSES}",
 )
-@click.version_option(version("rdstitch"), prog_name="rdstitch")
+@click.version_option(version("rdstitch"), "-V", "--version", prog_name="rdstitch")
 @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
 @click.pass_context
 def cli(context: click.Context, debug: bool) -> None:
@@ -70,11 +72,13 @@ for command in (pano, mosaic, apply, calibrate, trajectory, undistort):
     command.params.append(config_option())
     command.epilog = f"{command.epilog or ''}\n\n{EXIT_STATUSES}"
     cli.add_command(command)
+cli.add_command(help_command)
 
 
 def main() -> None:
     """Run the command line and leave with its exit status."""
     _open_standard_streams()
+    write_whatever_the_encoding()
     # Pictures and pairs are worked on side by side; threads within each matrix product would only be in the way.
     # NumPy reads this when it is loaded, which is later.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

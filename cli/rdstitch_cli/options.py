@@ -1,15 +1,15 @@
 """Options that several commands share, each defined once."""
 
-import math
 import os
-import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import click
 from click.core import ParameterSource
+
+from rdstitch_cli.parameter_types import Angle, Angles, Bytes, FileOr, UserPath
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 Decorator = Callable[[Command], Command]
@@ -19,8 +19,7 @@ SOLVERS = ("auto", "two-point", "three-point", "three-point-similarity", "four-p
 LENSES = ("auto", "division", "division-center", "division2", "division3")
 MODELS = ("auto", "rigid", "similarity", "tilting", "homography")
 
-# Whether a file can be read is for the library to say: it knows more, and has a status for it.
-PICTURE = click.Path(path_type=Path, readable=False)
+PICTURE = UserPath()
 
 
 def together(*options: Callable[[Any], Any]) -> Decorator[Any]:
@@ -32,69 +31,6 @@ def together(*options: Callable[[Any], Any]) -> Decorator[Any]:
         return command
 
     return decorate
-
-
-class Angles(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
-    """Two angles in degrees, ``PSI,THETA``; the value is in radians."""
-
-    name = "PSI,THETA"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        """Parse the text."""
-        if isinstance(value, tuple):
-            return value[0], value[1]
-        try:
-            psi, theta = (math.radians(float(part)) for part in str(value).split(","))
-        except ValueError:
-            self.fail(f"{value!r} is not two angles in degrees like 2.5,-1", param, ctx)
-        if not (abs(psi) < math.pi / 2 and abs(theta) < math.pi / 2):
-            self.fail(f"{value!r}: a tilt lies between -90 and 90 degrees", param, ctx)
-        return psi, theta
-
-
-class FileOr(click.Path):
-    """A file, or a word that stands for something else; a file of that name is written ``./word``."""
-
-    def __init__(self, word: str) -> None:
-        super().__init__(path_type=Path, readable=False)
-        self.word = word
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Keep the word; of anything else, make a path."""
-        return value if value == self.word else super().convert(value, param, ctx)
-
-
-class Bytes(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
-    """An amount of memory like ``800M`` or ``1.5G``; the value is in bytes."""
-
-    name = "SIZE"
-    units: ClassVar[dict[str, int]] = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Parse the text."""
-        if isinstance(value, int):
-            return value
-        parts = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([KMGT]?)(?:i?B)?\s*", str(value), re.IGNORECASE)
-        amount = int(float(parts[1]) * self.units[parts[2].upper()]) if parts else 0
-        if amount < 1:
-            self.fail(f"{value!r} is no amount of memory like 800M or 2G", param, ctx)
-        return amount
-
-
-class Angle(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
-    """An angle in degrees that is not negative; the value is in radians."""
-
-    name = "DEG"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Parse the text."""
-        try:
-            angle = math.radians(float(value))
-        except ValueError:
-            angle = math.nan
-        if not 0.0 <= angle < math.inf:
-            self.fail(f"{value!r} is no angle in degrees like 0.5", param, ctx)
-        return angle
 
 
 def resolve(inputs: tuple[Path, ...]) -> list[Path]:
@@ -117,7 +53,7 @@ inputs = click.argument(
     "inputs",
     nargs=-1,
     required=True,
-    type=click.Path(path_type=Path, readable=False, allow_dash=True),
+    type=UserPath(allow_dash=True),
     metavar="INPUT...",
 )
 
@@ -248,6 +184,13 @@ trust = together(
     click.option("--force", is_flag=True, help="Write the result even when it fails its own checks."),
 )
 
+preview = click.option(
+    "--preview",
+    is_flag=True,
+    help="A quick small picture: at most 1200 pixels, few features of small versions of the pictures, straight seams; "
+    "options that are given stay as they are.",
+)
+
 compositing = together(
     click.option(
         "--exposure",
@@ -303,6 +246,20 @@ compositing = together(
         default=1.0,
         show_default=True,
         help="Factor to the size of the output; 1 keeps resolution.",
+    ),
+    click.option(
+        "--max-size",
+        type=click.IntRange(1),
+        metavar="N",
+        help="Longest side of the output, pixels; smaller than --scale makes it where that is more.",
+    ),
+    click.option(
+        "--quality",
+        type=click.IntRange(1, 100),
+        default=95,
+        show_default=True,
+        metavar="Q",
+        help="Quality of JPEG and WebP, 1 to 100.",
     ),
     click.option(
         "--rotate",

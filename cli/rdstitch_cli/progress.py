@@ -1,6 +1,7 @@
 """What the user sees while a command runs: bars on a terminal, lines of log, all on standard error."""
 
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import TracebackType
@@ -32,6 +33,7 @@ class Reporter:
         self._bars = verbosity >= 0 and sys.stderr.isatty()
         self._bar: tqdm[Never] | None = None
         self._stage = ""
+        self._began = time.perf_counter()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Show that ``done`` of ``total`` steps of a stage are done."""
@@ -53,6 +55,15 @@ class Reporter:
         """Say what is going on, for those who asked."""
         if self._verbosity >= 1:
             self._line(f"rdstitch: {text}")
+
+    def finish(self) -> None:
+        """Take the bar away before anything goes to standard output."""
+        self._close()
+
+    def made(self, text: str) -> None:
+        """End by saying what was made, and how long it took."""
+        if self._verbosity >= 0:
+            self._line(f"{text}, {time.perf_counter() - self._began:.1f} s")
 
     def __enter__(self) -> Self:
         """Begin reporting."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from rdstitch_cli.options import is_given
 from rdstitch_cli.progress import Reporter
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ def stitch_options(
     max_features: int,
     work_megapixels: float,
     solver: str,
+    preview: bool = False,
     **given: Any,
 ) -> "StitchOptions":
     """The library's options from a command's flags."""
@@ -47,6 +49,8 @@ def stitch_options(
     from rdstitch.features import FeatureOptions
     from rdstitch.pipeline import StitchOptions
 
+    if preview:
+        max_features, work_megapixels = _preview(max_features, work_megapixels, given)
     composite = {
         name: given.pop(name) for name in CompositeOptions.__dataclass_fields__ if name in given and name != "workers"
     }
@@ -58,6 +62,16 @@ def stitch_options(
         composite=CompositeOptions(**composite),
         solver=solver.replace("-", "_"),
         **given,
+    )
+
+
+def _preview(max_features: int, work_megapixels: float, given: dict[str, Any]) -> tuple[int, float]:
+    """Features and megapixels of a quick result; changes the other options that the user did not set."""
+    quick = {"max_size": 1200, "seam": "voronoi"}
+    given |= {name: value for name, value in quick.items() if not is_given(name)}
+    return (
+        max_features if is_given("max_features") else 1500,
+        work_megapixels if is_given("work_megapixels") else 0.5,
     )
 
 
@@ -107,6 +121,7 @@ class Report:
 
 def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = False) -> None:
     """λ and the plan of a dry run, or the sidecar, to standard output; what the user must know to standard error."""
+    reporter.finish()
     _warn_of(result.registration, reporter)
     if as_json:
         from rdstitch.sidecar.write import sidecar
@@ -140,6 +155,7 @@ def _duration(seconds: float) -> str:
 
 def report_registration(registration: "Registration", reporter: Reporter, *, as_json: bool = False) -> None:
     """λ, or the camera, to standard output; pictures left out to standard error."""
+    reporter.finish()
     _warn_of(registration, reporter)
     if as_json:
         from rdstitch.sidecar.write import plain

@@ -167,6 +167,7 @@ def compose_to_file(
             renderer.dtype,
             transparent=True,
             metadata=metadata or Metadata(size),
+            quality=renderer.options.quality,
             background=renderer.options.background,
         )
         check_format(path, layout)

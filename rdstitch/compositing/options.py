@@ -36,6 +36,10 @@ class CompositeOptions:
     crop: Crop = "none"
     # Size of the output; 1 keeps the resolution of the reference picture (or the median one) at its centre.
     scale: float = 1.0
+    # Longest side of the output, pixels; None: as ``scale`` makes it.
+    max_size: int | None = None
+    # Quality of JPEG and WebP, 1 to 100.
+    quality: int = 95
     # Degrees that the output is turned clockwise.
     rotate: float = 0.0
     # Bytes that the compositor may hold in pictures and tiles; None: 352 MB, or more where the canvas needs it.
@@ -62,6 +66,10 @@ class CompositeOptions:
                 raise ArgumentError(f"{option.name} must be one of {', '.join(allowed)}, not '{value}'")
         if not (math.isfinite(self.scale) and self.scale > 0):
             raise ArgumentError(f"scale must be positive, not {self.scale}")
+        if self.max_size is not None and self.max_size < 1:
+            raise ArgumentError(f"max_size must be at least 1, not {self.max_size}")
+        if not 1 <= self.quality <= 100:
+            raise ArgumentError(f"quality must be from 1 to 100, not {self.quality}")
         if not math.isfinite(self.rotate):
             raise ArgumentError(f"rotate must be an angle in degrees, not {self.rotate}")
         if self.max_memory is not None and self.max_memory <= 0:

@@ -128,6 +128,7 @@ def apply(
             composed.composite,
             composed.plan,
             composed.notes,
+            channel_order,
         )
         if output is not None and not dry_run:
             write_json_atomic(f"{output}.json", applied_sidecar(result))

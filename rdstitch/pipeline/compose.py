@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -96,10 +97,13 @@ def compose_pictures(
     beside = world_file_paths(output) if output is not None and has_place(positions) else ()
     for file in beside:
         check_output(file, overwrite, suffixes=())
-    names = [source.name for source in sources]
-    canvas = plan_canvas(
-        cameras, homographies, scale=options.scale, rotate=options.rotate, reference=reference, names=names
+    plan = partial(
+        plan_canvas, cameras, homographies, rotate=options.rotate, reference=reference, names=[s.name for s in sources]
     )
+    canvas = plan(scale=options.scale)
+    if options.max_size is not None and max(canvas.size) > options.max_size:
+        # The canvas has whole pixels around the pictures, so that one of them may be too many.
+        canvas = plan(scale=options.scale * (options.max_size - 1) / max(canvas.size))
     # A crop may yet make it fit.
     if output is not None and options.crop == "none":
         check_size(output, canvas.size)

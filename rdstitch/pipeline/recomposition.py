@@ -6,14 +6,16 @@ from pathlib import Path
 from typing import Any
 
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, CompositePlan
+from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.inputs.source import Source
 from rdstitch.messages import Message
+from rdstitch.output_image import OutputImage
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.write import VERSION, lens_fields, plain, versions
 
 
-@dataclass(frozen=True)
-class Recomposition:
+@dataclass(frozen=True, repr=False)
+class Recomposition(OutputImage):
     """A picture made from a saved registration.
 
     Attributes
@@ -35,6 +37,8 @@ class Recomposition:
         Of a dry run.
     notes : tuple of str
         What the user should know of the compositing.
+    channel_order : str
+        Of :attr:`image`: "bgr" or "rgb".
     """
 
     saved: SavedRegistration
@@ -47,6 +51,19 @@ class Recomposition:
     composite: Composite | None = None
     plan: CompositePlan | None = None
     notes: tuple[str, ...] = ()
+    channel_order: ChannelOrder = "bgr"
+
+    @property
+    def image_order(self) -> ChannelOrder:
+        """Order of the channels of :attr:`image`."""
+        return self.channel_order
+
+    @property
+    def summary(self) -> str:
+        """What was made, and of how many pictures, in one line."""
+        name, (width, height) = "" if self.output is None else f"{self.output}: ", self.canvas.size
+        used = sum(source is not None for source in self.sources)
+        return f"{name}{width} x {height} pixels, {used} of {used + len(self.left_out)} pictures"
 
 
 def applied_sidecar(result: Recomposition) -> dict[str, Any]:

@@ -38,6 +38,6 @@ def rdstitch(capsys: pytest.CaptureFixture[str]) -> Run:
         assert "Traceback" not in captured.err
         if status == 0 and "-o" in arguments:
             check_sidecar(Path(f"{arguments[arguments.index('-o') + 1]}.json"))
-        return Outcome(status, captured.out, captured.err)
+        return Outcome.of(status, captured.out, captured.err)
 
     return call

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from jsonschema import Draft202012Validator
@@ -38,13 +39,25 @@ DISTORTION = -0.2
 FAST = ("-j", "1", "--max-features", "600")
 
 
+_MADE = re.compile(r", \d+\.\d s$")
+
+
 @dataclass(frozen=True)
 class Outcome:
-    """What a run of the command line left behind."""
+    """What a run of the command line left behind; ``made`` is the last line of a success, which ``err`` is without."""
 
     status: int
     out: str
     err: str
+    made: str = ""
+
+    @classmethod
+    def of(cls, status: int, out: str, err: str) -> Self:
+        """With the last line taken off."""
+        lines = err.splitlines(keepends=True)
+        if status == 0 and lines and _MADE.search(lines[-1]):
+            return cls(status, out, "".join(lines[:-1]), lines[-1].rstrip("\n"))
+        return cls(status, out, err)
 
     @property
     def line(self) -> str:
@@ -81,7 +94,7 @@ def finished(process: "subprocess.Popen[bytes]", data: bytes | None = None) -> O
     """Wait for a process of :func:`start`."""
     out, err = process.communicate(data, timeout=300)
     assert b"Traceback" not in err, err.decode("utf-8", "replace")
-    return Outcome(process.returncode, out.decode("utf-8", "replace"), err.decode("utf-8", "replace"))
+    return Outcome.of(process.returncode, out.decode("utf-8", "replace"), err.decode("utf-8", "replace"))
 
 
 def check_sidecar(file: Path) -> None:

@@ -7,17 +7,19 @@ from typing import Any, Literal
 import click
 
 from rdstitch_cli import options
+from rdstitch_cli.help_pages import GroupedCommand
 from rdstitch_cli.progress import Reporter
 from rdstitch_cli.stitching import show_plan
 
 
 @click.command(
+    cls=GroupedCommand,
     epilog="""\b
 Examples:
   rdstitch apply field.tif.json --images flight/ -o field_again.tif --blend feather
   rdstitch apply field_red.tif.json --images flight_nir/ -o field_nir.tif
   rdstitch apply small.jpg.json --images originals/ -o large.tif --match name --strict
-"""
+""",
 )
 @click.argument("sidecar", type=options.PICTURE, metavar="SIDECAR")
 @click.option(
@@ -83,6 +85,7 @@ def apply(
             dry_run=dry_run,
             progress=reporter,
         )
+        reporter.finish()
         for missing in result.left_out.values():
             reporter.warn(str(missing))
         if result.matched == "order" and match == "auto":
@@ -91,3 +94,5 @@ def apply(
             reporter.warn(note)
         if result.plan is not None:
             show_plan(result.plan)
+        else:
+            reporter.made(result.summary)

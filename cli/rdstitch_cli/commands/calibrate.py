@@ -6,17 +6,19 @@ from typing import Any
 import click
 
 from rdstitch_cli import options
+from rdstitch_cli.help_pages import GroupedCommand
 from rdstitch_cli.progress import Reporter
 from rdstitch_cli.stitching import Report, report_registration, stitch_options
 
 
 @click.command(
+    cls=GroupedCommand,
     epilog="""\b
 Examples:
   rdstitch calibrate wall/ -o camera.json
   rdstitch calibrate wall/ -o camera.yml --report lens.html
   rdstitch undistort other/*.jpg --camera camera.json -o straight/
-"""
+""",
 )
 @options.inputs
 @click.option(
@@ -59,3 +61,4 @@ def calibrate(
             registration = recipe(paths, wanted, every=every, progress=told.progress)
         report_registration(registration, reporter, as_json=as_json)
         told.write(registration)
+        reporter.made(f"{output}: {registration.summary}")

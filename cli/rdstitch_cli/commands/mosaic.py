@@ -6,24 +6,27 @@ from typing import Any
 import click
 
 from rdstitch_cli import options
+from rdstitch_cli.help_pages import GroupedCommand
 from rdstitch_cli.progress import Reporter
 from rdstitch_cli.stitching import Report, stitch_options, summarize
 
 
 @click.command(
+    cls=GroupedCommand,
     epilog="""\b
 Examples:
   rdstitch mosaic floor/ -o floor.tif
   rdstitch mosaic flight/*.jpg -o field.tif --camera camera.json
   find . -name '*.jpg' -print0 | rdstitch mosaic - -o all.tif
   rdstitch mosaic drive.mp4 --every 10 -o drive.png --report drive.html
-"""
+""",
 )
 @options.inputs
 @options.output
 @options.overwrite
 @options.every
 @click.option("--reference", metavar="NAME", help="Picture that sets the frame; otherwise the best connected one.")
+@options.preview
 @options.known
 @options.estimation
 @options.compositing
@@ -61,3 +64,5 @@ def mosaic(
             result = recipe(paths, output, stitch_options(reporter, **given), every=every, progress=told.progress)
         summarize(result, reporter, as_json=as_json)
         told.write(result)
+        if result.plan is None:
+            reporter.made(result.summary)

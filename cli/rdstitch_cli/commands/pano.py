@@ -6,23 +6,26 @@ from typing import Any
 import click
 
 from rdstitch_cli import options
+from rdstitch_cli.help_pages import GroupedCommand
 from rdstitch_cli.progress import Reporter
 from rdstitch_cli.stitching import Report, stitch_options, summarize
 
 
 @click.command(
+    cls=GroupedCommand,
     epilog="""\b
 Examples:
   rdstitch pano left.jpg right.jpg -o pano.jpg
   rdstitch pano *.png -o wall.png --reference middle.png --report wall.html
   rdstitch pano a.jpg b.jpg -o ab.tif --camera camera.json
-"""
+""",
 )
 @options.inputs
 @options.output
 @options.overwrite
 @options.every
 @click.option("--reference", metavar="NAME", help="Picture whose frame is kept; otherwise the best connected one.")
+@options.preview
 @options.known
 @options.estimation
 @options.compositing
@@ -60,3 +63,5 @@ def pano(
             result = recipe(paths, output, stitch_options(reporter, **given), every=every, progress=told.progress)
         summarize(result, reporter, as_json=as_json)
         told.write(result)
+        if result.plan is None:
+            reporter.made(result.summary)

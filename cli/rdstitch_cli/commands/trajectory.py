@@ -6,16 +6,18 @@ from typing import Any, Literal
 import click
 
 from rdstitch_cli import options
+from rdstitch_cli.help_pages import GroupedCommand
 from rdstitch_cli.progress import Reporter
 from rdstitch_cli.stitching import report_registration, stitch_options
 
 
 @click.command(
+    cls=GroupedCommand,
     epilog="""\b
 Examples:
   rdstitch trajectory floor/ -o poses.csv
   rdstitch trajectory floor/ -o poses.txt --format tum --height 0.42
-"""
+""",
 )
 @options.inputs
 @click.option("-o", "--output", type=options.PICTURE, required=True, metavar="FILE", help="File to write.")
@@ -71,3 +73,4 @@ def trajectory(
             progress=reporter,
         )
         report_registration(registration, reporter)
+        reporter.made(f"{output}: {registration.summary}")

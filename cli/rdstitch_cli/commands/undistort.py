@@ -6,16 +6,18 @@ from typing import Literal
 import click
 
 from rdstitch_cli import options
+from rdstitch_cli.help_pages import GroupedCommand
 from rdstitch_cli.progress import Reporter
 from rdstitch_cli.stitching import read_lens
 
 
 @click.command(
+    cls=GroupedCommand,
     epilog="""\b
 Examples:
   rdstitch undistort frames/*.jpg --camera camera.json -o straight/
   rdstitch undistort wall.jpg --lambda -0.25 -o straight/
-"""
+""",
 )
 @options.inputs
 @options.lens
@@ -52,7 +54,7 @@ def undistort(
         raise click.UsageError("give either --camera FILE or --lambda L")
     with Reporter(-quiet + verbose) as reporter:
         lens = read_lens(camera, reporter)
-        recipe(
+        written = recipe(
             options.resolve(inputs),
             output,
             camera=lens,
@@ -61,3 +63,5 @@ def undistort(
             overwrite=overwrite,
             progress=reporter,
         )
+        reporter.finish()
+        reporter.made(f"{output}: {len(written)} pictures undistorted")

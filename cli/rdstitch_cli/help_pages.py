@@ -1,0 +1,94 @@
+"""Help pages: options in groups, those that matter first on top; ``rdstitch help``."""
+
+from collections.abc import Sequence
+
+import click
+
+_FIRST = "Options that matter first"
+_GROUPS = {
+    _FIRST: (
+        "output",
+        "overwrite",
+        "images",
+        "preview",
+        "reference",
+        "camera",
+        "focal",
+        "mask",
+        "scale",
+        "report",
+        "layout",
+        "height",
+        "view",
+        "quiet",
+    ),
+    "Input": ("every", "match", "topic", "timestamps"),
+    "Camera": ("distortion", "tilt", "attitude", "attitude_std", "save_camera"),
+    "Features and registration": (
+        "features",
+        "aliked_model",
+        "lightglue_model",
+        "max_features",
+        "work_megapixels",
+        "solver",
+        "model",
+        "threshold",
+    ),
+    "Output": (
+        "rotate",
+        "crop",
+        "max_size",
+        "exposure",
+        "seam",
+        "blend",
+        "interpolation",
+        "background",
+        "quality",
+        "plot",
+        "as_json",
+    ),
+    "Control": ("strict", "force", "dry_run", "cache", "max_memory", "workers", "seed", "verbose", "config", "help"),
+}
+_OTHERS = "Other options"
+
+
+class GroupedCommand(click.Command):
+    """A command whose help page shows its options in groups."""
+
+    def format_options(self, context: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the groups in their order, each with the options that this command has of it."""
+        rows: dict[str, list[tuple[int, tuple[str, str]]]] = {group: [] for group in (*_GROUPS, _OTHERS)}
+        for parameter in self.get_params(context):
+            record = parameter.get_help_record(context)
+            if record is not None:
+                group, rank = place_of(parameter.name or "")
+                rows[group].append((rank, record))
+        for group, found in rows.items():
+            if found:
+                with formatter.section(group):
+                    formatter.write_dl([record for _, record in sorted(found)])
+
+
+def place_of(name: str) -> tuple[str, int]:
+    """The group of an option, and its rank there."""
+    for group, names in _GROUPS.items():
+        if name in names:
+            return group, names.index(name)
+    return _OTHERS, 0
+
+
+@click.command("help", epilog="\b\nExamples:\n  rdstitch help\n  rdstitch help pano\n")
+@click.argument("commands", nargs=-1, metavar="[COMMAND]")
+@click.pass_context
+def help_command(context: click.Context, commands: Sequence[str]) -> None:
+    """Show the help of a command, or this page."""
+    root = context.find_root()
+    group = root.command
+    assert isinstance(group, click.Group)
+    if not commands:
+        click.echo(group.get_help(root))
+        return
+    command = group.get_command(root, commands[0])
+    if command is None or len(commands) > 1:
+        raise click.UsageError(f"there is no command {' '.join(commands)!r}", root)
+    click.echo(command.get_help(click.Context(command, info_name=commands[0], parent=root)))

@@ -1,0 +1,89 @@
+"""Types of options: how the text on the command line becomes a value, and what is said where it cannot."""
+
+import math
+import re
+from pathlib import Path
+from typing import Any, ClassVar
+
+import click
+
+
+class UserPath(click.Path):
+    """A file or folder; ``~`` at its beginning is the home folder, also where no shell has replaced it.
+
+    Whether a file can be read is for the library to find out: it knows more, and has an exit status for it.
+    """
+
+    def __init__(self, allow_dash: bool = False) -> None:
+        super().__init__(path_type=Path, readable=False, allow_dash=allow_dash)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Replace ``~`` and make a path; a file whose name begins with it is written ``./~name``."""
+        path = super().convert(value, param, ctx)
+        try:
+            return path.expanduser() if isinstance(path, Path) else path
+        except RuntimeError:  # there is no such user
+            return path
+
+
+class Angles(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
+    """Two angles in degrees, ``PSI,THETA``; the value is in radians."""
+
+    name = "PSI,THETA"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
+        """Parse the text."""
+        if isinstance(value, tuple):
+            return value[0], value[1]
+        try:
+            psi, theta = (math.radians(float(part)) for part in str(value).split(","))
+        except ValueError:
+            self.fail(f"{value!r} is not two angles in degrees like 2.5,-1", param, ctx)
+        if not (abs(psi) < math.pi / 2 and abs(theta) < math.pi / 2):
+            self.fail(f"{value!r}: a tilt lies between -90 and 90 degrees", param, ctx)
+        return psi, theta
+
+
+class FileOr(UserPath):
+    """A file, or a word that stands for something else; a file of that name is written ``./word``."""
+
+    def __init__(self, word: str) -> None:
+        super().__init__()
+        self.word = word
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Keep the word; of anything else, make a path."""
+        return value if value == self.word else super().convert(value, param, ctx)
+
+
+class Bytes(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
+    """An amount of memory like ``800M`` or ``1.5G``; the value is in bytes."""
+
+    name = "SIZE"
+    units: ClassVar[dict[str, int]] = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Parse the text."""
+        if isinstance(value, int):
+            return value
+        parts = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([KMGT]?)(?:i?B)?\s*", str(value), re.IGNORECASE)
+        amount = int(float(parts[1]) * self.units[parts[2].upper()]) if parts else 0
+        if amount < 1:
+            self.fail(f"{value!r} is no amount of memory like 800M or 2G", param, ctx)
+        return amount
+
+
+class Angle(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
+    """An angle in degrees that is not negative; the value is in radians."""
+
+    name = "DEG"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Parse the text."""
+        try:
+            angle = math.radians(float(value))
+        except ValueError:
+            angle = math.nan
+        if not 0.0 <= angle < math.inf:
+            self.fail(f"{value!r} is no angle in degrees like 0.5", param, ctx)
+        return angle

@@ -1,0 +1,143 @@
+"""What is seen on terminals: bars, the last line, help in groups, and encodings that know no λ."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+from rdstitch_cli.help_pages import place_of
+from rdstitch_cli.main import cli
+from rdstitch_cli.parameter_types import UserPath
+from rdstitch_cli.progress import Reporter
+from rdstitch_cli.terminal import spell_out
+
+from rdstitch.io import read_image
+from tests.cli.running import FAST, Run
+
+_RUN = "from rdstitch_cli.main import main; main()"
+
+
+def _process(*arguments: str | Path, **environment: str) -> "subprocess.CompletedProcess[bytes]":
+    locale = ("LC_", "LANG", "PYTHONUTF8")
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith(locale)}
+    return subprocess.run(
+        [sys.executable, "-c", _RUN, *arguments], capture_output=True, check=False, env={**inherited, **environment}
+    )
+
+
+def test_the_last_line_says_what_was_made(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    done = rdstitch("pano", *frames, "-o", tmp_path / "pano.png", *FAST)
+    width, height = read_image(tmp_path / "pano.png").pixels.shape[1::-1]
+    made = f"{tmp_path / 'pano.png'}: {width} x {height} pixels, 3 of 3 pictures, "
+    assert done.made.startswith(made)
+    assert re.fullmatch(r"λ = -0\.\d{4} ± 0\.\d{4}, \d+\.\d s", done.made[len(made) :])
+    assert "pixels" not in done.out
+    again = rdstitch("apply", tmp_path / "pano.png.json", "--images", frames[0].parent, "-o", tmp_path / "again.png")
+    assert f"again.png: {width} x {height} pixels, 3 of 3 pictures," in again.made
+    camera = rdstitch("calibrate", *frames, "-o", tmp_path / "camera.json", *FAST)
+    assert re.search(r"camera\.json: 3 of 3 pictures, λ = -0\.\d{4} ±", camera.made)
+    path = rdstitch("trajectory", *frames, "-o", tmp_path / "path.csv", *FAST)
+    assert "path.csv: 3 of 3 pictures" in path.made
+    straight = rdstitch("undistort", *frames, "-o", tmp_path / "straight", "--lambda", "-0.2")
+    assert "straight: 3 pictures undistorted" in straight.made
+
+
+def test_nothing_is_said_when_quiet_or_nothing_was_made(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    assert rdstitch("pano", *frames, "-o", tmp_path / "pano.png", "-q", *FAST).made == ""
+    assert rdstitch("pano", *frames, "-o", tmp_path / "dry.png", "--dry-run", *FAST).made == ""
+
+
+def test_the_bar_is_gone_before_lambda(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    with Reporter(0) as reporter:
+        reporter("compositing", 95, 100)
+        assert "compositing" in capfd.readouterr().err
+        reporter.finish()
+        left = capfd.readouterr().err
+        assert left.rstrip(" ").endswith("\r")  # wiped out
+
+
+def test_preview_is_small_and_leaves_what_is_given(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    done = rdstitch("pano", *frames, "-o", tmp_path / "small.png", "--preview", "--max-size", "200", "-j", "1")
+    assert done.status == 0
+    assert 190 <= max(read_image(tmp_path / "small.png").pixels.shape[:2]) <= 200
+
+
+def test_quality_makes_files_smaller(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    sizes = []
+    for quality in ("95", "40"):
+        file = tmp_path / f"q{quality}.jpg"
+        assert rdstitch("pano", *frames, "-o", file, "--quality", quality, *FAST).status == 0
+        sizes.append(file.stat().st_size)
+    assert sizes[1] < 0.5 * sizes[0]
+    assert rdstitch("pano", *frames, "-o", tmp_path / "q.jpg", "--quality", "0", *FAST).status == 2
+
+
+@pytest.mark.parametrize("name", sorted(set(cli.commands) - {"help"}))
+def test_every_option_has_a_place_and_at_most_ten_come_first(name: str) -> None:
+    places = {
+        parameter.name: place_of(parameter.name or "")[0]
+        for parameter in cli.commands[name].params
+        if isinstance(parameter, click.Option)
+    }
+    assert [option for option, place in places.items() if place == "Other options"] == []
+    first = [option for option, place in places.items() if place == "Options that matter first"]
+    assert 0 < len(first) <= 10
+    assert "output" in first
+
+
+def test_help_is_a_command_too(rdstitch: Run) -> None:
+    assert rdstitch("help").out == rdstitch("--help").out
+    assert rdstitch("help", "pano").out == rdstitch("pano", "--help").out
+    assert rdstitch("help", "stitch").status == 2
+    assert rdstitch("-V").out == rdstitch("--version").out
+
+
+@pytest.mark.parametrize(
+    "environment", [{"PYTHONIOENCODING": "cp1252"}, {"LANG": "C", "LC_ALL": "C", "PYTHONCOERCECLOCALE": "0"}]
+)
+def test_output_without_greek_letters(environment: dict[str, str], frames: list[Path], tmp_path: Path) -> None:
+    for name in ("pano", "calibrate", "trajectory"):
+        shown = _process(name, "--help", **environment)
+        assert (shown.returncode, shown.stderr) == (0, b"")
+        assert b"lambda" in shown.stdout or "λ".encode() in shown.stdout
+    done = _process("pano", *frames, "-o", tmp_path / "pano.png", *FAST, **environment, PYTHONUTF8="0")
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) < 0
+    last = done.stderr.splitlines()[-1]
+    assert b"lambda = -0." in last
+    assert last.endswith(b" s")
+
+
+def test_characters_are_spelled_out_and_bytes_stay() -> None:
+    def shown(text: str, encoding: str) -> bytes:
+        import codecs
+
+        codecs.register_error("rdstitch-test", spell_out)
+        return text.encode(encoding, "rdstitch-test")
+
+    assert shown("λ = -0.2 ± 0.1, ψ…", "ascii") == b"lambda = -0.2 +/- 0.1, psi..."
+    assert shown("λ = -0.2 ± 0.1, ψ…", "cp1252") == b"lambda = -0.2 \xb1 0.1, psi\x85"
+    assert shown("a\udcff\udcfeλ", "ascii") == b"a\xff\xfelambda"
+    assert shown("日", "cp1252") == b"\\u65e5"
+
+
+def test_tilde_is_the_home_folder_where_no_shell_saw_it(
+    rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    assert rdstitch("pano", *frames, "--output=~/pano.png", *FAST).status == 0
+    assert (tmp_path / "pano.png").exists()
+    assert UserPath().convert("~no-such-user/x", None, None) == Path("~no-such-user/x")
+
+
+def test_patterns_are_expanded_where_the_shell_leaves_them(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    pattern = str(frames[0].parent / "*.png")
+    done = rdstitch("pano", pattern, "-o", tmp_path / "pano.png", *FAST)
+    assert "3 of 3 pictures" in done.made
+    assert rdstitch("undistort", pattern, "-o", tmp_path / "straight", "--lambda", "-0.2").status == 0
+    assert len(list((tmp_path / "straight").iterdir())) == 3
