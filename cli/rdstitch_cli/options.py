@@ -194,10 +194,12 @@ preview = click.option(
 compositing = together(
     click.option(
         "--exposure",
-        type=click.Choice(["none", "gain", "blocks"]),
-        default="gain",
+        type=click.Choice(["none", "gain", "blocks", "balanced"]),
+        default="balanced",
         show_default=True,
-        help="Equal brightness: a gain per picture and one vignetting; blocks also evens out parts of pictures.",
+        help="Brightness: balanced leaves no step at seams, keeps every region near its own pictures' brightness and "
+        "clips nothing; gain makes the whole comparable (one factor per picture, one vignetting); blocks adds a "
+        "smooth field per picture to that.",
     ),
     click.option(
         "--seam",

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.camera import Camera
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.gain_compensation import Exposure
 from rdstitch.compositing.options import CompositeOptions
+from rdstitch.compositing.photometric import Exposure
 from rdstitch.compositing.preparation import OutputStrip, Progress, prepare
 from rdstitch.compositing.source_images import Preview, Source
 from rdstitch.io.layout import Layout
@@ -72,6 +72,7 @@ def compose(
     options: CompositeOptions | None = None,
     progress: Progress | None = None,
     previews: Sequence[Preview] | None = None,
+    exposures: Sequence[float | None] | None = None,
 ) -> Composite:
     """Put pictures together on a canvas, in memory.
 
@@ -91,6 +92,8 @@ def compose(
     previews : sequence of callables, optional
         Each reads one picture reduced by the factor that it is given, 2, 4 or 8, which for JPEG files is much faster;
         otherwise the whole pictures are read once more, for what is decided on small versions of them.
+    exposures : sequence of float or None, optional
+        Exposure of each picture as the camera wrote it down (time x sensitivity / f-number²), up to a common factor.
 
     Returns
     -------
@@ -105,7 +108,7 @@ def compose(
     LimitError
         When the memory limit is too low.
     """
-    with prepare(sources, cameras, homographies, canvas, options, progress, previews) as prepared:
+    with prepare(sources, cameras, homographies, canvas, options, progress, previews, exposures) as prepared:
         renderer, (width, height) = prepared.renderer, prepared.canvas.size
         pixels = np.zeros((height, width, renderer.channels), dtype=renderer.dtype)
         alpha = np.zeros((height, width), dtype=np.uint8)
@@ -129,6 +132,7 @@ def compose_to_file(
     progress: Progress | None = None,
     extra_tags: Callable[[Canvas], Iterable[ExtraTag]] | None = None,
     previews: Sequence[Preview] | None = None,
+    exposures: Sequence[float | None] | None = None,
 ) -> FileComposite:
     """Put pictures together straight into a file, whatever its size: memory is that of a strip of tiles.
 
@@ -137,7 +141,7 @@ def compose_to_file(
     path
         ``.tif`` (tiled, with overviews, BigTIFF where needed), ``.dzi`` (Deep Zoom), ``.png``, ``.jpg``, or ``.webp``
         (held in memory whole).
-    sources, cameras, homographies, canvas, options, progress, previews
+    sources, cameras, homographies, canvas, options, progress, previews, exposures
         As for :func:`compose`.
     metadata : Metadata, optional
         Colour profile, EXIF and resolution to keep.
@@ -159,7 +163,7 @@ def compose_to_file(
             covered += int(np.count_nonzero(alpha))
             yield samples, alpha
 
-    with prepare(sources, cameras, homographies, canvas, options, progress, previews) as prepared:
+    with prepare(sources, cameras, homographies, canvas, options, progress, previews, exposures) as prepared:
         renderer, size = prepared.renderer, prepared.canvas.size
         layout = Layout(
             size,

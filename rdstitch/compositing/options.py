@@ -6,7 +6,7 @@ from typing import Literal, get_args, get_type_hints
 
 from rdstitch.errors import ArgumentError
 
-Exposure = Literal["none", "gain", "blocks"]
+Exposure = Literal["none", "gain", "blocks", "balanced"]
 Seam = Literal["none", "voronoi", "graphcut"]
 Blend = Literal["none", "feather", "multiband"]
 Crop = Literal["none", "auto"]
@@ -23,9 +23,10 @@ class CompositeOptions:
         When a value is not one of those listed.
     """
 
-    # Brightness made equal, in linear light: "gain" one factor per picture and channel and one vignetting for all;
-    # "blocks" also a smooth field per picture; "none" for people who measure.
-    exposure: Exposure = "gain"
+    # Brightness: "balanced" makes pictures agree where they overlap, keeps every region near the brightness of its own
+    # pictures, and clips nothing; "gain" makes the whole comparable, with one factor per picture and channel and one
+    # vignetting for all; "blocks" adds a smooth field per picture to that; "none" for people who measure.
+    exposure: Exposure = "balanced"
     # Where one picture ends and the next begins: "graphcut" goes round what differs between them (parallax, people),
     # "voronoi" where their borders are equally far, "none" leaves it to the blending.
     seam: Seam = "graphcut"

@@ -15,12 +15,13 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.blender import margin
 from rdstitch.compositing.boxes import Box
+from rdstitch.compositing.brightness import estimate_exposure
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.crop import coverage_map, crop_box
-from rdstitch.compositing.gain_compensation import estimate_exposure, no_exposure
 from rdstitch.compositing.image_cache import PictureCache
 from rdstitch.compositing.image_parts import ShownPart, shown_parts
 from rdstitch.compositing.options import CompositeOptions
+from rdstitch.compositing.photometric import no_exposure
 from rdstitch.compositing.plan import CompositePlan, plan_composite
 from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seam_finder import find_seams
@@ -129,6 +130,7 @@ def prepare(
     options: CompositeOptions | None = None,
     progress: Progress | None = None,
     previews: Sequence[Preview] | None = None,
+    exposures: Sequence[float | None] | None = None,
 ) -> Iterator[Prepared]:
     """Decide on exposure, seams and cropping, from one small look at each picture; see :func:`compose`.
 
@@ -146,7 +148,8 @@ def prepare(
     with closing(pictures):
         same = no_exposure(len(cameras), channels)
         renderer = Renderer(warps, pictures, same, None, options, plan.bands, channels, dtype)
-        yield _decided(renderer, reader, cameras, matrices, canvas, plan, _part_of(progress, 0.0, _PREPARATION))
+        share = _part_of(progress, 0.0, _PREPARATION)
+        yield _decided(renderer, reader, cameras, matrices, canvas, plan, exposures, share)
 
 
 def _decided(
@@ -156,6 +159,7 @@ def _decided(
     homographies: FloatArray,
     canvas: Canvas,
     plan: CompositePlan,
+    exposures: Sequence[float | None] | None,
     progress: Progress | None,
 ) -> Prepared:
     """Decide for a renderer that knows of no exposure and no seams yet."""
@@ -169,7 +173,7 @@ def _decided(
         topmost = [index for index, warp in enumerate(warps) if warp.box[1] < plan.tile_size]
         renderer.pictures.prefetch(sorted(topmost, key=lambda index: warps[index].box))
         if options.exposure != "none":
-            exposure = estimate_exposure(survey, cameras, blocks=options.exposure == "blocks")
+            exposure = estimate_exposure(survey, cameras, options.exposure, exposures)
         if options.seam != "none":
             seams = find_seams(survey, exposure, options.seam == "graphcut", _part_of(progress, 0.7, 1.0))
             if options.blend == "feather":

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.blender import MultibandBlender, margin, rounding_constant, spread
 from rdstitch.compositing.boxes import Box, Float32Array, aligned, bounds, cut, grown, intersection, without
-from rdstitch.compositing.gain_compensation import Exposure, full_scale
 from rdstitch.compositing.image_cache import PictureCache
 from rdstitch.compositing.options import CompositeOptions
+from rdstitch.compositing.photometric import Exposure, full_scale
 from rdstitch.compositing.seam_finder import NOBODY, SeamMap
 from rdstitch.compositing.warp import (
     Geometry,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, Float32Array
-from rdstitch.compositing.gain_compensation import Exposure, full_scale
+from rdstitch.compositing.photometric import Exposure, full_scale
 from rdstitch.compositing.survey import Survey, SurveyTile
 from rdstitch.compositing.warp import locate
 from rdstitch.io.reduction import block_mean

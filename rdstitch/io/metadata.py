@@ -1,6 +1,7 @@
 """What a picture file says about itself: size, lens, place, attitude, camera; read without decoding pixels."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from rdstitch.io.xmp import finite, xmp_number, xmp_text
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _BIT_DEPTHS = {"1": 1, "I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
+_EXPOSURE_TAGS = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings)
 _ORIENTATION, _PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE = 0x0112, 0xA002, 0xA003, 0x927C
 
 
@@ -50,6 +52,8 @@ class Metadata:
     make, model, serial : str
         Of the camera; empty where not known.
     dpi : (float, float) or None
+    exposure : float or None
+        Exposure time x sensitivity / f-number²: what the samples' light is proportional to, for the same scene.
     exif : bytes
         EXIF block with orientation 1, without maker note and thumbnail; empty where there is none.
     icc_profile : bytes
@@ -67,6 +71,7 @@ class Metadata:
     model: str = ""
     serial: str = ""
     dpi: tuple[float, float] | None = None
+    exposure: float | None = None
     exif: bytes = b""
     icc_profile: bytes = b""
 
@@ -126,9 +131,20 @@ def metadata_of(image: Image.Image) -> Metadata:
         model=_text(exif.get(ExifTags.Base.Model)),
         serial=_text(photo.get(ExifTags.Base.BodySerialNumber)) or _text(exif.get(ExifTags.Base.CameraSerialNumber)),
         dpi=(float(dpi[0]), float(dpi[1])) if dpi and all(finite(d) for d in dpi) else None,
+        exposure=_exposure(photo),
         exif=_clean_exif(exif),
         icc_profile=image.info.get("icc_profile") or b"",
     )
+
+
+def _exposure(photo: Mapping[int, Any]) -> float | None:
+    """Exposure time x sensitivity / f-number²; without a number or a sensitivity, these are taken to be constant."""
+    time, aperture, speed = (photo.get(tag) for tag in _EXPOSURE_TAGS)
+    speed = speed[0] if isinstance(speed, tuple) and speed else speed
+    seconds, number, sensitivity = finite(time), finite(aperture or 1.0), finite(speed or 100.0)
+    if not (seconds and number and sensitivity and min(seconds, number, sensitivity) > 0.0):
+        return None
+    return seconds * sensitivity / number**2
 
 
 def _bit_depth(image: Image.Image) -> int:

@@ -114,11 +114,13 @@ def compose_pictures(
         channels = 1 if pixels.ndim == 2 else pixels.shape[2]
         return Composed(canvas, plan=plan_composite(cameras, canvas, options, channels, pixels.dtype.itemsize))
 
+    exposures = [source.metadata.exposure for source in sources]
+
     def told(share: float) -> None:
         progress("compositing", round(100 * share), 100)
 
     if output is None:
-        composite = compose(read, cameras, homographies, canvas, options, told, read)
+        composite = compose(read, cameras, homographies, canvas, options, told, read, exposures)
         return Composed(composite.canvas, composite, notes=composite.notes)
     matrices = np.asarray(homographies, dtype=np.float64)
     placed: list[tuple[Georeference | None, str]] = []
@@ -127,7 +129,9 @@ def compose_pictures(
         placed.append(georeference(positions, cameras, final.matrix @ matrices))
         return placed[0][0].tiff_tags() if placed[0][0] is not None else []
 
-    written = compose_to_file(output, read, cameras, matrices, canvas, options, sources[0].metadata, told, tags, read)
+    written = compose_to_file(
+        output, read, cameras, matrices, canvas, options, sources[0].metadata, told, tags, read, exposures
+    )
     place, note = placed[0]
     if place is not None and beside:
         place.write_beside(output)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, compose, compose_to_file, plan_canvas
 from rdstitch.compositing.crop import largest_rectangle
+from rdstitch.compositing.options import Exposure
 from rdstitch.compositing.preparation import prepare
 from rdstitch.compositing.source_images import Source
 from rdstitch.errors import ArgumentError, InputError, LimitError
@@ -63,6 +64,75 @@ def test_unequal_light_leaves_no_visible_seam(gamma: float, seed: int, exposure:
     assert sharpness(mine, truth, ok) > 0.95
     estimated = result.exposure.log_gain.mean(axis=1)
     assert np.std(estimated - np.log(gains) / gamma) < 0.03
+
+
+# A strip that gets darker from picture to picture, as automatic exposure leaves it over ground that gets brighter.
+DRIFT = np.exp(np.linspace(0.8, -0.8, 6) / 2.2)
+
+
+def _white(pixels: NDArray[Any]) -> float:
+    return float((pixels.max(axis=-1) == 255).mean())
+
+
+def test_brightness_stays_near_that_of_the_pictures() -> None:
+    """Ground that gets brighter from left to right, and a camera whose automatic exposure makes up for that."""
+    scene = render(6, 1, size=(300, 220), seed=6)
+    v, u = np.mgrid[:220, :300]
+    frames = []
+    for k, frame in enumerate(scene.frames):
+        along = scene.rendering.to_plane(k, np.stack([u, v], axis=-1))[..., 0] - scene.rendering.poses.position[k, 0]
+        brighter = np.exp(1.6 * along / scene.rendering.texture.size[0])[..., None]
+        frames.append(np.clip(np.rint(frame * brighter), 0, 255).astype(np.uint8))
+    sources: list[Source] = [partial(as_picture, frame) for frame in frames]
+    white, middle = {}, {}
+    choices: tuple[Exposure, ...] = ("gain", "balanced")
+    for choice in choices:
+        options = CompositeOptions(exposure=choice)
+        result = compose(sources, scene.cameras, scene.homographies, scene.canvas, options)
+        lit = result.pixels[result.alpha > 0]
+        white[choice], middle[choice] = _white(lit), float(np.median(lit))
+    inputs = np.concatenate([frame.reshape(-1, 3) for frame in frames])
+    assert white["gain"] > _white(inputs) + 0.02
+    assert white["balanced"] <= _white(inputs) + 0.005
+    assert middle["balanced"] == pytest.approx(float(np.median(inputs)), rel=0.07)
+
+
+def test_brightness_that_drifts_becomes_a_slope_without_steps() -> None:
+    scene = render(6, 1, size=(300, 220), seed=6)
+    grey_wall = [np.full_like(frame, round(110 * gain)) for frame, gain in zip(scene.frames, DRIFT, strict=True)]
+    sources: list[Source] = [partial(as_picture, frame) for frame in grey_wall]
+    row = {}
+    choices: tuple[Exposure, ...] = ("none", "gain", "balanced")
+    for choice in choices:
+        options = CompositeOptions(exposure=choice, blend="none")
+        result = compose(sources, scene.cameras, scene.homographies, scene.canvas, options)
+        row[choice] = result.pixels[result.pixels.shape[0] // 2, 30:-30, 0].astype(int)
+    largest = {choice: np.abs(np.diff(values)).max() for choice, values in row.items()}
+    assert largest["none"] > 12
+    assert largest["balanced"] <= 2
+    assert largest["gain"] <= 2
+    # Its ends are nearly as bright as those of the pictures, the whole no brighter than before.
+    own, even, mine = (np.log(values[0] / values[-1]) for values in row.values())
+    assert abs(even) < 0.1 * own
+    assert mine > 0.6 * own
+    assert np.median(row["balanced"]) == pytest.approx(110.0, rel=0.1)
+
+
+def test_a_clipped_sky_ends_in_no_step() -> None:
+    """One picture is burnt out where the other is not; beside the seam the two are equally bright."""
+    scene = render(2, 1, size=(320, 240), overlap=0.6, photometry=Photometry(gain=np.array([1.0, 1.0])), seed=8)
+    sky = [frame.copy() for frame in scene.frames]
+    sky[0][:100], sky[1][:100] = 255, 215
+    sources: list[Source] = [partial(as_picture, frame) for frame in sky]
+    steps = {}
+    choices: tuple[Exposure, ...] = ("gain", "balanced")
+    for choice in choices:
+        options = CompositeOptions(exposure=choice, blend="none", seam="voronoi")
+        result = compose(sources, scene.cameras, scene.homographies, scene.canvas, options)
+        row = grey(result.pixels)[60, 40:-40]
+        steps[choice] = float(np.abs(np.diff(row)).max())
+    assert steps["gain"] > 0.1
+    assert steps["balanced"] < 0.4 * steps["gain"]
 
 
 def test_vignetting_is_found() -> None:

@@ -1,0 +1,215 @@
+"""Brightness as a photographer would leave it: no step at any seam, and every region as bright as its own pictures.
+
+Gains alone make the whole comparable, and carry the automatic exposure of one end of a flight to the other, where
+bright ground is then burnt out. Here the correction of each picture is a smooth field instead of one factor: fields of
+overlapping pictures make up for the difference between them, are as even as that allows, and tend to leave the
+picture's own brightness alone (least squares over all pictures, a screened membrane). What is left over at low
+frequency, and skies that differ, get a soft transition in the same way.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
+from rdstitch.compositing.boxes import Box, cut, intersection
+from rdstitch.compositing.gain_compensation import estimate_gains
+from rdstitch.compositing.options import Exposure as ExposureChoice
+from rdstitch.compositing.photometric import Exposure, bilinear_weights, full_scale
+from rdstitch.compositing.survey import Survey, SurveyTile
+
+_NODES = 7  # along each side of a picture
+# Pictures are compared by the means of cells: so many along a picture that is not cut off.
+_CELLS = 16
+_DARKEST = 0.02
+# How well the means of a cell agree, log units, where nothing but light differs; what differs by more counts less.
+_CELL_SIGMA, _HUBER = 0.03, 1.345
+_ROUNDS = 5
+# How far a picture may stray from its own brightness, or, with gains that hold, from these (log units), and how much a
+# field may rise, and bend, from one side of a picture to the other. Brightness follows the pictures' own over a
+# distance of the first by the third, in pictures.
+_OWN_SIGMA, _GAIN_SIGMA = 0.02, 0.3
+_RISE_SIGMA, _BEND_SIGMA = 0.1, 0.5
+# Own brightness is that of a picture and its neighbours, weighted by a Gaussian of this standard deviation, in
+# pictures: what one picture alone is brighter by is to vanish.
+_NEIGHBOURHOOD = 0.3
+# From here on, as a share of the full range, brightened samples are compressed instead of clipped.
+_KNEE = 0.75
+_MEDIAN_SAMPLES, _MEDIAN_ROUNDS = 2000, 4
+
+
+def estimate_exposure(
+    survey: Survey,
+    cameras: Sequence[Camera],
+    choice: ExposureChoice = "balanced",
+    exposures: Sequence[float | None] | None = None,
+) -> Exposure:
+    """What makes pictures agree where they overlap, with the median brightness of the set kept.
+
+    Parameters
+    ----------
+    survey : Survey
+    cameras : sequence of Camera
+    choice : str
+        "gain": one factor per picture and channel, and one vignetting for all. "blocks": also a smooth field per
+        picture. "balanced": gains and fields that stay near the pictures' own brightness at large scale, and nothing
+        is clipped.
+    exposures : sequence of float or None, optional
+        See :func:`rdstitch.compositing.gain_compensation.estimate_gains`.
+    """
+    exposure = estimate_gains(survey, cameras, exposures)
+    cells = None if choice == "gain" else _compare(survey, exposure)
+    if cells is not None:
+        wanted, sigma = np.zeros_like(exposure.log_gain), _GAIN_SIGMA
+        if choice == "balanced":
+            wanted, sigma = -_brightness_around(survey, exposure.log_gain), _OWN_SIGMA
+        exposure = replace(exposure, fields=_fit_fields(cells, exposure, cameras, wanted, sigma))
+    if choice == "balanced" and any(t is not None and t.pixels.dtype.kind == "u" for t in survey.tiles):
+        exposure = replace(exposure, knee=_KNEE)
+    return _with_median_kept(exposure, survey, cameras)
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Cells that two pictures show: pictures (M,), measured px of the middle in either (M, 2), difference (M, C).
+
+    The difference is what the first picture is brighter by, log units.
+    """
+
+    first: NDArray[np.intp]
+    second: NDArray[np.intp]
+    point1: FloatArray
+    point2: FloatArray
+    difference: FloatArray
+
+
+def _compare(survey: Survey, exposure: Exposure) -> _Cells | None:
+    """Means of the cells of every overlap, clipped samples included: a burnt-out sky must not end in a step either."""
+    tiles = survey.tiles
+    found: list[tuple[Any, ...]] = []
+    for i, a in enumerate(tiles):
+        for j, b in enumerate(tiles[:i]):
+            if a is None or b is None or (box := intersection(a.box, b.box)) is None:
+                continue
+            seen = cut(a.inside, a.box, box) & cut(b.inside, b.box, box)
+            side = max(2, round(max(*seen.shape, *a.inside.shape, *b.inside.shape) / _CELLS))
+            count, x, y = _cell_means(seen, box, side)
+            means = [_cell_values(tile, box, seen, side) for tile in (a, b)]
+            good = (count > side**2 / 2) & (np.minimum(*means).min(axis=-1) > _DARKEST)
+            if good.any():
+                values = [np.log(mean[good] + exposure.offset) for mean in means]
+                points = [survey.warps[k].source_points(x[good], y[good]) for k in (i, j)]
+                pair = (np.full(len(points[0]), k, dtype=np.intp) for k in (i, j))
+                found.append((*pair, *points, values[0] - values[1]))
+    if not found:
+        return None
+    cells = [np.concatenate([entry[k] for entry in found]) for k in range(5)]
+    good = np.isfinite(cells[2]).all(axis=1) & np.isfinite(cells[3]).all(axis=1)
+    return _Cells(*(values[good] for values in cells))
+
+
+def _cell_means(seen: NDArray[np.bool_], box: Box, side: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Number of px that count in each cell of a box, and their mean place on the reduced canvas."""
+    count = _cell_sums(seen.astype(np.float64), side)
+    x, y = np.arange(box[0], box[2], dtype=np.float64), np.arange(box[1], box[3], dtype=np.float64)[:, None]
+    with np.errstate(invalid="ignore"):
+        return count, _cell_sums(seen * x, side) / count, _cell_sums(seen * y, side) / count
+
+
+def _cell_values(tile: SurveyTile, box: Box, seen: NDArray[np.bool_], side: int) -> FloatArray:
+    """Mean share of the full range in each cell, shape (m, n, C); NaN where nothing counts."""
+    pixels = cut(tile.pixels, tile.box, box).astype(np.float64) / full_scale(tile.pixels.dtype)
+    with np.errstate(invalid="ignore"):
+        mean = _cell_sums(pixels * seen[..., None], side) / _cell_sums(seen.astype(np.float64), side)[..., None]
+    return np.nan_to_num(mean)
+
+
+def _cell_sums(values: FloatArray, side: int) -> FloatArray:
+    """Sums over cells of ``side`` x ``side`` px; the last ones may be cut off."""
+    rows, columns = (np.arange(0, n, side) for n in values.shape[:2])
+    return np.asarray(np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1), dtype=np.float64)
+
+
+def _brightness_around(survey: Survey, log_gain: FloatArray) -> FloatArray:
+    """What each picture and its neighbours are brighter by than the average, (N, C)."""
+    boxes = np.array([(0, 0, 0, 0) if tile is None else tile.box for tile in survey.tiles], dtype=np.float64)
+    centers, present = (boxes[:, :2] + boxes[:, 2:]) / 2.0, np.array([tile is not None for tile in survey.tiles])
+    size = float(np.median(np.sqrt(np.prod(boxes[present, 2:] - boxes[present, :2], axis=1))))
+    distance = np.linalg.norm(centers[:, None] - centers, axis=-1) / (_NEIGHBOURHOOD * size)
+    weight = np.exp(-0.5 * distance**2) * present
+    return np.asarray(weight @ log_gain / np.maximum(weight.sum(axis=1), 1e-12)[:, None])
+
+
+def _fit_fields(
+    cells: _Cells, exposure: Exposure, cameras: Sequence[Camera], wanted: FloatArray, sigma: float
+) -> FloatArray:
+    """Fields (N, B, B, C), beside gains and vignetting, by iteratively reweighted least squares.
+
+    ``wanted`` (N, C) is what they tend to, within ``sigma``.
+    """
+    count, channels = exposure.log_gain.shape
+    signed = ((1.0, cells.first, cells.point1), (-1.0, cells.second, cells.point2))
+    left = cells.difference - exposure.log_gain[cells.first] + exposure.log_gain[cells.second]
+    columns, entries = np.empty((len(left), 8), dtype=np.intp), np.empty((len(left), 8))
+    for part, (sign, picture, points) in enumerate(signed):
+        place = np.s_[4 * part : 4 * part + 4]
+        for k in np.unique(picture):
+            chosen = picture == k
+            nodes, shares = bilinear_weights(cameras[k], points[chosen], _NODES)
+            columns[chosen, place], entries[chosen, place] = k * _NODES**2 + nodes, sign * shares
+            # Only the vignetting: there are no fields yet.
+            left[chosen] -= sign * exposure.smooth_part(int(k), cameras[k], points[chosen])
+    rows = np.repeat(np.arange(len(left)), 8)
+    design = sparse.csr_array((entries.ravel(), (rows, columns.ravel())), shape=(len(left), count * _NODES**2))
+    even, near = _field_prior(sigma)
+    prior = sparse.csr_array(sparse.kron(sparse.eye_array(count), even + near))
+    expected = sparse.kron(sparse.eye_array(count), near) @ np.repeat(wanted, _NODES**2, axis=0)
+    weight = np.ones(len(left))
+    for _ in range(_ROUNDS):
+        weighted = (sparse.diags_array(weight / _CELL_SIGMA**2) @ design).T
+        solution = splu(sparse.csc_array(weighted @ design + prior)).solve(weighted @ left + expected)
+        residual = np.abs(left - design @ solution).mean(axis=1)
+        weight = 1.0 / np.maximum(1.0, residual / (_HUBER * _CELL_SIGMA))
+    return np.asarray(solution.reshape(count, _NODES, _NODES, channels), dtype=np.float64)
+
+
+def _field_prior(sigma: float) -> tuple[sparse.csr_array, sparse.csr_array]:
+    """Precision of one picture's nodes: fields rise and bend little; and are near to what is wanted."""
+    n, one = _NODES, sparse.eye_array(_NODES)
+    rise = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(n - 1, n)) * (n - 1)
+    bend = sparse.diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(n - 2, n)) * (n - 1) ** 2
+    total: Any = sparse.csr_array((n * n, n * n))
+    for step, size in ((rise, _RISE_SIGMA), (bend, _BEND_SIGMA)):
+        for both in (sparse.kron(step, one), sparse.kron(one, step)):
+            total = total + both.T @ both / (size**2 * both.shape[0])
+    return sparse.csr_array(total), sparse.csr_array(sparse.eye_array(n * n) / (sigma**2 * n * n))
+
+
+def _with_median_kept(exposure: Exposure, survey: Survey, cameras: Sequence[Camera]) -> Exposure:
+    """Gains with a common factor that leaves the median of all samples where it was."""
+    values, logs = [], []
+    for index, tile in enumerate(survey.tiles):
+        if tile is None:
+            continue
+        where = np.flatnonzero(tile.inside)
+        where = where[:: max(1, len(where) // _MEDIAN_SAMPLES)]
+        y, x = (axis.astype(np.float64) for axis in np.unravel_index(where, tile.inside.shape))
+        points = survey.warps[index].source_points(x + tile.box[0], y + tile.box[1])
+        pixels = tile.pixels.reshape(-1, tile.pixels.shape[2])[where].astype(np.float64)
+        values.append(pixels / full_scale(tile.pixels.dtype))
+        logs.append(exposure.log_gain[index] + exposure.smooth_part(index, cameras[index], points))
+    if not values:
+        return exposure
+    value, log = np.concatenate(values) + exposure.offset, np.concatenate(logs)
+    known = np.isfinite(log).all(axis=1)
+    value, log = value[known], log[known]
+    target, common = float(np.median(value.mean(axis=1))), 0.0
+    for _ in range(_MEDIAN_ROUNDS):
+        common += float(np.log(np.median((value * np.exp(-log - common)).mean(axis=1)) / target)) if target > 0 else 0.0
+    return replace(exposure, log_gain=exposure.log_gain + common)

@@ -1,0 +1,165 @@
+"""The photometric model: by what the samples of each picture are multiplied, so that all look exposed alike.
+
+Light ``L`` gives the sample ``v = full ((1 + b) L^(1/p) - b)``: sRGB above its toe for ``b`` = 0.055, any power law,
+and so also raw light, for ``b`` = 0. A factor on the light is then a factor ``q`` on ``v + b``, whatever the power, and
+
+    log(v + b) = log q_i + a1 r² + a2 r⁴ + a3 r⁶ + f_i(u, v) + log(light of that point of the plane)
+
+is linear in all unknowns: ``q_i`` per picture and channel, the vignetting ``a`` of the lens over the distance r from
+the distortion centre, and a smooth field ``f_i`` per picture.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
+from rdstitch.compositing.boxes import Float32Array
+from rdstitch.compositing.lattice import LATTICE_STEPS, interpolated
+from rdstitch.compositing.warp import Geometry
+
+# The correction is smooth: it is computed at this spacing, canvas px, and interpolated.
+_LATTICE = LATTICE_STEPS[0]
+_ROWS = 128  # that are corrected at a time
+_DEPTHS = {"uint8": cv2.CV_8U, "uint16": cv2.CV_16U, "float32": cv2.CV_32F}
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """What every picture's samples are multiplied by: ``v' = q (v + b) - b``.
+
+    Attributes
+    ----------
+    offset : float
+        ``b``, share of the full range.
+    log_gain : ndarray of shape (N, C)
+        log of what picture i is brighter by than the average.
+    vignetting : ndarray of shape (3,)
+        Coefficients of r², r⁴, r⁶ in log(v + b); r in half diagonals from the distortion centre.
+    fields : ndarray of shape (N, B, B, C), or (N, 0, 0, C)
+        Smooth remainder on a grid over each picture (rows, columns), log of what the picture is brighter by there.
+    knee : float
+        Share of the full range from which brightened samples are compressed, so that full scale stays full scale and
+        nothing else gets there; 1: they are clipped.
+    rms_before, rms_after : float
+        Robust difference between overlapping pictures, share of the full range.
+    """
+
+    offset: float
+    log_gain: FloatArray
+    vignetting: FloatArray = field(default_factory=lambda: np.zeros(3))
+    fields: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0, 0)))
+    knee: float = 1.0
+    rms_before: float = 0.0
+    rms_after: float = 0.0
+
+    def smooth_part(self, index: int, camera: Camera, points: FloatArray) -> FloatArray:
+        """Vignetting and field at measured px (..., 2), log units, shape (..., 1) or (..., C)."""
+        r2 = squared_radius(camera, points)
+        log = (r2 * (self.vignetting[0] + r2 * (self.vignetting[1] + r2 * self.vignetting[2])))[..., None]
+        if self.fields.size:
+            nodes, shares = bilinear_weights(camera, points, self.fields.shape[1])
+            values = self.fields[index].reshape(-1, self.fields.shape[3])
+            log = log + (values[nodes] * shares[..., None]).sum(axis=-2)
+        return np.asarray(log, dtype=np.float64)
+
+    def correct(self, index: int, geometry: Geometry, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Resampled pixels (h, w, C) of picture ``index``, as if all were exposed alike.
+
+        In the type of the pixels. Depends, px by px, on nothing but the px: every box gives the same, bit for bit.
+        """
+        gain = np.exp(-self.log_gain[index]).astype(np.float32)
+        if not (self.vignetting.any() or self.fields.size):
+            return pixels if (gain == 1).all() else self._apply(pixels, [gain], [self._compression(gain)])
+        nodes = self._smooth_nodes(index, geometry) * gain
+        factors, rates = (
+            [interpolated(values[..., k], geometry.box, _LATTICE) for k in range(len(gain))] if values.any() else []
+            for values in (nodes, self._compression(nodes))
+        )
+        return self._apply(pixels, factors, rates)
+
+    def _apply(self, pixels: NDArray[Any], factors: list[Any], rates: list[Any]) -> NDArray[Any]:
+        """``q (v + b) - b``, compressed above the knee; one array for all channels, or one plane a channel."""
+        full = np.float32(full_scale(pixels.dtype))
+        offset, knee = np.float32(self.offset) * full, np.float32(self.knee) * full
+        depth = _DEPTHS[pixels.dtype.name]
+        done = np.empty_like(pixels)
+        flat = done.reshape(len(done), -1)
+
+        def part(arrays: list[Any], rows: slice) -> Any:
+            # Planes are joined by OpenCV: numpy is slow along an axis of three.
+            return arrays[0] if arrays[0].ndim == 1 else _joined([plane[rows] for plane in arrays])
+
+        # A few rows at a time: what is computed in between stays in the processor's cache.
+        for top in range(0, len(pixels), _ROWS):
+            rows = slice(top, top + _ROWS)
+            values: Any = pixels[rows] + offset
+            values *= part(factors, rows)
+            if self.knee >= 1.0 or not rates:
+                # Rounded and clipped to the type; the stubs know no scalars.
+                cv2.subtract(values.reshape(len(values), -1), float(offset), flat[rows], dtype=depth)  # type: ignore[call-overload]
+                continue
+            values -= offset
+            excess = np.maximum(values - knee, np.float32(0.0))
+            values -= excess
+            rate = part(rates, rows) * (np.float32(1.0) / full)
+            values += excess / (np.float32(1.0) + rate * excess)
+            cv2.subtract(values.reshape(len(values), -1), 0.0, flat[rows], dtype=depth)  # type: ignore[call-overload]
+        return done
+
+    def _compression(self, gain: Float32Array) -> Float32Array:
+        """How fast samples above the knee approach full scale: what is full scale before the gain stays so after it.
+
+        ``w`` above the knee becomes ``w / (1 + c w)``; 0 where the gain does not brighten.
+        """
+        if self.knee >= 1.0:
+            return np.zeros_like(gain)
+        white = np.maximum(gain * np.float32(1.0 + self.offset) - np.float32(self.offset), np.float32(1.0))
+        rate = (white - 1) / (np.float32(1.0 - self.knee) * (white - np.float32(self.knee)))
+        return np.asarray(rate, dtype=np.float32)
+
+    def _smooth_nodes(self, index: int, geometry: Geometry) -> Float32Array:
+        """What vignetting and field are made up for by, at nodes around a box (m, n, 1 or C)."""
+        camera = geometry.warp.camera
+        width, height = camera.image_size
+        points = geometry.lattice.nodes(geometry.box, _LATTICE).astype(np.float64)
+        # Outside the picture only mirrored content is corrected; the model must not run away there.
+        points = np.clip(points, -0.5, (width - 0.5, height - 0.5))
+        return np.exp(-self.smooth_part(index, camera, points)).astype(np.float32)
+
+
+def no_exposure(count: int, channels: int) -> Exposure:
+    """Leaves every sample as it is."""
+    return Exposure(0.0, np.zeros((count, channels)))
+
+
+def full_scale(dtype: np.dtype[Any]) -> float:
+    """Largest sample; 1 for floating point."""
+    return float(np.iinfo(dtype).max) if dtype.kind == "u" else 1.0
+
+
+def squared_radius(camera: Camera, points: FloatArray) -> FloatArray:
+    """Squared distance from the distortion centre, half diagonals."""
+    return np.asarray((camera.normalize(points) ** 2).sum(axis=-1), dtype=np.float64)
+
+
+def bilinear_weights(camera: Camera, points: FloatArray, side: int) -> tuple[NDArray[np.intp], FloatArray]:
+    """Interpolation on a grid of ``side`` x ``side`` nodes over a picture: four nodes (..., 4) and their shares."""
+    width, height = camera.image_size
+    place = (np.asarray(points) + 0.5) / (width, height) * (side - 1)
+    place = np.clip(place, 0.0, side - 1.0)
+    cell = np.minimum(place.astype(np.intp), side - 2)
+    x, y = np.moveaxis(place - cell, -1, 0)
+    node = cell[..., 1] * side + cell[..., 0]
+    nodes = np.stack([node, node + 1, node + side, node + side + 1], axis=-1)
+    return nodes, np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=-1)
+
+
+def _joined(planes: list[Float32Array]) -> Float32Array:
+    """Planes (h, w) as one array (h, w, C)."""
+    joined = np.asarray(cv2.merge(planes), dtype=np.float32)
+    return joined.reshape(*planes[0].shape, len(planes))
