@@ -1,0 +1,117 @@
+"""Whether pictures are aligned locally, and how: decided by matches that are held out of the fit."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
+from rdstitch.local_alignment.field import DisplacementField
+from rdstitch.local_alignment.fit import Stiffness, fit_fields, picture_fields
+from rdstitch.local_alignment.matches import Match, PlaneMatches, place_matches, plane_scale
+
+Choice = Literal["auto", "off"] | int
+
+_CELLS = 12
+# The stiffest fields first: they are taken unless freer ones are better by a share that matters.
+_SLOPES = (0.005, 0.02, 0.06)
+_HELD_OUT = 5  # every so many-th match
+# Share by which held-out residuals must get smaller for local alignment to be worth while, and for freer fields.
+_WORTHWHILE, _BETTER = 0.15, 0.03
+_FEWEST_MATCHES = 100
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Residuals of matches that took no part in a fit, px of the median picture: median and 95 %."""
+
+    median: float
+    percentile95: float
+
+    @classmethod
+    def of(cls, residual: FloatArray) -> "HeldOut":
+        """From residuals (M, 2)."""
+        length = np.linalg.norm(residual, axis=1)
+        return cls(float(np.median(length)), float(np.percentile(length, 95)))
+
+
+@dataclass(frozen=True)
+class LocalAlignment:
+    """What local alignment found.
+
+    Attributes
+    ----------
+    fields : tuple of DisplacementField
+        One a picture; empty where pictures are not aligned locally.
+    reason : str
+        Why they are, or are not.
+    cells : int
+        Of the grid along the longer side of a picture; 0 without fields.
+    before, after : HeldOut or None
+        Residuals of held-out matches without and with fields; None where nothing was tried.
+    """
+
+    fields: tuple[DisplacementField, ...]
+    reason: str
+    cells: int = 0
+    before: HeldOut | None = None
+    after: HeldOut | None = None
+
+
+def no_local_alignment(reason: str) -> LocalAlignment:
+    """Pictures stay where the alignment puts them."""
+    return LocalAlignment((), reason)
+
+
+def align_locally(
+    matches: Sequence[Match], cameras: Sequence[Camera], homographies: FloatArray, choice: Choice = "auto"
+) -> LocalAlignment:
+    """Smooth displacement fields that bring matches of overlapping pictures together.
+
+    Parameters
+    ----------
+    matches : sequence of Match
+        Putative matches of all pairs, right and wrong; ``image1`` and ``image2`` count the cameras.
+    cameras : sequence of Camera
+    homographies : ndarray of shape (N, 3, 3)
+        Undistorted coordinates, in half diagonals, to the plane.
+    choice : "auto", "off" or int
+        "auto": only where matches that are held out of the fit come nearer by 15 % or more. A number: always, with so
+        many cells along the longer side of a picture.
+
+    Returns
+    -------
+    LocalAlignment
+    """
+    if choice == "off":
+        return no_local_alignment("switched off")
+    scale = plane_scale(cameras, homographies)
+    placed = place_matches(matches, cameras, homographies, scale)
+    if placed is None or len(placed) < _FEWEST_MATCHES:
+        return no_local_alignment("there are too few matches")
+    cells = _CELLS if choice == "auto" else choice
+    held_out = np.arange(len(placed)) % _HELD_OUT == 0
+    stiffness, before, after = _choose(placed.take(~held_out), placed.take(held_out), cameras, cells)
+    text = f"matches held out of the fit: {before.median:.2f} px apart without, {after.median:.2f} px with it"
+    if choice == "auto" and after.median > (1.0 - _WORTHWHILE) * before.median:
+        return LocalAlignment((), f"not worth while; {text}", 0, before, after)
+    fields = picture_fields(fit_fields(placed, cameras, stiffness), cameras, homographies, scale)
+    return LocalAlignment(fields, text, cells, before, after)
+
+
+def _choose(
+    fitted: PlaneMatches, held_out: PlaneMatches, cameras: Sequence[Camera], cells: int
+) -> tuple[Stiffness, HeldOut, HeldOut]:
+    """The stiffness that held-out matches like best, and their residuals without and with it."""
+    before = HeldOut.of(held_out.residual)
+    best, after = Stiffness(cells, _SLOPES[0]), before
+    for k, slope in enumerate(_SLOPES):
+        stiffness = Stiffness(cells, slope)
+        found = HeldOut.of(fit_fields(fitted, cameras, stiffness).residual(cameras, held_out))
+        if k == 0 or found.median < (1.0 - _BETTER) * after.median:
+            best, after = stiffness, found
+        else:
+            break
+    return best, before, after

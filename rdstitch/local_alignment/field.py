@@ -1,0 +1,110 @@
+"""A smooth displacement field over one picture: a bicubic spline through displacements on a coarse grid."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from rdstitch.arrays import FloatArray
+from rdstitch.errors import ArgumentError
+
+_DECIMALS = 3  # px; what a sidecar stores is what was used
+
+
+@dataclass(frozen=True, eq=False)
+class DisplacementField:
+    """Displacements of one picture.
+
+    What the alignment expects at the measured px ``q`` is at ``q + field(q)``.
+
+    Attributes
+    ----------
+    image_size : (int, int)
+        Width and height of the picture, px.
+    values : ndarray of shape (m, n, 2)
+        Displacement, px, at nodes that are spread evenly from the first to the last px of each row and column, m rows
+        of n.
+    """
+
+    image_size: tuple[int, int]
+    values: FloatArray
+
+    def __post_init__(self) -> None:
+        """Check the shape."""
+        if self.values.ndim != 3 or self.values.shape[2] != 2 or min(self.values.shape[:2]) < 2:
+            raise ArgumentError(
+                f"a displacement field has shape (m, n, 2), m and n at least 2, not {self.values.shape}"
+            )
+        if not np.isfinite(self.values).all():
+            raise ArgumentError("displacements must be finite")
+
+    @classmethod
+    def of(cls, image_size: tuple[int, int], values: FloatArray) -> Self:
+        """A field with values rounded as a sidecar stores them."""
+        return cls(image_size, np.round(values, _DECIMALS) + 0.0)
+
+    def __call__(self, points: FloatArray) -> FloatArray:
+        """Displacement (..., 2) at measured px (..., 2); outside the picture that of its border, 0 at NaN."""
+        place = np.moveaxis(self._grid_coordinates(points), -1, 0)[::-1]
+        return np.stack([ndimage.map_coordinates(c, place, order=3, mode="mirror", prefilter=False)
+                         for c in self._coefficients], axis=-1)  # fmt: skip
+
+    def resized(self, image_size: tuple[int, int]) -> "DisplacementField":
+        """The same for a picture of another size that shows the same."""
+        ratio = np.array(image_size, dtype=np.float64) / self.image_size
+        return DisplacementField(image_size, self.values * ratio)
+
+    @cached_property
+    def largest(self) -> float:
+        """Length of the largest displacement of a node, px."""
+        return float(np.linalg.norm(self.values, axis=-1).max())
+
+    @cached_property
+    def steepest(self) -> float:
+        """Largest change of the displacement per px, between nodes; from 1 on a picture may fold."""
+        spacing = (np.array(self.image_size) - 1.0) / (self.values.shape[1] - 1, self.values.shape[0] - 1)
+        across = np.linalg.norm(np.diff(self.values, axis=1), axis=-1) / spacing[0]
+        down = np.linalg.norm(np.diff(self.values, axis=0), axis=-1) / spacing[1]
+        return float(max(across.max(), down.max()))
+
+    @cached_property
+    def _coefficients(self) -> list[FloatArray]:
+        return [ndimage.spline_filter(self.values[..., k], order=3, mode="mirror") for k in (0, 1)]
+
+    def _grid_coordinates(self, points: FloatArray) -> FloatArray:
+        """Column and row (..., 2) in units of the grid, within it."""
+        last = np.array([self.values.shape[1] - 1, self.values.shape[0] - 1])
+        place = np.asarray(points, dtype=np.float64) * (last / (np.array(self.image_size) - 1.0))
+        return np.clip(np.nan_to_num(place), 0.0, last)
+
+
+def bilinear(
+    points: FloatArray, image_size: tuple[int, int], shape: Sequence[int]
+) -> tuple[NDArray[np.intp], FloatArray]:
+    """Nodes (N, 4) around measured px (N, 2), counted row by row, and their shares (N, 4)."""
+    rows, columns = shape
+    last = np.array([columns - 1, rows - 1])
+    place = np.clip(points * (last / (np.array(image_size) - 1.0)), 0.0, last)
+    cell = np.minimum(place.astype(np.intp), last - 1)
+    x, y = (place - cell).T
+    node = cell[:, 1] * columns + cell[:, 0]
+    nodes = np.stack([node, node + 1, node + columns, node + columns + 1], axis=1)
+    return nodes, np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=1)
+
+
+def grid_shape(image_size: tuple[int, int], cells: int) -> tuple[int, int]:
+    """Rows and columns of nodes with ``cells`` cells along the longer side, nearly square."""
+    spacing = max(image_size) / cells
+    columns, rows = (max(3, round(side / spacing) + 1) for side in image_size)
+    return rows, columns
+
+
+def node_points(image_size: tuple[int, int], shape: Sequence[int]) -> FloatArray:
+    """Measured px (m n, 2) of the nodes, row by row."""
+    rows, columns = shape
+    x, y = np.linspace(0, image_size[0] - 1, columns), np.linspace(0, image_size[1] - 1, rows)
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
