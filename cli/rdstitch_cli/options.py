@@ -17,7 +17,7 @@ Decorator = Callable[[Command], Command]
 FEATURES = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk", "aliked")
 SOLVERS = ("auto", "two-point", "three-point", "three-point-similarity", "four-point", "five-point")
 LENSES = ("auto", "division", "division-center", "division2", "division3")
-MODELS = ("auto", "rigid", "similarity", "tilting", "homography")
+MODELS = ("auto", "rigid", "similarity", "tilting", "pose", "homography")
 
 PICTURE = UserPath()
 

@@ -16,7 +16,8 @@ from rdstitch.alignment.bundle_adjustment import (
 )
 from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.initialization import adjust_pairs_independently
-from rdstitch.alignment.motion_models import HOMOGRAPHY, PSI, SIMILARITY, THETA, Model
+from rdstitch.alignment.metric_upgrade import metric_upgrade
+from rdstitch.alignment.motion_models import HOMOGRAPHY, POSE, PSI, SIMILARITY, THETA, Model
 from rdstitch.alignment.normal_equations import robust_cost
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
@@ -31,6 +32,9 @@ _LONG_CHAIN = 60
 
 _TRIAL_LINKS, _TRIAL_MATCHES = 30, 40
 """What the tilts to start from are tried on."""
+
+POSE_TILT_SPREAD = math.radians(35.0)
+"""Of pictures of which nothing is known: half of the tilts lie below 40 degrees."""
 
 _TILT_SPREAD_START = math.radians(3.0)
 _TILT_SPREAD_LEAST = math.radians(0.05)
@@ -158,7 +162,9 @@ class Problem:
         if not others and not model.shared_names and self.count > _LONG_CHAIN:
             others = [self.fit(SIMILARITY)]
         starts = [self._taken_over(model, other) for other in others]
-        if not (others and self._tilts_are_free(model)):
+        if model is POSE:
+            starts.append(self._upgraded())
+        elif not (others and self._tilts_are_free(model)):
             starts.append(self._chained(model, others))
         return self.refine(model, self._nearest(model, starts))
 
@@ -168,6 +174,8 @@ class Problem:
 
     def refine(self, model: Model, start: Parameters, tilt_spread: float | None = None) -> Fit:
         """Adjust a model from a given start."""
+        if model is POSE and self.knowledge.attitudes_std is None:
+            return Fit(model, self._run(model, start, POSE_TILT_SPREAD), self.free_lens, POSE_TILT_SPREAD)
         if not self._tilts_are_free(model) or self.knowledge.attitudes_std is not None:
             spread = self.knowledge.attitudes_std or 0.0
             own = spread if self._tilts_are_free(model) else 0.0
@@ -214,6 +222,15 @@ class Problem:
         origin = model.origins(shared, attitudes[[tree.root]])[0]
         chained = tree.chained(homographies, o.image1, origin)
         return Parameters(model.poses_from(chained, shared, attitudes), shared, lens)
+
+    def _upgraded(self) -> Parameters:
+        """Chained homographies with the metric of the plane that makes them pictures of one camera."""
+        o, prior = self.observations, self.knowledge
+        tree = spanning_tree(self.count, o.image1, o.image2, self.trust, self.reference)
+        chained = tree.chained(self.homographies, o.image1, np.eye(3))
+        upgraded = metric_upgrade(chained, tree.root, prior.log_focal, prior.log_focal_std)
+        shared = POSE.shared_from(np.array([*upgraded.tilt, upgraded.log_focal]))
+        return Parameters(upgraded.poses, shared, self.lens)
 
     def _planar_apart(self, model: Model, others: Sequence[Fit]) -> BundleAdjustmentResult:
         """Every link on its own, from the tilt of another planar model or the best of several."""

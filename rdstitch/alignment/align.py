@@ -46,7 +46,7 @@ class AlignmentOptions:
     reference : int, optional
         The picture that defines the plane's frame; the centre of the match graph if not given.
     model : str
-        "rigid", "similarity", "tilting", "homography", or "auto": the least free one that the data allow.
+        "rigid", "similarity", "tilting", "pose", "homography", or "auto": the least free one that the data allow.
     lens_known : bool
         Whether the lens is that of the cameras; estimated otherwise.
     tilt : (float, float), optional
@@ -118,8 +118,10 @@ class AlignmentOptions:
         """Models to be tried, from the least to the most free."""
         if self.model != "auto":
             return [self.model]
-        exact = self.attitudes is not None and self.attitudes_std == 0.0
-        return [name for name in MODELS if not (exact and name == "tilting")]
+        # Measured attitudes say how far tilts may be from them; exact ones leave nothing of the tilts open.
+        measured, exact = self.attitudes is not None, self.attitudes is not None and self.attitudes_std == 0.0
+        without = {"tilting": exact, "pose": measured}
+        return [name for name in MODELS if not without.get(name, False)]
 
 
 def align(

@@ -12,10 +12,11 @@ model      per picture                                     picture
 rigid      φ, tx, ty                                       robot: tilt and height stay (Valtonen Örnhag et al.)
 similarity φ, tx, ty, log h                                drone that climbs and sinks
 tilting    φ, tx, ty, log h, δψ, δθ                        drone in wind: small tilts of its own
+pose       φ, tx, ty, log h, δψ, δθ                        kite, hand: any pose of one camera, six degrees of freedom
 homography 8                                               any motion, any camera
 ========== =============================================== ===================================================
 
-The first three share the tilt (ψ, θ) and the focal length:
+All but the last share the tilt (ψ, θ) and the focal length:
 ``P_i = diag(f, f, 1) Rx(ψ + δψ_i) Ry(θ + δθ_i) Rz(φ_i) diag(1, 1, h_i) T(t_i)``, ``T = I - t e3'``.
 
 The pictures see ψ/f, θ/f and f t far better than f itself. The adjustment therefore moves those; otherwise it would
@@ -294,6 +295,7 @@ def _unit_determinant(matrices: FloatArray) -> FloatArray:
 RIGID = PlanarModel("rigid", (YAW, X, Y))
 SIMILARITY = PlanarModel("similarity", (YAW, X, Y, LOG_HEIGHT))
 TILTING = PlanarModel("tilting", (YAW, X, Y, LOG_HEIGHT, PSI, THETA))
+POSE = PlanarModel("pose", (YAW, X, Y, LOG_HEIGHT, PSI, THETA))
 HOMOGRAPHY = HomographyModel()
-MODELS: dict[str, Model] = {model.name: model for model in (RIGID, SIMILARITY, TILTING, HOMOGRAPHY)}
+MODELS: dict[str, Model] = {model.name: model for model in (RIGID, SIMILARITY, TILTING, POSE, HOMOGRAPHY)}
 """The family by name, from the least to the most free."""

@@ -105,7 +105,7 @@ class Alignment:
     reference : int
         The picture that defines the plane's frame.
     model : str
-        "rigid", "similarity", "tilting" or "homography".
+        "rigid", "similarity", "tilting", "pose" or "homography".
     model_reason : str
         Why this model was taken.
     poses : Poses or None

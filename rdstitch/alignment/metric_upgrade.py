@@ -1,0 +1,112 @@
+"""From homographies of a plane to poses of one camera: planar self-calibration (Triggs, ECCV 1998).
+
+Homographies between pictures leave the plane's metric open. In the camera of the reference picture the plane has a
+normal, two angles; with it and the focal length f every plane-to-picture homography becomes ``diag(f, f, 1) [a b c]``
+with ``a`` and ``b`` orthogonal and of the same length. These two conditions a picture give normal and f. They are few
+unknowns, so all of them are tried on a grid, from which the adjustment finds the minimum.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y, inverses
+from rdstitch.arrays import FloatArray
+from rdstitch.planar_motion import rotation_from_tilt, tilt_from_normal
+
+_LARGEST_TILT = math.radians(75.0)
+_TILT_STEPS = 31
+"""Five degrees a step, less than the adjustment bridges."""
+
+_FOCAL_RANGE = np.linspace(-1.5, 1.5, 7)
+"""Standard deviations of the prior on log f."""
+
+_OUTLYING = 0.3
+"""Error of the two conditions, relative, beyond which all errors count alike."""
+
+
+@dataclass(frozen=True)
+class MetricPoses:
+    """Poses of one camera.
+
+    Attributes
+    ----------
+    poses : ndarray of shape (N, 6)
+        In the columns of the planar models; tilts are those of the pictures less the shared one.
+    tilt : ndarray of shape (2,)
+        Shared (ψ, θ), radians: the median.
+    log_focal : float
+        Of the focal length in half diagonals.
+    """
+
+    poses: FloatArray
+    tilt: FloatArray
+    log_focal: float
+
+
+def metric_upgrade(homographies: FloatArray, reference: int, log_focal: float, log_focal_std: float) -> MetricPoses:
+    """The poses of one camera that come nearest to plane-to-picture homographies.
+
+    Parameters
+    ----------
+    homographies : ndarray of shape (N, 3, 3)
+        From any frame of the plane to undistorted coordinates of the pictures, half diagonals, with positive third
+        coordinates in front of the camera.
+    reference : int
+        Picture that lies at the origin of the plane, at height one.
+    log_focal, log_focal_std : float
+        Prior on the logarithm of the focal length in half diagonals.
+    """
+    relative = homographies @ inverses(homographies[reference : reference + 1])[0]
+    angles = np.linspace(-_LARGEST_TILT, _LARGEST_TILT, _TILT_STEPS)
+    tilts = np.stack(np.meshgrid(angles, angles, indexing="ij"), axis=-1).reshape(-1, 2)
+    best, best_cost, best_focal = tilts[0], math.inf, log_focal
+    for step in _FOCAL_RANGE:
+        focal = log_focal + step * log_focal_std
+        cost = _cost(relative, tilts, focal) + step**2 * _OUTLYING**2 / len(homographies)
+        index = int(np.argmin(cost))
+        if cost[index] < best_cost:
+            best, best_cost, best_focal = tilts[index], float(cost[index]), focal
+    return _decomposed(relative, best, best_focal)
+
+
+def _cost(relative: FloatArray, tilts: FloatArray, log_focal: float) -> FloatArray:
+    """Mean truncated squared error of the conditions (T,) of the N pictures for each of T tilts of the reference."""
+    metric = _metric(relative, tilts, log_focal)
+    a, b = metric[..., 0], metric[..., 1]
+    aa, bb, ab = ((p * q).sum(axis=-1) for p, q in ((a, a), (b, b), (a, b)))
+    error = ((aa - bb) ** 2 + (2.0 * ab) ** 2) / np.maximum(aa + bb, 1e-300) ** 2
+    behind = (metric[..., 2] * np.cross(a, b)).sum(axis=-1) <= 0.0
+    cost: FloatArray = np.where(behind, _OUTLYING**2, np.minimum(error, _OUTLYING**2)).mean(axis=1)
+    return cost
+
+
+def _metric(relative: FloatArray, tilts: FloatArray, log_focal: float) -> FloatArray:
+    """``diag(f, f, 1)⁻¹ G_i diag(f, f, 1) R`` (T, N, 3, 3) for tilts (T, 2) of the reference."""
+    calibration = np.exp([log_focal, log_focal, 0.0])
+    normalized = relative / calibration[:, None] * calibration
+    product: FloatArray = normalized[None] @ rotation_from_tilt(tilts)[:, None]
+    return product
+
+
+def _decomposed(relative: FloatArray, tilt: FloatArray, log_focal: float) -> MetricPoses:
+    """The nearest poses: ``[a b c] ~ R Rz(φ) [e1 e2 (-t, h)]``."""
+    metric = _metric(relative, tilt[None], log_focal)[0]
+    left, _, right = np.linalg.svd(metric[:, :, :2], full_matrices=False)
+    axes = left @ right  # orthonormal, nearest to a and b
+    size = np.einsum("nij,nij->n", axes, metric[:, :, :2]) / 2.0
+    normal = np.cross(axes[:, :, 0], axes[:, :, 1])
+    normal *= np.where(normal[:, 2] < 0.0, -1.0, 1.0)[:, None]
+    tilts = tilt_from_normal(normal)
+    flat = np.swapaxes(rotation_from_tilt(tilts), 1, 2) @ metric / np.maximum(size, 1e-300)[:, None, None]
+    yaw = np.arctan2(flat[:, 1, 0] - flat[:, 0, 1], flat[:, 0, 0] + flat[:, 1, 1])
+    c, s = np.cos(yaw), np.sin(yaw)
+    shared = np.median(tilts, axis=0)
+    poses = np.zeros((len(relative), 6))
+    poses[:, YAW] = yaw
+    poses[:, X] = -(c * flat[:, 0, 2] + s * flat[:, 1, 2]) * math.exp(log_focal)
+    poses[:, Y] = -(-s * flat[:, 0, 2] + c * flat[:, 1, 2]) * math.exp(log_focal)
+    poses[:, LOG_HEIGHT] = np.log(np.clip(np.abs(flat[:, 2, 2]), 1e-3, 1e3))
+    poses[:, [PSI, THETA]] = tilts - shared
+    return MetricPoses(poses, shared, log_focal)
