@@ -18,7 +18,7 @@ class Message:
     Attributes
     ----------
     text : str
-        One sentence without its full stop.
+        One sentence without its full stop; it names the pictures where there are several.
     images : tuple of str
         Paths of the pictures that it concerns; empty where it concerns all of them.
     severity : str
@@ -33,8 +33,13 @@ class Message:
     def __str__(self) -> str:
         """The line for standard error."""
         if self.severity == "left out":
-            return f"left out {', '.join(self.images)}: {self.text}"
-        return f"not reliable: {self.text}" if self.severity == "failure" else self.text
+            return f"left out {self.images[0]}: {self.text}"
+        return f"not reliable: {self.clause}" if self.severity == "failure" else self.clause
+
+    @property
+    def clause(self) -> str:
+        """The text with the picture that it concerns, where it is one."""
+        return f"{Path(self.images[0]).name}: {self.text}" if len(self.images) == 1 else self.text
 
 
 def left_out(path: str | Path, reason: str) -> Message:

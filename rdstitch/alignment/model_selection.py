@@ -66,6 +66,8 @@ def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolAr
     """
     bound = _NoiseModel.of_links_apart(problem)
     least = bound.misfit(_errors(problem, problem.homographies, problem.lens))
+    if problem.count == 2 and len(names) > 1:  # two pictures cannot tell one camera in any pose from a homography
+        names = [name for name in names if name != POSE.name]
     fits: list[Fit] = []
     for name in names:
         model = MODELS[name]
@@ -74,7 +76,7 @@ def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolAr
             break
         fits.append(problem.fit(model, fits[-1:]))
     cameras = [fit for fit in fits if fit.model is not HOMOGRAPHY]
-    noise = bound if len(fits) < len(names) else _NoiseModel.of_fit(problem, (cameras or fits)[-1])
+    noise = bound if len(fits) < len(names) else _NoiseModel.of_fit(problem, fits[-1])
     costs = np.array([noise.cost(problem, fit) for fit in fits])
     for lens in lenses:
         for index in np.argsort(costs, kind="stable")[:2].tolist():
@@ -211,7 +213,7 @@ def _reason(fits: Sequence[Fit], best: int, names: Sequence[str]) -> str:
         f"{name}: {what}; it leaves an error of {own:.2f} px"
         + (f", less free models more ({less})" if less else "")
         + (f", more freedom gains too little ({more})" if more else "")
-        + (", and nothing is left for more freedom to gain" if len(fits) < len(names) else "")
+        + (", and free homographies could gain too little" if len(fits) < len(names) else "")
     )
 
 

@@ -18,6 +18,7 @@ from rdstitch.matching.two_view import PairRegistration
 from rdstitch.matching.two_view_rounds import Pair, Pairing
 from rdstitch.messages import Message, names_of
 from rdstitch.options import StitchOptions
+from rdstitch.pipeline.working_size import at_working_size
 
 _CLOSURE_ROUNDS = 2
 
@@ -46,6 +47,7 @@ class Aligner:
     paths : tuple of str
         Of the pictures, for messages.
     cameras : tuple of Camera
+        Of the size that features are detected at.
     options : AlignmentOptions
     cache : Cache
     """
@@ -65,9 +67,9 @@ class Aligner:
             When the reference picture is none of the pictures.
         """
         paths = tuple(str(source.path) for source in sources)
-        return cls(
-            paths, tuple(source.camera.with_focal() for source in sources), _alignment_options(sources, options), cache
-        )
+        megapixels = options.features.work_megapixels
+        cameras = tuple(at_working_size(source.camera.with_focal(), megapixels) for source in sources)
+        return cls(paths, cameras, _alignment_options(sources, options), cache)
 
     def align(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
         """Align the pictures by the pairs that were registered; from an earlier run where the cache has it.
@@ -89,7 +91,7 @@ class Aligner:
         """The same pairs with a model that has metric poses, where the user left the choice of the model open."""
         if aligned.alignment.poses is not None or self.options.model != "auto":
             return aligned
-        return replace(self, options=replace(self.options, model="tilting")).align(aligned.pairs)
+        return replace(self, options=replace(self.options, model="pose")).align(aligned.pairs)
 
 
 def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candidates: Sequence[Pair]) -> AlignedPairs:

@@ -10,9 +10,8 @@ import numpy as np
 
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.trajectory import Trajectory
-from rdstitch.cache import Cache
 from rdstitch.camera_files import CAMERA_SUFFIXES, save_camera
-from rdstitch.errors import ArgumentError, InputError, PartialResultError
+from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.path_plot import path_as_svg
 from rdstitch.inputs.attitudes import with_attitudes
 from rdstitch.inputs.find import find_pictures
@@ -22,13 +21,13 @@ from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.atomic import check_distinct, check_output, write_json_atomic, write_text_atomic
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
+from rdstitch.pipeline.accept import accept
 from rdstitch.pipeline.compose import compose_pictures
 from rdstitch.pipeline.register import in_frame_of_reference, register
 from rdstitch.progress import Progress, silent
 from rdstitch.registration import Registration
 from rdstitch.sidecar.write import sidecar
 from rdstitch.stitch_result import StitchResult
-from rdstitch.verification.verdict import RefusedError, judge
 
 Layout = Literal["csv", "tum"]
 
@@ -126,7 +125,7 @@ def calibrate(
     with _pictures(inputs, None, options, every) as frames:
         _check_outputs(None, options, files_of(frames))
         registration = _register_all(frames, options, progress)
-        registration = _accept(registration, options, lens_only=True)
+        registration = accept(registration, options, lens_only=True)
     _release_decoded_images(registration)
     _save_camera(registration, options)
     return registration
@@ -170,7 +169,7 @@ def trajectory(
             check_output(file, options.overwrite, files_of(frames), suffixes=())
         check_distinct(files)
         registration = _register_all(frames, options, progress, metric=True)
-        registration = _accept(registration, options)
+        registration = accept(registration, options)
     _release_decoded_images(registration)
     registration = registration.with_messages(_scale_uncertainty(registration.alignment))
     path = Trajectory.from_alignment(registration.alignment, height)
@@ -223,7 +222,7 @@ def _composite(
     registration: Registration, output: str | Path | None, options: StitchOptions, progress: Progress
 ) -> StitchResult:
     """Judge, compose into the file or into memory, write the sidecar."""
-    registration = _accept(registration, options)
+    registration = accept(registration, options)
     alignment = registration.alignment
     used = np.flatnonzero(alignment.used)
     sources = [registration.sources[i] for i in used]
@@ -254,17 +253,6 @@ def _composite(
         write_json_atomic(f"{output}.json", sidecar(result))
     _save_camera(registration, options)
     return result
-
-
-def _accept(registration: Registration, options: StitchOptions, *, lens_only: bool = False) -> Registration:
-    """The registration with what its checks found; one that cannot be relied on goes no further, unless forced."""
-    found = judge(registration, options.threshold, options.threads, Cache(options.cache), lens_only=lens_only)
-    registration = registration.with_messages(found)
-    if not registration.ok and not options.force:
-        raise RefusedError(registration)
-    if options.strict and registration.left_out:
-        raise PartialResultError("; ".join(map(str, registration.left_out)))
-    return registration
 
 
 def _release_decoded_images(registration: Registration) -> None:

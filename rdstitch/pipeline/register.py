@@ -18,6 +18,7 @@ from rdstitch.messages import Message, left_out
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner, close_loops, rematch_weak_pairs
 from rdstitch.pipeline.detect_features import detect_features
+from rdstitch.pipeline.working_size import at_working_size, features_at
 from rdstitch.progress import Progress, silent
 from rdstitch.registration import Registration
 
@@ -39,7 +40,8 @@ def register(
 
     Pairs that fail alone are tried again with the λ that the others agree on, which then takes only two or four points.
     Once there are poses, pictures that these put beside each other are tried too (loop closures), and every pair of a
-    picture that found no place. Where the pictures come from two lenses, those of one are aligned.
+    picture that found no place. Where the pictures come from two lenses, those of one are aligned. All pixels in the
+    result are those of the size that features are detected at, see :mod:`rdstitch.pipeline.working_size`.
 
     Parameters
     ----------
@@ -59,10 +61,15 @@ def register(
     cache = Cache(options.cache)
     aligner = Aligner.of(sources, options, cache)
     detected = detect_features(sources, options.features, options.threads, cache, skip_bad=skip_bad, progress=progress)
-    candidates = first_pairs(detected.features, options.seed)
+    cameras = [at_working_size(source.camera, options.features.work_megapixels) for source in sources]
+    features = [
+        features_at(found, source.camera, camera)
+        for found, source, camera in zip(detected.features, sources, cameras, strict=True)
+    ]
+    candidates = first_pairs(features, options.seed)
     pairing = Pairing(
-        detected.features,
-        [source.camera for source in sources],
+        features,
+        cameras,
         _matcher(options),
         options.matching,
         progress,

@@ -35,7 +35,7 @@ def summary(registration: Registration, result: StitchResult | None) -> str:
 
 def notices(registration: Registration) -> str:
     """Warnings, and pictures that were left out, each with the reason."""
-    warnings = [message.text for message in registration.warnings]
+    warnings = [message.clause for message in registration.warnings]
     missing = [f"{message.images[0]}: {message.text}" for message in registration.left_out]
     return section(
         "Warnings and left-out pictures",
@@ -48,7 +48,7 @@ def notices(registration: Registration) -> str:
 def _verdict(registration: Registration) -> str:
     if registration.ok:
         return element("p", "The result passed its own checks.", class_="good")
-    failures = "; ".join(message.text for message in registration.failures)
+    failures = "; ".join(message.clause for message in registration.failures)
     return element("p", escape(f"Not to be relied on: {failures}"), class_="bad")
 
 

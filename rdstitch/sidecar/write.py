@@ -53,8 +53,8 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
         "pairs": _pairs(result),
         "verdict": {
             "ok": result.ok,
-            "failures": [message.text for message in registration.failures],
-            "warnings": [message.text for message in registration.warnings],
+            "failures": [message.clause for message in registration.failures],
+            "warnings": [message.clause for message in registration.warnings],
             "relief": alignment.relief,
         },
         "options": result.options,

@@ -20,7 +20,7 @@ def _unmasked(sources: Sequence[Source]) -> list[Message]:
     if not 0 < len(without) < len(sources):
         return []
     text = f"{len(without)} of {len(sources)} pictures have no mask: {shortened([source.name for source in without])}"
-    return [Message(text, tuple(str(source.path) for source in without))]
+    return [Message(text)]
 
 
 def _several_cameras(sources: Sequence[Source]) -> list[Message]:

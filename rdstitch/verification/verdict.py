@@ -1,11 +1,10 @@
 """Every run judges itself: can the result be relied on?"""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 
-from rdstitch.alignment.result import LinkFit
+from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.errors import RegistrationError
 from rdstitch.matching.match_graph import connected_components
@@ -17,12 +16,15 @@ from rdstitch.verification.overlap_check import CheckedLink, check_overlaps
 Pair = tuple[int, int]
 
 _LARGEST_RMS = 1.0  # of the whole, in thresholds
+_LARGEST_RMS_OF_RELIEF = 3.0  # the same where neighbours' errors agree and the pictures look alike
+_MOST_AMBIGUOUS = 0.4  # share of the pairs that may fit elsewhere: more is a pattern all over
 _LEAST_INLIERS = 0.5  # share of a pair's own inliers that agree with the whole
 # The same over all pairs of a picture; right ones have been seen to have 83 % even with relief, others 52 %.
 _LEAST_OF_A_PICTURE = 0.6
 # Of the cells of an overlap that agree: chance lets up to 7 % do so, and right registrations of difficult pictures
 # (low sun, parallax, blur) have been seen to have 20 %.
 _LEAST_AGREEMENT, _DOUBTFUL_AGREEMENT = 0.10, 0.15
+_USUAL_AGREEMENT = 0.25
 _LEAST_CELLS = 8  # below, the overlap has too little texture to say anything
 
 
@@ -35,7 +37,7 @@ class RefusedError(RegistrationError):
     """
 
     def __init__(self, registration: Registration) -> None:
-        reasons = "; ".join(message.text for message in registration.failures)
+        reasons = "; ".join(message.clause for message in registration.failures)
         super().__init__(f"no reliable result: {reasons} (--force writes it all the same)")
         self.registration = registration
 
@@ -73,15 +75,22 @@ def judge(
     alignment = registration.alignment
     paths = [str(source.path) for source in registration.sources]
     used = [fit for fit in alignment.links if fit.used]
-    checked = [] if registration.static_background else check_overlaps(registration, workers, cache)
+    resting = registration.static_background
     disagreeing = _disagreeing(paths, used)
-    suspicions = {**disagreeing, **_unlike(paths, checked), **_ambiguous(paths, checked)}
-    grave = {} if registration.static_background else disagreeing if lens_only else suspicions
-    decisive = _decisive(grave, used, len(paths))
-    return (
-        *_error_of_the_whole(alignment.rms, threshold, used),
+    geometric = [
         *_mixed(paths, registration),
-        *([] if registration.static_background else _misfits(paths, used)),
+        *([] if resting else _misfits(paths, used)),
+        *([] if resting else (disagreeing[pair] for pair in _decisive(disagreeing, used, len(paths)))),
+    ]
+    if geometric:  # what the pixels say of pictures that may be left out need not be known
+        return tuple(geometric)
+    checked = [] if resting else check_overlaps(registration, workers, cache)
+    ambiguous = _ambiguous(paths, checked)
+    suspicions = {**disagreeing, **_unlike(paths, checked), **ambiguous}
+    decisive = [] if lens_only or resting else _decisive(suspicions, used, len(paths))
+    return (
+        *_error_of_the_whole(alignment, threshold, used, checked),
+        *([] if lens_only else _pattern(ambiguous, checked)),
         *(suspicions[pair] for pair in decisive),
         *_outvoted(paths, [pair for pair in suspicions if pair not in decisive]),
         *_little_alike(paths, checked),
@@ -93,15 +102,32 @@ def _failure(text: str, images: Sequence[str] = ()) -> Message:
     return Message(text, tuple(images), "failure")
 
 
-def _error_of_the_whole(rms: float, threshold: float, used: Sequence[LinkFit]) -> list[Message]:
-    """Errors of all pairs together."""
+def _error_of_the_whole(
+    alignment: Alignment, threshold: float, used: Sequence[LinkFit], checked: Sequence[CheckedLink]
+) -> list[Message]:
+    """Errors of all pairs together; those of rough ground are a warning where the pixels agree."""
     found = []
-    if not np.isfinite(rms) or rms > _LARGEST_RMS * threshold:
-        found.append(_failure(f"the pictures disagree by {rms:.1f} px, more than the threshold of {threshold:g} px"))
-    given, kept = sum(fit.count for fit in used), sum(fit.inliers for fit in used)
+    rms, given, kept = alignment.rms, sum(fit.count for fit in used), sum(fit.inliers for fit in used)
+    if not rms <= _LARGEST_RMS * threshold:
+        text = f"the pictures disagree by {rms:.1f} px, more than the threshold of {threshold:g} px"
+        rough = alignment.relief.found and rms <= _LARGEST_RMS_OF_RELIEF * threshold and _look_alike(checked)
+        found.append(Message(f"{text}: the ground is rough") if rough else _failure(text))
     if kept < _LEAST_INLIERS * given:
         found.append(_failure(f"only {kept} of {given} matches of the pairs agree with the whole"))
     return found
+
+
+def _look_alike(checked: Sequence[CheckedLink]) -> bool:
+    """Whether pictures look alike where most pairs put them, as far as there is something to see."""
+    shares = [link.agreement.share for link in checked if link.agreement.cells >= _LEAST_CELLS]
+    return bool(shares) and float(np.median(shares)) >= _USUAL_AGREEMENT
+
+
+def _pattern(ambiguous: Mapping[Pair, Message], checked: Sequence[CheckedLink]) -> list[Message]:
+    """A pattern that repeats itself over so many pairs that leaving some of them out proves nothing."""
+    if len(ambiguous) <= _MOST_AMBIGUOUS * len(checked):
+        return []
+    return [_failure(f"{len(ambiguous)} of {len(checked)} pairs fit as well elsewhere (a repeated pattern?)")]
 
 
 def _outvoted(paths: Sequence[str], pairs: Sequence[Pair]) -> list[Message]:
@@ -135,8 +161,7 @@ def _misfits(paths: Sequence[str], used: Sequence[LinkFit]) -> list[Message]:
         kept[[fit.image1, fit.image2]] += fit.inliers
     return [
         _failure(
-            f"{Path(paths[k]).name}: only {kept[k]} of {given[k]} of its matches agree with the whole; "
-            "another camera or zoom?",
+            f"only {kept[k]} of {given[k]} of its matches agree with the whole; another camera or zoom?",
             [paths[k]],
         )
         for k in np.flatnonzero(kept < _LEAST_OF_A_PICTURE * given).tolist()
@@ -178,7 +203,7 @@ def _unlike(paths: Sequence[str], checked: Sequence[CheckedLink]) -> dict[Pair, 
             paths,
             link.fit,
             f" do not look alike where they are put together ({link.agreement.confirming} of {link.agreement.cells} "
-            "places agree); leave one of them out",
+            "places agree)",
         )
         for link in checked
         if link.agreement.cells >= _LEAST_CELLS and link.agreement.share < _LEAST_AGREEMENT

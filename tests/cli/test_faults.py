@@ -20,7 +20,7 @@ from rdstitch_cli.main import run
 
 from rdstitch.inputs import source as sources
 from rdstitch.io import Metadata, read_image, read_metadata
-from rdstitch.pipeline import recipes
+from rdstitch.pipeline import accept, recipes
 from rdstitch.verification.verdict import judge
 from tests.cli.faulty import UNREADABLE, UNUSABLE, Make
 from tests.cli.running import DISTORTION, FAST, Outcome, Run, finished, start
@@ -374,7 +374,7 @@ def test_a_picture_changes_after_its_registration(
             assert cv2.imwrite(str(place / "b.png"), np.zeros((30, 40), np.uint8))
         return verdict
 
-    monkeypatch.setattr(recipes, "judge", spoil)
+    monkeypatch.setattr(accept, "judge", spoil)
     done = rdstitch("pano", place / "a.png", place / "b.png", "-o", place / "out.png", *FAST)
     _refused(done, 3, place / "b.png")
     assert not (place / "out.png").exists()

@@ -17,7 +17,7 @@ from rdstitch.compositing import CompositeOptions
 from rdstitch.io import preview, read_image
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline import calibrate, pano, recipes
+from rdstitch.pipeline import accept, calibrate, pano
 from rdstitch.pipeline.timing import StageTimer
 from rdstitch.report import report_page, thumbnails, write_report
 from tests.cli.running import FAST, Run
@@ -133,7 +133,7 @@ def test_what_is_refused_is_shown(
     rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, output: str
 ) -> None:
     found = (Message("the pictures <disagree>", severity="failure"), Message("look at that seam"))
-    monkeypatch.setattr(recipes, "judge", lambda *arguments, **options: found)
+    monkeypatch.setattr(accept, "judge", lambda *arguments, **options: found)
     report = tmp_path / "report.html"
     arguments = (command, *frames[:2], "-o", tmp_path / output, "--report", report, *FAST)
     assert rdstitch(*arguments).status == 4

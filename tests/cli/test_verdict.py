@@ -9,7 +9,7 @@ from PIL import ExifTags, Image
 
 from rdstitch.camera import Camera
 from rdstitch.messages import Message
-from rdstitch.pipeline import recipes
+from rdstitch.pipeline import accept
 from tests.cli.running import DISTORTION, FAST, Run, flight
 
 # Without a focal length, a path says that its lengths are guessed.
@@ -18,7 +18,7 @@ OUTPUTS = {"pano": "out.png", "mosaic": "out.png", "calibrate": "camera.json", "
 
 
 def _pretend(monkeypatch: pytest.MonkeyPatch, *found: Message) -> None:
-    monkeypatch.setattr(recipes, "judge", lambda *arguments, **options: found)
+    monkeypatch.setattr(accept, "judge", lambda *arguments, **options: found)
 
 
 @pytest.mark.parametrize("command", OUTPUTS)

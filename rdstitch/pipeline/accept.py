@@ -1,0 +1,158 @@
+"""Stage: check a registration; what fails a check is left out by name, and the rest is aligned anew."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rdstitch.alignment.result import LinkFit
+from rdstitch.alignment.unaligned import explain_unaligned
+from rdstitch.cache import Cache
+from rdstitch.errors import PartialResultError, RegistrationError
+from rdstitch.matching.match_graph import connected_components
+from rdstitch.messages import Message, left_out, names_of
+from rdstitch.options import StitchOptions
+from rdstitch.pipeline.aligner import Aligner
+from rdstitch.pipeline.working_size import at_full_size
+from rdstitch.registration import Registration
+from rdstitch.verification.verdict import RefusedError, judge
+
+_MOST_ROUNDS = 20
+"""Times that something is left out; each takes one adjustment."""
+
+
+@dataclass(frozen=True)
+class _Offenders:
+    """What one round leaves out: pictures, and links without which other pictures may fall off.
+
+    Attributes
+    ----------
+    reasons : mapping of int to Message
+        What is wrong with a picture, by its index.
+    links : mapping of (int, int) to Message
+        What is wrong with a pair of pictures.
+    """
+
+    reasons: Mapping[int, Message]
+    links: Mapping[tuple[int, int], Message]
+
+
+def accept(registration: Registration, options: StitchOptions, *, lens_only: bool = False) -> Registration:
+    """The registration of what passes all checks, with everything that the user should know of it.
+
+    Parameters
+    ----------
+    registration : Registration
+        In pixels of the working size; the result is in those of the pictures.
+    options : StitchOptions
+    lens_only : bool
+        Only the lens is wanted, so that doubts about the places of pictures do not matter.
+
+    Raises
+    ------
+    RefusedError
+        When nothing trustworthy remains, unless ``options.force``: then everything is kept.
+    PartialResultError
+        When a picture is left out, under ``options.strict``.
+    """
+    cache = Cache(options.cache)
+    current, found = registration, _checked(registration, options, cache, lens_only)
+    first = registration.with_messages(found)
+    if not first.ok and not options.force:
+        aligner = Aligner.of(registration.sources, options, cache)
+        offending = 0
+        for _ in range(_MOST_ROUNDS):
+            if current.with_messages(found).ok:
+                break
+            worst = _worst(current, found)
+            shrunk, offending = _without(current, worst, aligner), offending + len(worst.reasons)
+            # Where as many pictures fail as pass, nobody can say which of them are right.
+            if shrunk is None or shrunk.alignment.used.sum() <= offending:
+                raise RefusedError(at_full_size(first))
+            current, found = shrunk, _checked(shrunk, options, cache, lens_only)
+    accepted = at_full_size(current).with_messages(found)
+    if not accepted.ok and not options.force:
+        raise RefusedError(at_full_size(first))
+    if options.strict and accepted.left_out:
+        raise PartialResultError("; ".join(map(str, accepted.left_out)))
+    return accepted
+
+
+def _checked(registration: Registration, options: StitchOptions, cache: Cache, lens_only: bool) -> tuple[Message, ...]:
+    return judge(registration, options.threshold, options.threads, cache, lens_only=lens_only)
+
+
+def _worst(registration: Registration, found: Iterable[Message]) -> _Offenders:
+    """The worst pictures, no two of them linked, since a bad picture spoils its neighbours; else the failing pairs."""
+    index = {str(source.path): k for k, source in enumerate(registration.sources)}
+    failures = [message for message in found if message.severity == "failure"]
+    single = {index[m.images[0]]: m for m in failures if len(m.images) == 1}
+    if not single:
+        pairs = (m for m in failures if len(m.images) == 2)
+        return _Offenders({}, {(index[m.images[0]], index[m.images[1]]): m for m in pairs})
+    used = [fit for fit in registration.alignment.links if fit.used]
+    fit_share = agreement(used, len(registration.sources))
+    chosen: dict[int, Message] = {}
+    for picture in sorted(single, key=lambda k: (fit_share[k], k)):
+        linked = {fit.image1 + fit.image2 - picture for fit in used if picture in (fit.image1, fit.image2)}
+        if not linked & chosen.keys():
+            chosen[picture] = single[picture]
+    return _Offenders(chosen, {})
+
+
+def agreement(links: Sequence[LinkFit], count: int) -> np.ndarray:
+    """Share of the matches of each picture that agree with the whole, shape (N,); 1 without any."""
+    given, kept = np.zeros(count), np.zeros(count)
+    for fit in links:
+        given[[fit.image1, fit.image2]] += fit.count
+        kept[[fit.image1, fit.image2]] += fit.inliers
+    return np.where(given > 0, kept / np.maximum(given, 1.0), 1.0)
+
+
+def _held_by(registration: Registration, offenders: _Offenders) -> dict[int, set[int]]:
+    """The pictures left out that each other picture is linked with."""
+    held: dict[int, set[int]] = {}
+    for fit in registration.alignment.links:
+        for own, other in ((fit.image1, fit.image2), (fit.image2, fit.image1)):
+            if fit.used and other in offenders.reasons and own not in offenders.reasons:
+                held.setdefault(own, set()).add(other)
+    return held
+
+
+def _without(registration: Registration, offenders: _Offenders, aligner: Aligner) -> Registration | None:
+    """The rest, aligned anew; None where nothing can be left out, or nothing that fits together would be left."""
+    if not offenders.reasons and not offenders.links:
+        return None
+    before = registration.alignment.used
+    kept = {
+        (fit.image1, fit.image2)
+        for fit in registration.alignment.links
+        if fit.used
+        and not {fit.image1, fit.image2} & offenders.reasons.keys()
+        and (fit.image1, fit.image2) not in offenders.links
+    }
+    largest = connected_components(len(before), [i for i, _ in kept], [j for _, j in kept])[0]
+    if len(largest) < 2:
+        return None
+    inside = set(largest)
+    pairs = [p for p in registration.pairs if (p.image1, p.image2) in kept and p.image1 in inside]
+    try:
+        aligned = aligner.align(pairs)
+    except RegistrationError:
+        return None
+    named = {message.images for message in registration.left_out}
+    reasons = dict(offenders.reasons)
+    for (i, j), message in offenders.links.items():
+        reasons.update({k: message for k in (i, j) if k not in inside})
+    for picture, others in _held_by(registration, offenders).items():
+        if picture not in inside:
+            named_others = ", ".join(names_of(aligner.paths[k] for k in sorted(others)))
+            reasons.setdefault(picture, Message(f"hangs on {named_others}, which was left out; add pictures around it"))
+    explained = explain_unaligned(aligned.alignment, aligner.paths)
+    news = [
+        left_out(aligner.paths[k], reasons[k].text) if k in reasons else message
+        for k, message in zip(np.flatnonzero(~aligned.alignment.used).tolist(), explained, strict=True)
+        if message.images not in named
+    ]
+    whole = [m for m in registration.messages if m not in registration.alignment.messages]
+    return replace(registration, alignment=aligned.alignment, messages=(*aligned.alignment.messages, *whole, *news))
