@@ -31,7 +31,7 @@ class StitchOptions:
     solver: str = "auto"  # minimal solver of the pairs, one of rdstitch.robust.SOLVERS
     lens: str = "auto"  # lens, one of rdstitch.alignment.LENSES; auto: the simplest that the pictures allow
     model: str = "auto"  # motion model of the whole, one of rdstitch.alignment.MODELS
-    threshold: float = 3.0  # px, largest transfer error of an inlier
+    threshold: float = 3.0  # largest transfer error of an inlier, px of the size that features are detected at
     confidence: float = 0.999  # probability that no better model of a pair was missed
     max_iterations: int = 10000  # samples per pair
     camera: Camera | None = None  # known camera: its λ is kept, its focal length trusted

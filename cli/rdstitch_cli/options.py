@@ -158,7 +158,12 @@ estimation = together(
         "--model", type=click.Choice(MODELS), default="auto", show_default=True, help="How freely the camera moved."
     ),
     click.option(
-        "--threshold", type=float, default=3.0, show_default=True, metavar="PX", help="Largest error of an inlier, px."
+        "--threshold",
+        type=float,
+        default=3.0,
+        show_default=True,
+        metavar="PX",
+        help="Largest error of an inlier, px of the size that features are detected at (see --work-megapixels).",
     ),
     click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of random sampling."),
     click.option(

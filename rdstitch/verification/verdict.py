@@ -79,6 +79,7 @@ def judge(
     disagreeing = _disagreeing(paths, used)
     geometric = [
         *_mixed(paths, registration),
+        *_agreement_of_all(used),
         *([] if resting else _misfits(paths, used)),
         *([] if resting else (disagreeing[pair] for pair in _decisive(disagreeing, used, len(paths)))),
     ]
@@ -89,7 +90,7 @@ def judge(
     suspicions = {**disagreeing, **_unlike(paths, checked), **ambiguous}
     decisive = [] if lens_only or resting else _decisive(suspicions, used, len(paths))
     return (
-        *_error_of_the_whole(alignment, threshold, used, checked),
+        *_error_of_the_whole(alignment, threshold, checked),
         *([] if lens_only else _pattern(ambiguous, checked)),
         *(suspicions[pair] for pair in decisive),
         *_outvoted(paths, [pair for pair in suspicions if pair not in decisive]),
@@ -102,19 +103,22 @@ def _failure(text: str, images: Sequence[str] = ()) -> Message:
     return Message(text, tuple(images), "failure")
 
 
-def _error_of_the_whole(
-    alignment: Alignment, threshold: float, used: Sequence[LinkFit], checked: Sequence[CheckedLink]
-) -> list[Message]:
+def _error_of_the_whole(alignment: Alignment, threshold: float, checked: Sequence[CheckedLink]) -> list[Message]:
     """Errors of all pairs together; those of rough ground are a warning where the pixels agree."""
-    found = []
-    rms, given, kept = alignment.rms, sum(fit.count for fit in used), sum(fit.inliers for fit in used)
-    if not rms <= _LARGEST_RMS * threshold:
-        text = f"the pictures disagree by {rms:.1f} px, more than the threshold of {threshold:g} px"
-        rough = alignment.relief.found and rms <= _LARGEST_RMS_OF_RELIEF * threshold and _look_alike(checked)
-        found.append(Message(f"{text}: the ground is rough") if rough else _failure(text))
-    if kept < _LEAST_INLIERS * given:
-        found.append(_failure(f"only {kept} of {given} matches of the pairs agree with the whole"))
-    return found
+    rms = alignment.rms
+    if rms <= _LARGEST_RMS * threshold:
+        return []
+    text = f"the pictures disagree by {rms:.1f} px, more than the threshold of {threshold:g} px"
+    rough = alignment.relief.found and rms <= _LARGEST_RMS_OF_RELIEF * threshold and _look_alike(checked)
+    return [Message(f"{text}: the ground is rough") if rough else _failure(text)]
+
+
+def _agreement_of_all(used: Sequence[LinkFit]) -> list[Message]:
+    """Matches of all pairs together."""
+    given, kept = sum(fit.count for fit in used), sum(fit.inliers for fit in used)
+    if kept >= _LEAST_INLIERS * given:
+        return []
+    return [_failure(f"only {kept} of {given} matches of the pairs agree with the whole")]
 
 
 def _look_alike(checked: Sequence[CheckedLink]) -> bool:

@@ -28,7 +28,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Registration:
 
 
 def _texts(registration: Registration, *, lens_only: bool = False) -> list[str]:
-    return [m.text for m in judge(registration, THRESHOLD, lens_only=lens_only) if m.severity == "failure"]
+    return [m.clause for m in judge(registration, THRESHOLD, lens_only=lens_only) if m.severity == "failure"]
 
 
 def test_a_right_registration_passes(good: Registration) -> None:
