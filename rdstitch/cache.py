@@ -8,7 +8,7 @@ whether or not a version number was raised; what is damaged is computed again.
 import hashlib
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -81,19 +81,48 @@ class Cache:
         """
         if self.folder is None:
             return compute()
-        name = digest((_FORMAT, _software(), stage, inputs))
-        file = self.folder / stage / name[:2] / name[2:]
-        with suppress(InputError, ArgumentError, OSError):
-            # The name once more: an entry that was mistaken for another is no better than a damaged one.
-            kept: tuple[str, Value] = unpack(file.read_bytes(), kinds)
-            if isinstance(kept, tuple) and kept[0] == name:
-                return kept[1]
+        file = self._file(stage, inputs)
+        kept: list[Value] = _read(file, kinds)
+        if kept:
+            return kept[0]
         value = compute()
-        # A cache that has become full or read-only is no reason to stop.
-        with suppress(OSError):
-            if not unless():
-                _write(file, pack((name, value)))
+        if not unless():
+            _keep(file, value)
         return value
+
+    def recall_many(
+        self,
+        stage: str,
+        kinds: tuple[type, ...],
+        inputs: Sequence[tuple[Any, ...]],
+        compute: Callable[[list[int]], list[Value]],
+    ) -> list[Value]:
+        """As :meth:`recall` for a stage that computes several results at once.
+
+        Parameters
+        ----------
+        stage, kinds
+            As in :meth:`recall`.
+        inputs : sequence of tuple
+            Of each result.
+        compute : callable
+            Gives the results of some of the inputs, called with their places.
+        """
+        if self.folder is None:
+            return compute(list(range(len(inputs))))
+        files = [self._file(stage, own) for own in inputs]
+        found: list[list[Value]] = [_read(file, kinds) for file in files]
+        missing = [index for index, kept in enumerate(found) if not kept]
+        for index, value in zip(missing, compute(missing) if missing else [], strict=True):
+            found[index] = [value]
+            _keep(files[index], value)
+        return [kept[0] for kept in found]
+
+    def _file(self, stage: str, inputs: tuple[Any, ...]) -> Path:
+        """Where the result of a stage is kept: its name is the digest of everything that it depends on."""
+        assert self.folder is not None
+        name = digest((_FORMAT, _software(), stage, inputs))
+        return self.folder / stage / name[:2] / name[2:]
 
     def file(self, path: str | Path | None) -> str:
         """What stands for the content of a file in the inputs of a stage; empty without a file or a cache.
@@ -137,6 +166,26 @@ def _sources(folder: Traversable, prefix: str) -> Iterator[tuple[str, bytes]]:
             yield from _sources(entry, f"{prefix}{entry.name}/")
         elif entry.name.endswith(".py"):
             yield prefix + entry.name, entry.read_bytes()
+
+
+def _name(file: Path) -> str:
+    """The name of a result, as it is also written into its file: what is mistaken for it is no better than damaged."""
+    return file.parent.name + file.name
+
+
+def _read(file: Path, kinds: tuple[type, ...]) -> list[Value]:
+    """The result that a file holds; none where it is missing or damaged."""
+    with suppress(InputError, ArgumentError, OSError):
+        kept: tuple[str, Value] = unpack(file.read_bytes(), kinds)
+        if isinstance(kept, tuple) and kept[0] == _name(file):
+            return [kept[1]]
+    return []
+
+
+def _keep(file: Path, value: Any) -> None:
+    """Write a result; a cache that has become full or read-only is no reason to stop."""
+    with suppress(OSError):
+        _write(file, pack((_name(file), value)))
 
 
 NO_CACHE = Cache()

@@ -25,6 +25,7 @@ OBSERVABLE_STD = 0.1
 """Standard deviation of λ from which on it counts as not observable: a tenth of the radius at the corner."""
 
 _NEWTON_STEPS, _NEWTON_TOLERANCE = 40, 1e-14
+_RATIO_STEPS = 12
 _FARTHEST = 4.0
 """Half diagonals: with more coefficients than λ the model is not used beyond, where only the highest power counts."""
 
@@ -96,8 +97,39 @@ def distort(points: ArrayLike, distortion: ArrayLike, higher: Sequence[float] = 
         radius = np.sqrt(radius2)
         measured = _distorted_radius(radius, float(np.asarray(distortion).item()), tuple(higher))
         return x * np.where(radius > 0.0, measured / np.maximum(radius, 1e-300), 1.0)[..., None]
-    discriminant = 1.0 - 4.0 * np.asarray(distortion) * radius2
-    return x * (2.0 / (1.0 + np.sqrt(np.where(discriminant >= 0.0, discriminant, np.nan))))[..., None]
+    return x * distorted_ratio(radius2, np.asarray(distortion))[..., None]
+
+
+def distorted_ratio(radius2: FloatArray, distortion: FloatArray, distortion2: FloatArray | None = None) -> FloatArray:
+    """Measured over undistorted radius, from the squared undistorted radius; NaN where there is none.
+
+    Unlike for :func:`distort`, μ broadcasts too: from the root for λ alone, by Newton's method on
+    ``k = 1 + λ k² r² + μ k⁴ r⁴``.
+    """
+    discriminant = 1.0 - 4.0 * distortion * radius2
+    if distortion2 is None:
+        root: FloatArray = np.sqrt(np.where(discriminant >= 0.0, discriminant, np.nan))
+        return 2.0 / (1.0 + root)
+    with np.errstate(over="ignore", invalid="ignore"):
+        ratio = 2.0 / (1.0 + np.sqrt(np.maximum(discriminant, 0.0)))
+        for _ in range(_RATIO_STEPS):
+            value, slope = _ratio_equation(ratio, radius2, distortion, distortion2)
+            step = value / np.where(slope < 0.0, slope, -1.0)
+            ratio = ratio - step
+            if not (np.abs(step) > _NEWTON_TOLERANCE).any():
+                break
+        value, slope = _ratio_equation(ratio, radius2, distortion, distortion2)
+    solved = (np.abs(value) <= 1e-9 * np.abs(ratio)) & (ratio > 0.0) & (slope < 0.0)
+    return np.where(solved, ratio, np.nan)
+
+
+def _ratio_equation(
+    ratio: FloatArray, radius2: FloatArray, distortion: FloatArray, distortion2: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """``1 - k + λ k² r² + μ k⁴ r⁴`` and its derivative by k."""
+    value = 1.0 - ratio + distortion * ratio**2 * radius2 + distortion2 * ratio**4 * radius2**2
+    slope = -1.0 + 2.0 * distortion * ratio * radius2 + 4.0 * distortion2 * ratio**3 * radius2**2
+    return value, slope
 
 
 @lru_cache(maxsize=256)

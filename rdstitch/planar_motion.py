@@ -80,42 +80,73 @@ class PlanarMotion:
             In focal-normalized coordinates, of any scale and sign.
         """
         h = np.array(homography, dtype=np.float64)
-        h = h / np.linalg.norm(h)
-        row_space = np.linalg.svd(h - np.eye(3) * np.trace(h) / 3)[2][0]
-        candidates = [cls.from_homography_and_normal(h, n) for n in (*np.linalg.eig(h.T)[1].T.real, row_space)]
-        return min(candidates, key=lambda motion: motion._distance(h))
+        return cls._of_row(motions_from_homographies(h[None])[0])
 
     @classmethod
     def from_homography_and_normal(cls, h: FloatArray, normal: FloatArray) -> Self:
         """The motion nearest to a homography (3, 3) for a given plane normal (3,) of any length and sign."""
-        if not normal.any():
-            normal = np.array([0.0, 0.0, 1.0])
-        psi, theta = tilt_from_normal(normal if normal[2] >= 0.0 else -normal)
-        rotation = rotation_from_tilt((psi, theta))
-        motion = rotation.T @ h @ rotation
-        scale = np.copysign(np.sqrt(np.abs(np.linalg.det(motion[:2, :2]))), motion[2, 2])
-        motion = motion / (scale if scale != 0.0 else 1.0)
-        yaw = float(np.arctan2(motion[1, 0] - motion[0, 1], motion[0, 0] + motion[1, 1]))
-        c, s = np.cos(yaw), np.sin(yaw)
-        tx, ty = -np.array([[c, s], [-s, c]]) @ motion[:2, 2]
-        return cls((float(psi), float(theta)), yaw, (float(tx), float(ty)), float(motion[2, 2]))
+        return cls._of_row(motions_from_homographies(h[None], normal[None])[0])
 
-    def _distance(self, unit: FloatArray) -> float:
-        """Distance to a homography of unit norm, up to sign."""
-        own = self.homography()
-        own = own / np.linalg.norm(own)
-        return float(min(np.linalg.norm(own - unit), np.linalg.norm(own + unit)))
+    @classmethod
+    def _of_row(cls, row: FloatArray) -> Self:
+        psi, theta, yaw, tx, ty, height = row.tolist()
+        return cls((psi, theta), yaw, (tx, ty), height)
 
 
-def rigid_in_plane(yaw: float, translation: ArrayLike, height: float = 1.0) -> FloatArray:
-    """``Rz(φ) diag(1, 1, height) T``, shape (3, 3): the motion as the plane sees it."""
+def motions_from_homographies(homography: FloatArray, normal: FloatArray | None = None) -> FloatArray:
+    """Rows (ψ, θ, φ, tx, ty, height) of the planar motions that homographies describe, or come close to, (B, 6).
+
+    Parameters
+    ----------
+    homography : ndarray of shape (B, 3, 3)
+        In focal-normalized coordinates, of any scale and sign.
+    normal : ndarray of shape (B, 3), optional
+        Plane normals, of any length and sign; found as :meth:`PlanarMotion.from_homography` says if not given.
+    """
+    if normal is not None:
+        return _motions_for_normals(homography, normal)
+    h = homography / np.linalg.norm(homography, axis=(1, 2), keepdims=True)
+    turned = h - np.eye(3) * np.trace(h, axis1=1, axis2=2)[:, None, None] / 3
+    normals = np.concatenate(
+        [
+            np.swapaxes(np.linalg.eig(np.swapaxes(h, 1, 2))[1].real, 1, 2),
+            np.linalg.svd(turned)[2][:, :1],
+        ],
+        axis=1,
+    )
+    motions = _motions_for_normals(np.repeat(h, 4, axis=0), normals.reshape(-1, 3)).reshape(-1, 4, 6)
+    rotation = rotation_from_tilt(motions[..., :2])
+    own = rotation @ rigid_in_plane(motions[..., 2], motions[..., 3:5], motions[..., 5]) @ np.swapaxes(rotation, -2, -1)
+    own = own / np.linalg.norm(own, axis=(-2, -1), keepdims=True)
+    distance = [np.linalg.norm(own - sign * h[:, None], axis=(-2, -1)) for sign in (1.0, -1.0)]
+    best = np.minimum(*distance).argmin(axis=1)
+    return np.asarray(motions[np.arange(len(h)), best])
+
+
+def _motions_for_normals(h: FloatArray, normal: FloatArray) -> FloatArray:
+    """Rows of :func:`motions_from_homographies` for given normals."""
+    normal = np.where(normal.any(axis=1, keepdims=True), normal, [0.0, 0.0, 1.0])
+    tilt = tilt_from_normal(np.where(normal[:, 2:] >= 0.0, normal, -normal))
+    rotation = rotation_from_tilt(tilt)
+    motion = np.swapaxes(rotation, 1, 2) @ h @ rotation
+    scale = np.copysign(np.sqrt(np.abs(np.linalg.det(motion[:, :2, :2]))), motion[:, 2, 2])
+    motion = motion / np.where(scale != 0.0, scale, 1.0)[:, None, None]
+    yaw = np.arctan2(motion[:, 1, 0] - motion[:, 0, 1], motion[:, 0, 0] + motion[:, 1, 1])
     c, s = np.cos(yaw), np.sin(yaw)
-    t = np.asarray(translation, dtype=np.float64)
-    rotation = np.array([[c, -s], [s, c]])
-    motion = np.zeros((3, 3))
-    motion[:2, :2] = rotation
-    motion[:2, 2] = -rotation @ t
-    motion[2, 2] = height
+    x, y = motion[:, 0, 2], motion[:, 1, 2]
+    return np.column_stack([tilt, yaw, -c * x - s * y, s * x - c * y, motion[:, 2, 2]])
+
+
+def rigid_in_plane(yaw: ArrayLike, translation: ArrayLike, height: ArrayLike = 1.0) -> FloatArray:
+    """``Rz(φ) diag(1, 1, height) T`` of shape (..., 3, 3): motions as the plane sees them; angles (...), t (..., 2)."""
+    angle, t = np.asarray(yaw, dtype=np.float64), np.asarray(translation, dtype=np.float64)
+    c, s = np.cos(angle), np.sin(angle)
+    motion = np.zeros((*angle.shape, 3, 3))
+    motion[..., 0, 0], motion[..., 0, 1] = c, -s
+    motion[..., 1, 0], motion[..., 1, 1] = s, c
+    motion[..., 0, 2] = -(c * t[..., 0] - s * t[..., 1])
+    motion[..., 1, 2] = -(s * t[..., 0] + c * t[..., 1])
+    motion[..., 2, 2] = height
     return motion
 
 

@@ -64,7 +64,7 @@ def _pairs(settings: Settings) -> list[MatchedPair]:
 
 
 def _curves(pair: MatchedPair, runs: int) -> list[_Curve]:
-    data = Measurements.from_pixels(pair.points1, pair.points2, pair.camera, pair.camera, None)
+    data = Measurements.from_pixels(pair.points1, pair.points2, pair.camera, pair.camera)
     return [_Curve(s.name, _mean_share(s, data, runs)) for s in all_solvers(pair.camera, pair.tilt)]
 
 
@@ -78,7 +78,7 @@ def _mean_share(solver: MinimalSolver, data: Measurements, runs: int) -> FloatAr
         counts = np.zeros(together * length)
         np.maximum.at(counts, found.sample, inliers)
         total += np.maximum.accumulate(counts.reshape(together, length), axis=1).sum(axis=0)
-    share: FloatArray = total / (runs * len(data))
+    share: FloatArray = total / (runs * int(data.count[0]))
     return share
 
 

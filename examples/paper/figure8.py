@@ -134,7 +134,7 @@ def _drive_election(d: Drive) -> _Election:
             continue
         found = []
         for seed, pair in enumerate(d.pairs):
-            data = Measurements.from_pixels(pair.points1, pair.points2, cameras[0], cameras[0], None)
+            data = Measurements.from_pixels(pair.points1, pair.points2, cameras[0], cameras[0])
             found.append(best_of(solver, data, _ITERATIONS, seed))
         votes[solver.name] = np.array([model[1] for model in found if model is not None])
     links = estimated_links(d.pairs, cameras[0])

@@ -86,7 +86,7 @@ def _from_solver(d: Drive, solver: MinimalSolver) -> _Path:
     cameras, found = d.blank_cameras, []
     for pair in d.pairs:
         if pair.image2 - pair.image1 == 1:
-            data = Measurements.from_pixels(pair.points1, pair.points2, cameras[0], cameras[0], None)
+            data = Measurements.from_pixels(pair.points1, pair.points2, cameras[0], cameras[0])
             found.append(best_of(solver, data, _ITERATIONS, seed=pair.image1))
     lam = float(np.median([model[1] for model in found if model is not None]))
     identity = np.eye(3)

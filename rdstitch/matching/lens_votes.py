@@ -18,6 +18,7 @@ _MOST = 250  # correspondences of a pair that are asked
 _LEAST_STD = 2e-4  # λ; no pair knows it better than that the division model holds
 _COMMON_STD = 0.05  # λ; by so much relief and lenses of another kind change what a pair sees, of both pictures alike
 _ROUNDS = 6
+_PAIRS_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Votes:
     def of(cls, pairs: Sequence[PairRegistration], threshold: float) -> Self:
         """The votes of the pairs that see λ; ``threshold``, px, as they were estimated with."""
         asked = [pair for pair in pairs if pair.relation and np.isfinite(pair.relation.distortion_std)]
-        found = [(pair, _vote(pair, threshold)) for pair in asked]
+        found = list(zip(asked, _votes(asked, threshold), strict=True))
         seen = [(pair, vote) for pair, vote in found if np.isfinite(vote.covariance).all()]
         return cls(
             np.array([pair.image1 for pair, _ in seen], dtype=np.intp),
@@ -98,12 +99,22 @@ class Votes:
         return np.asarray(np.einsum("lij,lj->li", self._whitening, values))
 
 
-def _vote(pair: PairRegistration, threshold: float) -> OwnLenses:
-    """λ of both pictures, from what lies not too far from where one λ puts it."""
-    relation, matched = pair.relation, pair.correspondences
-    apart = np.linalg.norm(relation.transfer(matched.points1) - matched.points2, axis=1)
+def _votes(pairs: Sequence[PairRegistration], threshold: float) -> list[OwnLenses]:
+    """λ of both pictures of each pair, from what lies not too far from where one λ puts it."""
+    found: list[OwnLenses] = []
+    for start in range(0, len(pairs), _PAIRS_AT_ONCE):
+        block = pairs[start : start + _PAIRS_AT_ONCE]
+        points = [_near(pair, threshold) for pair in block]
+        cameras = [(pair.relation.camera, pair.relation.camera2) for pair in block]
+        relations = [pair.relation for pair in block]
+        found += own_lenses(relations, Measurements.of_pairs(points, cameras), threshold)
+    return found
+
+
+def _near(pair: PairRegistration, threshold: float) -> tuple[FloatArray, FloatArray]:
+    """Matches not too far from where one λ puts them, evenly spread, px."""
+    matched = pair.correspondences
+    apart = np.linalg.norm(pair.relation.transfer(matched.points1) - matched.points2, axis=1)
     near = np.flatnonzero(apart < _FARTHEST * threshold)
     near = near[spread_choice(matched.points1[near], _MOST)]
-    points1, points2 = matched.points1[near], matched.points2[near]
-    data = Measurements.from_pixels(points1, points2, relation.camera, relation.camera2, None)
-    return own_lenses(relation, data, threshold)
+    return matched.points1[near], matched.points2[near]

@@ -13,14 +13,26 @@ from rdstitch.features import Correspondences, Features, Matcher, match_overlap
 from rdstitch.matching.links import Link
 from rdstitch.matching.options import PairOptions
 from rdstitch.radial_homography import RadialHomography
-from rdstitch.robust import estimate_radial_homography
+from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
 
 Value = TypeVar("Value")
+
+Pair = tuple[int, int]
 
 Progress = Callable[[int, int], None]
 
 Recall = Callable[[int, Callable[[], Value]], Value]
 """Called with the position of a pair and what computes something of it; gives that, perhaps from an earlier run."""
+
+
+Estimate = Callable[[list[int]], list[RadialHomography]]
+
+RecallMany = Callable[[Sequence[int], Estimate], list[RadialHomography]]
+"""Called with the positions of pairs and with what estimates those at some places among them; gives all of theirs."""
+
+_PAIRS_AT_ONCE = 256  # after so many there is progress to show, and to keep
+_SELECT_BELOW = 50
+"""Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them."""
 
 
 @dataclass(frozen=True)
@@ -100,17 +112,17 @@ def match_pairs(
 
 def estimate_pairs(
     cameras: Sequence[Camera],
-    pairs: Sequence[tuple[int, int]],
+    pairs: Sequence[Pair],
     matched: Sequence[Correspondences],
     options: PairOptions,
     *,
     tilts: Sequence[tuple[float, float] | None] | None = None,
     progress: Progress | None = None,
-    recall: Recall[RadialHomography] | None = None,
+    recall: RecallMany = lambda pairs, compute: compute(list(range(len(pairs)))),
 ) -> list[PairRegistration]:
-    """Estimate the relation of every pair, one after the other.
+    """Estimate the two-view geometry of every pair, many at a time, but in one thread.
 
-    Several at a time would take half as long again: small arrays keep the interpreter busy, for which threads wait.
+    Several threads would take half as long again: small arrays keep the interpreter busy, for which threads wait.
 
     Parameters
     ----------
@@ -125,36 +137,37 @@ def estimate_pairs(
     progress : callable, optional
         Called with the number of pairs done and their total.
     recall : callable, optional
-        Stands between this function and the estimation of each pair; see :data:`Recall`.
+        Stands between this function and the estimation of some pairs; see :data:`RecallMany`.
     """
+    limits = RansacOptions(options.threshold, options.confidence, options.max_iterations, options.seed)
+    how = EstimationOptions(options.solver, options.distortion, limits, _SELECT_BELOW)
 
-    def relate(index: int) -> RadialHomography:
-        image1, image2 = pairs[index]
-        camera1, camera2, found = cameras[image1], cameras[image2], matched[index]
-        tilt1, tilt2 = (None, None) if tilts is None else (tilts[image1], tilts[image2])
-        return estimate_radial_homography(
+    def matches_of(index: int) -> PairMatches:
+        (image1, image2), found = pairs[index], matched[index]
+        camera = cameras[image1]
+        own = Camera(camera.image_size, focal=camera.focal, focal_source=camera.focal_source, center=camera.center)
+        own = own.with_focal()
+        known = [None, None] if tilts is None else [tilts[image1], tilts[image2]]
+        return PairMatches(
             found.points1,
             found.points2,
-            camera1.image_size,
-            image_size2=camera2.image_size,
-            focal=camera1.focal,
-            focal_source=camera1.focal_source,
-            center=camera1.center,
-            solver=options.solver,
-            tilt=None if tilt1 is None or tilt2 is None else np.array([tilt1, tilt2]),
-            distortion=options.distortion,
-            quality=-found.ratio,
-            threshold=options.threshold,
-            confidence=options.confidence,
-            max_iterations=options.max_iterations,
-            seed=options.seed,
+            own,
+            own.resized(cameras[image2].image_size),
+            -found.ratio,
+            None if None in known else np.array(known, dtype=np.float64),
         )
 
-    done = []
-    for index, pair in enumerate(pairs):
-        compute = partial(relate, index)
-        relation = compute() if recall is None else recall(index, compute)
-        done.append(PairRegistration(*pair, matched[index], relation))
+    done: list[PairRegistration] = []
+    for start in range(0, len(pairs), _PAIRS_AT_ONCE):
+        block = range(start, min(start + _PAIRS_AT_ONCE, len(pairs)))
+
+        def estimate(places: list[int], block: range = block) -> list[RadialHomography]:
+            return estimate_radial_homographies([matches_of(block[place]) for place in places], how)
+
+        relations = recall(block, estimate)
+        done += [
+            PairRegistration(*pairs[k], matched[k], relation) for k, relation in zip(block, relations, strict=True)
+        ]
         if progress is not None:
             progress(len(done), len(pairs))
     return done

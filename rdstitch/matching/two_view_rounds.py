@@ -224,10 +224,15 @@ class Pairing:
         if self.static is not None:
             matched = [self.static.without_static(found) for found in matched]
 
-        def recall(index: int, compute: Callable[[], RadialHomography]) -> RadialHomography:
-            i, j = pairs[index]
-            inputs = (self.cameras[i], self.cameras[j], self.cache.digest(matched[index]), options, *self._tilts(i, j))
-            return self.cache.recall("pairs", (RadialHomography, Camera, PlanarMotion), inputs, compute)
+        def recall(
+            indices: Sequence[int], compute: Callable[[list[int]], list[RadialHomography]]
+        ) -> list[RadialHomography]:
+            inputs = []
+            for index in indices:
+                i, j = pairs[index]
+                digest = self.cache.digest(matched[index])
+                inputs.append((self.cameras[i], self.cameras[j], digest, options, *self._tilts(i, j)))
+            return self.cache.recall_many("pairs", (RadialHomography, Camera, PlanarMotion), inputs, compute)
 
         return estimate_pairs(
             self.cameras,

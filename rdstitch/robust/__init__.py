@@ -1,11 +1,26 @@
-"""Robust estimation of one pair: from matches, many of them wrong, to homography and λ.
+"""Robust estimation of pairs: from matches, many of them wrong, to homography and λ, for many pairs in lockstep.
 
-:func:`estimate_radial_homography` is the whole of it; it reads in the order of the modules: ``sampling`` draws
-minimal samples, the solvers of ``minimal`` turn them into hypotheses, ``scoring`` compares those in measured pixels,
-``local_optimization`` refines the best, ``ransac`` drives the four, ``selection`` decides how free the motion was, and
-``verification`` asks whether it could all be chance.
+:func:`estimate_radial_homography` is the whole of it for one pair; it reads in the order of the modules: ``sampling``
+draws minimal samples, the solvers of ``minimal`` turn them into hypotheses, ``scoring`` compares those in measured
+pixels, ``refinement`` improves the best by the ``levenberg_marquardt`` of the loss in ``linearization``, ``ransac``
+drives the four, ``model_selection`` decides how free the motion was, and ``verification`` whether it could all be
+chance.
 """
 
-from rdstitch.robust.estimate import SOLVERS, estimate_radial_homography
+from rdstitch.robust.estimate import (
+    SOLVERS,
+    EstimationOptions,
+    PairMatches,
+    estimate_radial_homographies,
+    estimate_radial_homography,
+)
+from rdstitch.robust.ransac import RansacOptions
 
-__all__ = ["SOLVERS", "estimate_radial_homography"]
+__all__ = [
+    "SOLVERS",
+    "EstimationOptions",
+    "PairMatches",
+    "RansacOptions",
+    "estimate_radial_homographies",
+    "estimate_radial_homography",
+]

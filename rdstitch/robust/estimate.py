@@ -1,23 +1,105 @@
-"""Homography and distortion of one pair of pictures from its correspondences: the public function."""
+"""Homography and distortion of pairs of images from their matches: the public functions."""
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
 from rdstitch.radial_homography import RadialHomography
-from rdstitch.robust.measurements import Measurements
+from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
-from rdstitch.robust.model_selection import Selection, rms_of, select_model
-from rdstitch.robust.pair_models import HomographyModel, PairModel, PlanarModel, Tilts
-from rdstitch.robust.ransac import Hypothesis, RansacOptions, Search, ransac
+from rdstitch.robust.model_selection import PairFit, PairSelection, rms_of, select_models
+from rdstitch.robust.pair_models import HomographyModel, PairModel, PlanarModel
+from rdstitch.robust.ransac import RansacOptions, ransac
 from rdstitch.robust.verification import LEAST_PLACES, places, rejection_reason
 
 SOLVERS = ("auto", "two_point", "three_point", "three_point_similarity", "four_point", "five_point")
 
 _AUTO_LEAVES_OUT = "four_point"  # finds what three points find, from more samples
+_MATCHES_AT_ONCE = 1 << 14
+"""Matches, with padding, of the pairs in one batch: enough to hide Python's overhead, few enough for the caches."""
+
+
+@dataclass(frozen=True)
+class PairMatches:
+    """Matches of one pair of images, and what is known of the cameras.
+
+    Attributes
+    ----------
+    points1, points2 : ndarray of shape (N, 2)
+        Measured points of image 1 and image 2, pixels.
+    camera1, camera2 : Camera
+        With the focal length and the distortion centre; one lens, so λ is shared.
+    quality : ndarray of shape (N,), optional
+        How much each match can be trusted, the higher the better.
+    tilts : ndarray of shape (2, 2), optional
+        Known (ψ, θ) of both images, radians.
+    """
+
+    points1: FloatArray
+    points2: FloatArray
+    camera1: Camera
+    camera2: Camera
+    quality: FloatArray | None = None
+    tilts: FloatArray | None = None
+
+    def __len__(self) -> int:
+        """Number of matches."""
+        return len(self.points1)
+
+    @property
+    def focal(self) -> float:
+        """Focal length in half diagonals."""
+        assert self.camera1.focal is not None
+        return self.camera1.focal / self.camera1.half_diagonal
+
+    @property
+    def batch_key(self) -> tuple[int, float, float, bool]:
+        """What pairs that go on in lockstep have in common."""
+        return padded_length(len(self)), self.focal, self.camera1.focal_log_std, self.tilts is None
+
+    @property
+    def order(self) -> IntArray:
+        """The matches, best first."""
+        return np.arange(len(self)) if self.quality is None else np.argsort(-self.quality, kind="stable")
+
+
+@dataclass(frozen=True)
+class EstimationOptions:
+    """How pairs are estimated.
+
+    Attributes
+    ----------
+    solver : str
+        One of :data:`SOLVERS`.
+    distortion : float, optional
+        Known λ in the half-diagonal frame; it is then not estimated.
+    ransac : RansacOptions
+    select_below : int or None
+        Inliers below which the models of planar motion compete with the free homography, which needs more of them;
+        None: always.
+    """
+
+    solver: str = "auto"
+    distortion: float | None = None
+    ransac: RansacOptions = field(default_factory=RansacOptions)
+    select_below: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.solver not in SOLVERS:
+            raise ArgumentError(f"unknown solver {self.solver!r}; choose one of {', '.join(SOLVERS)}")
+        if self.distortion is not None and self.solver != "auto":
+            raise ArgumentError(f"with known distortion there is nothing to choose; leave out solver={self.solver!r}")
+        if self.distortion is not None and not -1.0 < self.distortion < 1.0:
+            raise ArgumentError(f"distortion must lie between -1 and 1, not {self.distortion}")
+        limits = self.ransac
+        if not limits.threshold > 0.0 or not 0.0 < limits.confidence < 1.0 or limits.max_iterations < 1:
+            raise ArgumentError("threshold and max_iterations must be positive, confidence between 0 and 1")
 
 
 def estimate_radial_homography(
@@ -38,32 +120,32 @@ def estimate_radial_homography(
     max_iterations: int = 10000,
     seed: int = 0,
 ) -> RadialHomography:
-    """Estimate homography and division-model distortion together from point matches of two pictures of a plane.
+    """Estimate homography and division-model distortion together from point matches of two images of a plane.
 
     Parameters
     ----------
     points1, points2 : array_like of shape (N, 2)
-        Measured points of picture 1 and picture 2, px; wrong matches are expected among them.
+        Measured points of image 1 and image 2, pixels; wrong matches are expected among them.
     image_size : (int, int)
-        Width and height of picture 1, px.
+        Width and height of image 1, pixels.
     image_size2 : (int, int), optional
-        Of picture 2, where it differs: the same lens at another resolution or turned by a quarter.
+        Of image 2, where it differs: the same lens at another resolution or turned by a quarter.
     focal : float, optional
-        Focal length, px of picture 1; guessed if not given. Models of planar motion use it.
+        Focal length, pixels of image 1; guessed if not given. Models of planar motion use it.
     focal_source : str, optional
         How much the focal length can be trusted, a key of :data:`rdstitch.camera.FOCAL_LOG_STD`; "option" if not given.
     center : (float, float), optional
-        Distortion centre of picture 1, px; the image centre if not given.
+        Distortion centre of image 1, pixels; the image centre if not given.
     solver : str
         One of :data:`SOLVERS`. "auto" lets all solvers that the input allows compete.
     tilt : array_like of shape (2,) or (2, 2), optional
-        Known tilt (ψ, θ), radians, or one a picture.
+        Known tilt (ψ, θ), radians, or one an image.
     distortion : float, optional
         Known λ in the half-diagonal frame; it is then not estimated.
     quality : array_like of shape (N,), optional
         How much each match can be trusted, the higher the better: better matches are sampled first (PROSAC).
     threshold : float
-        Largest transfer error of an inlier, px of picture 2.
+        Largest transfer error of an inlier, pixels of image 2.
     confidence : float
         Wanted probability that no better model was missed.
     max_iterations : int
@@ -89,111 +171,141 @@ def estimate_radial_homography(
     >>> result.ok, result.model
     (True, 'rigid')
     """
-    camera1 = _camera(image_size, center, focal, focal_source)
-    camera2 = camera1.resized(image_size2 or image_size)
+    camera1 = Camera(image_size, focal=focal, focal_source=None if focal is None else focal_source or "option")
+    camera1 = (camera1 if center is None else replace(camera1, center=center)).with_focal()
+    limits = RansacOptions(threshold, confidence, max_iterations, seed, LEAST_PLACES)
+    options = EstimationOptions(solver, distortion, limits)
     tilts = _tilts(tilt)
-    _check(solver, tilts, distortion, threshold, confidence, max_iterations)
-    p1, p2 = np.asarray(points1, dtype=np.float64), np.asarray(points2, dtype=np.float64)
+    p1, p2 = checked_matches(points1, points2)
     weights = None if quality is None else np.asarray(quality, dtype=np.float64)
-    data = Measurements.from_pixels(p1, p2, camera1, camera2, weights)
-
-    solvers = _solvers(solver, camera1, tilts, distortion)
-    if (found := places(p1, p2, camera2.image_size)) < LEAST_PLACES:
-        reason = f"only {len(data)} matches, in {found} places of the picture"
-        return RadialHomography.failed(reason, camera1, camera2, len(data))
-    search = ransac(solvers, data, RansacOptions(threshold, confidence, max_iterations, seed, LEAST_PLACES))
-    if search.best is None:
-        reason = f"no plausible model in {search.iterations} samples of {len(data)} matches"
-        return RadialHomography.failed(reason, camera1, camera2, len(data), search.iterations)
-    chosen = select_model(
-        _models(camera1, tilts), search.best.homography, search.best.distortion, data, threshold,
-        fixed_distortion=distortion is not None,
-    )  # fmt: skip
-    doubt = rejection_reason(p1, p2, chosen.fit.errors < threshold, camera2.image_size, threshold)
-    if doubt is not None:
-        return RadialHomography.failed(doubt, camera1, camera2, len(data), search.iterations)
-    return _result(chosen, search, search.best, camera1, camera2, threshold)
+    if weights is not None and weights.shape != (len(p1),):
+        raise ArgumentError(f"quality must have shape ({len(p1)},), not {weights.shape}")
+    pair = PairMatches(p1, p2, camera1, camera1.resized(image_size2 or image_size), weights, tilts)
+    return estimate_radial_homographies([pair], options)[0]
 
 
-def _camera(
-    image_size: tuple[int, int], center: tuple[float, float] | None, focal: float | None, source: str | None
-) -> Camera:
-    camera = Camera(image_size, focal=focal, focal_source=None if focal is None else source or "option")
-    camera = camera if center is None else replace(camera, center=center)
-    return camera.with_focal()
+def estimate_radial_homographies(pairs: Sequence[PairMatches], options: EstimationOptions) -> list[RadialHomography]:
+    """As :func:`estimate_radial_homography`, of many pairs at once: several times faster, the same result for each.
+
+    Raises
+    ------
+    ArgumentError
+        When the two-point solver is wanted for a pair without known tilts.
+    """
+    if options.solver == "two_point" and any(pair.tilts is None for pair in pairs):
+        raise ArgumentError("the two_point solver needs the tilt")
+    result: dict[int, RadialHomography] = {}
+    batches: dict[tuple[int, float, float, bool], list[int]] = {}
+    for index, pair in enumerate(pairs):
+        if (found := places(pair.points1, pair.points2, pair.camera2.image_size)) < LEAST_PLACES:
+            reason = f"only {len(pair)} matches, in {found} places of the image"
+            result[index] = RadialHomography.failed(reason, pair.camera1, pair.camera2, len(pair))
+        else:
+            batches.setdefault(pair.batch_key, []).append(index)
+    for (length, *_), members in batches.items():
+        step = max(1, _MATCHES_AT_ONCE // length)
+        for start in range(0, len(members), step):
+            block = members[start : start + step]
+            result.update(zip(block, _estimate_batch([pairs[i] for i in block], options), strict=True))
+    return [result[index] for index in range(len(pairs))]
 
 
-def _tilts(tilt: ArrayLike | None) -> Tilts | None:
+def _estimate_batch(pairs: list[PairMatches], options: EstimationOptions) -> list[RadialHomography]:
+    """Of pairs with the same ``batch_key``."""
+    order = [pair.order for pair in pairs]
+    data = Measurements.of_pairs(
+        [(pair.points1[own], pair.points2[own]) for pair, own in zip(pairs, order, strict=True)],
+        [(pair.camera1, pair.camera2) for pair in pairs],
+    )
+    known = [pair.tilts for pair in pairs if pair.tilts is not None]
+    tilts = np.stack(known) if known else None
+    ordered = np.array([pair.quality is not None for pair in pairs])
+    focal, std = pairs[0].focal, pairs[0].camera1.focal_log_std
+    solvers = _solvers(options, focal, std, tilts is not None)
+    search = ransac(solvers, data, ordered, tilts, options.ransac)
+    threshold = options.ransac.threshold
+
+    found = np.flatnonzero(np.isfinite(search.best.cost))
+    limit = np.inf if options.select_below is None else options.select_below
+    few = search.best.inliers[found].sum(axis=1) < limit
+    fits: dict[int, PairFit] = {}
+    family: list[PairModel] = _models(focal, std, tilts is not None)
+    for models, rows in ((family, few), (family[-1:], ~few)):
+        own = found[rows]
+        if not len(own):
+            continue
+        selection = PairSelection(
+            search.best.homography[own],
+            search.best.distortion[own],
+            data.take(own),
+            None if tilts is None else tilts[own],
+            np.ones(len(own)),
+            threshold,
+            options.distortion is not None,
+        )
+        fits.update(zip(own.tolist(), select_models(models, selection), strict=True))
+
+    result = []
+    for row, pair in enumerate(pairs):
+        iterations, count = int(search.iterations[row]), len(pair)
+        if row not in fits:
+            reason = f"no plausible model in {iterations} samples of {count} matches"
+            result.append(RadialHomography.failed(reason, pair.camera1, pair.camera2, count, iterations))
+            continue
+        errors = np.empty(count)
+        errors[order[row]] = fits[row].errors[:count]
+        solver = solvers[int(search.best.solver[row])].name
+        result.append(_result(pair, fits[row], errors, threshold, solver, iterations, bool(search.confident[row])))
+    return result
+
+
+def _tilts(tilt: ArrayLike | None) -> FloatArray | None:
+    """Of both images."""
     if tilt is None:
         return None
     angles = np.asarray(tilt, dtype=np.float64)
     if angles.shape not in ((2,), (2, 2)) or not np.isfinite(angles).all():
-        raise ArgumentError(f"tilt must be (psi, theta) or one such pair a picture, finite, not {tilt!r}")
-    (psi1, theta1), (psi2, theta2) = np.broadcast_to(angles, (2, 2)).tolist()
-    return (psi1, theta1), (psi2, theta2)
+        raise ArgumentError(f"tilt must be (psi, theta) or one such pair an image, finite, not {tilt!r}")
+    return np.broadcast_to(angles, (2, 2))
 
 
-def _check(
-    solver: str,
-    tilts: Tilts | None,
-    distortion: float | None,
-    threshold: float,
-    confidence: float,
-    iterations: int,
-) -> None:
-    if solver not in SOLVERS:
-        raise ArgumentError(f"unknown solver {solver!r}; choose one of {', '.join(SOLVERS)}")
-    if solver == "two_point" and tilts is None:
-        raise ArgumentError("the two_point solver needs the tilt")
-    if distortion is not None and solver != "auto":
-        raise ArgumentError(f"with known distortion there is nothing to choose; leave out solver={solver!r}")
-    if distortion is not None and not -1.0 < distortion < 1.0:
-        raise ArgumentError(f"distortion must lie between -1 and 1, not {distortion}")
-    if not threshold > 0.0 or not 0.0 < confidence < 1.0 or iterations < 1:
-        raise ArgumentError("threshold and max_iterations must be positive, confidence between 0 and 1")
+def _solvers(options: EstimationOptions, focal: float, focal_std: float, tilts_known: bool) -> list[MinimalSolver]:
+    solvers = minimal_solvers(focal, focal_std, tilts_known, options.distortion)
+    if options.solver == "auto":
+        return [solver for solver in solvers if solver.name != _AUTO_LEAVES_OUT]
+    if options.solver == "three_point":
+        solvers = minimal_solvers(focal, focal_std, False, options.distortion)
+    return [solver for solver in solvers if solver.name == options.solver]
 
 
-def _solvers(name: str, camera: Camera, tilts: Tilts | None, distortion: float | None) -> list[MinimalSolver]:
-    solvers = minimal_solvers(_focal(camera), camera.focal_log_std, tilts, distortion)
-    if name == "auto":
-        return [s for s in solvers if s.name != _AUTO_LEAVES_OUT]
-    if name == "three_point" and tilts is not None:
-        solvers = minimal_solvers(_focal(camera), camera.focal_log_std, None, distortion)
-    return [s for s in solvers if s.name == name]
-
-
-def _models(camera: Camera, tilts: Tilts | None) -> list[PairModel]:
-    focal, std = _focal(camera), camera.focal_log_std
-    planar = [PlanarModel(focal, std, tilts, height_free=free) for free in (False, True)]
+def _models(focal: float, focal_std: float, tilts_known: bool) -> list[PairModel]:
+    planar = [PlanarModel(focal, focal_std, tilts_known, height_free=free) for free in (False, True)]
     return [*planar, HomographyModel()]
 
 
-def _focal(camera: Camera) -> float:
-    """Focal length in half diagonals."""
-    assert camera.focal is not None
-    return camera.focal / camera.half_diagonal
-
-
 def _result(
-    chosen: Selection, search: Search, found: Hypothesis, camera1: Camera, camera2: Camera, threshold: float
+    pair: PairMatches, fit: PairFit, errors: FloatArray, threshold: float, solver: str, iterations: int, confident: bool
 ) -> RadialHomography:
-    fit, model = chosen.fit, chosen.fit.model
-    camera1 = replace(camera1, distortion=fit.distortion, distortion_std=chosen.distortion_std)
-    if not search.confident:
-        reason = f"{chosen.reason}; the search stopped at its limit of samples before it was confident"
-    else:
-        reason = chosen.reason
+    """What was found of a pair, unless that could be chance."""
+    inliers = errors < threshold
+    doubt = rejection_reason(pair.points1, pair.points2, inliers, pair.camera2.image_size, threshold)
+    if doubt is not None:
+        return RadialHomography.failed(doubt, pair.camera1, pair.camera2, len(pair), iterations)
+    reason = fit.reason
+    if not confident:
+        reason += "; the search stopped at its limit of samples before it was confident"
+    camera1 = replace(pair.camera1, distortion=fit.distortion, distortion_std=fit.distortion_std)
     return RadialHomography(
         homography=fit.homography / np.cbrt(np.linalg.det(fit.homography)),
         camera=camera1,
-        camera2=camera1.resized(camera2.image_size),
-        inliers=fit.errors < threshold,
-        covariance=chosen.covariance,
-        distortion_std=chosen.distortion_std,
-        model=model.name,
-        motion=model.motion(fit.state) if isinstance(model, PlanarModel) else None,
-        rms=rms_of(fit.errors, threshold),
-        solver=found.solver,
-        iterations=search.iterations,
+        camera2=camera1.resized(pair.camera2.image_size),
+        inliers=inliers,
+        covariance=fit.covariance,
+        distortion_std=fit.distortion_std,
+        model=fit.model.name,
+        motion=fit.model.motion(fit.state) if isinstance(fit.model, PlanarModel) else None,
+        rms=float(rms_of(errors[None], threshold)[0]),
+        solver=solver,
+        iterations=iterations,
         reason=reason,
     )

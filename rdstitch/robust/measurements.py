@@ -1,72 +1,112 @@
-"""The data of one pair of pictures, as robust estimation sees it."""
+"""The matches of many pairs of images, as robust estimation sees them: one array with the pairs first."""
 
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
+
+_STEPS_PER_OCTAVE = 4
+_LEAST_WIDTH = 16
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """Corresponding points of two pictures, normalized by half the diagonal of their picture.
+    """Matches of B pairs of images, normalized by half the diagonal of their image, padded to N a pair.
 
     Attributes
     ----------
-    x1, x2 : ndarray of shape (N, 2)
-        Normalized measured points.
-    camera1, camera2 : Camera
-        The pictures' frames; one lens, so λ is shared.
-    quality : ndarray of shape (N,) or None
-        The higher, the more likely a correspondence is right; None where nothing is known.
+    x1, x2 : ndarray of shape (B, 2, N)
+        Normalized measured points; zeros where ``present`` is False.
+    present : ndarray of shape (B, N), bool
+        Which are matches; the rest is padding, or matches that are left out.
+    count : ndarray of shape (B,), intp
+        Matches of each pair: they come before the padding.
+    px : ndarray of shape (B,)
+        Pixels of image 2 in one normalized unit.
+    px_ratio : ndarray of shape (B,)
+        Pixels of image 2 that one pixel of image 1 becomes when normalized coordinates are kept.
     """
 
     x1: FloatArray
     x2: FloatArray
-    camera1: Camera
-    camera2: Camera
-    quality: FloatArray | None = None
+    present: BoolArray
+    count: IntArray
+    px: FloatArray
+    px_ratio: FloatArray
 
     @classmethod
-    def from_pixels(
-        cls,
-        points1: FloatArray,
-        points2: FloatArray,
-        camera1: Camera,
-        camera2: Camera,
-        quality: FloatArray | None,
-    ) -> "Measurements":
-        """Check and normalize measured points (N, 2), px."""
-        for name, points in (("points1", points1), ("points2", points2)):
-            if points.ndim != 2 or points.shape[1] != 2:
-                raise ArgumentError(f"{name} must have shape (N, 2), not {points.shape}")
-            if not np.isfinite(points).all():
-                raise ArgumentError(f"{name} has values that are not finite")
-        if len(points1) != len(points2):
-            raise ArgumentError(f"points1 and points2 differ in length: {len(points1)} and {len(points2)}")
-        if quality is not None and quality.shape != (len(points1),):
-            raise ArgumentError(f"quality must have shape ({len(points1)},), not {quality.shape}")
-        return cls(camera1.normalize(points1), camera2.normalize(points2), camera1, camera2, quality)
+    def of_pairs(
+        cls, points: Sequence[tuple[FloatArray, FloatArray]], cameras: Sequence[tuple[Camera, Camera]]
+    ) -> Self:
+        """Of checked matches, pixels (N, 2), and the cameras of both images of each pair."""
+        counts = np.array([len(points1) for points1, _ in points], dtype=np.intp)
+        width = padded_length(int(counts.max(initial=0)))
+        x = np.zeros((2, len(points), 2, width))
+        for row, (both, pair_cameras) in enumerate(zip(points, cameras, strict=True)):
+            for side, (measured, camera) in enumerate(zip(both, pair_cameras, strict=True)):
+                x[side, row, :, : counts[row]] = camera.normalize(measured).T
+        size1, size2 = (np.array([pair[side].half_diagonal for pair in cameras]) for side in (0, 1))
+        return cls(x[0], x[1], np.arange(width) < counts[:, None], counts, size2, size2 / size1)
 
-    def subset(self, chosen: NDArray[Any]) -> "Measurements":
-        """The chosen correspondences, given by index or as a mask."""
-        quality = None if self.quality is None else self.quality[chosen]
-        return replace(self, x1=self.x1[chosen], x2=self.x2[chosen], quality=quality)
+    @classmethod
+    def from_pixels(cls, points1: ArrayLike, points2: ArrayLike, camera1: Camera, camera2: Camera) -> Self:
+        """Check and normalize the matches of one pair, pixels (N, 2)."""
+        return cls.of_pairs([checked_matches(points1, points2)], [(camera1, camera2)])
 
     def __len__(self) -> int:
-        """Number of correspondences."""
-        return len(self.x1)
+        """Number of pairs."""
+        return len(self.count)
 
-    @property
-    def px(self) -> float:
-        """Pixels of picture 2 in one normalized unit of picture 2."""
-        return self.camera2.half_diagonal
+    @cached_property
+    def radius2(self) -> FloatArray:
+        """Squared distance of the points of image 1 from the distortion centre, (B, N)."""
+        return self.x1[:, 0] ** 2 + self.x1[:, 1] ** 2
 
-    @property
-    def px_ratio(self) -> float:
-        """Pixels of picture 2 that one pixel of picture 1 becomes when normalized coordinates are kept."""
-        return self.camera2.half_diagonal / self.camera1.half_diagonal
+    def take(self, pairs: NDArray[Any]) -> Self:
+        """Some of the pairs, by index or as a mask."""
+        return type(self)(*(getattr(self, name)[pairs] for name in _COLUMNS))
+
+    def only(self, chosen: BoolArray) -> Self:
+        """Without the matches that are not chosen (B, N)."""
+        return type(self)(self.x1, self.x2, self.present & chosen, self.count, self.px, self.px_ratio)
+
+    def at(self, index: IntArray) -> Self:
+        """The matches at some places of each pair, (B, K); the padding at those beyond the matches."""
+        places = np.minimum(index, self.present.shape[1] - 1)
+        x1, x2 = (np.take_along_axis(x, places[:, None], axis=2) for x in (self.x1, self.x2))
+        present = np.take_along_axis(self.present, places, axis=1) & (index < self.count[:, None])
+        return type(self)(x1, x2, present, present.sum(axis=1), self.px, self.px_ratio)
+
+
+_COLUMNS = ("x1", "x2", "present", "count", "px", "px_ratio")
+
+
+def padded_length(count: int) -> int:
+    """Matches that ``count`` are padded to: four steps an octave, so that pairs of similar size share a batch.
+
+    It depends on the pair alone, and so does every sum over its matches: whatever the pairs beside it.
+    """
+    if count <= _LEAST_WIDTH:
+        return _LEAST_WIDTH
+    step = 1 << max((count - 1).bit_length() - 1 - _STEPS_PER_OCTAVE.bit_length() + 1, 0)
+    return -(-count // step) * step
+
+
+def checked_matches(points1: ArrayLike, points2: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Matches as two arrays (N, 2) of float64; ArgumentError where shapes differ or a value is not finite."""
+    p1, p2 = np.asarray(points1, dtype=np.float64), np.asarray(points2, dtype=np.float64)
+    for name, points in (("points1", p1), ("points2", p2)):
+        if points.ndim != 2 or points.shape[1] != 2:
+            raise ArgumentError(f"{name} must have shape (N, 2), not {points.shape}")
+        if not np.isfinite(points).all():
+            raise ArgumentError(f"{name} has values that are not finite")
+    if len(p1) != len(p2):
+        raise ArgumentError(f"points1 and points2 differ in length: {len(p1)} and {len(p2)}")
+    return p1, p2

@@ -8,15 +8,13 @@ import numpy as np
 
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
-from rdstitch.robust.pair_models import HomographyModel, PairModel, PlanarModel, Tilts
+from rdstitch.robust.pair_models import HomographyModel, PairModel, PlanarModel
 from rdstitch.solvers.solutions import Solutions
 
-Solve = Callable[[FloatArray, FloatArray], Solutions]
+Solve = Callable[[FloatArray, FloatArray, FloatArray | None], Solutions]
 
 DISTORTION_RANGE = (-0.95, 0.5)
 """λ in the half-diagonal frame that is searched: from nearly folding barrel to strong pincushion distortion."""
-
-_LEVEL: Tilts = ((0.0, 0.0), (0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -29,7 +27,8 @@ class MinimalSolver:
         As the user names it.
     sample_size : int
     solve : callable
-        Maps points (B, sample_size, 2) of both pictures, in the half-diagonal frame, to solutions in that frame.
+        Maps points (B, sample_size, 2) of both images, in the half-diagonal frame, and the known tilts (B, 2, 2) of
+        both images of each sample, radians, or None, to solutions in that frame.
     model : PairModel
         The model that the solver assumes; its solutions are refined with it first.
     fixed_distortion : bool
@@ -43,9 +42,7 @@ class MinimalSolver:
     fixed_distortion: bool = False
 
 
-def minimal_solvers(
-    focal: float, focal_std: float, tilts: Tilts | None, distortion: float | None
-) -> list[MinimalSolver]:
+def minimal_solvers(focal: float, focal_std: float, tilts_known: bool, distortion: float | None) -> list[MinimalSolver]:
     """The solvers that the known quantities allow, those with the fewest points first.
 
     Parameters
@@ -54,51 +51,58 @@ def minimal_solvers(
         Focal length in half diagonals.
     focal_std : float
         Standard deviation of its logarithm.
-    tilts : pair of (float, float) or None
-        Known tilts (ψ, θ) of both pictures, radians.
+    tilts_known : bool
+        Whether the tilts of both images are known.
     distortion : float or None
         Known λ in the half-diagonal frame.
     """
-    rigid = PlanarModel(focal, focal_std, tilts)
-    similarity = PlanarModel(focal, focal_std, tilts, height_free=True)
-    assumed = tilts or _LEVEL
+    rigid = PlanarModel(focal, focal_std, tilts_known)
+    similarity = PlanarModel(focal, focal_std, tilts_known, height_free=True)
     if distortion is not None:
         known = distortion * focal**2
-        points2 = partial(solvers.two_point_similarity, distortion=known, tilt=assumed)
+        points2 = partial(solvers.two_point_similarity, distortion=known)
         dlt = partial(solvers.four_point_dlt, distortion=distortion)
         return [
-            MinimalSolver("two_point_similarity", 2, _in_focal_lengths(points2, focal), similarity, True),
-            MinimalSolver("four_point_dlt", 4, dlt, HomographyModel(), True),
+            MinimalSolver("two_point_similarity", 2, _tilted(points2, focal), similarity, True),
+            MinimalSolver("four_point_dlt", 4, _untilted(dlt), HomographyModel(), True),
         ]
     low, high = DISTORTION_RANGE
     searched = {"distortion_range": (low * focal**2, high * focal**2)}
-    if tilts is None:
-        planar = MinimalSolver(
-            "three_point", 3, _in_focal_lengths(partial(solvers.three_point, **searched), focal), rigid
-        )
+    if tilts_known:
+        planar = MinimalSolver("two_point", 2, _tilted(partial(solvers.two_point, **searched), focal), rigid)
     else:
-        two_point = partial(solvers.two_point, tilt=tilts, **searched)
-        planar = MinimalSolver("two_point", 2, _in_focal_lengths(two_point, focal), rigid)
-    scaled = partial(solvers.three_point_similarity, tilt=assumed, **searched)
-    four_point = _in_focal_lengths(partial(solvers.four_point, **searched), focal)
+        planar = MinimalSolver("three_point", 3, _untilted(partial(solvers.three_point, **searched), focal), rigid)
+    scaled = partial(solvers.three_point_similarity, **searched)
+    four_point = partial(solvers.four_point, **searched)
     five_point = partial(solvers.five_point, distortion_range=DISTORTION_RANGE)
     return [
         planar,
-        MinimalSolver("three_point_similarity", 3, _in_focal_lengths(scaled, focal), similarity),
-        MinimalSolver("four_point", 4, four_point, rigid),
-        MinimalSolver("five_point", 5, five_point, HomographyModel()),
+        MinimalSolver("three_point_similarity", 3, _tilted(scaled, focal), similarity),
+        MinimalSolver("four_point", 4, _untilted(four_point, focal), rigid),
+        MinimalSolver("five_point", 5, _untilted(five_point), HomographyModel()),
     ]
 
 
-def _in_focal_lengths(solve: Solve, focal: float) -> Solve:
-    """A solver that sees focal-normalized points, as one for points in half diagonals.
+def _tilted(solve: Callable[..., Solutions], focal: float) -> Solve:
+    """A solver of focal-normalized points that takes tilts; without any, the camera is taken to be level."""
 
-    With ``x_f = x / focal``: ``λ = λ_f / focal²`` and ``H = K H_f K⁻¹``, ``K = diag(focal, focal, 1)``.
-    """
-    k = np.array([focal, focal, 1.0])
-
-    def solve_in_half_diagonals(x1: FloatArray, x2: FloatArray) -> Solutions:
-        found = solve(x1 / focal, x2 / focal)
-        return Solutions(found.sample, found.homography * (k[:, None] / k), found.distortion / focal**2)
+    def solve_in_half_diagonals(x1: FloatArray, x2: FloatArray, tilts: FloatArray | None = None) -> Solutions:
+        known = (0.0, 0.0) if tilts is None else tilts
+        return _in_half_diagonals(solve(x1 / focal, x2 / focal, tilt=known), focal)
 
     return solve_in_half_diagonals
+
+
+def _untilted(solve: Callable[..., Solutions], focal: float = 1.0) -> Solve:
+    """A solver of focal-normalized points that does not need tilts."""
+
+    def solve_in_half_diagonals(x1: FloatArray, x2: FloatArray, tilts: FloatArray | None = None) -> Solutions:
+        return _in_half_diagonals(solve(x1 / focal, x2 / focal), focal)
+
+    return solve_in_half_diagonals
+
+
+def _in_half_diagonals(found: Solutions, focal: float) -> Solutions:
+    """With ``x_f = x / focal``: ``λ = λ_f / focal²`` and ``H = K H_f K⁻¹``, ``K = diag(focal, focal, 1)``."""
+    k = np.array([focal, focal, 1.0])
+    return Solutions(found.sample, found.homography * (k[:, None] / k), found.distortion / focal**2)

@@ -1,159 +1,229 @@
-"""Which model of the family describes a pair: the least free one that explains the data."""
+"""Which model of the family describes each of many pairs: the least free one that explains the data."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.division_model import OBSERVABLE_STD
-from rdstitch.robust.local_optimization import Linearized, Refined, refine
+from rdstitch.robust.covariance import covariances
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyModel, PairModel
-from rdstitch.robust.verification import numbered_cells
+from rdstitch.robust.refinement import Fits, Inspection, PairProblems, refine
 
-_LEAST_NOISE = 0.02  # px; below, noise-free data would reject every model over rounding
+_LEAST_NOISE = 0.02  # pixels; below, noise-free data would reject every model over rounding
 _RAYLEIGH_MEDIAN = 1.1774  # median length of a two-dimensional normal vector of standard deviation 1
 _LOSS_WIDTH = 4.0  # scale of the loss in standard deviations of the noise
-
-_SINGULAR = 1e-13  # eigenvalue of the correlation matrix of the parameters
-_CELLS_PER_HALF_DIAGONAL = 5.0
-_NEAR = 3.0  # errors, in thresholds, beyond which a correspondence has no say in the choice
+_NEAR = 3.0  # errors, in thresholds, beyond which a match has no say in the choice
+_FREE_STEPS, _STEPS = 8, 15
 
 
 @dataclass(frozen=True)
-class Selection:
-    """The chosen model, fitted.
+class PairFit:
+    """The chosen model of one pair, fitted.
 
     Attributes
     ----------
-    fit : Refined
-    noise : float
-        Standard deviation of the transfer errors, per axis, px.
+    model : PairModel
+    state : ndarray of shape (S,)
+    homography : ndarray of shape (3, 3)
+    distortion : float
+    errors : ndarray of shape (N,)
+        Whitened transfer errors, pixels; inf where there is no transfer.
     covariance : ndarray of shape (P, P)
         Of λ (first, where it was estimated) and the model's parameters.
     distortion_std : float
-        Standard deviation of λ; 0 where it was given, inf where it is not observable (λ is then 0 in ``fit``).
+        Standard deviation of λ; 0 where it was given, inf where it is not observable (λ is then 0).
     reason : str
     """
 
-    fit: Refined
-    noise: float
+    model: PairModel
+    state: FloatArray
+    homography: FloatArray
+    distortion: float
+    errors: FloatArray
     covariance: FloatArray
     distortion_std: float
     reason: str
 
 
-def select_model(
-    models: list[PairModel],
-    homography: FloatArray,
-    distortion: float,
-    data: Measurements,
-    threshold: float,
-    *,
-    fixed_distortion: bool,
-) -> Selection:
-    """Fit every model and choose by the Bayesian information criterion.
+@dataclass(frozen=True)
+class PairSelection:
+    """B pairs for which a model is to be chosen.
 
-    The noise is that of the freest model, so that a lesser model is held against what the pictures allow and not
-    against its own misfit.
+    Attributes
+    ----------
+    homography : ndarray of shape (B, 3, 3)
+        Where to start.
+    distortion : ndarray of shape (B,)
+        Where to start, or what λ is known to be.
+    data : Measurements
+    tilts : ndarray of shape (B, 2, 2) or None
+        Known tilts (ψ, θ) of both images, radians.
+    noise : ndarray of shape (B,)
+        Standard deviation of the errors per axis, pixels.
+    threshold : float
+        Largest transfer error of an inlier, pixels.
+    fixed_distortion : bool
+        Whether λ is known.
+    """
+
+    homography: FloatArray
+    distortion: FloatArray
+    data: Measurements
+    tilts: FloatArray | None
+    noise: FloatArray
+    threshold: float
+    fixed_distortion: bool
+
+    def take(self, rows: IntArray) -> Self:
+        """Some of the pairs."""
+        tilts = None if self.tilts is None else self.tilts[rows]
+        return replace(
+            self,
+            homography=self.homography[rows],
+            distortion=self.distortion[rows],
+            data=self.data.take(rows),
+            tilts=tilts,
+            noise=self.noise[rows],
+        )
+
+    def fit(self, model: PairModel, width: FloatArray, steps: int) -> tuple[Fits, Inspection]:
+        """A model fitted to every pair from where it stands, with a loss of the given widths (B,), pixels."""
+        start = Fits(model.initialize(self.homography, self.tilts), self.homography, self.distortion)
+        problems = PairProblems(model, self.data, width, self.noise, self.fixed_distortion)
+        fits = refine(problems, start, steps)
+        return fits, problems.inspect(fits)
+
+    def at(self, fits: Fits) -> Self:
+        """Standing at fits."""
+        return replace(self, homography=fits.homography, distortion=fits.distortion)
+
+
+def select_models(models: list[PairModel], pairs: PairSelection) -> list[PairFit]:
+    """Fit every model to each pair and choose by the Bayesian information criterion.
+
+    The noise is that of the freest model, so that a lesser model is held against what the images allow and not against
+    its own misfit.
 
     Parameters
     ----------
     models : list of PairModel
         From least to most free; the last one is a :class:`HomographyModel`.
-    homography, distortion
-        Where to start.
-    data : Measurements
-    threshold : float
-        Largest transfer error of an inlier, px.
-    fixed_distortion : bool
-        Whether λ is known.
+    pairs : PairSelection
+        ``noise`` is estimated anew.
     """
-    free = refine(
-        HomographyModel(),
-        homography,
-        distortion,
-        data,
-        threshold,
-        fixed_distortion=fixed_distortion,
-        iterations=8,
-    )
-    noise = noise_of(free.errors, threshold)
-    inliers = max(1, int(np.sum(free.errors < threshold)))
-    near = data.subset(free.errors < _NEAR * threshold)
+    threshold = pairs.threshold
+    free, seen = pairs.fit(HomographyModel(), np.full(len(pairs.data), threshold), _FREE_STEPS)
+    noise = noise_of(seen.errors, threshold)
+    near = replace(pairs.at(free), noise=noise, data=pairs.data.only(seen.errors < _NEAR * threshold))
+    inliers = np.maximum((seen.errors < threshold).sum(axis=1), 1)
+    fitted = [near.fit(model, loss_width(noise, threshold), _STEPS) for model in models]
+    criteria = [found.cost / noise**2 + found.information.shape[1] * np.log(2 * inliers) for _, found in fitted]
+    chosen = np.argmin(criteria, axis=0)
+    rms = np.stack([rms_of(found.errors, threshold) for _, found in fitted], axis=1)
+    result: dict[int, PairFit] = {}
+    for index, (fits, found) in enumerate(fitted):
+        rows = np.flatnonzero(chosen == index)
+        if len(rows):
+            own = replace(near.at(fits), noise=noise_of(found.errors, threshold)).take(rows)
+            reasons = [_explained(models, index, rms[row]) for row in rows]
+            result.update(
+                zip(rows.tolist(), _finished(models[index], own, pairs.data.take(rows), reasons), strict=True)
+            )
+    return [result[row] for row in range(len(pairs.data))]
 
-    def fit(model: PairModel, start: Refined, distortion: float, fixed: bool, iterations: int = 15) -> Refined:
-        points = near if iterations else data
-        return refine(
+
+def _finished(model: PairModel, near: PairSelection, data: Measurements, reasons: list[str]) -> Iterator[PairFit]:
+    """The chosen model with its covariance, and without λ where that is not observable.
+
+    Parameters
+    ----------
+    model : PairModel
+    near : PairSelection
+        Standing at the fits; with the matches that the choice was made by.
+    data : Measurements
+        All matches.
+    reasons : list of str
+        Why this model was chosen, for each pair.
+    """
+    found = _inspected(model, near, data)
+    std = np.zeros(len(data)) if near.fixed_distortion else np.sqrt(found.covariance[:, 0, 0])
+    unseen = np.flatnonzero(~(std < OBSERVABLE_STD))
+    straight = None
+    if len(unseen):
+        level = replace(near.take(unseen), distortion=np.zeros(len(unseen)), fixed_distortion=True)
+        fits, _ = level.fit(model, loss_width(level.noise, near.threshold), _STEPS)
+        straight = _inspected(model, level.at(fits), data.take(unseen))
+    place = {row: index for index, row in enumerate(unseen.tolist())}
+    for row, reason in enumerate(reasons):
+        if row not in place or straight is None:
+            yield found.pair(model, row, float(std[row]), reason)
+        else:
+            why = f"{reason}; λ is not observable (standard deviation {std[row]:.2g}) and was set to 0"
+            yield straight.pair(model, place[row], np.inf, why)
+
+
+@dataclass(frozen=True)
+class _Inspected:
+    """Fits of B pairs with errors and covariances."""
+
+    fits: Fits
+    errors: FloatArray
+    covariance: FloatArray
+
+    def pair(self, model: PairModel, row: int, std: float, reason: str) -> PairFit:
+        """One of the pairs."""
+        fits = self.fits
+        distortion = float(fits.distortion[row])
+        return PairFit(
             model,
-            start.homography,
+            fits.state[row],
+            fits.homography[row],
             distortion,
-            points,
-            loss_width(noise, threshold),
-            fixed_distortion=fixed,
-            noise=noise,
-            iterations=iterations,
+            self.errors[row],
+            self.covariance[row],
+            std,
+            reason,
         )
 
-    fits = [fit(model, free, free.distortion, fixed_distortion) for model in models]
-    criteria = [f.cost / noise**2 + len(f.information) * np.log(2 * inliers) for f in fits]
-    chosen = fits[int(np.argmin(criteria))]
-    reason = _explain(fits, chosen, threshold)
-    noise = noise_of(chosen.errors, threshold)
-    chosen = fit(chosen.model, chosen, chosen.distortion, fixed_distortion, iterations=0)
-    covariance = covariance_of(chosen, noise, data)
-    std = 0.0 if fixed_distortion else float(np.sqrt(covariance[0, 0]))
-    if std < OBSERVABLE_STD:
-        return Selection(chosen, noise, covariance, std, reason)
-    straight = fit(chosen.model, chosen, 0.0, True)
-    straight = fit(chosen.model, straight, 0.0, True, iterations=0)
-    reason += f"; λ is not observable (standard deviation {std:.2g}) and was set to 0"
-    return Selection(straight, noise, covariance_of(straight, noise, data), np.inf, reason)
+
+def _inspected(model: PairModel, pairs: PairSelection, data: Measurements) -> _Inspected:
+    """The fits as they stand, on all matches."""
+    width = loss_width(pairs.noise, pairs.threshold)
+    fits, found = replace(pairs, data=data).fit(model, width, 0)
+    covariance = covariances(found.information, found.influence, pairs.noise, data)
+    return _Inspected(fits, found.errors, covariance)
 
 
-def noise_of(errors: FloatArray, threshold: float) -> float:
-    """Standard deviation per axis, px, from the median error of those below the threshold."""
-    inside = errors[errors < threshold]
-    return _LEAST_NOISE if not len(inside) else max(float(np.median(inside)) / _RAYLEIGH_MEDIAN, _LEAST_NOISE)
+def noise_of(errors: FloatArray, threshold: float) -> FloatArray:
+    """Standard deviations per axis, pixels, (B,), from the median of the errors (B, N) below the threshold."""
+    inside = errors < threshold
+    count = inside.sum(axis=1)
+    ordered = np.sort(np.where(inside, errors, np.inf), axis=1)
+    middle = np.stack([np.maximum(count - 1, 0) // 2, count // 2], axis=1)
+    middle = np.minimum(middle, errors.shape[1] - 1)
+    median = np.take_along_axis(ordered, middle, axis=1).mean(axis=1)
+    return np.where(count > 0, np.maximum(median / _RAYLEIGH_MEDIAN, _LEAST_NOISE), _LEAST_NOISE)
 
 
-def loss_width(noise: float, threshold: float) -> float:
-    """Scale of the loss, px, for errors of this standard deviation per axis."""
-    return min(threshold, _LOSS_WIDTH * noise)
+def loss_width(noise: FloatArray, threshold: float) -> FloatArray:
+    """Scales of the loss, pixels, for errors of these standard deviations per axis."""
+    return np.minimum(threshold, _LOSS_WIDTH * noise)
 
 
-def covariance_of(fit: Refined | Linearized, noise: float, data: Measurements) -> FloatArray:
-    """Covariance that holds also where neighbouring errors are alike, as parallax and lens misfit make them.
-
-    ``A⁻¹ (Σ_c g_c g_c') A⁻¹`` over the cells c of a grid, ``A`` the normal matrix and ``g_c`` the gradient of the
-    correspondences in a cell (White's estimator with clusters), but in no direction less than ``noise² A⁻¹``, what
-    independent errors give. Infinite where a parameter is not determined.
-    """
-    scale = np.sqrt(np.diag(fit.information))
-    size = len(scale)
-    if not (scale > 0.0).all():
-        return np.full((size, size), np.inf)
-    values, vectors = np.linalg.eigh(fit.information / np.outer(scale, scale))
-    if values[0] < _SINGULAR:
-        return np.full((size, size), np.inf)
-    # In the basis where noise² A⁻¹ is the identity, the larger of the two is a matter of eigenvalues.
-    root = (vectors / np.sqrt(values)) / scale[:, None]
-    cells = np.unique(numbered_cells(data.x1 * _CELLS_PER_HALF_DIAGONAL), return_inverse=True)[1]
-    influence = np.zeros((int(cells.max()) + 1, size))
-    np.add.at(influence, cells, fit.influence @ root)
-    spread, directions = np.linalg.eigh(influence.T @ influence / noise**2)
-    root = root @ directions * np.sqrt(np.maximum(spread, 1.0))
-    return np.asarray(noise**2 * root @ root.T)
+def rms_of(errors: FloatArray, threshold: float) -> FloatArray:
+    """Root mean squares of the errors (B, N) below the threshold, pixels, (B,); NaN where there are none."""
+    inside = errors < threshold
+    count = inside.sum(axis=1)
+    total = np.square(np.where(inside, errors, 0.0)).sum(axis=1)
+    return np.asarray(np.sqrt(np.where(count > 0, total, np.nan) / np.maximum(count, 1)))
 
 
-def _explain(fits: list[Refined], chosen: Refined, threshold: float) -> str:
+def _explained(models: list[PairModel], chosen: int, rms: FloatArray) -> str:
     """One clause on why this model and not another."""
-    listed = ", ".join(f"{f.model.name} {rms_of(f.errors, threshold):.2f} px" for f in fits)
-    why = "no model with less freedom" if chosen is fits[-1] else "the least free model that"
-    return f"{chosen.model.name}: {why} explains the data (rms {listed})"
-
-
-def rms_of(errors: FloatArray, threshold: float) -> float:
-    """Root mean square of the errors below the threshold, px; NaN where there are none."""
-    inside = errors[errors < threshold]
-    return float(np.sqrt(np.mean(inside**2))) if len(inside) else np.nan
+    listed = ", ".join(f"{model.name} {value:.2f} px" for model, value in zip(models, rms, strict=True))
+    why = "no model with less freedom" if chosen == len(models) - 1 else "the least free model that"
+    return f"{models[chosen].name}: {why} explains the data (rms {listed})"

@@ -1,36 +1,37 @@
-"""Homography and, for each of the two pictures, a λ of its own: what a pair sees of two lenses.
+"""Homography and, for each of the two images, a λ of its own: what a pair sees of two lenses.
 
-A lens that is no division model, or whose axis misses the centre of the picture, bends one part of a picture more than
-another, and the two pictures of a pair overlap in different parts of them. So that this is not taken for two lenses, μ
-and the distortion centre, which both pictures share, are free too.
+A lens that is no division model, or whose axis misses the centre of the image, bends one part of an image more than
+another, and the two images of a pair overlap in different parts of them. So that this is not taken for two lenses, μ
+and the distortion centre, which both images share, are free too.
 """
 
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_STD
 from rdstitch.division_model import MAX_ABS_DISTORTION
-from rdstitch.radial_homography import RadialHomography, side_by_side, transfer_jacobian
-from rdstitch.robust.local_optimization import Linearized, descend, linearized
+from rdstitch.radial_homography import RadialHomography
+from rdstitch.robust.covariance import covariances
+from rdstitch.robust.levenberg_marquardt import NormalEquations, descend
+from rdstitch.robust.linearization import Lens, differentiate, entry_equations, influence
 from rdstitch.robust.measurements import Measurements
-from rdstitch.robust.model_selection import covariance_of, loss_width, noise_of
+from rdstitch.robust.model_selection import loss_width, noise_of
 from rdstitch.robust.pair_models import HomographyModel
 
 _HOMOGRAPHY = HomographyModel()
-_OWN_STD = LENS_STD[[0, 0, 1, 3, 4]]  # of λ of picture 1, λ of picture 2, μ, and the distortion centre
+_OWN_STD = LENS_STD[[0, 0, 1, 3, 4]]  # of λ of image 1, λ of image 2, μ, and the distortion centre
 _LENS = len(_OWN_STD)
 _ITERATIONS = 10
 _ROUNDS = 2  # what one λ leaves is no measure of the noise
 
-_State = tuple[FloatArray, FloatArray]  # of the homography, and of the lenses as in _OWN_STD
-
 
 @dataclass(frozen=True)
 class OwnLenses:
-    """λ of both pictures of a pair, half-diagonal frame.
+    """λ of both images of a pair, half-diagonal frame.
 
     Attributes
     ----------
@@ -42,45 +43,88 @@ class OwnLenses:
     covariance: FloatArray
 
 
-def own_lenses(relation: RadialHomography, data: Measurements, threshold: float) -> OwnLenses:
-    """Free λ of each picture of a pair, from the relation that one λ gave.
+def own_lenses(relations: Sequence[RadialHomography], data: Measurements, threshold: float) -> list[OwnLenses]:
+    """Free λ of each image of pairs, from the relations that one λ gave.
 
     Parameters
     ----------
-    relation : RadialHomography
+    relations : sequence of RadialHomography
+        One a pair.
     data : Measurements
         Also of what one λ could not explain.
     threshold : float
-        Largest transfer error of an inlier, px.
+        Largest transfer error of an inlier, pixels.
     """
-    state: _State = _HOMOGRAPHY.initialize(relation.homography), np.zeros(_LENS)
-    state[1][:2] = relation.distortion
-    found = _linearize(state, data, threshold, noise=1.0)
-    for _ in range(_ROUNDS):
-        noise = noise_of(found.errors, threshold)
-        evaluate = partial(_linearize, data=data, scale=loss_width(noise, threshold), noise=noise)
-        state, found = descend(evaluate, _moved, state, _ITERATIONS)
-    return OwnLenses(state[1][:2], covariance_of(found, noise_of(found.errors, threshold), data)[:2, :2])
+    count = len(data)
+    parameters = np.zeros((count, _LENS + 9))
+    parameters[:, :2] = [[relation.distortion] * 2 for relation in relations]
+    parameters[:, _LENS:] = _HOMOGRAPHY.initialize(np.stack([relation.homography for relation in relations]))
+    with np.errstate(all="ignore"):  # a wild step may leave the lens model
+        problems = _Problems(data, np.full(count, threshold), np.ones(count))
+        for _ in range(_ROUNDS):
+            noise = noise_of(problems.errors(parameters), threshold)
+            problems = _Problems(data, loss_width(noise, threshold), noise)
+            parameters = descend(problems, _retract, parameters, _ITERATIONS)
+        noise = noise_of(problems.errors(parameters), threshold)
+        information = problems.normal_equations(parameters).information
+        covariance = covariances(information, problems.influence(parameters), noise, data)
+    return [OwnLenses(own[:2], known[:2, :2]) for own, known in zip(parameters, covariance, strict=True)]
 
 
-def _moved(state: _State, step: FloatArray) -> _State | None:
-    """The state after a step; None where a lens would fold."""
-    lens = state[1] + step[:_LENS]
-    return (_HOMOGRAPHY.retract(state[0], step[_LENS:]), lens) if np.abs(lens[:2]).max() < MAX_ABS_DISTORTION else None
+def _retract(parameters: FloatArray, step: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Parameters after steps, and whether no lens would fold."""
+    lens = parameters[:, :_LENS] + step[:, :_LENS]
+    moved = np.hstack([lens, _HOMOGRAPHY.retract(parameters[:, _LENS:], step[:, _LENS:])])
+    possible = (np.abs(lens[:, :2]).max(axis=1) < MAX_ABS_DISTORTION) & np.isfinite(moved).all(axis=1)
+    return np.where(possible[:, None], moved, parameters), possible
 
 
-@np.errstate(all="ignore")  # a wild step may leave the lens model
-def _linearize(state: _State, data: Measurements, scale: float, noise: float) -> Linearized:
-    """Loss, normal matrix and gradient at a state."""
-    homography, lens = state
-    (first, second, mu), center = lens[:3].tolist(), lens[3:]
-    transfer = transfer_jacobian(
-        _HOMOGRAPHY.homography(homography), first, data.x1 - center, (mu,), own_distortion=second
-    )
-    own, shared = transfer.by_own_distortion, transfer.by_lens[:, :, [1, 3, 4]]
-    columns = side_by_side(transfer.by_distortion - own, own, shared, transfer.by_homography)
-    chain = np.zeros((_LENS + 9, _LENS + 8))
-    chain[:_LENS, :_LENS] = np.eye(_LENS)
-    chain[_LENS:, _LENS:] = _HOMOGRAPHY.jacobian(homography)
-    prior = lens / _OWN_STD, np.hstack([np.diag(1.0 / _OWN_STD), np.zeros((_LENS, 8))])
-    return linearized(replace(transfer, points=transfer.points + center), columns, chain, prior, data, scale, noise)
+@dataclass(frozen=True)
+class _Problems:
+    """Pairs as problems of least squares; parameters are those of :data:`_OWN_STD`, then the homography."""
+
+    data: Measurements
+    scale: FloatArray
+    noise: FloatArray
+
+    def take(self, rows: BoolArray | IntArray) -> Self:
+        """Some of them."""
+        return type(self)(self.data.take(rows), self.scale[rows], self.noise[rows])
+
+    def normal_equations(self, parameters: FloatArray) -> NormalEquations:
+        """Loss, normal matrix and gradient; the lens has priors."""
+        found = differentiate(*_parts(parameters), self.data)
+        entries = entry_equations(found, self.data.present, self.scale, True)
+        chain = _chain(parameters)
+        information = np.swapaxes(chain, 1, 2) @ entries.information @ chain
+        gradient = np.einsum("bkp,bk->bp", chain, entries.gradient)
+        lens, weight = parameters[:, :_LENS] / _OWN_STD, self.noise**2
+        information[:, :_LENS, :_LENS] += weight[:, None, None] * np.diag(_OWN_STD**-2.0)
+        gradient[:, :_LENS] += weight[:, None] * lens / _OWN_STD
+        return NormalEquations(entries.cost + weight * (lens**2).sum(axis=1), information, gradient)
+
+    def errors(self, parameters: FloatArray) -> FloatArray:
+        """Whitened transfer errors, pixels, (B, N); inf where there is no transfer, or no match."""
+        found = differentiate(*_parts(parameters), self.data)
+        errors: FloatArray = np.sqrt(found.squared)
+        errors[found.lost | ~self.data.present] = np.inf
+        return errors
+
+    def influence(self, parameters: FloatArray) -> FloatArray:
+        """Each match's share of the gradient, (B, N, P)."""
+        found = differentiate(*_parts(parameters), self.data)
+        return influence(found, self.data.present, self.scale, True) @ _chain(parameters)
+
+
+def _parts(parameters: FloatArray) -> tuple[FloatArray, Lens]:
+    """Homographies and lenses."""
+    first, second, mu = parameters[:, :3].T
+    return _HOMOGRAPHY.homography(parameters[:, _LENS:]), Lens(first, second, mu, parameters[:, 3:_LENS])
+
+
+def _chain(parameters: FloatArray) -> FloatArray:
+    """Derivative of the entries of H and the lens by the parameters of a step, (B, 9 + 5, 5 + 8)."""
+    chain = np.zeros((len(parameters), 9 + _LENS, _LENS + 8))
+    chain[:, :9, _LENS:] = _HOMOGRAPHY.jacobian(parameters[:, _LENS:])
+    chain[:, 9:, :_LENS] = np.eye(_LENS)
+    return chain

@@ -4,8 +4,8 @@
 "similarity"  the same with a change of height
 "homography"  any homography
 
-Refinement knows a model only by its four functions. The state of the planar models is
-``(ψ, θ, φ, tx, ty, log height, log focal correction)``; of these the free ones are estimated.
+Refinement knows a model only by its functions, which take the states of B pairs at once. The state of the planar models
+is ``(ψ1, θ1, ψ2, θ2, φ, tx, ty, log height, log focal correction)``; of these the free ones are estimated.
 """
 
 from dataclasses import dataclass, field
@@ -14,41 +14,38 @@ from typing import Protocol
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
+from rdstitch.planar_motion import PlanarMotion, motions_from_homographies, rigid_in_plane, rotation_from_tilt
 
-Tilts = tuple[tuple[float, float], tuple[float, float]]
-
-_PSI_THETA_YAW_TX_TY = (0, 1, 2, 3, 4)
-_HEIGHT = 5
-_FOCAL = 6
+_TILTS, _YAW, _TX, _TY, _HEIGHT, _FOCAL = slice(0, 4), 4, 5, 6, 7, 8
+_PSI, _THETA = (0, 2), (1, 3)
 
 
 class PairModel(Protocol):
-    """A parametrisation of the homography between two pictures, in the half-diagonal frame."""
+    """A parametrisation of the homography between two images, in the half-diagonal frame."""
 
     @property
     def name(self) -> str:
         """Name of the model in the family."""
         ...
 
-    def initialize(self, homography: FloatArray) -> FloatArray:
-        """State that describes a homography, or comes close."""
+    def initialize(self, homography: FloatArray, tilts: FloatArray | None = None) -> FloatArray:
+        """States (B, S) that describe homographies (B, 3, 3), or come close; known tilts (B, 2, 2), radians."""
         ...
 
     def homography(self, state: FloatArray) -> FloatArray:
-        """H (3, 3)."""
+        """H (B, 3, 3)."""
         ...
 
     def jacobian(self, state: FloatArray) -> FloatArray:
-        """Derivative of the entries of H, row by row, by a step, shape (9, P)."""
+        """Derivative of the entries of H, row by row, by a step, shape (B, 9, P)."""
         ...
 
     def retract(self, state: FloatArray, step: FloatArray) -> FloatArray:
-        """The state after a step of shape (P,)."""
+        """The states after steps of shape (B, P)."""
         ...
 
     def prior(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What is known beforehand: residuals in standard deviations (K,), and their derivative (K, P)."""
+        """What is known beforehand: residuals in standard deviations (B, K), and their derivative (K, P)."""
         ...
 
 
@@ -58,29 +55,30 @@ class HomographyModel:
 
     name: str = "homography"
 
-    def initialize(self, homography: FloatArray) -> FloatArray:
-        """The homography at unit norm."""
-        return np.asarray(homography / np.linalg.norm(homography)).ravel()
+    def initialize(self, homography: FloatArray, tilts: FloatArray | None = None) -> FloatArray:
+        """The homographies at unit norm."""
+        flat = homography.reshape(-1, 9)
+        return np.asarray(flat / np.linalg.norm(flat, axis=1, keepdims=True))
 
     def homography(self, state: FloatArray) -> FloatArray:
-        """H (3, 3)."""
-        return state.reshape(3, 3)
+        """H (B, 3, 3)."""
+        return state.reshape(-1, 3, 3)
 
     def jacobian(self, state: FloatArray) -> FloatArray:
-        """An orthonormal basis of the complement of H, shape (9, 8): a Householder reflection's last columns."""
+        """An orthonormal basis of the complement of H, shape (B, 9, 8): a Householder reflection's last columns."""
         axis = state.copy()
-        axis[0] += np.copysign(1.0, axis[0])
-        reflection = np.eye(9) - 2.0 * np.outer(axis, axis) / (axis @ axis)
-        return np.asarray(reflection[:, 1:])
+        axis[:, 0] += np.copysign(1.0, axis[:, 0])
+        scaled = axis * (2.0 / np.einsum("bi,bi->b", axis, axis))[:, None]
+        return np.asarray(np.eye(9)[:, 1:] - axis[:, :, None] * scaled[:, None, 1:])
 
     def retract(self, state: FloatArray, step: FloatArray) -> FloatArray:
         """Step along the tangent, then back to unit norm."""
-        moved = state + self.jacobian(state) @ step
-        return np.asarray(moved / np.linalg.norm(moved))
+        moved = state + np.einsum("bip,bp->bi", self.jacobian(state), step)
+        return np.asarray(moved / np.linalg.norm(moved, axis=1, keepdims=True))
 
     def prior(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Nothing is known."""
-        return np.empty(0), np.empty((0, 8))
+        return np.empty((len(state), 0)), np.empty((0, 8))
 
 
 @dataclass(frozen=True)
@@ -93,114 +91,113 @@ class PlanarModel:
         Focal length in half diagonals.
     focal_std : float
         Standard deviation of its logarithm; 0 fixes it.
-    tilts : pair of (float, float) or None
-        Known tilts of picture 1 and picture 2, radians; None where an unknown tilt is shared.
+    tilts_known : bool
+        Whether the tilts of both images are known; otherwise they share an unknown one.
     height_free : bool
         Whether the height may change.
     """
 
     focal: float
     focal_std: float = 0.0
-    tilts: Tilts | None = None
+    tilts_known: bool = False
     height_free: bool = False
-    _free: tuple[int, ...] = field(init=False, repr=False)
+    _directions: FloatArray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Note which entries of the state are free."""
-        free = [i for i in _PSI_THETA_YAW_TX_TY if self.tilts is None or i > 1]
+        """Note by what each step changes the state, (P, 9)."""
+        free: list[tuple[int, ...]] = [] if self.tilts_known else [_PSI, _THETA]
+        free += [(_YAW,), (_TX,), (_TY,)]
         if self.height_free:
-            free.append(_HEIGHT)
+            free.append((_HEIGHT,))
         # With known tilt, a wrong focal length is hidden in the height of the plane.
-        if self.focal_std > 0.0 and self.tilts is None:
-            free.append(_FOCAL)
-        object.__setattr__(self, "_free", tuple(free))
+        if self.focal_free:
+            free.append((_FOCAL,))
+        directions = np.zeros((len(free), 9))
+        for row, entries in zip(directions, free, strict=True):
+            row[[*entries]] = 1.0
+        object.__setattr__(self, "_directions", directions)
+
+    @property
+    def focal_free(self) -> bool:
+        """Whether the focal length is corrected."""
+        return self.focal_std > 0.0 and not self.tilts_known
 
     @property
     def name(self) -> str:
         """Name of the model in the family."""
         return "similarity" if self.height_free else "rigid"
 
-    def initialize(self, homography: FloatArray) -> FloatArray:
-        """The nearest planar motion."""
-        k = self._calibration(0.0)
-        h = np.linalg.inv(k) @ homography @ k
-        if self.tilts is None:
-            motion = PlanarMotion.from_homography(h)
+    def initialize(self, homography: FloatArray, tilts: FloatArray | None = None) -> FloatArray:
+        """The nearest planar motions."""
+        k = np.array([self.focal, self.focal, 1.0])
+        h = homography * (k / k[:, None])
+        if self.tilts_known:
+            assert tilts is not None
+            rotation = rotation_from_tilt(tilts)
+            h = np.swapaxes(rotation[:, 1], 1, 2) @ h @ rotation[:, 0]
+            motion = motions_from_homographies(h, np.broadcast_to([0.0, 0.0, 1.0], (len(h), 3)))
+            tilt = tilts.reshape(-1, 4)
         else:
-            r1, r2 = rotation_from_tilt(self.tilts)
-            motion = PlanarMotion.from_homography_and_normal(r2.T @ h @ r1, np.array([0.0, 0.0, 1.0]))
-        height = np.log(max(motion.height, 1e-3)) if self.height_free else 0.0
-        return np.array([*motion.tilt, motion.yaw, *motion.translation, height, 0.0])
+            motion = motions_from_homographies(h)
+            tilt = np.tile(motion[:, :2], 2)
+        height = np.log(np.maximum(motion[:, 5:], 1e-3)) if self.height_free else np.zeros((len(h), 1))
+        return np.concatenate([tilt, motion[:, 2:5], height, np.zeros((len(h), 1))], axis=1)
 
     def motion(self, state: FloatArray) -> PlanarMotion:
-        """The motion that a state stands for (with the tilt of picture 1 where the two are known)."""
-        tilt = (float(state[0]), float(state[1])) if self.tilts is None else self.tilts[0]
-        return PlanarMotion(tilt, float(state[2]), (float(state[3]), float(state[4])), float(np.exp(state[_HEIGHT])))
-
-    def focal_correction(self, state: FloatArray) -> float:
-        """Factor by which the focal length was corrected."""
-        return float(np.exp(state[_FOCAL]))
+        """The motion that one state (9,) stands for, with the tilt of image 1 where the two differ."""
+        psi, theta, _, _, yaw, tx, ty, height, _ = state.tolist()
+        return PlanarMotion((psi, theta), yaw, (tx, ty), float(np.exp(height)))
 
     def homography(self, state: FloatArray) -> FloatArray:
-        """H (3, 3)."""
-        r1, r2 = self._rotations(state)
-        k = self._calibration(state[_FOCAL])
-        motion = rigid_in_plane(state[2], state[3:5], np.exp(state[_HEIGHT]))
-        return np.asarray(k @ r2 @ motion @ r1.T @ np.linalg.inv(k))
+        """H (B, 3, 3)."""
+        rotation, motion = self._parts(state)
+        h = rotation[:, 1] @ motion @ np.swapaxes(rotation[:, 0], 1, 2)
+        return self._in_half_diagonals(h, state)
 
     def jacobian(self, state: FloatArray) -> FloatArray:
-        """Derivative by the free entries of the state, shape (9, P)."""
-        r1, r2 = self._rotations(state)
-        k = self._calibration(state[_FOCAL])
-        k_inverse = np.linalg.inv(k)
-        motion = rigid_in_plane(state[2], state[3:5], np.exp(state[_HEIGHT]))
-        columns: dict[int, FloatArray] = {}
-        if self.tilts is None:
-            by_psi, by_theta = _rotation_derivatives(state[0], state[1])
-            columns[0] = by_psi @ motion @ r1.T + r2 @ motion @ by_psi.T
-            columns[1] = by_theta @ motion @ r1.T + r2 @ motion @ by_theta.T
-        columns[2] = r2 @ _QUARTER_TURN @ motion @ r1.T
-        for entry, axis in ((3, 0), (4, 1)):
-            by_translation = np.zeros((3, 3))
-            by_translation[:, 2] = -motion[:, axis]
-            columns[entry] = r2 @ by_translation @ r1.T
-        by_height = np.zeros((3, 3))
-        by_height[2, 2] = motion[2, 2]
-        columns[_HEIGHT] = r2 @ by_height @ r1.T
-        log_k = np.diag([1.0, 1.0, 0.0])
-        inner = r2 @ motion @ r1.T
-        columns[_FOCAL] = log_k @ inner - inner @ log_k
-        return np.stack([(k @ columns[i] @ k_inverse).ravel() for i in self._free], axis=1)
+        """Derivative by the free entries of the state, shape (B, 9, P)."""
+        rotation, motion = self._parts(state)
+        r1, r2 = rotation[:, 0], rotation[:, 1]
+        back = np.swapaxes(r1, 1, 2)
+        columns = np.zeros((len(state), 9, 3, 3))
+        after, before = r2 @ motion, motion @ back
+        columns[:, 0] = after @ np.swapaxes(_ABOUT_X @ r1, 1, 2)
+        columns[:, 1] = after @ np.swapaxes(r1 @ _ABOUT_Y, 1, 2)
+        columns[:, 2] = _ABOUT_X @ r2 @ before
+        columns[:, 3] = r2 @ _ABOUT_Y @ before
+        columns[:, _YAW] = r2 @ _ABOUT_Z @ before
+        for entry, axis in ((_TX, 0), (_TY, 1)):
+            columns[:, entry] = -after[:, :, axis, None] * back[:, None, 2]
+        columns[:, _HEIGHT] = r2[:, :, 2, None] * motion[:, 2, 2, None, None] * back[:, None, 2]
+        inner = after @ back
+        columns[:, _FOCAL] = inner * (_IN_PLANE[:, None] - _IN_PLANE)
+        by_state = self._in_half_diagonals(columns, state[:, None]).reshape(len(state), 9, 9)
+        return np.swapaxes(self._directions @ by_state, 1, 2)
 
     def retract(self, state: FloatArray, step: FloatArray) -> FloatArray:
-        """Add the step to the free entries."""
-        moved = state.copy()
-        moved[list(self._free)] += step
-        return moved
+        """Add the steps to the free entries."""
+        return np.asarray(state + step @ self._directions)
 
     def prior(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The focal length, where it is free."""
-        if _FOCAL not in self._free:
-            return np.empty(0), np.empty((0, len(self._free)))
-        derivative = np.zeros((1, len(self._free)))
-        derivative[0, self._free.index(_FOCAL)] = 1.0 / self.focal_std
-        return state[[_FOCAL]] / self.focal_std, derivative
+        if not self.focal_free:
+            return np.empty((len(state), 0)), np.empty((0, len(self._directions)))
+        return state[:, _FOCAL:] / self.focal_std, self._directions[:, _FOCAL][None] / self.focal_std
 
-    def _rotations(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        r1, r2 = rotation_from_tilt(np.array([state[:2], state[:2]]) if self.tilts is None else self.tilts)
-        return r1, r2
+    def _parts(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rotations of both images (B, 2, 3, 3) and the motion as the plane sees it (B, 3, 3)."""
+        motion = rigid_in_plane(state[:, _YAW], state[:, _TX : _TY + 1], np.exp(state[:, _HEIGHT]))
+        return rotation_from_tilt(state[:, _TILTS].reshape(-1, 2, 2)), motion
 
-    def _calibration(self, log_correction: float) -> FloatArray:
-        focal = self.focal * np.exp(log_correction)
-        return np.diag([focal, focal, 1.0])
-
-
-_QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    def _in_half_diagonals(self, h: FloatArray, state: FloatArray) -> FloatArray:
+        """``K h K⁻¹`` of matrices (..., 3, 3)."""
+        focal = self.focal * np.exp(state[..., _FOCAL, None, None])
+        powers = _IN_PLANE[:, None] - _IN_PLANE
+        return np.asarray(h * np.where(powers == 0.0, 1.0, np.where(powers > 0.0, focal, 1.0 / focal)))
 
 
-def _rotation_derivatives(psi: float, theta: float) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of ``Rx(ψ) Ry(θ)`` by ψ and θ: with the generators Gx, Gy they are ``Gx R`` and ``R Gy``."""
-    rotation = rotation_from_tilt((psi, theta))
-    about_x = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    about_y = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
-    return about_x @ rotation, rotation @ about_y
+_IN_PLANE = np.array([1.0, 1.0, 0.0])
+_ABOUT_X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+_ABOUT_Y = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+_ABOUT_Z = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+"""Generators: with ``R = Rx(ψ) Ry(θ)`` the derivatives by ψ and θ are ``Gx R`` and ``R Gy``."""

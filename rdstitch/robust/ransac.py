@@ -1,69 +1,101 @@
-"""RANSAC over several minimal solvers at once: sample, solve, score, optimise locally, stop when confident."""
+"""RANSAC over several minimal solvers and many pairs: sample, solve, score, optimise locally, stop when confident.
+
+The pairs go on in lockstep, each until it is confident; no pair's result depends on the others.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
-from rdstitch.robust.local_optimization import refine
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
 from rdstitch.robust.pair_models import HomographyModel, PairModel
+from rdstitch.robust.refinement import Fits, PairProblems, refine
 from rdstitch.robust.sampling import Sampler
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
 from rdstitch.solvers.solutions import Solutions
 
-_FIRST_BATCH = 32
+_FIRST_BATCH = 64
 _LARGEST_BATCH = 512
+_SAMPLES_AT_ONCE = 4096
 _LEAST_EXPLORATION = 96  # samples that every solver draws unless its own confidence is reached before
-_QUICK_SCORE = 384  # correspondences on which hypotheses are compared before the best are scored on all
+_QUICK_SCORE = 128  # matches on which hypotheses are compared before the best are scored on all
 _SOLVER_SUCCESS = 0.8  # share of all-inlier samples that lead to the model, in the face of noise
 _NOVELTY = 0.1  # share of a hypothesis's inliers that must be new for it to be worth optimising
 _FREE_REFINEMENT = 12  # inliers from which on refinement may leave the model that the minimal solver assumes
+_LOCAL_STEPS = 4
 
 
 @dataclass(frozen=True)
 class RansacOptions:
     """When to stop, and what counts as agreement."""
 
-    threshold: float = 3.0  # px: largest transfer error of an inlier
+    threshold: float = 3.0  # pixels, largest transfer error of an inlier
     confidence: float = 0.999  # probability that a better model was not missed
-    max_iterations: int = 10000  # samples, over all solvers
+    max_iterations: int = 10000  # samples a pair, over all solvers
     seed: int = 0
     least_inliers: int = 8  # a model with fewer would not be accepted, so none such is searched for
 
 
-@dataclass(frozen=True)
-class Hypothesis:
-    """A homography with λ, and how well it explains the correspondences.
+@dataclass
+class Hypotheses:
+    """For each of B pairs a homography with λ, and how well it explains the matches.
 
     Attributes
     ----------
-    homography : ndarray of shape (3, 3)
+    homography : ndarray of shape (B, 3, 3)
         In the half-diagonal frame.
-    distortion : float
-    cost : float
-        Mean truncated loss: 1 where nothing fits, 0 where all fits exactly.
-    inliers : ndarray of shape (N,), bool
-    solver : str
-        Name of the minimal solver that found it.
+    distortion : ndarray of shape (B,)
+    cost : ndarray of shape (B,)
+        Mean truncated loss: 1 where nothing fits, 0 where all fits exactly; inf where there is no hypothesis.
+    inliers : ndarray of shape (B, N), bool
+    solver : ndarray of shape (B,), intp
+        Which minimal solver found it.
     """
 
     homography: FloatArray
-    distortion: float
-    cost: float
-    inliers: NDArray[np.bool_]
-    solver: str
+    distortion: FloatArray
+    cost: FloatArray
+    inliers: BoolArray
+    solver: IntArray
 
-    @property
-    def inlier_share(self) -> float:
-        """Share of the correspondences that agree."""
-        return float(self.inliers.mean())
+    @classmethod
+    def none(cls, data: Measurements) -> "Hypotheses":
+        """No hypothesis yet."""
+        count = len(data)
+        return cls(
+            np.full((count, 3, 3), np.nan),
+            np.zeros(count),
+            np.full(count, np.inf),
+            np.zeros(data.present.shape, dtype=np.bool_),
+            np.zeros(count, dtype=np.intp),
+        )
 
-    def repeats(self, other: "Hypothesis") -> bool:
-        """Whether it explains hardly anything that the other does not explain."""
-        return int((self.inliers & ~other.inliers).sum()) <= _NOVELTY * int(self.inliers.sum())
+    @classmethod
+    def judged(
+        cls, homography: FloatArray, distortion: FloatArray, data: Measurements, threshold: float, solver: int
+    ) -> "Hypotheses":
+        """Hypotheses on all matches of their pairs."""
+        errors2 = transfer_errors2(homography, distortion, np.arange(len(data)), data)
+        relative = np.minimum(errors2 / threshold**2, 1.0)
+        relative[~data.present] = 1.0
+        inliers = relative < 1.0
+        missed = (relative * data.present).sum(axis=1)
+        return cls(homography, distortion, missed / data.count, inliers, np.full(len(data), solver))
+
+    def take(self, rows: IntArray) -> "Hypotheses":
+        """Those of some pairs; copies."""
+        return Hypotheses(
+            self.homography[rows], self.distortion[rows], self.cost[rows], self.inliers[rows], self.solver[rows]
+        )
+
+    def put(self, rows: IntArray, others: "Hypotheses", better: BoolArray) -> None:
+        """Replace those of some pairs where others are better."""
+        where = rows[better]
+        self.homography[where], self.distortion[where] = others.homography[better], others.distortion[better]
+        self.cost[where], self.inliers[where] = others.cost[better], others.inliers[better]
+        self.solver[where] = others.solver[better]
 
 
 @dataclass(frozen=True)
@@ -72,119 +104,175 @@ class Search:
 
     Attributes
     ----------
-    best : Hypothesis or None
-        None where no sample gave a plausible model.
-    iterations : int
+    best : Hypotheses
+        With infinite cost where no sample gave a plausible model.
+    iterations : ndarray of shape (B,), intp
         Samples drawn.
-    confident : bool
+    confident : ndarray of shape (B,), bool
         Whether the search stopped because it was confident, not because ``max_iterations`` was reached.
     """
 
-    best: Hypothesis | None
-    iterations: int
-    confident: bool
+    best: Hypotheses
+    iterations: IntArray
+    confident: BoolArray
 
 
-def ransac(solvers: list[MinimalSolver], data: Measurements, options: RansacOptions) -> Search:
-    """Search the model that explains most correspondences, with all solvers taking turns.
+def ransac(
+    solvers: list[MinimalSolver],
+    data: Measurements,
+    ordered: BoolArray,
+    tilts: FloatArray | None,
+    options: RansacOptions,
+) -> Search:
+    """Search the model that explains most matches of each pair, with all solvers taking turns.
 
-    Solvers with fewer points need fewer samples but assume more of the motion. They share the best model so far, so
-    that as soon as one of them is confident, and each has had a look, all are done.
+    The last solver, which assumes least, begins; most pairs need no other. Solvers with fewer points need fewer samples
+    but assume more of the motion: they join where that is not enough. All share the best model so far, so that as soon
+    as one of them is confident, and each has explored a little, the pair is done.
 
     Parameters
     ----------
     solvers : list of MinimalSolver
-        Those that need more correspondences than there are do not take part.
     data : Measurements
+        Every pair has at least as many matches as the largest sample.
+    ordered : ndarray of shape (B,), bool
+        Whether the best matches of a pair come first.
+    tilts : ndarray of shape (B, 2, 2) or None
+        Known tilts (ψ, θ) of both images, radians.
     options : RansacOptions
     """
-    lanes = [
-        _Lane(solver, data, options, index) for index, solver in enumerate(solvers) if solver.sample_size <= len(data)
-    ]
-    best: Hypothesis | None = None
-    iterations, batch = 0, _FIRST_BATCH
-    while lanes and iterations < options.max_iterations:
-        for lane in lanes:
-            if lane.drawn < max(_LEAST_EXPLORATION, lane.needed(best)):
-                best = lane.advance(batch, best)
-        iterations = sum(lane.drawn for lane in lanes)
-        explored = all(lane.drawn >= min(_LEAST_EXPLORATION, lane.needed(best)) for lane in lanes)
-        if explored and any(lane.drawn >= lane.needed(best) for lane in lanes):
-            return Search(best, iterations, True)
-        batch = min(2 * batch, _LARGEST_BATCH)
-    return Search(best, iterations, False)
+    lanes = [_Lane(solver, data, ordered, tilts, options, index) for index, solver in enumerate(solvers)]
+    best = Hypotheses.none(data)
+    confident = np.zeros(len(data), dtype=np.bool_)
+    active = np.arange(len(data))
+    turns, batch = lanes[-1:], _FIRST_BATCH
+    while len(active):
+        for lane in turns:
+            lane.advance(best, active[lane.drawn[active] < lane.needed(best, active, explore=True)], batch)
+        needed = np.stack([lane.needed(best, active) for lane in lanes])
+        drawn = np.stack([lane.drawn[active] for lane in lanes])
+        explored = (drawn >= np.minimum(_LEAST_EXPLORATION, needed)).all(axis=0)
+        # Where the solver that assumes least is confident, nothing is left to explore.
+        sure = (drawn[-1] >= needed[-1]) | (explored & (drawn >= needed).any(axis=0))
+        confident[active[sure]] = True
+        active = active[~sure & (drawn.sum(axis=0) < options.max_iterations)]
+        batch = batch if turns is not lanes else min(2 * batch, _LARGEST_BATCH)
+        turns = lanes
+    return Search(best, np.sum([lane.drawn for lane in lanes], axis=0), confident)
 
 
 class _Lane:
     """One minimal solver's share of the search."""
 
-    def __init__(self, solver: MinimalSolver, data: Measurements, options: RansacOptions, index: int) -> None:
-        self.drawn = 0
-        self._solver = solver
-        self._data = data
+    def __init__(
+        self,
+        solver: MinimalSolver,
+        data: Measurements,
+        ordered: BoolArray,
+        tilts: FloatArray | None,
+        options: RansacOptions,
+        index: int,
+    ) -> None:
+        self.drawn = np.zeros(len(data), dtype=np.intp)
+        self._solver, self._index = solver, index
+        self._data, self._ordered, self._tilts = data, ordered, tilts
         self._options = options
-        self._least_raw_cost = np.inf
-        self._sampler = Sampler(
-            len(data), solver.sample_size, data.quality, options.max_iterations, [options.seed, index]
-        )
+        self._least_raw_cost = np.ones(len(data))
+        self._sampler = Sampler(solver.sample_size, options.max_iterations, [options.seed, index])
         self._quick = _subset(data, options.seed)
 
-    def needed(self, best: Hypothesis | None) -> float:
-        """Samples after which a better model than the best is unlikely to have been missed."""
-        least = self._options.least_inliers / len(self._data)
-        share = least if best is None else max(best.inlier_share, least)
-        good = _SOLVER_SUCCESS * min(share, 1.0) ** self._solver.sample_size
-        return float(np.log1p(-self._options.confidence) / np.log1p(-min(good, 1.0 - 1e-12)))
+    def needed(self, best: Hypotheses, rows: IntArray, *, explore: bool = False) -> FloatArray:
+        """Samples after which a better model than the best of each of some pairs is unlikely to have been missed.
 
-    def advance(self, batch: int, best: Hypothesis | None) -> Hypothesis | None:
-        """Draw a batch of samples and return the best hypothesis so far."""
-        picks = self._sampler.draw(batch)
-        self.drawn += batch
-        found = self._solver.solve(self._data.x1[picks], self._data.x2[picks])
+        With ``explore`` at least as many as every solver draws.
+        """
+        counts = self._data.count[rows]
+        agreeing = np.maximum(best.inliers[rows].sum(axis=1), self._options.least_inliers)
+        good = _SOLVER_SUCCESS * np.minimum(agreeing / counts, 1.0) ** self._solver.sample_size
+        needed = np.log1p(-self._options.confidence) / np.log1p(-np.minimum(good, 1.0 - 1e-12))
+        return np.asarray(np.maximum(needed, _LEAST_EXPLORATION) if explore else needed)
+
+    def advance(self, best: Hypotheses, rows: IntArray, batch: int) -> None:
+        """Draw a batch of samples of some pairs, and put the best hypotheses where they are better."""
+        if not len(rows):
+            return
+        picks = self._sampler.draw(self.drawn[rows], batch, self._data.count[rows], self._ordered[rows])
+        self.drawn[rows] += batch
+        step = max(1, _SAMPLES_AT_ONCE // batch)
+        found = [self._best_of(rows[i : i + step], picks[i : i + step]) for i in range(0, len(rows), step)]
+        homography, distortion, cost = (np.concatenate(column) for column in zip(*found, strict=True))
+        better = cost < self._least_raw_cost[rows]
+        rows, homography, distortion = rows[better], homography[better], distortion[better]
+        self._least_raw_cost[rows] = cost[better]
+        if not len(rows):
+            return
+        data, threshold = self._data.take(rows), self._options.threshold
+        judged = Hypotheses.judged(homography, distortion, data, threshold, self._index)
+        fresh = (judged.inliers & ~best.inliers[rows]).sum(axis=1) > _NOVELTY * judged.inliers.sum(axis=1)
+        worthwhile = np.flatnonzero(fresh | ~(judged.cost > best.cost[rows]))
+        if len(worthwhile):
+            optimized = self._optimized(judged.take(worthwhile), data.take(worthwhile), rows[worthwhile])
+            best.put(rows[worthwhile], optimized, optimized.cost < best.cost[rows[worthwhile]])
+
+    def _best_of(self, rows: IntArray, picks: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of each pair the hypothesis that explains a part of its matches best: H, λ and cost; inf where none is."""
+        _, batch, size = picks.shape
+        places = picks.reshape(len(rows), 1, -1)
+        x1, x2 = (
+            np.take_along_axis(x[rows], places, axis=2).reshape(len(rows), 2, batch, size).transpose(0, 2, 3, 1)
+            for x in (self._data.x1, self._data.x2)
+        )
+        tilts = None if self._tilts is None else np.repeat(self._tilts[rows], batch, axis=0)
+        found = self._solver.solve(x1.reshape(-1, size, 2), x2.reshape(-1, size, 2), tilts)
         keep = plausible(found, corner_radius=1.0)
         found = Solutions(found.sample[keep], found.homography[keep], found.distortion[keep])
-        if not len(found):
-            return best
-        costs = truncated_costs(found, self._quick, self._options.threshold)
-        first = int(np.argmin(costs))
-        if costs[first] >= min(self._least_raw_cost, 1.0):
-            return best
-        self._least_raw_cost = float(costs[first])
-        candidate = self._judge(found.homography[first], float(found.distortion[first]))
-        if best is not None and candidate.cost > best.cost and candidate.repeats(best):
-            return best
-        candidate = self._optimize(candidate)
-        return candidate if best is None or candidate.cost < best.cost else best
-
-    def _optimize(self, start: Hypothesis) -> Hypothesis:
-        """The best of a hypothesis, its refinement in the model it assumes, and from there as a free homography."""
-        best = self._refined(start, self._solver.model, 3.0 * self._options.threshold)
-        enough = best.inlier_share * len(self._data) >= _FREE_REFINEMENT
-        return self._refined(best, HomographyModel() if enough else self._solver.model, self._options.threshold)
-
-    def _refined(self, start: Hypothesis, model: PairModel, scale: float) -> Hypothesis:
-        """The start or its refinement, whichever is better."""
-        fit = refine(
-            model,
-            start.homography,
-            start.distortion,
-            self._data,
-            scale,
-            fixed_distortion=self._solver.fixed_distortion,
-            iterations=4,
+        pair = found.sample // batch
+        costs = truncated_costs(
+            found.homography, found.distortion, pair, self._quick.take(rows), self._options.threshold
         )
-        refined = self._judge(fit.homography, fit.distortion)
-        return refined if refined.cost < start.cost else start
+        order = np.lexsort((costs, pair))
+        first = order[np.flatnonzero(np.diff(pair[order], prepend=-1))]
+        homography, distortion = np.zeros((len(rows), 3, 3)), np.zeros(len(rows))
+        least = np.full(len(rows), np.inf)
+        which = pair[first]
+        homography[which], distortion[which] = found.homography[first], found.distortion[first]
+        least[which] = costs[first]
+        return homography, distortion, least
 
-    def _judge(self, homography: FloatArray, distortion: float) -> Hypothesis:
-        errors2 = transfer_errors2(homography[None], np.array([distortion]), self._data)[0]
-        relative = np.minimum(errors2 / self._options.threshold**2, 1.0)
-        return Hypothesis(homography, distortion, float(relative.mean()), relative < 1.0, self._solver.name)
+    def _optimized(self, start: Hypotheses, data: Measurements, rows: IntArray) -> Hypotheses:
+        """The best of each hypothesis, its refinement in the model it assumes, and from there as a free homography."""
+        best = self._refined(start, data, rows, self._solver.model, 3.0 * self._options.threshold)
+        if isinstance(self._solver.model, HomographyModel):
+            return self._refined(best, data, rows, self._solver.model, self._options.threshold)
+        enough = best.inliers.sum(axis=1) >= _FREE_REFINEMENT
+        for chosen, model in ((enough, HomographyModel()), (~enough, self._solver.model)):
+            part = np.flatnonzero(chosen)
+            if len(part):
+                refined = self._refined(best.take(part), data.take(part), rows[part], model, self._options.threshold)
+                best.put(part, refined, refined.cost < best.cost[part])
+        return best
+
+    def _refined(
+        self, start: Hypotheses, data: Measurements, rows: IntArray, model: PairModel, scale: float
+    ) -> Hypotheses:
+        """The start or its refinement, whichever is better."""
+        problems = PairProblems(
+            model, data, np.full(len(data), scale), np.ones(len(data)), self._solver.fixed_distortion
+        )
+        state = model.initialize(start.homography, None if self._tilts is None else self._tilts[rows])
+        fits = refine(problems, Fits(state, start.homography, start.distortion), _LOCAL_STEPS)
+        judged = Hypotheses.judged(fits.homography, fits.distortion, data, self._options.threshold, self._index)
+        result = start.take(np.arange(len(data)))
+        result.put(np.arange(len(data)), judged, judged.cost < start.cost)
+        return result
 
 
 def _subset(data: Measurements, seed: int) -> Measurements:
-    """At most ``_QUICK_SCORE`` correspondences, for a first comparison of many hypotheses."""
-    if len(data) <= _QUICK_SCORE:
+    """At most ``_QUICK_SCORE`` matches of each pair, spread over its list, to compare many hypotheses by."""
+    if data.present.shape[1] <= _QUICK_SCORE:
         return data
-    chosen = np.sort(np.random.default_rng([seed, 1 << 20]).choice(len(data), _QUICK_SCORE, replace=False))
-    return data.subset(chosen)
+    jitter = np.random.default_rng([seed, 1 << 20]).random(_QUICK_SCORE)
+    places = ((np.arange(_QUICK_SCORE) + jitter) * (data.count[:, None] / _QUICK_SCORE)).astype(np.intp)
+    few = data.count <= _QUICK_SCORE
+    places[few] = np.arange(_QUICK_SCORE)
+    return data.at(places)

@@ -1,66 +1,65 @@
-"""Drawing minimal samples: uniformly, or the most promising correspondences first (PROSAC)."""
+"""Drawing minimal samples of many pairs: uniformly, or the most promising matches first (PROSAC)."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
-
-IndexArray = NDArray[np.intp]
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
 
 
 class Sampler:
-    """Draws batches of samples of distinct correspondences.
+    """Draws batches of samples of distinct matches, for many pairs in parallel.
 
-    With a quality for each correspondence every other sample is a PROSAC sample (Chum and Matas 2005): it is drawn
-    from the best n correspondences, where n grows with the number of samples until it comprises all. The samples
+    Where the matches of a pair are ordered by quality, every other sample is a PROSAC sample (Chum and Matas 2005): it
+    is drawn from the best n matches, where n grows with the number of samples until it comprises all. The samples
     between are uniform, so that a misleading quality costs no more than a factor of two.
+
+    All pairs share one stream of random numbers, so that what a pair draws depends on no other pair, nor on the size of
+    the batches.
 
     Parameters
     ----------
-    count : int
-        Number of correspondences.
     sample_size : int
-        Correspondences in one sample, at most ``count``.
-    quality : ndarray of shape (count,) or None
-        The higher the better.
+        Matches in one sample.
     growth : int
-        Number of samples after which PROSAC draws from all correspondences.
+        Number of samples after which PROSAC draws from all matches.
     seed : int or sequence of int
     """
 
-    def __init__(
-        self, count: int, sample_size: int, quality: FloatArray | None, growth: int, seed: int | list[int]
-    ) -> None:
+    def __init__(self, sample_size: int, growth: int, seed: int | list[int]) -> None:
         self._random = np.random.default_rng(seed)
-        self._sample_size = sample_size
-        self._count = count
-        self._drawn = 0
-        self._order = None if quality is None else np.argsort(-quality, kind="stable")
-        pool = np.arange(sample_size, count + 1)
-        share = np.ones(len(pool))
-        for i in range(sample_size):
-            share *= (pool - i) / (count - i)
-        self._last_of_pool = np.maximum(growth * share, 1.0)
-        self._last_of_pool[-1] = np.inf
+        self._numbers = np.empty((0, sample_size))
+        self._growth = growth
 
-    def draw(self, batch: int) -> IndexArray:
-        """Indices of the next ``batch`` samples, shape (batch, sample_size)."""
-        pool = np.full(batch, self._count)
-        if self._order is not None:
-            number = self._drawn + np.arange(0, batch, 2) + 1
-            pool[::2] = np.searchsorted(self._last_of_pool, number) + self._sample_size
-        self._drawn += batch
-        picks = self._distinct(pool)
-        if self._order is not None:
-            picks[::2] = self._order[picks[::2]]
-        return picks
+    def draw(self, start: IntArray, batch: int, counts: IntArray, ordered: BoolArray) -> IntArray:
+        """Places in each pair of the matches of some of its samples, shape (B, batch, sample_size).
 
-    def _distinct(self, pool: IndexArray) -> IndexArray:
-        """For each row, ``sample_size`` distinct integers below ``pool``, uniformly."""
-        picks = np.empty((len(pool), self._sample_size), dtype=np.intp)
-        for i in range(self._sample_size):
-            pick = self._random.integers(0, pool - i)
-            for earlier in np.sort(picks[:, :i], axis=1).T:
-                pick = pick + (pick >= earlier)
-            picks[:, i] = pick
-        return picks
+        Parameters
+        ----------
+        start : ndarray of shape (B,), intp
+            Number of the first sample of each pair.
+        batch : int
+            Samples of each pair.
+        counts : ndarray of shape (B,), intp
+            Matches of each pair, at least ``sample_size``.
+        ordered : ndarray of shape (B,), bool
+            Whether its best matches come first.
+        """
+        sample_size = self._numbers.shape[1]
+        missing = int(start.max(initial=0)) + batch - len(self._numbers)
+        if missing > 0:
+            self._numbers = np.concatenate([self._numbers, self._random.random((missing, sample_size))])
+        number = start[:, None] + np.arange(batch)
+        # The samples from the best n of N matches are a share (n / N)^k of all: so n grows by the k-th root.
+        share = np.minimum((number + 1) / self._growth, 1.0) ** (1.0 / sample_size)
+        grown = np.clip(np.ceil(counts[:, None] * share).astype(np.intp), sample_size, counts[:, None])
+        return _distinct(self._numbers[number], np.where(ordered[:, None] & (number % 2 == 0), grown, counts[:, None]))
+
+
+def _distinct(numbers: FloatArray, pool: IntArray) -> IntArray:
+    """For each sample (B, S) as many distinct integers below its ``pool`` as it has numbers in [0, 1)."""
+    picks = np.empty(numbers.shape, dtype=np.intp)
+    for i in range(numbers.shape[-1]):
+        pick = (numbers[..., i] * (pool - i)).astype(np.intp)
+        for earlier in np.moveaxis(np.sort(picks[..., :i], axis=-1), -1, 0):
+            pick += pick >= earlier
+        picks[..., i] = pick
+    return picks

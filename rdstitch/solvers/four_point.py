@@ -115,7 +115,7 @@ class QuarticEquation(SampleArrays):
         symmetric = 0.5 * (h + h.swapaxes(0, 1))
         v = 0.5 * np.stack([h[2, 1] - h[1, 2], h[0, 2] - h[2, 0], h[1, 0] - h[0, 1]])
         trace = h[0, 0] + h[1, 1] + h[2, 2]
-        t2 = (symmetric * symmetric).sum(axis=(0, 1))
+        t2 = (symmetric * symmetric).sum(axis=0).sum(axis=0)
         n2 = (v * v).sum(axis=0)
         vsv = (v * (symmetric * v).sum(axis=1)).sum(axis=0)
         a2 = trace * trace

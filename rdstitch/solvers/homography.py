@@ -68,6 +68,6 @@ class Quadrangles(SampleArrays):
         images = self.points[:, 1, :3]
         lifted = (*images, 1.0 + squared_radii(images) * distortion)
         h = np.stack([(row * lines).sum(axis=1) for row in lifted])
-        norm = np.sqrt((h * h).sum(axis=(0, 1)))
+        norm = np.sqrt((h * h).sum(axis=0).sum(axis=0))
         scale = np.sign(alpha[0] * first * (second * third)) / np.where(norm > 0.0, norm, np.inf)
         return np.ascontiguousarray((h * scale).transpose(2, 0, 1)), possible

@@ -41,14 +41,17 @@ def value_and_slope_from_values(degree: int) -> FloatArray:
 
 def chebyshev_values(series: FloatArray, t: FloatArray) -> FloatArray:
     """Values at t (N,) of Chebyshev series (S, degree + 1, N), S at each place; shape (S, N)."""
-    basis = np.empty(series.shape[1:])
-    basis[0], basis[1:2] = 1.0, t
-    twice = 2.0 * t
-    # In place, for this is the innermost loop of all solvers.
-    for k in range(2, len(basis)):
-        np.multiply(twice, basis[k - 1], out=basis[k])
-        basis[k] -= basis[k - 2]
-    return np.asarray(np.einsum("skn,kn->sn", series, basis))
+    # Term by term and in place: this is the innermost loop of all solvers, and a sum of products by einsum is rounded
+    # differently at the end of an array, so that a root would depend on the number of others.
+    twice, before, current = 2.0 * t, np.ones_like(t), t
+    total = series[:, 1] * t if series.shape[1] > 1 else np.zeros_like(series[:, 0])
+    total += series[:, 0]
+    for k in range(2, series.shape[1]):
+        following = twice * current
+        following -= before
+        before, current = current, following
+        total += series[:, k] * following
+    return np.asarray(total)
 
 
 @lru_cache

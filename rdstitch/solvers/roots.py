@@ -33,6 +33,7 @@ _DEPTH = 6
 # Relative to the largest value of the polynomial: what counts as a double root. Values of the polynomial are rounded
 # to about 1e-15 of it.
 _TOUCHING = 1e-13
+_KERNEL_WIDTH = 48
 _NEWTON_STEPS = 40
 # In units of half the interval. Newton's method squares the error: the next step would be below rounding error.
 _NEWTON_CONVERGED = 1e-7
@@ -78,7 +79,8 @@ def real_roots(equation: Equation, degree: int, low: FloatArray, high: FloatArra
         some = equation.take(part) if len(part) < len(half) else equation
         values = some.polynomial(middle[part] + chebyshev_nodes(degree)[:, None] * half[part])
         values[:, ~((half[part] > 0.0) & np.isfinite(values).all(axis=0))] = 1.0
-        np.matmul(value_and_slope_from_values(degree), values, out=series[..., start : start + size])
+        values = _filled(values)
+        series[..., start : start + size] = (value_and_slope_from_values(degree) @ values)[..., : len(part)]
         found.append(isolate(values, start))
     if not found:
         return np.empty(0, dtype=np.intp), np.empty(0)
@@ -173,7 +175,7 @@ def isolate(values: FloatArray, first: int = 0) -> Brackets:
         if not len(sample):
             break
         width /= _PARTS
-        current = (current @ split).reshape(-1, count)
+        current = (_filled(current.T).T @ split)[: len(current)].reshape(-1, count)
         sample = np.repeat(sample, _PARTS)
         left = (left[:, None] + width * np.arange(_PARTS)).ravel()
         positive = current > 0.0
@@ -184,6 +186,14 @@ def isolate(values: FloatArray, first: int = 0) -> Brackets:
     if len(sample):
         found.append(_close_pairs(current, sample, left, width, np.abs(values).max(axis=0)))
     return Brackets.joined(found, first)
+
+
+def _filled(values: FloatArray) -> FloatArray:
+    """Columns (K, B) filled up with ones to a multiple of what the kernels of a matrix product take at once.
+
+    The last columns are otherwise rounded differently, and a sample's roots would depend on the samples beside it.
+    """
+    return np.pad(values, ((0, 0), (0, -values.shape[1] % _KERNEL_WIDTH)), constant_values=1.0)
 
 
 def _close_pairs(
@@ -230,7 +240,8 @@ def bracketed_newton(series: FloatArray, brackets: Brackets) -> tuple[FloatArray
     rising = change > 0.0
     t = left - brackets.value_left * (right - left) / np.where(change != 0.0, change, np.inf)
     roots, slopes = t.copy(), np.empty_like(t)
-    active = np.arange(len(t))
+    # What has converged stays as it is, however long the others take.
+    active, settled = np.arange(len(t)), np.zeros(len(t), dtype=np.bool_)
     for _ in range(_NEWTON_STEPS):
         value, slope = chebyshev_values(series, t)
         above = (value > 0.0) == rising
@@ -238,12 +249,14 @@ def bracketed_newton(series: FloatArray, brackets: Brackets) -> tuple[FloatArray
         left = np.where(above, left, t)
         following = t - value / np.where(slope != 0.0, slope, np.inf)
         following = np.where((following >= left) & (following <= right), following, 0.5 * (left + right))
-        roots[active], slopes[active] = following, slope
-        going = np.flatnonzero(np.abs(following - t) > _NEWTON_CONVERGED)
+        roots[active] = np.where(settled, roots[active], following)
+        slopes[active] = np.where(settled, slopes[active], slope)
+        settled |= np.abs(following - t) <= _NEWTON_CONVERGED
+        going = np.flatnonzero(~settled)
         if not len(going):
             break
         if len(going) < 0.7 * len(t):
-            active, series = active[going], np.take(series, going, axis=-1)
+            active, settled, series = active[going], settled[going], np.take(series, going, axis=-1)
             left, right, rising, following = left[going], right[going], rising[going], following[going]
         t = following
     return roots, slopes

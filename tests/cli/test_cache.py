@@ -50,7 +50,7 @@ def work(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     # The package has a function of the module's name.
     watch(import_module("rdstitch.features.detect"), "_detect")
-    watch(two_view, "estimate_radial_homography")
+    watch(two_view, "estimate_radial_homographies")
     watch(aligner, "align")
     watch(overlap_check, "overlap_agreement")
     return called
@@ -61,15 +61,15 @@ def test_only_what_depends_on_a_changed_option_is_done_again(
 ) -> None:
     output = tmp_path / "out.png"
     arguments = ("mosaic", *frames, "-o", output, "--overwrite", "--cache", tmp_path / "new" / "cache", *FAST)
-    for expected in ({"_detect", "estimate_radial_homography", "align", "overlap_agreement"}, set()):
+    for expected in ({"_detect", "estimate_radial_homographies", "align", "overlap_agreement"}, set()):
         work.clear()
         first = rdstitch(*arguments)
         assert (first.status, set(work)) == (0, expected)
         assert _result(output) == plain
     for options, expected in (
         (("--blend", "feather", "--scale", "0.5"), set()),
-        (("--seed", "1"), {"estimate_radial_homography", "align", "overlap_agreement"}),
-        (("--features", "orb"), {"_detect", "estimate_radial_homography", "align", "overlap_agreement"}),
+        (("--seed", "1"), {"estimate_radial_homographies", "align", "overlap_agreement"}),
+        (("--features", "orb"), {"_detect", "estimate_radial_homographies", "align", "overlap_agreement"}),
     ):
         work.clear()
         assert rdstitch(*arguments, *options).status == 0

@@ -57,3 +57,20 @@ def test_a_new_version_of_a_package_makes_entries_void(
     assert _recall(tmp_path / "cache", 1) == 1
     monkeypatch.setattr(cache, "version", lambda name: "2.0" if name == changed else "1.0")
     assert _recall(tmp_path / "cache", 2) == 2
+
+
+def test_of_several_results_only_those_that_are_missing_are_computed(tmp_path: Path) -> None:
+    asked: list[list[int]] = []
+
+    def recalled(cache: Cache, names: str) -> list[str]:
+        def compute(places: list[int]) -> list[str]:
+            asked.append(places)
+            return [names[place].upper() for place in places]
+
+        return cache.recall_many("stage", (), [(name,) for name in names], compute)
+
+    assert recalled(Cache(tmp_path), "ac") == ["A", "C"]
+    assert recalled(Cache(tmp_path), "abcd") == ["A", "B", "C", "D"]
+    assert recalled(Cache(tmp_path), "abcd") == ["A", "B", "C", "D"]
+    assert recalled(Cache(), "ab") == ["A", "B"]
+    assert asked == [[0, 1], [1, 3], [0, 1]]

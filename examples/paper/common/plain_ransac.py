@@ -1,5 +1,6 @@
 """Plain RANSAC, the same for every solver: no local optimisation, which would hide what the solvers differ in."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -10,7 +11,7 @@ from examples.paper.common.peers import homlib_solver
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.robust.measurements import Measurements
-from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
+from rdstitch.robust.minimal import MinimalSolver, Solve, minimal_solvers
 from rdstitch.robust.pair_models import HomographyModel
 from rdstitch.robust.sampling import Sampler
 from rdstitch.robust.scoring import plausible, transfer_errors2
@@ -34,7 +35,8 @@ def all_solvers(camera: Camera, tilt: tuple[float, float]) -> list[MinimalSolver
     """
     assert camera.focal is not None
     given = partial(minimal_solvers, camera.focal / camera.half_diagonal, 0.01)
-    told, untold, flat = given((tilt, tilt), None), given(None, None), given((tilt, tilt), 0.0)
+    told, untold, flat = given(True, None), given(False, None), given(True, 0.0)
+    told = [replace(solver, solve=_with_tilt(solver, tilt)) for solver in told]
     names = {
         "2 points, tilt given": (told, "two_point"),
         "3 points, tilt given, height free": (told, "three_point_similarity"),
@@ -47,14 +49,33 @@ def all_solvers(camera: Camera, tilt: tuple[float, float]) -> list[MinimalSolver
     for name, function, arguments in HOMLIB:
         solve = homlib_solver(function, *arguments)
         if solve is not None:
-            found.append(MinimalSolver(name, 5, solve, HomographyModel()))
+            found.append(MinimalSolver(name, 5, _without_tilt(solve), HomographyModel()))
     return found
+
+
+def _without_tilt(solve: Callable[[FloatArray, FloatArray], Solutions]) -> Solve:
+    """A solver that takes no tilts, as one that is given none."""
+
+    def solve_without(x1: FloatArray, x2: FloatArray, tilts: FloatArray | None = None) -> Solutions:
+        return solve(x1, x2)
+
+    return solve_without
+
+
+def _with_tilt(solver: MinimalSolver, tilt: tuple[float, float]) -> Solve:
+    """What a solver finds where both images of every sample have one known tilt."""
+
+    def solve(x1: FloatArray, x2: FloatArray, tilts: FloatArray | None = None) -> Solutions:
+        return solver.solve(x1, x2, np.broadcast_to(tilt, (len(x1), 2, 2)))
+
+    return solve
 
 
 def draw_samples(solver: MinimalSolver, data: Measurements, count: int, seed: int) -> tuple[Solutions, FloatArray]:
     """Solutions (M) of ``count`` uniform samples, and how many matches agree with each (M,)."""
-    picks = Sampler(len(data), solver.sample_size, None, 1, [seed]).draw(count)
-    found = solver.solve(data.x1[picks], data.x2[picks])
+    start, ordered = np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.bool_)
+    picks = Sampler(solver.sample_size, 1, [seed]).draw(start, count, data.count, ordered)[0]
+    found = solver.solve(data.x1[0].T[picks], data.x2[0].T[picks], None)
     return found, _inliers(found, data)
 
 
@@ -72,6 +93,7 @@ def _inliers(found: Solutions, data: Measurements) -> FloatArray:
     result = np.zeros(len(found))
     possible = np.flatnonzero(plausible(found, corner_radius=1.0))
     for part in np.array_split(possible, max(1, len(possible) // _SOLUTIONS_AT_ONCE)):
-        errors2 = transfer_errors2(found.homography[part], found.distortion[part], data)
-        result[part] = (errors2 < THRESHOLD**2).sum(axis=1)
+        pair = np.zeros(len(part), dtype=np.intp)
+        errors2 = transfer_errors2(found.homography[part], found.distortion[part], pair, data)
+        result[part] = ((errors2 < THRESHOLD**2) & data.present).sum(axis=1)
     return result

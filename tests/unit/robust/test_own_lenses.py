@@ -27,8 +27,8 @@ def _seen(first: Camera | None, second: Camera | None, seed: int, motion: str = 
     kept = np.isfinite(points1).all(axis=1) & np.isfinite(points2).all(axis=1)
     points1, points2 = points1[kept], points2[kept]
     relation = estimate_radial_homography(points1, points2, lens.image_size)
-    data = Measurements.from_pixels(points1, points2, relation.camera, relation.camera2, None)
-    return own_lenses(relation, data, _THRESHOLD)
+    data = Measurements.from_pixels(points1, points2, relation.camera, relation.camera2)
+    return own_lenses([relation], data, _THRESHOLD)[0]
 
 
 def _difference(found: OwnLenses) -> tuple[float, float]:
@@ -70,6 +70,6 @@ def test_pictures_that_only_turn_about_the_axis_do_not_tell_which_lens() -> None
     c, s = np.cos(0.3), np.sin(0.3)
     points2 = (points1 - lens.center) @ np.array([[c, s], [-s, c]]) + lens.center + 0.3 * rng.standard_normal((300, 2))
     relation = estimate_radial_homography(points1, points2, lens.image_size)
-    data = Measurements.from_pixels(points1, points2, lens, lens, None)
-    found = own_lenses(replace(relation, camera=lens, camera2=lens), data, _THRESHOLD)
+    data = Measurements.from_pixels(points1, points2, lens, lens)
+    found = own_lenses([replace(relation, camera=lens, camera2=lens)], data, _THRESHOLD)[0]
     assert np.sqrt(np.diag(found.covariance)).min() > 0.1

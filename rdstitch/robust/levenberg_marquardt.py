@@ -1,0 +1,96 @@
+"""Levenberg-Marquardt for many small problems in lockstep."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol, Self
+
+import numpy as np
+
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+
+_LEAST_GAIN = 1e-5
+"""Expected relative fall of the loss that is worth another step: a hundredth of the noise."""
+
+_FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e-9, 1e4
+
+
+@dataclass
+class NormalEquations:
+    """The loss of B problems at some parameters, and what a step from there takes.
+
+    Attributes
+    ----------
+    cost : ndarray of shape (B,)
+    information : ndarray of shape (B, P, P)
+        Weighted ``J'J``.
+    gradient : ndarray of shape (B, P)
+        Half the gradient of the cost.
+    """
+
+    cost: FloatArray
+    information: FloatArray
+    gradient: FloatArray
+
+
+class Problems(Protocol):
+    """B problems of least squares, as the descent sees them."""
+
+    def take(self, rows: BoolArray | IntArray) -> Self:
+        """Some of them."""
+        ...
+
+    def normal_equations(self, parameters: FloatArray) -> NormalEquations:
+        """At parameters (B, K)."""
+        ...
+
+
+Retract = Callable[[FloatArray, FloatArray], tuple[FloatArray, BoolArray]]
+"""Parameters (B, K) and steps (B, P) to the parameters after the step, and whether these are possible (B,)."""
+
+
+def descend(problems: Problems, retract: Retract, start: FloatArray, iterations: int) -> FloatArray:
+    """Where at most so many steps lead to, parameters of shape (B, K).
+
+    A problem that has converged takes no further part, so that each is solved as if it were alone.
+    """
+    result = start.copy()
+    current = problems.normal_equations(start)
+    parameters, damping, rows = start, np.full(len(start), _FIRST_DAMPING), np.arange(len(start))
+    for _ in range(iterations):
+        step = _damped_step(current, damping)
+        gain = -np.einsum("bp,bp->b", step, current.gradient)
+        going = (gain > _LEAST_GAIN * current.cost) & (damping <= _LARGEST_DAMPING)
+        if not going.all():
+            rows, step, parameters, damping = rows[going], step[going], parameters[going], damping[going]
+            problems = problems.take(going)
+            current = NormalEquations(current.cost[going], current.information[going], current.gradient[going])
+        if not len(rows):
+            break
+        moved, possible = retract(parameters, step)
+        there = problems.normal_equations(moved)
+        better = possible & (there.cost < current.cost)
+        parameters = np.where(better[:, None], moved, parameters)
+        current = NormalEquations(
+            np.where(better, there.cost, current.cost),
+            np.where(better[:, None, None], there.information, current.information),
+            np.where(better[:, None], there.gradient, current.gradient),
+        )
+        damping = np.where(better, np.maximum(damping / 10.0, _LEAST_DAMPING), damping * 20.0)
+        result[rows] = parameters
+    return result
+
+
+def _damped_step(equations: NormalEquations, damping: FloatArray) -> FloatArray:
+    """Steps (B, P); NaN where the equations are singular or not finite."""
+    diagonal = np.einsum("bpp->bp", equations.information)
+    largest = diagonal.max(axis=1, keepdims=True)
+    solvable = np.isfinite(equations.information).all(axis=(1, 2)) & (largest[:, 0] > 0.0)
+    damped = equations.information.copy()
+    np.einsum("bpp->bp", damped)[...] += damping[:, None] * diagonal + 1e-12 * largest
+    damped[~solvable] = np.eye(damped.shape[1])
+    try:
+        step = -np.linalg.solve(damped, equations.gradient[:, :, None])[:, :, 0]
+    except np.linalg.LinAlgError:
+        step = -(np.linalg.pinv(damped) @ equations.gradient[:, :, None])[:, :, 0]
+    step[~solvable] = np.nan
+    return np.asarray(step, dtype=np.float64)

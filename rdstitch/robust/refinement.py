@@ -1,0 +1,130 @@
+"""Refinement of homography and λ over all matches of many pairs at once."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.division_model import MAX_ABS_DISTORTION
+from rdstitch.robust.levenberg_marquardt import NormalEquations, descend
+from rdstitch.robust.linearization import Lens, differentiate, entry_equations, influence
+from rdstitch.robust.measurements import Measurements
+from rdstitch.robust.pair_models import PairModel
+
+
+@dataclass(frozen=True)
+class Fits:
+    """One model fitted to the matches of B pairs.
+
+    Attributes
+    ----------
+    state : ndarray of shape (B, S)
+        The model's states.
+    homography : ndarray of shape (B, 3, 3)
+    distortion : ndarray of shape (B,)
+        λ in the half-diagonal frame.
+    """
+
+    state: FloatArray
+    homography: FloatArray
+    distortion: FloatArray
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """The loss at fits, with what their covariance is made of.
+
+    Attributes
+    ----------
+    errors : ndarray of shape (B, N)
+        Whitened transfer errors, pixels; inf where there is no transfer, or no match.
+    cost : ndarray of shape (B,)
+        Value of the loss, px².
+    information : ndarray of shape (B, P, P)
+        Weighted ``J'J``: by λ first (only where it is free), then by the model's parameters.
+    influence : ndarray of shape (B, N, P)
+        Each match's share of the gradient, in the same order.
+    """
+
+    errors: FloatArray
+    cost: FloatArray
+    information: FloatArray
+    influence: FloatArray
+
+
+@dataclass(frozen=True)
+class PairProblems:
+    """Refinement of B pairs as problems of least squares; parameters are ``(λ, state)``."""
+
+    model: PairModel
+    data: Measurements
+    scale: FloatArray
+    noise: FloatArray
+    fixed_distortion: bool
+
+    def take(self, rows: BoolArray | IntArray) -> Self:
+        """Some of them."""
+        return type(self)(self.model, self.data.take(rows), self.scale[rows], self.noise[rows], self.fixed_distortion)
+
+    def normal_equations(self, parameters: FloatArray) -> NormalEquations:
+        """Loss, normal matrix and gradient."""
+        distortion, state = parameters[:, 0], parameters[:, 1:]
+        found = differentiate(self.model.homography(state), Lens(distortion), self.data)
+        entries = entry_equations(found, self.data.present, self.scale, not self.fixed_distortion)
+        chain = self.chain(state)
+        information = np.swapaxes(chain, 1, 2) @ entries.information @ chain
+        gradient = np.einsum("bkp,bk->bp", chain, entries.gradient)
+        cost = entries.cost
+        residual, by_state = self.model.prior(state)
+        if residual.shape[1]:
+            free = 0 if self.fixed_distortion else 1
+            weight = self.noise**2
+            information[:, free:, free:] += weight[:, None, None] * (by_state.T @ by_state)
+            gradient[:, free:] += weight[:, None] * (residual @ by_state)
+            cost = cost + weight * (residual**2).sum(axis=1)
+        return NormalEquations(cost, information, gradient)
+
+    def chain(self, state: FloatArray) -> FloatArray:
+        """Derivative of the entries of H and λ by λ and the model's parameters, (B, 9 + E, E + P)."""
+        free = 0 if self.fixed_distortion else 1
+        by_state = self.model.jacobian(state)
+        chain = np.zeros((len(state), 9 + free, free + by_state.shape[2]))
+        chain[:, :9, free:] = by_state
+        chain[:, 9:, :free] = 1.0
+        return chain
+
+    def retract(self, parameters: FloatArray, step: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Parameters after steps, and whether a lens can be so."""
+        free = 0 if self.fixed_distortion else 1
+        moved = np.empty_like(parameters)
+        moved[:, 0] = parameters[:, 0] + (step[:, 0] if free else 0.0)
+        moved[:, 1:] = self.model.retract(parameters[:, 1:], step[:, free:])
+        possible = (np.abs(moved[:, 0]) < MAX_ABS_DISTORTION) & np.isfinite(moved).all(axis=1)
+        return np.where(possible[:, None], moved, parameters), possible
+
+    def inspect(self, fits: Fits) -> Inspection:
+        """Errors, loss and influence of the matches at fits."""
+        found = differentiate(fits.homography, Lens(fits.distortion), self.data)
+        equations = self.normal_equations(np.column_stack([fits.distortion, fits.state]))
+        errors = np.sqrt(found.squared)
+        errors[found.lost | ~self.data.present] = np.inf
+        shares = influence(found, self.data.present, self.scale, not self.fixed_distortion) @ self.chain(fits.state)
+        return Inspection(errors, equations.cost, equations.information, shares)
+
+
+@np.errstate(all="ignore")  # a wild step may leave the lens model
+def refine(problems: PairProblems, start: Fits, iterations: int) -> Fits:
+    """Fit the model and λ by at most so many steps.
+
+    Parameters
+    ----------
+    problems : PairProblems
+        Of B pairs.
+    start : Fits
+        Their ``distortion`` is kept where it is fixed.
+    iterations : int
+    """
+    found = descend(problems, problems.retract, np.column_stack([start.distortion, start.state]), iterations)
+    state = found[:, 1:]
+    return Fits(state, problems.model.homography(state), found[:, 0])

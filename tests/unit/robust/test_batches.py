@@ -1,0 +1,92 @@
+"""Many pairs in lockstep: each comes out as if it were alone, bit for bit."""
+
+import numpy as np
+import pytest
+
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
+from rdstitch.robust import (
+    EstimationOptions,
+    PairMatches,
+    estimate_radial_homographies,
+    estimate_radial_homography,
+)
+from rdstitch.robust.linearization import Lens, TransferDerivatives, differentiate, entry_equations, influence
+from rdstitch.robust.measurements import Measurements, padded_length
+from rdstitch.synthetic import correspondences
+
+
+def _pairs(count: int) -> list[PairMatches]:
+    pairs = []
+    for seed in range(count):
+        motion = ("rigid", "similarity", "homography")[seed % 3]
+        outliers = (0.2, 0.5, 0.7)[seed % 3]
+        matches = correspondences(60 + 35 * (seed % 5), seed=seed, outliers=outliers, motion=motion)
+        camera = Camera(matches.truth.camera.image_size).with_focal()
+        quality = np.linspace(1.0, 0.0, len(matches.points1)) if seed % 2 else None
+        pairs.append(PairMatches(matches.points1, matches.points2, camera, camera, quality))
+    rng = np.random.default_rng(0)
+    first, second = rng.uniform((0, 0), (999, 799), (2, 80, 2))
+    return [*pairs, PairMatches(first, second, camera, camera), PairMatches(first[:5], second[:5], camera, camera)]
+
+
+@pytest.mark.parametrize("options", [EstimationOptions(), EstimationOptions(select_below=50)])
+def test_a_pair_is_estimated_as_if_it_were_alone(options: EstimationOptions) -> None:
+    pairs = _pairs(12)
+    together = estimate_radial_homographies(pairs, options)
+    assert sum(bool(found) for found in together) == 12
+    for pair, found in zip(pairs, together, strict=True):
+        alone = estimate_radial_homographies([pair], options)[0]
+        assert alone.homography.tobytes() == found.homography.tobytes()
+        assert alone.covariance.tobytes() == found.covariance.tobytes()
+        assert alone.inliers.tobytes() == found.inliers.tobytes()
+        assert (alone.iterations, alone.reason, alone.model) == (found.iterations, found.reason, found.model)
+
+
+def test_one_pair_by_either_function() -> None:
+    pair = _pairs(3)[1]
+    one = estimate_radial_homography(pair.points1, pair.points2, pair.camera1.image_size, quality=pair.quality)
+    assert one.homography.tobytes() == estimate_radial_homographies([pair], EstimationOptions())[0].homography.tobytes()
+
+
+def test_no_pairs() -> None:
+    assert estimate_radial_homographies([], EstimationOptions()) == []
+
+
+@pytest.mark.parametrize("count", [1, 16, 17, 33, 100, 129, 1000, 1025])
+def test_padding_is_at_most_a_quarter(count: int) -> None:
+    length = padded_length(count)
+    assert count <= length <= max(16, 1.25 * count)
+    assert padded_length(length) == length
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_normal_equations_are_those_of_the_jacobian(own: bool) -> None:
+    rng = np.random.default_rng(1)
+    points1 = rng.uniform((50, 50), (600, 420), (40, 2))
+    points2 = points1 + np.array([4.0, 2.5])
+    data = Measurements.from_pixels(points1, points2, Camera((640, 480)), Camera((640, 480)))
+    h = np.eye(3) + 0.02 * rng.normal(size=(3, 3))
+    lens = np.array([-0.2, -0.25, 0.03, 0.01, -0.02])
+    size = 14 if own else 10
+
+    def at(values: FloatArray) -> TransferDerivatives:
+        (first, second, mu), center = values[9:12, None], values[None, 12:]
+        seen = Lens(first, second, mu, center) if own else Lens(first)
+        return differentiate(values[:9].reshape(1, 3, 3), seen, data)
+
+    values = np.concatenate([h.ravel(), lens])
+    found = at(values)
+    steps = 1e-6 * np.eye(14)[:size]
+    jacobian = np.stack([(at(values + step).error - at(values - step).error)[0] / 2e-6 for step in steps], axis=-1)
+    xx, xy, yy = found.precision[0]
+    precision = np.stack([[xx, xy], [xy, yy]])
+    relative = data.present[0] / (1.0 + found.squared[0] / 9.0)
+    expected = np.einsum("inp,ijn,jnq,n->pq", jacobian, precision, jacobian, relative**2)
+    gradient = np.einsum("inp,ijn,jn,n->p", jacobian, precision, found.error[0], relative**2)
+    equations = entry_equations(found, data.present, np.array([3.0]), True)
+    np.testing.assert_allclose(equations.information[0], expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
+    np.testing.assert_allclose(equations.gradient[0], gradient, rtol=1e-5, atol=1e-5 * np.abs(gradient).max())
+    np.testing.assert_allclose(equations.cost[0], (found.squared[0] * relative).sum())
+    shares = influence(found, data.present, np.array([3.0]), True)[0]
+    np.testing.assert_allclose(shares.sum(axis=0), equations.gradient[0])
