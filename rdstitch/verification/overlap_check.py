@@ -68,6 +68,12 @@ def check_overlaps(registration: Registration, workers: int = 1, cache: Cache = 
     return cache.recall("overlaps", (CheckedLink, LinkFit, Agreement, Ambiguity), (placed, chosen), compute)
 
 
+def share_alike(checked: Sequence[CheckedLink]) -> float:
+    """Share of all overlaps together that looks alike, in [0, 1]; NaN where nothing was compared."""
+    cells = sum(link.agreement.cells for link in checked)
+    return sum(link.agreement.confirming for link in checked) / cells if cells else float("nan")
+
+
 def _compare(
     registration: Registration, chosen: Sequence[LinkFit], pictures: Sequence[int], workers: int
 ) -> list[CheckedLink]:

@@ -11,7 +11,8 @@ from rdstitch.matching.match_graph import connected_components
 from rdstitch.messages import Message, Severity, names_of, shortened
 from rdstitch.registration import Registration
 from rdstitch.verification.input_doubts import doubtful_inputs
-from rdstitch.verification.overlap_check import CheckedLink, check_overlaps
+from rdstitch.verification.overlap_check import CheckedLink, check_overlaps, share_alike
+from rdstitch.verification.rival_motion import find_rival_motions, rival_messages
 
 Pair = tuple[int, int]
 
@@ -87,6 +88,7 @@ def judge(
         return tuple(geometric)
     checked = [] if resting else check_overlaps(registration, workers, cache)
     ambiguous = _ambiguous(paths, checked)
+    rivals = find_rival_motions(alignment, registration.pairs, threshold)
     suspicions = {**disagreeing, **_unlike(paths, checked), **ambiguous}
     decisive = [] if lens_only or resting else _decisive(suspicions, used, len(paths))
     return (
@@ -94,6 +96,7 @@ def judge(
         *([] if lens_only else _pattern(ambiguous, checked)),
         *(suspicions[pair] for pair in decisive),
         *_outvoted(paths, [pair for pair in suspicions if pair not in decisive]),
+        *rival_messages(paths, rivals, share_alike(checked), lens_only=lens_only),
         *_little_alike(paths, checked),
         *doubtful_inputs(registration.sources),
     )

@@ -22,3 +22,23 @@ def test_never_silently_wrong(kind: str, tmp_path: Path) -> None:
         assert "frame_" in judged.text
     if kind == "mixed ground" and judged.status == 0:
         assert "frame_0002.png" in judged.text
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed", "said"),
+    [
+        ("body", 1, "stays where it is"),
+        ("banner", 2, "stays where it is"),
+        ("vehicle", 1, "moves otherwise"),
+        ("vehicle", 6, "moves otherwise"),
+        ("round border", 0, ""),
+        ("curved border", 0, ""),
+    ],
+)
+def test_what_moves_otherwise_is_never_stitched_without_a_word(kind: str, seed: int, said: str, tmp_path: Path) -> None:
+    judged = judge_set(trust_set(seed, kind), tmp_path)
+    assert judged.status in (0, 4), judged.text
+    assert judged.right, judged
+    assert said in judged.text
+    if kind in ("round border", "curved border"):
+        assert judged.status == 0, judged.text
