@@ -132,13 +132,9 @@ def rival_messages(
     )
     if lens_only or (share < _CONTESTED_SHARE and not agreement < _LEAST_AGREEMENT):
         return [Message(f"{what} (a vehicle, a second plane?); a mask keeps it out", images)]
-    return [
-        Message(
-            f"{what}, and it is not clear which of the two is the plane; mask what does not belong to it",
-            images,
-            "failure",
-        )
-    ]
+    # It concerns all pictures: without the one that shows it best, the rival would only be harder to see.
+    text = f"{what}, and it is not clear which of the two is the plane; mask what does not belong to it"
+    return [Message(text, severity="failure")]
 
 
 def _rival(alignment: Alignment, pair: PairRegistration, threshold: float, seed: int) -> RivalMotion:
