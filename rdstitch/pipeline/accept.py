@@ -64,6 +64,8 @@ def accept(registration: Registration, options: StitchOptions, *, lens_only: boo
         for _ in range(_MOST_ROUNDS):
             if current.with_messages(found).ok:
                 break
+            if _concerns_all(found):
+                raise RefusedError(at_full_size(first if current is registration else current.with_messages(found)))
             worst = _worst(current, found)
             shrunk, offending = _without(current, worst, aligner), offending + len(worst.reasons)
             # Where as many pictures fail as pass, nobody can say which of them are right.
@@ -80,6 +82,11 @@ def accept(registration: Registration, options: StitchOptions, *, lens_only: boo
 
 def _checked(registration: Registration, options: StitchOptions, cache: Cache, lens_only: bool) -> tuple[Message, ...]:
     return judge(registration, options.threshold, options.threads, cache, lens_only=lens_only)
+
+
+def _concerns_all(found: Iterable[Message]) -> bool:
+    """Whether something fails that no picture or pair is to blame for, so that leaving one out would only hide it."""
+    return any(message.severity == "failure" and len(message.images) > 2 for message in found)
 
 
 def _worst(registration: Registration, found: Iterable[Message]) -> _Offenders:
