@@ -3,8 +3,11 @@
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from threading import Lock
+from typing import Any
 
 import cv2
+
+_SILENT = 0  # the log level of that name
 
 
 class _SharedSetting:
@@ -38,9 +41,9 @@ class _SharedSetting:
 
 
 _threads = _SharedSetting(cv2.getNumThreads, cv2.setNumThreads, 1)
-_log_level = _SharedSetting(
-    cv2.utils.logging.getLogLevel, cv2.utils.logging.setLogLevel, cv2.utils.logging.LOG_LEVEL_SILENT
-)
+# OpenCV 4 has the same functions at its top level; its stubs know neither.
+_logging: Any = getattr(cv2.utils, "logging", cv2)
+_log_level = _SharedSetting(_logging.getLogLevel, _logging.setLogLevel, _SILENT)
 
 
 def one_opencv_thread() -> AbstractContextManager[None]:

@@ -1,5 +1,7 @@
 """OpenCV's threads and log level are as they were, whatever happened meanwhile."""
 
+from typing import Any
+
 import cv2
 import pytest
 
@@ -39,16 +41,16 @@ def test_there_is_one_thread_inside_and_as_many_as_before_afterwards() -> None:
 
 
 def test_the_log_level_survives_threads() -> None:
-    logging = cv2.utils.logging
+    logging: Any = getattr(cv2.utils, "logging", cv2)
     before = logging.getLogLevel()
     first, second = silent_opencv(), silent_opencv()
     try:
-        logging.setLogLevel(logging.LOG_LEVEL_INFO)
+        logging.setLogLevel(4)
         first.__enter__()
         second.__enter__()
         first.__exit__(None, None, None)
-        assert logging.getLogLevel() == logging.LOG_LEVEL_SILENT
+        assert logging.getLogLevel() == 0
         second.__exit__(None, None, None)
-        assert logging.getLogLevel() == logging.LOG_LEVEL_INFO
+        assert logging.getLogLevel() == 4
     finally:
         logging.setLogLevel(before)
