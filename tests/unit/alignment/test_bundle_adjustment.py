@@ -7,7 +7,6 @@ from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters,
 from rdstitch.alignment.motion_models import HOMOGRAPHY, MODELS, RIGID, TILTING, Model
 from rdstitch.alignment.normal_equations import chain, link_equations, robust_cost, robust_weight, squared_errors
 from rdstitch.alignment.observations import Observations
-from rdstitch.matching.thinning import spread_choice
 from tests.alignment_scenes import Scene, grid, jittered, scene
 
 FREE_LENS = np.array([True, True, True, True, True])
@@ -120,15 +119,3 @@ def test_outliers_do_not_move_the_result() -> None:
 def test_errors_of_a_given_scatter_give_their_sigma() -> None:
     errors = np.random.default_rng(0).normal(0, 0.7, (20_000, 2))
     assert sigma_of((errors**2).sum(axis=1)) == pytest.approx(0.7, rel=0.03)
-
-
-def test_thinning_keeps_the_overlap_covered() -> None:
-    rng = np.random.default_rng(0)
-    crowd = rng.normal(0.2, 0.01, (900, 2))
-    spread = rng.uniform(-1, 1, (100, 2))
-    points = np.concatenate([crowd, spread])
-    kept = spread_choice(points, 100)
-    assert len(kept) == 100
-    assert len(np.unique(kept)) == 100
-    assert (kept >= 900).sum() > 60
-    assert (spread_choice(points[:7], 100) == np.arange(7)).all()

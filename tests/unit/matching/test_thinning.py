@@ -1,0 +1,39 @@
+"""Fewer correspondences, evenly spread."""
+
+import numpy as np
+
+from rdstitch.matching.thinning import spread_choice
+
+
+def test_thinning_keeps_the_overlap_covered() -> None:
+    rng = np.random.default_rng(0)
+    crowd = rng.normal(0.2, 0.01, (900, 2))
+    spread = rng.uniform(-1, 1, (100, 2))
+    points = np.concatenate([crowd, spread])
+    kept = spread_choice(points, 100)
+    assert len(kept) == 100
+    assert len(np.unique(kept)) == 100
+    assert (kept >= 900).sum() > 60
+    assert (spread_choice(points[:7], 100) == np.arange(7)).all()
+
+
+def test_each_cell_gives_one_before_any_gives_two() -> None:
+    rng = np.random.default_rng(1)
+    # Ten in each of the nine cells of a grid of three by three, but one in the last.
+    cells = np.repeat(np.stack(np.meshgrid(range(3), range(3)), axis=-1).reshape(-1, 2), 10, axis=0)[:81]
+    points = (cells + rng.uniform(0.2, 0.8, cells.shape)) / 3.0
+    points[0], points[-1] = 0.0, 1.0
+    kept = spread_choice(points, 9)
+    assert (np.diff(kept) > 0).all()
+    cell = np.minimum((points[kept] * 3).astype(int), 2)
+    assert len(np.unique(cell, axis=0)) == 9
+    # Of each cell the first.
+    assert kept.tolist() == [0, 10, 20, 30, 40, 50, 60, 70, 80]
+
+
+def test_whoever_wants_all_gets_all() -> None:
+    points = np.random.default_rng(0).uniform(size=(20, 2))
+    assert spread_choice(points, None).tolist() == list(range(20))
+    assert spread_choice(points, 20).tolist() == list(range(20))
+    assert len(spread_choice(points, 19)) == 19
+    assert spread_choice(np.zeros((5, 2)), 1).tolist() == [0]
