@@ -8,13 +8,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rdstitch import solvers
+    from rdstitch import errors, solvers, synthetic
+    from rdstitch.alignment import Alignment
+    from rdstitch.alignment.trajectory import Trajectory
     from rdstitch.camera import Camera
     from rdstitch.camera_files import load_camera, save_camera
     from rdstitch.compositing import CompositeOptions
     from rdstitch.features import FeatureOptions
+    from rdstitch.messages import Message
     from rdstitch.pipeline import (
         Recomposition,
+        Registration,
         StitchOptions,
         StitchResult,
         apply,
@@ -28,43 +32,57 @@ if TYPE_CHECKING:
     from rdstitch.report import write_report
     from rdstitch.robust import estimate_radial_homography
 
+    __version__: str
+
 _HOMES = {
+    "Alignment": "rdstitch.alignment",
     "Camera": "rdstitch.camera",
     "CompositeOptions": "rdstitch.compositing",
     "FeatureOptions": "rdstitch.features",
+    "Message": "rdstitch.messages",
     "RadialHomography": "rdstitch.radial_homography",
     "Recomposition": "rdstitch.pipeline",
+    "Registration": "rdstitch.pipeline",
     "StitchOptions": "rdstitch.pipeline",
     "StitchResult": "rdstitch.pipeline",
-    "estimate_radial_homography": "rdstitch.robust",
+    "Trajectory": "rdstitch.alignment.trajectory",
     "apply": "rdstitch.pipeline",
-    "load_camera": "rdstitch.camera_files",
-    "save_camera": "rdstitch.camera_files",
     "calibrate": "rdstitch.pipeline",
+    "errors": "rdstitch",
+    "estimate_radial_homography": "rdstitch.robust",
+    "load_camera": "rdstitch.camera_files",
     "mosaic": "rdstitch.pipeline",
     "pano": "rdstitch.pipeline",
-    "trajectory": "rdstitch.pipeline",
+    "save_camera": "rdstitch.camera_files",
     "solvers": "rdstitch",
+    "synthetic": "rdstitch",
+    "trajectory": "rdstitch.pipeline",
     "undistort": "rdstitch.pipeline",
     "write_report": "rdstitch.report",
 }
 
 __all__ = [
+    "Alignment",
     "Camera",
     "CompositeOptions",
     "FeatureOptions",
+    "Message",
     "RadialHomography",
     "Recomposition",
+    "Registration",
     "StitchOptions",
     "StitchResult",
+    "Trajectory",
     "apply",
     "calibrate",
+    "errors",
     "estimate_radial_homography",
     "load_camera",
     "mosaic",
     "pano",
     "save_camera",
     "solvers",
+    "synthetic",
     "trajectory",
     "undistort",
     "write_report",
@@ -73,8 +91,15 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Load a public name from its home."""
+    if name == "__version__":
+        return import_module("importlib.metadata").version(__name__)
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     if _HOMES[name] == __name__:
         return import_module(f"{__name__}.{name}")
     return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    """The public names, loaded or not."""
+    return [*__all__, "__version__", "__doc__", "__all__"]

@@ -8,7 +8,6 @@ corner.
 The lens is the division model of :mod:`rdstitch.division_model`, with λ alone or with further even coefficients.
 """
 
-import json
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from numpy.typing import ArrayLike
 from rdstitch.arrays import FloatArray
 from rdstitch.division_model import distort, is_one_to_one, nearest_distortion, undistort
 from rdstitch.errors import ArgumentError
-from rdstitch.records import Record, read_json
+from rdstitch.records import Record
 
 _FILE_VERSION = 2
 """Of camera files; version 1 had λ and μ only, as ``lambda`` and ``lambda2``."""
@@ -227,19 +226,29 @@ class Camera:
         }
 
     def save(self, path: str | Path) -> None:
-        """Write a camera file (JSON) that :meth:`load` reads."""
-        Path(path).write_text(json.dumps(self.as_dict(), indent=2) + "\n", encoding="utf-8")
+        """Write a camera file: :func:`rdstitch.save_camera`, with its formats and its errors.
 
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Read a camera file.
+        Raises
+        ------
+        OutputError
+            When the name says no format, or the file cannot be written.
+        """
+        from rdstitch.camera_files import save_camera
+
+        save_camera(self, path)
+
+    @staticmethod
+    def load(path: str | Path) -> "Camera":
+        """Read a camera file of any known format: :func:`rdstitch.load_camera`.
 
         Raises
         ------
         InputError
             When the file cannot be read or is no camera file.
         """
-        return cls.from_record(read_json(path))
+        from rdstitch.camera_files import load_camera
+
+        return load_camera(path)
 
     @classmethod
     def from_record(cls, record: Record) -> Self:

@@ -19,6 +19,64 @@ from rdstitch.robust import SOLVERS
 class StitchOptions:
     """How pictures are registered and composited.
 
+    Attributes
+    ----------
+    features : FeatureOptions
+        Which features are detected.
+    ratio : float, optional
+        Largest ratio of the distances to the nearest and second nearest descriptor; None: what suits the features.
+    lightglue_model : path, optional
+        ONNX file of a network that matches the features instead.
+    solver : str
+        Minimal solver of the pairs: "auto", "two_point", "three_point", "three_point_similarity", "four_point" or
+        "five_point".
+    lens : str
+        Lens model, one of ``rdstitch.alignment.LENSES``; "auto": the simplest that the pictures allow.
+    model : str
+        Motion model of the whole, one of ``rdstitch.alignment.MODELS``; "auto": the least free that the pictures allow.
+    threshold : float
+        Largest transfer error of an inlier, pixels of the size that features are detected at.
+    confidence : float
+        Probability that no better model of a pair was missed.
+    max_iterations : int
+        Samples per pair.
+    camera : Camera, optional
+        Known camera: its λ is kept, its focal length trusted.
+    distortion : float, optional
+        Known λ, in the half-diagonal frame; it is kept.
+    focal : float, optional
+        Known focal length, pixels.
+    tilt : (float, float), optional
+        Known tilt (psi, theta) of all pictures, radians.
+    attitude : path, optional
+        Measured tilt of each picture: CSV of name, psi, theta, degrees; or "xmp".
+    attitude_std : float
+        Standard deviation of these tilts, radians; 0: exact.
+    mask : path, optional
+        Picture, or folder of them, that is dark where the pictures do not count.
+    channel_order : str
+        Order of the channels of arrays that come in or go out: "bgr", as OpenCV has it, or "rgb".
+    reference : str, optional
+        Name of the picture whose frame is kept; None: the best connected.
+    composite : CompositeOptions
+        How the pictures are put together.
+    cache : path, optional
+        Folder of results of earlier runs, to continue from; made if missing.
+    seed : int
+        Seed of random sampling: the same gives the same result, bit for bit.
+    workers : int
+        Pictures and pairs worked on at the same time; 0: as many as there are cores.
+    overwrite : bool
+        Replace existing outputs.
+    strict : bool
+        Fail when a picture is left out.
+    force : bool
+        Write the picture even when the result failed its checks.
+    save_camera : path, optional
+        Camera file to write; see rdstitch.camera_files for formats.
+    dry_run : bool
+        Register and plan the compositing; write nothing.
+
     Raises
     ------
     ArgumentError
@@ -26,32 +84,32 @@ class StitchOptions:
     """
 
     features: FeatureOptions = field(default_factory=FeatureOptions)
-    ratio: float | None = None  # largest ratio of distances of a match; None: what suits the features
-    lightglue_model: str | Path | None = None  # ONNX file of a network that matches the features instead
-    solver: str = "auto"  # minimal solver of the pairs, one of rdstitch.robust.SOLVERS
-    lens: str = "auto"  # lens, one of rdstitch.alignment.LENSES; auto: the simplest that the pictures allow
-    model: str = "auto"  # motion model of the whole, one of rdstitch.alignment.MODELS
-    threshold: float = 3.0  # largest transfer error of an inlier, px of the size that features are detected at
-    confidence: float = 0.999  # probability that no better model of a pair was missed
-    max_iterations: int = 10000  # samples per pair
-    camera: Camera | None = None  # known camera: its λ is kept, its focal length trusted
-    distortion: float | None = None  # known λ, half-diagonal frame; kept
-    focal: float | None = None  # known focal length, px
-    tilt: tuple[float, float] | None = None  # known tilt (psi, theta) of all pictures, radians
-    attitude: str | Path | None = None  # measured tilt of each picture: CSV of name, psi, theta, degrees; or "xmp"
-    attitude_std: float = math.radians(1.0)  # its standard deviation, radians; 0: exact
-    mask: str | Path | None = None  # picture, or folder of them, that is dark where the pictures do not count
-    channel_order: ChannelOrder = "bgr"  # of arrays that come in or go out: "bgr", as OpenCV has it, or "rgb"
-    reference: str | None = None  # name of the picture whose frame is kept; None: the best connected
+    ratio: float | None = None
+    lightglue_model: str | Path | None = None
+    solver: str = "auto"
+    lens: str = "auto"
+    model: str = "auto"
+    threshold: float = 3.0
+    confidence: float = 0.999
+    max_iterations: int = 10000
+    camera: Camera | None = None
+    distortion: float | None = None
+    focal: float | None = None
+    tilt: tuple[float, float] | None = None
+    attitude: str | Path | None = None
+    attitude_std: float = math.radians(1.0)
+    mask: str | Path | None = None
+    channel_order: ChannelOrder = "bgr"
+    reference: str | None = None
     composite: CompositeOptions = field(default_factory=CompositeOptions)
-    cache: Path | None = None  # folder of results of earlier runs, to continue from; made if missing
+    cache: Path | None = None
     seed: int = 0
-    workers: int = 0  # pictures and pairs worked on at the same time; 0: as many as there are cores
-    overwrite: bool = False  # replace existing outputs
-    strict: bool = False  # fail when a picture is left out
-    force: bool = False  # write the picture even when the result failed its checks
-    save_camera: Path | None = None  # camera file to write; see rdstitch.camera_files for formats
-    dry_run: bool = False  # register, and plan the compositing; write nothing
+    workers: int = 0
+    overwrite: bool = False
+    strict: bool = False
+    force: bool = False
+    save_camera: Path | None = None
+    dry_run: bool = False
 
     def __post_init__(self) -> None:
         """Check ranges and contradictions."""

@@ -235,7 +235,7 @@ def whiten(whitening: FloatArray, values: FloatArray) -> FloatArray:
     return result
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RadialHomography:
     """The relation of two pictures of a plane: homography, λ, and how far both can be trusted.
 
@@ -290,6 +290,14 @@ class RadialHomography:
         none = np.zeros(count, dtype=np.bool_)
         h = np.full((3, 3), np.nan)
         return cls(h, camera, camera2, none, iterations=iterations, reason=reason, ok=False)
+
+    def __repr__(self) -> str:
+        """One line: the model, its inliers and λ, or why the fit failed."""
+        if not self.ok:
+            return f"<RadialHomography failed: {self.reason}>"
+        agreeing = f"{int(self.inliers.sum())} of {len(self.inliers)} inliers"
+        known = f"λ = {self.distortion:.4f}" if self.distortion_observable else "λ not observable"
+        return f"<RadialHomography {self.model}, {agreeing}, {known}, rms {self.rms:.2f} pixels>"
 
     def __bool__(self) -> bool:
         """Whether the fit succeeded."""

@@ -13,7 +13,7 @@ from rdstitch.matching.two_view import PairRegistration
 from rdstitch.messages import Message, of_severity
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Registration:
     """Pictures registered as one.
 
@@ -40,6 +40,12 @@ class Registration:
     messages: tuple[Message, ...]
     static_background: bool = False
     mixed: TwoLenses | None = None
+
+    def __repr__(self) -> str:
+        """One line: of how many pictures, by which motion model, and λ."""
+        used = int(self.alignment.used.sum())
+        total = used + len(self.left_out)
+        return f"<Registration {used} of {total} pictures, {self.alignment.model}, {self.lens}>"
 
     def with_messages(self, messages: Iterable[Message]) -> Self:
         """The same with more to know about it."""

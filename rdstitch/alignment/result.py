@@ -86,7 +86,7 @@ class Relief:
     explanation: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Alignment:
     """All pictures registered as one.
 
@@ -160,6 +160,11 @@ class Alignment:
     links: tuple[LinkFit, ...]
     relief: Relief
     messages: tuple[Message, ...] = ()
+
+    def __repr__(self) -> str:
+        """One line: of how many pictures, by which motion model, and how well they agree."""
+        used, count = int(self.used.sum()), len(self.used)
+        return f"<Alignment {used} of {count} pictures, {self.model}, rms {self.rms:.2f} pixels>"
 
     def relation(self, image1: int, image2: int) -> FloatArray:
         """Homography (3, 3) from undistorted normalized coordinates of one picture to those of another."""

@@ -17,7 +17,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Trajectory:
     """Poses of the frames of a sequence, in order.
 
@@ -73,6 +73,11 @@ class Trajectory:
         unit = height / poses.height[first]
         yaw = np.unwrap(poses.yaw[frame] - poses.yaw[first])
         return cls(frame, turned * unit, yaw, poses.height[frame] * unit)
+
+    def __repr__(self) -> str:
+        """One line: the number of frames and the length of the path."""
+        length = float(np.linalg.norm(np.diff(self.position, axis=0), axis=1).sum())
+        return f"<Trajectory {len(self)} frames, {length:.3g} long, from height {self.height[0]:.3g}>"
 
     def __len__(self) -> int:
         """Number of frames."""

@@ -21,7 +21,7 @@ from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_format, write_strips
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Composite:
     """The stitched picture.
 
@@ -45,8 +45,12 @@ class Composite:
     exposure: Exposure
     notes: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        """One line: its size and sample type."""
+        return f"<Composite {self.canvas.size[0]} x {self.canvas.size[1]} pixels, {self.pixels.dtype}>"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class FileComposite:
     """A stitched picture that went to a file; attributes as of :class:`Composite`.
 
@@ -62,6 +66,10 @@ class FileComposite:
     exposure: Exposure
     coverage: float
     notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        """One line: its file and size."""
+        return f"<FileComposite {self.path}: {self.canvas.size[0]} x {self.canvas.size[1]} pixels>"
 
 
 def compose(

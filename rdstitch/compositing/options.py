@@ -17,44 +17,64 @@ Interpolation = Literal["linear", "cubic", "lanczos"]
 class CompositeOptions:
     """Options of the compositor; the command line has the same names and defaults.
 
+    Attributes
+    ----------
+    exposure : str
+        Gain compensation. "balanced" makes pictures agree where they overlap, keeps every region near the brightness of
+        its own pictures, and clips nothing; "gain" makes the whole comparable, with one factor per picture and channel
+        and one vignetting for all; "blocks" adds a smooth field per picture to that; "none" is for people who measure.
+    seam : str
+        Where one picture ends and the next begins: "graphcut" goes round what differs between them (parallax,
+        people), "voronoi" where their borders are equally far, "none" leaves it to the blending.
+    blend : str
+        "multiband" hides the seam over a width that suits each size of detail, "feather" averages over a
+        strip along the seam (without seams: over the whole overlap), "none" cuts.
+    crop : str
+        "none"; "auto" cuts to the largest upright rectangle without holes, where that keeps a fair part of the
+        picture.
+    scale : float
+        Factor to the size of the output; 1 keeps the resolution of the reference picture, or the median one, at its
+        centre.
+    max_size : int, optional
+        Longest side of the output, pixels; None: as ``scale`` makes it.
+    quality : int
+        Quality of JPEG and WebP, 1 to 100.
+    rotate : float
+        Degrees that the output is turned clockwise.
+    max_memory : int, optional
+        Bytes that the compositor may hold in pictures and tiles; None: 352 MB, or more where the canvas needs
+        it.
+    interpolation : str
+        Kernel of the one resampling: "linear", "cubic" or "lanczos".
+    background : int
+        Grey of what no picture covers, in formats without transparency: 0 black, 255 white.
+    bands : int, optional
+        Bands of "multiband"; the widest transition is about 2**bands pixels. None: by the size of the pictures.
+    tile_size : int, optional
+        Side of the square tiles that the canvas is worked on in, pixels, a multiple of 256; None: 512 where
+        memory allows. It does not change the result.
+    workers : int, optional
+        Tiles that are worked on at one time; None: one per processor, up to 4. It does not change the result.
+
     Raises
     ------
     ArgumentError
         When a value is not one of those listed.
     """
 
-    # Brightness: "balanced" makes pictures agree where they overlap, keeps every region near the brightness of its own
-    # pictures, and clips nothing; "gain" makes the whole comparable, with one factor per picture and channel and one
-    # vignetting for all; "blocks" adds a smooth field per picture to that; "none" for people who measure.
     exposure: Exposure = "balanced"
-    # Where one picture ends and the next begins: "graphcut" goes round what differs between them (parallax, people),
-    # "voronoi" where their borders are equally far, "none" leaves it to the blending.
     seam: Seam = "graphcut"
-    # "multiband" hides the seam over a width that suits each size of detail, "feather" averages over a strip along
-    # the seam (without seams: over the whole overlap), "none" cuts.
     blend: Blend = "multiband"
-    # "auto" cuts to the largest upright rectangle without holes, where that keeps a fair part of the picture.
     crop: Crop = "none"
-    # Size of the output; 1 keeps the resolution of the reference picture (or the median one) at its centre.
     scale: float = 1.0
-    # Longest side of the output, pixels; None: as ``scale`` makes it.
     max_size: int | None = None
-    # Quality of JPEG and WebP, 1 to 100.
     quality: int = 95
-    # Degrees that the output is turned clockwise.
     rotate: float = 0.0
-    # Bytes that the compositor may hold in pictures and tiles; None: 352 MB, or more where the canvas needs it.
     max_memory: int | None = None
-    # Kernel of the one resampling.
     interpolation: Interpolation = "cubic"
-    # Grey of what no picture covers, in formats without transparency: 0 black, 255 white.
     background: int = 0
-    # Bands of "multiband"; the widest transition is about 2**bands px. None: by the size of the pictures.
     bands: int | None = None
-    # Side of the square tiles that the canvas is worked on in, px, a multiple of 256; None: 512 where memory allows.
-    # It does not change the result.
     tile_size: int | None = None
-    # Tiles that are worked on at one time; None: one per processor, up to 4. It does not change the result.
     workers: int | None = None
 
     def __post_init__(self) -> None:

@@ -16,29 +16,66 @@ CLOSER = 4.0
 class FeatureOptions:
     """Which features to detect, and how many.
 
+    Attributes
+    ----------
+    kind : str
+        "rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk" or "aliked".
+    max_features : int
+        Keypoints kept per picture.
+    work_megapixels : float, optional
+        Pictures are halved until they have no more megapixels than this before features are detected; None: never.
+    spread : bool
+        Keep the strongest of each cell of a grid in turn, rather than the strongest of the picture.
+    spread_cell : float
+        Side of a cell of that grid, fraction of the picture's diagonal.
+    sift_contrast : float
+        SIFT's contrast threshold; 0.04 is OpenCV's, too high for hazy pictures.
+    surf_threshold : float
+        Determinant of the Hessian, grey levels², from which on a blob counts.
+    surf_octaves : int
+        Octaves of scale.
+    surf_layers : int
+        Scales per octave.
+    surf_extended : bool
+        Descriptors of 128 numbers instead of 64.
+    surf_upright : bool
+        No orientation: for pictures that are turned by less than about 15°.
+    surf_refine : bool
+        Place blobs by Gaussian derivatives; False: by box filters alone, as the paper does.
+    orb_fast_threshold : int
+        Grey levels by which a corner must differ from its surroundings.
+    kaze_threshold : float
+        Least response of KAZE and AKAZE; 0.001 is OpenCV's.
+    brisk_threshold : int
+        Grey levels by which a corner must differ; 30 is OpenCV's.
+    aliked_model : path, optional
+        ONNX file of the network of "aliked".
+    aliked_size : int
+        Side of the square picture that the network takes, pixels.
+
     Raises
     ------
     ArgumentError
         When a value is out of range, or the kind unknown.
     """
 
-    kind: str = "rootsift"  # one of KINDS
-    max_features: int = 4000  # keypoints kept per picture
-    work_megapixels: float | None = WORK_MEGAPIXELS  # pictures are halved until they have no more, 10⁶ px; None: never
-    spread: bool = True  # the strongest of each cell of a grid in turn, rather than the strongest of the picture
-    spread_cell: float = 0.05  # side of a cell of that grid, fraction of the picture's diagonal
-    sift_contrast: float = 0.02  # SIFT's contrast threshold; 0.04 is OpenCV's, too high for hazy pictures
-    surf_threshold: float = 100.0  # determinant of the Hessian, grey levels², from which on a blob counts
-    surf_octaves: int = 4  # octaves of scale
-    surf_layers: int = 3  # scales per octave
-    surf_extended: bool = False  # 128 numbers a descriptor instead of 64
-    surf_upright: bool = False  # no orientation: for pictures that are turned by less than about 15°
-    surf_refine: bool = True  # place blobs by Gaussian derivatives; False: by box filters alone, as the paper does
-    orb_fast_threshold: int = 7  # grey levels by which a corner must differ from its surroundings
-    kaze_threshold: float = 0.0005  # least response of KAZE and AKAZE; 0.001 is OpenCV's
-    brisk_threshold: int = 25  # grey levels by which a corner must differ; 30 is OpenCV's
-    aliked_model: str | Path | None = None  # ONNX file of the network
-    aliked_size: int = 640  # side of the square picture that the network takes, px
+    kind: str = "rootsift"
+    max_features: int = 4000
+    work_megapixels: float | None = WORK_MEGAPIXELS
+    spread: bool = True
+    spread_cell: float = 0.05
+    sift_contrast: float = 0.02
+    surf_threshold: float = 100.0
+    surf_octaves: int = 4
+    surf_layers: int = 3
+    surf_extended: bool = False
+    surf_upright: bool = False
+    surf_refine: bool = True
+    orb_fast_threshold: int = 7
+    kaze_threshold: float = 0.0005
+    brisk_threshold: int = 25
+    aliked_model: str | Path | None = None
+    aliked_size: int = 640
 
     def __post_init__(self) -> None:
         """Check ranges."""

@@ -57,10 +57,22 @@ def pano(
     progress : callable
         Called with the name of a stage, the number of steps done, and their total.
 
+    Returns
+    -------
+    StitchResult
+        The picture or its file, with everything that was estimated.
+
     Raises
     ------
     RdstitchError
         See the tree in :mod:`rdstitch.errors`.
+
+    Examples
+    --------
+    >>> import rdstitch
+    >>> result = rdstitch.pano(["left.png", "middle.png"], options=rdstitch.StitchOptions(seed=1))
+    >>> result.image.shape[2], result.ok
+    (3, True)
     """
     options = options or StitchOptions()
     with _pictures(inputs, output, options, every) as frames:
@@ -94,10 +106,23 @@ def mosaic(
         Use every n-th video frame.
     progress : callable
 
+    Returns
+    -------
+    StitchResult
+        The picture or its file, with everything that was estimated.
+
     Raises
     ------
     RdstitchError
         See the tree in :mod:`rdstitch.errors`.
+
+    Examples
+    --------
+    >>> import rdstitch
+    >>> small = rdstitch.CompositeOptions(scale=0.5)
+    >>> result = rdstitch.mosaic(["flight/"], "small.tif", rdstitch.StitchOptions(composite=small))
+    >>> result.output.name, result.registration.alignment.used.all()
+    ('small.tif', np.True_)
     """
     options = options or StitchOptions()
     with _pictures(inputs, output, options, every) as frames:
@@ -115,6 +140,11 @@ def calibrate(
     ----------
     inputs, options, every, progress
         As for :func:`mosaic`; nothing is composited. ``options.save_camera`` names the file to write.
+
+    Returns
+    -------
+    Registration
+        With the cameras and poses in ``alignment``.
 
     Raises
     ------

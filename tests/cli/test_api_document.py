@@ -1,11 +1,16 @@
 """docs/api.md: every public name has an example, and the examples run."""
 
+import dataclasses
 import doctest
 import inspect
 import re
 import shutil
+import subprocess
+import sys
+from importlib import metadata
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import rdstitch
@@ -30,18 +35,77 @@ def _code() -> str:
     return "\n".join(lines) + "\n"
 
 
-def test_the_examples_run(frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _run(test: doctest.DocTest) -> None:
+    output: list[str] = []
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL)
+    results = runner.run(test, out=output.append)
+    assert results.failed == 0, "".join(output)
+
+
+@pytest.fixture
+def pictures(frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The pictures that the examples name, in the current folder."""
     (tmp_path / "flight").mkdir()
     for name, frame in zip(("left", "middle", "right"), frames, strict=True):
         shutil.copy(frame, tmp_path / f"{name}.png")
         shutil.copy(frame, tmp_path / "flight")
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.usefixtures("pictures")
+def test_the_examples_run() -> None:
     test = doctest.DocTestParser().get_doctest(_code(), {}, "api.md", str(_DOCUMENT), 0)
     assert len(test.examples) > 40
-    told: list[str] = []
-    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL)
-    results = runner.run(test, out=told.append)
-    assert results.failed == 0, "".join(told)
+    _run(test)
+
+
+@pytest.mark.usefixtures("pictures")
+@pytest.mark.parametrize("name", ["pano", "mosaic", "estimate_radial_homography"])
+def test_the_examples_of_help_run(name: str) -> None:
+    function = getattr(rdstitch, name)
+    (test,) = doctest.DocTestFinder(recurse=False).find(function, name, globs={"np": np})
+    assert test.examples
+    assert "Returns\n" in (function.__doc__ or "").replace("    ", "")
+    _run(test)
+
+
+def test_the_package_shows_its_names_and_loads_them_when_they_are_used() -> None:
+    assert set(rdstitch.__all__) < set(dir(rdstitch))
+    assert "__version__" in dir(rdstitch)
+    program = (
+        "import sys, rdstitch; print(rdstitch.__version__); heavy = {'numpy', 'scipy', 'cv2'} & sys.modules.keys(); "
+        "rdstitch.errors.InputError, rdstitch.synthetic.pair_poses; print(sorted(heavy))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == f"{metadata.version('rdstitch')}\n[]\n"
+    with pytest.raises(AttributeError, match="no attribute 'stitch'"):
+        rdstitch.stitch  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    "kind", [getattr(rdstitch, name) for name in rdstitch.__all__ if dataclasses.is_dataclass(getattr(rdstitch, name))]
+)
+def test_help_describes_every_field(kind: type) -> None:
+    """Options with their units; of results some fields share a line."""
+    text = (inspect.getdoc(kind) or "").split("Raises\n")[0]
+    entries = re.split(r"\n(?=[\w, ]+ : )", text)
+    names = {name: entry for entry in entries for name in entry.split(" : ")[0].split(", ")}
+    fields = [field.name for field in dataclasses.fields(kind) if not field.name.startswith("_")]
+    assert [name for name in fields if name not in names] == []
+    if kind.__name__.endswith("Options"):
+        assert [name for name in fields if len(names[name].splitlines()) < 2] == []
+
+
+@pytest.mark.usefixtures("pictures")
+def test_results_show_themselves_in_one_line() -> None:
+    result = rdstitch.mosaic(["flight/"], options=rdstitch.StitchOptions(workers=1))
+    registration = result.registration
+    path = rdstitch.Trajectory.from_alignment(registration.alignment)
+    failed = rdstitch.RadialHomography.failed("too few matches", registration.camera, registration.camera, 3)
+    shown = [result, registration, registration.alignment, path, registration.pairs[0].relation, failed]
+    lines = [repr(each) for each in (*shown, result.composite)]
+    assert all(len(line) < 120 and "\n" not in line and line[0] == "<" for line in lines), lines
+    assert lines[5] == "<RadialHomography failed: too few matches>"
 
 
 @pytest.mark.parametrize("name", rdstitch.__all__)

@@ -197,3 +197,24 @@ def test_a_name_that_says_no_format_is_refused(tmp_path: Path, name: str) -> Non
     with pytest.raises(OutputError, match="camera file"):
         save_camera(CAMERAS[0], tmp_path / name)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["camera.json", "camera.yml", "opencv.json", "cameras.json", "camera.pto"])
+def test_the_methods_of_a_camera_are_the_functions(tmp_path: Path, name: str) -> None:
+    (tmp_path / "function").mkdir()
+    lens = Camera((640, 480), distortion=-0.2, focal=520.0)
+    lens.save(tmp_path / name)
+    save_camera(lens, tmp_path / "function" / name)
+    assert (tmp_path / name).read_bytes() == (tmp_path / "function" / name).read_bytes()
+    assert Camera.load(tmp_path / name) == load_camera(tmp_path / name)
+
+
+def test_the_methods_of_a_camera_fail_as_the_functions_do(tmp_path: Path) -> None:
+    lens = Camera((640, 480))
+    with pytest.raises(OutputError, match="not the name of a camera file"):
+        lens.save(tmp_path / "camera.txt")
+    with pytest.raises(OutputError, match="cannot be written"):
+        lens.save(tmp_path / "missing" / "camera.json")
+    with pytest.raises(InputError):
+        Camera.load(tmp_path / "camera.json")
+    assert list(tmp_path.iterdir()) == []

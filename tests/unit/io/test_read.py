@@ -223,8 +223,7 @@ class TestMetadata:
 
     def test_focal_length(self, tmp_path: Path) -> None:
         exif = Image.Exif()
-        photo = exif.get_ifd(0x8769)
-        photo[0xA405] = 28
+        exif[0x8769] = {0xA405: 28}
         Image.new("L", (400, 300)).save(tmp_path / "a.jpg", exif=exif)
         metadata = read_metadata(tmp_path / "a.jpg")
         assert metadata.focal_source == "FocalLengthIn35mmFilm"
@@ -232,18 +231,15 @@ class TestMetadata:
 
     def test_focal_plane_resolution_counts_original_pixels(self, tmp_path: Path) -> None:
         exif = Image.Exif()
-        photo = exif.get_ifd(0x8769)
-        # 5 mm, 800 px per mm at a width of 4000 px; the file was made smaller since.
-        photo[0x920A], photo[0xA20E], photo[0xA210], photo[0xA002] = 5.0, 800.0, 4, 4000
+        # 5 mm, 800 pixels per mm at a width of 4000 pixels; the file was made smaller since.
+        exif[0x8769] = {0x920A: 5.0, 0xA20E: 800.0, 0xA210: 4, 0xA002: 4000}
         Image.new("L", (1000, 750)).save(tmp_path / "a.jpg", exif=exif)
         assert read_metadata(tmp_path / "a.jpg").focal_px == pytest.approx(1000.0)
 
     def test_place_and_attitude(self, tmp_path: Path) -> None:
         exif = Image.Exif()
         exif[0x010F], exif[0x0110] = "Maker", "Model"
-        exif.get_ifd(0x8825).update(
-            {1: "S", 2: (33.0, 30.0, 36.0), 3: "W", 4: (70.0, 15.0, 0.0), 5: b"\x01", 6: 12.5},
-        )
+        exif[0x8825] = {1: "S", 2: (33.0, 30.0, 36.0), 3: "W", 4: (70.0, 15.0, 0.0), 5: b"\x01", 6: 12.5}
         xmp = (
             '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:GimbalYawDegree="+31.5" '
             'drone-dji:GimbalPitchDegree="-89.90" drone-dji:FlightYawDegree="1">'
