@@ -42,10 +42,8 @@ class Registration:
     mixed: TwoLenses | None = None
 
     def __repr__(self) -> str:
-        """One line: of how many pictures, by which motion model, and λ."""
-        used = int(self.alignment.used.sum())
-        total = used + len(self.left_out)
-        return f"<Registration {used} of {total} pictures, {self.alignment.model}, {self.lens}>"
+        """One line: of how many pictures, and λ."""
+        return f"<Registration {self.summary}>"
 
     def with_messages(self, messages: Iterable[Message]) -> Self:
         """The same with more to know about it."""

@@ -134,7 +134,7 @@ def _sixteen_bit(good: Path, folder: Path) -> Path:
 def _hostile_exif(good: Path, folder: Path) -> Path:
     exif = Image.Exif()
     exif[0x010F] = "\x1b[31m" * 500
-    exif.get_ifd(0x8769)[0x920A] = (0, 0)
+    exif[0x8769] = {0x920A: (0, 0)}
     return _saved(good, folder / "odd.jpg", lambda image: image, exif=exif)
 
 

@@ -26,10 +26,10 @@ def place(tmp_path: Path, frames: list[Path], monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize(
     ("command", "status", "told"),
     [
-        ("panos a.png b.png -o out.png", 2, "Did you mean 'pano'"),
+        ("panos a.png b.png -o out.png", 2, "No such command 'panos'"),
         ("pano a.png b.png -o", 2, "requires an argument"),
         ("pano a.png b.png", 2, "'-o'"),
-        ("pano a.png b.png -o out.png --blen none", 2, "'--blend'"),
+        ("pano a.png b.png -o out.png --blen none", 2, "--blend"),
         ("pano a.png b.png -o -", 6, "-: "),
         ("pano a.png https://example.org/b.png -o out.png", 3, "download it first"),
         ("mosaic @more -o out.png", 3, "more: "),

@@ -108,7 +108,7 @@ def test_what_pictures_say_of_their_cameras_is_told(
     for number, (frame, model, length) in enumerate(zip(frames, models, lengths, strict=True)):
         exif = Image.Exif()
         exif[ExifTags.Base.Model] = model
-        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = length
+        exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLengthIn35mmFilm: length}
         with Image.open(frame) as image:
             image.save(tmp_path / f"{number}.jpg", exif=exif, quality=95)
     done = rdstitch("mosaic", tmp_path, "-o", tmp_path / "out.png", *FAST)
