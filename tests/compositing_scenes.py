@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from examples.judging.comparison import plane_under
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, plan_canvas
 from rdstitch.io import Metadata, Picture
-from rdstitch.synthetic.comparison import plane_under
 from rdstitch.synthetic.layouts import grid_poses
 from rdstitch.synthetic.rendering import Photometry, sequence_over
 from rdstitch.synthetic.rendering import Sequence as Rendering

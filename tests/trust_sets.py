@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from examples.judging import alignment_error
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.errors import RdstitchError
@@ -22,7 +23,6 @@ from rdstitch.synthetic import (
     Poses,
     Sequence,
     Texture,
-    alignment_error,
     gradient,
     grid_poses,
     ground,

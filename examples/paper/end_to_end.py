@@ -9,21 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from examples.judging import PlaneComparison, compare_with_plane
 from examples.paper.common.report import Pixels, Report, Table
 from examples.paper.common.settings import Effort, Settings
 from examples.paper.common.stitchers import Stitcher, installed_stitchers
 from examples.paper.common.subprocesses import Run, run_all
 from rdstitch.camera import Camera
 from rdstitch.io.read import read_image
-from rdstitch.synthetic import (
-    Photometry,
-    PlaneComparison,
-    Sequence,
-    compare_with_plane,
-    grid_poses,
-    ground,
-    sequence_over,
-)
+from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
 
 HEADER = (
     "stitcher",

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from examples.judging import fit_homography, fit_similarity
 from examples.paper.common.charts import (
     before_and_after,
     board_grid,
@@ -32,7 +33,6 @@ from rdstitch.matching.distortion_consensus import Consensus, vote
 from rdstitch.planar_motion import rotation_from_tilt
 from rdstitch.radial_homography import project
 from rdstitch.robust.measurements import Measurements
-from rdstitch.synthetic import fit_homography, fit_similarity
 
 OWN, WEIGHTED, ADJUSTED = "rdstitch, pairs", "rdstitch, weighted votes", "rdstitch, adjusted"
 

@@ -1,9 +1,6 @@
 """Ground truth: problem instances, matches and rendered image sequences, for tests, examples and benchmarks."""
 
-from rdstitch.synthetic.alignment import AlignmentError, alignment_error
-from rdstitch.synthetic.comparison import PlaneComparison, compare_with_plane, coverage, plane_under, sharpness
 from rdstitch.synthetic.correspondences import SyntheticMatches, correspondences
-from rdstitch.synthetic.fitting import fit_homography, fit_similarity
 from rdstitch.synthetic.instances import HALF_SIZE, Instances, PlanarInstances, general_instances, planar_instances
 from rdstitch.synthetic.layouts import (
     drive_poses,
@@ -34,7 +31,6 @@ from rdstitch.synthetic.textures import (
 __all__ = [
     "HALF_SIZE",
     "RELIEFS",
-    "AlignmentError",
     "BrownLens",
     "EndlessTexture",
     "FisheyeLens",
@@ -44,22 +40,16 @@ __all__ = [
     "Photometry",
     "PictureTexture",
     "PlanarInstances",
-    "PlaneComparison",
     "Poses",
     "Relief",
     "Sequence",
     "SyntheticMatches",
     "Texture",
-    "alignment_error",
     "best_division_model",
     "blank",
     "boxes",
-    "compare_with_plane",
     "correspondences",
-    "coverage",
     "drive_poses",
-    "fit_homography",
-    "fit_similarity",
     "fit_to_plane",
     "general_instances",
     "gradient",
@@ -71,12 +61,10 @@ __all__ = [
     "pair_poses",
     "parking_poses",
     "planar_instances",
-    "plane_under",
     "repeated",
     "ridges",
     "rotation_poses",
     "sequence_over",
-    "sharpness",
     "survey_poses",
     "turn_poses",
 ]

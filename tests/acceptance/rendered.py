@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
+from examples.judging import AlignmentError, PlaneComparison, alignment_error, compare_with_plane
 from rdstitch import StitchResult
 from rdstitch.io.read import read_image
 from rdstitch.radial_homography import to_plane
-from rdstitch.synthetic import AlignmentError, PlaneComparison, Sequence, alignment_error, compare_with_plane
+from rdstitch.synthetic import Sequence
 
 
 def geometry(sequence: Sequence, result: StitchResult, model: str) -> AlignmentError:

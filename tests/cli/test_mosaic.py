@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from examples.judging import alignment_error
 from rdstitch.matching.two_view_rounds import Pairing
-from rdstitch.synthetic import Sequence, alignment_error
+from rdstitch.synthetic import Sequence
 from tests.cli.running import DISTORTION, FAST, Run, finished, start, transfers
 
 

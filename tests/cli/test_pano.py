@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from examples.judging import alignment_error, compare_with_plane
 from rdstitch.camera import Camera
 from rdstitch.io import read_image
-from rdstitch.synthetic import Sequence, alignment_error, compare_with_plane
+from rdstitch.synthetic import Sequence
 from tests.cli.running import DISTORTION, FAST, Run, finished, start, transfers
 
 

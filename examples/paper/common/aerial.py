@@ -2,12 +2,13 @@
 
 import numpy as np
 
+from examples.judging import fit_similarity
+from examples.judging.fitting import apply
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.radial_homography import project
 from rdstitch.registration import Registration
-from rdstitch.synthetic import Photometry, Sequence, fit_similarity, ground, sequence_over, survey_poses
-from rdstitch.synthetic.fitting import apply
+from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over, survey_poses
 
 _CENTRE = np.array([0.0, 0.0, 1.0])
 

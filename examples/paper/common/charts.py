@@ -7,14 +7,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from examples.judging import fit_homography, fit_similarity
+from examples.judging.fitting import apply
 from examples.paper.common.report import Pixels
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, CompositeOptions, compose
 from rdstitch.io.read import read_image
-from rdstitch.synthetic import PictureTexture, Poses, fit_homography, fit_similarity, sequence_over
+from rdstitch.synthetic import PictureTexture, Poses, sequence_over
 from rdstitch.synthetic import Sequence as RenderedSequence
-from rdstitch.synthetic.fitting import apply
 
 _SQUARE = 80  # texels of a rendered chart
 _SQUARES = 30  # a side

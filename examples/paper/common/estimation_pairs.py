@@ -10,6 +10,7 @@ from functools import partial
 import cv2
 import numpy as np
 
+from examples.judging.fitting import apply
 from examples.paper.common.planar_scenes import PlanarScene
 from examples.paper.common.report import Pixels
 from rdstitch.arrays import FloatArray
@@ -17,7 +18,6 @@ from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions, detect, match
 from rdstitch.synthetic import Photometry, ground, pair_poses, sequence_over
 from rdstitch.synthetic import Sequence as RenderedSequence
-from rdstitch.synthetic.fitting import apply
 
 _GRID = (20, 15)
 _FEATURES = FeatureOptions(max_features=1500)

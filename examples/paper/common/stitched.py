@@ -6,6 +6,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from examples.judging import AlignmentError, alignment_error
 from examples.paper.common.report import Pixels
 from rdstitch.alignment import Alignment
 from rdstitch.arrays import FloatArray
@@ -15,7 +16,7 @@ from rdstitch.io.read import read_image
 from rdstitch.pipeline import StitchOptions, calibrate, mosaic
 from rdstitch.radial_homography import project
 from rdstitch.registration import Registration
-from rdstitch.synthetic import AlignmentError, Sequence, alignment_error
+from rdstitch.synthetic import Sequence
 
 
 def stitch_files(files: Many[Path], options: StitchOptions) -> tuple[Registration, Pixels]:

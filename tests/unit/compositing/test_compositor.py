@@ -10,6 +10,7 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
+from examples.judging.comparison import sharpness
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, compose, compose_to_file, plan_canvas
 from rdstitch.compositing.crop import largest_rectangle
@@ -18,7 +19,6 @@ from rdstitch.compositing.preparation import prepare
 from rdstitch.compositing.source_images import Source
 from rdstitch.errors import ArgumentError, InputError, LimitError
 from rdstitch.io import Metadata, read_image
-from rdstitch.synthetic.comparison import sharpness
 from rdstitch.synthetic.rendering import Photometry
 from tests.compositing_scenes import Scene, as_picture, gradient, grey, inner, render
 

@@ -6,24 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
+from examples.judging import alignment_error, compare_with_plane, coverage, fit_homography, fit_similarity, sharpness
+from examples.judging.alignment import Transfer
+from examples.judging.fitting import apply, quantile
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
-from rdstitch.synthetic import (
-    PictureTexture,
-    alignment_error,
-    blank,
-    compare_with_plane,
-    coverage,
-    fit_homography,
-    fit_similarity,
-    grid_poses,
-    ground,
-    sequence_over,
-    sharpness,
-)
-from rdstitch.synthetic.alignment import Transfer
-from rdstitch.synthetic.fitting import apply, quantile
+from rdstitch.synthetic import PictureTexture, blank, grid_poses, ground, sequence_over
 from rdstitch.synthetic.poses import to_plane
 from rdstitch.synthetic.textures import Picture
 

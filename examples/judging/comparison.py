@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from examples.judging.fitting import FITS, apply, fit_similarity, quantile
+from examples.judging.patches import patch_displacements
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.synthetic.fitting import FITS, apply, fit_similarity, quantile
-from rdstitch.synthetic.patches import patch_displacements
 from rdstitch.synthetic.textures import Picture, PictureTexture, Texture
 
 _ROUNDS = 5
@@ -92,7 +92,7 @@ def compare_with_plane(
 
     The mosaic is placed roughly by feature matches, or by ``start``. Then, until it
     settles: the plane is drawn in the mosaic's place, patches of the mosaic are looked for in it
-    (:func:`rdstitch.synthetic.patches.patch_displacements`), and the transform that minimises the sum of their squared
+    (:func:`examples.judging.patches.patch_displacements`), and the transform that minimises the sum of their squared
     distances is found anew. In the first round patches more than three times the median away do not take part in the
     fit, afterwards all do that were found.
 
@@ -113,7 +113,7 @@ def compare_with_plane(
     start : array_like of shape (3, 3), optional
         Mosaic px to texels, right to within ``search``.
     patch, spacing, search : int
-        See :func:`rdstitch.synthetic.patches.patch_displacements`.
+        See :func:`examples.judging.patches.patch_displacements`.
 
     Raises
     ------

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from examples.judging.fitting import FITS, apply, quantile
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.synthetic.fitting import FITS, apply, quantile
 from rdstitch.synthetic.rendering import Sequence
 
 Transfer = Callable[[FloatArray], FloatArray]

@@ -1,0 +1,17 @@
+"""How far a stitched picture or a registration is from the truth of :mod:`rdstitch.synthetic`, and from real ones."""
+
+from examples.judging.alignment import AlignmentError, alignment_error
+from examples.judging.comparison import PlaneComparison, compare_with_plane, coverage, plane_under, sharpness
+from examples.judging.fitting import fit_homography, fit_similarity
+
+__all__ = [
+    "AlignmentError",
+    "PlaneComparison",
+    "alignment_error",
+    "compare_with_plane",
+    "coverage",
+    "fit_homography",
+    "fit_similarity",
+    "plane_under",
+    "sharpness",
+]
