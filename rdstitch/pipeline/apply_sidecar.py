@@ -1,7 +1,7 @@
 """Recomposing from a saved registration: other bands of the same flight, other sizes, other compositing options."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -100,11 +100,7 @@ def apply(
         sources, left_out = _sources(saved, chosen)
         if strict and left_out:
             raise PartialResultError("; ".join(map(str, left_out.values())))
-        used = {index: source for index, source in enumerate(sources) if source is not None}
-        if not used:
-            first = next(iter(left_out.values()))
-            raise InputError(f"{saved.path}: none of its pictures can be used; {first.images[0]}: {first.text}")
-        used = dict(zip(used, with_masks(list(used.values()), mask), strict=True))
+        used = _used(saved, sources, left_out, mask)
         composed = compose_pictures(
             list(used.values()),
             [source.camera for source in used.values()],
@@ -133,6 +129,20 @@ def apply(
         if output is not None and not dry_run:
             write_json_atomic(f"{output}.json", applied_sidecar(result))
         return result
+
+
+def _used(
+    saved: SavedRegistration,
+    sources: Sequence[Source | None],
+    left_out: Mapping[int, Message],
+    mask: str | Path | None,
+) -> dict[int, Source]:
+    """The pictures of the output, with their masks, by their number in the registration; at least one."""
+    used = {index: source for index, source in enumerate(sources) if source is not None}
+    if not used:
+        first = next(iter(left_out.values()))
+        raise InputError(f"{saved.path}: none of its pictures can be used; {first.images[0]}: {first.text}")
+    return dict(zip(used, with_masks(list(used.values()), mask), strict=True))
 
 
 def _check_outputs(output: Path, overwrite: bool, inputs: Sequence[Path], sidecar: Path) -> None:

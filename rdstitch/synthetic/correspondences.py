@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
-from rdstitch.planar_motion import PlanarMotion
 from rdstitch.radial_homography import RadialHomography
-from rdstitch.synthetic.instances import general_instances, planar_instances
+from rdstitch.synthetic.instances import Instances, PlanarInstances, general_instances, planar_instances
 
 
 @dataclass(frozen=True)
@@ -86,40 +85,9 @@ def correspondences(
     half_diagonal = float(np.hypot(*image_size)) / 2
     f = 1.2 * half_diagonal if focal is None else focal
     camera = Camera(image_size, distortion, focal=f, focal_source="option")
-    lam = camera.distortion_px * f**2
     half = (np.array(image_size) - 1.0) / 2.0
     right = count - round(count * outliers)
-    field = (half[0] / f, half[1] / f)
-    # The longest motion is that which still leaves pictures of this field of view something in common.
-    length = (0.1 * half_diagonal / f, 1.5 * half_diagonal / f)
-    planar: PlanarMotion | None = None
-    if motion == "homography":
-        drawn = general_instances(
-            1,
-            right,
-            seed=seed,
-            distortion=(lam, lam),
-            max_angle=max_tilt,
-            translation=length,
-            half_size=field,
-            overlap=overlap,
-        )
-    elif motion in ("rigid", "similarity"):
-        change = max_height_change if motion == "similarity" else 0.0
-        drawn = planar_instances(
-            1,
-            right,
-            seed=seed,
-            distortion=(lam, lam),
-            max_tilt=max_tilt,
-            translation=length,
-            height=(1.0 - change, 1.0 + change),
-            half_size=field,
-            overlap=overlap,
-        )
-        planar = drawn.motion(0)
-    else:
-        raise ArgumentError(f"motion must be rigid, similarity or homography, not {motion!r}")
+    drawn = _instance(camera, half / f, motion, right, seed, max_tilt, max_height_change, overlap)
 
     rng = np.random.default_rng((seed, 1))
     points1, points2 = (half * rng.uniform(-1.0, 1.0, (count, 2)) for _ in range(2))
@@ -131,16 +99,58 @@ def correspondences(
     quality = np.where(inliers, rng.beta(4.0, 2.0, count), rng.beta(2.0, 4.0, count))
 
     zoom = np.diag([f, f, half_diagonal])
-    h = zoom @ drawn.homography[0] @ np.linalg.inv(zoom)
     truth = RadialHomography(
-        homography=h,
+        homography=zoom @ drawn.homography[0] @ np.linalg.inv(zoom),
         camera=camera,
         camera2=camera,
         inliers=inliers,
         distortion_std=0.0,
         model=motion,
-        motion=planar,
+        motion=drawn.motion(0) if isinstance(drawn, PlanarInstances) else None,
         rms=noise,
         solver="truth",
     )
     return SyntheticMatches(points1 + camera.center, points2 + camera.center, quality, truth)
+
+
+def _instance(
+    camera: Camera,
+    half_size: FloatArray,
+    motion: str,
+    count: int,
+    seed: int,
+    max_tilt: float,
+    max_height_change: float,
+    overlap: float,
+) -> Instances:
+    """One instance of ``count`` noise-free correspondences, in focal-normalized coordinates."""
+    assert camera.focal is not None
+    lam = camera.distortion_px * camera.focal**2
+    field = (float(half_size[0]), float(half_size[1]))
+    # The longest motion is that which still leaves pictures of this field of view something in common.
+    length = (0.1 * camera.half_diagonal / camera.focal, 1.5 * camera.half_diagonal / camera.focal)
+    if motion == "homography":
+        return general_instances(
+            1,
+            count,
+            seed=seed,
+            distortion=(lam, lam),
+            max_angle=max_tilt,
+            translation=length,
+            half_size=field,
+            overlap=overlap,
+        )
+    if motion not in ("rigid", "similarity"):
+        raise ArgumentError(f"motion must be rigid, similarity or homography, not {motion!r}")
+    change = max_height_change if motion == "similarity" else 0.0
+    return planar_instances(
+        1,
+        count,
+        seed=seed,
+        distortion=(lam, lam),
+        max_tilt=max_tilt,
+        translation=length,
+        height=(1.0 - change, 1.0 + change),
+        half_size=field,
+        overlap=overlap,
+    )
