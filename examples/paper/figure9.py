@@ -26,6 +26,7 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import Poses
 from rdstitch.alignment.trajectory import Trajectory, compare
 from rdstitch.arrays import FloatArray
+from rdstitch.camera import LENS_PARAMETERS
 from rdstitch.matching.links import Link
 from rdstitch.planar_motion import PlanarMotion, rotation_from_tilt
 from rdstitch.radial_homography import RadialHomography
@@ -136,9 +137,10 @@ def _adjusted(d: Drive, start: Trajectory, tilt: tuple[float, float], distortion
     none = Priors.none(RIGID, count)
     focal_prior = np.array([0.0, 0.0, _FOCAL_STD**-2.0])
     known = Priors(natural, focal_prior, none.lens, none.lens_precision, none.poses, none.poses_precision)
-    free = FreeParameters.fixing(RIGID, count, [0], np.array([True, False, False, False]))
+    free = FreeParameters.fixing(RIGID, count, [0], np.array([name == "distortion" for name in LENS_PARAMETERS]))
     adjuster = BundleAdjuster(RIGID, Observations.from_links(links, cameras), free, known)
-    lens = np.array([distortion, 0.0, 0.0, 0.0])
+    lens = np.zeros(len(LENS_PARAMETERS))
+    lens[0] = distortion
     return adjuster.run(Parameters(poses, RIGID.shared_from(natural), lens))
 
 

@@ -10,6 +10,7 @@ from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_l
 from rdstitch.alignment.initialization import adjust_pairs_independently, relations_at
 from rdstitch.alignment.motion_models import HOMOGRAPHY
 from rdstitch.alignment.observations import Observations
+from rdstitch.camera import LENS_PARAMETERS
 from tests.alignment_scenes import grid, scene
 
 
@@ -62,14 +63,15 @@ def test_a_link_is_suspected_by_what_its_covariance_allows(shift: float, noise: 
     moved = link.points2 + shift * given.cameras[0].half_diagonal * np.array([0.6, 0.8])
     links = [replace(link, points2=moved) if k == wrong else other for k, other in enumerate(given.links)]
     observations = Observations.from_links(links, given.cameras)
-    lens = np.array([given.distortion, 0.0, 0.0, 0.0])
+    lens = np.zeros(len(LENS_PARAMETERS))
+    lens[0] = given.distortion
     apart = adjust_pairs_independently(
         HOMOGRAPHY,
         observations,
         relations_at(observations, [link.relation for link in links], lens),
         np.empty(0),
         lens,
-        np.array([True, False, False, False]),
+        lens != 0.0,
         Priors.none(HOMOGRAPHY, 0),
         np.zeros((9, 2)),
     )

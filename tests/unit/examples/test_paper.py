@@ -165,7 +165,7 @@ def test_figure9_adjustment_brings_every_start_to_the_same_trajectory() -> None:
             row = table.row(name)
             assert row["adjusted, %"] < min(1.0, row["translation, chained, %"] + 0.1), (table.title, name)
             assert row["λ error, adjusted"] < 5e-3, (table.title, name)
-        assert table.row("4 points, no distortion (DLT)")["translation, chained, %"] > 5.0
+        assert table.row("4 points, no distortion (DLT)")["translation, chained, %"] > 3.0
 
 
 def test_figure10_ignoring_the_distortion_makes_surveys_drift() -> None:
