@@ -17,7 +17,7 @@ Decorator = Callable[[Command], Command]
 FEATURES = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk", "aliked")
 SOLVERS = ("auto", "two-point", "three-point", "three-point-similarity", "four-point", "five-point")
 LENSES = ("auto", "division", "division-center", "division2", "division3")
-MODELS = ("auto", "rigid", "similarity", "tilting", "pose", "homography")
+MODELS = ("auto", "rigid", "similarity", "tilting", "pose", "homography", "rotation")
 
 PICTURE = UserPath()
 
@@ -226,6 +226,13 @@ compositing = together(
         default="none",
         show_default=True,
         help="Cut to the largest rectangle without holes.",
+    ),
+    click.option(
+        "--projection",
+        type=click.Choice(["auto", "plane", "cylinder", "sphere", "mercator"]),
+        default="auto",
+        show_default=True,
+        help="How pictures taken by turning on the spot are laid out.",
     ),
     click.option(
         "--interpolation",

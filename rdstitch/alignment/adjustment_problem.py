@@ -20,6 +20,7 @@ from rdstitch.alignment.metric_upgrade import metric_upgrade
 from rdstitch.alignment.motion_models import HOMOGRAPHY, POSE, PSI, SIMILARITY, THETA, Model
 from rdstitch.alignment.normal_equations import robust_cost
 from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.rotation_model import FOCAL_STARTS, ROTATION
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import Camera
 from rdstitch.matching.match_graph import spanning_tree
@@ -76,6 +77,10 @@ class CameraPriors:
         known = replace(none, lens=self.lens, lens_precision=self.lens_std**-2.0)
         if not model.shared_names:
             return known
+        if model is ROTATION:
+            return replace(
+                known, shared=np.array([self.log_focal]), shared_precision=np.array([self.log_focal_std**-2.0])
+            )
         tilt_precision = 0.0 if math.isinf(self.tilt_std) else max(self.tilt_std, 1e-6) ** -2.0
         poses, precision = np.zeros_like(none.poses), np.zeros_like(none.poses)
         free = list(getattr(model, "free", ()))
@@ -157,15 +162,18 @@ class Problem:
     knowledge: CameraPriors
     overdispersion: float = 1.0
 
-    def fit(self, model: Model, others: Sequence[Fit] = ()) -> Fit:
-        """Adjust a model from the chained links or from the solution of a less free model, whichever is nearer."""
+    def fit(self, model: Model, others: Sequence[Fit] = (), shared: FloatArray | None = None) -> Fit:
+        """Adjust a model from the chained links or from the solution of a less free model, whichever is nearer.
+
+        The links start from ``shared`` parameters where these are known, otherwise from the best of several.
+        """
         if not others and not model.shared_names and self.count > _LONG_CHAIN:
             others = [self.fit(SIMILARITY)]
         starts = [self._taken_over(model, other) for other in others]
         if model is POSE:
             starts.append(self._upgraded())
         elif not (others and self._tilts_are_free(model)):
-            starts.append(self._chained(model, others))
+            starts.append(self._chained(model, others, shared))
         return self.refine(model, self._nearest(model, starts))
 
     def squared(self, model: Model, parameters: Parameters) -> FloatArray:
@@ -211,12 +219,12 @@ class Problem:
         priors = self.knowledge.priors(model, self.count, tilt_spread)
         return BundleAdjuster(model, self.observations, freedom, priors, self.overdispersion)
 
-    def _chained(self, model: Model, others: Sequence[Fit]) -> Parameters:
+    def _chained(self, model: Model, others: Sequence[Fit], start: FloatArray | None) -> Parameters:
         """Every link on its own, chained along the tree of the links trusted most."""
         o, attitudes = self.observations, self.knowledge.attitudes
         shared, lens, homographies = np.zeros(0), self.lens, self.homographies
         if model.shared_names:
-            apart = self._planar_apart(SIMILARITY if self._tilts_are_free(model) else model, others)
+            apart = self._links_apart(SIMILARITY if self._tilts_are_free(model) else model, others, start)
             shared, lens, homographies = apart.parameters.shared, apart.parameters.lens, apart.homographies
         tree = spanning_tree(self.count, o.image1, o.image2, self.trust, self.reference)
         origin = model.origins(shared, attitudes[[tree.root]])[0]
@@ -232,30 +240,44 @@ class Problem:
         shared = POSE.shared_from(np.array([*upgraded.tilt, upgraded.log_focal]))
         return Parameters(upgraded.poses, shared, self.lens)
 
-    def _planar_apart(self, model: Model, others: Sequence[Fit]) -> BundleAdjustmentResult:
-        """Every link on its own, from the tilt of another planar model or the best of several."""
+    def _links_apart(self, model: Model, others: Sequence[Fit], start: FloatArray | None) -> BundleAdjustmentResult:
+        """Every link on its own, from given shared parameters, those of another planar model or the best of several."""
         priors = self.knowledge.priors(model, self.count, _TILT_SPREAD_START)
-        free, known = self.free_lens, self.knowledge.attitudes
         planar = [other for other in others if other.model.shared_names]
-        if planar:
-            best = planar[-1].adjusted.parameters.shared
-        else:
-            links = len(self.observations)
-            few = np.linspace(0, links - 1, min(links, _TRIAL_LINKS)).astype(np.intp)
-            sample, own = self.observations.subset(few).thinned(_TRIAL_MATCHES), self.homographies[few]
-            trials = [
-                adjust_pairs_independently(model, sample, own, shared, self.lens, free, priors, known)
-                for shared in self._tilts_to_try(model, priors.shared)
-            ]
-            width = WIDTH_PER_SIGMA * min(trial.sigma for trial in trials)
-            cost = [float(robust_cost(trial.squared, width).sum()) for trial in trials]
-            best = trials[int(np.argmin(cost))].parameters.shared
+        best = start
+        if best is None:
+            best = (planar[-1].adjusted if planar else self.trial(model)).parameters.shared
         return adjust_pairs_independently(
-            model, self.observations, self.homographies, best, self.lens, free, priors, known
+            model,
+            self.observations,
+            self.homographies,
+            best,
+            self.lens,
+            self.free_lens,
+            priors,
+            self.knowledge.attitudes,
         )
 
-    def _tilts_to_try(self, model: Model, natural: FloatArray) -> list[FloatArray]:
-        """Shared parameters for the known or zero tilt, and for four around that, 0.2 radians away."""
+    def trial(self, model: Model) -> BundleAdjustmentResult:
+        """A few links on their own, from the best of several shared parameters."""
+        priors = self.knowledge.priors(model, self.count, _TILT_SPREAD_START)
+        links = len(self.observations)
+        few = np.linspace(0, links - 1, min(links, _TRIAL_LINKS)).astype(np.intp)
+        sample, own = self.observations.subset(few).thinned(_TRIAL_MATCHES), self.homographies[few]
+        trials = [
+            adjust_pairs_independently(
+                model, sample, own, shared, self.lens, self.free_lens, priors, self.knowledge.attitudes
+            )
+            for shared in self._shared_to_try(model, priors.shared)
+        ]
+        width = WIDTH_PER_SIGMA * min(trial.sigma for trial in trials)
+        cost = [float(robust_cost(trial.squared, width).sum()) for trial in trials]
+        return trials[int(np.argmin(cost))]
+
+    def _shared_to_try(self, model: Model, natural: FloatArray) -> list[FloatArray]:
+        """Focal lengths; or shared parameters for the known or zero tilt, and for four around it, 0.2 radians away."""
+        if model is ROTATION:
+            return [np.array([log_focal]) for log_focal in (*natural, *FOCAL_STARTS)]
         steps = np.array([(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2)])
         if np.isfinite(self.knowledge.tilt_std):
             steps = steps[:1]

@@ -18,10 +18,11 @@ from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.initialization import relations_at
 from rdstitch.alignment.lens_selection import LENSES, choose_lens
-from rdstitch.alignment.model_selection import Choice, choose_model
-from rdstitch.alignment.motion_models import MODELS
+from rdstitch.alignment.model_family import MODELS
+from rdstitch.alignment.model_selection import Choice
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import Alignment
+from rdstitch.alignment.turn_or_plane import choose_motion
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_STD, Camera
 from rdstitch.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTION
@@ -176,7 +177,7 @@ def align(
     trust = few.matches.astype(np.float64) * np.where(confirmed > 0, 1.0, _UNCONFIRMED)
     graph = _Graph(len(cameras), few, relations, trust, lens, free_lens, known, options)
     problem, pictures = graph.problem(~wrong)
-    choice = choose_model(problem, options.models, chosen.refinements)
+    choice = choose_motion(problem, options.models, chosen.refinements)
     graph = replace(graph, free_lens=choice.fit.free_lens)
     choice, pictures, wrong = _drop_wrong_pairs(graph, problem, pictures, choice, wrong)
 

@@ -11,10 +11,12 @@ from rdstitch.alignment.bundle_adjustment import WIDTH_PER_SIGMA
 from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.lens_selection import CENTER, LensChoice
 from rdstitch.alignment.model_selection import Choice
-from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y, metric_poses
+from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y, metric_poses
 from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.planarity import coherence, judge_relief
 from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, Poses, Relief
+from rdstitch.alignment.rotation_frame import levelled
+from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS, Camera
 from rdstitch.matching.distortion_consensus import Consensus
@@ -62,12 +64,12 @@ class AdjustedPictures:
 def build_alignment(found: AdjustedPictures) -> Alignment:
     """The alignment, in the frame of the reference picture."""
     problem, fit = found.problem, found.choice.fit
-    adjusted, planar = fit.adjusted, bool(fit.model.shared_names)
+    adjusted, planar = fit.adjusted, isinstance(fit.model, PlanarModel)
     shared, lens = fit.model.natural(adjusted.parameters.shared)[0], adjusted.parameters.lens
     covariance = adjusted.covariance
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     names = (*fit.model.shared_names, *(n for n, free in zip(LENS_PARAMETERS, problem.free_lens, strict=True) if free))
-    focal = float(np.exp(shared[2])) if planar else None
+    focal = float(np.exp(shared[-1])) if fit.model.shared_names else None
     lens_covariance = _lens_covariance(names, covariance)
     cameras = tuple(_adjusted_camera(found, camera, lens, lens_covariance, focal) for camera in found.cameras)
     own = cameras[int(found.pictures[problem.reference])]
@@ -91,7 +93,7 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
         tilt=(float(shared[0]), float(shared[1])) if planar else None,
         tilt_spread=fit.tilt_spread,
         focal=focal,
-        focal_std=None if focal is None else float(std[2]) * focal,
+        focal_std=None if focal is None else float(std[names.index("log_focal")]) * focal,
         distortion=own.nearest_distortion,
         distortion_std=0.0 if own.distortion_std is None else own.distortion_std,
         lens=found.lens.name,
@@ -154,6 +156,9 @@ def _in_frame_of_reference(found: AdjustedPictures) -> tuple[FloatArray, Poses |
     count, fit, reference = len(found.cameras), found.choice.fit, found.problem.reference
     matrices = fit.adjusted.matrices.matrices
     homographies = np.full((count, 3, 3), np.nan)
+    if fit.model is ROTATION:
+        homographies[found.pictures] = levelled(matrices, reference)
+        return homographies, None
     if not fit.model.shared_names:
         homographies[found.pictures] = matrices[reference] @ np.linalg.inv(matrices)
         return homographies, None

@@ -64,8 +64,8 @@ def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolAr
     A homography for every link on its own leaves errors that no model of the family can undercut. Once freer models
     could not pay for their freedom even with those, they are not tried.
     """
-    bound = _NoiseModel.of_links_apart(problem)
-    least = bound.misfit(_errors(problem, problem.homographies, problem.lens))
+    bound = NoiseModel.of_links_apart(problem)
+    least = bound.misfit(link_errors(problem, problem.homographies, problem.lens))
     if problem.count == 2 and len(names) > 1:  # two pictures cannot tell one camera in any pose from a homography
         names = [name for name in names if name != POSE.name]
     fits: list[Fit] = []
@@ -76,13 +76,13 @@ def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolAr
             break
         fits.append(problem.fit(model, fits[-1:]))
     cameras = [fit for fit in fits if fit.model is not HOMOGRAPHY]
-    noise = bound if len(fits) < len(names) else _NoiseModel.of_fit(problem, fits[-1])
+    noise = bound if len(fits) < len(names) else NoiseModel.of_fit(problem, fits[-1])
     costs = np.array([noise.cost(problem, fit) for fit in fits])
     for lens in lenses:
         for index in np.argsort(costs, kind="stable")[:2].tolist():
             wider = problem.extend(fits[index], lens | fits[index].free_lens)
             cost = noise.cost(problem, wider)
-            if cost < costs[index] and _within_reason(wider):
+            if cost < costs[index] and within_reason(wider):
                 fits[index], costs[index] = wider, cost
     best = int(np.argmin(costs[: max(len(cameras), 1)]))
     if cameras and len(fits) > len(cameras) and _beyond_one_camera(problem, fits[best], fits[-1]):
@@ -90,7 +90,7 @@ def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolAr
     return Choice(fits[best], _reason(fits, best, list(names)), noise.overdispersion)
 
 
-def _cannot_gain(bound: "_NoiseModel", problem: Problem, fits: Sequence[Fit], model: Model) -> bool:
+def _cannot_gain(bound: "NoiseModel", problem: Problem, fits: Sequence[Fit], model: Model) -> bool:
     """Whether free homographies could not leave errors so much smaller that they would be taken."""
     if model is not HOMOGRAPHY or not fits or problem.count == 2:
         return False
@@ -104,21 +104,21 @@ def _beyond_one_camera(problem: Problem, camera: Fit, free: Fit) -> bool:
     The variance of the errors is unknown, and only as many of them are independent as those of the camera show:
     ``n log σ² + k log n`` decides (Schwarz's criterion). Two pictures need no more than one homography.
     """
-    noise = _NoiseModel.of_fit(problem, camera)
+    noise = NoiseModel.of_fit(problem, camera)
     variance = [fit.adjusted.sigma**2 + _EXACTNESS**2 for fit in (camera, free)]
-    count = [_NoiseModel.parameters(problem, fit.model, fit.free_lens) for fit in (camera, free)]
+    count = [NoiseModel.parameters(problem, fit.model, fit.free_lens) for fit in (camera, free)]
     gain = noise.effective * math.log(variance[0] / variance[1])
     earned = gain > (count[1] - count[0]) * math.log(noise.effective)
     return earned and (count[1] <= count[0] or variance[0] > _LEAST_RATIO**2 * variance[1])
 
 
-def _within_reason(fit: Fit) -> bool:
+def within_reason(fit: Fit) -> bool:
     """Whether the distortion centre is where lenses have it."""
     return bool(np.abs(fit.adjusted.parameters.lens[2:]).max() < _FARTHEST_CENTRE)
 
 
 @dataclass(frozen=True)
-class _NoiseModel:
+class NoiseModel:
     """What the errors of a model are measured by.
 
     Attributes
@@ -185,7 +185,7 @@ class _NoiseModel:
         return self.misfit(fit.adjusted.squared) + self.price(problem, fit.model, fit.free_lens) + wide
 
 
-def _errors(problem: Problem, homographies: FloatArray, lens: FloatArray) -> FloatArray:
+def link_errors(problem: Problem, homographies: FloatArray, lens: FloatArray) -> FloatArray:
     """``|r|²`` (M,) of the correspondences; inf where there is no transfer."""
     errors = whitened_errors(problem.observations, homographies, lens)
     squared: FloatArray = np.nan_to_num(np.einsum("mi,mi->m", errors, errors), nan=np.inf)

@@ -98,14 +98,15 @@ class Alignment:
         From undistorted coordinates of picture i, in half diagonals from its distortion centre, to the plane; the
         third coordinate is positive in front of the camera. NaN for pictures left out. In planar models the plane is
         metric, rectified, with its unit the height of the reference picture; in the general model it is the
-        undistorted reference picture.
+        undistorted reference picture. In the rotation model they lead to directions (x right, y down, z ahead) of a
+        level frame, whatever their third coordinate.
     used : ndarray of shape (N,), bool
     components : tuple of tuple of int
         The groups of pictures that overlap, largest first; the first is the aligned one.
     reference : int
         The picture that defines the plane's frame.
     model : str
-        "rigid", "similarity", "tilting", "pose" or "homography".
+        "rigid", "similarity", "tilting", "pose", "homography" or "rotation".
     model_reason : str
         Why this model was taken.
     poses : Poses or None
@@ -172,11 +173,20 @@ class Alignment:
         return product
 
     @property
+    def on_sphere(self) -> bool:
+        """Whether :attr:`homographies` lead to directions around one centre, not to a plane."""
+        return self.model == "rotation"
+
+    @property
     def support(self) -> dict[tuple[int, int], int]:
         """Number of inliers of every pair of pictures that the alignment uses."""
         return {(fit.image1, fit.image2): fit.inliers for fit in self.links if fit.used}
 
     def transfer(self, image1: int, image2: int, points: FloatArray) -> FloatArray:
         """Where points (N, 2) of one picture, px, are in another; NaN where its lens cannot see them."""
+        if self.on_sphere:
+            # What both pictures show may lie behind the plane that is before them.
+            seen = to_plane(self.cameras[image1], self.relation(image1, image2), points)
+            return from_plane(self.cameras[image2], np.eye(3), seen)
         plane = to_plane(self.cameras[image1], self.homographies[image1], points)
         return from_plane(self.cameras[image2], self.homographies[image2], plane)

@@ -53,6 +53,8 @@ class Trajectory:
         ArgumentError
             When the alignment has no poses (general model), or the height is not positive.
         """
+        if alignment.on_sphere:
+            raise ArgumentError("the camera turned on the spot: there is no path; --model tilting looks for one anyhow")
         if alignment.poses is None:
             raise ArgumentError(
                 "one homography per picture has no metric poses; choose a planar model (rigid, similarity or tilting)"

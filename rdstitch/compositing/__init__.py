@@ -3,6 +3,7 @@
 from rdstitch.compositing.canvas import Canvas, plan_canvas
 from rdstitch.compositing.compositor import Composite, FileComposite, compose, compose_to_file
 from rdstitch.compositing.options import CompositeOptions
+from rdstitch.compositing.panorama_canvas import plan_panorama
 from rdstitch.compositing.plan import CompositePlan, plan_composite
 
 __all__ = [
@@ -15,4 +16,5 @@ __all__ = [
     "compose_to_file",
     "plan_canvas",
     "plan_composite",
+    "plan_panorama",
 ]

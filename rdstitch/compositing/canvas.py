@@ -1,12 +1,13 @@
 """The canvas: where every picture lies in the output, and how large that is.
 
 A homography ``G`` maps the half-diagonal-normalized undistorted coordinates of its picture to *plane* coordinates,
-which have no unit; the canvas is the plane scaled, turned and shifted to pixels.
+which have no unit; the canvas is the plane scaled, turned and shifted to pixels. Where pictures were taken by turning
+on the spot, G maps them to directions, and the canvas is what a projection makes of these.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +15,7 @@ from numpy.typing import ArrayLike
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box
+from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.radial_homography import to_plane
 
@@ -34,29 +36,67 @@ class Canvas:
     matrix : ndarray of shape (3, 3)
         Affine, from plane coordinates to canvas px (centre of the top-left pixel at (0, 0)).
     footprints : tuple of ndarray of shape (K, 2)
-        Outline of each picture, canvas px, clockwise from the picture's top-left corner.
+        Outline of each picture, canvas px, clockwise from the picture's top-left corner. Of a canvas that goes all the
+        way round, one of its places; it may reach beyond the canvas.
+    projection : Projection
+        What ``matrix`` is applied to: the places that it gives to directions.
+    period : float or None
+        Width of a full turn, px, where the pictures go all the way round; None where they do not.
     """
 
     size: tuple[int, int]
     matrix: FloatArray
     footprints: tuple[FloatArray, ...]
+    projection: Projection = PLANE
+    period: float | None = None
 
     def boxes(self) -> list[Box]:
-        """Bounds (x0, y0, x1, y1) of every picture, whole px inside the canvas, end exclusive."""
+        """Bounds (x0, y0, x1, y1) of every picture, whole px inside the canvas, end exclusive.
+
+        A picture that lies across the edge of a canvas that goes all the way round has the whole width.
+        """
         width, height = self.size
         boxes = []
         for outline in self.footprints:
             low, high = np.floor(outline.min(axis=0)), np.ceil(outline.max(axis=0)) + 1
+            if self.period is not None:
+                low[0], high[0] = self._all_places(float(low[0]), float(high[0]))
             x0, y0 = (max(0, int(v)) for v in low)
             boxes.append((x0, y0, min(width, int(high[0])), min(height, int(high[1]))))
         return boxes
+
+    def areas(self) -> list[int]:
+        """Of the bounds of every picture, as if it had only one place on the canvas, square px."""
+        if self.period is None:
+            return [(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in self.boxes()]
+        sizes = [np.minimum(np.ptp(outline, axis=0) + 1, self.size) for outline in self.footprints]
+        return [int(width * height) for width, height in sizes]
+
+    def _all_places(self, low: float, high: float) -> tuple[float, float]:
+        """From the leftmost to the rightmost of the places that repeat themselves with each turn."""
+        width, period = self.size[0], self.period or 1.0
+        turns = [k * period for k in range(-2, 3) if low + k * period < width and high + k * period > 0]
+        return low + min(turns), high + max(turns)
+
+    def place(self, camera: Camera, homography: FloatArray, points: ArrayLike) -> FloatArray:
+        """Canvas px (N, 2) of measured px (N, 2) of a picture; NaN where it has no place."""
+        if self.projection == PLANE:
+            return to_plane(camera, self.matrix @ homography, points)
+        flat = camera.normalize(camera.undistort(points))
+        directions = np.concatenate([flat, np.ones((len(flat), 1))], axis=1) @ homography.T
+        places: FloatArray = self.projection.project(directions) @ self.matrix[:2, :2].T + self.matrix[:2, 2]
+        return places
 
     def cropped(self, box: Box) -> "Canvas":
         """The part (x0, y0, x1, y1) of this canvas as a canvas of its own."""
         x0, y0, x1, y1 = box
         shift = np.array([[1.0, 0.0, -x0], [0.0, 1.0, -y0], [0.0, 0.0, 1.0]])
         footprints = tuple(outline - (x0, y0) for outline in self.footprints)
-        return Canvas((x1 - x0, y1 - y0), shift @ self.matrix, footprints)
+        return replace(self, size=(x1 - x0, y1 - y0), matrix=shift @ self.matrix, footprints=footprints)
+
+    def widened(self, margin: int) -> "Canvas":
+        """The same with ``margin`` px more on the left and on the right."""
+        return self.cropped((-margin, 0, self.size[0] + margin, self.size[1]))
 
     def reduced(self, factor: int) -> "Canvas":
         """The same canvas with px ``factor`` times as large."""
@@ -64,7 +104,8 @@ class Canvas:
         shift = 0.5 / factor - 0.5
         to_reduced = np.array([[1.0 / factor, 0.0, shift], [0.0, 1.0 / factor, shift], [0.0, 0.0, 1.0]])
         footprints = tuple(outline / factor + shift for outline in self.footprints)
-        return Canvas((width, height), to_reduced @ self.matrix, footprints)
+        period = None if self.period is None else self.period / factor
+        return Canvas((width, height), to_reduced @ self.matrix, footprints, self.projection, period)
 
 
 def plan_canvas(
@@ -119,7 +160,7 @@ def plan_canvas(
     low = np.min([outline.min(axis=0) for outline in placed], axis=0)
     high = np.max([outline.max(axis=0) for outline in placed], axis=0)
     _refuse_absurd(cameras, placed, high - low, scale, called)
-    _refuse_scale(cameras, high - low)
+    refuse_scale(cameras, high - low)
     # The outermost edge is the canvas' edge, half a pixel before the centre of the first pixel.
     size = np.maximum(np.ceil(high - low - 1e-6), 1).astype(int)
     matrix = np.eye(3)
@@ -193,7 +234,7 @@ def _refuse_absurd(
         )
 
 
-def _refuse_scale(cameras: Sequence[Camera], extent: FloatArray) -> None:
+def refuse_scale(cameras: Sequence[Camera], extent: FloatArray) -> None:
     """Refuse a scale that leaves nothing of the pictures, or blows them up beyond all sense."""
     pixels = sum(c.image_size[0] * c.image_size[1] for c in cameras)
     if float(extent.min()) < 1.0 or float(np.prod(extent)) > _LARGEST_ENLARGEMENT * pixels:

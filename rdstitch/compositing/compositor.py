@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.options import CompositeOptions
+from rdstitch.compositing.photo_sphere import photo_sphere_xmp
 from rdstitch.compositing.photometric import Exposure
 from rdstitch.compositing.preparation import OutputStrip, Progress, prepare
 from rdstitch.compositing.source_images import Preview, Source
@@ -178,7 +179,7 @@ def compose_to_file(
             renderer.channels,
             renderer.dtype,
             transparent=True,
-            metadata=metadata or Metadata(size),
+            metadata=replace(metadata or Metadata(size), xmp=photo_sphere_xmp(prepared.canvas)),
             quality=renderer.options.quality,
             background=renderer.options.background,
         )

@@ -68,6 +68,28 @@ def crop_box(covered: NDArray[np.bool_], factor: int, size: tuple[int, int]) -> 
     return (x0 * unit, y0 * unit, min(x1 * unit, size[0]), min(y1 * unit, size[1])), ""
 
 
+def crop_rows(covered: NDArray[np.bool_], factor: int, size: tuple[int, int], whole: Box) -> tuple[Box | None, str]:
+    """As :func:`crop_box`, for a canvas that goes all the way round: rows without holes, at their full width.
+
+    Parameters
+    ----------
+    covered, factor, size
+        As for :func:`crop_box`.
+    whole : (int, int, int, int)
+        One full turn of the canvas.
+    """
+    columns = slice(-(-whole[0] // factor), whole[2] // factor)
+    full = np.concatenate([[False], covered[:, columns].all(axis=1), [False]])
+    edges = np.flatnonzero(full[1:] != full[:-1]).reshape(-1, 2)
+    first, last = edges[np.argmax(np.diff(edges, axis=1))] if len(edges) else (0, 0)
+    # A reduced px stands for those around its centre: one row less on each side makes sure of all of them.
+    first, last = first + (first > 0), last - (last < len(covered))
+    kept = (last - first) * covered.shape[1] / max(1, int(covered.sum()))
+    if kept < _LEAST_KEPT:
+        return None, f"not cropped: the rows without holes would keep {max(0.0, 100 * kept):.0f} % of the picture"
+    return (whole[0], int(first) * factor, whole[2], min(int(last) * factor, size[1])), ""
+
+
 def largest_rectangle(cells: NDArray[np.bool_]) -> Box:
     """Largest upright rectangle of true cells: x0, y0, x1, y1, end exclusive; empty where there is none.
 

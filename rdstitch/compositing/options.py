@@ -10,6 +10,8 @@ Exposure = Literal["none", "gain", "blocks", "balanced"]
 Seam = Literal["none", "voronoi", "graphcut"]
 Blend = Literal["none", "feather", "multiband"]
 Crop = Literal["none", "auto"]
+Projection = Literal["auto", "plane", "cylinder", "sphere", "mercator"]
+PROJECTIONS: tuple[Projection, ...] = get_args(Projection)
 Interpolation = Literal["linear", "cubic", "lanczos"]
 
 
@@ -32,6 +34,10 @@ class CompositeOptions:
     crop : str
         "none"; "auto" cuts to the largest upright rectangle without holes, where that keeps a fair part of the
         picture.
+    projection : str
+        How pictures taken by turning on the spot are laid out: "plane", "cylinder", "sphere" (equirectangular),
+        "mercator", or "auto": the plane up to a view of 90 degrees, the cylinder for what is wide and low, the sphere
+        for the rest. Pictures of a plane stay on it.
     scale : float
         Factor to the size of the output; 1 keeps the resolution of the reference picture, or the median one, at its
         centre.
@@ -66,6 +72,7 @@ class CompositeOptions:
     seam: Seam = "graphcut"
     blend: Blend = "multiband"
     crop: Crop = "none"
+    projection: Projection = "auto"
     scale: float = 1.0
     max_size: int | None = None
     quality: int = 95

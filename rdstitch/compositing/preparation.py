@@ -5,6 +5,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from typing import Any
 
@@ -17,16 +18,17 @@ from rdstitch.compositing.blender import margin
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.brightness import estimate_exposure
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.crop import coverage_map, crop_box
+from rdstitch.compositing.crop import coverage_map, crop_box, crop_rows
 from rdstitch.compositing.image_cache import PictureCache
 from rdstitch.compositing.image_parts import ShownPart, shown_parts
+from rdstitch.compositing.lattice import LATTICE_STEPS
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photometric import no_exposure
 from rdstitch.compositing.plan import CompositePlan, plan_composite
 from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seam_finder import find_seams
 from rdstitch.compositing.source_images import PictureReader, Preview, Source
-from rdstitch.compositing.survey import survey_pictures
+from rdstitch.compositing.survey import survey_factor, survey_pictures
 from rdstitch.compositing.warp import plan_warp
 from rdstitch.errors import ArgumentError
 from rdstitch.io.layout import STRIP_ROWS
@@ -143,6 +145,8 @@ def prepare(
     reader = PictureReader(sources, [c.image_size for c in cameras], previews)
     channels, dtype = reader.samples
     plan = plan_composite(cameras, canvas, options, channels, dtype.itemsize)
+    if canvas.period is not None:
+        canvas = canvas.widened(_wrap_margin(canvas, plan.bands))
     warps = [plan_warp(c, g, canvas, k) for k, (c, g) in enumerate(zip(cameras, matrices, strict=True))]
     pictures = PictureCache(reader, [w.shrink for w in warps], plan.cache_bytes, ahead=plan.workers > 1)
     with closing(pictures):
@@ -176,11 +180,16 @@ def _decided(
             exposure = estimate_exposure(survey, cameras, options.exposure, exposures)
         if options.seam != "none":
             seams = find_seams(survey, exposure, options.seam == "graphcut", _part_of(progress, 0.7, 1.0))
+            if canvas.period is not None:
+                seams = seams.repeated(round(canvas.period))
             if options.blend == "feather":
                 seams = replace(seams, softness=max(1, (1 << plan.bands) // (2 * seams.factor)))
-    box, note = None, ""
+    box, note = _unwidened(canvas), ""
     if options.crop == "auto":
-        box, note = crop_box(*coverage_map(cameras, homographies, canvas, survey), canvas.size)
+        covered, factor = coverage_map(cameras, homographies, canvas, survey)
+        find = crop_box if box is None else partial(crop_rows, whole=box)
+        found, note = find(covered, factor, canvas.size)
+        box = found or box
     cropped = canvas if box is None else canvas.cropped(box)
     # What a tile's blending feels is aligned to the coarsest band.
     around = margin(plan.bands) + (2 << plan.bands)
@@ -188,6 +197,24 @@ def _decided(
     origin, notes = (0, 0) if box is None else box[:2], (note,) if note else ()
     renderer = replace(renderer, exposure=exposure, seams=seams)
     return Prepared(renderer, cropped, origin, plan, notes, shown, around)
+
+
+def _wrap_margin(canvas: Canvas, bands: int) -> int:
+    """What a canvas that goes all the way round needs of its other end on each side, px, for blending to join them.
+
+    A multiple of the spacings of lattices, bands and reduced px, so that both ends are computed alike.
+    """
+    needed, unit = margin(bands) + (2 << bands), max(LATTICE_STEPS[0], 2 << bands, survey_factor(canvas))
+    return min(-(-needed // unit) * unit, canvas.size[0] // unit * unit)
+
+
+def _unwidened(canvas: Canvas) -> Box | None:
+    """The middle of a canvas that was widened: one full turn; None for others."""
+    if canvas.period is None:
+        return None
+    (width, height), turn = canvas.size, round(canvas.period)
+    left = (width - turn) // 2
+    return left, 0, left + turn, height
 
 
 def _part_of(progress: Progress | None, start: float, stop: float) -> Progress | None:

@@ -7,7 +7,7 @@ other, so that memory is that of one label per px of the reduced canvas.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -69,6 +69,15 @@ class SeamMap:
         x, y = (edge % self.factor + (1 + self.softness) * self.factor for edge in box[:2])
         share = share[y : y + box[3] - box[1], x : x + box[2] - box[0]]
         return share * np.float32(1.0 / side**2)
+
+    def repeated(self, period: int) -> "SeamMap":
+        """The map of a canvas that goes all the way round, wider than a full turn of ``period`` canvas px.
+
+        Both ends, where it shows the same again, have the owners of the middle.
+        """
+        turn = period // self.factor
+        margin = (self.labels.shape[1] - turn) // 2
+        return replace(self, labels=np.take(self.labels, np.arange(-margin, turn + margin) % turn + margin, axis=1))
 
     def _window(self, box: Box) -> NDArray[np.int32]:
         """The labels that have a say in a box, one and the softness more on each side; the border repeats itself."""

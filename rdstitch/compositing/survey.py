@@ -72,7 +72,7 @@ class Survey:
 
 def survey_factor(canvas: Canvas) -> int:
     """Reduction at which all pictures together fit easily into memory, a power of two."""
-    areas = [(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in canvas.boxes()]
+    areas = canvas.areas()
     factor = 1
     while max(areas) > _LARGEST_PICTURE * factor**2 or sum(areas) > _LARGEST_TOTAL * factor**2:
         factor *= 2

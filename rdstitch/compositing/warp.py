@@ -1,7 +1,7 @@
 """One resampling from the original: canvas px → plane → undistorted → measured px of one picture."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -14,6 +14,7 @@ from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box, Float32Array, encloses
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.lattice import LATTICE_STEPS, Lattice
+from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.compositing.source_images import KERNEL_MARGIN, LoadedPicture
 from rdstitch.radial_homography import to_plane
 
@@ -29,6 +30,29 @@ _LEAST_WEIGHT = np.float32(1e-6)
 
 
 @dataclass(frozen=True)
+class Surface:
+    """A canvas that is no plane.
+
+    Attributes
+    ----------
+    projection : Projection
+    from_canvas : ndarray of shape (3, 3)
+        Canvas px to places of the projection, affine.
+    """
+
+    projection: Projection
+    from_canvas: FloatArray
+
+    def directions(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Directions at canvas px, by coordinate."""
+        a = self.from_canvas
+        # Upright, as nearly all canvases are, each coordinate stays a single row or column of numbers.
+        across = a[0, 0] * x + a[0, 2] if a[0, 1] == 0.0 else a[0, 0] * x + a[0, 1] * y + a[0, 2]
+        down = a[1, 1] * y + a[1, 2] if a[1, 0] == 0.0 else a[1, 0] * x + a[1, 1] * y + a[1, 2]
+        return self.projection.directions(across, down)
+
+
+@dataclass(frozen=True)
 class Warp:
     """How the canvas is filled from one picture.
 
@@ -36,13 +60,16 @@ class Warp:
     ----------
     camera : Camera
     from_canvas : ndarray of shape (3, 3)
-        Canvas px to normalized undistorted coordinates; third coordinate positive in front of the camera.
+        Canvas px, or the directions of a projection, to normalized undistorted coordinates; third coordinate positive
+        in front of the camera.
     box : (int, int, int, int)
         Where the picture can lie on the canvas: x0, y0, x1, y1, px, end exclusive.
     step : int
         Spacing of the coordinate lattice, canvas px.
     shrink : float
         Picture px per canvas px (median over the picture); above 1 the picture gets smaller.
+    surface : Surface or None
+        What gives directions to canvas px; None where the canvas is a plane.
     """
 
     camera: Camera
@@ -50,14 +77,22 @@ class Warp:
     box: Box
     step: int
     shrink: float
+    surface: "Surface | None" = None
 
     def source_points(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Measured px (..., 2) of the picture at canvas px ``x``, ``y``; NaN where there are none."""
         m = self.from_canvas
-        z = m[2, 0] * x + m[2, 1] * y + m[2, 2]
-        z = np.where(z > 0.0, z, np.nan)
-        u = (m[0, 0] * x + m[0, 1] * y + m[0, 2]) / z
-        v = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) / z
+        if self.surface is None:
+            z = m[2, 0] * x + m[2, 1] * y + m[2, 2]
+            z = np.where(z > 0.0, z, np.nan)
+            u = (m[0, 0] * x + m[0, 1] * y + m[0, 2]) / z
+            v = (m[1, 0] * x + m[1, 1] * y + m[1, 2]) / z
+        else:
+            dx, dy, dz = self.surface.directions(x, y)
+            z = m[2, 0] * dx + m[2, 1] * dy + m[2, 2] * dz
+            z = np.where(z > 0.0, z, np.nan)
+            u = (m[0, 0] * dx + m[0, 1] * dy + m[0, 2] * dz) / z
+            v = (m[1, 0] * dx + m[1, 1] * dy + m[1, 2] * dz) / z
         return self.camera.distort(self.camera.denormalize(np.stack([u, v], axis=-1)))
 
     def contains(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
@@ -114,6 +149,12 @@ class Geometry:
 
 def plan_warp(camera: Camera, homography: FloatArray, canvas: Canvas, index: int) -> Warp:
     """Everything about the resampling of picture ``index`` that does not depend on the tile."""
+    if canvas.projection != PLANE:
+        surface = Surface(canvas.projection, np.asarray(np.linalg.inv(canvas.matrix), dtype=np.float64))
+        from_directions = np.asarray(np.linalg.inv(homography), dtype=np.float64)
+        draft = Warp(camera, from_directions, canvas.boxes()[index], 1, 1.0, surface)
+        probes = canvas.place(camera, homography, np.concatenate([_grid(camera), camera.outline(_PROBES)]))
+        return replace(draft, step=_lattice_step(draft, probes), shrink=_shrink(draft, probes))
     to_canvas = canvas.matrix @ homography
     from_canvas = np.asarray(np.linalg.inv(to_canvas), dtype=np.float64)
     outline = canvas.footprints[index]
@@ -250,9 +291,14 @@ def _reduce(values: Float32Array, reduction: int) -> Float32Array:
 
 def _probes(camera: Camera, to_canvas: FloatArray, outline: FloatArray) -> FloatArray:
     """Canvas px (K, 2) spread over the picture, its outline included."""
+    return np.concatenate([to_plane(camera, to_canvas, _grid(camera)), outline])
+
+
+def _grid(camera: Camera) -> FloatArray:
+    """Measured px (K, 2) spread over a picture."""
     width, height = camera.image_size
     grid = np.stack(np.meshgrid(np.linspace(0, width - 1, _PROBES), np.linspace(0, height - 1, _PROBES)), axis=-1)
-    return np.concatenate([to_plane(camera, to_canvas, grid.reshape(-1, 2)), outline])
+    return grid.reshape(-1, 2)
 
 
 def _lattice_step(warp: Warp, probes: FloatArray) -> int:

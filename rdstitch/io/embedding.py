@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from rdstitch.io.metadata import Metadata
 
 _EXIF_HEADER = b"Exif\0\0"
+_XMP_HEADER = b"http://ns.adobe.com/xap/1.0/\0"
 _ICC_HEADER = b"ICC_PROFILE\0"
 _LARGEST_SEGMENT = 65533
 _JFIF = 0xE0
@@ -14,7 +15,7 @@ _METRES_PER_INCH = 0.0254
 
 
 def embed_in_jpeg(head: bytes, metadata: Metadata) -> list[bytes]:
-    """A JPEG file's beginning with EXIF (APP1) and ICC profile (APP2) after the JFIF header (APP0).
+    """A JPEG file's beginning with EXIF and XMP (APP1) and ICC profile (APP2) after the JFIF header (APP0).
 
     EXIF of more than 64 kB does not fit into a JPEG segment and is left out.
     """
@@ -27,17 +28,21 @@ def embed_in_jpeg(head: bytes, metadata: Metadata) -> list[bytes]:
             jfif = jfif[:11] + struct.pack(">BHH", 1, *(round(d) for d in metadata.dpi)) + jfif[16:]
     exif = bare_exif(metadata)
     segments = [_segment(0xE1, _EXIF_HEADER + exif)] if exif else []
+    if metadata.xmp and len(metadata.xmp) + len(_XMP_HEADER) <= _LARGEST_SEGMENT:
+        segments.append(_segment(0xE1, _XMP_HEADER + metadata.xmp))
     return [head[:2], jfif, *segments, *_icc_segments(metadata.icc_profile), head[after_header:]]
 
 
 def png_metadata_chunks(metadata: Metadata) -> Iterator[bytes]:
-    """ICCP, pHYs and eXIf chunks, which stand between header and pixels."""
+    """ICCP, pHYs, eXIf and iTXt chunks, which stand between header and pixels."""
     if metadata.icc_profile:
         yield png_chunk(b"iCCP", b"ICC profile\0\0" + zlib.compress(metadata.icc_profile, 9))
     if metadata.dpi is not None and all(0 < d < 1e6 for d in metadata.dpi):
         yield png_chunk(b"pHYs", struct.pack(">IIB", *(round(d / _METRES_PER_INCH) for d in metadata.dpi), 1))
     if exif := bare_exif(metadata):
         yield png_chunk(b"eXIf", exif)
+    if metadata.xmp:
+        yield png_chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + metadata.xmp)
 
 
 def png_chunk(kind: bytes, body: bytes) -> bytes:

@@ -58,6 +58,8 @@ class Metadata:
         EXIF block with orientation 1, without maker note and thumbnail; empty where there is none.
     icc_profile : bytes
         Colour profile; empty where there is none.
+    xmp : bytes
+        XMP packet that is to be written; what files have is not kept.
     """
 
     size: tuple[int, int]
@@ -74,6 +76,7 @@ class Metadata:
     exposure: float | None = None
     exif: bytes = b""
     icc_profile: bytes = b""
+    xmp: bytes = b""
 
     @property
     def nadir(self) -> tuple[float, float, float] | None:

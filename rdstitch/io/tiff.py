@@ -28,6 +28,7 @@ _HALVED_ROWS = 32
 _BUFFER = 2**24
 _LEVEL = 2  # of 0 to 3: 1 takes as long and makes files larger, 3 takes longer and makes them no smaller
 _BIGTIFF_FROM = 2**32 - 2**27
+_XMP = 700
 _COPIED_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.Artist, ExifTags.Base.Copyright)
 # (code, type, count, value, only on the first page), as tifffile takes them.
 ExtraTag = tuple[int, int, int, Any, bool]
@@ -142,7 +143,9 @@ def _reread(spill: IO[bytes], size: tuple[int, int], layout: Layout) -> Iterator
 
 
 def _copied_tags(metadata: Metadata) -> Iterator[ExtraTag]:
-    """Tags of the first picture's EXIF that stay true of a mosaic."""
+    """XMP, and tags of the first picture's EXIF that stay true of a mosaic."""
+    if metadata.xmp:
+        yield _XMP, 1, len(metadata.xmp), metadata.xmp, True
     if metadata.exif:
         exif = Image.Exif()
         exif.load(metadata.exif)

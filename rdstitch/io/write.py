@@ -174,5 +174,6 @@ def _webp(layout: Layout, strips: Iterable[Strip]) -> bytes:
         method=_WEBP_EFFORT,
         exif=layout.metadata.exif,
         icc_profile=layout.metadata.icc_profile,
+        xmp=layout.metadata.xmp,
     )
     return stream.getvalue()

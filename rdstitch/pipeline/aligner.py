@@ -14,6 +14,7 @@ from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, RegistrationError
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import neighbours
+from rdstitch.matching.neighbours_around import neighbours_around
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.matching.two_view_rounds import Pair, Pairing
 from rdstitch.messages import Message, names_of
@@ -89,7 +90,7 @@ class Aligner:
 
     def metric(self, aligned: AlignedPairs) -> AlignedPairs:
         """The same pairs with a model that has metric poses, where the user left the choice of the model open."""
-        if aligned.alignment.poses is not None or self.options.model != "auto":
+        if aligned.alignment.poses is not None or aligned.alignment.on_sphere or self.options.model != "auto":
             return aligned
         return replace(self, options=replace(self.options, model="pose")).align(aligned.pairs)
 
@@ -99,7 +100,8 @@ def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candi
     for _ in range(_CLOSURE_ROUNDS):
         pairs, alignment = aligned.pairs, aligned.alignment
         tried = {(pair.image1, pair.image2) for pair in pairs}
-        loop_closures = neighbours(alignment.cameras, alignment.homographies, tried)
+        find = neighbours_around if alignment.on_sphere else neighbours
+        loop_closures = find(alignment.cameras, alignment.homographies, tried)
         unaligned = {(i, j) for i, j in candidates if not (alignment.used[i] and alignment.used[j])} - tried
         found = pairing.estimate(sorted(unaligned.union(loop_closures)), distortion=alignment.distortion)
         pairs = tuple(sorted([*pairs, *found], key=lambda pair: (pair.image1, pair.image2)))

@@ -112,6 +112,7 @@ def apply(
             progress,
             overwrite=overwrite,
             dry_run=dry_run,
+            turned=saved.turned,
         )
         result = Recomposition(
             saved,

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import (
     Canvas,
@@ -18,7 +19,9 @@ from rdstitch.compositing import (
     compose_to_file,
     plan_canvas,
     plan_composite,
+    plan_panorama,
 )
+from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference, georeference, has_place, world_file_paths
 from rdstitch.inputs.source import Source, readers
 from rdstitch.io.atomic import check_output
@@ -65,6 +68,7 @@ def compose_pictures(
     *,
     overwrite: bool,
     dry_run: bool = False,
+    turned: bool = False,
 ) -> Composed:
     """Plan the canvas, see whether a file can hold it, and put the pictures on it.
 
@@ -86,6 +90,8 @@ def compose_pictures(
         Replace an existing world file.
     dry_run : bool
         Only plan.
+    turned : bool
+        Whether the camera turned on the spot, so that the homographies lead to directions, not to a plane.
 
     Raises
     ------
@@ -93,17 +99,19 @@ def compose_pictures(
         When a file beside the output exists already.
     """
     release_free_heap()
-    positions = [source.metadata.gps for source in sources]
+    # A camera that turned on the spot was at one place, and its pictures show no plane.
+    positions = [None if turned else source.metadata.gps for source in sources]
     beside = world_file_paths(output) if output is not None and has_place(positions) else ()
     for file in beside:
         check_output(file, overwrite, suffixes=())
-    plan = partial(
-        plan_canvas, cameras, homographies, rotate=options.rotate, reference=reference, names=[s.name for s in sources]
-    )
+    matrices = np.asarray(homographies, dtype=np.float64)
+    plan = partial(_plan, cameras, matrices, reference, [s.name for s in sources], options, turned)
     canvas = plan(scale=options.scale)
     if options.max_size is not None and max(canvas.size) > options.max_size:
-        # The canvas has whole pixels around the pictures, so that one of them may be too many.
-        canvas = plan(scale=options.scale * (options.max_size - 1) / max(canvas.size))
+        # The canvas has whole pixels around the pictures, and a full turn a multiple of some, so that these may be too
+        # many.
+        spare = 1 if canvas.period is None else max(32, options.max_size // 128)
+        canvas = plan(scale=options.scale * (options.max_size - spare) / max(canvas.size))
     # A crop may yet make it fit.
     if output is not None and options.crop == "none":
         check_size(output, canvas.size)
@@ -122,7 +130,6 @@ def compose_pictures(
     if output is None:
         composite = compose(read, cameras, homographies, canvas, options, told, read, exposures)
         return Composed(composite.canvas, composite, notes=composite.notes)
-    matrices = np.asarray(homographies, dtype=np.float64)
     placed: list[tuple[Georeference | None, str]] = []
 
     def tags(final: Canvas) -> list[ExtraTag]:
@@ -136,3 +143,32 @@ def compose_pictures(
     if place is not None and beside:
         place.write_beside(output)
     return Composed(written.canvas, notes=(*written.notes, *([note] if note else [])))
+
+
+def _plan(
+    cameras: Sequence[Camera],
+    homographies: FloatArray,
+    reference: int | None,
+    names: Sequence[str],
+    options: CompositeOptions,
+    turned: bool,
+    *,
+    scale: float,
+) -> Canvas:
+    """The canvas on a plane, or, of pictures taken by turning on the spot, in a projection."""
+    if turned:
+        return plan_panorama(
+            cameras,
+            homographies,
+            projection=options.projection,
+            scale=scale,
+            rotate=options.rotate,
+            reference=reference,
+            names=names,
+        )
+    if options.projection not in ("auto", "plane"):
+        raise ArgumentError(
+            f"the {options.projection} projection is for pictures taken by turning on the spot; these were not, "
+            "leave out --projection"
+        )
+    return plan_canvas(cameras, homographies, scale=scale, rotate=options.rotate, reference=reference, names=names)

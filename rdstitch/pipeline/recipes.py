@@ -267,6 +267,7 @@ def _composite(
         progress,
         overwrite=options.overwrite,
         dry_run=options.dry_run,
+        turned=alignment.on_sphere,
     )
     _release_decoded_images(registration)
     result = StitchResult(

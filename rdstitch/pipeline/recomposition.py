@@ -11,7 +11,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.messages import Message
 from rdstitch.output_image import OutputImage
 from rdstitch.sidecar.read import SavedRegistration
-from rdstitch.sidecar.write import VERSION, lens_fields, plain, versions
+from rdstitch.sidecar.write import VERSION, lens_fields, output_geometry, plain, to_output, versions
 
 
 @dataclass(frozen=True, repr=False)
@@ -90,8 +90,7 @@ def applied_sidecar(result: Recomposition) -> dict[str, Any]:
         "reference": source.name,
         "output": {
             "file": None if result.output is None else result.output.name,
-            "size": result.canvas.size,
-            "plane_to_output": result.canvas.matrix,
+            **output_geometry(result.canvas, turned=result.saved.turned),
         },
         "images": entries,
         "pairs": [],
@@ -120,5 +119,5 @@ def _image(result: Recomposition, index: int, entry: dict[str, Any]) -> dict[str
         "path": str(source.path),
         "size": source.camera.image_size,
         **lens_fields(source.camera),
-        "to_output": result.canvas.matrix @ picture.to_plane,
+        "to_output": to_output(result.canvas, picture.to_plane),
     }

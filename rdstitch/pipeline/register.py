@@ -100,8 +100,10 @@ def register(
 
 
 def in_frame_of_reference(registration: Registration) -> Registration:
-    """The same registration with the undistorted reference picture as its plane."""
+    """The same registration with the undistorted reference picture as its plane; directions stay as they are."""
     alignment = registration.alignment
+    if alignment.on_sphere:
+        return registration
     homographies = np.linalg.inv(alignment.homographies[alignment.reference]) @ alignment.homographies
     return replace(registration, alignment=replace(alignment, homographies=homographies))
 

@@ -125,14 +125,23 @@ def select_models(models: list[PairModel], pairs: PairSelection) -> list[PairFit
     chosen = np.argmin(criteria, axis=0)
     rms = np.stack([rms_of(found.errors, threshold) for _, found in fitted], axis=1)
     result: dict[int, PairFit] = {}
-    for index, (fits, found) in enumerate(fitted):
+
+    def finished(index: int, rows: IntArray) -> dict[int, PairFit]:
+        fits, found = fitted[index]
+        own = replace(near.at(fits), noise=noise_of(found.errors, threshold)).take(rows)
+        reasons = [_explained(models, index, rms[row]) for row in rows]
+        return dict(zip(rows.tolist(), _finished(models[index], own, pairs.data.take(rows), reasons), strict=True))
+
+    for index in range(len(models)):
         rows = np.flatnonzero(chosen == index)
         if len(rows):
-            own = replace(near.at(fits), noise=noise_of(found.errors, threshold)).take(rows)
-            reasons = [_explained(models, index, rms[row]) for row in rows]
-            result.update(
-                zip(rows.tolist(), _finished(models[index], own, pairs.data.take(rows), reasons), strict=True)
-            )
+            result.update(finished(index, rows))
+    # A camera that turns on the spot moves like one beside a plane seen edge on, where tilt, focal length and λ cannot
+    # be told apart; as a free homography the same images may show λ well.
+    unseen = [row for row, fit in result.items() if chosen[row] < len(models) - 1 and np.isinf(fit.distortion_std)]
+    if unseen:
+        free_fits = finished(len(models) - 1, np.array(sorted(unseen), dtype=np.intp))
+        result.update({row: fit for row, fit in free_fits.items() if np.isfinite(fit.distortion_std)})
     return [result[row] for row in range(len(pairs.data))]
 
 

@@ -1,13 +1,14 @@
 """Reading a sidecar: a registration that was found before, checked field by field."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import FOCAL_LOG_STD, Camera, read_coefficients
 from rdstitch.compositing import CompositeOptions
+from rdstitch.compositing.options import PROJECTIONS
 from rdstitch.errors import ArgumentError
 from rdstitch.records import Record, read_json
 from rdstitch.sidecar.write import VERSION
@@ -50,6 +51,8 @@ class SavedRegistration:
         The picture whose resolution the output has.
     distortion : float
         λ in the half-diagonal frame.
+    turned : bool
+        Whether the camera turned on the spot, so that ``to_plane`` leads to directions.
     composite : CompositeOptions
         What the picture was composited with.
     content : dict
@@ -60,6 +63,7 @@ class SavedRegistration:
     pictures: tuple[SavedPicture, ...]
     reference: int
     distortion: float
+    turned: bool
     composite: CompositeOptions
     content: dict[str, Any]
 
@@ -84,7 +88,8 @@ def read_sidecar(path: str | Path) -> SavedRegistration:
         pictures,
         _reference(record["reference"], pictures),
         record["lambda"].number(),
-        _composite_options(record["options"]["composite"]),
+        record["model"].text() == "rotation",
+        _as_laid_out(_composite_options(record["options"]["composite"]), record),
         record.value,
     )
 
@@ -135,6 +140,14 @@ def _composite_options(record: Record) -> CompositeOptions:
         return CompositeOptions(**given)
     except ArgumentError as error:
         record.fail(str(error))
+
+
+def _as_laid_out(options: CompositeOptions, record: Record) -> CompositeOptions:
+    """The options with the projection that "auto" came to where the camera turned on the spot."""
+    if options.projection != "auto" or record["model"].value != "rotation":
+        return options
+    chosen = record["output"]["projection"].choice(PROJECTIONS)
+    return replace(options, projection=next(name for name in PROJECTIONS if name == chosen))
 
 
 def _option(record: Record, hint: Any) -> Any:

@@ -9,7 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.compositing import Canvas
+from rdstitch.compositing.photo_sphere import center_of_view, field_of_view
+from rdstitch.compositing.projection import PLANE
 from rdstitch.stitch_result import StitchResult
 
 VERSION = 2
@@ -20,9 +24,10 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
     """The sidecar's content; every number that does not exist is null.
 
     ``lambda`` is for half the image diagonal. ``images[].to_plane`` maps undistorted, half-diagonal-normalized
-    coordinates of a picture to the plane, ``output.plane_to_output`` those to px of the output, ``images[].to_output``
-    is the product; ``pairs[].homography`` maps coordinates of the first picture to those of the second. All fields are
-    described in docs/sidecar.md.
+    coordinates of a picture to the plane, or to directions where the camera turned on the spot,
+    ``output.plane_to_output`` places of the plane, or of the projection, to px of the output; ``images[].to_output`` is
+    the product, on a plane; ``pairs[].homography`` maps coordinates of the first picture to those of the second. All
+    fields are described in docs/sidecar.md.
     """
     registration, alignment = result.registration, result.registration.alignment
     camera = registration.camera
@@ -46,8 +51,7 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
         "reference": registration.sources[alignment.reference].name,
         "output": {
             "file": None if result.output is None else result.output.name,
-            "size": result.canvas.size,
-            "plane_to_output": result.canvas.matrix,
+            **output_geometry(result.canvas, turned=alignment.on_sphere),
         },
         "images": _images(result),
         "pairs": _pairs(result),
@@ -79,7 +83,7 @@ def _images(result: StitchResult) -> list[dict[str, Any]]:
             "features": registration.keypoints[index],
             **lens_fields(alignment.cameras[index]),
             "to_plane": alignment.homographies[index] if used else None,
-            "to_output": result.canvas.matrix @ alignment.homographies[index] if used else None,
+            "to_output": to_output(result.canvas, alignment.homographies[index]) if used else None,
             "pose": None,
         }
         if used and poses is not None:
@@ -96,6 +100,23 @@ def _images(result: StitchResult) -> list[dict[str, Any]]:
         for path, reason in reasons.items()
     ]
     return entries + unread
+
+
+def output_geometry(canvas: Canvas, *, turned: bool) -> dict[str, Any]:
+    """Size and projection of the output; its view, where the camera turned on the spot."""
+    return {
+        "size": canvas.size,
+        "plane_to_output": canvas.matrix,
+        "projection": canvas.projection.name,
+        "wraps_around": canvas.period is not None,
+        "field_of_view_deg": np.degrees(field_of_view(canvas)) if turned else None,
+        "center_deg": np.degrees(center_of_view(canvas)) if turned else None,
+    }
+
+
+def to_output(canvas: Canvas, homography: FloatArray) -> FloatArray | None:
+    """From undistorted coordinates to px of the output, where one matrix can say that: on a plane."""
+    return canvas.matrix @ homography if canvas.projection == PLANE else None
 
 
 def lens_fields(camera: Camera) -> dict[str, Any]:

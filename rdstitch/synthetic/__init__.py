@@ -14,6 +14,7 @@ from rdstitch.synthetic.layouts import (
     turn_poses,
 )
 from rdstitch.synthetic.lenses import BrownLens, FisheyeLens, Lens, best_division_model
+from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, panorama_rotations, turning_sequence
 from rdstitch.synthetic.poses import Poses, fit_to_plane
 from rdstitch.synthetic.relief import RELIEFS, Relief, boxes, hills, ridges
 from rdstitch.synthetic.rendering import Photometry, Sequence, sequence_over
@@ -45,9 +46,11 @@ __all__ = [
     "Sequence",
     "SyntheticMatches",
     "Texture",
+    "TurningSequence",
     "best_division_model",
     "blank",
     "boxes",
+    "camera_rotations",
     "correspondences",
     "drive_poses",
     "fit_to_plane",
@@ -59,6 +62,7 @@ __all__ = [
     "joined",
     "line_poses",
     "pair_poses",
+    "panorama_rotations",
     "parking_poses",
     "planar_instances",
     "repeated",
@@ -67,4 +71,5 @@ __all__ = [
     "sequence_over",
     "survey_poses",
     "turn_poses",
+    "turning_sequence",
 ]

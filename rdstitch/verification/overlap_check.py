@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 
@@ -90,8 +90,18 @@ def _compare(
         ambiguity = placement_ambiguity(drawings[i, scale], drawings[j, scale])
         return CheckedLink(fit, overlap_agreement(placed[i], placed[j]), ambiguity)
 
+    def compare_around(fit: LinkFit) -> CheckedLink:
+        # No plane shows all pictures of a turn; the one before the second picture shows both.
+        first = replace(placed[fit.image1], homography=alignment.relation(fit.image1, fit.image2))
+        second = replace(placed[fit.image2], homography=np.eye(3))
+        scale = drawing_scale(second)
+        ambiguity = placement_ambiguity(draw(first, scale), draw(second, scale))
+        return CheckedLink(fit, overlap_agreement(first, second), ambiguity)
+
     with ThreadPoolExecutor(workers) as pool:
         placed = dict(zip(pictures, pool.map(place, pictures), strict=True))
+        if alignment.on_sphere:
+            return list(pool.map(compare_around, chosen))
         scales = _scales([drawing_scale(placed[fit.image2]) for fit in chosen])
         wanted = sorted(
             {(k, scale) for fit, scale in zip(chosen, scales, strict=True) for k in (fit.image1, fit.image2)}

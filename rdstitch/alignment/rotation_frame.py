@@ -1,0 +1,66 @@
+"""The common frame of pictures taken by turning on the spot: level, and centred on what they show."""
+
+import numpy as np
+
+from rdstitch.arrays import FloatArray
+
+_FULL_CIRCLE = np.pi / 2
+"""Pictures whose centres leave no wider gap than this, radians, count as all the way round."""
+
+
+def levelled(matrices: FloatArray, reference: int) -> FloatArray:
+    """Matrices from undistorted coordinates of each picture to directions in a level frame.
+
+    The frame has x to the right, y down, and z towards the middle of what the pictures show, or towards the reference
+    picture where they show everything around.
+
+    Parameters
+    ----------
+    matrices : ndarray of shape (N, 3, 3)
+        ``diag(f, f, 1) R_i``, from directions in any frame to the pictures, all with the same f.
+    reference : int
+
+    Returns
+    -------
+    ndarray of shape (N, 3, 3)
+    """
+    focal = float(np.linalg.norm(matrices[0, 0]))
+    rotations = matrices / np.array([[focal], [focal], [1.0]])
+    frame = level_frame(rotations, reference)
+    directions: FloatArray = frame @ np.swapaxes(rotations, 1, 2) @ np.diag([1.0, 1.0, focal])
+    return directions
+
+
+def level_frame(rotations: FloatArray, reference: int) -> FloatArray:
+    """Rotation (3, 3) to the level frame from the one that rotations (N, 3, 3) lead from to the cameras.
+
+    People hold cameras so that the horizon is level, whichever way they turn: the x axes of all pictures lie in one
+    plane, and the direction down is the one they have least in common with (Brown and Lowe 2007, section 5). The less
+    the pictures turn, the more counts what is down in them.
+    """
+    right, down, ahead = np.moveaxis(rotations, 1, 0)
+    mean_down = _unit(down.mean(axis=0))
+    spread, axes = np.linalg.eigh(right.T @ right)
+    axis = axes[:, 0] * (1.0 if axes[:, 0] @ mean_down > 0.0 else -1.0)
+    certainty = (spread[1] - spread[0]) / max(spread[1] + spread[0], 1e-12)
+    y = _unit(certainty * axis + (1.0 - certainty) * mean_down)
+    x = _unit(np.cross(y, ahead[reference]))
+    z = np.cross(x, y)
+    heading = _middle(np.arctan2(ahead @ x, ahead @ z))
+    x, z = np.cos(heading) * x - np.sin(heading) * z, np.sin(heading) * x + np.cos(heading) * z
+    return np.stack([x, y, z])
+
+
+def _middle(headings: FloatArray) -> float:
+    """Middle of headings, radians: opposite to the widest gap between them; 0 where they go all the way round."""
+    ordered = np.sort(headings)
+    gaps = np.diff(np.append(ordered, ordered[0] + 2.0 * np.pi))
+    widest = int(np.argmax(gaps))
+    if gaps[widest] < _FULL_CIRCLE:
+        return 0.0
+    return float(ordered[widest] + gaps[widest] / 2.0 + np.pi)
+
+
+def _unit(vector: FloatArray) -> FloatArray:
+    unit: FloatArray = vector / max(float(np.linalg.norm(vector)), 1e-12)
+    return unit

@@ -1,0 +1,109 @@
+"""A camera that turns on the spot, as a motion model: ``P_i = diag(f, f, 1) R_i`` from directions to the picture.
+
+Two pictures are related by ``H_ij = P_j P_i⁻¹ = K R_j R_i' K⁻¹`` wherever both look: no plane is needed, and nothing
+ends at a horizon, so that a full circle closes. A step turns the camera in its own frame, ``R ← exp([δ]x) R``.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from rdstitch.alignment.motion_models import ModelMatrices
+from rdstitch.arrays import BoolArray, FloatArray
+
+FOCAL_STARTS = tuple(math.log(focal) for focal in (0.6, 0.9, 1.4, 2.2, 3.6, 6.0))
+"""Logarithms of focal lengths in half diagonals: from fisheyes to long lenses, near enough to each other that the
+adjustment of pairs converges from the nearest."""
+
+_LARGEST_STEP = 0.5  # radians; where the motion is no rotation, steps may run away
+_LOG_FOCAL_LIMITS = math.log(0.2), math.log(50.0)
+
+_CROSS = np.zeros((3, 3, 3))
+_CROSS[[0, 1, 2], [2, 0, 1], [1, 2, 0]] = 1.0
+_CROSS[[0, 1, 2], [1, 2, 0], [2, 0, 1]] = -1.0
+
+
+@dataclass(frozen=True)
+class RotationModel:
+    """Camera that turns about its centre.
+
+    Poses are R, row by row, from the common frame of directions to the camera; the shared parameter is log f, f in
+    half diagonals.
+    """
+
+    name: str = "rotation"
+    pose_size: int = 3
+    shared_names: tuple[str, ...] = ("log_focal",)
+
+    @property
+    def gauge(self) -> BoolArray:
+        """All of the reference picture: the frame of directions may be turned."""
+        return np.ones(3, dtype=np.bool_)
+
+    def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
+        """Matrices from directions to the pictures, with derivatives."""
+        rotations = poses.reshape(-1, 3, 3)
+        focal = _focal(shared)
+        scale = np.array([[focal], [focal], [1.0]])
+        matrices = scale * rotations
+        by_pose = scale * (_CROSS @ rotations[:, None])
+        by_focal = np.array([[focal], [focal], [0.0]]) * rotations
+        return ModelMatrices(matrices, by_pose, by_focal[:, None])
+
+    def natural(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Log f itself."""
+        return shared, np.eye(1)
+
+    def shared_from(self, natural: FloatArray) -> FloatArray:
+        """Log f."""
+        return np.asarray(natural[-1:], dtype=np.float64)
+
+    def moved(self, poses: FloatArray, step: FloatArray) -> FloatArray:
+        """Poses after a step of shape (N, 3), radians."""
+        turned: FloatArray = rotation_from_vector(step) @ poses.reshape(-1, 3, 3)
+        return turned.reshape(-1, 9)
+
+    def offsets(self, poses: FloatArray) -> FloatArray:
+        """Zeros: no prior speaks of a rotation."""
+        return np.zeros((len(poses), 3))
+
+    def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+        """``diag(f, f, 1)``."""
+        focal = _focal(shared)
+        return np.tile(np.diag([focal, focal, 1.0]), (len(attitudes), 1, 1))
+
+    def poses_from(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+        """The nearest rotations."""
+        focal = _focal(shared)
+        matrices = homographies / np.array([[focal], [focal], [1.0]])
+        matrices = matrices * np.sign(np.linalg.det(matrices))[:, None, None]
+        return nearest_rotation(matrices).reshape(-1, 9)
+
+
+def _focal(shared: FloatArray) -> float:
+    """Focal length, half diagonals, within what a lens can have."""
+    return float(np.exp(np.clip(shared[0], *_LOG_FOCAL_LIMITS)))
+
+
+def nearest_rotation(matrices: FloatArray) -> FloatArray:
+    """Rotations (N, 3, 3) nearest to matrices, up to their scale (orthogonal Procrustes, Kabsch)."""
+    left, _, right = np.linalg.svd(matrices)
+    left[..., 2] *= np.sign(np.linalg.det(left @ right))[..., None]
+    rotation: FloatArray = left @ right
+    return rotation
+
+
+def rotation_from_vector(vectors: FloatArray) -> FloatArray:
+    """Rotations (N, 3, 3) about axes (N, 3) by their length, radians (Rodrigues); long ones are shortened."""
+    angle = np.linalg.norm(vectors, axis=1)
+    vectors = vectors * np.minimum(1.0, _LARGEST_STEP / np.maximum(angle, 1e-300))[:, None]
+    angle = np.minimum(angle, _LARGEST_STEP)
+    cross = np.einsum("nk,kij->nij", vectors, _CROSS)
+    first = np.sinc(angle / np.pi)[:, None, None]
+    second = 0.5 * np.sinc(angle / (2.0 * np.pi))[:, None, None] ** 2
+    rotation: FloatArray = np.eye(3) + first * cross + second * (cross @ cross)
+    return rotation
+
+
+ROTATION = RotationModel()

@@ -1,0 +1,67 @@
+"""Did the camera turn on the spot, or move over a plane? The least free model that the data allow.
+
+A turn has three parameters a picture, as few as a rigid motion over a plane, and needs no plane. Where it explains the
+pictures, models over a plane do so too, with more parameters: a camera that stays where it is sees the same of a plane
+as of anything else. So the turn is taken where it fits, and a plane where there is translation.
+"""
+
+from collections.abc import Sequence
+
+from rdstitch.alignment.adjustment_problem import Fit, Problem
+from rdstitch.alignment.model_selection import Choice, NoiseModel, choose_model, link_errors, within_reason
+from rdstitch.alignment.motion_models import RIGID
+from rdstitch.alignment.rotation_model import ROTATION
+from rdstitch.arrays import BoolArray
+
+_POSSIBLE = 4.0
+"""Times the noise that pairs may be off from a turn on the spot for it to be tried on all of them."""
+
+
+def choose_motion(problem: Problem, names: Sequence[str], lenses: Sequence[BoolArray] = ()) -> Choice:
+    """The turn on the spot, or the best of the models over a plane; see :func:`choose_model`.
+
+    Where no model over a plane could explain the pictures better than a turn does, none is tried.
+    """
+    planar = [name for name in names if name != ROTATION.name]
+    if len(planar) == len(names):
+        return choose_model(problem, names, lenses)
+    bound = NoiseModel.of_links_apart(problem)
+    trial = problem.trial(ROTATION)
+    if planar and trial.sigma > _POSSIBLE * bound.noise:
+        return choose_model(problem, planar, lenses)
+    turned = problem.fit(ROTATION, shared=trial.parameters.shared)
+    if not planar:
+        reason = f"as asked for; it leaves an error of {turned.adjusted.sigma:.2f} px"
+        return _choice(problem, bound, turned, lenses, reason)
+    explained = (
+        "the camera turned on the spot, so that the pictures say nothing of the scene's shape (a plane seen from one "
+        f"place would look the same); it leaves an error of {turned.adjusted.sigma:.2f} px"
+    )
+    least = bound.misfit(link_errors(problem, problem.homographies, problem.lens))
+    if _cost(bound, problem, turned) <= least + bound.price(problem, RIGID, problem.free_lens):
+        return _choice(problem, bound, turned, lenses, f"{explained}, and nothing is left for more freedom to gain")
+    over_plane = choose_model(problem, planar, lenses)
+    if bound.cost(problem, over_plane.fit) < _cost(bound, problem, turned):
+        return over_plane
+    other = over_plane.fit
+    gains = f"{explained}, more freedom gains too little ({other.model.name} {other.adjusted.sigma:.2f} px)"
+    return _choice(problem, bound, turned, lenses, gains)
+
+
+def _choice(problem: Problem, noise: NoiseModel, turned: Fit, lenses: Sequence[BoolArray], reason: str) -> Choice:
+    """The turn, with more of the lens free where that pays."""
+    for lens in lenses:
+        wider = problem.extend(turned, lens | turned.free_lens)
+        if noise.cost(problem, wider) < noise.cost(problem, turned) and within_reason(wider):
+            turned = wider
+    return Choice(turned, f"{ROTATION.name}: {reason}", noise.overdispersion)
+
+
+def _cost(noise: NoiseModel, problem: Problem, turned: Fit) -> float:
+    """Misfit and price of a turn, and of the focal length that it takes.
+
+    With a focal length that grows without limit a turn becomes a shift over a plane: what is known of the focal length
+    counts.
+    """
+    log_focal, known = float(turned.adjusted.parameters.shared[0]), problem.knowledge
+    return noise.cost(problem, turned) + ((log_focal - known.log_focal) / known.log_focal_std) ** 2

@@ -1,0 +1,215 @@
+"""The canvas of pictures taken by turning on the spot: which projection, how large, and whether it goes all round."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
+from rdstitch.compositing.canvas import Canvas, plan_canvas, refuse_scale
+from rdstitch.compositing.projection import PLANE, TURN, Projection
+from rdstitch.errors import ArgumentError, LimitError
+
+_POINTS_PER_SIDE = 64
+# Radians: the view up to which a plane shows it without much stretching, and the height up to which a cylinder does.
+_PLANE_VIEW = math.radians(90.0)
+_CYLINDER_HEIGHT = math.radians(70.0)
+# A full turn is a multiple of this many px, or of less than 1/256 of it, so that both ends of a canvas have the same
+# lattices, reduced px and bands.
+_UNIT, _UNITS_PER_TURN = 32, 256
+
+
+@dataclass(frozen=True)
+class View:
+    """What pictures show of the directions around their centre.
+
+    Attributes
+    ----------
+    outlines : tuple of ndarray of shape (K, 2)
+        Longitude and latitude of each picture's border, radians; longitudes without a jump, around that of the picture.
+    around : bool
+        Whether they go all the way round.
+    """
+
+    outlines: tuple[FloatArray, ...]
+    around: bool
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Width and height of the view, radians."""
+        low, high = self.bounds
+        return (TURN if self.around else float(high[0] - low[0])), float(high[1] - low[1])
+
+    @property
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Least and largest longitude and latitude."""
+        everything = np.concatenate(self.outlines)
+        return everything.min(axis=0), everything.max(axis=0)
+
+
+def view_of(cameras: Sequence[Camera], directions: FloatArray) -> View:
+    """What pictures show.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+    directions : ndarray of shape (N, 3, 3)
+        From undistorted normalized coordinates of each picture to directions.
+    """
+    outlines = [_outline(camera, matrix) for camera, matrix in zip(cameras, directions, strict=True)]
+    low = np.array([outline[:, 0].min() for outline in outlines])
+    high = np.array([outline[:, 0].max() for outline in outlines])
+    gap = _widest_gap(low, high)
+    if gap is None:
+        return View(tuple(outlines), True)
+    # From the middle of what nobody shows on, everything is in one piece.
+    shifts = np.floor((0.5 * (low + high) - gap) / TURN) * TURN
+    moved = [outline - (shift, 0.0) for outline, shift in zip(outlines, shifts, strict=True)]
+    back = np.rint(np.mean([outline[:, 0].mean() for outline in moved]) / TURN) * TURN
+    return View(tuple(outline - (back, 0.0) for outline in moved), False)
+
+
+def choose_projection(view: View) -> Projection:
+    """The plane for what fits on it, the cylinder for what is wide and low, the sphere for the rest.
+
+    A full turn is always shown on the sphere, since viewers that turn it know no other projection.
+    """
+    low, high = view.bounds
+    steepest = float(max(-low[1], high[1]))
+    if max(view.extent) <= _PLANE_VIEW and steepest <= _PLANE_VIEW / 2:
+        return PLANE
+    return Projection("cylinder" if not view.around and 2.0 * steepest <= _CYLINDER_HEIGHT else "sphere")
+
+
+def plan_panorama(
+    cameras: Sequence[Camera],
+    directions: FloatArray,
+    *,
+    projection: str = "auto",
+    scale: float = 1.0,
+    rotate: float = 0.0,
+    reference: int | None = None,
+    names: Sequence[str] | None = None,
+) -> Canvas:
+    """Plan the canvas that holds every picture of a panorama.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+    directions : ndarray of shape (N, 3, 3)
+        From undistorted normalized coordinates of each picture to directions.
+    projection : str
+        "plane", "cylinder", "sphere", "mercator", or "auto": what suits the view.
+    scale, rotate, reference, names
+        As for :func:`rdstitch.compositing.plan_canvas`.
+
+    Raises
+    ------
+    ArgumentError
+        When a panorama that goes all the way round should be turned.
+    LimitError
+        When a picture looks farther than the projection shows, or the canvas would be absurd.
+    """
+    view = view_of(cameras, directions)
+    chosen = choose_projection(view) if projection == "auto" else Projection(projection)
+    if chosen == PLANE:
+        return plan_canvas(cameras, directions, scale=scale, rotate=rotate, reference=reference, names=names)
+    called = [f"picture {k + 1}" for k in range(len(cameras))] if names is None else list(names)
+    lengths = np.linalg.norm(directions, axis=1)
+    focal = lengths[:, 2] / lengths[:, 0] * [camera.half_diagonal for camera in cameras]
+    resolution = scale * float(np.median(focal) if reference is None else focal[reference])
+    canvas = _lay_out(view, chosen, resolution, rotate, called)
+    refuse_scale(cameras, np.array(canvas.size, dtype=np.float64))
+    return canvas
+
+
+def _lay_out(view: View, projection: Projection, resolution: float, rotate: float, names: Sequence[str]) -> Canvas:
+    """The canvas that holds a view.
+
+    Parameters
+    ----------
+    view : View
+    projection : Projection
+        Not the plane.
+    resolution : float
+        px per radian at the horizon.
+    rotate : float
+        Degrees that the output is turned clockwise.
+    names : sequence of str
+        What to call the pictures in messages.
+    """
+    for outline, name in zip(view.outlines, names, strict=True):
+        if projection.name != "sphere" and np.abs(outline[:, 1]).max() > projection.largest_latitude:
+            raise LimitError(
+                f"{name}: looks too far up or down for the {projection.name} projection; use --projection sphere"
+            )
+    if view.around and rotate:
+        raise ArgumentError("a panorama that goes all the way round cannot be turned; leave out --rotate")
+    places = [_places(outline, projection) for outline in view.outlines]
+    period = None
+    if view.around:
+        width = TURN * resolution
+        unit = max(_UNIT, 1 << int(math.log2(max(width / _UNITS_PER_TURN, 1.0))))
+        period = float(math.ceil(width / unit) * unit)
+        resolution = period / TURN
+    angle = math.radians(rotate)
+    cos, sin = resolution * math.cos(angle), resolution * math.sin(angle)
+    linear = np.array([[cos, -sin], [sin, cos]])
+    placed = [outline @ linear.T for outline in places]
+    everything = np.concatenate(placed)
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    if period is not None:
+        low[0], high[0] = -period / 2.0, period / 2.0
+    size = np.maximum(np.ceil(high - low - 1e-6), 1).astype(int)
+    matrix = np.eye(3)
+    matrix[:2, :2], matrix[:2, 2] = linear, -low - 0.5
+    footprints = tuple(outline - low - 0.5 for outline in placed)
+    return Canvas((int(size[0]), int(size[1])), matrix, footprints, projection, period)
+
+
+def _outline(camera: Camera, matrix: FloatArray) -> FloatArray:
+    """Longitude and latitude (K, 2) of a picture's border, and of the pole that it shows with all longitudes."""
+    border = camera.normalize(camera.undistort(camera.outline(_POINTS_PER_SIDE)))
+    rays = np.concatenate([border, np.ones((len(border), 1))], axis=1) @ matrix.T
+    ahead = matrix[:, 2]
+    middle = math.atan2(ahead[0], ahead[2])
+    longitude = middle + np.mod(np.arctan2(rays[:, 0], rays[:, 2]) - middle + np.pi, TURN) - np.pi
+    latitude = np.arctan2(rays[:, 1], np.hypot(rays[:, 0], rays[:, 2]))
+    poles = [sign for sign in (-1.0, 1.0) if _shows(camera, matrix, np.array([0.0, sign, 0.0]))]
+    if not poles:
+        return np.stack([longitude, latitude], axis=1)
+    top = -np.pi / 2 if -1.0 in poles else float(latitude.min())
+    bottom = np.pi / 2 if 1.0 in poles else float(latitude.max())
+    left, right = middle - np.pi, middle + np.pi
+    return np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
+
+
+def _shows(camera: Camera, matrix: FloatArray, direction: FloatArray) -> bool:
+    """Whether a picture shows a direction."""
+    x, y, z = np.linalg.solve(matrix, direction)
+    if z <= 0.0:
+        return False
+    u, v = camera.distort(camera.denormalize(np.array([[x / z, y / z]])))[0]
+    width, height = camera.image_size
+    return bool(-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5)
+
+
+def _places(outline: FloatArray, projection: Projection) -> FloatArray:
+    """Places (K, 2) of longitudes and latitudes, with the longitudes as they are."""
+    level = np.stack([np.zeros(len(outline)), np.sin(outline[:, 1]), np.cos(outline[:, 1])], axis=1)
+    return np.stack([outline[:, 0], projection.project(level)[:, 1]], axis=1)
+
+
+def _widest_gap(low: FloatArray, high: FloatArray) -> float | None:
+    """Middle of the widest range of longitudes that no interval covers, radians; None where all are covered."""
+    if float((high - low).max()) >= TURN:
+        return None
+    order = np.argsort(np.mod(low, TURN), kind="stable")
+    start, length = np.mod(low, TURN)[order], (high - low)[order]
+    # Once round, the intervals begin again.
+    reach = np.maximum.accumulate(np.concatenate([start + length - TURN, start + length]))[len(start) - 1 : -1]
+    gaps = start - reach
+    widest = int(np.argmax(gaps))
+    return float(start[widest] - gaps[widest] / 2.0) if gaps[widest] > 0.0 else None

@@ -1,0 +1,167 @@
+"""Pictures of a camera that is turned on the spot: the scene is a sphere of texture around it.
+
+The scene has x to the right, y down and z ahead, like a camera that looks straight ahead. Its texture is laid out by
+longitude, which grows to the right, and latitude, which grows downwards, both in equal steps.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rdstitch.arrays import FloatArray
+from rdstitch.synthetic.lenses import Lens, focal_length
+from rdstitch.synthetic.poses import Poses
+from rdstitch.synthetic.rendering import Photometry, Sequence
+from rdstitch.synthetic.textures import Picture, Texture, ground
+
+
+def camera_rotations(heading: ArrayLike, pitch: ArrayLike = 0.0, roll: ArrayLike = 0.0) -> FloatArray:
+    """Rotations (N, 3, 3) from the scene to cameras: ``(Ry(heading) Rx(pitch) Rz(roll))'``.
+
+    Parameters
+    ----------
+    heading : array_like of shape (N,)
+        Where each camera looks, radians to the right.
+    pitch, roll : array_like of shape (N,) or ()
+        Radians upwards, and clockwise.
+    """
+    heading, pitch, roll = np.broadcast_arrays(*(np.atleast_1d(np.asarray(a, float)) for a in (heading, pitch, roll)))
+    one, zero = np.ones_like(heading), np.zeros_like(heading)
+    (ch, sh), (cp, sp), (cr, sr) = ((np.cos(angle), np.sin(angle)) for angle in (heading, pitch, roll))
+    about_y = np.array([[ch, zero, sh], [zero, one, zero], [-sh, zero, ch]]).transpose(2, 0, 1)
+    about_x = np.array([[one, zero, zero], [zero, cp, -sp], [zero, sp, cp]]).transpose(2, 0, 1)
+    about_z = np.array([[cr, -sr, zero], [sr, cr, zero], [zero, zero, one]]).transpose(2, 0, 1)
+    to_scene = about_y @ about_x @ about_z
+    return np.ascontiguousarray(np.swapaxes(to_scene, 1, 2))
+
+
+def panorama_rotations(
+    count: int, step: float, *, rows: int = 1, row_pitch: float = 0.5, jitter: float = 0.05, seed: int = 0
+) -> FloatArray:
+    """Rotations (rows count, 3, 3) of pictures taken by hand, one row after the other.
+
+    Parameters
+    ----------
+    count : int
+        Pictures of a row.
+    step : float
+        Between neighbours, radians.
+    rows : int
+        Rows, whose pitches are ``row_pitch`` radians apart, around the horizon.
+    jitter : float
+        Headings, pitches and rolls are uniform in ± this, radians, around what is aimed at.
+    seed : int
+    """
+    rng = np.random.default_rng(seed)
+    row, column = np.divmod(np.arange(rows * count), count)
+    heading = (column - (count - 1) / 2) * step
+    pitch = ((rows - 1) / 2 - row) * row_pitch
+    errors = rng.uniform(-jitter, jitter, (3, rows * count))
+    return camera_rotations(heading + errors[0], pitch + errors[1], errors[2])
+
+
+@dataclass(frozen=True)
+class _Around:
+    """A texture that goes on at its right border with its left one, twice as wide as it is."""
+
+    texture: Texture
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, texels."""
+        return 2 * self.texture.size[0], self.texture.size[1]
+
+    @property
+    def channels(self) -> int:
+        """1 for grey, 3 for RGB."""
+        return self.texture.channels
+
+    def region(self, left: int, top: int, right: int, bottom: int) -> Picture:
+        """See :class:`Texture`."""
+        width = self.texture.size[0]
+        rows = self.texture.region(0, top, width, bottom)
+        return rows.take(np.arange(left, right) % width, axis=1)
+
+
+@dataclass(frozen=True)
+class TurningSequence(Sequence):
+    """Pictures of a camera that turns about its centre; made by :func:`turning_sequence`.
+
+    Attributes
+    ----------
+    rotations : ndarray of shape (N, 3, 3)
+        From the scene to each camera.
+    position : ndarray of shape (N, 3)
+        Where each camera's centre is, in radii of the sphere: zeros for a turn on the spot, other numbers for parallax.
+    """
+
+    rotations: FloatArray = field(default_factory=lambda: np.empty((0, 3, 3)))
+    position: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+
+    def to_plane(self, index: int, points: ArrayLike) -> FloatArray:
+        """Measured pixels (..., 2) of one picture to texels of the sphere; NaN outside the lens."""
+        rays = self.rays(index, points)
+        if self.position[index].any():
+            rays = _where_it_meets_the_sphere(self.position[index], rays)
+        ahead = self.rotations[index][2]
+        middle = np.arctan2(ahead[0], ahead[2])
+        # The longitude relative to the picture's centre has no jump within the picture.
+        longitude = middle + np.mod(np.arctan2(rays[..., 0], rays[..., 2]) - middle + np.pi, 2 * np.pi) - np.pi
+        latitude = np.arctan2(rays[..., 1], np.hypot(rays[..., 0], rays[..., 2]))
+        width, height = self.texture.size[0] / 2, self.texture.size[1]
+        x = width * (longitude / (2 * np.pi) + 1.0) - 0.5
+        y = height * (latitude / np.pi + 0.5) - 0.5
+        return np.stack([x, y], axis=-1)
+
+    def rays(self, index: int, points: ArrayLike) -> FloatArray:
+        """Directions (..., 3) in the scene of measured pixels (..., 2) of one picture, of length 1."""
+        pinhole = (self.lens.undistort(points) - np.asarray(self.lens.center)) / focal_length(self.lens)
+        rays = np.concatenate([pinhole, np.ones((*pinhole.shape[:-1], 1))], axis=-1)
+        rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        turned: FloatArray = rays @ self.rotations[index]
+        return turned
+
+
+def turning_sequence(
+    lens: Lens,
+    rotations: FloatArray,
+    *,
+    seed: int,
+    photometry: Photometry | None = None,
+    texels_per_pixel: float = 1.0,
+    channels: int = 3,
+    position: ArrayLike | None = None,
+) -> TurningSequence:
+    """Pictures that a camera takes of a sphere around it.
+
+    Parameters
+    ----------
+    lens : Lens
+    rotations : ndarray of shape (N, 3, 3)
+        From the scene to each camera, as :func:`camera_rotations` gives them.
+    seed : int
+        Of the texture and the noise.
+    photometry : Photometry, optional
+    texels_per_pixel : float
+        Texels at the horizon for each pixel at the picture's centre.
+    channels : int
+        1 for grey, 3 for RGB.
+    position : array_like of shape (N, 3), optional
+        Of each camera's centre, in radii of the sphere; all at its centre if not given.
+    """
+    circumference = round(2 * np.pi * focal_length(lens) * texels_per_pixel)
+    texture = ground((circumference, circumference // 2), seed=seed, channels=channels)
+    count = len(rotations)
+    where = np.zeros((count, 3)) if position is None else np.asarray(position, dtype=np.float64)
+    unused = Poses.of(np.zeros((count, 2)), 1.0)
+    settings = Photometry() if photometry is None else photometry
+    return TurningSequence(_Around(texture), lens, unused, settings, seed=seed, rotations=rotations, position=where)
+
+
+def _where_it_meets_the_sphere(position: FloatArray, rays: FloatArray) -> FloatArray:
+    """Points (..., 3) of the unit sphere that unit rays (..., 3) from a position inside it meet."""
+    along = rays @ position
+    distance = np.sqrt(along**2 + 1.0 - position @ position) - along
+    met: FloatArray = position + distance[..., None] * rays
+    return met

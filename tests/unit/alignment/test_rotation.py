@@ -1,0 +1,126 @@
+"""Turning on the spot: derivatives of the model, the level frame, the choice between a turn and a plane."""
+
+import numpy as np
+import pytest
+
+from rdstitch.alignment import AlignmentOptions, align
+from rdstitch.alignment.rotation_frame import level_frame
+from rdstitch.alignment.rotation_model import ROTATION, nearest_rotation, rotation_from_vector
+from rdstitch.camera import Camera
+from rdstitch.matching.links import Link
+from rdstitch.radial_homography import RadialHomography
+from rdstitch.synthetic.panorama import camera_rotations, panorama_rotations
+
+LENS = Camera((640, 480), -0.2, focal=554.0, focal_source="guess")
+
+
+def _links(rotations: np.ndarray, rng: np.random.Generator, noise: float = 0.2, count: int = 120) -> list[Link]:
+    """Matches between all pictures that overlap, with their true homographies."""
+    assert LENS.focal is not None
+    focal = LENS.focal / LENS.half_diagonal
+    k = np.diag([focal, focal, 1.0])
+    links = []
+    for i in range(len(rotations)):
+        for j in range(i + 1, len(rotations)):
+            h = k @ rotations[j] @ rotations[i].T @ np.linalg.inv(k)
+            points = rng.uniform((0, 0), (639, 479), (count, 2))
+            flat = LENS.normalize(LENS.undistort(points))
+            moved = np.column_stack([flat, np.ones(count)]) @ h.T
+            moved[moved[:, 2] <= 0.05] = np.nan
+            seen = LENS.distort(LENS.denormalize(moved[:, :2] / moved[:, 2:]))
+            inside = ((seen >= 0) & (seen < (640, 480))).all(axis=1)
+            if inside.sum() < 20:
+                continue
+            noisy = [p[inside] + noise * rng.standard_normal((int(inside.sum()), 2)) for p in (points, seen)]
+            relation = RadialHomography(h, LENS, LENS, np.ones(len(noisy[0]), dtype=np.bool_), distortion_std=0.01)
+            links.append(Link(i, j, noisy[0], noisy[1], relation))
+    return links
+
+
+def test_derivatives_are_those_of_the_matrices() -> None:
+    poses = camera_rotations([0.3, -2.0], [0.2, 0.4], [0.1, -0.3]).reshape(-1, 9)
+    shared = np.array([np.log(1.4)])
+    found = ROTATION.matrices(poses, shared)
+    step = 1e-6
+    for k in range(3):
+        change = np.zeros((2, 3))
+        change[:, k] = step
+        high, low = (ROTATION.matrices(ROTATION.moved(poses, by), shared).matrices for by in (change, -change))
+        np.testing.assert_allclose(found.by_pose[:, k], (high - low) / (2 * step), atol=1e-8)
+    high, low = (ROTATION.matrices(poses, shared + by).matrices for by in (step, -step))
+    np.testing.assert_allclose(found.by_shared[:, 0], (high - low) / (2 * step), atol=1e-8)
+
+
+def test_rotations_are_found_in_scaled_and_negated_matrices() -> None:
+    rotations = camera_rotations([0.3, 2.0, -1.0], [0.2, -0.4, 0.1])
+    np.testing.assert_allclose(nearest_rotation(2.5 * rotations), rotations, atol=1e-12)
+    shared = np.array([0.3])
+    matrices = ROTATION.matrices(rotations.reshape(-1, 9), shared).matrices
+    np.testing.assert_allclose(
+        ROTATION.poses_from(-3.0 * matrices, shared, np.zeros((3, 2))), rotations.reshape(-1, 9), atol=1e-12
+    )
+    turned = rotation_from_vector(np.array([[0.0, 0.2, 0.0], [0.0, 3.0, 0.0]]))
+    np.testing.assert_allclose(turned[0] @ turned[0].T, np.eye(3), atol=1e-12)
+    assert np.arccos((np.trace(turned[0]) - 1) / 2) == pytest.approx(0.2)
+    assert np.arccos((np.trace(turned[1]) - 1) / 2) == pytest.approx(0.5)  # long steps are shortened
+
+
+@pytest.mark.parametrize("pitch", [-0.5, 0.0, 0.4])
+def test_the_horizon_is_level_whatever_the_frame(pitch: float) -> None:
+    headings = np.radians([0, 25, 55, 90, 130])
+    level = camera_rotations(headings, pitch)
+    anyhow = level @ camera_rotations(0.7, 0.5, -0.9)[0]
+    frame = level_frame(anyhow, 2)
+    ahead = (anyhow @ frame.T)[:, 2]
+    np.testing.assert_allclose(ahead[:, 1], -np.sin(pitch), atol=1e-9)
+    # The middle of what is shown lies ahead.
+    middle = np.degrees(np.arctan2(ahead[:, 0], ahead[:, 2]))
+    assert middle.min() == pytest.approx(-65.0, abs=1e-6)
+    assert middle.max() == pytest.approx(65.0, abs=1e-6)
+
+
+def test_a_full_turn_has_the_reference_picture_ahead() -> None:
+    rotations = camera_rotations(np.arange(12) * np.pi / 6)
+    ahead = (rotations @ level_frame(rotations, 5).T)[5, 2]
+    np.testing.assert_allclose(ahead, (0.0, 0.0, 1.0), atol=1e-9)
+
+
+def test_a_full_turn_closes_and_gives_lens_and_focal_length() -> None:
+    rng = np.random.default_rng(5)
+    rotations = panorama_rotations(13, 2 * np.pi / 13, seed=5)
+    cameras = [Camera(LENS.image_size).with_focal()] * 13
+    found = align(cameras, _links(rotations, rng, noise=0.1))
+    assert found.model == "rotation"
+    assert found.used.all()
+    assert found.on_sphere
+    assert found.distortion == pytest.approx(-0.2, abs=0.002)
+    assert found.focal is not None
+    assert found.focal * LENS.half_diagonal == pytest.approx(554.0, rel=0.003)
+    middle = np.array([(319.5, 239.5)])
+    for i in range(13):
+        j = (i + 1) % 13
+        k = np.diag([554.0, 554.0, 1.0])
+        ray = k @ rotations[j] @ rotations[i].T @ np.array([0.0, 0.0, 1.0])
+        truth = LENS.distort(ray[:2] / ray[2] + LENS.center)
+        assert np.linalg.norm(found.transfer(i, j, middle)[0] - truth) < 0.1
+
+
+def test_a_shift_over_a_plane_is_no_turn() -> None:
+    rng = np.random.default_rng(8)
+    cameras = [Camera(LENS.image_size).with_focal()] * 4
+    links = []
+    for i in range(4):
+        for j in range(i + 1, min(i + 3, 4)):
+            h = np.eye(3)
+            h[:2, 2] = np.array([-0.4, 0.05]) * (j - i)
+            points = rng.uniform((0, 0), (639, 479), (300, 2))
+            flat = LENS.normalize(LENS.undistort(points)) + h[:2, 2]
+            seen = LENS.distort(LENS.denormalize(flat))
+            inside = ((seen >= 0) & (seen < (640, 480))).all(axis=1)
+            noisy = [p[inside] + 0.3 * rng.standard_normal((int(inside.sum()), 2)) for p in (points, seen)]
+            relation = RadialHomography(h, LENS, LENS, np.ones(len(noisy[0]), dtype=np.bool_), distortion_std=0.01)
+            links.append(Link(i, j, noisy[0], noisy[1], relation))
+    assert align(cameras, links).model == "rigid"
+    forced = align(cameras, links, AlignmentOptions(model="rotation"))
+    assert forced.model == "rotation"
+    assert "as asked for" in forced.model_reason

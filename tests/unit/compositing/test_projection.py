@@ -1,0 +1,179 @@
+"""Projections, the canvas of a panorama, and the join of a full turn."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from rdstitch.camera import Camera
+from rdstitch.compositing import Canvas, Composite, CompositeOptions, compose, plan_panorama
+from rdstitch.compositing.panorama_canvas import choose_projection, view_of
+from rdstitch.compositing.photo_sphere import center_of_view, field_of_view, photo_sphere_xmp
+from rdstitch.compositing.projection import PLANE, Projection
+from rdstitch.compositing.warp import plan_warp
+from rdstitch.errors import ArgumentError, LimitError
+from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, turning_sequence
+from rdstitch.synthetic.rendering import Photometry
+from tests.compositing_scenes import as_picture, gradient, grey
+
+NAMES = ("plane", "cylinder", "sphere", "mercator")
+LENS = Camera((160, 120), -0.2, focal=110.0, focal_source="option")
+
+
+def _directions(rotations: np.ndarray) -> np.ndarray:
+    """What the alignment gives: from undistorted coordinates, in half diagonals, to directions."""
+    assert LENS.focal is not None
+    return np.swapaxes(rotations, 1, 2) @ np.diag([1.0, 1.0, LENS.focal / LENS.half_diagonal])
+
+
+def _panorama(rotations: np.ndarray, gains: float = 0.0) -> tuple[TurningSequence, np.ndarray]:
+    gain = np.exp(np.random.default_rng(1).normal(0.0, gains, len(rotations)))
+    return turning_sequence(LENS, rotations, seed=4, photometry=Photometry(gain=gain)), _directions(rotations)
+
+
+def _composed(
+    sequence: TurningSequence, directions: np.ndarray, canvas: Canvas, options: CompositeOptions
+) -> Composite:
+    frames = sequence.frames()
+    return compose([partial(as_picture, frame) for frame in frames], [LENS] * len(frames), directions, canvas, options)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_directions_come_back(name: str) -> None:
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(200, 3))
+    directions[:, 2] = np.abs(directions[:, 2]) if name == "plane" else directions[:, 2]
+    places = Projection(name).project(directions)
+    back = np.stack(np.broadcast_arrays(*Projection(name).directions(*places.T)), axis=-1)
+    np.testing.assert_allclose(
+        back / np.linalg.norm(back, axis=1, keepdims=True),
+        directions / np.linalg.norm(directions, axis=1, keepdims=True),
+        atol=1e-9,
+    )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_near_the_horizon_all_agree(name: str) -> None:
+    direction = np.array([[1e-4, 2e-4, 1.0]])
+    np.testing.assert_allclose(Projection(name).project(direction), [[1e-4, 2e-4]], atol=1e-11)
+
+
+def test_the_projection_follows_the_view() -> None:
+    lens = [LENS]
+    narrow = view_of(lens, _directions(camera_rotations(0.0)))
+    assert choose_projection(narrow) == PLANE
+    wide = view_of(lens * 4, _directions(camera_rotations(np.radians([-60, -20, 20, 60]))))
+    assert choose_projection(wide).name == "cylinder"
+    high = view_of(lens * 2, _directions(camera_rotations([0.0, 0.0], np.radians([30.0, -30.0]))))
+    assert choose_projection(high).name == "sphere"
+    around = view_of(lens * 9, _directions(camera_rotations(np.arange(9) * 2 * np.pi / 9)))
+    assert around.around
+    assert choose_projection(around).name == "sphere"
+
+
+@pytest.mark.parametrize("heading", [0.0, 2.0, np.pi])
+def test_the_edge_lies_where_nothing_is_shown(heading: float) -> None:
+    headings = heading + np.radians([-100, -50, 0, 50, 100])
+    view = view_of([LENS] * 5, _directions(camera_rotations(headings)))
+    assert not view.around
+    width, _ = view.extent
+    assert width < np.radians(290)
+    canvas = plan_panorama([LENS] * 5, _directions(camera_rotations(headings)), projection="sphere")
+    for box in canvas.boxes():
+        assert box[2] - box[0] < 0.3 * canvas.size[0]
+
+
+@pytest.mark.parametrize("name", ["cylinder", "sphere", "mercator"])
+@pytest.mark.parametrize("rotate", [0.0, 15.0])
+def test_points_of_a_picture_come_back_through_the_warp(name: str, rotate: float) -> None:
+    rotations = camera_rotations([0.4, -0.5], [0.2, -0.1], [0.1, 0.2])
+    directions = _directions(rotations)
+    canvas = plan_panorama([LENS] * 2, directions, projection=name, rotate=rotate)
+    px = np.random.default_rng(0).uniform((0, 0), (159, 119), (50, 2))
+    for index in range(2):
+        places = canvas.place(LENS, directions[index], px)
+        assert ((places > -0.6) & (places < np.array(canvas.size) - 0.4)).all()
+        warp = plan_warp(LENS, directions[index], canvas, index)
+        np.testing.assert_allclose(warp.source_points(places[:, 0], places[:, 1]), px, atol=1e-6)
+        assert warp.shrink == pytest.approx(1.0, rel=0.3)
+
+
+def test_what_a_projection_cannot_show_is_refused_by_name() -> None:
+    up = _directions(camera_rotations([0.0, 0.5], [0.0, 1.4]))
+    with pytest.raises(LimitError, match=r"b.png.*--projection sphere"):
+        plan_panorama([LENS] * 2, up, projection="cylinder", names=["a.png", "b.png"])
+    around = _directions(camera_rotations(np.arange(9) * 2 * np.pi / 9))
+    with pytest.raises(ArgumentError, match="rotate"):
+        plan_panorama([LENS] * 9, around, rotate=10.0)
+    with pytest.raises(LimitError):
+        plan_panorama([LENS] * 9, around, projection="plane")
+
+
+OPTIONS = {
+    "multiband": CompositeOptions(),
+    "feather": CompositeOptions(blend="feather", seam="voronoi"),
+    "no seam": CompositeOptions(seam="none", exposure="none"),
+    "small tiles": CompositeOptions(tile_size=256, workers=2),
+}
+
+
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
+def test_a_full_turn_is_joined_without_a_seam(options: CompositeOptions) -> None:
+    """The step across the edge is no larger than any other step between neighbouring columns."""
+    rotations = camera_rotations(0.3 + np.arange(9) * 2 * np.pi / 9)
+    sequence, directions = _panorama(rotations, gains=0.2)
+    canvas = plan_panorama([LENS] * 9, directions)
+    assert canvas.period == canvas.size[0]
+    assert canvas.period % 32 == 0
+    found = _composed(sequence, directions, canvas, options)
+    assert found.canvas.size == canvas.size
+    values = grey(found.pixels)
+    rows = (found.alpha > 0).all(axis=1)
+    steps = np.abs(values[rows] - np.roll(values[rows], 1, axis=1)).mean(axis=0)
+    assert steps[0] < np.quantile(steps, 0.99)
+    # Shown from another heading, the same sphere is the same picture, moved.
+    turn = 2 * np.pi * 96 / canvas.size[0]
+    turned = _directions(rotations @ camera_rotations(turn)[0].T)
+    moved = _composed(sequence, turned, plan_panorama([LENS] * 9, turned), options)
+    back = np.roll(grey(moved.pixels), 96, axis=1)
+    differences = np.abs(back - values)[rows]
+    assert np.median(differences) < 0.005
+    assert np.mean(differences > 0.05) < 0.01
+
+
+def test_poles_are_shown_whole() -> None:
+    rotations = camera_rotations([*(np.arange(8) * np.pi / 4), 0.0], [*[0.9] * 8, np.pi / 2])
+    sequence, directions = _panorama(rotations)
+    canvas = plan_panorama([LENS] * 9, directions)
+    assert canvas.boxes()[8][0] == 0
+    assert canvas.boxes()[8][2] == canvas.size[0]
+    found = _composed(sequence, directions, canvas, CompositeOptions())
+    assert (found.alpha[: canvas.size[1] // 3] > 0).all()
+
+
+def test_cropping_a_full_turn_keeps_its_width() -> None:
+    sequence, directions = _panorama(camera_rotations(np.arange(9) * 2 * np.pi / 9, 0.0, [0.05, -0.05, 0.0] * 3))
+    canvas = plan_panorama([LENS] * 9, directions)
+    found = _composed(sequence, directions, canvas, CompositeOptions(crop="auto"))
+    assert found.canvas.size[0] == canvas.size[0]
+    assert found.canvas.size[1] < canvas.size[1]
+    assert (found.alpha > 0).all()
+    assert gradient(grey(found.pixels)).mean() > 0.0
+
+
+def test_viewers_are_told_which_part_of_the_sphere_it_is() -> None:
+    rotations = camera_rotations(np.arange(9) * 2 * np.pi / 9, 0.2)
+    canvas = plan_panorama([LENS] * 9, _directions(rotations))
+    width, height = canvas.size
+    text = photo_sphere_xmp(canvas).decode()
+    assert f'GPano:FullPanoWidthPixels="{width}"' in text
+    assert f'GPano:FullPanoHeightPixels="{width // 2}"' in text
+    assert f'GPano:CroppedAreaImageHeightPixels="{height}"' in text
+    low, high = view_of([LENS] * 9, _directions(rotations)).bounds
+    top = (np.pi / 2 + low[1]) * width / (2 * np.pi)
+    assert f'GPano:CroppedAreaTopPixels="{round(top)}"' in text
+    across, down = field_of_view(canvas)
+    assert across == pytest.approx(2 * np.pi)
+    assert down == pytest.approx(high[1] - low[1], abs=2 / 110)
+    assert center_of_view(canvas)[1] == pytest.approx((low[1] + high[1]) / 2, abs=1 / 110)
+    assert photo_sphere_xmp(plan_panorama([LENS] * 9, _directions(rotations), projection="cylinder")) == b""
