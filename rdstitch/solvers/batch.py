@@ -4,7 +4,7 @@ Inside a solver the points of both pictures are one array of shape (2, 2, k, b):
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Self
 
 import numpy as np
@@ -63,11 +63,13 @@ def solve_in_blocks(solve: BlockSolver, x1: ArrayLike, x2: ArrayLike, count: int
             block = slice(start, start + block_size)
             points = np.ascontiguousarray(np.stack([a[block].T, b[block].T], axis=1))
             part = solve(points, index[block])
-            parts.append(Solutions(index[part.sample + start], part.homography, part.distortion))
+            parts.append(replace(part, sample=index[part.sample + start]))
     if len(parts) < 2:
         return parts[0] if parts else Solutions.empty()
+    focal = [part.focal for part in parts if part.focal is not None]
     return Solutions(
         np.concatenate([part.sample for part in parts]),
         np.concatenate([part.homography for part in parts]),
         np.concatenate([part.distortion for part in parts]),
+        None if not focal else np.concatenate(focal),
     )

@@ -64,7 +64,7 @@ def four_point_dlt(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike) -> Solut
     ArgumentError
         When a shape is wrong.
     """
-    lam = _distortions(distortion, x1)
+    lam = distortions(distortion, x1)
 
     def solve(points: FloatArray, samples: IndexArray) -> Solutions:
         own = lam[samples]
@@ -79,7 +79,7 @@ def four_point_dlt(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike) -> Solut
 def _motion(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike, tilt: ArrayLike, *, height_free: bool) -> Solutions:
     """Motion in the plane from two points."""
     rotations = TiltRotations.from_tilt(tilt, np.shape(x1)[0] if np.ndim(x1) else 0)
-    lam = _distortions(distortion, x1)
+    lam = distortions(distortion, x1)
 
     def solve(points: FloatArray, samples: IndexArray) -> Solutions:
         own, rotation = lam[samples], rotations.take(samples)
@@ -91,8 +91,8 @@ def _motion(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike, tilt: ArrayLike
     return solve_in_blocks(solve, x1, x2, 2)
 
 
-def _distortions(distortion: ArrayLike, x1: ArrayLike) -> FloatArray:
-    """λ of every sample."""
+def distortions(distortion: ArrayLike, x1: ArrayLike) -> FloatArray:
+    """λ of every sample of a batch, from one for all or one for each."""
     lam = np.asarray(distortion, dtype=np.float64)
     count = np.shape(x1)[0] if np.ndim(x1) == 3 else 1
     if lam.shape not in ((), (count,)) or not np.isfinite(lam).all():

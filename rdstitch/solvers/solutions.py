@@ -22,11 +22,14 @@ class Solutions:
         ``p2(λ) ~ H p1(λ)`` with the sign that keeps the sample's points in front of the camera.
     distortion : ndarray of shape (M,)
         λ in the frame of the points.
+    focal : ndarray of shape (M,), optional
+        Focal length in the unit of the points, from solvers that find it.
     """
 
     sample: NDArray[np.intp]
     homography: FloatArray
     distortion: FloatArray
+    focal: FloatArray | None = None
 
     def __len__(self) -> int:
         """Number of solutions."""

@@ -18,6 +18,7 @@ from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, panor
 from rdstitch.synthetic.poses import Poses, fit_to_plane
 from rdstitch.synthetic.relief import RELIEFS, Relief, boxes, hills, ridges
 from rdstitch.synthetic.rendering import Photometry, Sequence, sequence_over
+from rdstitch.synthetic.rotation_instances import RotationInstances, rotation_instances
 from rdstitch.synthetic.textures import (
     EndlessTexture,
     LinedTexture,
@@ -43,6 +44,7 @@ __all__ = [
     "PlanarInstances",
     "Poses",
     "Relief",
+    "RotationInstances",
     "Sequence",
     "SyntheticMatches",
     "Texture",
@@ -67,6 +69,7 @@ __all__ = [
     "planar_instances",
     "repeated",
     "ridges",
+    "rotation_instances",
     "rotation_poses",
     "sequence_over",
     "survey_poses",

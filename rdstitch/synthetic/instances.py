@@ -159,7 +159,7 @@ def planar_instances(
         middle = _rigid_in_plane(motion[which])
         return rotation2[which] @ middle @ np.swapaxes(rotation[which], 1, 2)
 
-    x1, x2, h = _visible_points(rng, lam, rotation[:, :, 2], points, half_size, overlap, draw)
+    x1, x2, h = visible_points(rng, lam, rotation[:, :, 2], points, half_size, overlap, draw)
     return PlanarInstances(
         x1=x1 + noise * rng.standard_normal(x1.shape),
         x2=x2 + noise * rng.standard_normal(x2.shape),
@@ -203,7 +203,7 @@ def general_instances(
         t *= (rng.uniform(*translation, len(which)) / np.linalg.norm(t, axis=1))[:, None]
         return attitude @ turn @ (np.eye(3) - t[:, :, None] * normal[which][:, None, :])
 
-    x1, x2, h = _visible_points(rng, lam, normal, points, half_size, overlap, draw)
+    x1, x2, h = visible_points(rng, lam, normal, points, half_size, overlap, draw)
     return Instances(
         x1=x1 + noise * rng.standard_normal(x1.shape),
         x2=x2 + noise * rng.standard_normal(x2.shape),
@@ -212,7 +212,7 @@ def general_instances(
     )
 
 
-def _visible_points(
+def visible_points(
     rng: np.random.Generator,
     distortion: FloatArray,
     normal: FloatArray,

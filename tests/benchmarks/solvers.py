@@ -18,7 +18,7 @@ import scipy.linalg
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
 from rdstitch.solvers import Solutions
-from rdstitch.synthetic import Instances, PlanarInstances, general_instances, planar_instances
+from rdstitch.synthetic import Instances, PlanarInstances, general_instances, planar_instances, rotation_instances
 
 INSTANCES = 20_000
 BATCH = 4096
@@ -63,6 +63,7 @@ def cases(seed: int, count: int, known_tilt: float) -> list[Case]:
     scaled, tilt_scaled = told(3, height=(0.75, 1.3))
     three, four = (planar_instances(count, points, seed=seed) for points in (3, 4))
     free_four, five = (general_instances(count, points, seed=seed) for points in (4, 5))
+    turned_two, turned_three = (rotation_instances(count, points, seed=seed) for points in (2, 3))
     return [
         Case(solvers.two_point, two, "small", tilt_two),
         Case(solvers.three_point, three, "small"),
@@ -73,6 +74,9 @@ def cases(seed: int, count: int, known_tilt: float) -> list[Case]:
         Case(solvers.two_point_rigid, two, "small", tilt_two, two.distortion),
         Case(solvers.two_point_similarity, scaled_two, "small", tilt_scaled_two, scaled_two.distortion),
         Case(solvers.four_point_dlt, free_four, "small", distortion=free_four.distortion),
+        Case(solvers.rotation_two_point, turned_two, "small"),
+        Case(solvers.rotation_three_point, turned_three, "small"),
+        Case(solvers.rotation_two_point_focal, turned_two, "small", distortion=turned_two.distortion),
     ]
 
 

@@ -9,7 +9,7 @@ import pytest
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
 from rdstitch.solvers import Solutions
-from rdstitch.synthetic import Instances, PlanarInstances, general_instances, planar_instances
+from rdstitch.synthetic import Instances, PlanarInstances, general_instances, planar_instances, rotation_instances
 
 COUNT = 4000
 SEED = 424_242
@@ -21,6 +21,14 @@ KINDS: dict[str, dict[str, Any]] = {
     "large motion": {"translation": (0.5, 1.0), "overlap": 0.05},
     "small yaw": {"yaw": (-0.1, 0.1)},
     "narrow": {"half_size": (0.4, 0.3)},
+    "wide": {"half_size": (1.1, 0.8), "distortion": (-0.5, 0.0)},
+    "pincushion": {"distortion": (0.0, 0.3)},
+}
+
+ROTATIONS: dict[str, dict[str, Any]] = {
+    "any roll": {},
+    "small turn": {"angle": (0.03, 0.15), "roll": 0.05},
+    "narrow": {"half_size": (0.4, 0.3), "angle": (0.05, 0.4)},
     "wide": {"half_size": (1.1, 0.8), "distortion": (-0.5, 0.0)},
     "pincushion": {"distortion": (0.0, 0.3)},
 }
@@ -83,6 +91,39 @@ def test_known_distortion() -> None:
     check(scaled, solvers.two_point_similarity(scaled.x1, scaled.x2, scaled.distortion, tilts(scaled)), 1.0)
     free = general_instances(COUNT, 4, seed=SEED)
     check(free, solvers.four_point_dlt(free.x1, free.x2, free.distortion), 0.9995)
+
+
+@pytest.mark.parametrize("kind", ROTATIONS)
+def test_rotation(kind: str) -> None:
+    known = rotation_instances(COUNT, 2, seed=SEED, **ROTATIONS[kind])
+    check(known, solvers.rotation_two_point(known.x1, known.x2), 0.9995, 1e-13)
+    free = rotation_instances(COUNT, 3, seed=SEED, focal=(0.6, 3.0), **ROTATIONS[kind])
+    found = solvers.rotation_three_point(free.x1, free.x2)
+    check(free, found, 0.999)
+    true = np.abs(found.distortion - free.distortion[found.sample]) < 1e-9
+    assert found.focal is not None
+    assert np.median(np.abs(found.focal / free.focal[found.sample] - 1.0)[true]) < 1e-10
+    lens = solvers.rotation_two_point_focal(free.x1[:, :2], free.x2[:, :2], free.distortion)
+    assert lens.focal is not None
+    best = np.full(COUNT, np.inf)
+    np.minimum.at(best, lens.sample, np.abs(lens.focal / free.focal[lens.sample] - 1.0))
+    assert np.mean(best < 1e-3) >= 0.999
+    assert np.median(best) < 1e-12
+
+
+def test_rotations_are_rotations_whatever_the_noise() -> None:
+    noisy = rotation_instances(500, 3, seed=SEED, noise=3e-3)
+    for found, focal in (
+        (solvers.rotation_two_point(noisy.x1[:, :2], noisy.x2[:, :2]), None),
+        (solvers.rotation_three_point(noisy.x1, noisy.x2), "found"),
+    ):
+        length = np.ones(len(found)) if focal is None else found.focal
+        assert length is not None
+        k = np.stack([length, length, np.ones(len(found))], axis=-1)
+        rotation = found.homography * (k[:, None, :] / k[:, :, None])
+        products = rotation @ np.swapaxes(rotation, 1, 2)
+        np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), products.shape), atol=1e-9)
+        assert (np.linalg.det(rotation) > 0.0).all()
 
 
 def test_homographies_have_the_scale_of_planar_motion() -> None:

@@ -14,7 +14,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.planar_motion import rotation_from_tilt
 from rdstitch.radial_homography import lift, transfer
 from rdstitch.solvers import Solutions
-from rdstitch.synthetic import planar_instances
+from rdstitch.synthetic import planar_instances, rotation_instances
 
 TILT = (0.12, -0.2)
 
@@ -28,6 +28,8 @@ class Case:
     solve: Callable[..., Solutions]
     exact: bool = True
     """Whether solutions fit all points of the sample."""
+    turns: bool = False
+    """Whether it is for a camera that turns on the spot."""
 
 
 CASES = [
@@ -37,16 +39,23 @@ CASES = [
     Case("four_point", 4, solvers.four_point),
     Case("five_point", 5, solvers.five_point, exact=False),
     Case("five_point_qep", 5, solvers.five_point_qep, exact=False),
+    Case("rotation_two_point", 2, solvers.rotation_two_point, turns=True),
+    Case("rotation_three_point", 3, solvers.rotation_three_point, exact=False, turns=True),
     Case("two_point_rigid", 2, partial(solvers.two_point_rigid, distortion=-0.3, tilt=TILT)),
     Case("two_point_similarity", 2, partial(solvers.two_point_similarity, distortion=-0.3, tilt=TILT)),
     Case("four_point_dlt", 4, partial(solvers.four_point_dlt, distortion=-0.3)),
+    Case("rotation_two_point_focal", 2, partial(solvers.rotation_two_point_focal, distortion=-0.3), turns=True),
 ]
 every_solver = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-searching = pytest.mark.parametrize("case", CASES[:6], ids=lambda case: case.name)
+searching = pytest.mark.parametrize("case", CASES[:8], ids=lambda case: case.name)
 
 
-def samples(count: int, batch: int = 300, noise: float = 0.0) -> tuple[FloatArray, FloatArray]:
-    """Points of planar motions with the tilt and the λ that the cases are told, the same for all."""
+def samples(case: "Case | int", batch: int = 300, noise: float = 0.0) -> tuple[FloatArray, FloatArray]:
+    """Points of planar motions with the tilt and the λ that the cases are told, or of rotations with that λ."""
+    count = case.count if isinstance(case, Case) else case
+    if isinstance(case, Case) and case.turns:
+        turned = rotation_instances(batch, count, seed=7, distortion=(-0.3, -0.3), noise=noise)
+        return turned.x1, turned.x2
     instances = planar_instances(batch, count, seed=7, distortion=(-0.3, -0.3), max_tilt=0.0, noise=noise)
     if count == 2:
         return tilted(instances.x1), tilted(instances.x2)
@@ -60,7 +69,7 @@ def tilted(points: FloatArray) -> FloatArray:
 
 @every_solver
 def test_solutions_are_sorted_finite_and_in_front(case: Case) -> None:
-    x1, x2 = samples(case.count, noise=1e-3)
+    x1, x2 = samples(case, noise=1e-3)
     found = case.solve(x1, x2)
     assert len(found) > 150
     assert found.sample.dtype == np.intp
@@ -79,7 +88,7 @@ def test_solutions_are_sorted_finite_and_in_front(case: Case) -> None:
 def test_solutions_fit_the_sample_that_they_solve(case: Case) -> None:
     if not case.exact or "point_rigid" in case.name:
         pytest.skip("leaves part of the sample to the data")
-    x1, x2 = samples(case.count, noise=1e-3)
+    x1, x2 = samples(case, noise=1e-3)
     found = case.solve(x1, x2)
     for i, (h, lam) in enumerate(zip(found.homography, found.distortion, strict=True)):
         sample = found.sample[i]
@@ -90,7 +99,7 @@ def test_solutions_fit_the_sample_that_they_solve(case: Case) -> None:
 def test_range_is_respected_and_complete(case: Case) -> None:
     if case.name == "five_point_qep":
         pytest.skip("weighs its equations by the range")
-    x1, x2 = samples(case.count, noise=3e-3)
+    x1, x2 = samples(case, noise=3e-3)
     wide = case.solve(x1, x2, distortion_range=(-1.5, 0.5))
     narrow = case.solve(x1, x2, distortion_range=(-0.6, -0.1))
     assert ((narrow.distortion > -0.6) & (narrow.distortion < -0.1)).all()
@@ -101,7 +110,7 @@ def test_range_is_respected_and_complete(case: Case) -> None:
 
 @every_solver
 def test_one_sample_needs_no_batch_axis(case: Case) -> None:
-    x1, x2 = samples(case.count)
+    x1, x2 = samples(case)
     single, batch = case.solve(x1[0], x2[0]), case.solve(x1[:1], x2[:1])
     assert len(single) > 0
     assert np.array_equal(single.sample, np.zeros(len(single)))
@@ -110,7 +119,7 @@ def test_one_sample_needs_no_batch_axis(case: Case) -> None:
 
 @every_solver
 def test_a_sample_does_not_depend_on_its_batch(case: Case) -> None:
-    x1, x2 = samples(case.count, batch=40, noise=1e-3)
+    x1, x2 = samples(case, batch=40, noise=1e-3)
     together = case.solve(x1, x2)
     for i in range(0, 40, 7):
         alone = case.solve(x1[i], x2[i])
@@ -129,7 +138,7 @@ def test_an_empty_batch_has_no_solution(case: Case) -> None:
 @every_solver
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_samples_that_are_not_finite_are_skipped(case: Case, value: float) -> None:
-    x1, x2 = samples(case.count, batch=5)
+    x1, x2 = samples(case, batch=5)
     expected = case.solve(x1, x2)
     x1[1, 0, 1] = value
     x2[3, -1, 0] = value
@@ -142,7 +151,7 @@ def test_samples_that_are_not_finite_are_skipped(case: Case, value: float) -> No
 @every_solver
 @pytest.mark.parametrize("picture", [0, 1, 2])
 def test_coincident_points_have_no_solution(case: Case, picture: int) -> None:
-    x1, x2 = samples(case.count, batch=50)
+    x1, x2 = samples(case, batch=50)
     if picture != 1:
         x1[:, 1] = x1[:, 0]
     if picture != 0:
@@ -158,7 +167,7 @@ def test_all_points_at_the_centre_have_no_solution(case: Case) -> None:
 
 @every_solver
 def test_huge_coordinates_are_refused_quietly(case: Case) -> None:
-    x1, x2 = samples(case.count, batch=4)
+    x1, x2 = samples(case, batch=4)
     assert len(case.solve(1e200 * x1, 1e200 * x2)) == 0
 
 
@@ -197,7 +206,7 @@ def test_pictures_of_different_shape_raise(case: Case) -> None:
 @searching
 @pytest.mark.parametrize("limits", [(0.5, -1.5), (0.1, 0.1), (np.nan, 0.5)])
 def test_an_empty_range_raises(case: Case, limits: tuple[float, float]) -> None:
-    x1, x2 = samples(case.count, batch=2)
+    x1, x2 = samples(case, batch=2)
     with pytest.raises(ArgumentError):
         case.solve(x1, x2, distortion_range=limits)
 

@@ -1,0 +1,133 @@
+"""Rays of a camera that turns on the spot, and the rotation between two bundles of them.
+
+Inside a solver the points of both pictures have shape (2, 2, k, b): coordinate, picture, point, sample. With the lens
+gone a measured point is the ray ``r = (x, g z)``, ``z = 1 + λ |x|²`` and g the focal length. A rotation keeps the
+angles between rays, so that their tangents agree:
+
+``(r_1 · r_2)² |r̂_1 × r̂_2|² = (r̂_1 · r̂_2)² |r_1 × r_2|²``,
+
+with ``r_1 · r_2 = x_1 · x_2 + g² z_1 z_2`` and ``|r_1 × r_2|² = (x_1 × x_2)² + g² |z_2 x_1 - z_1 x_2|²``. Both are
+linear in g², and for a known focal length of degree 2 in λ.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.solvers.batch import IndexArray, SampleArrays
+from rdstitch.solvers.lines import squared_radii
+from rdstitch.solvers.solutions import Solutions
+
+
+@dataclass(frozen=True)
+class RayPairs(SampleArrays):
+    """Pairs of rays, P of them in each sample.
+
+    Attributes
+    ----------
+    dot, cross : ndarray of shape (2, P, b)
+        ``x_1 · x_2`` and ``(x_1 × x_2)²``; picture, pair, sample.
+    depth : ndarray of shape (2, 2, P, b)
+        ``|x|²`` of the first and the second point: the slopes of their ``z``.
+    across : ndarray of shape (2, 2, 2, P, b)
+        Constants and slopes in λ of ``z_2 x_1 - z_1 x_2``; constant or slope, coordinate.
+    """
+
+    dot: FloatArray
+    cross: FloatArray
+    depth: FloatArray
+    across: FloatArray
+
+    @classmethod
+    def between(cls, first: FloatArray, second: FloatArray) -> "RayPairs":
+        """Of points (2, 2, P, b) each."""
+        (xa, ya), (xb, yb) = first, second
+        ra, rb = squared_radii(first), squared_radii(second)
+        turn = xa * yb - ya * xb
+        across = np.stack([first - second, np.stack([rb * xa - ra * xb, rb * ya - ra * yb])])
+        return cls(xa * xb + ya * yb, turn * turn, np.stack([ra, rb]), across)
+
+    def products(self, distortion: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """``z_1 z_2`` and ``|z_2 x_1 - z_1 x_2|²`` for λ of shape (..., b); shape (2, P, ..., b) each."""
+        depth, across = (_spread(values, distortion) for values in (self.depth, self.across))
+        x, y = across[0] + across[1] * distortion
+        first, second = 1.0 + depth * distortion
+        return first * second, x * x + y * y
+
+    def tangents_differ(self, distortion: FloatArray, focal2: FloatArray) -> FloatArray:
+        """The difference of both sides of the equation for λ and g² of shape (..., b); shape (P, ..., b)."""
+        product, length = self.products(distortion)
+        dot = _spread(self.dot, distortion) + focal2 * product
+        cross = _spread(self.cross, distortion) + focal2 * length
+        value: FloatArray = dot[0] * dot[0] * cross[1] - dot[1] * dot[1] * cross[0]
+        return value
+
+    def same_side(self, distortion: FloatArray, focal2: FloatArray) -> BoolArray:
+        """Whether all angles, (b,), are acute or obtuse in both pictures alike, which tangents squared do not say."""
+        dot = self.dot + focal2 * self.products(distortion)[0]
+        return np.asarray((dot[0] * dot[1] > 0.0).all(axis=0))
+
+
+def _spread(values: FloatArray, distortion: FloatArray) -> FloatArray:
+    """Values (..., b) that broadcast against λ of shape (..., b)."""
+    return values.reshape(*values.shape[:-1], *[1] * (distortion.ndim - 1), values.shape[-1])
+
+
+def rays(points: FloatArray, distortion: FloatArray, focal: FloatArray | float = 1.0) -> FloatArray:
+    """Unit rays (3, 2, k, b) of points (2, 2, k, b) for one λ and one focal length a sample."""
+    found = np.concatenate([points, (focal * (1.0 + distortion * squared_radii(points)))[None]])
+    unit: FloatArray = found / np.sqrt((found * found).sum(axis=0))
+    return unit
+
+
+def rotation_of_two(bundle: FloatArray) -> FloatArray:
+    """Rotations (b, 3, 3) that turn the rays of picture 1 to those of picture 2 best, for unit rays (3, 2, 2, b).
+
+    For two rays the least-squares rotation (Kabsch) turns their bisector and their plane into each other.
+    """
+    first, second = bundle[:, :, 0], bundle[:, :, 1]
+    along, apart = _unit(first + second), _unit(first - second)
+    normal = np.cross(along, apart, axis=0)
+    frames = np.stack([along, apart, normal], axis=1)
+    rotation: FloatArray = np.einsum("ikb,jkb->bij", frames[:, :, 1], frames[:, :, 0])
+    return rotation
+
+
+def rotation_of_many(bundle: FloatArray) -> FloatArray:
+    """The least-squares rotations (b, 3, 3) of unit rays (3, 2, k, b), by Kabsch's singular value decomposition."""
+    correlation = np.einsum("ikb,jkb->bij", bundle[:, 1], bundle[:, 0])
+    left, _, right = np.linalg.svd(correlation)
+    left[..., 2] *= np.where(np.linalg.det(left @ right) < 0.0, -1.0, 1.0)[:, None]
+    rotation: FloatArray = left @ right
+    return rotation
+
+
+def with_focal(rotation: FloatArray, focal: FloatArray) -> FloatArray:
+    """``K R K⁻¹``, ``K = diag(g, g, 1)``, of rotations (b, 3, 3) and focal lengths (b,)."""
+    k = np.stack([focal, focal, np.ones_like(focal)], axis=-1)
+    homography: FloatArray = rotation * (k[:, :, None] / k[:, None, :])
+    return homography
+
+
+def turned_solutions(
+    points: FloatArray,
+    sample: IndexArray,
+    distortion: FloatArray,
+    focal: FloatArray,
+    rotate: Callable[[FloatArray], FloatArray],
+) -> Solutions:
+    """Solutions from λ and focal lengths (b,) of points (2, 2, k, b); those that leave a point behind are left out."""
+    bundle = rays(points, distortion, focal)
+    rotation = rotate(bundle)
+    # In front of the camera of picture 2, whatever the errors of a sample that no rotation fits.
+    ahead = np.einsum("bj,jkb->kb", rotation[:, 2], bundle[:, 0])
+    kept = np.flatnonzero((ahead > 0.0).all(axis=0) & np.isfinite(rotation).all(axis=(1, 2)))
+    homography = with_focal(rotation[kept], focal[kept])
+    return Solutions(sample[kept], homography, distortion[kept], focal[kept])
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    unit: FloatArray = vectors / np.sqrt((vectors * vectors).sum(axis=0))
+    return unit
