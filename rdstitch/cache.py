@@ -20,10 +20,12 @@ from typing import Any, TypeVar
 
 from rdstitch.errors import ArgumentError, InputError, OutputError
 from rdstitch.io.packing import digest, pack, unpack
+from rdstitch.regular_files import open_regular, read_limited
 
 Value = TypeVar("Value")
 
 _FORMAT = 1
+_LARGEST_ENTRY = 2**31  # bytes
 _OPENCV = tuple(f"opencv-{kind}" for kind in ("contrib-python-headless", "contrib-python", "python-headless", "python"))
 _PACKAGES = ("numpy", "scipy", *_OPENCV, "pillow", "simplejpeg", "tifffile")
 
@@ -132,7 +134,7 @@ class Cache:
         if self.folder is None or path is None:
             return ""
         try:
-            with Path(path).open("rb") as stream:
+            with open_regular(path) as stream:
                 return hashlib.file_digest(stream, "sha256").hexdigest()
         except OSError:
             return os.urandom(16).hex()
@@ -176,7 +178,7 @@ def _name(file: Path) -> str:
 def _read(file: Path, kinds: tuple[type, ...]) -> list[Value]:
     """The result that a file holds; none where it is missing or damaged."""
     with suppress(InputError, ArgumentError, OSError):
-        kept: tuple[str, Value] = unpack(file.read_bytes(), kinds)
+        kept: tuple[str, Value] = unpack(read_limited(file, _LARGEST_ENTRY), kinds)
         if isinstance(kept, tuple) and kept[0] == _name(file):
             return [kept[1]]
     return []

@@ -10,14 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.errors import InputError
+from rdstitch.regular_files import read_limited
 
-_LARGEST_FILE = 256 * 2**20  # bytes; a sidecar of ten thousand pictures has about 30 MB
+LARGEST_FILE = 256 * 2**20  # bytes; a sidecar of ten thousand pictures has about 30 MB
 _LARGEST_SIDE = 10**7  # px
 _DEEPEST = 50  # objects and lists within one another
 
 
-def read_text(path: str | Path) -> str:
+def read_text(path: str | Path, *, regular: bool = True) -> str:
     """The text of a file of a reasonable size.
+
+    Parameters
+    ----------
+    path : path
+    regular : bool
+        Refuse pipes and devices, of which reading may not come to an end.
 
     Raises
     ------
@@ -25,12 +32,8 @@ def read_text(path: str | Path) -> str:
         When it cannot be read.
     """
     try:
-        with Path(path).open("rb") as stream:
-            data = stream.read(_LARGEST_FILE + 1)
-        if len(data) > _LARGEST_FILE:
-            raise InputError(f"{path}: too large to be such a file")
         # Names of files that are not UTF-8 are written as they are, and come back as they were.
-        return data.decode("utf-8-sig", "surrogateescape")
+        return read_limited(path, LARGEST_FILE, regular=regular).decode("utf-8-sig", "surrogateescape")
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from rdstitch.compositing import Canvas, Composite, CompositePlan
 from rdstitch.inputs.frame import ChannelOrder
+from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.output_image import OutputImage
@@ -28,6 +29,8 @@ class StitchResult(OutputImage):
         The picture itself; None where it went to a file, or was only planned.
     plan : CompositePlan or None
         Of a dry run.
+    fingerprint : Fingerprint or None
+        Size and digest of the file.
     """
 
     registration: Registration
@@ -36,6 +39,7 @@ class StitchResult(OutputImage):
     output: Path | None = None
     composite: Composite | None = None
     plan: CompositePlan | None = None
+    fingerprint: Fingerprint | None = None
 
     @property
     def ok(self) -> bool:

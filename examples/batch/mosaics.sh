@@ -10,9 +10,14 @@ mkdir -p "$out"
 job='
     out=$1 folder=$2
     shift 2
-    name=$(basename "$folder")
-    [ ! -e "$out/$name.tif" ] || exit 0
-    rdstitch mosaic "$folder" -o "$out/$name.tif" "$@" > /dev/null || {
+    picture=$out/$(basename "$folder").tif
+    if [ -e "$picture" ]; then
+        # The sidecar is written last and names its picture by digest: only both together are a result.
+        ! grep -qs "$(sha256sum < "$picture" | cut -d " " -f 1)" "$picture.json" || exit 0
+        echo "$picture: is not the picture that its sidecar names; remove both to make them again" >&2
+        exit 1
+    fi
+    rdstitch mosaic "$folder" -o "$picture" "$@" > /dev/null || {
         echo "$folder: exit status $?" >&2
         exit 1
     }

@@ -5,12 +5,17 @@ camera=$(realpath "$1") folder=$2 out=$3
 mkdir -p "$out"
 out=$(realpath "$out")
 cd "$folder"
+if [ "$out" -ef . ]; then
+    echo "$out: is the folder of the pictures; choose another one" >&2
+    exit 1
+fi
 
-status=0
-find . -type d -exec sh -c '
+job='
     camera=$1 out=$2 folder=$3
     # As many pictures as fit on one command line at a time; xargs without any input runs nothing.
     find "$folder" -maxdepth 1 -type f \( -iname "*.jpg" -o -iname "*.png" -o -iname "*.tif" \) -print0 |
         xargs -0 -r rdstitch undistort --camera "$camera" -o "$out/$folder" --overwrite
-' undistort_all.sh "$camera" "$out" '{}' \; || status=1
-exit $status
+'
+# OUT may lie within FOLDER: what is in it is no input.
+find . -type d \( -exec test '{}' -ef "$out" \; -prune -o -print0 \) |
+    xargs -0 -r -I '{}' sh -c "$job" undistort_all.sh "$camera" "$out" '{}' || exit 1

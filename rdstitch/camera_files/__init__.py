@@ -79,7 +79,18 @@ def save_camera(camera: Camera, path: str | Path) -> None:
     OutputError
         When the name says none, or the file cannot be written.
     """
-    write_text_atomic(path, _writer(Path(path))(camera))
+    write_text_atomic(path, camera_file_text(camera, path))
+
+
+def camera_file_text(camera: Camera, path: str | Path) -> str:
+    """What :func:`save_camera` writes into a file of this name.
+
+    Raises
+    ------
+    OutputError
+        When the name says no format.
+    """
+    return _writer(Path(path))(camera)
 
 
 def _writer(path: Path) -> Callable[[Camera], str]:

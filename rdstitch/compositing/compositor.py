@@ -16,8 +16,10 @@ from rdstitch.compositing.photo_sphere import photo_sphere_xmp
 from rdstitch.compositing.photometric import Exposure
 from rdstitch.compositing.preparation import OutputStrip, Progress, prepare
 from rdstitch.compositing.source_images import Preview, Source
+from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.io.layout import Layout
 from rdstitch.io.metadata import Metadata
+from rdstitch.io.outputs import Outputs
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_format, write_strips
 
@@ -60,12 +62,15 @@ class FileComposite:
     path : Path
     coverage : float
         Share of the output that pictures cover.
+    fingerprint : Fingerprint
+        Size and digest of the file.
     """
 
     path: Path
     canvas: Canvas
     exposure: Exposure
     coverage: float
+    fingerprint: Fingerprint
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
@@ -142,6 +147,8 @@ def compose_to_file(
     extra_tags: Callable[[Canvas], Iterable[ExtraTag]] | None = None,
     previews: Sequence[Preview] | None = None,
     exposures: Sequence[float | None] | None = None,
+    *,
+    outputs: Outputs | None = None,
 ) -> FileComposite:
     """Put pictures together straight into a file, whatever its size: memory is that of a strip of tiles.
 
@@ -156,6 +163,8 @@ def compose_to_file(
         Colour profile, EXIF and resolution to keep.
     extra_tags : callable, optional
         Gives further tags of a TIFF file for the canvas after cropping.
+    outputs : Outputs, optional
+        Where the file is staged, to be published with what belongs to it; without, it replaces what is there.
 
     Raises
     ------
@@ -187,6 +196,6 @@ def compose_to_file(
         tags = () if extra_tags is None else extra_tags(prepared.canvas)
         # Nothing goes on behind a writer that fails.
         with closing(prepared.strips(progress)) as strips:
-            write_strips(path, layout, counted(strips), tags)
+            written = write_strips(path, layout, counted(strips), tags, outputs=outputs)
     share = covered / (size[0] * size[1])
-    return FileComposite(Path(path), prepared.canvas, renderer.exposure, share, prepared.notes)
+    return FileComposite(Path(path), prepared.canvas, renderer.exposure, share, written, prepared.notes)

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.io.atomic import write_text_atomic
 from rdstitch.io.metadata import GpsPosition
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.radial_homography import to_plane
@@ -74,13 +73,11 @@ class Georeference:
             (_GEO_KEYS, _SHORT, len(keys), keys, True),
         ]
 
-    def write_beside(self, picture: str | Path) -> None:
-        """Write :func:`world_file_paths` a picture that has no place for them."""
-        world, system = world_file_paths(picture)
+    def world_file_texts(self) -> tuple[str, str]:
+        """The contents of :func:`world_file_paths`."""
         a, b = self.scale.real, self.scale.imag
         numbers = (a, b, b, -a, self.origin.real, self.origin.imag)
-        write_text_atomic(world, "".join(f"{number:.10f}\n" for number in numbers))
-        write_text_atomic(system, self._well_known_text() + "\n")
+        return "".join(f"{number:.10f}\n" for number in numbers), self._well_known_text() + "\n"
 
     def _well_known_text(self) -> str:
         zone, south = abs(self.zone), self.zone < 0

@@ -4,14 +4,20 @@ import glob
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from rdstitch.errors import InputError
 from rdstitch.inputs.frame import Frame, Named
 from rdstitch.io.decoding import FOREIGN_SUFFIXES
+from rdstitch.io.staging import temporary_folder
 from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames
-from rdstitch.records import read_text
+from rdstitch.messages import Message, names_of, shortened
+from rdstitch.records import LARGEST_FILE, read_text
+from rdstitch.regular_files import read_limited
 
 PICTURE_SUFFIXES = frozenset(
     (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".jp2", ".ppm", ".pgm", ".pnm", ".gif")
@@ -19,14 +25,54 @@ PICTURE_SUFFIXES = frozenset(
 """What counts as a picture in a folder; a file that is named is tried whatever it is called."""
 
 
+@dataclass(frozen=True)
+class FoundPictures:
+    """What the user's arguments stand for.
+
+    Attributes
+    ----------
+    frames : list of Frame
+        In natural order within a folder or pattern.
+    outputs : list of Path
+        Pictures in folders and patterns that rdstitch wrote, by the sidecars beside them, and that are no input.
+    """
+
+    frames: list[Frame]
+    outputs: list[Path]
+
+    @property
+    def messages(self) -> list[Message]:
+        """What the user should know of what was not taken."""
+        if not self.outputs:
+            return []
+        paths = [str(path) for path in self.outputs]
+        names = shortened(names_of(paths))
+        return [Message(f"not taken as input, since sidecars say that rdstitch wrote them: {names}", tuple(paths))]
+
+
+@contextmanager
+def found_pictures(
+    arguments: Iterable[Named], *, output: str | Path | None = None, every: int = 1
+) -> Iterator[FoundPictures]:
+    """The pictures of :func:`find_pictures`, of videos too, whose frames exist only inside the block."""
+    with ExitStack() as stack:
+
+        @cache
+        def frames_folder() -> Path:
+            return stack.enter_context(temporary_folder())
+
+        exclude = [] if output is None else [output]
+        yield find_pictures(arguments, exclude=exclude, frames_folder=frames_folder, every=every)
+
+
 def find_pictures(
     arguments: Iterable[Named],
     *,
     exclude: Iterable[str | Path] = (),
-    frames_folder: Path | None = None,
+    frames_folder: Callable[[], Path] | None = None,
     every: int = 1,
-) -> list[Frame]:
-    """The frames that the arguments stand for, in natural order within a folder or pattern.
+) -> FoundPictures:
+    """The frames that the arguments stand for.
 
     Parameters
     ----------
@@ -34,11 +80,10 @@ def find_pictures(
         Each a picture file, a folder, a pattern (``*``, ``?``, ``[...]``), ``@FILE`` with one argument a line or
         separated by NUL, a video file, or a frame, which stays as it is.
     exclude : iterable of path
-        Files that are no input, such as the output, where they come from a folder or pattern or are rdstitch's own
-        work. Any other picture that is named stays: its user must hear that it would be written over. Pictures in
-        folders and patterns beside which rdstitch wrote a sidecar are its own work and left out too.
-    frames_folder : Path, optional
-        Where frames of videos are written, losslessly; without it a video is refused.
+        Files that are no input, such as the output, where they come from a folder or pattern or rdstitch wrote them.
+        Any other picture that is named stays: its user must hear that it would be written over.
+    frames_folder : callable, optional
+        Gives the folder where frames of videos are written, losslessly; without it a video is refused.
     every : int
         Use every n-th video frame.
 
@@ -48,11 +93,19 @@ def find_pictures(
         When an argument names nothing.
     """
     unwanted = {_entry(Path(path)) for path in exclude}
-    return [
-        frame
-        for frame, named in _expand(arguments, frames_folder, every)
-        if _entry(frame.path) not in unwanted or (named and not _is_rdstitch_output(frame.path))
-    ]
+    frames: list[Frame] = []
+    outputs: list[Path] = []
+    for frame, named in _expand(arguments, frames_folder, every):
+        is_output = frame.picture is None and _is_rdstitch_output(frame.path)
+        if _entry(frame.path) in unwanted and (is_output or not named):
+            continue
+        if is_output and not named:
+            outputs.append(frame.path)
+        else:
+            frames.append(frame)
+    if outputs and not frames:
+        raise InputError(f"{outputs[0].parent}: there are no pictures but those that rdstitch wrote")
+    return FoundPictures(frames, outputs)
 
 
 def _entry(path: Path) -> Path:
@@ -67,7 +120,7 @@ def natural_key(path: Path) -> list[tuple[int, str | int]]:
 
 
 def _expand(
-    arguments: Iterable[Named], frames_folder: Path | None, every: int, lists: tuple[Path, ...] = ()
+    arguments: Iterable[Named], frames_folder: Callable[[], Path] | None, every: int, lists: tuple[Path, ...] = ()
 ) -> Iterator[tuple[Frame, bool]]:
     """Every frame, and whether it was named one by one; ``lists`` are those that the arguments come from."""
     for argument in arguments:
@@ -80,7 +133,9 @@ def _expand(
                 file = Path(text[1:])
                 if file in lists:
                     raise InputError(f"{file}: the list of pictures names itself")
-                yield from _expand(names_in(read_text(file)), frames_folder, every, (*lists, file))
+                # Another program may write the list while we read it: @<(find ...) in a shell.
+                names = names_in(read_text(file, regular=False))
+                yield from _expand(names, frames_folder, every, (*lists, file))
             elif glob.has_magic(text):
                 yield from ((Frame(found), False) for found in _matching(text))
             else:
@@ -90,7 +145,7 @@ def _expand(
         elif path.suffix.lower() in VIDEO_SUFFIXES:
             if frames_folder is None:
                 raise InputError(f"{path}: a video is no picture here; use 'rdstitch mosaic' or extract its frames")
-            yield from ((Frame(*frame), True) for frame in extract_frames(path, frames_folder, every))
+            yield from ((Frame(*frame), True) for frame in extract_frames(path, frames_folder(), every))
         else:
             yield Frame(path), True
 
@@ -115,7 +170,7 @@ def _in_folder(folder: Path) -> list[Path]:
         entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
     except OSError as error:
         raise InputError(f"{folder}: cannot read the folder: {error.strerror}") from error
-    found = [path for path in entries if path.suffix.lower() in PICTURE_SUFFIXES and not _is_rdstitch_output(path)]
+    found = [path for path in entries if path.suffix.lower() in PICTURE_SUFFIXES]
     # Many cameras write a raw file beside each picture.
     stems = {path.stem for path in found}
     found += [path for path in entries if path.suffix.lower() in FOREIGN_SUFFIXES and path.stem not in stems]
@@ -126,17 +181,16 @@ def _in_folder(folder: Path) -> list[Path]:
 
 def _matching(pattern: str) -> list[Path]:
     matching = map(Path, glob.glob(pattern))  # noqa: PTH207 - a pattern may be absolute
-    found = [path for path in matching if path.is_file() and not _is_rdstitch_output(path)]
+    found = [path for path in matching if path.is_file()]
     if not found:
         raise InputError(f"{pattern}: no file matches this pattern")
     return sorted(found, key=natural_key)
 
 
 def _is_rdstitch_output(path: Path) -> bool:
-    """Whether rdstitch made this picture: the sidecar beside it says so."""
-    sidecar = path.with_name(path.name + ".json")
+    """Whether rdstitch wrote this picture: the sidecar beside it says so, and means this one."""
     try:
-        with sidecar.open(encoding="utf-8") as stream:
-            return bool(json.loads(stream.read()).get("format") == "rdstitch sidecar")
-    except (OSError, ValueError, AttributeError, RecursionError):
+        record = json.loads(read_limited(path.with_name(path.name + ".json"), LARGEST_FILE))
+        return bool(record["format"] == "rdstitch sidecar" and record["output"]["file"] == path.name)
+    except (OSError, ValueError, TypeError, LookupError, RecursionError):
         return False

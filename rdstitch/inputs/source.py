@@ -9,11 +9,12 @@ import numpy as np
 
 from rdstitch.cache import Cache
 from rdstitch.camera import Camera
-from rdstitch.errors import ArgumentError, InputError
+from rdstitch.errors import ArgumentError, InputError, LimitError, RdstitchError
 from rdstitch.features.options import WORK_MEGAPIXELS
 from rdstitch.features.picture import halving
 from rdstitch.inputs.decoded_image_cache import DecodedImageCache
 from rdstitch.inputs.frame import Frame, Named
+from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.io.mask import read_mask
 from rdstitch.io.metadata import Metadata, read_metadata
 from rdstitch.io.read import Picture, read_image, reduced
@@ -39,6 +40,8 @@ class Source:
         Its number and time in the sequence; the pixels, where they are no file.
     decoded_images : DecodedImageCache
         Where it is kept between two stages that both look at it.
+    guard : InputGuard
+        What notices changes of the file, and damage.
     """
 
     path: Path
@@ -50,6 +53,7 @@ class Source:
     decoded_images: DecodedImageCache = field(
         default_factory=partial(DecodedImageCache, room=0), compare=False, repr=False
     )
+    guard: InputGuard = field(default_factory=InputGuard, compare=False, repr=False)
 
     @property
     def name(self) -> str:
@@ -93,7 +97,12 @@ class Source:
     def _load(self, reduction: int) -> Picture:
         """The pixels from the file, masked."""
         array = None if self.frame is None else self.frame.picture
-        picture = read_image(self.path, reduction) if array is None else reduced(array, reduction)
+        if array is None:
+            with self.guard.reading(self.path):
+                picture = read_image(self.path, reduction)
+        else:
+            picture = reduced(array, reduction)
+        self.guard.check(self.path, picture)
         expected = self.camera.image_size
         if picture.pixels.shape[1::-1] != reduced_size(expected, reduction):
             now, before = ("{} x {}".format(*size) for size in (picture.metadata.size, expected))
@@ -132,7 +141,14 @@ def readers(sources: Sequence[Source]) -> list[Callable[..., Picture]]:
 
 
 def read_sources(
-    inputs: Iterable[Named], *, camera: Camera | None, focal: float | None, distortion: float | None, skip_bad: bool
+    inputs: Iterable[Named],
+    *,
+    camera: Camera | None,
+    focal: float | None,
+    distortion: float | None,
+    skip_bad: bool,
+    guard: InputGuard | None = None,
+    max_memory: int | None = None,
 ) -> tuple[list[Source], list[Message]]:
     """Read the headers of the pictures; a file named twice counts once.
 
@@ -147,12 +163,19 @@ def read_sources(
         Known λ, half-diagonal frame.
     skip_bad : bool
         Leave out files that cannot be read, with the reason, instead of raising.
+    guard : InputGuard, optional
+        What notices changes of the files, and damage.
+    max_memory : int or None
+        Bytes that a picture may take while it is decoded.
 
     Raises
     ------
     InputError
         When a file cannot be read.
+    LimitError
+        When a picture needs more memory.
     """
+    guard = guard or InputGuard()
     sources: list[Source] = []
     unread: list[Message] = []
     seen: set[Path] = set()
@@ -163,8 +186,9 @@ def read_sources(
         try:
             key = path.resolve()
             metadata = read_metadata(path) if frame.picture is None else frame.picture.metadata
-        except (InputError, OSError, RuntimeError) as error:
-            reason = error if isinstance(error, InputError) else InputError(f"{path}: cannot be read: {error}")
+            _check_memory(path, metadata, max_memory)
+        except (InputError, LimitError, OSError, RuntimeError) as error:
+            reason = error if isinstance(error, RdstitchError) else InputError(f"{path}: cannot be read: {error}")
             if not skip_bad:
                 raise reason from error
             unread.append(left_out(path, str(reason)))
@@ -172,8 +196,19 @@ def read_sources(
         if frame.picture is not None or key not in seen:
             seen.add(key)
             known = _camera(metadata, camera, focal, distortion)
-            sources.append(Source(path, metadata, known, frame=frame, decoded_images=decoded_images))
+            sources.append(Source(path, metadata, known, frame=frame, decoded_images=decoded_images, guard=guard))
     return sources, unread
+
+
+def _check_memory(path: Path, metadata: Metadata, max_memory: int | None) -> None:
+    """Refuse a picture before it is decoded: it is then there twice, as the compositor also reckons."""
+    width, height = metadata.size
+    need = 2 * width * height * metadata.channels * -(-metadata.bit_depth // 8)
+    if max_memory is not None and need > max_memory:
+        raise LimitError(
+            f"{path}: {width} x {height} pixels need {need / 2**20:.0f} MB to be decoded, and --max-memory allows "
+            f"{max_memory / 2**20:.0f} MB; raise it, or make the picture smaller"
+        )
 
 
 def _camera(metadata: Metadata, camera: Camera | None, focal: float | None, distortion: float | None) -> Camera:

@@ -2,14 +2,14 @@
 
 import json
 import os
-import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rdstitch.errors import OutputError
-from rdstitch.io.deepzoom import check_tiles_folder
+from rdstitch.io.deepzoom import check_tiles_folder, tiles_folder
+from rdstitch.io.outputs import Outputs, naming
 
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".dzi")
 
@@ -42,24 +42,34 @@ def check_output(
     if known and file.suffix.lower() not in known:
         what = f"unknown file type '{file.suffix}'" if file.suffix else "no file type in the name"
         raise OutputError(f"{file}: {what}; use one of {' '.join(known)}")
-    folder = file.parent
     try:
-        if file.is_dir():
-            raise OutputError(f"{file}: is a folder; name a file in it")
-        if not folder.is_dir():
-            raise OutputError(f"{file}: the folder {folder} does not exist; create it first")
-        if file.suffix.lower() == ".dzi":
-            check_tiles_folder(file, overwrite)
-        if file.exists():
-            if any(_same_file(file, Path(other)) for other in inputs):
-                raise OutputError(f"{file}: is one of the input pictures; choose another name")
-            if not overwrite:
-                raise OutputError(f"{file}: exists already; choose another name or use --overwrite")
-    except (OSError, ValueError) as error:
-        raise _output_error(file, error) from error
+        with naming(file):
+            _check_place(file, overwrite, inputs)
+    except ValueError as error:
+        raise OutputError(f"{file}: cannot be written: {error}") from error
+    return file
+
+
+def _check_place(file: Path, overwrite: bool, inputs: Iterable[str | Path]) -> None:
+    """The part of :func:`check_output` that needs the file system."""
+    folder = file.parent
+    if file.is_dir():
+        raise OutputError(f"{file}: is a folder; name a file in it")
+    if not folder.is_dir():
+        raise OutputError(f"{file}: the folder {folder} does not exist; create it first")
+    if file.suffix.lower() == ".dzi":
+        check_tiles_folder(tiles_folder(Path(os.path.realpath(file))), overwrite)
+    if file.is_symlink() and not file.exists():
+        raise OutputError(f"{file}: is a link to nothing; remove it, or choose another name")
+    if file.exists():
+        if any(_same_file(file, Path(other)) for other in inputs):
+            raise OutputError(f"{file}: is one of the input pictures; choose another name")
+        if not overwrite:
+            raise OutputError(f"{file}: exists already; choose another name or use --overwrite")
+        # A link stays, and what it leads to is replaced.
+        folder = Path(os.path.realpath(file)).parent
     if not os.access(folder, os.W_OK | os.X_OK):
         raise OutputError(f"{file}: no permission to write into the folder {folder}")
-    return file
 
 
 def check_distinct(paths: Iterable[str | Path]) -> None:
@@ -86,59 +96,20 @@ def _same_file(first: Path, second: Path) -> bool:
         return False
 
 
-def _output_error(file: Path, error: BaseException) -> OutputError:
-    """One line for a failed write."""
-    return OutputError(f"{file}: cannot be written: {getattr(error, 'strerror', None) or error}")
-
-
 @contextmanager
-def atomic_output(path: str | Path) -> Iterator[Path]:
-    """A temporary file beside ``path`` that takes its place when the block ends without an error.
-
-    Yields the temporary name. It lies in the same folder, so that the last step is one rename: a reader sees the old
-    file or the new one, also after a crash.
+def atomic_output(path: str | Path, overwrite: bool = True) -> Iterator[Path]:
+    """A staged file that takes the place of ``path`` when the block ends without an error; see :class:`Outputs`.
 
     Raises
     ------
     OutputError
-        For any failure of the file system, a full disk among them; the temporary file is removed.
+        For any failure of the file system, a full disk among them; the staged file is removed.
     """
-    file = Path(path)
-    temporary = None
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{file.name[:100]}.", suffix=f".part{file.suffix}", dir=file.parent)
-        os.close(handle)
-        temporary = Path(name)
-        yield temporary
-        _keep_mode(temporary, file)
-        _sync(temporary)
-        temporary.replace(file)
-        temporary = None
-    except OSError as error:
-        raise _output_error(file, error) from error
-    finally:
-        if temporary is not None:
-            with suppress(OSError):
-                temporary.unlink()
+    with Outputs(overwrite) as outputs, outputs.writing(path) as staged:
+        yield staged
 
 
-def _keep_mode(temporary: Path, file: Path) -> None:
-    """Give the file the mode of the one it replaces, else what the umask allows (mkstemp says 0600)."""
-    if file.exists():
-        temporary.chmod(file.stat().st_mode & 0o777)
-        return
-    mask = os.umask(0)
-    os.umask(mask)
-    temporary.chmod(0o666 & ~mask)
-
-
-def _sync(file: Path) -> None:
-    """Wait until the disk has the file: a full disk must be noticed before the old file is replaced."""
-    with file.open("rb") as stream:
-        os.fsync(stream.fileno())
-
-
-def write_bytes_atomic(path: str | Path, data: bytes) -> None:
+def write_bytes_atomic(path: str | Path, data: bytes, overwrite: bool = True) -> None:
     """Write a file, whole or not at all.
 
     Raises
@@ -146,18 +117,23 @@ def write_bytes_atomic(path: str | Path, data: bytes) -> None:
     OutputError
         When the file system refuses.
     """
-    with atomic_output(path) as temporary:
-        temporary.write_bytes(data)
+    with Outputs(overwrite) as outputs:
+        outputs.write(path, data)
 
 
 def write_text_atomic(path: str | Path, text: str) -> None:
     """Write a UTF-8 text file, whole or not at all; see :func:`write_bytes_atomic`."""
-    write_bytes_atomic(path, text.encode("utf-8", "surrogateescape"))
+    write_bytes_atomic(path, text_bytes(text))
 
 
 def write_json_atomic(path: str | Path, data: Any) -> None:
     """Write JSON, whole or not at all; see :func:`json_bytes` and :func:`write_bytes_atomic`."""
     write_bytes_atomic(path, json_bytes(data))
+
+
+def text_bytes(text: str) -> bytes:
+    """Text in UTF-8; names of files that are none come out as they are."""
+    return text.encode("utf-8", "surrogateescape")
 
 
 def json_bytes(data: Any) -> bytes:

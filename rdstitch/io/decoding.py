@@ -80,8 +80,6 @@ def decoding(path: Path) -> Iterator[None]:
         yield
     except MemoryError as error:
         raise InputError(f"{path}: too large to read into memory; make it smaller first") from error
-    except Image.DecompressionBombError as error:
-        raise InputError(f"{path}: more than 178 megapixels; cut it up or make it smaller first") from error
     except PermissionError as error:
         raise InputError(f"{path}: permission denied; make it readable") from error
     except _DAMAGE as error:

@@ -4,10 +4,9 @@ A picture's levels, each half as large as the next, are cut into tiles while the
 strips. Beside ``name.dzi``, which tells the size, the folder ``name_files`` holds ``LEVEL/COLUMN_ROW.jpg``.
 """
 
-import shutil
-import tempfile
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+import os
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,11 @@ from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import read_image
 from rdstitch.io.reduction import halved, reduced_size
 
+LARGEST_TILE_PROFILE = 2**16
+"""Bytes of a colour profile that is written into every tile; the larger ones of RGB pictures have 60 kB."""
+
 _TILE, _OVERLAP = 254, 1
+_LEVEL_NAME, _TILE_NAME = re.compile(r"[0-9]{1,2}"), re.compile(r"[0-9]+_[0-9]+\.jpg")
 _DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 <Image xmlns="http://schemas.microsoft.com/deepzoom/2008" Format="jpg" Overlap="{overlap}" TileSize="{tile}">
   <Size Width="{width}" Height="{height}"/>
@@ -35,21 +38,32 @@ def tiles_folder(path: Path) -> Path:
     return path.with_name(f"{path.stem}_files")
 
 
-def check_tiles_folder(path: Path, overwrite: bool) -> None:
-    """Refuse to replace a folder that is not wanted replaced, or that is no folder of tiles.
+def check_tiles_folder(folder: Path, overwrite: bool) -> None:
+    """Refuse to replace a folder that is to be kept, or in which anything is no tile.
 
     Raises
     ------
     OutputError
         With what to do about it.
     """
-    folder = tiles_folder(path)
     if not folder.exists():
         return
     if not overwrite:
         raise OutputError(f"{folder}: exists already; choose another name or use --overwrite")
-    if not folder.is_dir() or not all(entry.name.isdecimal() and entry.is_dir() for entry in folder.iterdir()):
-        raise OutputError(f"{folder}: is no folder of Deep Zoom tiles; choose another name")
+    if folder.is_symlink() or not folder.is_dir() or not holds_only_tiles(folder):
+        raise OutputError(f"{folder}: is a link, or holds other files than Deep Zoom tiles; choose another name")
+
+
+def holds_only_tiles(folder: Path) -> bool:
+    """Whether everything in a folder, however deep, is what :func:`write_deep_zoom` writes there."""
+    with os.scandir(folder) as levels:
+        for level in levels:
+            if not _LEVEL_NAME.fullmatch(level.name) or not level.is_dir(follow_symlinks=False):
+                return False
+            with os.scandir(level) as tiles:
+                if not all(_TILE_NAME.fullmatch(tile.name) and tile.is_file(follow_symlinks=False) for tile in tiles):
+                    return False
+    return True
 
 
 def write_deep_zoom(description: Path, folder: Path, layout: Layout, strips: Iterable[Strip]) -> None:
@@ -66,7 +80,8 @@ def write_deep_zoom(description: Path, folder: Path, layout: Layout, strips: Ite
     """
     width, height = layout.size
     # The profile belongs to the pixels, and so into every tile; EXIF does not.
-    profile = Metadata(layout.size, icc_profile=layout.metadata.icc_profile)
+    kept = layout.metadata.icc_profile if len(layout.metadata.icc_profile) <= LARGEST_TILE_PROFILE else b""
+    profile = Metadata(layout.size, icc_profile=kept)
     eight = replace(layout, dtype=np.dtype(np.uint8), transparent=True, metadata=profile)
     largest = _levels(folder, eight)
     for samples, alpha in strips:
@@ -74,26 +89,6 @@ def write_deep_zoom(description: Path, folder: Path, layout: Layout, strips: Ite
     description.write_text(
         _DESCRIPTION.format(overlap=_OVERLAP, tile=_TILE, width=width, height=height), encoding="utf-8"
     )
-
-
-@contextmanager
-def replaced_folder(folder: Path) -> Iterator[Path]:
-    """A temporary folder beside ``folder`` that takes its place when the block ends without an error."""
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name[:100]}.", suffix=".part", dir=folder.parent))
-    try:
-        new, old = temporary / "new", temporary / "old"
-        new.mkdir()
-        yield new
-        if folder.exists():
-            folder.replace(old)
-        try:
-            new.replace(folder)
-        except OSError:
-            if old.exists():
-                old.replace(folder)
-            raise
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def read_deep_zoom(path: Path, size: tuple[int, int], side: int) -> NDArray[np.uint8]:

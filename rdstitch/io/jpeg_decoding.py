@@ -1,5 +1,6 @@
 """JPEG files straight into arrays, whole or at a fraction of their size."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -8,38 +9,52 @@ import simplejpeg
 from numpy.typing import NDArray
 
 from rdstitch.io.reduction import reduced_size
+from rdstitch.regular_files import open_regular
 
+_END_OF_IMAGE = b"\xff\xd9"
+_PADDING = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
 _SMALLEST = 8  # px a side; below, different reductions give pictures of the same size
 
 
-def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) -> NDArray[Any] | None:
-    """Samples (h, w) or (h, w, 3) in RGB order as stored, not turned upright.
+def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) -> tuple[NDArray[Any] | None, str]:
+    """Samples (h, w) or (h, w, 3) in RGB order as stored, not turned upright, and what is wrong with the file.
 
     What Pillow would decode, bit for bit, in less time and memory. Pillow has the last word on files about which
-    the decoder has any complaint.
+    the decoder has any complaint: it refuses some, and decodes others without a word, whatever comes out.
 
     Parameters
     ----------
     file : Path
     size : (int, int)
-        Width and height of the whole picture, px.
+        Width and height of the whole picture, pixels.
     factor : int
-        1, 2, 4 or 8; so many px a side become one.
+        1, 2, 4 or 8; so many pixels a side become one.
     grey : bool
 
     Returns
     -------
-    ndarray or None
+    samples : ndarray or None
         None where something is not as it should be, or the file has no such reduction or is tiny.
+    complaint : str
+        The decoder's; empty where it has none, or one that says nothing of the pixels.
     """
     if min(size) < _SMALLEST:
-        return None
+        return None, ""
     width, height = reduced_size(size, factor)
+    with open_regular(file) as stream:
+        data = stream.read()
     try:
         samples = simplejpeg.decode_jpeg(
-            file.read_bytes(), "GRAY" if grey else "RGB", min_height=height, min_width=width, strict=True
+            data, "GRAY" if grey else "RGB", min_height=height, min_width=width, strict=True
         )
-    except ValueError:
-        return None
+    except ValueError as error:
+        return None, "" if _is_padding(str(error), data) else str(error)
     whole: NDArray[Any] = np.asarray(samples)[..., 0] if grey else np.asarray(samples)
-    return whole if whole.shape[:2] == (height, width) else None
+    return (whole if whole.shape[:2] == (height, width) else None), ""
+
+
+def _is_padding(complaint: str, data: bytes) -> bool:
+    """Whether the decoder only complains of zeros before the end, as some cameras write them."""
+    found = _PADDING.search(complaint)
+    end = data.rfind(_END_OF_IMAGE)
+    return found is not None and not data[max(0, end - int(found[1])) : end].strip(b"\0\xff")

@@ -1,17 +1,19 @@
 """What a picture file says about itself: size, lens, place, attitude, camera; read without decoding pixels."""
 
 import math
+import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import tifffile
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import ExifTags, Image
 
 from rdstitch.camera import is_focal_length
 from rdstitch.io.attitude import Attitude, read_attitude
 from rdstitch.io.decoding import check_readable, decoding
+from rdstitch.io.opening import check_megapixels, opened_picture
 from rdstitch.io.orientation import SIDEWAYS, turned_direction
 from rdstitch.io.xmp import finite, xmp_number, xmp_text
 
@@ -19,6 +21,11 @@ _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _BIT_DEPTHS = {"1": 1, "I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
 _EXPOSURE_TAGS = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings)
+LARGEST_PROFILE = 2**20 - 2**10
+"""Bytes of a colour profile: PNG readers, such as Pillow's, refuse pictures whose profile takes a megabyte."""
+
+_COLOUR_SPACE = slice(16, 20)  # of a profile's header
+_UNWRITABLE = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, struct.error)
 _ORIENTATION, _PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE = 0x0112, 0xA002, 0xA003, 0x927C
 
 
@@ -41,6 +48,8 @@ class Metadata:
         Width and height, px, after the EXIF orientation is applied.
     bit_depth : int
         Bits per sample.
+    channels : int
+        Samples per pixel, with alpha.
     orientation : int
         EXIF orientation (1 to 8) stored in the file; readers of this project have applied it already.
     focal_px : float or None
@@ -60,6 +69,8 @@ class Metadata:
         Colour profile; empty where there is none.
     xmp : bytes
         XMP packet that is to be written; what files have is not kept.
+    profile_lost : str
+        Why the file's colour profile is not kept; empty where it is, or where there is none.
     """
 
     size: tuple[int, int]
@@ -77,6 +88,8 @@ class Metadata:
     exif: bytes = b""
     icc_profile: bytes = b""
     xmp: bytes = b""
+    profile_lost: str = ""
+    channels: int = 3
 
     @property
     def nadir(self) -> tuple[float, float, float] | None:
@@ -99,15 +112,17 @@ def read_metadata(path: str | Path) -> Metadata:
     check_readable(file)
     with decoding(file):
         try:
-            with Image.open(file) as image:
+            with opened_picture(file) as image:
                 return metadata_of(image)
-        except UnidentifiedImageError:
+        except SyntaxError:
             # Pillow knows few sample layouts of TIFF (no 16-bit colour with alpha, no five bands).
             with tifffile.TiffFile(file) as tiff:
                 page = tiff.pages.first
-                if min(page.imagewidth, page.imagelength) < 1:
+                size = page.imagewidth, page.imagelength
+                if min(size) < 1:
                     raise ValueError("no pixels") from None
-                return Metadata((page.imagewidth, page.imagelength), bit_depth=page.bitspersample)
+                check_megapixels(file, size)
+                return Metadata(size, bit_depth=page.bitspersample, channels=page.samplesperpixel)
 
 
 def metadata_of(image: Image.Image) -> Metadata:
@@ -115,13 +130,13 @@ def metadata_of(image: Image.Image) -> Metadata:
     # First, since looking for EXIF at the end of a PNG file decodes it, and Pillow then forgets.
     bit_depth = _bit_depth(image)
     exif = image.getexif()
-    orientation = exif.get(_ORIENTATION, 1)
-    orientation = orientation if orientation in range(1, 9) else 1
+    orientation = _orientation(exif.get(_ORIENTATION))
     width, height = image.size
     photo = exif.get_ifd(ExifTags.IFD.Exif)
     xmp = xmp_text(image)
     focal, source = _focal_px(exif, photo, xmp, image.size)
     dpi = image.info.get("dpi")
+    profile, profile_lost = _colour_profile(image)
     return Metadata(
         size=(height, width) if orientation in SIDEWAYS else (width, height),
         bit_depth=bit_depth,
@@ -136,7 +151,9 @@ def metadata_of(image: Image.Image) -> Metadata:
         dpi=(float(dpi[0]), float(dpi[1])) if dpi and all(finite(d) for d in dpi) else None,
         exposure=_exposure(photo),
         exif=_clean_exif(exif),
-        icc_profile=image.info.get("icc_profile") or b"",
+        icc_profile=profile,
+        profile_lost=profile_lost,
+        channels=_channels(image),
     )
 
 
@@ -160,6 +177,32 @@ def _bit_depth(image: Image.Image) -> int:
         bits = tags.get(258, (1,))
         return int(bits[0] if isinstance(bits, tuple) else bits)
     return _BIT_DEPTHS.get(image.mode, 8)
+
+
+def _orientation(value: Any) -> int:
+    """EXIF orientation, also where a program has stored it as text or as a float; 1 where it means nothing."""
+    if isinstance(value, tuple) and value:
+        value = value[0]
+    number = finite(_text(value) if isinstance(value, bytes) else value)
+    return 1 if number is None or number not in range(1, 9) else int(number)
+
+
+def _colour_profile(image: Image.Image) -> tuple[bytes, str]:
+    """The colour profile, or why it is not kept."""
+    profile = image.info.get("icc_profile")
+    if not isinstance(profile, bytes):
+        return b"", ""
+    if len(profile) > LARGEST_PROFILE:
+        return b"", f"its colour profile of {len(profile) / 1e6:.1f} MB is too large for PNG readers"
+    if profile[_COLOUR_SPACE] == b"CMYK":
+        return b"", "its colour profile is one of inks (CMYK), and the output is RGB"
+    return profile, ""
+
+
+def _channels(image: Image.Image) -> int:
+    """Samples per pixel of what it is decoded to."""
+    palette = image.mode in ("P", "PA")
+    return len(image.getbands()) if not palette else 4 if "transparency" in image.info or image.mode == "PA" else 3
 
 
 def _text(value: Any) -> str:
@@ -216,10 +259,17 @@ def _clean_exif(exif: Image.Exif) -> bytes:
     """EXIF for the output: what orientation, size and maker note said is no longer true of it."""
     if not len(exif):
         return b""
+    # First, since what is not of the type that belongs to it cannot be written.
+    exif[_ORIENTATION] = 1
     kept = Image.Exif()
-    kept.load(exif.tobytes())
-    kept[_ORIENTATION] = 1
+    try:
+        kept.load(exif.tobytes())
+    except _UNWRITABLE:
+        return b""
     photo = kept.get_ifd(ExifTags.IFD.Exif)
     for tag in (_PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE):
         photo.pop(tag, None)
-    return kept.tobytes()
+    try:
+        return kept.tobytes()
+    except _UNWRITABLE:
+        return b""

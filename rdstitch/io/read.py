@@ -3,7 +3,7 @@
 import math
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +17,17 @@ from rdstitch.errors import InputError
 from rdstitch.io.decoding import check_readable, decoding
 from rdstitch.io.jpeg_decoding import decoded_jpeg
 from rdstitch.io.metadata import Metadata, metadata_of, read_metadata
+from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, opened_picture
 from rdstitch.io.orientation import turned
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
 from rdstitch.opencv_state import silent_opencv
+from rdstitch.regular_files import open_regular
 
 Pixels = NDArray[Any]
 
 _OPAQUE = 255
 _LARGEST_DECODED_REDUCTION = 8  # of the JPEG decoder
 _ROWS_AT_A_TIME = 128
-_TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _PNG_PIXEL_CHUNKS = (b"IHDR", b"tRNS", b"IDAT", b"IEND")
 _JPEG = ("JPEG", "MPO")
 _GREY_16 = ("I;16", "I;16B", "I;16L", "I;16N", "I")
@@ -44,11 +44,14 @@ class Picture:
     alpha : ndarray of shape (height, width), uint8, or None
         255 where the picture is opaque, 0 where it says nothing; None when it is opaque everywhere.
     metadata : Metadata
+    damage : str
+        Why some of the pixels may be wrong: the complaint of a decoder that went on nevertheless. Empty without one.
     """
 
     pixels: Pixels
     alpha: NDArray[np.uint8] | None
     metadata: Metadata
+    damage: str = ""
 
     @property
     def nbytes(self) -> int:
@@ -78,18 +81,20 @@ def read_image(path: str | Path, reduction: int = 1) -> Picture:
     file = Path(path)
     check_readable(file)
     with decoding(file):
-        with file.open("rb") as stream:
-            magic = stream.read(8)
-        if magic[:4] in _TIFF_MAGIC:
+        with open_regular(file) as stream:
+            magic = stream.read(len(PNG_MAGIC))
+        if magic[:4] in TIFF_MAGIC:
             return reduced(as_picture(file, *_read_tiff(file), read_metadata(file)), reduction)
-        with Image.open(file) as image:
+        with opened_picture(file) as image:
             metadata = metadata_of(image)
-            if magic == _PNG_MAGIC and metadata.bit_depth == 16 and image.mode not in _GREY_16:
+            if magic == PNG_MAGIC and metadata.bit_depth == 16 and image.mode not in _GREY_16:
                 samples, alpha = _split(_read_16_bit_png(file))
             else:
                 factor = _decoders_share(image, metadata, reduction)
-                samples, alpha = _from_jpeg(file, image, factor) or _from_pillow(image, factor)
-                return reduced(as_picture(file, samples, alpha, metadata), reduction // factor)
+                found, damage = _from_jpeg(file, image, factor)
+                samples, alpha = _from_pillow(image, factor) if found is None else (found, None)
+                picture = replace(as_picture(file, samples, alpha, metadata), damage=damage)
+                return reduced(picture, reduction // factor)
         return reduced(as_picture(file, samples, alpha, metadata), reduction)
 
 
@@ -98,7 +103,7 @@ def reduced(picture: Picture, factor: int) -> Picture:
     if factor == 1:
         return picture
     alpha = None if picture.alpha is None else block_minimum(picture.alpha, factor)
-    return Picture(block_mean(picture.pixels, factor), alpha, picture.metadata)
+    return replace(picture, pixels=block_mean(picture.pixels, factor), alpha=alpha)
 
 
 def _decoders_share(image: Image.Image, metadata: Metadata, reduction: int) -> int:
@@ -109,12 +114,11 @@ def _decoders_share(image: Image.Image, metadata: Metadata, reduction: int) -> i
     return 1 if image.format not in _JPEG or min(image.size) < factor or crosswise else factor
 
 
-def _from_jpeg(file: Path, image: Image.Image, factor: int) -> tuple[Pixels, None] | None:
-    """Samples of an opened JPEG file in grey or colour; None for others, and where Pillow must say what is wrong."""
+def _from_jpeg(file: Path, image: Image.Image, factor: int) -> tuple[Pixels | None, str]:
+    """Samples of an opened JPEG file in grey or colour, None for others; and what is wrong with it."""
     if image.format not in _JPEG or image.mode not in ("L", "RGB"):
-        return None
-    samples = decoded_jpeg(file, image.size, factor, grey=image.mode == "L")
-    return None if samples is None else (samples, None)
+        return None, ""
+    return decoded_jpeg(file, image.size, factor, grey=image.mode == "L")
 
 
 def _from_pillow(image: Image.Image, factor: int) -> tuple[Pixels, Pixels | None]:
@@ -157,8 +161,9 @@ def _is_grey(image: Image.Image) -> bool:
 
 def _read_16_bit_png(file: Path) -> Pixels:
     """16-bit colour, which Pillow would cut to 8 bit; damage is found by the checksums, which OpenCV tolerates."""
-    data = file.read_bytes()
-    position, kind = len(_PNG_MAGIC), b""
+    with open_regular(file) as stream:
+        data = memoryview(stream.read())
+    position, kind = len(PNG_MAGIC), b""
     kept = [data[:position]]
     while kind != b"IEND":
         length, kind = struct.unpack_from(">I4s", data, position)
@@ -181,8 +186,10 @@ def _decode_with_opencv(data: bytes) -> Pixels:
     if samples is None:
         raise ValueError("the decoder gives up")
     if samples.ndim == 3 and samples.shape[2] in (3, 4):
-        code = cv2.COLOR_BGR2RGB if samples.shape[2] == 3 else cv2.COLOR_BGRA2RGBA
-        return cv2.cvtColor(samples, code)
+        # In pieces, since a large picture must not be there twice.
+        for top in range(0, len(samples), _ROWS_AT_A_TIME):
+            rows = samples[top : top + _ROWS_AT_A_TIME]
+            rows[..., :3] = rows[..., 2::-1].copy()
     return samples
 
 

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import cv2
 
 from rdstitch.errors import InputError, OutputError
+from rdstitch.io.decoding import check_readable
 
 VIDEO_SUFFIXES = frozenset((".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"))
 
@@ -28,6 +29,7 @@ def extract_frames(path: Path, folder: Path, every: int = 1) -> list[VideoFrame]
     OutputError
         When a frame cannot be written.
     """
+    check_readable(path)
     capture = cv2.VideoCapture(str(path))
     try:
         if not capture.isOpened():

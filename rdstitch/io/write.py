@@ -5,6 +5,7 @@ WebP. The same picture gives the same bytes either way.
 """
 
 import io
+import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.errors import ArgumentError, LimitError, OutputError
-from rdstitch.io.atomic import PICTURE_SUFFIXES, atomic_output
-from rdstitch.io.deepzoom import check_tiles_folder, replaced_folder, tiles_folder, write_deep_zoom
+from rdstitch.io.atomic import PICTURE_SUFFIXES
+from rdstitch.io.deepzoom import check_tiles_folder, tiles_folder, write_deep_zoom
+from rdstitch.io.fingerprint import Fingerprint, fingerprint
 from rdstitch.io.jpeg import jpeg_pieces
 from rdstitch.io.layout import STRIP_ROWS, Layout, Strip, as_eight_bit, check_strips, with_alpha
 from rdstitch.io.metadata import Metadata
+from rdstitch.io.outputs import Outputs, naming
 from rdstitch.io.png import png_pieces
 from rdstitch.io.tiff import ExtraTag, write_tiff
 
@@ -38,6 +41,7 @@ def write_image(
     *,
     quality: int = 95,
     background: int = 0,
+    overwrite: bool = True,
 ) -> None:
     """Write a picture; the format follows the suffix.
 
@@ -58,6 +62,8 @@ def write_image(
         Of JPEG and WebP, 1 to 100.
     background : int
         Grey of what is transparent, in a format without transparency: 0 black, 255 white.
+    overwrite : bool
+        Replace an existing file.
 
     Raises
     ------
@@ -74,12 +80,18 @@ def write_image(
     height, width, channels = samples.shape
     described = metadata or Metadata((width, height))
     layout = Layout((width, height), channels, samples.dtype, alpha is not None, described, quality, background)
-    write_strips(path, layout, _strips_of(samples, alpha))
+    with Outputs(overwrite) as outputs:
+        write_strips(path, layout, _strips_of(samples, alpha), outputs=outputs)
 
 
 def write_strips(
-    path: str | Path, layout: Layout, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag] = ()
-) -> None:
+    path: str | Path,
+    layout: Layout,
+    strips: Iterable[Strip],
+    extra_tags: Iterable[ExtraTag] = (),
+    *,
+    outputs: Outputs | None = None,
+) -> Fingerprint:
     """Write a picture that comes in strips; see :func:`write_image`.
 
     Parameters
@@ -91,29 +103,50 @@ def write_strips(
         From top to bottom; all but the last have a multiple of 256 rows.
     extra_tags
         Further tags of a TIFF file.
+    outputs : Outputs, optional
+        Where the picture is staged, to be published with what belongs to it; without, it replaces what is there.
+
+    Returns
+    -------
+    Fingerprint
+        Size and digest of what was written.
     """
+    if outputs is None:
+        with Outputs(overwrite=True) as alone:
+            return write_strips(path, layout, strips, extra_tags, outputs=alone)
     file = Path(path)
     check_format(file, layout)
     suffix = file.suffix.lower()
     checked = check_strips(layout, strips)
-    with atomic_output(file) as temporary:
-        if suffix in _TIFF:
-            write_tiff(temporary, layout, checked, extra_tags)
-            return
-        if suffix == ".dzi":
-            check_tiles_folder(file, overwrite=True)
-            with replaced_folder(tiles_folder(file)) as folder:
-                write_deep_zoom(temporary, folder, layout, checked)
-            return
-        pieces: Iterable[bytes | memoryview]
-        if suffix in _JPEG:
-            pieces = jpeg_pieces(layout, checked)
-        elif suffix == ".png":
-            pieces = png_pieces(layout, checked)
-        else:
-            pieces = [_webp(layout, checked)]
-        with temporary.open("wb") as stream:
-            stream.writelines(pieces)
+    tiles = None
+    if suffix == ".dzi":
+        folder = tiles_folder(Path(os.path.realpath(file)))
+        check_tiles_folder(folder, overwrite=True)
+        with outputs.writing_folder(folder) as tiles, outputs.writing(file) as staged:
+            write_deep_zoom(staged, tiles, layout, checked)
+    else:
+        with outputs.writing(file) as staged:
+            _write_file(staged, suffix, layout, checked, extra_tags)
+    with naming(file):
+        return fingerprint(staged, tiles)
+
+
+def _write_file(
+    file: Path, suffix: str, layout: Layout, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag]
+) -> None:
+    """Write one file in the format of a suffix."""
+    if suffix in _TIFF:
+        write_tiff(file, layout, strips, extra_tags)
+        return
+    pieces: Iterable[bytes | memoryview]
+    if suffix in _JPEG:
+        pieces = jpeg_pieces(layout, strips)
+    elif suffix == ".png":
+        pieces = png_pieces(layout, strips)
+    else:
+        pieces = [_webp(layout, strips)]
+    with file.open("wb") as stream:
+        stream.writelines(pieces)
 
 
 def check_format(path: str | Path, layout: Layout) -> None:

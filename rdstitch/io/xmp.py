@@ -6,11 +6,14 @@ from typing import Any
 
 from PIL import Image
 
+_MOST = 2**20  # characters; drones write 2,000 to 20,000
+_LONGEST = 64  # characters of a number, and of the space around it
+
 
 def xmp_text(image: Image.Image) -> str:
-    """The XMP block as text; empty where there is none."""
+    """The XMP block as text, as far as it can be one of a camera; empty where there is none."""
     block = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
-    return block.decode("utf-8", "replace") if isinstance(block, bytes) else str(block)
+    return (block.decode("utf-8", "replace") if isinstance(block, bytes) else str(block))[:_MOST]
 
 
 def xmp_number(xmp: str, name: str) -> float | None:
@@ -23,7 +26,9 @@ def xmp_number(xmp: str, name: str) -> float | None:
         With the customary prefix of its namespace, or without for any.
     """
     # A search rather than an XML parser: drones write XMP that no parser accepts.
-    found = re.search(rf"""[<:\s]{name}\s*(?:=\s*["']([^"'<]*)|>([^<]*)<)""", xmp)
+    # Repetitions are bounded, so that it takes time in proportion to the text, whatever that is.
+    gap, value = rf"\s{{0,{_LONGEST}}}", rf"{{0,{_LONGEST}}}"
+    found = re.search(rf"""[<:\s]{name}{gap}(?:={gap}["']([^"'<]{value})|>([^<]{value})<)""", xmp)
     return None if found is None else finite((found.group(1) or found.group(2) or "").strip())
 
 

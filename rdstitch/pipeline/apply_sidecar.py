@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Literal
 
 import numpy as np
@@ -12,19 +11,21 @@ import numpy as np
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, InputError, OutputError, PartialResultError
-from rdstitch.inputs.find import find_pictures
+from rdstitch.inputs.find import found_pictures
 from rdstitch.inputs.frame import ChannelOrder, Frame, Images, as_inputs, files_of
+from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.masks import with_masks
 from rdstitch.inputs.source import Source, read_sources
-from rdstitch.io.atomic import check_output, write_json_atomic
+from rdstitch.io.atomic import check_output, json_bytes
 from rdstitch.io.decoding import check_readable
+from rdstitch.io.outputs import Outputs
 from rdstitch.messages import Message
 from rdstitch.messages import left_out as left_out_message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.compose import compose_pictures
 from rdstitch.pipeline.recomposition import Recomposition, applied_sidecar
 from rdstitch.progress import Progress, silent
-from rdstitch.sidecar.read import SavedRegistration, read_sidecar
+from rdstitch.sidecar.read import SavedRegistration, mismatch_with_picture, read_sidecar
 
 Match = Literal["auto", "name", "order"]
 _MATCHES = ("auto", "name", "order")
@@ -90,14 +91,16 @@ def apply(
     threads = StitchOptions(workers=workers).threads
     saved = read_sidecar(sidecar)
     options = composite or saved.composite
-    with TemporaryDirectory(prefix="rdstitch-") as folder:
-        exclude = [] if output is None else [output]
-        given = as_inputs(images, channel_order)
-        frames = find_pictures(given, exclude=exclude, frames_folder=Path(folder), every=every)
+    doubts = [mismatch] if (mismatch := mismatch_with_picture(saved)) else []
+    if strict and doubts:
+        raise InputError(doubts[0])
+    given = as_inputs(images, channel_order)
+    with found_pictures(given, output=output, every=every) as found, Outputs(overwrite) as outputs:
         if output is not None:
-            _check_outputs(Path(output), overwrite, files_of(frames), saved.path)
-        chosen, matched = _match(saved, frames, match)
-        sources, left_out = _sources(saved, chosen)
+            _check_outputs(Path(output), overwrite, files_of(found.frames), saved.path)
+        chosen, matched = _match(saved, found.frames, match)
+        guard = InputGuard(strict)
+        sources, left_out = _sources(saved, chosen, guard, options.max_memory)
         if strict and left_out:
             raise PartialResultError("; ".join(map(str, left_out.values())))
         used = _used(saved, sources, left_out, mask)
@@ -111,6 +114,7 @@ def apply(
             threads,
             progress,
             overwrite=overwrite,
+            outputs=outputs,
             dry_run=dry_run,
             turned=saved.turned,
         )
@@ -124,11 +128,12 @@ def apply(
             None if output is None else Path(output),
             composed.composite,
             composed.plan,
-            composed.notes,
+            (*doubts, *map(str, (*found.messages, *guard.messages)), *composed.notes),
             channel_order,
+            composed.fingerprint,
         )
         if output is not None and not dry_run:
-            write_json_atomic(f"{output}.json", applied_sidecar(result))
+            outputs.write(f"{output}.json", json_bytes(applied_sidecar(result)))
         return result
 
 
@@ -204,7 +209,7 @@ def _by_order(saved: SavedRegistration, frames: Sequence[Frame]) -> Sequence[Fra
 
 
 def _sources(
-    saved: SavedRegistration, chosen: Sequence[Frame | None]
+    saved: SavedRegistration, chosen: Sequence[Frame | None], guard: InputGuard, max_memory: int | None
 ) -> tuple[list[Source | None], dict[int, Message]]:
     """The pictures with their cameras, and why which of those used then is not among them."""
     sources: list[Source | None] = []
@@ -216,7 +221,9 @@ def _sources(
         if frame is None:
             left_out[index] = left_out_message(picture.path, "is not among the given pictures")
             continue
-        found, unread = read_sources([frame], camera=None, focal=None, distortion=None, skip_bad=True)
+        found, unread = read_sources(
+            [frame], camera=None, focal=None, distortion=None, skip_bad=True, guard=guard, max_memory=max_memory
+        )
         if unread:
             left_out[index] = unread[0]
         else:

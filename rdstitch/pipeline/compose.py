@@ -24,7 +24,10 @@ from rdstitch.compositing import (
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference, georeference, has_place, world_file_paths
 from rdstitch.inputs.source import Source, readers
-from rdstitch.io.atomic import check_output
+from rdstitch.io.atomic import check_output, text_bytes
+from rdstitch.io.deepzoom import LARGEST_TILE_PROFILE
+from rdstitch.io.fingerprint import Fingerprint
+from rdstitch.io.outputs import Outputs
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_size
 from rdstitch.pipeline.memory import release_free_heap
@@ -48,12 +51,15 @@ class Composed:
         Of a dry run.
     notes : tuple of str
         What the user should know, such as why nothing was cropped.
+    fingerprint : Fingerprint or None
+        Size and digest of the file.
     """
 
     canvas: Canvas
     composite: Composite | None = None
     plan: CompositePlan | None = None
     notes: tuple[str, ...] = ()
+    fingerprint: Fingerprint | None = None
 
 
 def compose_pictures(
@@ -67,6 +73,7 @@ def compose_pictures(
     progress: Progress,
     *,
     overwrite: bool,
+    outputs: Outputs,
     dry_run: bool = False,
     turned: bool = False,
 ) -> Composed:
@@ -88,6 +95,8 @@ def compose_pictures(
     progress : callable
     overwrite : bool
         Replace an existing world file.
+    outputs : Outputs
+        Where the files are staged.
     dry_run : bool
         Only plan.
     turned : bool
@@ -137,12 +146,25 @@ def compose_pictures(
         return placed[0][0].tiff_tags() if placed[0][0] is not None else []
 
     written = compose_to_file(
-        output, read, cameras, matrices, canvas, options, sources[0].metadata, told, tags, read, exposures
+        output,
+        read,
+        cameras,
+        matrices,
+        canvas,
+        options,
+        sources[0].metadata,
+        told,
+        tags,
+        read,
+        exposures,
+        outputs=outputs,
     )
     place, note = placed[0]
     if place is not None and beside:
-        place.write_beside(output)
-    return Composed(written.canvas, notes=(*written.notes, *([note] if note else [])))
+        for file, text in zip(beside, place.world_file_texts(), strict=True):
+            outputs.write(file, text_bytes(text))
+    notes = (*written.notes, *([note] if note else []), *_profile_notes(sources[0], Path(output)))
+    return Composed(written.canvas, notes=notes, fingerprint=written.fingerprint)
 
 
 def _plan(
@@ -172,3 +194,11 @@ def _plan(
             "leave out --projection"
         )
     return plan_canvas(cameras, homographies, scale=scale, rotate=options.rotate, reference=reference, names=names)
+
+
+def _profile_notes(source: Source, output: Path) -> list[str]:
+    """Why the output lacks the colour profile of the picture whose metadata it has."""
+    lost, size = source.metadata.profile_lost, len(source.metadata.icc_profile)
+    if output.suffix.lower() == ".dzi" and size > LARGEST_TILE_PROFILE:
+        lost = f"its colour profile of {size / 1e3:.0f} kB is too large to be in every tile"
+    return [f"{source.name}: {lost}; colours are as if it had none"] if lost else []

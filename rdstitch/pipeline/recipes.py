@@ -1,24 +1,24 @@
 """The recipes: each reads as the sequence of its stages."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Literal
 
 import numpy as np
 
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.trajectory import Trajectory
-from rdstitch.camera_files import CAMERA_SUFFIXES, save_camera
+from rdstitch.camera_files import CAMERA_SUFFIXES, camera_file_text
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.path_plot import path_as_svg
 from rdstitch.inputs.attitudes import with_attitudes
-from rdstitch.inputs.find import find_pictures
-from rdstitch.inputs.frame import Frame, Images, Named, as_inputs, files_of
+from rdstitch.inputs.find import FoundPictures, found_pictures
+from rdstitch.inputs.frame import Images, Named, as_inputs, files_of
+from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.masks import with_masks
 from rdstitch.inputs.source import Source, read_sources
-from rdstitch.io.atomic import check_distinct, check_output, write_json_atomic, write_text_atomic
+from rdstitch.io.atomic import check_distinct, check_output, json_bytes, text_bytes
+from rdstitch.io.outputs import Outputs
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.accept import accept
@@ -75,11 +75,11 @@ def pano(
     (3, True)
     """
     options = options or StitchOptions()
-    with _pictures(inputs, output, options, every) as frames:
-        _check_outputs(output, options, files_of(frames))
-        sources, _ = _read(frames, options, skip_bad=False)
+    with found_pictures(as_inputs(inputs, options.channel_order), output=output, every=every) as found:
+        _check_outputs(output, options, files_of(found.frames))
+        sources, _ = _read(found.frames, options, skip_bad=False)
         registration = register(sources, options, skip_bad=False, progress=progress)
-        registration = in_frame_of_reference(registration)
+        registration = in_frame_of_reference(registration).with_messages(found.messages)
         return _composite(registration, output, options, progress)
 
 
@@ -125,9 +125,9 @@ def mosaic(
     ('small.tif', np.True_)
     """
     options = options or StitchOptions()
-    with _pictures(inputs, output, options, every) as frames:
-        _check_outputs(output, options, files_of(frames))
-        registration = _register_all(frames, options, progress)
+    with found_pictures(as_inputs(inputs, options.channel_order), output=output, every=every) as found:
+        _check_outputs(output, options, files_of(found.frames))
+        registration = _register_all(found, options, progress)
         return _composite(registration, output, options, progress)
 
 
@@ -152,13 +152,14 @@ def calibrate(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = options or StitchOptions()
-    with _pictures(inputs, None, options, every) as frames:
-        _check_outputs(None, options, files_of(frames))
-        registration = _register_all(frames, options, progress)
+    with found_pictures(as_inputs(inputs, options.channel_order), every=every) as found:
+        _check_outputs(None, options, files_of(found.frames))
+        registration = _register_all(found, options, progress)
         registration = accept(registration, options, lens_only=True)
     _release_decoded_images(registration)
-    _save_camera(registration, options)
-    return registration
+    with Outputs(options.overwrite) as outputs:
+        _save_camera(registration, options, outputs)
+    return _with_damage(registration)
 
 
 def trajectory(
@@ -193,38 +194,31 @@ def trajectory(
         The path, and the registration that it comes from.
     """
     options = options or StitchOptions()
-    with _pictures(inputs, None, options, every) as frames:
+    with found_pictures(as_inputs(inputs, options.channel_order), every=every) as found:
         files = [file for file in (output, plot) if file is not None]
         for file in files:
-            check_output(file, options.overwrite, files_of(frames), suffixes=())
+            check_output(file, options.overwrite, files_of(found.frames), suffixes=())
         check_distinct(files)
-        registration = _register_all(frames, options, progress, metric=True)
+        registration = _register_all(found, options, progress, metric=True)
         registration = accept(registration, options)
     _release_decoded_images(registration)
-    registration = registration.with_messages(_scale_uncertainty(registration.alignment))
+    registration = _with_damage(registration).with_messages(_scale_uncertainty(registration.alignment))
     path = Trajectory.from_alignment(registration.alignment, height)
-    if output is not None:
-        write_text_atomic(output, path.as_csv() if layout == "csv" else path.as_tum())
-    if plot is not None:
-        write_text_atomic(plot, path_as_svg(path))
+    with Outputs(options.overwrite) as outputs:
+        if output is not None:
+            outputs.write(output, text_bytes(path.as_csv() if layout == "csv" else path.as_tum()))
+        if plot is not None:
+            outputs.write(plot, text_bytes(path_as_svg(path)))
     return path, registration
 
 
-@contextmanager
-def _pictures(inputs: Images, output: str | Path | None, options: StitchOptions, every: int) -> Iterator[list[Frame]]:
-    """The frames that the inputs stand for; those of videos exist only inside the block."""
-    given, exclude = as_inputs(inputs, options.channel_order), [] if output is None else [output]
-    with TemporaryDirectory(prefix="rdstitch-") as folder:
-        yield find_pictures(given, exclude=exclude, frames_folder=Path(folder), every=every)
-
-
 def _register_all(
-    frames: Sequence[Frame], options: StitchOptions, progress: Progress, *, metric: bool = False
+    found: FoundPictures, options: StitchOptions, progress: Progress, *, metric: bool = False
 ) -> Registration:
     """Register a sequence, leaving out what cannot be read."""
-    sources, unread = _read(frames, options, skip_bad=True)
+    sources, unread = _read(found.frames, options, skip_bad=True)
     registration = register(sources, options, skip_bad=True, metric=metric, progress=progress)
-    return registration.with_messages(unread)
+    return registration.with_messages([*unread, *found.messages])
 
 
 def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Sequence[str | Path]) -> None:
@@ -239,7 +233,13 @@ def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Se
 
 def _read(inputs: Sequence[Named], options: StitchOptions, *, skip_bad: bool) -> tuple[list[Source], list[Message]]:
     sources, unread = read_sources(
-        inputs, camera=options.camera, focal=options.focal, distortion=options.distortion, skip_bad=skip_bad
+        inputs,
+        camera=options.camera,
+        focal=options.focal,
+        distortion=options.distortion,
+        skip_bad=skip_bad,
+        guard=InputGuard(options.strict),
+        max_memory=options.composite.max_memory,
     )
     if len(sources) < 2:
         if unread:
@@ -251,39 +251,47 @@ def _read(inputs: Sequence[Named], options: StitchOptions, *, skip_bad: bool) ->
 def _composite(
     registration: Registration, output: str | Path | None, options: StitchOptions, progress: Progress
 ) -> StitchResult:
-    """Judge, compose into the file or into memory, write the sidecar."""
+    """Judge, then compose into memory, or into a file that is published with all that belongs to it."""
     registration = accept(registration, options)
     alignment = registration.alignment
     used = np.flatnonzero(alignment.used)
-    sources = [registration.sources[i] for i in used]
-    composed = compose_pictures(
-        sources,
-        [alignment.cameras[i] for i in used],
-        alignment.homographies[used],
-        int(np.flatnonzero(used == alignment.reference)[0]),
-        output,
-        options.composite,
-        options.threads,
-        progress,
-        overwrite=options.overwrite,
-        dry_run=options.dry_run,
-        turned=alignment.on_sphere,
-    )
-    _release_decoded_images(registration)
-    result = StitchResult(
-        registration.with_messages(map(Message, composed.notes)),
-        composed.canvas,
-        options,
-        None if output is None else Path(output),
-        composed.composite,
-        composed.plan,
-    )
-    if options.dry_run:
-        return result
-    if output is not None:
-        write_json_atomic(f"{output}.json", sidecar(result))
-    _save_camera(registration, options)
+    with Outputs(options.overwrite) as outputs:
+        composed = compose_pictures(
+            [registration.sources[i] for i in used],
+            [alignment.cameras[i] for i in used],
+            alignment.homographies[used],
+            int(np.flatnonzero(used == alignment.reference)[0]),
+            output,
+            options.composite,
+            options.threads,
+            progress,
+            overwrite=options.overwrite,
+            outputs=outputs,
+            dry_run=options.dry_run,
+            turned=alignment.on_sphere,
+        )
+        _release_decoded_images(registration)
+        result = StitchResult(
+            _with_damage(registration).with_messages(map(Message, composed.notes)),
+            composed.canvas,
+            options,
+            None if output is None else Path(output),
+            composed.composite,
+            composed.plan,
+            composed.fingerprint,
+        )
+        if not options.dry_run:
+            _save_camera(registration, options, outputs)
+            # Last: whoever finds it finds what it belongs to.
+            if output is not None:
+                outputs.write(f"{output}.json", json_bytes(sidecar(result)))
     return result
+
+
+def _with_damage(registration: Registration) -> Registration:
+    """The registration with what the decoders have found wrong, in whichever stage."""
+    guards = {id(source.guard): source.guard for source in registration.sources}
+    return registration.with_messages(message for guard in guards.values() for message in guard.messages)
 
 
 def _release_decoded_images(registration: Registration) -> None:
@@ -304,6 +312,6 @@ def _scale_uncertainty(alignment: Alignment) -> list[Message]:
     ]
 
 
-def _save_camera(registration: Registration, options: StitchOptions) -> None:
+def _save_camera(registration: Registration, options: StitchOptions, outputs: Outputs) -> None:
     if options.save_camera is not None:
-        save_camera(registration.camera, options.save_camera)
+        outputs.write(options.save_camera, text_bytes(camera_file_text(registration.camera, options.save_camera)))

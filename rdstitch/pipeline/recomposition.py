@@ -8,10 +8,11 @@ from typing import Any
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, CompositePlan
 from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.inputs.source import Source
+from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.messages import Message
 from rdstitch.output_image import OutputImage
 from rdstitch.sidecar.read import SavedRegistration
-from rdstitch.sidecar.write import VERSION, lens_fields, output_geometry, plain, to_output, versions
+from rdstitch.sidecar.write import VERSION, identity_fields, lens_fields, output_geometry, plain, to_output, versions
 
 
 @dataclass(frozen=True, repr=False)
@@ -36,9 +37,11 @@ class Recomposition(OutputImage):
     plan : CompositePlan or None
         Of a dry run.
     notes : tuple of str
-        What the user should know of the compositing.
+        What the user should know of the compositing, and of the sidecar.
     channel_order : str
         Of :attr:`image`: "bgr" or "rgb".
+    fingerprint : Fingerprint or None
+        Size and digest of the file.
     """
 
     saved: SavedRegistration
@@ -52,6 +55,7 @@ class Recomposition(OutputImage):
     plan: CompositePlan | None = None
     notes: tuple[str, ...] = ()
     channel_order: ChannelOrder = "bgr"
+    fingerprint: Fingerprint | None = None
 
     @property
     def image_order(self) -> ChannelOrder:
@@ -89,7 +93,7 @@ def applied_sidecar(result: Recomposition) -> dict[str, Any]:
         "focal_px": camera.focal,
         "reference": source.name,
         "output": {
-            "file": None if result.output is None else result.output.name,
+            **identity_fields(result.output, result.fingerprint),
             **output_geometry(result.canvas, turned=result.saved.turned),
         },
         "images": entries,

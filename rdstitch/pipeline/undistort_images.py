@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal, overload
 
 import numpy as np
@@ -12,7 +11,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, compose
 from rdstitch.errors import ArgumentError, OutputError
-from rdstitch.inputs.find import find_pictures
+from rdstitch.inputs.find import found_pictures
 from rdstitch.inputs.frame import ChannelOrder, Images, as_inputs, files_of, in_order
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.atomic import check_output
@@ -95,15 +94,14 @@ def undistort(
     if view not in ("same", "all", "valid"):
         raise ArgumentError(f"unknown view {view!r}; choose same, all or valid")
     given = as_inputs(inputs, channel_order)
-    with TemporaryDirectory(prefix="rdstitch-") as frames_folder:
-        frames = find_pictures(given, frames_folder=Path(frames_folder))
-        sources, _ = read_sources(frames, camera=camera, focal=None, distortion=distortion, skip_bad=False)
+    with found_pictures(given) as found:
+        sources, _ = read_sources(found.frames, camera=camera, focal=None, distortion=distortion, skip_bad=False)
         if folder is None:
             return [in_order(_undistorted(source, view).pixels, channel_order) for source in sources]
-        outputs = _outputs(sources, Path(folder), files_of(frames), overwrite)
+        outputs = _outputs(sources, Path(folder), files_of(found.frames), overwrite)
         for done, (source, output) in enumerate(zip(sources, outputs, strict=True), start=1):
             picture = _undistorted(source, view)
-            write_image(output, picture.pixels, picture.alpha, metadata=source.metadata)
+            write_image(output, picture.pixels, picture.alpha, metadata=source.metadata, overwrite=overwrite)
             progress("undistorting", done, len(sources))
         return outputs
 

@@ -10,6 +10,8 @@ from rdstitch.camera import FOCAL_LOG_STD, Camera, read_coefficients
 from rdstitch.compositing import CompositeOptions
 from rdstitch.compositing.options import PROJECTIONS
 from rdstitch.errors import ArgumentError
+from rdstitch.io.deepzoom import tiles_folder
+from rdstitch.io.fingerprint import Fingerprint, fingerprint
 from rdstitch.records import Record, read_json
 from rdstitch.sidecar.write import VERSION
 
@@ -82,6 +84,7 @@ def read_sidecar(path: str | Path) -> SavedRegistration:
     if (version := record["version"]).value not in range(1, VERSION + 1):
         version.fail(f"this rdstitch reads versions 1 to {VERSION} of sidecars, not {version.value}")
     record["verdict"].fields()
+    _check_output(record["output"])
     pictures = tuple(_picture(item) for item in record["images"].items())
     return SavedRegistration(
         Path(path),
@@ -92,6 +95,32 @@ def read_sidecar(path: str | Path) -> SavedRegistration:
         _as_laid_out(_composite_options(record["options"]["composite"]), record),
         record.value,
     )
+
+
+def mismatch_with_picture(saved: SavedRegistration) -> str:
+    """Why the picture beside a sidecar is not the one that it was written with; empty where it is, or is not there."""
+    output = saved.content["output"]
+    if output.get("sha256") is None or output.get("file") is None:
+        return ""
+    picture = saved.path.with_name(output["file"])
+    tiles = tiles_folder(picture) if picture.suffix.lower() == ".dzi" else None
+    try:
+        same = fingerprint(picture, tiles) == Fingerprint(output.get("bytes"), output["sha256"])
+    except OSError:
+        return ""
+    return (
+        "" if same else f"{picture}: is not the picture that {saved.path.name} was written with; one of them is newer"
+    )
+
+
+def _check_output(record: Record) -> None:
+    """What tells which picture the sidecar belongs to; versions before had no size and digest."""
+    if (name := record.get("file")) is not None and Path(name.text()).name != name.value:
+        name.expected("the name of a file in the same folder")
+    if (size := record.get("bytes")) is not None:
+        size.integer(0)
+    if (digest := record.get("sha256")) is not None:
+        digest.text()
 
 
 def _picture(record: Record) -> SavedPicture:

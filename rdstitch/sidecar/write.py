@@ -14,6 +14,7 @@ from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas
 from rdstitch.compositing.photo_sphere import center_of_view, field_of_view
 from rdstitch.compositing.projection import PLANE
+from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.stitch_result import StitchResult
 
 VERSION = 2
@@ -50,7 +51,7 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
         "rms_px": alignment.rms,
         "reference": registration.sources[alignment.reference].name,
         "output": {
-            "file": None if result.output is None else result.output.name,
+            **identity_fields(result.output, result.fingerprint),
             **output_geometry(result.canvas, turned=alignment.on_sphere),
         },
         "images": _images(result),
@@ -117,6 +118,15 @@ def output_geometry(canvas: Canvas, *, turned: bool) -> dict[str, Any]:
 def to_output(canvas: Canvas, homography: FloatArray) -> FloatArray | None:
     """From undistorted coordinates to px of the output, where one matrix can say that: on a plane."""
     return canvas.matrix @ homography if canvas.projection == PLANE else None
+
+
+def identity_fields(output: Path | None, written: Fingerprint | None) -> dict[str, Any]:
+    """What the sidecar belongs to; by size and digest a reader sees whether it still does."""
+    return {
+        "file": None if output is None else output.name,
+        "bytes": None if written is None else written.size,
+        "sha256": None if written is None else written.sha256,
+    }
 
 
 def lens_fields(camera: Camera) -> dict[str, Any]:

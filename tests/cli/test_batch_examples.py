@@ -68,6 +68,15 @@ def test_mosaics_and_their_summary(environment: dict[str, str], floors: Path, tm
     assert _run(environment, "mosaics.sh", floors, out, needs=("find", "xargs")).returncode == 0
     assert {path.name: path.stat().st_mtime_ns for path in out.glob("*.tif")} == made
 
+    # A picture that is not the one that its sidecar names is neither kept in silence nor replaced.
+    (out / "hall one.tif").write_bytes(b"half")
+    done = _run(environment, "mosaics.sh", floors, out, needs=("find", "xargs", "sha256sum"))
+    assert (done.returncode, f"{out / 'hall one.tif'}: is not the picture" in done.stderr) == (1, True)
+    assert (out / "hall one.tif").read_bytes() == b"half"
+    for file in out.glob("hall one.tif*"):
+        file.unlink()
+    assert _run(environment, "mosaics.sh", floors, out, "--scale", "0.5", *FAST, needs=("find",)).returncode == 0
+
     table = _run(environment, "summary.sh", out, needs=("find", "xargs", "jq"))
     assert (table.returncode, table.stderr) == (0, "")
     head, *rows = (line.split("\t") for line in table.stdout.splitlines())
@@ -78,7 +87,13 @@ def test_mosaics_and_their_summary(environment: dict[str, str], floors: Path, tm
     bands = _run(environment, "bands.sh", out / "hall one.tif.json", tmp_path / "bands", floors / "hall one", needs=())
     assert Outcome.of(bands.returncode, bands.stdout, bands.stderr).err == ""
     assert bands.returncode == 0
-    assert read_image(tmp_path / "bands" / "hall one.tif").pixels.shape == read_image(out / "hall one.tif").pixels.shape
+    made_band = tmp_path / "bands" / "hall one.tif"
+    assert read_image(made_band).pixels.shape == read_image(out / "hall one.tif").pixels.shape
+    again = _run(environment, "bands.sh", out / "hall one.tif.json", tmp_path / "bands", floors / "hall one", needs=())
+    assert (again.returncode, again.stderr) == (0, "")
+    Path(f"{made_band}.json").unlink()
+    again = _run(environment, "bands.sh", out / "hall one.tif.json", tmp_path / "bands", floors / "hall one", needs=())
+    assert (again.returncode, f"{made_band}: is not the picture" in again.stderr) == (1, True)
 
 
 def test_mosaics_by_parallel(environment: dict[str, str], floors: Path, tmp_path: Path) -> None:
@@ -88,12 +103,24 @@ def test_mosaics_by_parallel(environment: dict[str, str], floors: Path, tmp_path
     assert sorted(path.name for path in out.glob("*.tif")) == ["hall one.tif", "it's two.tif"]
 
 
-def test_undistorting_a_tree(environment: dict[str, str], floors: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("place", ["straight", "floors/straight"])
+def test_undistorting_a_tree(environment: dict[str, str], floors: Path, tmp_path: Path, place: str) -> None:
+    Camera((400, 300), -0.2).save(tmp_path / "camera.json")
+    arguments = (tmp_path / "camera.json", floors, tmp_path / place)
+    originals = sorted(str(path.relative_to(floors)) for path in floors.rglob("*.png"))
+    for _ in range(2):
+        done = _run(environment, "undistort_all.sh", *arguments, needs=("find", "xargs", "realpath"))
+        assert done.returncode == 0
+        assert all("2 pictures undistorted" in line for line in done.stderr.splitlines())
+        made = sorted(str(path.relative_to(tmp_path / place)) for path in (tmp_path / place).rglob("*.png"))
+        assert made == originals
+
+
+def test_undistorting_a_tree_tells_of_failures(environment: dict[str, str], floors: Path, tmp_path: Path) -> None:
     Camera((400, 300), -0.2).save(tmp_path / "camera.json")
     arguments = (tmp_path / "camera.json", floors, tmp_path / "straight")
+    done = _run(environment, "undistort_all.sh", *arguments[:2], floors, needs=("find", "xargs", "realpath"))
+    assert (done.returncode, "choose another one" in done.stderr) == (1, True)
+    (floors / "empty" / "bad.png").write_bytes(b"no picture")
     done = _run(environment, "undistort_all.sh", *arguments, needs=("find", "xargs", "realpath"))
-    assert done.returncode == 0
-    assert all("2 pictures undistorted" in line for line in done.stderr.splitlines())
-    originals = sorted(str(path.relative_to(floors)) for path in floors.rglob("*.png"))
-    made = sorted(str(path.relative_to(tmp_path / "straight")) for path in (tmp_path / "straight").rglob("*.png"))
-    assert made == originals
+    assert (done.returncode, "bad.png" in done.stderr) == (1, True)

@@ -389,7 +389,7 @@ def test_bad_luck_in_the_middle(
     def fail(*arguments: Any, **options: Any) -> None:
         raise raised
 
-    monkeypatch.setattr(recipes, "write_json_atomic", fail)
+    monkeypatch.setattr(recipes, "sidecar", fail)
     done = rdstitch("pano", place / "a.png", place / "b.png", "-o", place / "out.png", *FAST)
     assert done.status == status
     assert done.line

@@ -38,8 +38,9 @@ def test_it_decodes_what_pillow_does(
 ) -> None:
     file = tmp_path / "a.jpg"
     Image.fromarray(pixels).convert("L" if grey else "RGB").save(file, **options)
-    found = decoded_jpeg(file, SIZE, factor, grey=grey)
+    found, complaint = decoded_jpeg(file, SIZE, factor, grey=grey)
     assert found is not None
+    assert complaint == ""
     assert found.shape[1::-1] == reduced_size(SIZE, factor)
     np.testing.assert_array_equal(found, _by_pillow(file, factor))
     np.testing.assert_array_equal(read_image(file, factor).pixels, found)
@@ -48,7 +49,7 @@ def test_it_decodes_what_pillow_does(
 def test_tiny_pictures_are_left_to_pillow(tmp_path: Path, pixels: NDArray[np.uint8]) -> None:
     for side, factor in ((3, 2), (5, 4), (7, 1)):
         Image.fromarray(pixels[:side, :side]).save(tmp_path / "a.jpg")
-        assert decoded_jpeg(tmp_path / "a.jpg", (side, side), factor, grey=False) is None
+        assert decoded_jpeg(tmp_path / "a.jpg", (side, side), factor, grey=False) == (None, "")
         assert read_image(tmp_path / "a.jpg", factor).pixels.shape[1::-1] == reduced_size((side, side), factor)
 
 
@@ -58,9 +59,24 @@ def test_complaints_are_left_to_pillow(tmp_path: Path, pixels: NDArray[np.uint8]
     data = file.read_bytes()
     cut.write_bytes(data[: len(data) // 2])
     padded.write_bytes(data[:-2] + bytes(100) + data[-2:])
-    assert decoded_jpeg(cut, SIZE, 1, grey=False) is None
-    assert decoded_jpeg(file, (SIZE[0] + 8, SIZE[1]), 1, grey=False) is None
-    np.testing.assert_array_equal(read_image(padded).pixels, read_image(file).pixels)
+    found, complaint = decoded_jpeg(cut, SIZE, 1, grey=False)
+    assert (found, "Premature end" in complaint) == (None, True)
+    assert decoded_jpeg(file, (SIZE[0] + 8, SIZE[1]), 1, grey=False) == (None, "")
+    read = read_image(padded)
+    np.testing.assert_array_equal(read.pixels, read_image(file).pixels)
+    assert read.damage == ""
+
+
+def test_damage_is_named(tmp_path: Path, pixels: NDArray[np.uint8]) -> None:
+    file = tmp_path / "a.jpg"
+    Image.fromarray(pixels).save(file)
+    assert read_image(file).damage == ""
+    data = file.read_bytes()
+    file.write_bytes(data[: len(data) // 2] + data[len(data) // 2 + 400 :])
+    for factor in (1, 2):
+        damaged = read_image(file, factor)
+        assert "orrupt JPEG data" in damaged.damage
+        assert damaged.pixels.shape[1::-1] == reduced_size(SIZE, factor)
 
 
 def test_inks_become_colours(tmp_path: Path, pixels: NDArray[np.uint8]) -> None:

@@ -1,0 +1,95 @@
+"""Files that change during a run, or whose pixels a decoder has doubts about: noticed once for all who read them."""
+
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rdstitch.errors import InputError
+from rdstitch.io.read import Picture
+from rdstitch.messages import Message
+from rdstitch.regular_files import open_regular
+
+_PIECE = 2**20
+
+_Stamp = tuple[int, int, int, int]
+
+
+class InputGuard:
+    """What is known of the input files of one run; shared by its sources, and by threads.
+
+    Parameters
+    ----------
+    strict : bool
+        Refuse a damaged picture, rather than warn of it.
+    """
+
+    def __init__(self, strict: bool = False) -> None:
+        self._strict = strict
+        self._stamps: dict[Path, _Stamp | None] = {}
+        self._checksums: dict[Path, int] = {}
+        self._damaged: dict[Path, str] = {}
+
+    @contextmanager
+    def reading(self, path: Path) -> Iterator[None]:
+        """Read a file inside the block; its content must be what it was before.
+
+        Raises
+        ------
+        InputError
+            When it has changed since it was read for the first time, or changes meanwhile.
+        """
+        before = _stamp(path)
+        yield
+        if path not in self._checksums:
+            self._checksums[path] = _checksum(path)
+        elif before != self._stamps[path] and _checksum(path) != self._checksums[path]:
+            raise InputError(f"{path}: its content has changed during the run; run again")
+        self._stamps[path] = before
+        if _stamp(path) != before:
+            raise InputError(f"{path}: is being written to; run again when that has ended")
+
+    def check(self, path: Path, picture: Picture) -> None:
+        """Take note of a picture that may be damaged.
+
+        Raises
+        ------
+        InputError
+            When damaged pictures are refused.
+        """
+        if not picture.damage:
+            return
+        reason = f"is damaged, and parts of it may be wrong ({picture.damage}); copy it again from its source"
+        if self._strict:
+            raise InputError(f"{path}: {reason}")
+        self._damaged[path] = reason
+
+    @property
+    def messages(self) -> list[Message]:
+        """What the user should know of the files."""
+        return [Message(f"{path}: {self._damaged[path]}", (str(path),)) for path in sorted(self._damaged)]
+
+    def __reduce__(self) -> tuple[type["InputGuard"], tuple[bool]]:
+        """Copies and other processes begin anew."""
+        return InputGuard, (self._strict,)
+
+
+def _stamp(path: Path) -> _Stamp | None:
+    """What changes with every change of a file, and is cheap to see; None where there is none."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+def _checksum(path: Path) -> int:
+    """CRC-32 of the content: against accidents, not against forgers."""
+    value = 0
+    try:
+        with open_regular(path) as stream:
+            while piece := stream.read(_PIECE):
+                value = zlib.crc32(piece, value)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read any more: {error.strerror}; run again") from error
+    return value

@@ -1,0 +1,48 @@
+"""Size and digest of a written picture, by which a sidecar says what it belongs to."""
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Fingerprint:
+    """What a picture's files come to.
+
+    Attributes
+    ----------
+    size : int
+        Bytes of all files.
+    sha256 : str
+        Of the file; of a Deep Zoom picture that of the list of its files, as ``sha256sum`` prints it (digest, two
+        spaces, name), in order of names, the description first as ``.dzi``.
+    """
+
+    size: int
+    sha256: str
+
+
+def fingerprint(picture: Path, tiles: Path | None = None) -> Fingerprint:
+    """The fingerprint of a picture, and of the tiles that belong to it.
+
+    Raises
+    ------
+    OSError
+        When a file cannot be read.
+    """
+    if tiles is None:
+        return Fingerprint(picture.stat().st_size, _sha256(picture))
+    files = [(".dzi", picture), *_named(tiles)]
+    listing = "".join(f"{_sha256(file)}  {name}\n" for name, file in files)
+    return Fingerprint(sum(file.stat().st_size for _, file in files), hashlib.sha256(listing.encode()).hexdigest())
+
+
+def _named(tiles: Path) -> Iterator[tuple[str, Path]]:
+    for file in sorted(path for path in tiles.rglob("*") if path.is_file()):
+        yield file.relative_to(tiles).as_posix(), file
+
+
+def _sha256(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -1,0 +1,83 @@
+"""Opening picture files: only the formats below, only regular files, and nothing of them decoded yet."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, BinaryIO
+
+from PIL import (
+    BmpImagePlugin,
+    GifImagePlugin,
+    ImageFile,
+    Jpeg2KImagePlugin,
+    JpegImagePlugin,
+    PngImagePlugin,
+    PpmImagePlugin,
+    TiffImagePlugin,
+    WebPImagePlugin,
+)
+
+from rdstitch.errors import InputError
+from rdstitch.regular_files import open_regular
+
+TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+
+# Pillow opens some forty formats, and starts Ghostscript for one of them, whatever a file is called.
+_FORMATS: dict[bytes, Callable[[IO[bytes], str], ImageFile.ImageFile]] = {
+    b"\xff\xd8\xff": JpegImagePlugin.jpeg_factory,
+    PNG_MAGIC: PngImagePlugin.PngImageFile,
+    **dict.fromkeys(TIFF_MAGIC, TiffImagePlugin.TiffImageFile),
+    b"RIFF": WebPImagePlugin.WebPImageFile,
+    b"BM": BmpImagePlugin.BmpImageFile,
+    b"GIF8": GifImagePlugin.GifImageFile,
+    b"\xff\x4f\xff\x51": Jpeg2KImagePlugin.Jpeg2KImageFile,
+    b"\0\0\0\x0cjP  \r\n\x87\n": Jpeg2KImagePlugin.Jpeg2KImageFile,
+    **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6"), PpmImagePlugin.PpmImageFile),
+}
+_LONGEST_MAGIC = max(map(len, _FORMATS))
+_NAMES = "JPEG, PNG, TIFF, WebP, BMP, GIF, JPEG 2000, PBM, PGM, PPM"
+_MOST_MEGAPIXELS = 178
+
+
+@contextmanager
+def opened_picture(file: Path) -> Iterator[ImageFile.ImageFile]:
+    """A picture whose header has been read.
+
+    Raises
+    ------
+    InputError
+        When it is none of these formats, or larger than any camera's.
+    OSError, SyntaxError, …
+        What :func:`rdstitch.io.decoding.decoding` makes an InputError of: the file is missing, no regular one, or
+        damaged.
+    """
+    with open_regular(file) as stream, _factory(file, stream)(stream, str(file)) as image:
+        check_megapixels(file, image.size)
+        yield image
+
+
+def check_megapixels(file: Path, size: tuple[int, int]) -> None:
+    """Refuse what claims to be larger than any camera's picture.
+
+    Raises
+    ------
+    InputError
+        The text says what to do.
+    """
+    megapixels = size[0] * size[1] / 1e6
+    if megapixels > _MOST_MEGAPIXELS:
+        raise InputError(
+            f"{file}: {size[0]} x {size[1]} pixels are {megapixels:.0f} megapixels, more than {_MOST_MEGAPIXELS}; "
+            "cut it up or make it smaller first"
+        )
+
+
+def _factory(file: Path, stream: BinaryIO) -> Callable[[IO[bytes], str], ImageFile.ImageFile]:
+    """What opens the format of a file, by its first bytes."""
+    beginning = stream.read(_LONGEST_MAGIC)
+    stream.seek(0)
+    for magic, factory in _FORMATS.items():
+        if beginning.startswith(magic):
+            return factory
+    raise InputError(f"{file}: is no picture in a format that is read here: {_NAMES}")

@@ -1,0 +1,159 @@
+"""A picture and all that belongs to it appear together: whatever fails, all is old, all is new, or nothing is there."""
+
+import json
+import shutil
+from hashlib import sha256
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from rdstitch.io import read_image
+from tests.cli.running import FAST, Run, finished, start
+from tests.faults import OPERATIONS, Operation, failing_disk
+
+
+@pytest.fixture(scope="module")
+def located(frames: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of three pictures with positions, in ``flight``, and the sidecar of their mosaic, ``field.tif.json``."""
+    from rdstitch_cli.main import run
+
+    folder = tmp_path_factory.mktemp("located")
+    (folder / "flight").mkdir()
+    for number, frame in enumerate(frames):
+        with Image.open(frame) as image:
+            exif = Image.Exif()
+            exif[0x8825] = {1: "N", 2: (45.0, 0.0, 0.0), 3: "E", 4: (9.0, 0.0, 0.1 * number)}
+            image.convert("RGB").save(folder / "flight" / f"{frame.stem}.jpg", exif=exif, quality=95)
+    assert run(["mosaic", str(folder / "flight"), "-o", str(folder / "field.tif"), *FAST]) == 0
+    return folder
+
+
+def _outputs(folder: Path) -> dict[str, bytes]:
+    """Every file with its content, hidden ones too."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def _check_all_failures(
+    rdstitch: Run, located: Path, folder: Path, operation: Operation, name: str, overwrite: bool, step: int
+) -> None:
+    """Let every operation fail once, in turn; ``step`` of 2 takes every other one."""
+    arguments: tuple[str | Path, ...] = ("apply", located / "field.tif.json", "--images", located / "flight")
+    arguments = (*arguments, "-o", folder / name, "--scale", "0.3", "--blend", "none", "--seam", "none", "-j", "1")
+    if overwrite:
+        arguments = (*arguments, "--overwrite")
+    before: dict[str, bytes] = {}
+    if overwrite:
+        assert rdstitch(*arguments, "--rotate", "90").status == 0
+        before = _outputs(folder)
+    with failing_disk(operation) as disk:
+        assert rdstitch(*arguments).status == 0
+    after = _outputs(folder)
+    assert len(after) >= 2
+    assert disk.count > 0
+    for failing in range(0, disk.count, step):
+        shutil.rmtree(folder)
+        folder.mkdir()
+        for path, content in before.items():
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            (folder / path).write_bytes(content)
+        with failing_disk(operation, failing):
+            done = rdstitch(*arguments)
+        assert done.status == 6, (failing, done.err)
+        assert str(folder) in done.line
+        assert _outputs(folder) == before
+    assert rdstitch(*arguments).status == 0
+    assert _outputs(folder) == after
+
+
+@pytest.mark.parametrize("operation", OPERATIONS)
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("name", ["out.jpg", "out.tif", "out.dzi"])
+def test_whatever_fails(
+    rdstitch: Run, located: Path, tmp_path: Path, operation: Operation, overwrite: bool, name: str
+) -> None:
+    # The writes of tiles and strips are many, and alike; all of them are in the slow test.
+    step = 5 if operation == "write" else 3
+    _check_all_failures(rdstitch, located, tmp_path, operation, name, overwrite, step)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("operation", OPERATIONS)
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("name", ["out.jpg", "out.png", "out.webp", "out.tif", "out.dzi"])
+def test_whatever_fails_every_single_time(
+    rdstitch: Run, located: Path, tmp_path: Path, operation: Operation, overwrite: bool, name: str
+) -> None:
+    _check_all_failures(rdstitch, located, tmp_path, operation, name, overwrite, 1)
+
+
+def test_of_two_processes_one_succeeds(located: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out.dzi"
+    options = (("--rotate", "0"), ("--rotate", "90"))
+    arguments = ("apply", located / "field.tif.json", "--images", located / "flight", "-o", output, "-j", "1")
+    running = [start(*arguments, *option) for option in options]
+    done = [finished(process) for process in running]
+    assert sorted(one.status for one in done) == [0, 6]
+    (failed,) = (one for one in done if one.status)
+    assert "exists already" in failed.line
+    record = json.loads((tmp_path / "out.dzi.json").read_text(encoding="utf-8"))
+    assert record["options"]["composite"]["rotate"] == (0, 90)[next(k for k, one in enumerate(done) if not one.status)]
+    files = [tmp_path / "out.dzi", *sorted((tmp_path / "out_files").rglob("*.jpg"))]
+    names = [".dzi", *(file.relative_to(tmp_path / "out_files").as_posix() for file in files[1:])]
+    digests = (sha256(file.read_bytes()).hexdigest() for file in files)
+    listing = "".join(f"{digest}  {name}\n" for digest, name in zip(digests, names, strict=True))
+    assert record["output"]["sha256"] == sha256(listing.encode()).hexdigest()
+    assert record["output"]["bytes"] == sum(file.stat().st_size for file in files)
+
+
+def test_the_sidecar_names_what_it_belongs_to(rdstitch: Run, located: Path, tmp_path: Path) -> None:
+    picture, sidecar = (Path(shutil.copy(located / name, tmp_path)) for name in ("field.tif", "field.tif.json"))
+    record = json.loads(sidecar.read_text(encoding="utf-8"))["output"]
+    assert record["sha256"] == sha256(picture.read_bytes()).hexdigest()
+    assert record["bytes"] == picture.stat().st_size
+    arguments = ("apply", sidecar, "--images", located / "flight", "--scale", "0.3", "-j", "1", "-o")
+    assert rdstitch(*arguments, tmp_path / "same.jpg", "--strict").err == ""
+    picture.write_bytes(picture.read_bytes()[:-1] + b"x")
+    done = rdstitch(*arguments, tmp_path / "other.jpg")
+    assert (done.status, f"{picture}: is not the picture that field.tif.json was written with" in done.line) == (
+        0,
+        True,
+    )
+    done = rdstitch(*arguments, tmp_path / "strict.jpg", "--strict")
+    assert (done.status, str(picture) in done.line) == (3, True)
+    picture.unlink()
+    assert rdstitch(*arguments, tmp_path / "alone.jpg", "--strict").err == ""
+
+
+def test_a_picture_beside_any_sidecar_does_not_vanish(rdstitch: Run, located: Path, tmp_path: Path) -> None:
+    flight = tmp_path / "flight"
+    shutil.copytree(located / "flight", flight)
+    first = sorted(flight.iterdir())[0]
+    shutil.copy(located / "field.tif.json", f"{first}.json")
+    done = rdstitch("mosaic", flight, "-o", tmp_path / "out.tif", *FAST)
+    assert (done.status, done.err) == (0, "")
+    assert len(json.loads((tmp_path / "out.tif.json").read_text(encoding="utf-8"))["images"]) == 3
+    # What rdstitch wrote itself is no input of the next run, and that is said.
+    for name in ("field.tif", "field.tif.json"):
+        shutil.copy(located / name, flight)
+    done = rdstitch("mosaic", flight, "-o", tmp_path / "again.tif", *FAST)
+    assert done.status == 0
+    assert "rdstitch wrote them: field.tif" in done.line
+    assert read_image(tmp_path / "again.tif").pixels.shape == read_image(tmp_path / "out.tif").pixels.shape
+    only = tmp_path / "only"
+    only.mkdir()
+    for name in ("field.tif", "field.tif.json"):
+        shutil.copy(located / name, only)
+    assert "no pictures but those that rdstitch wrote" in rdstitch("mosaic", only, "-o", tmp_path / "x.tif").line
+
+
+def test_a_link_as_output(rdstitch: Run, located: Path, tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "out.jpg").symlink_to("disk/picture.jpg")
+    arguments = ("apply", located / "field.tif.json", "--images", located / "flight", "--scale", "0.3", "-j", "1")
+    done = rdstitch(*arguments, "-o", tmp_path / "out.jpg", "--overwrite")
+    assert (done.status, "link to nothing" in done.line) == (6, True)
+    (tmp_path / "disk" / "picture.jpg").write_bytes(b"old")
+    assert rdstitch(*arguments, "-o", tmp_path / "out.jpg", "--overwrite").status == 0
+    assert (tmp_path / "out.jpg").is_symlink()
+    assert read_image(tmp_path / "disk" / "picture.jpg").pixels.size > 0

@@ -1,0 +1,207 @@
+"""Outputs are published together or not at all, whatever fails, and nothing is lost."""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from rdstitch.errors import OutputError
+from rdstitch.io import outputs as outputs_module
+from rdstitch.io.atomic import check_output, write_bytes_atomic
+from rdstitch.io.outputs import Outputs
+from rdstitch.io.staging import StagingFolder, temporary_folder
+from tests.faults import OPERATIONS, Operation, failing_disk
+
+_NAMES = ("a.dzi", "a.dzw", "a.dzi.json")
+
+
+def _write_all(folder: Path, content: bytes, overwrite: bool) -> None:
+    with Outputs(overwrite) as outputs:
+        with outputs.writing_folder(folder / "a_files") as tiles, outputs.writing(folder / "a.dzi") as description:
+            (tiles / "0").mkdir()
+            for name in ("0_0.jpg", "1_0.jpg"):
+                (tiles / "0" / name).write_bytes(content)
+            description.write_bytes(content)
+        for name in _NAMES[1:]:
+            outputs.write(folder / name, content)
+
+
+def _state(folder: Path) -> dict[str, bytes]:
+    """Every file with its content, hidden ones too; empty folders are listed as well."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else b"folder" for path in folder.rglob("*")
+    }
+
+
+@pytest.mark.parametrize("operation", OPERATIONS)
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("links", [True, False])
+def test_any_failure_leaves_all_as_it_was(
+    tmp_path: Path, operation: Operation, overwrite: bool, links: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_links(*arguments: object) -> None:
+        raise OSError(1, "Operation not permitted")
+
+    if not links:
+        monkeypatch.setattr(os, "link", no_links)
+    if overwrite:
+        _write_all(tmp_path, b"old", overwrite=True)
+    before = _state(tmp_path)
+    failing, total = 0, 1
+    while failing < total:
+        with failing_disk(operation, failing) as disk, pytest.raises(OutputError, match="No space left") as caught:
+            _write_all(tmp_path, b"new", overwrite)
+        assert str(tmp_path / "a") in str(caught.value)
+        assert _state(tmp_path) == before
+        failing += 1
+        with failing_disk(operation) as disk:
+            _write_all(tmp_path, b"new", overwrite)
+        total = disk.count
+        assert set(_state(tmp_path).values()) == {b"new", b"folder"}
+        for name in (*_NAMES, "a_files"):
+            (tmp_path / name).rename(tmp_path.parent / f"{tmp_path.name}_{failing}_{name}")
+        if overwrite:
+            _write_all(tmp_path, b"old", overwrite=True)
+    assert total >= 3
+
+
+@pytest.mark.parametrize("appearing", [*_NAMES, "a_files/x"])
+def test_a_file_that_appears_during_the_run_is_kept(tmp_path: Path, appearing: str) -> None:
+    def write() -> None:
+        with Outputs(overwrite=False) as outputs:
+            with outputs.writing_folder(tmp_path / "a_files") as tiles:
+                (tiles / "0").mkdir()
+            for name in _NAMES:
+                outputs.write(tmp_path / name, b"ours")
+            (tmp_path / appearing).parent.mkdir(exist_ok=True)
+            (tmp_path / appearing).write_bytes(b"theirs")
+
+    with pytest.raises(OutputError, match="exists already"):
+        write()
+    assert set(_state(tmp_path).values()) <= {b"theirs", b"folder"}
+    assert (tmp_path / appearing).read_bytes() == b"theirs"
+
+
+def test_a_file_that_appears_at_the_last_moment_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    link = os.link
+
+    def late(source: Path, place: Path) -> None:
+        place.write_bytes(b"theirs")
+        link(source, place)
+
+    monkeypatch.setattr(os, "link", late)
+    with pytest.raises(OutputError, match="appeared during the run"):
+        write_bytes_atomic(tmp_path / "a.txt", b"ours", overwrite=False)
+    assert _state(tmp_path) == {"a.txt": b"theirs"}
+
+
+def test_what_cannot_be_put_back_is_kept_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _write_all(tmp_path, b"old", overwrite=True)
+
+    def fail(*arguments: object) -> None:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(outputs_module, "_restore", fail)
+    with failing_disk("rename", 7), pytest.raises(OutputError, match="cannot be put back, the old one is") as caught:
+        _write_all(tmp_path, b"new", overwrite=True)
+    kept = Path(str(caught.value).split("the old one is ")[1].split(";")[0])
+    assert kept.read_bytes() == b"old"
+
+
+@pytest.mark.parametrize("existing", [True, False])
+def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path: Path, existing: bool) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    target, link = tmp_path / "elsewhere" / "target.png", tmp_path / "link.png"
+    link.symlink_to(target)
+    if not existing:
+        with pytest.raises(OutputError, match="link to nothing"):
+            check_output(link, overwrite=True)
+        return
+    target.write_bytes(b"old")
+    target.chmod(0o640)
+    with pytest.raises(OutputError, match="exists"):
+        check_output(link)
+    check_output(link, overwrite=True)
+    write_bytes_atomic(link, b"new")
+    assert link.is_symlink()
+    assert (target.read_bytes(), target.stat().st_mode & 0o777) == (b"new", 0o640)
+    assert len(list((tmp_path / "elsewhere").iterdir())) == 1
+
+
+def test_a_folder_of_the_user_is_no_folder_of_tiles(tmp_path: Path) -> None:
+    treasure = tmp_path / "photos_files" / "2023" / "raw" / "wedding.nef"
+    treasure.parent.mkdir(parents=True)
+    treasure.write_bytes(b"dear")
+    with pytest.raises(OutputError, match=r"photos_files: .*holds other files"):
+        check_output(tmp_path / "photos.dzi", overwrite=True)
+
+    def write() -> None:
+        with Outputs(overwrite=True) as outputs:
+            with outputs.writing_folder(tmp_path / "photos_files"):
+                pass
+            outputs.write(tmp_path / "photos.dzi", b"new")
+
+    # Also when it comes there during the run.
+    with pytest.raises(OutputError, match="holds other files"):
+        write()
+    assert _state(tmp_path)["photos_files/2023/raw/wedding.nef"] == b"dear"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["photos_files"]
+
+
+@pytest.mark.parametrize("name", ["0/0_0.png", "0/x.jpg", "readme.txt", "x/0_0.jpg", "123/0_0.jpg", "0/1/0_0.jpg"])
+def test_whatever_is_no_tile_keeps_a_folder(tmp_path: Path, name: str) -> None:
+    (tmp_path / "a_files" / "0").mkdir(parents=True)
+    (tmp_path / "a_files" / "0" / "0_0.jpg").write_bytes(b"tile")
+    check_output(tmp_path / "a.dzi", overwrite=True)
+    (tmp_path / "a_files" / name).parent.mkdir(exist_ok=True)
+    (tmp_path / "a_files" / name).write_bytes(b"dear")
+    with pytest.raises(OutputError, match="holds other files"):
+        check_output(tmp_path / "a.dzi", overwrite=True)
+
+
+_KILLED = """
+import os, signal, sys
+from pathlib import Path
+from rdstitch.io.outputs import Outputs
+from rdstitch.io.staging import temporary_folder
+with temporary_folder() as folder, Outputs(False) as outputs:
+    (folder / "frame.png").write_bytes(b"half")
+    with outputs.writing(sys.argv[1]) as staged:
+        staged.write_bytes(b"half")
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def _leftovers(*folders: Path) -> list[Path]:
+    return [path for folder in folders for path in folder.iterdir() if "rdstitch-" in path.name]
+
+
+def test_leftovers_of_dead_processes_go_and_those_of_living_ones_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, temporary = tmp_path / "out", tmp_path / "tmp"
+    out.mkdir()
+    temporary.mkdir()
+    environment = {**os.environ, "TMPDIR": str(temporary), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    done = subprocess.run([sys.executable, "-c", _KILLED, out / "a.txt"], env=environment, check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert len(_leftovers(out, temporary)) == 2
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    living = StagingFolder(out)
+    with temporary_folder() as frames:
+        write_bytes_atomic(out / "a.txt", b"whole")
+        assert set(_leftovers(out, temporary)) == {living.path, frames}
+    living.close()
+    assert _leftovers(out, temporary) == []
+
+
+@pytest.mark.parametrize("make", [lambda path: path.mkdir(), lambda path: path.touch()])
+def test_what_only_has_the_name_of_a_leftover_stays(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    make(tmp_path / ".rdstitch-mine.part")
+    write_bytes_atomic(tmp_path / "a.txt", b"x")
+    assert (tmp_path / ".rdstitch-mine.part").exists()
