@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from importlib.resources.abc import Traversable
@@ -26,6 +26,7 @@ Value = TypeVar("Value")
 
 _FORMAT = 1
 _LARGEST_ENTRY = 2**31  # bytes
+_WRONG = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError)
 _OPENCV = tuple(f"opencv-{kind}" for kind in ("contrib-python-headless", "contrib-python", "python-headless", "python"))
 _PACKAGES = ("numpy", "scipy", *_OPENCV, "pillow", "simplejpeg", "tifffile")
 
@@ -65,6 +66,7 @@ class Cache:
         inputs: tuple[Any, ...],
         compute: Callable[[], Value],
         unless: Callable[[], bool] = lambda: False,
+        valid: Callable[[Value], bool] = lambda value: True,
     ) -> Value:
         """What a stage gives for its inputs: from an earlier run, else computed now and kept.
 
@@ -80,11 +82,14 @@ class Cache:
             Gives the result.
         unless : callable
             Asked after the computation: whether its result must not be kept.
+        valid : callable
+            Whether an entry is a result for these inputs by its shapes and ranges; else it is computed again, as where
+            it raises one of the errors that wrong values lead to.
         """
         if self.folder is None:
             return compute()
         file = self._file(stage, inputs)
-        kept: list[Value] = _read(file, kinds)
+        kept = _read(file, kinds, valid)
         if kept:
             return kept[0]
         value = compute()
@@ -98,6 +103,7 @@ class Cache:
         kinds: tuple[type, ...],
         inputs: Sequence[tuple[Any, ...]],
         compute: Callable[[list[int]], list[Value]],
+        valid: Callable[[int, Value], bool] = lambda index, value: True,
     ) -> list[Value]:
         """As :meth:`recall` for a stage that computes several results at once.
 
@@ -109,11 +115,13 @@ class Cache:
             Of each result.
         compute : callable
             Gives the results of some of the inputs, called with their places.
+        valid : callable
+            As in :meth:`recall`, with the place.
         """
         if self.folder is None:
             return compute(list(range(len(inputs))))
         files = [self._file(stage, own) for own in inputs]
-        found: list[list[Value]] = [_read(file, kinds) for file in files]
+        found = [_read(file, kinds, partial(valid, index)) for index, file in enumerate(files)]
         missing = [index for index, kept in enumerate(found) if not kept]
         for index, value in zip(missing, compute(missing) if missing else [], strict=True):
             found[index] = [value]
@@ -175,11 +183,11 @@ def _name(file: Path) -> str:
     return file.parent.name + file.name
 
 
-def _read(file: Path, kinds: tuple[type, ...]) -> list[Value]:
-    """The result that a file holds; none where it is missing or damaged."""
-    with suppress(InputError, ArgumentError, OSError):
+def _read(file: Path, kinds: tuple[type, ...], valid: Callable[[Value], bool]) -> list[Value]:
+    """The result that a file holds; none where it is missing, damaged, or no result for these inputs."""
+    with suppress(InputError, ArgumentError, OSError, *_WRONG):
         kept: tuple[str, Value] = unpack(read_limited(file, _LARGEST_ENTRY), kinds)
-        if isinstance(kept, tuple) and kept[0] == _name(file):
+        if isinstance(kept, tuple) and kept[0] == _name(file) and valid(kept[1]):
             return [kept[1]]
     return []
 
@@ -195,13 +203,21 @@ NO_CACHE = Cache()
 
 
 def _write(file: Path, data: bytes) -> None:
-    """Write a file at once; unlike an output it need not survive a loss of power, since damage is noticed."""
-    file.parent.mkdir(parents=True, exist_ok=True)
+    """Write a file at once; unlike an output it need not survive a loss of power, since damage is noticed.
+
+    Whoever may read and write in the folder of the cache may read and write the file.
+    """
+    mode = file.parents[2].stat().st_mode & 0o7777
+    for folder in (file.parents[1], file.parent):
+        with suppress(FileExistsError):
+            folder.mkdir()
+            folder.chmod(mode)
     handle, name = tempfile.mkstemp(prefix=".", suffix=".part", dir=file.parent)
     temporary = Path(name)
     try:
         with os.fdopen(handle, "wb") as stream:
             stream.write(data)
+        temporary.chmod(mode & 0o666)
         temporary.replace(file)
     except BaseException:
         with suppress(OSError):

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.division_model import distort, is_one_to_one, nearest_distortion, undistort
-from rdstitch.errors import ArgumentError
+from rdstitch.errors import ArgumentError, ImpossibleCameraError
 from rdstitch.records import Record
 
 _FILE_VERSION = 2
@@ -94,15 +94,15 @@ class Camera:
             object.__setattr__(self, "center", ((width - 1) / 2, (height - 1) / 2))
         numbers = (*self.coefficients, *self.center)
         if not all(math.isfinite(value) for value in numbers):
-            raise ArgumentError(f"camera has a value that is not finite: {numbers}")
+            raise ImpossibleCameraError(f"camera has a value that is not finite: {numbers}")
         if self.focal is not None and not is_focal_length(self.focal, self.image_size):
-            raise ArgumentError(f"no lens has a focal length of {self.focal:g} px for {width} x {height} px")
+            raise ImpossibleCameraError(f"no lens has a focal length of {self.focal:g} px for {width} x {height} px")
         if self.focal_source is not None and self.focal_source not in FOCAL_LOG_STD:
             raise ArgumentError(f"unknown source of a focal length: {self.focal_source!r}")
         with np.errstate(all="ignore"):  # absurd values, from a damaged file, overflow
             corner = float(np.linalg.norm(self.normalize(self.outline(1)), axis=1).max())
             if not is_one_to_one(corner, self.coefficients):
-                raise ArgumentError(
+                raise ImpossibleCameraError(
                     f"distortion {', '.join(f'{value:g}' for value in self.coefficients if value)} folds the picture "
                     "at a corner; λ alone must be above -1"
                 )

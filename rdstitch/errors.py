@@ -4,6 +4,7 @@
 
     RdstitchError                1  something unexpected
     ├── ArgumentError            2  an argument has the wrong shape, type or range (also a ValueError)
+    │   └── ImpossibleCameraError
     ├── InputError               3  a file cannot be read, or is not what it should be
     ├── RegistrationError        4  no overlap, or no result that can be relied on
     ├── PartialResultError       5  pictures were left out, and --strict forbids that
@@ -27,6 +28,10 @@ class ArgumentError(RdstitchError, ValueError):
     """An argument has the wrong shape, type or range."""
 
     exit_status = 2
+
+
+class ImpossibleCameraError(ArgumentError):
+    """A camera that cannot be; where it was estimated rather than given, that is a RegistrationError."""
 
 
 class InputError(RdstitchError):

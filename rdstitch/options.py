@@ -14,6 +14,9 @@ from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.matching.options import MatchingOptions, PairOptions
 from rdstitch.robust import SOLVERS
 
+_MAX_WORKERS = 1024  # threads; more than any machine has cores for
+_MAX_THRESHOLD = 1e4  # pixels; more than a picture is wide
+
 
 @dataclass(frozen=True)
 class StitchOptions:
@@ -133,8 +136,12 @@ class StitchOptions:
             raise ArgumentError(f"the standard deviation of attitudes must not be negative, not {self.attitude_std}")
         if not self.threshold > 0.0 or not 0.0 < self.confidence < 1.0 or self.max_iterations < 1:
             raise ArgumentError("threshold and max_iterations must be positive, confidence between 0 and 1")
+        if not self.threshold <= _MAX_THRESHOLD:
+            raise ArgumentError(f"the threshold of an inlier must be at most {_MAX_THRESHOLD:g} pixels")
         if self.workers < 0 or self.seed < 0:
             raise ArgumentError("workers and seed must not be negative")
+        if self.workers > _MAX_WORKERS:
+            raise ArgumentError(f"workers must be at most {_MAX_WORKERS}, not {self.workers}")
 
     @property
     def known_distortion(self) -> float | None:

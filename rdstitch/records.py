@@ -14,6 +14,7 @@ from rdstitch.regular_files import read_limited
 
 LARGEST_FILE = 256 * 2**20  # bytes; a sidecar of ten thousand pictures has about 30 MB
 _LARGEST_SIDE = 10**7  # px
+_SMALLEST_ENTRY, _LARGEST_ENTRY = 1e-30, 1e30  # of matrices
 _DEEPEST = 50  # objects and lists within one another
 
 
@@ -205,6 +206,9 @@ class Record:
         if len(rows) != 3:
             self.expected("three rows of three numbers")
         array = np.array(rows, dtype=np.float64)
+        # Products of several of them must be numbers too.
+        if not _SMALLEST_ENTRY <= np.abs(array).max() <= _LARGEST_ENTRY:
+            self.fail(f"the matrix needs entries of {_SMALLEST_ENTRY:g} to {_LARGEST_ENTRY:g}")
         with np.errstate(all="ignore"):
             scale = np.abs(array).max()
             if scale == 0.0 or not np.linalg.cond(array / scale) < 1e12:

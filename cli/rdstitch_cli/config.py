@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from rdstitch.errors import InputError
+from rdstitch_cli.parameter_types import Angle, Bytes
 
 COMMON = "common"
 """The table that holds for every command."""
@@ -101,6 +102,8 @@ def _converted(option: click.Option, value: Any, where: str) -> Any:
             raise InputError(f"{where}: expected a number, not {value!r}")
         if isinstance(option.type, click.types.IntParamType) and not isinstance(value, int):
             raise InputError(f"{where}: expected a whole number, not {value!r}")
+    elif isinstance(value, (int, float)) and not isinstance(value, bool) and isinstance(option.type, (Angle, Bytes)):
+        value = str(value)  # no unit is needed: degrees, or bytes
     elif not isinstance(value, str):
         raise InputError(f"{where}: expected a text, not {value!r}")
     try:

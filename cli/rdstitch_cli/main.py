@@ -52,6 +52,8 @@ Examples:
 _UNEXPECTED, _USAGE, _INTERRUPTED, _BROKEN_PIPE = 1, 2, 130, 141
 _ASKED_TO_END = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 _M_ARENA_MAX = -8
+_OPENCV_NO_MEMORY = -4  # cv2.Error.StsNoMem
+_OUT_OF_MEMORY = "out of memory; try smaller pictures or a smaller --scale"
 _DECODERS = ("PIL", "tifffile")
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -130,10 +132,12 @@ def run(arguments: list[str]) -> int:
     except RdstitchError as error:
         return _complain(str(error), error.exit_status, debug)
     except MemoryError:
-        return _complain("out of memory; try smaller pictures or a smaller --scale", 7, debug)
+        return _complain(_OUT_OF_MEMORY, 7, debug)
     except Exception as error:  # noqa: BLE001 - the last line of defence: no traceback for users
         if isinstance(error, OSError) and error.errno in _NO_SPACE:
             return _complain(f"{error.filename or 'standard output'}: cannot be written: {error.strerror}", 6, debug)
+        if getattr(error, "code", None) == _OPENCV_NO_MEMORY and type(error).__module__ == "cv2":
+            return _complain(_OUT_OF_MEMORY, 7, debug)
         if isinstance(error, FileNotFoundError) and _is_nowhere():
             return _complain("the current folder does not exist any more; change to another one", 3, debug)
         text = str(error) or type(error).__name__

@@ -92,8 +92,8 @@ class CompositeOptions:
             value = getattr(self, option.name)
             if isinstance(value, str) and value not in allowed:
                 raise ArgumentError(f"{option.name} must be one of {', '.join(allowed)}, not '{value}'")
-        if not (math.isfinite(self.scale) and self.scale > 0):
-            raise ArgumentError(f"scale must be positive, not {self.scale}")
+        if not 1e-6 <= self.scale <= 1e6:
+            raise ArgumentError(f"scale must lie between 1e-6 and 1e6, not {self.scale}")
         if self.max_size is not None and self.max_size < 1:
             raise ArgumentError(f"max_size must be at least 1, not {self.max_size}")
         if not 1 <= self.quality <= 100:

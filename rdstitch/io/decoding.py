@@ -83,6 +83,8 @@ def decoding(path: Path) -> Iterator[None]:
     except PermissionError as error:
         raise InputError(f"{path}: permission denied; make it readable") from error
     except _DAMAGE as error:
+        if isinstance(error, cv2.error) and error.code == cv2.Error.StsNoMem:
+            raise InputError(f"{path}: too large to read into memory; make it smaller first") from error
         reason = " ".join(str(error).split()) or type(error).__name__
         reason = reason.replace(f"'{path}'", "the file")
         raise InputError(f"{path}: not a picture that can be read, or damaged ({reason[:160]})") from error

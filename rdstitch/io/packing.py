@@ -10,7 +10,8 @@ import json
 import struct
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,6 +106,25 @@ def _describe_array(array: NDArray[Any], blocks: list[bytes]) -> Any:
     return {"array": array.dtype.str, "shape": list(array.shape), "order": order}
 
 
+def _is_of(value: Any, hint: Any) -> bool:
+    """Whether a value is what a field of a dataclass is declared as, as far as that can be seen."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return value in arguments
+    if origin in (Union, UnionType):
+        return any(_is_of(value, part) for part in arguments)
+    if origin is tuple and isinstance(value, tuple):
+        if arguments[1:] == (...,):
+            return all(_is_of(item, arguments[0]) for item in value)
+        return len(value) == len(arguments) and all(map(_is_of, value, arguments))
+    if hint is float:
+        return isinstance(value, (float, int)) and not isinstance(value, bool)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    kind = origin or hint
+    return not isinstance(kind, type) or isinstance(value, kind)
+
+
 def _build(described: Any, blocks: memoryview, kinds: dict[str, type]) -> Any:
     """The value that a description stands for. Arrays are taken from the blocks in the order of the description."""
     position = 0
@@ -128,7 +148,11 @@ def _build(described: Any, blocks: memoryview, kinds: dict[str, type]) -> Any:
             # In the order of the fields, as they were packed.
             kind = kinds[part["object"]]
             given = part["fields"]
-            return kind(**{f.name: build(given[f.name]) for f in dataclasses.fields(kind)})
+            values = {f.name: build(given[f.name]) for f in dataclasses.fields(kind)}
+            for name, hint in get_type_hints(kind).items():
+                if name in values and not _is_of(values[name], hint):
+                    raise TypeError(f"{kind.__name__}.{name} is a {type(values[name]).__name__}")
+            return kind(**values)
         ((name, content),) = part.items()
         if name == "dict":
             return {key: build(item) for key, item in content.items()}

@@ -198,7 +198,12 @@ class Pairing:
             (i, j), glimpse = pairs[index], glimpses[index]
             told = None if glimpse is None else self.cache.digest(glimpse)
             inputs = (self._digests[i], self._digests[j], self._matching, told)
-            return self.cache.recall("matches", (Correspondences,), inputs, compute)
+
+            def valid(found: Correspondences) -> bool:
+                own = found.of(self.features[i], self.features[j], found.indices, found.ratio)
+                return np.array_equal(own.points1, found.points1) and np.array_equal(own.points2, found.points2)
+
+            return self.cache.recall("matches", (Correspondences,), inputs, compute, valid=valid)
 
         # A network is no function: only one thread may use it.
         workers = 1 if network else self.options.workers
@@ -232,7 +237,13 @@ class Pairing:
                 i, j = pairs[index]
                 digest = self.cache.digest(matched[index])
                 inputs.append((self.cameras[i], self.cameras[j], digest, options, *self._tilts(i, j)))
-            return self.cache.recall_many("pairs", (RadialHomography, Camera, PlanarMotion), inputs, compute)
+
+            def valid(place: int, relation: RadialHomography) -> bool:
+                count = len(matched[indices[place]])
+                return relation.homography.shape == (3, 3) and relation.inliers.shape == (count,)
+
+            kinds = (RadialHomography, Camera, PlanarMotion)
+            return self.cache.recall_many("pairs", kinds, inputs, compute, valid)
 
         return estimate_pairs(
             self.cameras,

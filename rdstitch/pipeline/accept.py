@@ -13,6 +13,7 @@ from rdstitch.matching.match_graph import connected_components
 from rdstitch.messages import Message, left_out, names_of
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner
+from rdstitch.pipeline.estimates import impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.registration import Registration
 from rdstitch.verification.verdict import RefusedError, judge
@@ -37,6 +38,7 @@ class _Offenders:
     links: Mapping[tuple[int, int], Message]
 
 
+@impossible_estimates_fail()
 def accept(registration: Registration, options: StitchOptions, *, lens_only: bool = False) -> Registration:
     """The registration of what passes all checks, with everything that the user should know of it.
 

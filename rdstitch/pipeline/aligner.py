@@ -86,7 +86,13 @@ class Aligner:
         inputs = (self.cameras, self.cache.digest(links), self.options)
         compute = partial(align, self.cameras, links, self.options)
         kinds = (Alignment, Camera, LinkFit, Poses, Relief, Message)
-        return AlignedPairs(tuple(pairs), self.cache.recall("alignment", kinds, inputs, compute))
+
+        def valid(alignment: Alignment) -> bool:
+            count = len(self.cameras)
+            found, given = ([camera.image_size for camera in cameras] for cameras in (alignment.cameras, self.cameras))
+            return found == given and alignment.used.shape == (count,) and alignment.homographies.shape == (count, 3, 3)
+
+        return AlignedPairs(tuple(pairs), self.cache.recall("alignment", kinds, inputs, compute, valid=valid))
 
     def metric(self, aligned: AlignedPairs) -> AlignedPairs:
         """The same pairs with a model that has metric poses, where the user left the choice of the model open."""

@@ -63,7 +63,7 @@ def detect_features(
         source = sources[index]
         inputs = (source.content(cache), cache.file(source.mask), source.camera.image_size, wanted, network)
         try:
-            return cache.recall("features", (Features,), inputs, compute)
+            return cache.recall("features", (Features,), inputs, compute, valid=lambda found: _are_of(source, found))
         except InputError as error:
             if not skip_bad:
                 raise
@@ -78,6 +78,13 @@ def detect_features(
         ),
         {index: str(result) for index, result in enumerate(found) if isinstance(result, InputError)},
     )
+
+
+def _are_of(source: Source, features: Features) -> bool:
+    """Whether features may be those of a picture: all lie in it."""
+    size = source.camera.image_size
+    within = (features.points >= -0.5) & (features.points <= np.array(size) - 0.5)
+    return features.image_size == size and bool(within.all()) and bool(np.isfinite(features.descriptors).all())
 
 
 def _load(source: Source, megapixels: float | None) -> View:

@@ -18,6 +18,7 @@ from rdstitch.messages import Message, left_out
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner, close_loops, rematch_weak_pairs
 from rdstitch.pipeline.detect_features import detect_features
+from rdstitch.pipeline.estimates import impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_working_size, features_at
 from rdstitch.progress import Progress, silent
 from rdstitch.registration import Registration
@@ -28,6 +29,7 @@ _STATIC_BACKGROUND = Message(
 )
 
 
+@impossible_estimates_fail()
 def register(
     sources: Sequence[Source],
     options: StitchOptions,

@@ -65,7 +65,12 @@ def check_overlaps(registration: Registration, workers: int = 1, cache: Cache = 
         for k, source in ((k, registration.sources[k]) for k in pictures)
     ]
     compute = partial(_compare, registration, chosen, pictures, workers)
-    return cache.recall("overlaps", (CheckedLink, LinkFit, Agreement, Ambiguity), (placed, chosen), compute)
+
+    def valid(checked: list[CheckedLink]) -> bool:
+        return [link.pair for link in checked] == [(fit.image1, fit.image2) for fit in chosen]
+
+    kinds = (CheckedLink, LinkFit, Agreement, Ambiguity)
+    return cache.recall("overlaps", kinds, (placed, chosen), compute, valid=valid)
 
 
 def share_alike(checked: Sequence[CheckedLink]) -> float:

@@ -1,12 +1,19 @@
 """The cache: an entry is used only by the code that made it."""
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from rdstitch import cache
 from rdstitch.cache import Cache
+from rdstitch.features import FeatureOptions
+from rdstitch.io.packing import pack
+from rdstitch.pipeline import StitchOptions, mosaic
+from tests.cli.running import flight
 
 
 @pytest.fixture(autouse=True)
@@ -74,3 +81,49 @@ def test_of_several_results_only_those_that_are_missing_are_computed(tmp_path: P
     assert recalled(Cache(tmp_path), "abcd") == ["A", "B", "C", "D"]
     assert recalled(Cache(), "ab") == ["A", "B"]
     assert asked == [[0, 1], [1, 3], [0, 1]]
+
+
+@pytest.mark.parametrize(("folder", "entry"), [(0o700, 0o600), (0o755, 0o644), (0o2775, 0o664)])
+def test_entries_can_be_read_by_whoever_may_read_the_folder(tmp_path: Path, folder: int, entry: int) -> None:
+    (tmp_path / "cache").mkdir()
+    (tmp_path / "cache").chmod(folder)
+    assert _recall(tmp_path / "cache", 1) == 1
+    (file,) = (path for path in (tmp_path / "cache").rglob("*") if path.is_file())
+    assert file.stat().st_mode & 0o7777 == entry
+    assert {path.stat().st_mode & 0o7777 for path in file.parents[:2]} == {folder}
+
+
+def test_entries_that_are_no_result_are_computed_again(tmp_path: Path) -> None:
+    def recall(value: list[int]) -> list[int]:
+        return Cache(tmp_path / "cache").recall("stage", (), ("x",), lambda: value, valid=lambda kept: kept[0] > 0)
+
+    assert recall([]) == []
+    assert recall([-1]) == [-1]
+    assert recall([3]) == [3]
+    assert recall([4]) == [3]
+
+
+def test_an_entry_that_is_a_pipe_is_computed_again(tmp_path: Path, package: Path) -> None:
+    assert _recall(tmp_path / "cache", 1) == 1
+    (file,) = (path for path in (tmp_path / "cache").rglob("*") if path.is_file())
+    file.unlink()
+    os.mkfifo(file)
+    assert _recall(tmp_path / "cache", 2) == 2
+
+
+def test_an_emptied_check_is_made_again(tmp_path: Path) -> None:
+    """A list of no overlaps, well packed under the name of the right one, must not switch the check off."""
+    frames = flight(3, 2).write(tmp_path)
+    options = StitchOptions(cache=tmp_path / "cache", workers=1, features=FeatureOptions(max_features=600))
+    first = mosaic(frames, options=options)
+    broken: dict[str, Any] = {"overlaps": [], "pairs": "text", "alignment": None, "features": 3, "matches": ()}
+    for stage, value in broken.items():
+        entries = [path for path in (tmp_path / "cache" / stage).rglob("*") if path.is_file()]
+        assert entries
+        for path in entries:
+            path.write_bytes(pack((path.parent.name + path.name, value)))
+    again = mosaic(frames, options=options)
+    np.testing.assert_array_equal(again.image, first.image)
+    assert again.distortion == first.distortion
+    for path in (tmp_path / "cache" / "overlaps").rglob("*"):
+        assert path.is_dir() or path.stat().st_size > 300
