@@ -14,7 +14,7 @@ from rdstitch.alignment.model_selection import Choice
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y, metric_poses
 from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.planarity import coherence, judge_relief
-from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, Poses, Relief
+from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, Poses
 from rdstitch.alignment.rotation_frame import levelled
 from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
@@ -103,7 +103,7 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
         rms=float(np.sqrt(adjusted.squared[inliers].mean())) if inliers.any() else math.nan,
         links=_link_fits(found, inliers),
         relief=relief,
-        messages=_warnings(found, relief),
+        messages=_warnings(found),
     )
 
 
@@ -209,9 +209,9 @@ def _link_fits(found: AdjustedPictures, inliers: BoolArray) -> tuple[LinkFit, ..
     return tuple(result)
 
 
-def _warnings(found: AdjustedPictures, relief: Relief) -> tuple[Message, ...]:
+def _warnings(found: AdjustedPictures) -> tuple[Message, ...]:
     """What the user should know of the whole."""
-    result = [relief.explanation] if relief.found else []
+    result = []
     if not found.observable:
         result.append(
             "λ is not observable: the pictures hardly move, or only turn about the optical axis; "

@@ -17,8 +17,11 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 _CELLS = (2, 3, 4)
 """Cells per side of a link's overlap within which errors are added up; the worst counts."""
 
-_COHERENT, _LARGE = 0.5, 1.2
-"""Correlation, and px in common, from which on a scene does not count as flat."""
+_COHERENT = 0.5
+"""Correlation of neighbours from which on a scene does not count as flat, if what they have in common is large."""
+
+_LARGE = 0.00075
+"""Of a picture's diagonal: lenses that one λ describes roughly leave less, flights over trees and houses more."""
 
 _LEAST_DISTANCE = 0.005
 """Half diagonals; nearer points are the same feature found twice."""
@@ -33,7 +36,9 @@ class Coherence:
     correlation : float
         Mean correlation of the residuals of nearest neighbours within a link.
     size : float
-        Root mean square of the common part, px.
+        Root mean square of the common part, pixels.
+    relative_size : float
+        The same in diagonals of a picture.
     overdispersion : float
         How many times fewer independent observations there are than correspondences; at least 1. The product of two
         things: the variance of the sum of the residuals in a part of an overlap, in units of that of independent
@@ -42,6 +47,7 @@ class Coherence:
 
     correlation: float
     size: float
+    relative_size: float
     overdispersion: float
 
 
@@ -50,7 +56,7 @@ def coherence(observations: Observations, errors: FloatArray, inliers: BoolArray
     link, points, residual = observations.link[inliers], observations.points1[inliers], errors[inliers]
     pictures = len(np.unique(np.concatenate([observations.image1, observations.image2])))
     if len(points) < 2:
-        return Coherence(0.0, 0.0, 1.0)
+        return Coherence(0.0, 0.0, 0.0, 1.0)
     apart = np.column_stack([points, link * 10.0])
     nearby = cKDTree(apart).query(apart, k=min(4, len(apart)))
     distance, neighbour = np.asarray(nearby[0]), np.asarray(nearby[1])
@@ -61,9 +67,11 @@ def coherence(observations: Observations, errors: FloatArray, inliers: BoolArray
     products = np.einsum("mi,mi->m", residual, residual[other])[found]
     power = float(np.einsum("mi,mi->", residual, residual) / len(residual))
     common = float(products.mean()) if len(products) else 0.0
+    size = float(np.sqrt(max(common, 0.0)))
     return Coherence(
         common / power if power > 0.0 else 0.0,
-        float(np.sqrt(max(common, 0.0))),
+        size,
+        size / (2.0 * float(np.median(observations.scale2))),
         max(_overdispersion(link, points, residual, len(observations), cells) for cells in _CELLS)
         * max(1.0, len(observations) / max(pictures - 1, 1)),
     )
@@ -96,7 +104,7 @@ def judge_relief(found: Coherence, model: str) -> Relief:
         Name of the model that left the residuals.
     """
     agreement = f"errors of neighbours agree (correlation {found.correlation:.2f}, {found.size:.1f} px in common)"
-    relief = found.correlation > _COHERENT and found.size > _LARGE
+    relief = found.correlation > _COHERENT and found.relative_size > _LARGE
     if relief:
         text = (
             f"{agreement}: the scene is not one plane, or the {model} model does not describe the camera; λ may be off"

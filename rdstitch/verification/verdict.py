@@ -93,6 +93,7 @@ def judge(
     decisive = [] if lens_only or resting else _decisive(suspicions, used, len(paths))
     return (
         *_error_of_the_whole(alignment, threshold, checked),
+        *_relief(paths, alignment),
         *([] if lens_only else _pattern(ambiguous, checked)),
         *(suspicions[pair] for pair in decisive),
         *_outvoted(paths, [pair for pair in suspicions if pair not in decisive]),
@@ -114,6 +115,17 @@ def _error_of_the_whole(alignment: Alignment, threshold: float, checked: Sequenc
     text = f"the pictures disagree by {rms:.1f} px, more than the threshold of {threshold:g} px"
     rough = alignment.relief.found and rms <= _LARGEST_RMS_OF_RELIEF * threshold and _look_alike(checked)
     return [Message(f"{text}: the ground is rough") if rough else _failure(text)]
+
+
+def _relief(paths: Sequence[str], alignment: Alignment) -> list[Message]:
+    """Errors that neighbouring matches have in common, and the pair of pictures where they are largest."""
+    if not alignment.relief.found:
+        return []
+    worst = max((fit for fit in alignment.links if fit.used), key=lambda fit: fit.rms)
+    images = (paths[worst.image1], paths[worst.image2])
+    first, second = names_of(images)
+    text = f"{alignment.relief.explanation}; most of all between {first} and {second} ({worst.rms:.1f} pixels)"
+    return [Message(text, images)]
 
 
 def _agreement_of_all(used: Sequence[LinkFit]) -> list[Message]:
