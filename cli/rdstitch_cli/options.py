@@ -130,7 +130,7 @@ estimation = together(
     click.option(
         "--max-features",
         type=click.IntRange(1),
-        default=4000,
+        default=2000,
         show_default=True,
         metavar="N",
         help="At most so many features a picture.",
@@ -138,7 +138,7 @@ estimation = together(
     click.option(
         "--work-megapixels",
         type=click.FloatRange(0.0),
-        default=2.0,
+        default=0.6,
         show_default=True,
         metavar="MP",
         help="Pictures are halved until they have no more megapixels before features are detected, once less where "

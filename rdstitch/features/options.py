@@ -6,7 +6,7 @@ from pathlib import Path
 from rdstitch.errors import ArgumentError
 
 KINDS = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk", "aliked")
-WORK_MEGAPIXELS = 2.0
+WORK_MEGAPIXELS = 0.6
 """10⁶ px to which pictures are halved unless it is said otherwise."""
 CLOSER = 4.0
 """Times as many px are looked at where the working size shows too little."""
@@ -60,7 +60,7 @@ class FeatureOptions:
     """
 
     kind: str = "rootsift"
-    max_features: int = 4000
+    max_features: int = 2000
     work_megapixels: float | None = WORK_MEGAPIXELS
     spread: bool = True
     spread_cell: float = 0.05

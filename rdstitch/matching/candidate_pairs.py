@@ -1,12 +1,14 @@
 """Which pairs of pictures to look at, so that the cost does not grow with the square of their number.
 
-Up to :data:`EXHAUSTIVE_UP_TO` pictures every pair is tried. Beyond, pictures that follow one another and pictures that
-look alike; and once poses are known, those that the poses put beside each other.
+Up to :data:`EXHAUSTIVE_UP_TO` pictures every pair is looked at. Beyond, pictures that follow one another and pictures
+that look alike. Of these, each picture is registered with those that matter for its place; and once poses are known,
+with those that the poses put beside it and that close a loop.
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
+from typing import Protocol, TypeVar
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -23,11 +25,29 @@ _FOLLOWING = 3  # pictures after each one that are tried
 _LOOKALIKES = 6  # pictures that look most alike that are tried for each one
 _NEIGHBOURS = 10  # nearest pictures in the plane that are looked at for each one
 _LEAST_OVERLAP = 0.15  # share of the smaller footprint
+_PARTNERS = 6  # pairs of a picture that its place is found by; those that others choose come on top
+_CELLS_ASIDE = 4  # cells of a picture, a side, that its partners are to cover
 _WORDS = 64
 _TRAINING = 20000  # descriptors that the words are learned from
 _DESCRIBING = 1000  # strongest features that describe a picture
 
 Pairs = list[tuple[int, int]]
+
+Shared = TypeVar("Shared", bound="PointsOfTwo")
+
+
+class PointsOfTwo(Protocol):
+    """Places of matches in the two images of a pair, pixels (M, 2)."""
+
+    @property
+    def points1(self) -> FloatArray:
+        """In the first."""
+        ...
+
+    @property
+    def points2(self) -> FloatArray:
+        """In the second."""
+        ...
 
 
 def first_pairs(features: Sequence[Features], seed: int) -> Pairs:
@@ -77,8 +97,42 @@ def lookalikes(features: Sequence[Features], seed: int) -> set[tuple[int, int]]:
     return {(min(i, j), max(i, j)) for i, row in enumerate(best.tolist()) for j in row if len(features[i])}
 
 
+def pairs_that_matter(
+    shared: Mapping[tuple[int, int], Shared], cameras: Sequence[Camera]
+) -> dict[tuple[int, int], Shared]:
+    """Of pairs that share something those that one of their images needs for its place.
+
+    An image takes one partner after the other: the one whose matches add most to the sum of the square roots of the
+    numbers of matches in its cells. So partners with many matches come first, but rather around the image than
+    all on one side of it. Of a survey in which each image overlaps twenty others, a third of the pairs is left.
+
+    Parameters
+    ----------
+    shared : mapping of (int, int) to Shared
+        Some matches of each pair (i, j).
+    cameras : sequence of Camera
+        One an image; only their sizes are used.
+    """
+    partners: dict[int, list[tuple[tuple[int, int], FloatArray]]] = {}
+    for pair, found in shared.items():
+        for image, points in zip(pair, (found.points1, found.points2), strict=True):
+            cell = np.clip(points / cameras[image].image_size * _CELLS_ASIDE, 0, _CELLS_ASIDE - 1).astype(np.intp)
+            counts = np.bincount(cell @ [1, _CELLS_ASIDE], minlength=_CELLS_ASIDE**2)
+            partners.setdefault(image, []).append((pair, counts.astype(np.float64)))
+    chosen: set[tuple[int, int]] = set()
+    for own in partners.values():
+        counts, covered = np.array([cells for _, cells in own]), np.zeros(_CELLS_ASIDE**2)
+        for _ in range(min(_PARTNERS, len(own))):
+            best = int(np.sqrt(covered + counts).sum(axis=1).argmax())
+            chosen.add(own[best][0])
+            covered, counts[best] = covered + counts[best], 0.0
+    return {pair: found for pair, found in shared.items() if pair in chosen}
+
+
 def neighbours(cameras: Sequence[Camera], homographies: FloatArray, tried: set[tuple[int, int]]) -> Pairs:
-    """Pairs that the poses put over one another and that were not tried yet.
+    """Pairs that the poses put over one another and that were not tried yet, where the match graph needs them.
+
+    It does not need a pair of images that both have their partners, one of them in common: that closes no loop.
 
     Parameters
     ----------
@@ -95,11 +149,22 @@ def neighbours(cameras: Sequence[Camera], homographies: FloatArray, tried: set[t
     boxes = footprints[known]
     centres = boxes.mean(axis=1)
     nearest = KDTree(centres).query(centres, k=min(_NEIGHBOURS + 1, len(known)))[1].reshape(len(known), -1)
+    partners: dict[int, set[int]] = {}
+    for i, j in tried:
+        partners.setdefault(i, set()).add(j)
+        partners.setdefault(j, set()).add(i)
+
+    def needed(i: int, j: int) -> bool:
+        first, second = partners.get(i, set()), partners.get(j, set())
+        return min(len(first), len(second)) < _PARTNERS or not first & second
+
     found = set()
     for a, row in enumerate(nearest.tolist()):
         for b in row:
             pair = (known[min(a, b)], known[max(a, b)])
-            if a != b and pair not in tried and _overlap(boxes[a], boxes[b]) >= _LEAST_OVERLAP:
+            if a == b or pair in tried or not needed(*pair):
+                continue
+            if _overlap(boxes[a], boxes[b]) >= _LEAST_OVERLAP:
                 found.add(pair)
     return sorted(found)
 

@@ -10,6 +10,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features, Matcher, match_near
+from rdstitch.matching.candidate_pairs import pairs_that_matter
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.options import MatchingOptions, PairOptions
 from rdstitch.matching.static_background import (
@@ -99,7 +100,7 @@ class Pairing:
 
     def estimate_candidates(self, candidates: Sequence[Pair]) -> list[PairRegistration]:
         """Estimate the candidate pairs that share something at first sight; all of them where none of those holds."""
-        prescreened = self.prescreen_pairs(candidates)
+        prescreened = pairs_that_matter(self.prescreen_pairs(candidates), self.cameras)
         pairs = self.estimate(prescreened, shared=prescreened)
         return pairs if any(pair.relation for pair in pairs) else self.estimate(candidates)
 

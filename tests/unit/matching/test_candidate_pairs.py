@@ -1,12 +1,21 @@
 """Which pairs are looked at: all of a few pictures; of many, those that follow one another or look alike."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
+from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.features import Features
 from rdstitch.features.keypoints import Descriptors
-from rdstitch.matching.candidate_pairs import EXHAUSTIVE_UP_TO, first_pairs, lookalikes, neighbours
+from rdstitch.matching.candidate_pairs import (
+    EXHAUSTIVE_UP_TO,
+    first_pairs,
+    lookalikes,
+    neighbours,
+    pairs_that_matter,
+)
 
 
 def _features(descriptors: Descriptors) -> Features:
@@ -63,3 +72,69 @@ def test_pictures_that_overlap_by_a_fifth_are_neighbours(overlap: float, found: 
     shifted = np.array([[size, 0.0, x], [0.0, size, (1 - size) * height / 4], [0.0, 0.0, 1.0]])
     assert neighbours([lens, lens], np.stack([np.eye(3), shifted]), set()) == found
     assert neighbours([lens, lens], np.stack([np.eye(3), shifted]), {(0, 1)}) == []
+
+
+@dataclass(frozen=True)
+class _Shared:
+    """Places of matches."""
+
+    points1: FloatArray
+    points2: FloatArray
+
+
+def _shared_by_squares(side: int) -> dict[tuple[int, int], _Shared]:
+    """A survey of side x side images of 400 pixels, each 100 pixels from the next: one match every 20 pixels."""
+    rng = np.random.default_rng(0)
+    places = rng.uniform(0.0, 100.0 * side + 300.0, ((5 * side + 15) ** 2, 2))
+    corners = [np.array([100.0 * column, 100.0 * row]) for row in range(side) for column in range(side)]
+    seen = [((places - corner >= 0.0) & (places - corner < 400.0)).all(axis=1) for corner in corners]
+    shared = {}
+    for j, corner2 in enumerate(corners):
+        for i, corner1 in enumerate(corners[:j]):
+            both = places[seen[i] & seen[j]]
+            if len(both) > 8:
+                shared[i, j] = _Shared(both - corner1, both - corner2)
+    return shared
+
+
+def test_of_many_overlapping_pairs_each_image_keeps_a_few_all_around_it() -> None:
+    side = 7
+    shared = _shared_by_squares(side)
+    chosen = pairs_that_matter(shared, [Camera((400, 400))] * side**2)
+    degree = np.bincount(np.ravel(list(chosen)), minlength=side**2)
+    assert len(shared) > 12 * side**2
+    assert degree.min() >= 6
+    assert degree.mean() < 10
+    middle = side**2 // 2
+    directions = {
+        (int(np.sign(other % side - middle % side)), int(np.sign(other // side - middle // side)))
+        for pair in chosen
+        if middle in pair
+        for other in pair
+        if other != middle
+    }
+    assert {(1, 0), (-1, 0), (0, 1), (0, -1)} <= directions
+
+
+def test_a_weak_partner_on_the_other_side_is_kept_before_a_strong_one_on_the_same() -> None:
+    rng = np.random.default_rng(1)
+    right, left = rng.uniform((200, 0), (400, 400), (60, 2)), rng.uniform((0, 0), (100, 400), (25, 2))
+    shared = {(0, other): _Shared(right, right) for other in range(1, 12)}
+    # The others have partners enough among themselves.
+    shared |= {
+        (i, j): _Shared(np.tile(right, (4, 1)), np.tile(right, (4, 1))) for i in range(1, 12) for j in range(i + 1, 12)
+    }
+    shared[0, 12] = _Shared(left, left)
+    chosen = pairs_that_matter(shared, [Camera((400, 400))] * 13)
+    assert (0, 12) in chosen
+    assert sum(0 in pair for pair in chosen) == 6
+
+
+def test_neighbours_with_partners_in_common_are_not_tried_again_but_loops_are_closed() -> None:
+    """Frames along a line that nearly overlaps itself: all poses alike, so that all are neighbours."""
+    count = 20
+    homographies = np.tile(np.eye(3), (count, 1, 1))
+    tried = {(i, j) for i in range(count) for j in range(i + 1, min(i + 7, count))}
+    found = neighbours([Camera((640, 480))] * count, homographies, tried)
+    assert found
+    assert all(j - i > 12 or i < 6 or j > count - 7 for i, j in found)
