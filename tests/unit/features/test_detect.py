@@ -107,7 +107,7 @@ def test_nothing_is_seen_behind_a_mask(kind: str, picture: NDArray[np.uint8]) ->
     alpha = np.dstack([covered, np.where(allowed, 255, 0).astype(np.uint8)])
     number = covered.astype(np.float32)
     number[~allowed] = np.nan
-    options = FeatureOptions(kind=kind, work_megapixels=0.08)
+    options = FeatureOptions(kind=kind, work_megapixels=0.08, max_features=4000)
     masked = detect(covered, options, allowed)
     u, v = np.rint(masked.points).astype(int).T
     # The mask is judged in pixels of working size, here 1.2 px large.
@@ -128,9 +128,10 @@ def test_nothing_is_seen_behind_a_mask(kind: str, picture: NDArray[np.uint8]) ->
 
 def test_deeper_pictures_are_stretched(picture: NDArray[np.uint8]) -> None:
     grey = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)
-    reference = detect(grey)
+    options = FeatureOptions(max_features=4000)
+    reference = detect(grey, options)
     for deep in (grey.astype(np.uint16) * 16 + 100, grey.astype(np.float64) / 1000, grey.astype(np.float32) * 9):
-        found = match(reference, detect(deep), 0.8)
+        found = match(reference, detect(deep, options), 0.8)
         assert len(found) > 0.8 * len(reference)
         assert np.median(np.linalg.norm(found.points1 - found.points2, axis=1)) < 0.05
 

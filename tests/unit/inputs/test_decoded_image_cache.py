@@ -16,7 +16,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.io import Metadata, write_image
 from rdstitch.io.read import Picture, read_image
 
-SIZE = (1900, 1300)  # halved once for a look at it
+SIZE = (1500, 1000)  # halved once for a look at it
 
 
 @pytest.fixture
