@@ -63,7 +63,7 @@ class Pairing:
     static: StaticPlaces | None = None
 
     def prescreen_pairs(self, pairs: Sequence[Pair]) -> dict[Pair, Correspondences]:
-        """The pairs that share something at a glance, and what; that costs a sixteenth of a closer look.
+        """The pairs that share something at a glance and matter for the place of an image, and what they share.
 
         A pair that is passed over may overlap nevertheless, by little: the others then tell its place.
         """
@@ -74,11 +74,12 @@ class Pairing:
         most = np.zeros(len(self.features), dtype=np.intp)
         for pair, matches in shared.items():
             most[[*pair]] = np.maximum(most[[*pair]], len(matches))
-        return {
+        promising = {
             pair: matches
             for pair, matches in shared.items()
             if len(matches) >= max(_PROMISING, _WORTHWHILE * most[[*pair]].min())
         }
+        return pairs_that_matter(promising, self.cameras)
 
     def estimate(
         self,
@@ -100,7 +101,7 @@ class Pairing:
 
     def estimate_candidates(self, candidates: Sequence[Pair]) -> list[PairRegistration]:
         """Estimate the candidate pairs that share something at first sight; all of them where none of those holds."""
-        prescreened = pairs_that_matter(self.prescreen_pairs(candidates), self.cameras)
+        prescreened = self.prescreen_pairs(candidates)
         pairs = self.estimate(prescreened, shared=prescreened)
         return pairs if any(pair.relation for pair in pairs) else self.estimate(candidates)
 

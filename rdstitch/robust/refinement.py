@@ -8,7 +8,7 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.division_model import MAX_ABS_DISTORTION
 from rdstitch.robust.levenberg_marquardt import NormalEquations, descend
-from rdstitch.robust.linearization import Lens, differentiate, entry_equations, influence
+from rdstitch.robust.linearization import Lens, TransferDerivatives, differentiate, entry_equations, influence
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import PairModel
 
@@ -71,8 +71,10 @@ class PairProblems:
         """Loss, normal matrix and gradient."""
         distortion, state = parameters[:, 0], parameters[:, 1:]
         found = differentiate(self.model.homography(state), Lens(distortion), self.data)
+        return self._equations(found, state, self.chain(state))
+
+    def _equations(self, found: TransferDerivatives, state: FloatArray, chain: FloatArray) -> NormalEquations:
         entries = entry_equations(found, self.data.present, self.scale, not self.fixed_distortion)
-        chain = self.chain(state)
         information = np.swapaxes(chain, 1, 2) @ entries.information @ chain
         gradient = np.einsum("bkp,bk->bp", chain, entries.gradient)
         cost = entries.cost
@@ -106,10 +108,11 @@ class PairProblems:
     def inspect(self, fits: Fits) -> Inspection:
         """Errors, loss and influence of the matches at fits."""
         found = differentiate(fits.homography, Lens(fits.distortion), self.data)
-        equations = self.normal_equations(np.column_stack([fits.distortion, fits.state]))
+        chain = self.chain(fits.state)
+        equations = self._equations(found, fits.state, chain)
         errors = np.sqrt(found.squared)
         errors[found.lost | ~self.data.present] = np.inf
-        shares = influence(found, self.data.present, self.scale, not self.fixed_distortion) @ self.chain(fits.state)
+        shares = influence(found, self.data.present, self.scale, not self.fixed_distortion) @ chain
         return Inspection(errors, equations.cost, equations.information, shares)
 
 

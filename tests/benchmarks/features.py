@@ -30,7 +30,7 @@ from rdstitch.synthetic import ground
 PHOTO = Path(__file__).resolve().parents[2] / "../shared/data/textures_cc0/IMG_161122_163239_0001_RGB.JPG"
 SIZE = (1600, 1200)
 NOISE = 2.0  # standard deviation, grey levels
-FULL_SIZE = FeatureOptions(work_megapixels=None)
+FULL_SIZE = FeatureOptions(work_megapixels=None, max_features=4000)
 ROWS = {
     "rootsift": FULL_SIZE,
     "sift": replace(FULL_SIZE, kind="sift"),

@@ -115,7 +115,7 @@ def at_sizes(kinds: list[str]) -> Iterator[tuple[str, FeatureOptions]]:
     """The pictures whole and halved, if they have 0.5 to 2 megapixels."""
     for kind in kinds:
         for choice, megapixels in (("halved", 0.5), ("full size", None)):
-            yield choice, FeatureOptions(kind=kind, work_megapixels=megapixels)
+            yield choice, FeatureOptions(kind=kind, work_megapixels=megapixels, max_features=4000)
 
 
 if __name__ == "__main__":

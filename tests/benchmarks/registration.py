@@ -1,0 +1,181 @@
+"""Registration measured: ``python -m tests.benchmarks.registration [--pairs N] [--frames N] [--folder DIR] …``.
+
+Processor time of pairs, beside homlib's estimators in the same run, and of whole mosaics by stage, beside OpenCV and
+the package stitching where they are installed (``--peer-python``: a Python that has it). ``--folder`` adds one's own
+pictures. Times depend on the machine: only those of one run compare.
+"""
+
+import argparse
+import resource
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+import rdstitch
+from examples.paper.common.peers import optional_module
+from examples.paper.common.stitchers import installed_stitchers
+from examples.paper.common.subprocesses import run_all
+from examples.paper.end_to_end import SETS
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
+from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
+from rdstitch.synthetic import Sequence, correspondences
+from tests.acceptance.rendered import geometry
+from tests.floor_drives import floor_drive
+
+MATCHES = 300
+PEERS = {
+    "homlib LOMSAC, Fitzgibbon": "lomsac_fitzgibbon_cvpr_2001_two_sided_equal",
+    "homlib LOMSAC, Kukelova": "lomsac_kukelova_cvpr_2015_two_sided_equal",
+    "homlib LOMSAC, Wadenbäck": "lomsac_wadenback_3dv_2026_two_sided_equal",
+}
+_ROUNDS = 3
+_SELECT_BELOW = 50  # as registration estimates its pairs
+_COMPARED = ("OpenCV Stitcher, SCANS", "stitching, AffineStitcher")
+
+
+def print_pairs(count: int) -> None:
+    """Time of a pair and median error of λ, focal length unknown."""
+    for motion in ("rigid", "homography"):
+        for outliers in (0.3, 0.6):
+            made = [correspondences(MATCHES, seed=seed, outliers=outliers, motion=motion) for seed in range(count)]
+            truth = np.array([matches.truth.distortion for matches in made])
+            pairs = []
+            for matches in made:
+                camera = Camera(matches.truth.camera.image_size).with_focal()
+                pairs.append(PairMatches(matches.points1, matches.points2, camera, camera))
+            print(f"\n{count} pairs of {MATCHES} matches, {motion}, {100 * outliers:.0f} % outliers")
+            print(f"{'':34s}{'ms a pair':>10s}{'mean':>8s}{'|Δλ|':>9s}")
+            for name, seconds, found in _estimators(pairs):
+                error = np.median(np.abs(found - truth))
+                print(f"{name:34s}{1e3 * np.median(seconds):10.2f}{1e3 * seconds.mean():8.2f}{error:9.4f}")
+
+
+def _estimators(pairs: list[PairMatches]) -> Iterator[tuple[str, FloatArray, FloatArray]]:
+    """Name, seconds of each pair, and λ of each pair; inf where there is none."""
+    how = EstimationOptions(select_below=_SELECT_BELOW)
+    rounds = [_timed(lambda: estimate_radial_homographies(pairs, how)) for _ in range(_ROUNDS)]
+    seconds, found = min(rounds, key=lambda result: result[0])
+    yield "rdstitch, all pairs in a batch", np.full(len(pairs), seconds / len(pairs)), _distortions(found)
+    for name, options in (("rdstitch, one by one", how), ("  with competing motion models", EstimationOptions())):
+        alone = [_timed(partial(_alone, pair, options)) for pair in pairs]
+        yield name, np.array([taken for taken, _ in alone]), _distortions([one for _, one in alone])
+    homlib = optional_module("homlib")
+    if homlib is None:
+        print("homlib is not installed (pip install homlib): it is left out")
+        return
+    for name, function in PEERS.items():
+        runs = [_lomsac(homlib, function, pair) for pair in pairs]
+        yield name, np.array([taken for taken, _ in runs]), np.array([one for _, one in runs])
+
+
+def _alone(pair: PairMatches, options: EstimationOptions) -> rdstitch.RadialHomography:
+    return estimate_radial_homographies([pair], options)[0]
+
+
+def _lomsac(homlib: Any, function: str, pair: PairMatches) -> tuple[float, float]:
+    """Seconds and λ of homlib's estimator of a pair, with the options that ours has."""
+    camera = pair.camera1
+    options = homlib.LORansacOptions()
+    options.squared_inlier_threshold = (3.0 / camera.half_diagonal) ** 2
+    options.success_probability = 0.999
+    options.max_num_iterations = 10_000
+    options.final_least_squares = True
+    x1, x2 = (np.asfortranarray(camera.normalize(points).T) for points in (pair.points1, pair.points2))
+    taken, (pose, _) = _timed(lambda: getattr(homlib, function)(x1, x2, options))
+    return taken, float(pose.distortion_parameter)
+
+
+def _distortions(found: list[rdstitch.RadialHomography]) -> FloatArray:
+    return np.array([one.distortion if one else np.inf for one in found])
+
+
+def _timed(work: Callable[[], Any]) -> tuple[float, Any]:
+    """Processor seconds, and what came of it."""
+    begun = time.process_time()
+    result = work()
+    return time.process_time() - begun, result
+
+
+@dataclass
+class StageTimes:
+    """Processor seconds until each stage last reported; a progress of recipes."""
+
+    begun: float = field(default_factory=time.process_time)
+    spent: dict[str, float] = field(default_factory=dict)
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """What has passed since the last report belongs to the stage that now reports."""
+        now = time.process_time()
+        self.spent[stage] = self.spent.get(stage, 0.0) + now - self.begun
+        self.begun = now
+
+
+def print_mosaic(name: str, folder: Path, sequence: Sequence | None = None) -> None:
+    """One line: processor time, that of a picture, λ, pairs, errors against the truth where it is known; the stages."""
+    stages = StageTimes()
+    options = rdstitch.StitchOptions(workers=1, overwrite=True, force=True)
+    with TemporaryDirectory() as output:
+        seconds, result = _timed(lambda: rdstitch.mosaic([folder], Path(output) / "out.jpg", options, progress=stages))
+    alignment, pairs = result.registration.alignment, result.registration.pairs
+    used, count = int(alignment.used.sum()), len(alignment.used)
+    line = f"{name:34s}{seconds:8.1f}{seconds / count:8.3f}  λ {alignment.distortion:+.5f}  {used}/{count} pictures"
+    line += f"  {len(pairs)} pairs"
+    if sequence is not None:
+        error = geometry(sequence, result, "similarity")
+        line += f"  error {error.median:.3f}, 95 % {error.percentile95:.3f} px"
+    print(line)
+    print("    " + ", ".join(f"{stage} {taken:.1f}" for stage, taken in stages.spent.items() if taken > 0.05))
+
+
+def print_peers(files: list[Path], peer_python: str | None) -> None:
+    """Processor time of other stitchers on the same pictures, whatever comes of it."""
+    stitchers, notes = installed_stitchers(peer_python)
+    for stitcher in stitchers:
+        if stitcher.name in _COMPARED:
+            with TemporaryDirectory() as folder:
+                done = run_all(stitcher.commands(files, Path(folder) / "out.tif", 60.0), Path(folder), 600.0)
+            status = "time is up" if done.status is None else f"exit status {done.status}"
+            print(
+                f"{stitcher.name:34s}{done.processor_seconds:8.1f}{done.processor_seconds / len(files):8.3f}  {status}"
+            )
+    print(*notes, sep="\n")
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description="Processor time of registration")
+    parser.add_argument("--pairs", type=int, default=100, help="pairs of each kind; 0: none")
+    parser.add_argument("--frames", type=int, default=80, help="frames of 480 x 360 along a path; 0: none")
+    parser.add_argument("--views", action=argparse.BooleanOptionalAction, default=True, help="12 views of 640 x 480")
+    parser.add_argument("--folder", type=Path, action="append", default=[], help="pictures to stitch besides")
+    parser.add_argument("--peer-python", help="a Python that has the package stitching")
+    given = parser.parse_args()
+    if given.pairs:
+        print_pairs(given.pairs)
+    print(f"\n{'processor time of mosaic, s':34s}{'whole':>8s}{'a picture':>10s}")
+    with TemporaryDirectory() as folder:
+        work: list[tuple[str, Path, Sequence | None]] = []
+        if given.views:
+            work.append(("12 views of 640 x 480", Path(folder) / "views", SETS[0].sequence(seed=100)))
+        if given.frames:
+            drive = floor_drive("parking", given.frames, seed=23, overlap=0.75, size=(480, 360))
+            work.append((f"{given.frames} frames of 480 x 360", Path(folder) / "frames", drive))
+        for _, place, sequence in work:
+            assert sequence is not None
+            place.mkdir()
+            sequence.write(place)
+        for name, place, sequence in [*work, *((own.name, own, None) for own in given.folder)]:
+            print_mosaic(name, place, sequence)
+            print_peers(sorted(path for path in place.iterdir() if path.suffix != ".csv"), given.peer_python)
+    print(f"\nlargest memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
+
+
+if __name__ == "__main__":
+    main()
