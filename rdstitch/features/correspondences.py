@@ -20,7 +20,7 @@ class Correspondences:
     indices : ndarray of shape (M, 2), intp
         Indices into the features of picture 1 and picture 2.
     points1, points2 : ndarray of shape (M, 2), float64
-        px of the full-size pictures.
+        pixels of the full-size pictures.
     ratio : ndarray of shape (M,), float64
         Distance to the match over distance to the second-best, the worse of both directions; in [0, 1],
         ascending.

@@ -26,9 +26,9 @@ Recall = Callable[[int, Callable[[], Features]], Found]
 stands for them where the picture cannot be read."""
 
 Source = Callable[[float | None], View]
-"""Loads one picture when it is called with the 10⁶ px that are needed of it; None: all. More px may come."""
+"""Loads one picture when it is called with the 10⁶ pixels that are needed of it; None: all. More pixels may come."""
 
-_FEW = 0.5  # of the keypoints wanted: where a reduced picture shows fewer, it is looked at more closely
+_FEW = 0.5  # of the keypoints wanted: where a reduced picture shows fewer, a larger one is used
 
 
 def detect(image: Image, options: FeatureOptions | None = None, mask: Mask | None = None) -> Features:
@@ -46,7 +46,7 @@ def detect(image: Image, options: FeatureOptions | None = None, mask: Mask | Non
     Returns
     -------
     Features
-        Points in px of ``image``, strongest first; none for a blank picture. The same for the same picture,
+        Points in pixels of ``image``, strongest first; none for a blank picture. The same for the same picture,
         whatever the number of threads.
 
     Raises

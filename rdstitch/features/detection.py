@@ -19,12 +19,12 @@ class Detection(Protocol):
 
     @property
     def points(self) -> FloatArray:
-        """Places, px of the picture, (N, 2)."""
+        """Places, pixels of the picture, (N, 2)."""
         ...
 
     @property
     def scale(self) -> FloatArray:
-        """Diameters, px, (N,)."""
+        """Diameters, pixels, (N,)."""
         ...
 
     @property

@@ -32,9 +32,9 @@ def match_near(
     features1, features2 : Features
         Of the same kind. Where they have signs of the Laplacian, only equal signs match.
     expected : ndarray of shape (N1, 2)
-        Where the features of picture 1 should be in picture 2, px; NaN where nowhere.
+        Where the features of picture 1 should be in picture 2, pixels; NaN where nowhere.
     radius : float
-        How far from there is searched, px.
+        How far from there is searched, pixels.
     known : ndarray of shape (K, 2), intp
         Matches that are right, as indices into features 1 and 2; at least one.
     ratio : float, optional
@@ -66,11 +66,11 @@ def match_near(
 
 def _within(expected: FloatArray, points: FloatArray, radius: float) -> NDArray[np.intp]:
     """Pairs (C, 2) of expected places and points that are not farther apart than the radius."""
-    asked = np.flatnonzero(np.isfinite(expected).all(axis=1))
-    if not len(asked) or not len(points):
+    places = np.flatnonzero(np.isfinite(expected).all(axis=1))
+    if not len(places) or not len(points):
         return np.zeros((0, 2), dtype=np.intp)
-    near = cKDTree(expected[asked]).sparse_distance_matrix(cKDTree(points), radius, output_type="coo_matrix")
-    return np.column_stack([asked[near.row], near.col]).astype(np.intp)
+    near = cKDTree(expected[places]).sparse_distance_matrix(cKDTree(points), radius, output_type="coo_matrix")
+    return np.column_stack([places[near.row], near.col]).astype(np.intp)
 
 
 def _places(points: FloatArray) -> NDArray[np.intp]:

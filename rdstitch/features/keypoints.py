@@ -20,12 +20,12 @@ class Features:
     Attributes
     ----------
     points : ndarray of shape (N, 2), float64
-        Keypoints ``(u, v)``, px of the full-size picture, whatever size they were detected at.
+        Keypoints ``(u, v)``, pixels of the full-size picture, whatever size they were detected at.
     descriptors : ndarray of shape (N, D), float32 or uint8
         Numbers that are compared by their Euclidean distance (float32), or bits, eight to a byte, that are
         compared by the Hamming distance (uint8).
     scale : ndarray of shape (N,), float64
-        Diameter of the keypoint (OpenCV's ``size``), px of the full-size picture.
+        Diameter of the keypoint (OpenCV's ``size``), pixels of the full-size picture.
     angle : ndarray of shape (N,), float64
         Orientation, radians in [0, 2π), from u towards v; 0 where the kind has none.
     response : ndarray of shape (N,), float64
@@ -36,7 +36,7 @@ class Features:
     kind : str
         What detected and described them; features of different kinds cannot be compared.
     image_size : (int, int), optional
-        Width and height of the picture, px.
+        Width and height of the picture, pixels.
 
     Raises
     ------

@@ -54,7 +54,7 @@ class AlikedDetection:
 
     @property
     def scale(self) -> FloatArray:
-        """Diameters, px: the network has but one scale."""
+        """Diameters, pixels: the network has but one scale."""
         return np.ones(len(self.points))
 
     def describe(self, chosen: NDArray[np.intp]) -> Features:

@@ -16,7 +16,7 @@ from rdstitch.features.options import FeatureOptions
 Grey = NDArray[np.uint8]
 
 _ROOTSIFT_NORM = 512.0
-# Side in px below which some detectors raise, and none finds a thing.
+# Side in pixels below which some detectors raise, and none finds a thing.
 _SMALLEST_PICTURE = 16
 
 
@@ -71,7 +71,7 @@ class OpenCVDetection:
         u, v, size, degrees, response = _table(described, "size", "angle", "response").T
         return Features(
             points=np.column_stack([u, v]),
-            descriptors=root(descriptors) if self.kind == "rootsift" else cast(Descriptors, descriptors),
+            descriptors=to_rootsift(descriptors) if self.kind == "rootsift" else cast(Descriptors, descriptors),
             scale=size,
             # OpenCV marks "no orientation" by -1.
             angle=np.where(degrees < 0, 0.0, np.radians(degrees) % (2 * np.pi)),
@@ -107,7 +107,7 @@ def create_detector(options: FeatureOptions) -> Any:
         ) from error
 
 
-def root(descriptors: Descriptors) -> NDArray[np.float32]:
+def to_rootsift(descriptors: Descriptors) -> NDArray[np.float32]:
     """RootSIFT (Arandjelović and Zisserman, CVPR 2012): square roots of the L1-normalized descriptor, norm 512.
 
     Rounded to integers like SIFT's own, which loses nothing measurable and keeps distances exact.
@@ -133,7 +133,7 @@ def _sift(options: FeatureOptions) -> Any:
 
 
 def _orb(options: FeatureOptions) -> Any:
-    # Many more than asked for, because ORB keeps the strongest of the whole picture and we spread them.
+    # Many more than wanted, because ORB keeps the strongest of the whole picture and we spread them.
     return cv2.ORB.create(nfeatures=8 * options.max_features, fastThreshold=options.orb_fast_threshold)
 
 

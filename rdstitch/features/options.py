@@ -7,9 +7,9 @@ from rdstitch.errors import ArgumentError
 
 KINDS = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk", "aliked")
 WORK_MEGAPIXELS = 0.6
-"""10⁶ px to which pictures are halved unless it is said otherwise."""
+"""10⁶ pixels to which pictures are halved unless it is said otherwise."""
 CLOSER = 4.0
-"""Times as many px are looked at where the working size shows too little."""
+"""Times as many pixels are used where the working size shows too little."""
 
 
 @dataclass(frozen=True)

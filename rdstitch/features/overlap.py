@@ -1,4 +1,4 @@
-"""Where two pictures overlap, told by a few of their matches, so that no more than that need be compared."""
+"""Where two pictures overlap, from a few of their matches, so that no more than that need be matched."""
 
 from dataclasses import replace
 
@@ -10,12 +10,12 @@ from rdstitch.features.correspondences import Correspondences
 from rdstitch.features.keypoints import Features
 from rdstitch.features.match import Matcher
 
-_ENOUGH, _MOST = 50, 300  # matches that tell an overlap, and that are asked
+_ENOUGH, _MOST = 50, 300  # matches that an overlap takes at least, and that are used at most
 _SUPPORTING_NEIGHBOURS = 6  # other matches that a right one has near it, in both pictures
 _NEAR = 0.2  # how near, diagonals of a picture
 _STRAY = 8  # matches without such company that chance explains; more may be of a part with little texture
 _LEAST_REACH, _REACH = 0.12, 2.0  # how far an overlap goes on beside a match: diagonals, times the way to its company
-_CELLS = 24  # a side, by which places are told apart
+_CELLS = 24  # a side, by which places are distinguished
 
 Part = NDArray[np.intp]
 """Indices of the features in one part of a picture, ascending."""
@@ -36,7 +36,7 @@ def overlapping(features1: Features, features2: Features, matches: Correspondenc
     Returns
     -------
     (ndarray of shape (N1,), ndarray of shape (N2,)), intp, or None
-        None where the matches are too few or too scattered to tell.
+        None where the matches are too few or too scattered.
     """
     size1, size2 = features1.image_size, features2.image_size
     if len(matches) < _ENOUGH or size1 is None or size2 is None:
@@ -55,7 +55,7 @@ def overlapping(features1: Features, features2: Features, matches: Correspondenc
 def match_overlap(
     matcher: Matcher, features1: Features, features2: Features, matches: Correspondences
 ) -> Correspondences:
-    """Match the features of two pictures in the parts that ``matches`` tell overlap; everywhere if they do not tell."""
+    """Match the features of two pictures where ``matches`` show that these overlap, everywhere if they do not."""
     parts = overlapping(features1, features2, matches)
     if parts is None:
         return matcher(features1, features2)

@@ -29,9 +29,9 @@ class View:
     mask : ndarray of shape (height, width), bool or uint8, or None
         True or not zero where the picture counts; None for everywhere.
     reduction : int
-        Blocks of so many px a side of the whole picture are one px.
+        Blocks of so many pixels a side of the whole picture are one px.
     image_size : (int, int), optional
-        Width and height of the whole picture, px; where it is not given, this is the whole.
+        Width and height of the whole picture, pixels; where it is not given, this is the whole.
     """
 
     image: Image
@@ -41,7 +41,7 @@ class View:
 
     @property
     def full_size(self) -> tuple[int, int]:
-        """Width and height of the whole picture, px."""
+        """Width and height of the whole picture, pixels."""
         return self.image_size or (self.image.shape[1], self.image.shape[0])
 
 
@@ -53,11 +53,11 @@ class Picture:
     ----------
     grey : ndarray of shape (height, width), uint8
     clearance : ndarray of shape (height, width), float32, or None
-        Distance to the nearest masked pixel, px of ``grey``, zero if masked; None without mask.
+        Distance to the nearest masked pixel, pixels of ``grey``, zero if masked; None without mask.
     factor : ndarray of shape (2,)
-        Px of the whole picture for one of this, horizontally and vertically.
+        Pixels of the whole picture for one of this, horizontally and vertically.
     full_size : (int, int)
-        Width and height, px.
+        Width and height, pixels.
     """
 
     grey: NDArray[np.uint8]
@@ -71,7 +71,7 @@ class Picture:
         return bool(self.factor.max() > 1.0)
 
     def covers(self, points: FloatArray, radius: FloatArray) -> NDArray[np.bool_]:
-        """Whether discs (N, 2), (N,) keep clear of the mask; px of ``grey``."""
+        """Whether discs (N, 2), (N,) keep clear of the mask; pixels of ``grey``."""
         if self.clearance is None:
             return np.ones(len(points), dtype=bool)
         height, width = self.clearance.shape
@@ -80,12 +80,12 @@ class Picture:
         return clearance > radius
 
     def to_full_size(self, points: FloatArray) -> FloatArray:
-        """Px of ``grey`` to px of the full-size picture; (0, 0) is the centre of the first pixel in both."""
+        """Pixels of ``grey`` to pixels of the full-size picture; (0, 0) is the centre of the first pixel in both."""
         return (points + 0.5) * self.factor - 0.5
 
 
 def halving(image_size: tuple[int, int], megapixels: float) -> int:
-    """The power of two that width and height are divided by for at most so many 10⁶ px."""
+    """The power of two that width and height are divided by for at most so many 10⁶ pixels."""
     (width, height), factor = image_size, 1
     # Sizes are rounded up, so that halving twice is dividing by four.
     while factor < max(image_size) and -(-width // factor) * -(-height // factor) > megapixels * 1e6:
@@ -155,5 +155,5 @@ def _eight_bits(grey: Image, usable: NDArray[np.bool_] | None) -> NDArray[np.uin
 
 
 def _clearance(usable: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Distance of each pixel to the nearest one that is not usable, px."""
+    """Distance of each pixel to the nearest one that is not usable, pixels."""
     return np.asarray(cv2.distanceTransform(usable.astype(np.uint8), cv2.DIST_L2, 5), np.float32)

@@ -29,7 +29,7 @@ class Similarity(Protocol):
     def block(self, rows: NDArray[np.intp]) -> NDArray[Any]:
         """Similarities of some descriptors of picture 1 to all of picture 2, shape (len(rows), count 2).
 
-        They stay until the next block is asked for, which takes their place.
+        Valid until the next call, which overwrites them.
         """
         ...
 

@@ -26,7 +26,7 @@ def spread(points: FloatArray, response: FloatArray, count: int, cell: float) ->
     count : int
         Keypoints to keep at most.
     cell : float
-        Side of a cell, px.
+        Side of a cell, pixels.
     """
     if len(points) <= count:
         return strongest(response, count)

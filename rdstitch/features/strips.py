@@ -21,7 +21,7 @@ LARGE = 1_500_000
 """Px from which on a picture is taken in strips."""
 
 _STRIP = 400_000  # px of a strip without its overlap, about
-# How far the descriptors of the two finest octaves see, px: 4 px of sigma times 3 a cell, 2.5 cells, across the corner,
+# How far the descriptors of the two finest octaves reach, pixels: sigma of 4, times 3 a cell, 2.5 cells, diagonally,
 # and what is smoothed there.
 _OVERLAP = 64
 _FINEST = (255, 0)  # octaves -1 and 0, as OpenCV packs them
@@ -29,7 +29,7 @@ _FINEST = (255, 0)  # octaves -1 and 0, as OpenCV packs them
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Keypoints of a strip that begins ``top`` px down, or of a picture that is smaller by ``factor``."""
+    """Keypoints of a strip that begins ``top`` pixels down, or of a picture that is smaller by ``factor``."""
 
     detection: OpenCVDetection
     top: int
@@ -37,11 +37,11 @@ class _Part:
 
     @property
     def points(self) -> FloatArray:
-        """Places in the whole picture, px."""
+        """Places in the whole picture, pixels."""
         return self._in_whole(self.detection.points)
 
     def describe(self, chosen: NDArray[np.intp]) -> Features:
-        """Features in px of the whole picture."""
+        """Features in pixels of the whole picture."""
         found = self.detection.describe(chosen)
         return replace(
             found,
@@ -72,12 +72,12 @@ class StripsDetection:
 
     @property
     def points(self) -> FloatArray:
-        """Places, px of the picture, (N, 2)."""
+        """Places, pixels of the picture, (N, 2)."""
         return np.concatenate([part.points for part in self.parts])
 
     @property
     def scale(self) -> FloatArray:
-        """Diameters, px, (N,)."""
+        """Diameters, pixels, (N,)."""
         return np.concatenate([part.factor * part.detection.scale for part in self.parts])
 
     @property

@@ -1,6 +1,6 @@
-"""Which pairs of pictures to look at, so that the cost does not grow with the square of their number.
+"""Which pairs of pictures to match, so that the cost does not grow with the square of their number.
 
-Up to :data:`EXHAUSTIVE_UP_TO` pictures every pair is looked at. Beyond, pictures that follow one another and pictures
+Up to :data:`EXHAUSTIVE_UP_TO` pictures every pair is compared. Beyond, pictures that follow one another and pictures
 that look alike. Of these, each picture is registered with those that matter for its place; and once poses are known,
 with those that the poses put beside it and that close a loop.
 """
@@ -23,7 +23,7 @@ EXHAUSTIVE_UP_TO = 30
 
 _FOLLOWING = 3  # pictures after each one that are tried
 _LOOKALIKES = 6  # pictures that look most alike that are tried for each one
-_NEIGHBOURS = 10  # nearest pictures in the plane that are looked at for each one
+_NEIGHBOURS = 10  # nearest pictures in the plane that are considered for each one
 _LEAST_OVERLAP = 0.15  # share of the smaller footprint
 _PARTNERS = 6  # pairs of a picture that its place is found by; those that others choose come on top
 _CELLS_ASIDE = 4  # cells of a picture, a side, that its partners are to cover

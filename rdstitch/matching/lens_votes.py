@@ -14,7 +14,7 @@ from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.own_lenses import OwnLenses, own_lenses
 
 _FARTHEST = 10.0  # thresholds from where one λ puts them, within which correspondences may fit with two
-_MOST = 250  # correspondences of a pair that are asked
+_MOST = 250  # matches of a pair that are used
 _LEAST_STD = 2e-4  # λ; no pair knows it better than that the division model holds
 _COMMON_STD = 0.05  # λ; by so much relief and lenses of another kind change what a pair sees, of both pictures alike
 _ROUNDS = 6
@@ -41,9 +41,9 @@ class Votes:
 
     @classmethod
     def of(cls, pairs: Sequence[PairRegistration], threshold: float) -> Self:
-        """The votes of the pairs that see λ; ``threshold``, px, as they were estimated with."""
-        asked = [pair for pair in pairs if pair.relation and np.isfinite(pair.relation.distortion_std)]
-        found = list(zip(asked, _votes(asked, threshold), strict=True))
+        """The votes of the pairs that see λ; ``threshold``, pixels, as they were estimated with."""
+        registered = [pair for pair in pairs if pair.relation and np.isfinite(pair.relation.distortion_std)]
+        found = list(zip(registered, _votes(registered, threshold), strict=True))
         seen = [(pair, vote) for pair, vote in found if np.isfinite(vote.covariance).all()]
         return cls(
             np.array([pair.image1 for pair, _ in seen], dtype=np.intp),
@@ -56,7 +56,7 @@ class Votes:
         """Number of pairs."""
         return len(self.image1)
 
-    def missed(self, expected: FloatArray | float) -> FloatArray:
+    def mahalanobis_residuals(self, expected: FloatArray | float) -> FloatArray:
         """How far each vote is from what is expected, (L, 2), in its standard deviations."""
         return np.asarray(np.linalg.norm(self._whitened(self.distortion - expected), axis=1))
 
@@ -83,7 +83,7 @@ class Votes:
         design = self._whitening @ np.eye(len(lenses))[which]
         seen = np.bincount(which.ravel(), minlength=len(lenses)) > 0
         for _ in range(_ROUNDS):
-            weight = 1.0 / np.maximum(self.missed(lenses[which]), 0.1)
+            weight = 1.0 / np.maximum(self.mahalanobis_residuals(lenses[which]), 0.1)
             normal = np.einsum("l,lij,lik->jk", weight, design, design)
             right = np.einsum("l,lij,li->j", weight, design, self._whitened(self.distortion))
             lenses = np.where(seen, np.linalg.lstsq(normal, right, rcond=None)[0], lenses)
@@ -112,7 +112,7 @@ def _votes(pairs: Sequence[PairRegistration], threshold: float) -> list[OwnLense
 
 
 def _near(pair: PairRegistration, threshold: float) -> tuple[FloatArray, FloatArray]:
-    """Matches not too far from where one λ puts them, evenly spread, px."""
+    """Matches not too far from where one λ puts them, evenly spread, pixels."""
     matched = pair.correspondences
     apart = np.linalg.norm(pair.relation.transfer(matched.points1) - matched.points2, axis=1)
     near = np.flatnonzero(apart < _FARTHEST * threshold)

@@ -16,7 +16,7 @@ class Link:
     image1, image2 : int
         Indices of the pictures.
     points1, points2 : ndarray of shape (M, 2)
-        Where the inliers of the pair were measured, px of the one and of the other picture.
+        Where the inliers of the pair were measured, pixels of the one and of the other picture.
     relation : RadialHomography
         The pair's own estimate, from ``image1`` to ``image2``.
     """

@@ -20,7 +20,9 @@ _STARTS = 5  # divisions that are begun with
 _ROUNDS = 6
 _MOVES = 12
 _LEAST_GAP = 0.01  # λ; what is nearer is one lens that one λ does not quite describe
-_LEAST_GAP_PX = 4.0  # the same at a corner, px; with one λ, pictures are off by a tenth of that, rows of them by half
+_LEAST_GAP_PX = (
+    4.0  # the same at a corner, pixels; with one λ, pictures are off by a tenth of that, rows of them by half
+)
 _MEAN_MISS = 1.25  # standard deviations that a vote, two numbers, is off on average; less is luck
 # How many times better two lenses must explain the votes of pairs of both: at least, and times one over their number.
 _LEAST_GAIN, _GAIN_OF_FEW = 4.0, 2.8
@@ -47,7 +49,7 @@ class TwoLenses:
 
 
 def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
-    """The division of pictures into two lenses that the votes speak for; None where one lens will do.
+    """The division of pictures into two lenses that the votes support; None where one lens will do.
 
     Relief and lenses that one λ does not describe scatter the votes by many times their standard deviations, and a few
     scattered votes can always be divided somehow. Two lenses must therefore explain what pairs of both see far better
@@ -66,20 +68,22 @@ def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
     divisions = [(second, lenses) for second, lenses in divisions if abs(lenses[1] - lenses[0]) >= gap]
     if not divisions:
         return None
-    second, lenses = min(divisions, key=lambda division: votes.missed(division[1][votes.which(division[0])]).sum())
+    second, lenses = min(
+        divisions, key=lambda division: votes.mahalanobis_residuals(division[1][votes.which(division[0])]).sum()
+    )
     seen = np.isin(np.arange(count), [votes.image1, votes.image2])
     if 2 * second[seen].sum() > seen.sum():
         second, lenses = ~second, lenses[::-1]
     second &= seen  # of a picture without votes nothing is known that would tell it from most others
     which = votes.which(second)
     between = which[:, 0] != which[:, 1]
-    number, missed = int(between.sum()), votes.missed(lenses[which])
+    number, missed = int(between.sum()), votes.mahalanobis_residuals(lenses[which])
     least = max(float(missed[between].sum()), max(_MEAN_MISS, float(missed.mean())) * number)
-    by_one = votes.missed(votes.fitted(np.zeros_like(which), lenses[:1]))[between].sum()
+    by_one = votes.mahalanobis_residuals(votes.fitted(np.zeros_like(which), lenses[:1]))[between].sum()
     if not number or by_one < (_LEAST_GAIN + _GAIN_OF_FEW / number) * least:
         return None
-    told = _margins(count, votes, second, lenses)[seen].min() >= _LEAST_MARGIN
-    return TwoLenses(second, (float(lenses[0]), float(lenses[1])), bool(told and not between.all()))
+    clear = _margins(count, votes, second, lenses)[seen].min() >= _LEAST_MARGIN
+    return TwoLenses(second, (float(lenses[0]), float(lenses[1])), bool(clear and not between.all()))
 
 
 @dataclass(frozen=True)
@@ -145,7 +149,7 @@ def _of_the_other_lens(mixed: TwoLenses, pairs: Sequence[PairRegistration]) -> d
 
 
 def _guesses(count: int, votes: Votes) -> list[tuple[BoolArray, FloatArray]]:
-    """Divisions to start from: of the groups that the most telling votes hold together, those with the larger λ."""
+    """Divisions to start from: of the groups that the most certain votes connect, those with the larger λ."""
     difference, std = votes.differences
     held = spanning_forest(count, votes.image1, votes.image2, -std)
     alike = held[np.abs(difference[held]) < _DIFFERENT * std[held]]
@@ -183,8 +187,10 @@ def _improved_division(count: int, votes: Votes, second: BoolArray, lenses: Floa
 def _margins(count: int, votes: Votes, second: BoolArray, lenses: FloatArray) -> FloatArray:
     """By how much more the votes were missed if a picture came from the other lens, for each picture (N,)."""
     which = votes.which(second)
-    missed = votes.missed(lenses[which])
-    return _per_picture(count, votes, *(votes.missed(lenses[which ^ other]) - missed for other in np.eye(2, dtype=int)))
+    missed = votes.mahalanobis_residuals(lenses[which])
+    return _per_picture(
+        count, votes, *(votes.mahalanobis_residuals(lenses[which ^ other]) - missed for other in np.eye(2, dtype=int))
+    )
 
 
 def _per_picture(count: int, votes: Votes, of_first: FloatArray, of_last: FloatArray) -> FloatArray:

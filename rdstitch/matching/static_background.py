@@ -34,7 +34,7 @@ _MIN_OVERLAID_PAIRS, _MIN_OVERLAID_SHARE = 2, 0.2
 
 
 def is_static_pair(pair: PairRegistration, threshold: float) -> bool:
-    """Whether a pair is registered as if nothing had moved; ``threshold`` is that of its inliers, px."""
+    """Whether a pair is registered as if nothing had moved; ``threshold`` is that of its inliers, pixels."""
     return bool(pair.relation) and float(np.median(_moved(pair)[pair.relation.inliers])) < threshold * _STATIC
 
 
@@ -128,6 +128,6 @@ def show_motion(pairs: Sequence[PairRegistration], count: int, threshold: float)
 
 
 def _moved(pair: PairRegistration) -> FloatArray:
-    """How far each match moved in the picture, px."""
+    """How far each match moved in the picture, pixels."""
     moved: FloatArray = np.linalg.norm(pair.correspondences.points2 - pair.correspondences.points1, axis=1)
     return moved

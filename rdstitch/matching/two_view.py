@@ -44,7 +44,7 @@ class PairRegistration:
     image1, image2 : int
         Indices of the pictures.
     correspondences : Correspondences
-        The matches, of full-size px, right and wrong.
+        The putative matches, pixels.
     relation : RadialHomography
         The estimate from ``image1`` to ``image2``; falsy with the reason where there is none.
     """
@@ -66,7 +66,7 @@ def match_pairs(
     pairs: Sequence[tuple[int, int]],
     matcher: Matcher,
     *,
-    glimpses: Sequence[Correspondences | None] | None = None,
+    known_matches: Sequence[Correspondences | None] | None = None,
     progress: Progress | None = None,
     recall: Recall[Correspondences] | None = None,
     workers: int = 1,
@@ -81,8 +81,8 @@ def match_pairs(
         Indices of the pictures of each pair.
     matcher : callable
         Matches the features of two pictures.
-    glimpses : sequence of Correspondences or None, optional
-        Some matches of each pair, where they are known: they tell where the pictures overlap, and only there the rest
+    known_matches : sequence of Correspondences or None, optional
+        Some matches of each pair, where they are known: they show where the pictures overlap, and only there the rest
         is looked for.
     progress : callable, optional
         Called with the number of pairs done and their total.
@@ -94,11 +94,11 @@ def match_pairs(
 
     def work(index: int) -> Correspondences:
         image1, image2 = pairs[index]
-        glimpse = None if glimpses is None else glimpses[index]
-        if glimpse is None:
+        known = None if known_matches is None else known_matches[index]
+        if known is None:
             compute = partial(matcher, features[image1], features[image2])
         else:
-            compute = partial(match_overlap, matcher, features[image1], features[image2], glimpse)
+            compute = partial(match_overlap, matcher, features[image1], features[image2], known)
         return compute() if recall is None else recall(index, compute)
 
     done = []

@@ -28,7 +28,7 @@ from rdstitch.radial_homography import RadialHomography
 Pair = tuple[int, int]
 Transfer = Callable[[int, int, FloatArray], FloatArray]
 
-_PRESCREEN_FEATURES = 1000  # strongest features of a picture, by which it is told whether a pair is worth a closer look
+_PRESCREEN_FEATURES = 1000  # strongest features of a picture, by which pairs are prescreened
 _PROMISING = 8  # matches among these; pictures that share nothing have three to six by chance
 _WORTHWHILE = 0.05  # share of the matches that a picture has with the one most like it; less adds nothing
 _ENOUGH_MATCHES = 200  # of a picture with all others, from which on it needs no more
@@ -63,9 +63,9 @@ class Pairing:
     static: StaticPlaces | None = None
 
     def prescreen_pairs(self, pairs: Sequence[Pair]) -> dict[Pair, Correspondences]:
-        """The pairs that share something at a glance and matter for the place of an image, and what they share.
+        """The pairs whose strongest features match and that matter for the place of an image, with those matches.
 
-        A pair that is passed over may overlap nevertheless, by little: the others then tell its place.
+        A pair that is passed over may overlap nevertheless, by little: its place then follows from the others.
         """
         strongest = replace(
             self, features=[found.take(np.arange(min(len(found), _PRESCREEN_FEATURES))) for found in self.features]
@@ -89,7 +89,7 @@ class Pairing:
     ) -> list[PairRegistration]:
         """Match and estimate pairs (i, j), with λ free, or as the user or the other pairs say.
 
-        Where it is known what pictures share at a glance, only the parts in which they overlap are matched.
+        Where matches of the prescreening are given, only the parts in which the pictures overlap are matched.
         """
         chosen = list(pairs)
         if not chosen:
@@ -194,12 +194,12 @@ class Pairing:
         """Matches of every pair, from an earlier run where the cache has them."""
         # What a network finds depends on all that it is shown.
         network = self.options.lightglue_model is not None
-        glimpses = [None if shared is None or network else shared.get(pair) for pair in pairs]
+        known_matches = [None if shared is None or network else shared.get(pair) for pair in pairs]
 
         def recall(index: int, compute: Callable[[], Correspondences]) -> Correspondences:
-            (i, j), glimpse = pairs[index], glimpses[index]
-            told = None if glimpse is None else self.cache.digest(glimpse)
-            inputs = (self._digests[i], self._digests[j], self._matching, told)
+            (i, j), known = pairs[index], known_matches[index]
+            digest = None if known is None else self.cache.digest(known)
+            inputs = (self._digests[i], self._digests[j], self._matching, digest)
 
             def valid(found: Correspondences) -> bool:
                 own = found.of(self.features[i], self.features[j], found.indices, found.ratio)
@@ -213,7 +213,7 @@ class Pairing:
             self.features,
             pairs,
             self.matcher,
-            glimpses=glimpses,
+            known_matches=known_matches,
             progress=partial(self.progress, stage),
             recall=recall,
             workers=workers,

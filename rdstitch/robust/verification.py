@@ -13,7 +13,7 @@ _LARGEST_CHANCE = 1e-4
 
 
 def places(points1: FloatArray, points2: FloatArray, image_size: tuple[int, int]) -> int:
-    """In how many different places of the pictures correspondences (N, 2), px, lie: cells of a grid, in the lesser."""
+    """In how many cells of a grid the matches (N, 2), pixels, lie, in the picture in which these are fewer."""
     cell = float(np.hypot(*image_size)) / _CELLS_PER_DIAGONAL
     return min(len(np.unique(numbered_cells(points / cell))) for points in (points1, points2))
 
@@ -37,10 +37,10 @@ def rejection_reason(
     Parameters
     ----------
     points1, points2 : ndarray of shape (N, 2)
-        Measured points, px.
+        Measured points, pixels.
     inliers : ndarray of shape (N,), bool
     image_size : (int, int)
-        Of picture 2, px.
+        Of picture 2, pixels.
     threshold : float
         px.
     """

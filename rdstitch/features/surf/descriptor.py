@@ -27,7 +27,7 @@ def describe_patches(
     points : ndarray of shape (N, 2)
         px.
     scale : ndarray of shape (N,)
-        The s of the paper, px.
+        The s of the paper, pixels.
     angle : ndarray of shape (N,)
         Orientation, radians.
     extended : bool

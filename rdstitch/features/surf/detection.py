@@ -36,12 +36,12 @@ class SurfDetection:
 
     @property
     def points(self) -> FloatArray:
-        """Places, px of the picture, (N, 2)."""
+        """Places, pixels of the picture, (N, 2)."""
         return self.blobs.points
 
     @property
     def scale(self) -> FloatArray:
-        """Diameters, px, (N,)."""
+        """Diameters, pixels, (N,)."""
         return self.blobs.size
 
     @property

@@ -27,9 +27,9 @@ class Blobs:
     Attributes
     ----------
     points : ndarray of shape (N, 2)
-        Centres, px.
+        Centres, pixels.
     size : ndarray of shape (N,)
-        Side of the box filter that answers most, px.
+        Side of the box filter that answers most, pixels.
     response : ndarray of shape (N,)
         Determinant of the Hessian, grey levels².
     laplacian_sign : ndarray of shape (N,), int8
@@ -47,7 +47,7 @@ class Blobs:
 
     @property
     def scale(self) -> FloatArray:
-        """The s of the paper, px, shape (N,)."""
+        """The s of the paper, pixels, shape (N,)."""
         return self.size * SIGMA_PER_SIZE
 
     def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Self:
@@ -90,7 +90,7 @@ def find_blobs(grey: Grey, threshold: float, octaves: int, layers: int) -> Blobs
 
 
 def _blobs_of_rows(level: Grey, start: int, stop: int, threshold: float, layers: int) -> Blobs:
-    """Blobs centred in rows ``start`` to ``stop`` of a level, px of the level."""
+    """Blobs centred in rows ``start`` to ``stop`` of a level, pixels of the level."""
     height, width = level.shape
     lobes = [_SMALLEST_LOBE + 2 * k for k in range(layers + 2)]
     # One row more on either side, to compare with.

@@ -32,7 +32,7 @@ def orientations(levels: list[Grey], points: FloatArray, scale: FloatArray) -> F
     points : ndarray of shape (N, 2)
         px.
     scale : ndarray of shape (N,)
-        The s of the paper, px.
+        The s of the paper, pixels.
     """
     angles = np.empty(len(points))
     for start in range(0, len(points), _KEYPOINTS):

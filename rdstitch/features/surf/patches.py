@@ -22,9 +22,9 @@ def sample_patches(
     levels : list of ndarray
         The picture's pyramid.
     points : ndarray of shape (N, 2)
-        Centres of the grids, px.
+        Centres of the grids, pixels.
     spacing : ndarray of shape (N,)
-        Between neighbouring samples, px.
+        Between neighbouring samples, pixels.
     angle : ndarray of shape (N,)
         Direction of the grids' first axis, radians.
     count : int

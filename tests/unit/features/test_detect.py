@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.features import FeatureOptions, Features, View, detect, detect_all, match
-from rdstitch.features.opencv import root
+from rdstitch.features.opencv import to_rootsift
 from rdstitch.features.picture import halving
 from rdstitch.features.spread import spread, strongest
 from rdstitch.synthetic import ground
@@ -208,11 +208,11 @@ def test_bad_arguments_are_refused(picture: NDArray[np.uint8]) -> None:
 def test_rootsift_compares_roots() -> None:
     rng = np.random.default_rng(0)
     values = np.rint(rng.gamma(0.6, 60, (40, 128))).astype(np.float32)
-    rooted = root(values)
+    rooted = to_rootsift(values)
     exact = np.sqrt(values / values.sum(axis=1, keepdims=True))
     np.testing.assert_allclose(rooted / 512, exact, atol=0.5 / 512 + 1e-6)
     np.testing.assert_array_equal(rooted, np.rint(rooted))
-    np.testing.assert_array_equal(root(np.zeros((1, 128), np.float32)), 0)
+    np.testing.assert_array_equal(to_rootsift(np.zeros((1, 128), np.float32)), 0)
 
 
 def test_spreading_serves_every_cell_before_any_twice() -> None:
