@@ -16,7 +16,7 @@ from rdstitch.robust.sampling import Sampler
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
 from rdstitch.solvers.solutions import Solutions
 
-_FIRST_BATCH = 64
+_FIRST_BATCH, _SECOND_BATCH = 64, 256  # most pairs need no more than the first
 _LARGEST_BATCH = 512
 _SAMPLES_AT_ONCE = 4096
 _LEAST_EXPLORATION = 96  # samples that every solver draws unless its own confidence is reached before
@@ -156,7 +156,7 @@ def ransac(
         sure = (drawn[-1] >= needed[-1]) | (explored & (drawn >= needed).any(axis=0))
         confident[active[sure]] = True
         active = active[~sure & (drawn.sum(axis=0) < options.max_iterations)]
-        batch = batch if turns is not lanes else min(2 * batch, _LARGEST_BATCH)
+        batch = _SECOND_BATCH if turns is not lanes else min(2 * batch, _LARGEST_BATCH)
         turns = lanes
     return Search(best, np.sum([lane.drawn for lane in lanes], axis=0), confident)
 
