@@ -21,7 +21,7 @@ from rdstitch.io.layout import Layout
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.outputs import Outputs
 from rdstitch.io.tiff import ExtraTag
-from rdstitch.io.write import check_format, write_strips
+from rdstitch.io.write import check_format, check_memory, write_strips
 
 
 @dataclass(frozen=True, repr=False)
@@ -193,6 +193,7 @@ def compose_to_file(
             background=renderer.options.background,
         )
         check_format(path, layout)
+        check_memory(path, size, renderer.options.max_memory)
         tags = () if extra_tags is None else extra_tags(prepared.canvas)
         # Nothing goes on behind a writer that fails.
         with closing(prepared.strips(progress)) as strips:

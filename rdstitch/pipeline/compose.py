@@ -29,7 +29,7 @@ from rdstitch.io.deepzoom import LARGEST_TILE_PROFILE
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.io.outputs import Outputs
 from rdstitch.io.tiff import ExtraTag
-from rdstitch.io.write import check_size
+from rdstitch.io.write import check_memory, check_size
 from rdstitch.pipeline.memory import release_free_heap
 from rdstitch.progress import Progress
 
@@ -124,6 +124,7 @@ def compose_pictures(
     # A crop may yet make it fit.
     if output is not None and options.crop == "none":
         check_size(output, canvas.size)
+        check_memory(output, canvas.size, options.max_memory)
     options = replace(options, workers=threads)
     read = readers(sources)
     if dry_run:

@@ -11,8 +11,11 @@ import argparse
 import io
 import json
 import multiprocessing
+import os
 import random
+import re
 import resource
+import shutil
 import signal
 import sys
 import tempfile
@@ -20,6 +23,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
@@ -41,16 +45,17 @@ from rdstitch.features import Features
 from rdstitch.inputs.attitudes import with_attitudes
 from rdstitch.inputs.find import find_pictures
 from rdstitch.inputs.source import Source
-from rdstitch.io import packing, read_image, read_metadata
+from rdstitch.io import packing, read_image, read_metadata, write_image
+from rdstitch.io.deepzoom import holds_only_tiles
 from rdstitch.io.mask import read_mask
-from rdstitch.io.metadata import Metadata
+from rdstitch.io.metadata import Metadata, metadata_of
 from rdstitch.sidecar.read import read_sidecar
 from tests.damage import damaged
 from tests.property.test_camera_file_reading import TEXTS as CAMERA_FILES
 from tests.property.test_picture_reading import FILES as PICTURES
 from tests.property.test_sidecar_reading import GOOD as SIDECAR
 
-_SECONDS = 30  # a read that takes longer hangs
+_SECONDS = 5  # a read that takes longer hangs
 _MEMORY = 6 * 2**30  # bytes; a read that needs more is a bomb
 _LARGEST = 2_000_000  # px of a picture that is decoded: fields that claim more cost nothing to say
 
@@ -105,6 +110,14 @@ def _mask(file: Path) -> Any:
     return read_mask(file, (width, height)) if width * height < _LARGEST else None
 
 
+def _exif_blocks() -> tuple[bytes, ...]:
+    """EXIF with every tag that is read, and with the orientation as text and as a float."""
+    whole = Image.open(io.BytesIO(PICTURES["jpg"])).getexif().tobytes()
+    head = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01"
+    text, number = b"\x02\0\x02\0\0\x006\0\0\0", b"\x0b\0\x01\0\0\0\0\0\xc0\x40"
+    return (whole, *(head + value + bytes(4) for value in (text, number)))
+
+
 def _entries() -> tuple[bytes, ...]:
     """What the cache holds, without the digest that guards it."""
     rng = np.random.default_rng(7)
@@ -122,6 +135,39 @@ def _entry(file: Path) -> Any:
     data = packing._MAGIC + sha256(body).digest() + body
     # The cache computes again; nobody is told.
     return _by_name(file, partial(packing.unpack, data, (Camera, Features, Poses, Relief)))
+
+
+def _xmp(file: Path) -> Any:
+    """The file's content as the XMP block of a picture."""
+    image = Image.new("L", (40, 30))
+    image.info["xmp"] = file.read_bytes()
+    return _by_name(file, partial(metadata_of, image))
+
+
+def _exif(file: Path) -> Any:
+    """The file's content as the EXIF block of a picture, which is read, and kept for the output."""
+    picture = file.parent / "a.png"
+    Image.new("L", (40, 30)).save(picture, exif=file.read_bytes())
+    metadata = read_metadata(picture)
+    write_image(file.parent / "b.png", np.zeros((30, 40), np.uint8), metadata=metadata)
+    return read_metadata(file.parent / "b.png")
+
+
+def _tiles(file: Path) -> Any:
+    """The file's lines as the names of files in a folder: is it replaced only if all of them are tiles?"""
+    folder = Path(tempfile.mkdtemp(dir=file.parent)) / "a_files"
+    folder.mkdir()
+    for name in file.read_bytes().splitlines():
+        path = Path(os.path.normpath(folder / os.fsdecode(name)))
+        if b"\0" in name or not path.is_relative_to(folder) or len(name) > 200:
+            continue
+        with suppress(OSError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+    files = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()]
+    if holds_only_tiles(folder) and not all(re.fullmatch(r"[0-9]{1,2}/[0-9]+_[0-9]+\.jpg", name) for name in files):
+        raise AssertionError(f"a folder with {files} would be deleted")
+    shutil.rmtree(folder.parent)
 
 
 def _attitudes(file: Path) -> Any:
@@ -160,6 +206,14 @@ _CONFIGURATIONS = (
 _TABLES = b"name,psi,theta\na.jpg,1.5,-2\nb.jpg,0,0\n", b'theta,"x",psi,name\r\n1,2,3,"a.jpg"\r\n4,5,6,b.jpg'
 _LISTS = b"a.jpg\nb c.jpg\n\n*.png\n@list\n", b"/nowhere/[a]?.tif\r\nx\0y\n"
 
+_XMP_BLOCKS = (
+    b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:GimbalYawDegree="+31.5" '
+    b'drone-dji:GimbalPitchDegree="-89.90"><drone-dji:GimbalRollDegree>+0.25</drone-dji:GimbalRollDegree>'
+    b"<drone-dji:CalibratedFocalLength>3666.6</drone-dji:CalibratedFocalLength></rdf:Description></x:xmpmeta>",
+    b":CalibratedFocalLength>" * 5000 + b"<Camera:Yaw>1</Camera:Yaw>" * 2000 + b" " * 50_000,
+)
+_TILE_NAMES = (b"0/0_0.jpg\n1/0_0.jpg\n10/3_2.jpg\n10/12_40.jpg\n", b"0/0_0.jpg\n2023/raw/wedding.nef\nnotes.txt\n")
+
 PARSERS = (
     Parser("sidecar", (json.dumps(SIDECAR).encode(), json.dumps(SIDECAR, indent=2).encode()), read_sidecar),
     Parser("camera file", tuple(text.encode() for text in CAMERA_FILES), load_camera),
@@ -169,6 +223,9 @@ PARSERS = (
     Parser("list", _LISTS, _list),
     Parser("sidecar beside a picture", (json.dumps(SIDECAR).encode(),), _is_rdstitch_output, "a.png.json"),
     Parser("picture", _pictures(), _picture),
+    Parser("xmp", _XMP_BLOCKS, _xmp),
+    Parser("exif", _exif_blocks(), _exif),
+    Parser("deep zoom folder", _TILE_NAMES, _tiles),
     Parser("mask", tuple(_encoded("PNG", mode) for mode in ("1", "L", "RGBA", "I;16")), _mask),
 )
 

@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from rdstitch.errors import ImpossibleCameraError
 from rdstitch.pipeline import register
@@ -82,3 +83,19 @@ def test_no_memory_for_opencv(
     monkeypatch.setattr(register, "separate_lenses", fail)
     done = rdstitch("pano", *frames[:2], "-o", tmp_path / "out.png", *FAST)
     assert (done.status, "out of memory" in done.line) == (7, True)
+
+
+def test_webp_obeys_the_memory_limit(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    arguments = ("pano", *frames[:2], *FAST, "--scale", "5", "--max-memory", "120M")
+    done = rdstitch(*arguments, "-o", tmp_path / "out.webp")
+    assert (done.status, "--max-memory allows 120 MB; write a .tif" in done.line) == (7, True)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_picture_larger_than_the_memory_limit(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    large = tmp_path / "large.png"
+    Image.new("RGB", (6000, 5000)).save(large)
+    done = rdstitch("pano", frames[0], large, "-o", tmp_path / "out.png", *FAST, "--max-memory", "100M")
+    assert (done.status, f"{large}: 6000 x 5000 pixels need" in done.line) == (7, True)
+    done = rdstitch("mosaic", *frames[:2], large, "-o", tmp_path / "out.png", *FAST, "--max-memory", "100M")
+    assert (done.status, f"left out {large}" in done.line) == (0, True)
