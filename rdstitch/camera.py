@@ -171,6 +171,11 @@ class Camera:
             return self
         return replace(self, focal=_GUESSED_FOCAL * self.half_diagonal, focal_source="guess")
 
+    def with_coefficients(self, distortion: float, distortion2: float = 0.0, distortion3: float = 0.0) -> Self:
+        """The camera with another, given lens; the distortion centre stays."""
+        lens = replace(self, distortion=distortion, distortion2=distortion2, distortion3=distortion3)
+        return replace(lens, distortion_std=None, lens_covariance=None)
+
     def normalize(self, points: ArrayLike) -> FloatArray:
         """Pixels (..., 2) to normalized points, in half diagonals from the centre."""
         return (np.asarray(points, dtype=np.float64) - self.center) / self.half_diagonal

@@ -1,9 +1,13 @@
-"""Camera files: rdstitch's own, OpenCV's, OpenDroneMap's and Hugin's; what is not λ is fitted, and the residual told.
+"""Camera files: rdstitch's own and those of others, to whose lens models the lens is fitted; each states the residual.
 
 ===================================  ==========================================================
 ``*.json``                           rdstitch's own
 ``*.yml``, ``*.yaml``                OpenCV's FileStorage as YAML
 ``opencv.json``, ``*.opencv.json``   OpenCV's FileStorage as JSON
+``fisheye.yml``, ``*.fisheye.yml``   OpenCV's FileStorage as YAML, for ``cv2.fisheye``
+``camera_info.yaml``                 ROS
+``camchain.yaml``                    Kalibr
+``cameras.txt``                      COLMAP
 ``cameras.json``                     OpenDroneMap
 ``*.pto``                            Hugin
 ===================================  ==========================================================
@@ -16,19 +20,23 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rdstitch.camera import Camera
+from rdstitch.camera_files.colmap import colmap_text
+from rdstitch.camera_files.comments import read_comments
 from rdstitch.camera_files.division import CameraFile
 from rdstitch.camera_files.hugin import hugin_project, is_hugin, read_hugin
+from rdstitch.camera_files.kalibr import camera_chain_yaml
 from rdstitch.camera_files.lens_fit import LensFit
-from rdstitch.camera_files.opencv import is_opencv, opencv_json, opencv_yaml, read_opencv
+from rdstitch.camera_files.opencv import is_opencv, opencv_fisheye_yaml, opencv_json, opencv_yaml, read_opencv
 from rdstitch.camera_files.opencv_yaml import parse_yaml
 from rdstitch.camera_files.opendronemap import is_opendronemap, opendronemap_json, read_opendronemap
+from rdstitch.camera_files.ros import camera_info_yaml
 from rdstitch.errors import OutputError
 from rdstitch.io.atomic import write_text_atomic
 from rdstitch.records import parse_json, read_text
 
 __all__ = ["CAMERA_SUFFIXES", "CameraFile", "LensFit", "load_camera", "read_camera_file", "save_camera"]
 
-CAMERA_SUFFIXES = (".json", ".yml", ".yaml", ".pto")
+CAMERA_SUFFIXES = (".json", ".yml", ".yaml", ".pto", ".txt")
 """How names of camera files end, lower case."""
 
 
@@ -62,6 +70,8 @@ def read_camera_file(path: str | Path) -> CameraFile:
         return CameraFile(Camera.from_record(record), "rdstitch")
     if is_hugin(text):
         return read_hugin(text, file)
+    if (own := read_comments(text, file, "rdstitch")) is not None:
+        return own
     return read_opencv(parse_yaml(text, file))
 
 
@@ -95,14 +105,32 @@ def camera_file_text(camera: Camera, path: str | Path) -> str:
 
 def _writer(path: Path) -> Callable[[Camera], str]:
     name = path.name.lower()
-    if name == "cameras.json":
-        return opendronemap_json
-    if name == "opencv.json" or name.endswith(".opencv.json"):
-        return opencv_json
+    if (named := _NAMES.get(name)) is not None:
+        return named
+    for ending, writer in _ENDINGS.items():
+        if name.endswith(ending):
+            return writer
     writers = {".json": _own_json, ".yml": opencv_yaml, ".yaml": opencv_yaml, ".pto": hugin_project}
     if path.suffix.lower() not in writers:
         raise OutputError(f"{path}: not the name of a camera file; use one of {' '.join(CAMERA_SUFFIXES)}")
     return writers[path.suffix.lower()]
+
+
+_NAMES: dict[str, Callable[[Camera], str]] = {
+    "cameras.json": opendronemap_json,
+    "opencv.json": opencv_json,
+    "fisheye.yml": opencv_fisheye_yaml,
+    "fisheye.yaml": opencv_fisheye_yaml,
+    "camera_info.yaml": camera_info_yaml,
+    "camera_info.yml": camera_info_yaml,
+    "camchain.yaml": camera_chain_yaml,
+    "cameras.txt": colmap_text,
+}
+_ENDINGS: dict[str, Callable[[Camera], str]] = {
+    ".opencv.json": opencv_json,
+    ".fisheye.yml": opencv_fisheye_yaml,
+    ".fisheye.yaml": opencv_fisheye_yaml,
+}
 
 
 def _own_json(camera: Camera) -> str:

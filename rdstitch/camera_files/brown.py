@@ -6,9 +6,12 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.camera_files.lens_fit import LensFit, fit_polynomial
+from rdstitch.camera_files.lens_fit import LensFit, LensSamples, fit_polynomial
 
 _POWERS = (3, 5, 7)
+
+CLOSE = 0.1
+"""Pixels: a model that is nowhere farther from the lens needs no better one in its place."""
 
 
 @dataclass(frozen=True)
@@ -51,12 +54,35 @@ class Brown:
         return np.stack([bent_x, bent_y], axis=1) * self.focal + self.center
 
 
-def brown_of(camera: Camera) -> tuple[Brown, LensFit]:
-    """Brown's model of a camera: k1, k2, k3 by least squares; the focal length is guessed where it is not known."""
+def brown_of(camera: Camera, terms: int = 3) -> tuple[Brown, LensFit]:
+    """Brown's model of a camera by least squares; the focal length is guessed where it is not known.
+
+    Parameters
+    ----------
+    camera : Camera
+    terms : int
+        How many of k1, k2, k3 the format has.
+    """
     focal = camera.with_focal().focal
     assert focal is not None
-    radial, fit = fit_polynomial(camera, focal, _POWERS)
-    return Brown((focal, focal), camera.center, tuple(radial.tolist())), fit
+    radial, fit = fit_polynomial(camera, focal, _POWERS[:terms])
+    return Brown((focal, focal), camera.center, (*radial.tolist(), *[0.0] * (3 - terms))), fit
+
+
+def rational_of(camera: Camera) -> tuple[Brown, LensFit]:
+    """OpenCV's rational model of a camera: Brown's with a denominator, which also describes strong lenses."""
+    focal = camera.with_focal().focal
+    assert focal is not None
+    found, fit = LensSamples.of(camera, focal).fit_rational()
+    return Brown((focal, focal), camera.center, tuple(found[:3].tolist()), denominator=tuple(found[3:].tolist())), fit
+
+
+def least_brown_of(camera: Camera) -> tuple[Brown, LensFit]:
+    """Brown's polynomial where that is close to the lens, else the rational model."""
+    plain = brown_of(camera)
+    if plain[1].largest <= CLOSE:
+        return plain
+    return min(plain, rational_of(camera), key=lambda found: found[1].largest)
 
 
 def _series(coefficients: tuple[float, ...], r2: FloatArray) -> FloatArray:

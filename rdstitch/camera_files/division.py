@@ -1,10 +1,10 @@
 """What every foreign camera file gets besides: the division model itself, so that λ comes back as it was."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from rdstitch.camera import Camera
-from rdstitch.camera_files.lens_fit import Forward, LensFit, fit_division
+from rdstitch.camera_files.lens_fit import Forward, LensFit, fit_lens
 from rdstitch.errors import ArgumentError
 from rdstitch.records import Record
 
@@ -42,7 +42,7 @@ def fitted_camera(record: Record, kind: str, forward: Forward, camera: Camera) -
         When that is impossible.
     """
     try:
-        distortion, fit = fit_division(forward, camera)
-        return CameraFile(replace(camera, distortion=distortion), kind, fit)
+        lens, fit = fit_lens(forward, camera)
+        return CameraFile(lens, kind, fit)
     except ArgumentError as error:
         record.fail(str(error))

@@ -1,10 +1,10 @@
 """Hugin's project files: the lens of an image line, panotools' polynomial with a, b, c and the field of view v.
 
 ``r_d = a r⁴ + b r³ + c r² + (1 - a - b - c) r`` with r the undistorted radius in halves of the shorter side: the scale
-is kept there and not at the centre, so that the focal length that v tells is not the one at the centre.
+is kept there and not at the centre, so that the focal length that v implies is not the one at the centre. For fisheyes
+the undistorted radius is that of an equidistant one.
 """
 
-import json
 import math
 import re
 
@@ -12,15 +12,16 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.camera_files.division import CameraFile, fitted_camera, own_node
-from rdstitch.camera_files.lens_fit import fit_polynomial
+from rdstitch.camera_files.brown import CLOSE
+from rdstitch.camera_files.comments import comments, read_comments
+from rdstitch.camera_files.division import CameraFile, fitted_camera
+from rdstitch.camera_files.lens_fit import LensFit, LensSamples
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.records import Record, parse_json
+from rdstitch.records import Record
 
 _KIND = "Hugin"
-_OWN = "#rdstitch "
 _POWERS = (4, 3, 2)
-_RECTILINEAR = 0
+_RECTILINEAR, _CIRCULAR_FISHEYE, _FISHEYE = 0, 2, 3
 _PARAMETER = re.compile(r"([A-Za-z]+)(\"[^\"]*\"|\S*)")
 _HEAD = """# hugin project file
 #hugin_ptoversion 2
@@ -38,18 +39,18 @@ def read_hugin(text: str, file: str) -> CameraFile:
     Raises
     ------
     InputError
-        When there is no image, a parameter is wrong, or the lens is no rectilinear one.
+        When there is no image, a parameter is wrong, or the lens is neither a rectilinear one nor a fisheye.
     """
-    lines = text.splitlines()
-    for line in lines:
-        if line.startswith(_OWN):
-            return CameraFile(Camera.from_record(parse_json(line.removeprefix(_OWN), file)), _KIND)
-    image = next((line for line in lines if line.startswith("i ")), None)
+    if (own := read_comments(text, file, _KIND)) is not None:
+        return own
+    image = next((line for line in text.splitlines() if line.startswith("i ")), None)
     if image is None:
         raise InputError(f"{file}: has no image line, and so no lens")
     lens = Record(file, "the first image", {name: _number(value) for name, value in _PARAMETER.findall(image[2:])})
-    if lens["f"].integer() != _RECTILINEAR:
-        lens["f"].fail("only rectilinear lenses (f0) are known here, no fisheyes")
+    projection = lens["f"].integer()
+    if projection not in (_RECTILINEAR, _CIRCULAR_FISHEYE, _FISHEYE):
+        lens["f"].fail("only rectilinear lenses (f0) and fisheyes (f2, f3) are known here")
+    bend = _unbent if projection == _RECTILINEAR else np.arctan
     size = (lens["w"].side(), lens["h"].side())
     a, b, c, d, e = (0.0 if lens.get(name) is None else lens[name].number() for name in "abcde")
     view = lens["v"].number()
@@ -60,15 +61,20 @@ def read_hugin(text: str, file: str) -> CameraFile:
     if linear <= 0.0:
         lens.fail("a + b + c must be below 1")
 
+    # Tangents of the half field of view for a rectilinear lens, angles for a fisheye.
+    half_view = math.radians(view) / 2
+    focal = size[0] / 2 / (math.tan(half_view) if projection == _RECTILINEAR else half_view) * linear
+
     def forward(points: FloatArray) -> FloatArray:
         # The file's undistorted picture is larger by what the polynomial takes away at the centre.
-        ideal = (points - center) / (unit * linear)
-        radius = np.linalg.norm(ideal, axis=1, keepdims=True)
-        bent: FloatArray = ideal * (((a * radius + b) * radius + c) * radius + linear) * unit + center
-        return bent
+        rays = (points - center) / focal
+        radius = np.linalg.norm(rays, axis=1, keepdims=True)
+        ideal = bend(radius) * focal / (unit * linear)
+        bent = ideal * (((a * ideal + b) * ideal + c) * ideal + linear) * unit
+        result: FloatArray = np.where(radius > 0.0, bent / np.maximum(radius, 1e-300), focal) * rays + center
+        return result
 
     try:
-        focal = size[0] / 2 / math.tan(math.radians(view) / 2) * linear
         camera = Camera(size, center=center, focal=focal, focal_source="file")
     except ArgumentError as error:
         lens.fail(str(error))
@@ -81,22 +87,36 @@ def hugin_project(camera: Camera) -> str:
     from scipy.optimize import brentq
 
     (width, height), unit = camera.image_size, min(camera.image_size) / 2
-    found, fit = fit_polynomial(camera, unit, _POWERS)
+    focal = camera.with_focal().focal
+    assert focal is not None
+    samples = LensSamples.of(camera, focal)
+    projection, found, fit = _RECTILINEAR, *_fit(samples, samples.straight, unit)
+    fisheye, fisheye_fit = _fit(samples, np.arctan(samples.straight), unit)
+    if fit.largest > CLOSE and fisheye_fit.largest < fit.largest:
+        projection, found, fit = _FISHEYE, fisheye, fisheye_fit
     # The scale moves from the centre to r = 1: r = s u, where s (1 - a - b - c) = 1 and a = found / s⁴ and so on.
     scale: float = brentq(
         lambda s: s - 1.0 - sum(k / s ** (p - 1) for k, p in zip(found, _POWERS, strict=True)), 0.2, 5.0
     )
     a, b, c = (float(k / scale**p) for k, p in zip(found, _POWERS, strict=True))
-    focal = camera.with_focal().focal
-    assert focal is not None
-    view = 2.0 * math.degrees(math.atan(width / 2 / (focal * scale)))
+    half_width = width / 2 / (focal * scale)
+    view = 2.0 * math.degrees(math.atan(half_width) if projection == _RECTILINEAR else half_width)
     d, e = camera.center[0] - (width - 1) / 2, camera.center[1] - (height - 1) / 2
-    own = json.dumps(own_node(camera, fit))
     lens = f"v{view!r} a{a!r} b{b!r} c{c!r} d{d!r} e{e!r} g0 t0"
     return (
-        f'{_HEAD}{_OWN}{own}\np f0 w{width} h{height} v{view:.6g} n"TIFF_m c:LZW"\nm i0\n'
-        f'i w{width} h{height} f{_RECTILINEAR} {lens} r0 p0 y0 TrX0 TrY0 TrZ0 n"picture.jpg"\n'
+        f'{_HEAD}{comments(camera, fit, "a, b, c")}p f0 w{width} h{height} v{view:.6g} n"TIFF_m c:LZW"\nm i0\n'
+        f'i w{width} h{height} f{projection} {lens} r0 p0 y0 TrX0 TrY0 TrZ0 n"picture.jpg"\n'
     )
+
+
+def _fit(samples: LensSamples, straight: FloatArray, unit: float) -> tuple[FloatArray, LensFit]:
+    """Coefficients of :data:`_POWERS`, in ``unit``, that turn ideal radii (N,), focal lengths, into measured ones."""
+    size = samples.unit / unit
+    return samples.fit(straight, (straight[:, None] * size) ** np.array(_POWERS) / size)
+
+
+def _unbent(radius: FloatArray) -> FloatArray:
+    return radius
 
 
 def _number(text: str) -> float | str:

@@ -1,23 +1,25 @@
-"""From one lens model to another, by least squares over the picture, with what that costs in px.
+"""From one lens model to another, by least squares over the picture, with what that costs in pixels.
 
-Every model is a *forward* map: px of a lens without distortion to measured px. The division model is fitted to others
-so that the measured px agree; polynomials are fitted to the division model in the same way.
+Every model is a *forward* map: pixels of a lens without distortion to measured pixels. The division model is fitted to
+others so that the measured pixels agree; others are fitted to the division model in the same way.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.division_model import MAX_ABS_DISTORTION, distort
 from rdstitch.errors import ArgumentError
 
 Forward = Callable[[FloatArray], FloatArray]
 
 _GRID = 65  # points along each side of the picture that polynomials are fitted at
+_RATIONAL_STEPS, _DIVISION_STEPS = 12, 8
+_CLOSE = 0.1  # pixels: as exactly as a lens can be described at all
+_FAR = 0.1  # half diagonals: then the file is no lens of these pictures
 _RAYS, _STEPS, _REACH = 64, 1200, 8.0  # where other models are looked at: directions, steps, half diagonals
 
 
@@ -35,6 +37,64 @@ class LensFit:
     largest: float
 
 
+@dataclass(frozen=True)
+class LensSamples:
+    """Radii of points all over a picture, N of them.
+
+    Attributes
+    ----------
+    straight, bent : ndarray of shape (N,)
+        From the distortion centre, undistorted and measured, in ``unit``.
+    unit : float
+        Pixels.
+    """
+
+    straight: FloatArray
+    bent: FloatArray
+    unit: float
+
+    @classmethod
+    def of(cls, camera: Camera, unit: float) -> Self:
+        """Of a camera."""
+        width, height = camera.image_size
+        u, v = np.meshgrid(np.linspace(-0.5, width - 0.5, _GRID), np.linspace(-0.5, height - 0.5, _GRID))
+        measured = np.column_stack([u.ravel(), v.ravel()])
+        straight = np.linalg.norm(camera.undistort(measured) - camera.center, axis=1) / unit
+        return cls(straight, np.linalg.norm(measured - camera.center, axis=1) / unit, unit)
+
+    def fit(self, start: FloatArray, terms: FloatArray) -> tuple[FloatArray, LensFit]:
+        """Coefficients (K,) for which ``start + terms k`` are the measured radii; ``terms`` of shape (N, K)."""
+        coefficients = _least_squares(terms, self.bent - start)
+        return coefficients, self.compare(start + terms @ coefficients)
+
+    def fit_rational(self) -> tuple[FloatArray, LensFit]:
+        """Coefficients (6,) for which ``u (1 + k1 u² + k2 u⁴ + k3 u⁶) / (1 + k4 u² + k5 u⁴ + k6 u⁶)`` are the radii.
+
+        Linear least squares, weighted by the denominator of the step before; of all steps the one with the smallest
+        error is kept.
+        """
+        # Radii up to 1, whatever the unit: high powers of large ones are otherwise all that counts.
+        size = float(self.straight.max())
+        powers = (self.straight[:, None] / size) ** np.array([2, 4, 6])
+        terms = np.hstack([self.straight[:, None] * powers, -self.bent[:, None] * powers])
+        denominator, fits = np.ones_like(self.bent), []
+        for _ in range(_RATIONAL_STEPS):
+            k = _least_squares(terms / denominator[:, None], (self.bent - self.straight) / denominator)
+            denominator = 1.0 + powers @ k[3:]
+            if not (denominator > 1e-3).all():
+                break
+            fits.append((k, self.compare(self.straight * (1.0 + powers @ k[:3]) / denominator)))
+        if not fits:
+            return np.zeros(6), self.compare(self.straight)
+        coefficients, fit = min(fits, key=lambda found: found[1].largest)
+        return coefficients / np.tile(size ** np.array([2.0, 4.0, 6.0]), 2), fit
+
+    def compare(self, bent: FloatArray) -> LensFit:
+        """How far a model's measured radii (N,) are from these."""
+        error = np.abs(bent - self.bent) * self.unit
+        return LensFit(float(np.sqrt(np.mean(error**2))), float(error.max()))
+
+
 def fit_polynomial(camera: Camera, unit: float, powers: Sequence[int]) -> tuple[FloatArray, LensFit]:
     """Fit ``r_d = r_u + Σ k_j r_u^p_j`` to the division model of a camera.
 
@@ -42,7 +102,7 @@ def fit_polynomial(camera: Camera, unit: float, powers: Sequence[int]) -> tuple[
     ----------
     camera : Camera
     unit : float
-        What radii are measured in, px.
+        What radii are measured in, pixels.
     powers : sequence of int
         Exponents, each above 1, so that the scale at the centre stays.
 
@@ -51,56 +111,72 @@ def fit_polynomial(camera: Camera, unit: float, powers: Sequence[int]) -> tuple[
     ndarray of shape (len(powers),), LensFit
         The coefficients.
     """
-    width, height = camera.image_size
-    u, v = np.meshgrid(np.linspace(-0.5, width - 0.5, _GRID), np.linspace(-0.5, height - 0.5, _GRID))
-    measured = np.column_stack([u.ravel(), v.ravel()])
-    straight = np.linalg.norm(camera.undistort(measured) - camera.center, axis=1) / unit
-    bent = np.linalg.norm(measured - camera.center, axis=1) / unit
-    terms = straight[:, None] ** np.asarray(powers)
-    # Columns of one size, whatever the unit: high powers of large radii are otherwise all that counts.
-    size = np.abs(terms).max(axis=0)
-    coefficients = np.linalg.lstsq(terms / size, bent - straight, rcond=None)[0] / size
-    error = np.abs(straight + terms @ coefficients - bent) * unit
-    return coefficients, LensFit(float(np.sqrt(np.mean(error**2))), float(error.max()))
+    samples = LensSamples.of(camera, unit)
+    return samples.fit(samples.straight, samples.straight[:, None] ** np.asarray(powers))
 
 
-def fit_division(forward: Forward, camera: Camera) -> tuple[float, LensFit]:
-    """Fit λ to another lens model.
+def _least_squares(terms: FloatArray, values: FloatArray) -> FloatArray:
+    """Least squares with columns of one size."""
+    size = np.maximum(np.abs(terms).max(axis=0), 1e-300)
+    solution: FloatArray = np.linalg.lstsq(terms / size, values, rcond=None)[0] / size
+    return solution
+
+
+def fit_lens(forward: Forward, camera: Camera) -> tuple[Camera, LensFit]:
+    """Fit the division model to another lens model: with λ alone where that is enough, else with μ, else with ν too.
 
     Parameters
     ----------
     forward : callable
-        The other model: px without distortion (N, 2) to measured px (N, 2).
+        The other model: pixels without distortion (N, 2) to measured pixels (N, 2).
     camera : Camera
-        Size and distortion centre of the picture.
+        Size, distortion centre and focal length.
 
     Returns
     -------
-    float, LensFit
-        λ in the half-diagonal frame.
+    Camera, LensFit
+        The camera with the lens, and what it costs.
 
     Raises
     ------
     ArgumentError
-        When the other model folds the picture, or is far from every λ.
+        When the other model folds the picture, or is far from every division model.
     """
     straight, measured, weights = _rays(forward, camera)
     flat, bent = camera.normalize(straight), camera.normalize(measured)
-    farthest = float(np.einsum("ij,ij->i", flat, flat).max())
-    corner = float(np.square(camera.normalize(camera.outline(1))).sum(axis=1).max())
-    low, high = -MAX_ABS_DISTORTION / corner, 0.25 * MAX_ABS_DISTORTION / farthest
-    # Imported late: whoever converts no lens should not wait for SciPy's optimizers.
-    from scipy.optimize import minimize_scalar
+    radius = np.linalg.norm(bent, axis=1)
+    # A lens without distortion is what a model that is off centre or tangential would otherwise be fitted to.
+    ratio = np.einsum("ij,ij->i", flat, bent) / np.maximum(radius**2, 1e-300)
+    best: tuple[Camera, LensFit] | None = None
+    for count in (1, 2, 3):
+        coefficients = _fit_divisor(radius**2, 1.0 / ratio, weights, count)
+        try:
+            lens = camera.with_coefficients(*coefficients)
+        except ArgumentError:
+            continue
+        error = np.linalg.norm(lens.distort(straight) - measured, axis=1)
+        if not np.isfinite(error).all():
+            continue
+        fit = LensFit(float(np.sqrt(weights @ error**2 / weights.sum())), float(error.max()))
+        if best is None or fit.largest < 0.5 * best[1].largest:
+            best = lens, fit
+        if best[1].largest <= _CLOSE:
+            break
+    if best is None or best[1].largest > _FAR * camera.half_diagonal:
+        raise ArgumentError("the lens is far from every lens that the division model can describe")
+    return best
 
-    def cost(distortion: float) -> float:
-        return float(weights @ np.square(distort(flat, distortion) - bent).sum(axis=1))
 
-    found = minimize_scalar(cost, bounds=(low, high), method="bounded", options={"xatol": 1e-12})
-    distortion = float(found.x)
-    if not math.isfinite(found.fun) or min(distortion - low, high - distortion) < 1e-3 * (high - low):
-        raise ArgumentError("the lens is far from every lens that one λ can describe")
-    error = np.linalg.norm(distort(flat, distortion) - bent, axis=1) * camera.half_diagonal
-    return distortion, LensFit(float(np.sqrt(weights @ error**2 / weights.sum())), float(error.max()))
+def _fit_divisor(radius2: FloatArray, divisor: FloatArray, weights: FloatArray, count: int) -> list[float]:
+    """``count`` coefficients of ``g`` for which undistorted radii give the measured ones, by weighted least squares."""
+    terms = radius2[:, None] ** np.arange(1, count + 1)
+    found = np.zeros(count)
+    for _ in range(_DIVISION_STEPS):
+        # An error of g moves the measured radius by r / (g - 2 q g').
+        slope = divisor - 2.0 * terms @ (np.arange(1, count + 1) * found)
+        weight = np.sqrt(weights * radius2) / np.maximum(slope, 1e-2)
+        found = _least_squares(weight[:, None] * terms, weight * (divisor - 1.0))
+    return found.tolist()
 
 
 def _rays(forward: Forward, camera: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:

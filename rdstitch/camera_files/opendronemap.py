@@ -3,14 +3,16 @@
 import json
 
 from rdstitch.camera import Camera
-from rdstitch.camera_files.brown import Brown, brown_of
+from rdstitch.camera_files.brown import CLOSE, Brown, brown_of
 from rdstitch.camera_files.division import CameraFile, fitted_camera, own_node
+from rdstitch.camera_files.fisheye import Fisheye, fisheye_of
 from rdstitch.errors import ArgumentError
 from rdstitch.records import Record
 
 _KIND = "OpenDroneMap"
 _OWN = "rdstitch"
-_MODELS = ("perspective", "brown", "simple_radial", "radial")
+_FISHEYE = "fisheye_opencv"
+_MODELS = ("perspective", "brown", "simple_radial", "radial", _FISHEYE)
 
 
 def is_opendronemap(record: Record) -> bool:
@@ -33,7 +35,7 @@ def read_opendronemap(record: Record) -> CameraFile:
     ((_, entry),) = cameras.items()
     if (own := entry.get(_OWN)) is not None:
         return CameraFile(Camera.from_record(own), _KIND)
-    entry["projection_type"].choice(_MODELS)
+    kind = entry["projection_type"].choice(_MODELS)
     size = (entry["width"].side(), entry["height"].side())
     longer = max(size)
     either = entry.get("focal")
@@ -41,12 +43,12 @@ def read_opendronemap(record: Record) -> CameraFile:
     if not (fx > 0.0 and fy > 0.0):
         entry.fail("the focal length must be positive")
     shift = (_or_zero(entry, "c_x"), _or_zero(entry, "c_y"))
-    lens = Brown(
-        (fx * longer, fy * longer),
-        ((size[0] - 1) / 2 + shift[0] * longer, (size[1] - 1) / 2 + shift[1] * longer),
-        (_or_zero(entry, "k1"), _or_zero(entry, "k2"), _or_zero(entry, "k3")),
-        (_or_zero(entry, "p1"), _or_zero(entry, "p2")),
-    )
+    focal = (fx * longer, fy * longer)
+    center = ((size[0] - 1) / 2 + shift[0] * longer, (size[1] - 1) / 2 + shift[1] * longer)
+    k1, k2, k3, k4, p1, p2 = (_or_zero(entry, name) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    lens: Brown | Fisheye = Brown(focal, center, (k1, k2, k3), (p1, p2))
+    if kind == _FISHEYE:
+        lens = Fisheye(focal, center, (k1, k2, k3, k4))
     try:
         camera = Camera(size, center=lens.center, focal=lens.mean_focal, focal_source="file")
     except ArgumentError as error:
@@ -55,26 +57,28 @@ def read_opendronemap(record: Record) -> CameraFile:
 
 
 def opendronemap_json(camera: Camera) -> str:
-    """The camera as OpenDroneMap takes it with ``--cameras``: Brown's model."""
+    """The camera as OpenDroneMap takes it with ``--cameras``: Brown's model, or a fisheye's where that is closer."""
     lens, fit = brown_of(camera)
+    fisheye, fisheye_fit = fisheye_of(camera)
+    kind, (k1, k2, k3) = "brown", lens.radial
+    coefficients = {"k1": k1, "k2": k2, "p1": 0.0, "p2": 0.0, "k3": k3}
+    if fit.largest > CLOSE and fisheye_fit.largest < fit.largest:
+        kind, fit = _FISHEYE, fisheye_fit
+        coefficients = {f"k{i}": k for i, k in enumerate(fisheye.coefficients, start=1)}
     (width, height), longer = camera.image_size, max(camera.image_size)
-    focal, (k1, k2, k3) = lens.focal[0] / longer, lens.radial
+    focal = lens.mean_focal / longer
     entry = {
-        "projection_type": "brown",
+        "projection_type": kind,
         "width": width,
         "height": height,
         "focal_x": focal,
         "focal_y": focal,
         "c_x": (camera.center[0] - (width - 1) / 2) / longer,
         "c_y": (camera.center[1] - (height - 1) / 2) / longer,
-        "k1": k1,
-        "k2": k2,
-        "p1": 0.0,
-        "p2": 0.0,
-        "k3": k3,
+        **coefficients,
         _OWN: own_node(camera, fit),
     }
-    return json.dumps({f"v2 unknown unknown {width} {height} brown {focal:.4g}": entry}, indent=4) + "\n"
+    return json.dumps({f"v2 unknown unknown {width} {height} {kind} {focal:.4g}": entry}, indent=4) + "\n"
 
 
 def _or_zero(record: Record, name: str) -> float:

@@ -220,8 +220,7 @@ def _camera(metadata: Metadata, camera: Camera | None, focal: float | None, dist
         found = replace(found, focal=metadata.focal_px, focal_source="exif")
     if distortion is None:
         return found
-    one_parameter = replace(found, distortion2=0.0, distortion3=0.0, distortion_std=None, lens_covariance=None)
-    return replace(one_parameter, distortion=distortion)
+    return found.with_coefficients(distortion)
 
 
 def _fitted(camera: Camera, size: tuple[int, int]) -> Camera:

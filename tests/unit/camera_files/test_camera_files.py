@@ -2,6 +2,8 @@
 
 import json
 import re
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,15 +14,18 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.camera_files import load_camera, read_camera_file, save_camera
 from rdstitch.camera_files.brown import Brown
+from rdstitch.camera_files.opencv_yaml import parse_yaml
 from rdstitch.errors import InputError, OutputError
 
-NAMES = ["own.json", "c.yml", "c.yaml", "opencv.json", "left.opencv.json", "cameras.json", "c.pto"]
-FOREIGN = [name for name in NAMES if name != "own.json"]
+OPENCV = ["c.yml", "c.yaml", "opencv.json", "left.opencv.json", "a.fisheye.yml"]
+FOREIGN = [*OPENCV, "cameras.json", "c.pto", "camera_info.yaml"]
+NAMES = ["own.json", *FOREIGN, "camchain.yaml", "cameras.txt"]
 CAMERAS = [
     Camera((4000, 3000), -0.21, 0.0, (2013.25, 1490.5), 3300.0, "file", 0.0012),
     Camera((640, 480), 0.08, 0.01),
     Camera((3000, 4000), 0.0, focal=2500.0, focal_source="file"),
     Camera((1280, 720), -0.45, focal=700.0, focal_source="file"),
+    Camera((1280, 960), -0.53, -0.05, (650.0, 503.0), 600.0, "file", 0.003, -0.01, ((0.01,) * 5,) * 5),
 ]
 
 
@@ -65,7 +70,7 @@ def test_of_a_foreign_file_the_lens_is_fitted_and_the_residual_told(tmp_path: Pa
     np.testing.assert_allclose(found.camera.center, camera.center, atol=1e-6)
     assert found.camera.focal == pytest.approx(camera.with_focal().focal, rel=1e-6)
     # λ alone stands for λ and μ of the second camera.
-    assert found.camera.distortion == pytest.approx(camera.distortion + camera.distortion2, abs=0.006)
+    assert found.camera.nearest_distortion == pytest.approx(camera.distortion + camera.distortion2, abs=0.006)
     # The residual is what a user sees: px between the two lenses. The file's own model is off by some px too.
     apart = np.linalg.norm(found.camera.distort(camera.undistort(_points(camera))) - _points(camera), axis=1)
     assert apart.max() < found.fit.largest + 0.002 * camera.half_diagonal
@@ -91,6 +96,89 @@ def test_opencv_reads_what_is_written_and_distorts_alike(tmp_path: Path, name: s
     apart = np.linalg.norm(np.asarray(seen)[:, 0] - _points(camera), axis=1)
     largest = own.getNode("fit_largest_px").real()
     assert 0.5 * largest < apart.max() < 1.05 * largest < 5.0
+
+
+def _projected(matrix: FloatArray, values: list[float], rays: FloatArray, *, fisheye: bool) -> FloatArray:
+    """Where OpenCV sees rays (N, 3)."""
+    none, d = np.zeros(3), np.array(values)
+    if fisheye:
+        seen = cv2.fisheye.projectPoints(rays[None], none, none, matrix, d)[0]
+    else:
+        seen = cv2.projectPoints(rays, none, none, matrix, d)[0]
+    return np.asarray(seen, dtype=np.float64).reshape(-1, 2)
+
+
+Parsed = tuple[list[float], list[float], str]
+"""fx, fy, cx, cy; coefficients; and the name of the model."""
+
+
+def _camera_info(text: str) -> Parsed:
+    record = parse_yaml(text, "camera_info.yaml")
+    fx, _, cx, _, fy, cy = record["camera_matrix"]["data"].numbers()[:6]
+    return (
+        [fx, fy, cx, cy],
+        list(record["distortion_coefficients"]["data"].numbers()),
+        record["distortion_model"].text(),
+    )
+
+
+def _camera_chain(text: str) -> Parsed:
+    record = parse_yaml(text, "camchain.yaml")["cam0"]
+    values = list(record["distortion_coeffs"].numbers())
+    return list(record["intrinsics"].numbers()), values, record["distortion_model"].text()
+
+
+def _colmap(text: str) -> Parsed:
+    line = text.splitlines()[-1].split()
+    values = [float(value) for value in line[4:]]
+    return [*values[:2], values[2] - 0.5, values[3] - 0.5], values[4:], line[1]
+
+
+def _fisheye(text: str) -> Parsed:
+    record = parse_yaml(text, "fisheye.yml")
+    fx, _, cx, _, fy, cy = record["camera_matrix"]["data"].numbers()[:6]
+    return [fx, fy, cx, cy], list(record["distortion_coefficients"]["data"].numbers()), "equi"
+
+
+@pytest.mark.parametrize("camera", [CAMERAS[0], CAMERAS[3], CAMERAS[4]])
+@pytest.mark.parametrize(
+    ("name", "parse"),
+    [
+        ("camera_info.yaml", _camera_info),
+        ("camchain.yaml", _camera_chain),
+        ("cameras.txt", _colmap),
+        ("fisheye.yml", _fisheye),
+    ],
+)
+def test_what_is_exported_is_off_by_what_it_states(
+    tmp_path: Path, name: str, camera: Camera, parse: Callable[[str], Parsed]
+) -> None:
+    save_camera(camera, tmp_path / name)
+    text = (tmp_path / name).read_text(encoding="utf-8")
+    (fx, fy, cx, cy), values, model = parse(text)
+    assert camera.focal is not None
+    straight = camera.undistort(_points(camera))
+    rays = np.column_stack([(straight - camera.center) / camera.focal, np.ones(len(straight))])
+    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    fisheye = model in ("equi", "equidistant", "OPENCV_FISHEYE")
+    apart = np.linalg.norm(_projected(matrix, values, rays, fisheye=fisheye) - _points(camera), axis=1).max()
+    stated = float(re.findall(r"fit_largest_px\"?: ([-\d.e]+)", text)[-1])
+    assert 0.3 * stated < apart < 1.05 * stated + 1e-6
+    assert stated < 1.0
+
+
+@pytest.mark.parametrize("name", ["fisheye.yml", "c.yml"])
+def test_a_strong_lens_of_others_takes_more_than_one_coefficient(tmp_path: Path, name: str) -> None:
+    camera = CAMERAS[4]
+    save_camera(camera, tmp_path / name)
+    text = _without_own_node((tmp_path / name).read_text(encoding="utf-8"))
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    found = read_camera_file(tmp_path / name)
+    assert found.fit is not None
+    assert found.fit.largest < 0.2
+    assert found.camera.higher
+    apart = np.linalg.norm(found.camera.distort(camera.undistort(_points(camera))) - _points(camera), axis=1)
+    assert apart.max() < 0.3
 
 
 def test_what_opencv_writes_is_read(tmp_path: Path) -> None:
@@ -130,16 +218,24 @@ def test_brown_is_what_opencv_calls_so(count: int) -> None:
     np.testing.assert_allclose(lens.distort(points), np.asarray(seen)[:, 0], atol=1e-9)
 
 
-def test_hugin_means_what_its_manual_says(tmp_path: Path) -> None:
-    camera = CAMERAS[0]
+@pytest.mark.parametrize(("distortion", "projection"), [(-0.02, 0), (-0.21, 3)])
+def test_hugin_means_what_its_manual_says(tmp_path: Path, distortion: float, projection: int) -> None:
+    camera = replace(CAMERAS[0], distortion=distortion)
     save_camera(camera, tmp_path / "c.pto")
     line = next(line for line in (tmp_path / "c.pto").read_text(encoding="utf-8").splitlines() if line[:2] == "i ")
     a, b, c, d, e, v = (float(re.findall(rf" {name}(-?[\d.e-]+)", line)[0]) for name in "abcdev")
     # r_src = (a r³ + b r² + c r + 1 - a - b - c) r, in halves of the shorter side; v spans the width.
-    ideal = (camera.undistort(_points(camera)) - camera.center) / 3300.0 * (2000.0 / np.tan(np.radians(v) / 2)) / 1500.0
+    # A fisheye, f3, has angles where a rectilinear lens has tangents.
+    assert f" f{projection} " in line
+    ideal = (camera.undistort(_points(camera)) - camera.center) / 3300.0
+    half_view = np.tan(np.radians(v) / 2)
+    if projection:
+        tangent = np.linalg.norm(ideal, axis=1, keepdims=True)
+        ideal, half_view = ideal * np.arctan(tangent) / tangent, np.radians(v) / 2
+    ideal *= 2000.0 / half_view / 1500.0
     r = np.linalg.norm(ideal, axis=1, keepdims=True)
     seen = ideal * (a * r**3 + b * r**2 + c * r + 1 - a - b - c) * 1500.0 + [1999.5 + d, 1499.5 + e]
-    assert np.linalg.norm(seen - _points(camera), axis=1).max() < 5.0
+    assert np.linalg.norm(seen - _points(camera), axis=1).max() < 0.3
 
 
 def test_opendronemap_of_others(tmp_path: Path) -> None:
@@ -160,7 +256,7 @@ def test_opendronemap_of_others(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "old", "new", "named"),
     [
-        ("c.yml", "cols: 5", "cols: 4", "distortion_coefficients"),
+        ("c.yml", "cols: 8", "cols: 4", "distortion_coefficients"),
         ("c.yml", "rows: 3", "rows: x", "camera_matrix.rows"),
         ("c.yml", "image_width: 4000\n", "", "image_width"),
         ("c.yml", "3300.0, 0.0, 2013.25", "3300.0, 0.5, 2013.25", "camera_matrix"),
@@ -170,10 +266,10 @@ def test_opendronemap_of_others(tmp_path: Path) -> None:
         ("cameras.json", '"width": 4000', '"width": 1' + 400 * "0", "width"),
         ("c.pto", "i w4000", "i w4e30", "w: "),
         ("cameras.json", '"focal_x": ', '"focal_x": 1e308, "x": ', "focal length"),
-        ("cameras.json", '"projection_type": "brown"', '"projection_type": "fisheye"', "projection_type"),
+        ("cameras.json", '"fisheye_opencv",', '"fisheye",', "projection_type"),
         ("cameras.json", '"focal_x"', '"focal_z"', "focal_x"),
         ("cameras.json", '"k1": ', '"k1": 1', "folds"),
-        ("c.pto", " f0 v", " f3 v", "fisheye"),
+        ("c.pto", " f3 v", " f4 v", "fisheye"),
         ("c.pto", "i w4000", "i w40.5", "w: "),
         ("c.pto", "\ni ", "\nj ", "image line"),
     ],
