@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
-from rdstitch.division_model import distort, is_one_to_one, nearest_distortion, undistort
+from rdstitch.division_model import distort, is_one_to_one, nearest_one_parameter, undistort
 from rdstitch.errors import ArgumentError, ImpossibleCameraError
 from rdstitch.records import Record
 
@@ -135,8 +135,23 @@ class Camera:
         """
         if not self.higher:
             return self.distortion, 0.0, 0.0
-        nearest, rms, largest = nearest_distortion(self._radii2(), self.distortion, self.higher)
-        return nearest, rms * self.half_diagonal, largest * self.half_diagonal
+        radii = np.sqrt(self._radii2())
+        excess = self.excess_radius(radii)
+        nearest, _ = nearest_one_parameter(radii**2, self.distortion, self.higher)
+        return nearest, float(np.sqrt(np.mean(excess**2))), float(np.abs(excess).max())
+
+    def excess_radius(self, radii: FloatArray) -> FloatArray:
+        """How much farther out this lens measures rays than the nearest one-parameter lens does, pixels (N,).
+
+        Parameters
+        ----------
+        radii : ndarray of shape (N,)
+            Where this lens measures them, half diagonals from the distortion centre.
+        """
+        nearest, scale = nearest_one_parameter(self._radii2(), self.distortion, self.higher)
+        straight = undistort(np.stack([radii, np.zeros_like(radii)], axis=-1), self.distortion, self.higher)
+        other = distort(straight / scale, nearest)[..., 0]
+        return np.asarray((radii - other) * self.half_diagonal)
 
     def _radii2(self) -> FloatArray:
         """Squared radii, half diagonals, of points evenly over the picture."""

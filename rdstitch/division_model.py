@@ -145,9 +145,7 @@ def valid_radius(distortion: float, higher: tuple[float, ...] = ()) -> float:
     return min(*zeros, _FARTHEST) if any(higher) else min(zeros)
 
 
-def nearest_distortion(
-    radius2: FloatArray, distortion: float, higher: Sequence[float] = ()
-) -> tuple[float, float, float]:
+def nearest_one_parameter(radius2: FloatArray, distortion: float, higher: Sequence[float] = ()) -> tuple[float, float]:
     """The λ of the one-parameter model nearest to a lens, by least squares of measured radii.
 
     The scale of the undistorted picture is free, as no picture of a plane shows it. So this is the λ that the
@@ -162,11 +160,11 @@ def nearest_distortion(
 
     Returns
     -------
-    distortion, rms, largest : float
-        λ, and how far the two lenses are apart, in the unit of the radii.
+    distortion, scale : float
+        λ, and the factor by which undistorted points of the lens are to be *divided* before they are distorted with it.
     """
-    # With t the scale, s u = r / (t g): the nearest model measures that at r + r (t g - 1 - λ q) / (t g - 2 λ q) to
-    # first order, which is linear in t and λ but for the denominator.
+    # With t the scale, the undistorted radius becomes r / (t g): the nearest model measures that at
+    # r + r (t g - 1 - λ q) / (t g - 2 λ q) to first order, which is linear in t and λ but for the denominator.
     g, radius = divisor(radius2, distortion, higher), np.sqrt(radius2)
     solution = np.array([1.0, distortion])
     for _ in range(_NEAREST_STEPS):
@@ -176,9 +174,7 @@ def nearest_distortion(
         if np.abs(solution - previous).max() < _NEAREST_TOLERANCE:
             break
     scale, nearest = solution.tolist()
-    straight = np.stack([radius / (scale * g), np.zeros_like(radius)], axis=-1)
-    error = np.abs(distort(straight, nearest)[..., 0] - radius)
-    return nearest, float(np.sqrt(np.mean(error**2))), float(error.max())
+    return nearest, scale
 
 
 def _horner(coefficients: Sequence[float], q: FloatArray) -> FloatArray | float:

@@ -51,6 +51,11 @@ class Reporter:
         if self._verbosity >= 0:
             self._line(f"rdstitch: warning: {text}")
 
+    def note(self, text: str) -> None:
+        """Say what belongs to the result but not to standard output."""
+        if self._verbosity >= 0:
+            self._line(f"rdstitch: {text}")
+
     def log(self, text: str) -> None:
         """Say what is going on, for those who asked."""
         if self._verbosity >= 1:

@@ -16,6 +16,7 @@ What is written follows from the name, as above; what is read is known by its co
 """
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -34,7 +35,7 @@ from rdstitch.errors import OutputError
 from rdstitch.io.atomic import write_text_atomic
 from rdstitch.records import parse_json, read_text
 
-__all__ = ["CAMERA_SUFFIXES", "CameraFile", "LensFit", "load_camera", "read_camera_file", "save_camera"]
+__all__ = ["CAMERA_SUFFIXES", "CameraFile", "LensFit", "export_note", "load_camera", "read_camera_file", "save_camera"]
 
 CAMERA_SUFFIXES = (".json", ".yml", ".yaml", ".pto", ".txt")
 """How names of camera files end, lower case."""
@@ -103,6 +104,19 @@ def camera_file_text(camera: Camera, path: str | Path) -> str:
     return _writer(Path(path))(camera)
 
 
+def export_note(camera: Camera, path: str | Path) -> tuple[str, ...]:
+    """What the model of a camera file of others costs, one sentence; nothing for rdstitch's own.
+
+    Parameters
+    ----------
+    camera : Camera
+    path : path
+        As :func:`save_camera` takes it.
+    """
+    largest = _STATED.findall(_writer(Path(path))(camera))
+    return tuple(f"{path}: its lens model is at most {float(value):.3f} pixels from the lens" for value in largest[-1:])
+
+
 def _writer(path: Path) -> Callable[[Camera], str]:
     name = path.name.lower()
     if (named := _NAMES.get(name)) is not None:
@@ -115,6 +129,9 @@ def _writer(path: Path) -> Callable[[Camera], str]:
         raise OutputError(f"{path}: not the name of a camera file; use one of {' '.join(CAMERA_SUFFIXES)}")
     return writers[path.suffix.lower()]
 
+
+_STATED = re.compile(r"(?<!lambda_)fit_largest_px\"?: ([-+.\de]+)")
+"""The residual that files of others state."""
 
 _NAMES: dict[str, Callable[[Camera], str]] = {
     "cameras.json": opendronemap_json,

@@ -9,6 +9,7 @@ from rdstitch.io.atomic import write_bytes_atomic
 from rdstitch.registration import Registration
 from rdstitch.report.camera_path import path_over_plane
 from rdstitch.report.grid import grid
+from rdstitch.report.lens_curve import lens_curve
 from rdstitch.report.match_graph import match_graph
 from rdstitch.report.matched import matched
 from rdstitch.report.mosaic import mosaic
@@ -67,6 +68,7 @@ def report_page(result: StitchResult | Registration, stages: Sequence[tuple[str,
         match_graph(registration),
         votes(registration),
         grid(registration),
+        lens_curve(registration),
         matched(registration),
         residual_map(registration),
         path_over_plane(registration),

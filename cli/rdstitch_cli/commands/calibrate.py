@@ -27,7 +27,8 @@ Examples:
     type=options.PICTURE,
     required=True,
     metavar="FILE",
-    help="Camera file to write: .json, .yml (OpenCV), .pto (Hugin), cameras.json (OpenDroneMap).",
+    help="Camera file to write: .json, .yml and .fisheye.yml (OpenCV), .pto (Hugin), cameras.json (OpenDroneMap), "
+    "cameras.txt (COLMAP), camera_info.yaml (ROS), camchain.yaml (Kalibr).",
 )
 @options.overwrite
 @options.every
@@ -49,8 +50,12 @@ def calibrate(
 ) -> None:
     """Find λ, and where they can be seen the tilt and the focal length, from pictures of a plane.
 
+    λ goes to standard output; how far the lens is determined, and whether it takes more than λ, to standard error.
+
     INPUT is what 'rdstitch mosaic' takes. The camera file is what 'undistort', 'pano' and 'mosaic' take as --camera.
     """
+    from rdstitch.alignment.lens_description import describe_lens
+    from rdstitch.camera_files import export_note
     from rdstitch.pipeline import calibrate as recipe
 
     with Reporter(-quiet + verbose) as reporter:
@@ -60,5 +65,7 @@ def calibrate(
         with told.explaining():
             registration = recipe(paths, wanted, every=every, progress=told.progress)
         report_registration(registration, reporter, as_json=as_json)
+        for line in (*describe_lens(registration.alignment), *export_note(registration.camera, output)):
+            reporter.note(line)
         told.write(registration)
         reporter.made(f"{output}: {registration.summary}")

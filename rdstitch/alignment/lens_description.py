@@ -1,0 +1,81 @@
+"""How far the lens is determined, in words: what the user reads of it after a calibration."""
+
+import math
+
+import numpy as np
+
+from rdstitch.alignment.lens_selection import CENTER, free_parameters
+from rdstitch.alignment.result import Alignment
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import LENS_PARAMETERS, Camera
+from rdstitch.division_model import divisor, divisor_slope
+
+_COEFFICIENT_NAMES = ("λ", "μ", "ν")
+_ORDINALS = ("first", "second", "third")
+
+
+def describe_lens(alignment: Alignment) -> tuple[str, ...]:
+    """One line on λ, one on each of μ, ν and the distortion centre, and one on the choice of the lens."""
+    camera = alignment.cameras[alignment.reference]
+    if not math.isfinite(alignment.distortion_std):
+        return ("λ is not observable",)
+    if alignment.distortion_std == 0.0 and camera.lens_covariance is None:
+        return (f"λ = {alignment.distortion:.6f}, given",)
+    std, free = _std(camera), free_parameters(alignment.lens)
+    first = f"λ = {alignment.distortion:.6f} ± {alignment.distortion_std:.6f}"
+    if camera.higher:
+        largest = camera.one_parameter_fit()[2]
+        first += f" (the nearest one-parameter lens, at most {largest:.1f} pixels from the lens found)"
+    lines = [first, *(_coefficient(camera, std, index) for index in (1, 2) if free[index])]
+    lines += [f"{_ORDINALS[index]} coefficient not needed" for index in (1, 2) if not free[index]]
+    middle = (np.array(camera.image_size) - 1.0) / 2.0
+    if free[CENTER].all():
+        x, y = camera.center
+        dx, dy = std[CENTER] * camera.half_diagonal
+        off = float(np.linalg.norm(camera.center - middle))
+        lines.append(f"centre {x:.1f} ± {dx:.1f}, {y:.1f} ± {dy:.1f} pixels, {off:.1f} off the middle of the picture")
+    else:
+        lines.append("distortion centre: the middle of the picture will do")
+    return (*lines, alignment.lens_reason)
+
+
+def _coefficient(camera: Camera, std: FloatArray, index: int) -> str:
+    value, name = camera.coefficients[index], _COEFFICIENT_NAMES[index]
+    return f"{_ORDINALS[index]} coefficient {name} = {value:.4f} ± {std[index]:.4f}, with λ = {camera.distortion:.4f}"
+
+
+def _std(camera: Camera) -> FloatArray:
+    """Standard deviations of :data:`LENS_PARAMETERS`, shape (5,), half-diagonal frame."""
+    if camera.lens_covariance is None:
+        return np.zeros(len(LENS_PARAMETERS))
+    return np.sqrt(np.maximum(np.diag(np.array(camera.lens_covariance)), 0.0))
+
+
+def radius_std(camera: Camera, radii: FloatArray) -> FloatArray:
+    """Standard deviation of where the lens measures the rays that it measures at some radii, pixels.
+
+    Up to the scale of the undistorted picture, which no picture of a plane shows.
+
+    Parameters
+    ----------
+    camera : Camera
+    radii : ndarray of shape (N,)
+        Half diagonals from the distortion centre, evenly spaced from the centre to the corner.
+
+    Returns
+    -------
+    ndarray of shape (N,)
+    """
+    if camera.lens_covariance is None:
+        return np.zeros_like(radii)
+    q = radii**2
+    g = divisor(q, camera.distortion, camera.higher)
+    growth = g - 2.0 * q * divisor_slope(q, camera.distortion, camera.higher)
+    by_coefficient = (radii / growth)[:, None] * q[:, None] ** np.arange(1, 4)
+    by_scale = radii * g / growth
+    # What a change of scale makes up for, by least squares over the area of the picture, is no uncertainty.
+    area = radii * by_scale
+    by_coefficient = by_coefficient - np.outer(by_scale, area @ by_coefficient / max(float(area @ by_scale), 1e-300))
+    covariance = np.array(camera.lens_covariance)[:3, :3]
+    variance = np.einsum("ni,ij,nj->n", by_coefficient, covariance, by_coefficient)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)) * camera.half_diagonal)
