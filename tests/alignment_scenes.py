@@ -7,7 +7,6 @@ import numpy as np
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, TILTING, YAW, X, Y
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.division_model import distort
 from rdstitch.matching.links import Link
 from rdstitch.radial_homography import RadialHomography
 
@@ -63,6 +62,7 @@ def scene(
     size: tuple[int, int] = (640, 480),
     focal: float = 520.0,
     distortion: float = -0.25,
+    lens: Camera | None = None,
     tilt: tuple[float, float] = (0.0, 0.0),
     noise: float = 0.3,
     outliers: float = 0.05,
@@ -77,9 +77,10 @@ def scene(
     """Links between all pictures whose overlap is at least ``overlap``, at most ``reach`` frames apart.
 
     Outliers are what a pairwise estimation lets pass: off by up to 4 px. ``relief`` is the amplitude of smooth hills,
-    in heights above the plane.
+    in heights above the plane. ``lens`` is taken instead of ``size`` and ``distortion``.
     """
-    lens = Camera(size, distortion=distortion)
+    lens = lens or Camera(size, distortion=distortion)
+    size, distortion = lens.image_size, lens.nearest_distortion
     ratio = focal / lens.half_diagonal
     shared = TILTING.shared_from(np.array([*tilt, np.log(ratio)]))
     truth = TILTING.matrices(poses * [1, ratio, ratio, 1, 1, 1], shared).matrices
@@ -124,7 +125,7 @@ def _measured(matrix: FloatArray, pose: FloatArray, lens: Camera, plane: FloatAr
     raised = pose[[X, Y]] + shift * height[:, None]
     lifted = np.column_stack([raised, np.ones(len(plane))]) @ matrix.T
     projected = np.where(lifted[:, 2:] > 0, lifted[:, :2] / lifted[:, 2:], np.nan)
-    return lens.denormalize(distort(projected, lens.distortion))
+    return lens.distort(lens.denormalize(projected))
 
 
 def _relation(

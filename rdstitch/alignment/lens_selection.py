@@ -34,6 +34,13 @@ LENSES: dict[str, tuple[str, ...]] = {
 CENTER = np.array([name.startswith("center") for name in LENS_PARAMETERS])
 """Which of :data:`rdstitch.camera.LENS_PARAMETERS` are the distortion centre, shape (5,)."""
 
+_REFINEMENTS: dict[str, tuple[BoolArray, ...]] = {
+    "division": (CENTER,),
+    "division2": (np.array([name == "distortion3" for name in LENS_PARAMETERS]),),
+}
+"""What the motion model may show besides. A centre that is off the middle looks like motion that is less regular; where
+μ is needed ν may be, by less than single pairs show. That μ is needed only pairs can say: it could stand for relief."""
+
 _WORDS = {
     "division": "λ",
     "division-center": "λ and the distortion centre",
@@ -71,27 +78,22 @@ class LensChoice:
         Every link on its own with this lens.
     reason : str
         One sentence.
-    refinable : bool
-        Whether the distortion centre may still be freed, where the motion model shows it.
+    refinements : tuple of ndarray of shape (5,), bool
+        What may still be freed, where the motion model shows it.
     """
 
     name: str
     free: BoolArray
     apart: BundleAdjustmentResult
     reason: str
-    refinable: bool
-
-    @property
-    def refinements(self) -> list[BoolArray]:
-        """What else may be freed where the motion model shows it: the distortion centre."""
-        return [CENTER] if self.refinable else []
+    refinements: tuple[BoolArray, ...] = ()
 
     def refined(self, free: BoolArray) -> Self:
         """With the parameters that were freed in the end."""
         if (free == self.free).all():
             return self
-        reason = f"{_WORDS['division-center']}: the motion is more regular with it"
-        return replace(self, name="division-center", free=free, reason=reason)
+        name = next(name for name in LENSES if not (free & ~free_parameters(name)).any())
+        return replace(self, name=name, free=free, reason=f"{_WORDS[name]}: the motion is more regular with that")
 
 
 def free_parameters(name: str) -> BoolArray:
@@ -114,7 +116,7 @@ def choose_lens(
     known : CameraPriors
     """
     if not names:
-        return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), apart, "given", refinable=False)
+        return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), apart, "given")
     fits = [apart] if names[0] == "division" else []
     for name in names[len(fits) :]:
         start = fits[-1] if fits else apart
@@ -122,7 +124,7 @@ def choose_lens(
             homography_apart(observations, start.homographies, start.parameters.lens, free_parameters(name), known)
         )
     if len(names) == 1:
-        return LensChoice(names[0], free_parameters(names[0]), fits[0], "as requested", refinable=False)
+        return LensChoice(names[0], free_parameters(names[0]), fits[0], "as requested")
     judge = _Judge.of(observations, fits[-1])
     best = 0
     for index in range(1, len(names)):
@@ -130,7 +132,7 @@ def choose_lens(
             best = index
     name = names[best]
     reason = _reason(names, fits, judge, best)
-    return LensChoice(name, free_parameters(name), fits[best], reason, refinable=name == "division")
+    return LensChoice(name, free_parameters(name), fits[best], reason, _REFINEMENTS.get(name, ()))
 
 
 def is_plausible(adjusted: BundleAdjustmentResult) -> bool:

@@ -1,0 +1,126 @@
+"""The ladder of lenses: as simple as the pictures allow, and never taken in by relief."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rdstitch.alignment import LENSES, Alignment, AlignmentOptions, align
+from rdstitch.alignment.lens_description import describe_lens, radius_std
+from rdstitch.camera import LENS_PARAMETERS, Camera
+from rdstitch.errors import ArgumentError
+from tests.alignment_scenes import Scene, grid, scene
+
+SIZE = (640, 480)
+FISHEYE = Camera(SIZE, -0.49, -0.055, (335.0, 226.0), distortion3=-0.008)
+OFF_CENTRE = Camera(SIZE, -0.25, 0.0, (339.0, 229.0))
+
+
+def _scene(lens: Camera, seed: int, *, relief: float = 0.0, columns: int = 4, rows: int = 3) -> Scene:
+    rng = np.random.default_rng(seed)
+    poses = grid(columns, rows, (0.4, 0.35), np.pi, rng)
+    return scene(poses, lens=lens, rng=rng, noise=0.25, relief=relief, focal=420.0)
+
+
+def _align(given: Scene, **options: object) -> Alignment:
+    return align(given.cameras, given.links, AlignmentOptions(**options))  # type: ignore[arg-type]
+
+
+def _apart(found: Camera, truth: Camera) -> float:
+    """Largest distance of the two lenses, pixels, after the best similarity of the undistorted pictures."""
+    u, v = np.meshgrid(np.linspace(0, SIZE[0] - 1, 15), np.linspace(0, SIZE[1] - 1, 11))
+    points = np.column_stack([u.ravel(), v.ravel()])
+    ours, theirs = (camera.normalize(camera.undistort(points)) for camera in (found, truth))
+    design = np.column_stack([ours, np.ones(len(ours))])
+    mapped = design @ np.linalg.lstsq(design, theirs, rcond=None)[0]
+    return float(np.linalg.norm(truth.distort(truth.denormalize(mapped)) - points, axis=1).max())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_parameter_stays_one_parameter(seed: int) -> None:
+    found = _align(_scene(Camera(SIZE, -0.25), seed))
+    assert found.lens == "division"
+    assert found.cameras[0].coefficients[1:] == (0.0, 0.0)
+    assert found.cameras[0].center == (319.5, 239.5)
+    assert abs(found.distortion + 0.25) < 4.0 * found.distortion_std < 0.002
+
+
+def test_a_fisheye_off_centre_is_found() -> None:
+    given = _scene(FISHEYE, 0)
+    found, plain = _align(given), _align(given, lens="division")
+    assert found.lens in ("division2", "division3")
+    assert _apart(found.cameras[0], FISHEYE) < 0.3 < 1.5 < _apart(plain.cameras[0], FISHEYE)
+    assert found.distortion == found.cameras[0].nearest_distortion
+    assert abs(found.distortion - FISHEYE.nearest_distortion) < 0.003
+    covariance = np.array(found.cameras[0].lens_covariance)
+    assert covariance.shape == (len(LENS_PARAMETERS),) * 2
+    offset = np.array(found.cameras[0].center) - FISHEYE.center
+    assert (np.abs(offset) < 5.0 * np.sqrt(np.diag(covariance))[3:] * found.cameras[0].half_diagonal + 0.1).all()
+    assert "simpler lenses more" in found.lens_reason
+
+
+def test_a_centre_off_the_middle_is_found_alone() -> None:
+    found = _align(_scene(OFF_CENTRE, 1))
+    assert found.lens == "division-center"
+    np.testing.assert_allclose(found.cameras[0].center, OFF_CENTRE.center, atol=1.5)
+    assert found.cameras[0].higher == ()
+
+
+@pytest.mark.parametrize("relief", [0.01, 0.04])
+def test_relief_is_not_taken_for_lens(relief: float) -> None:
+    found = _align(_scene(Camera(SIZE, -0.05), 2, relief=relief))
+    assert found.lens in ("division", "division-center")
+    assert found.cameras[0].higher == ()
+
+
+def test_nothing_runs_away_where_there_are_no_matches() -> None:
+    given = _scene(Camera(SIZE, -0.25), 3)
+    middle = np.array([319.5, 239.5])
+    links = []
+    for link in given.links:
+        near = [np.linalg.norm(points - middle, axis=1) < 150.0 for points in (link.points1, link.points2)]
+        kept = near[0] & near[1]
+        if kept.sum() >= 30:
+            links.append(replace(link, points1=link.points1[kept], points2=link.points2[kept]))
+    found = _align(replace(given, links=links), lens="division3")
+    camera = found.cameras[0]  # which could not be made if the lens folded the picture
+    assert found.lens == "division3"
+    assert np.abs(np.array(camera.coefficients) - (-0.25, 0.0, 0.0)).max() < 0.3
+    # The stated uncertainty covers what is not seen: the error at the corner is within it.
+    assert radius_std(camera, np.linspace(0.05, 1.0, 20))[-1] > max(5.0, 0.3 * _apart(camera, Camera(SIZE, -0.25)))
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_a_lens_that_is_requested_is_estimated(name: str) -> None:
+    found = _align(_scene(FISHEYE, 4, columns=3, rows=2), lens=name)
+    assert found.lens == name
+    assert set(LENSES[name]) <= set(found.parameters)
+    assert not (set(LENS_PARAMETERS) - set(LENSES[name])) & set(found.parameters)
+
+
+def test_a_known_lens_is_kept_whole() -> None:
+    given = _scene(FISHEYE, 5, columns=3, rows=2)
+    cameras = [
+        replace(camera, center=FISHEYE.center).with_coefficients(*FISHEYE.coefficients) for camera in given.cameras
+    ]
+    found = _align(replace(given, cameras=cameras), lens_known=True)
+    assert found.cameras[0].coefficients == FISHEYE.coefficients
+    assert found.cameras[0].center == pytest.approx(FISHEYE.center)
+    assert found.distortion_std == 0.0
+    assert found.rms < 0.6
+    assert describe_lens(found) == (f"λ = {found.distortion:.6f}, given",)
+
+
+def test_an_unknown_lens_is_refused() -> None:
+    with pytest.raises(ArgumentError, match="division-center"):
+        AlignmentOptions(lens="brown")
+
+
+def test_the_description_says_what_is_needed() -> None:
+    plain = describe_lens(_align(_scene(Camera(SIZE, -0.25), 0, columns=3, rows=2)))
+    assert "±" in plain[0]
+    assert "second coefficient not needed" in plain
+    strong = describe_lens(_align(_scene(FISHEYE, 0)))
+    assert "nearest one-parameter lens" in strong[0]
+    assert any(line.startswith("second coefficient μ = -0.0") for line in strong)
+    assert any(line.startswith("centre 33") for line in strong)

@@ -1,0 +1,69 @@
+"""The division model with several coefficients: its domain, its inverse, and the nearest λ."""
+
+import numpy as np
+import pytest
+
+from rdstitch.camera import Camera
+from rdstitch.division_model import distort, nearest_one_parameter, undistort, valid_radius
+from rdstitch.errors import ArgumentError
+from rdstitch.synthetic import FisheyeLens
+
+
+def test_one_coefficient_is_the_closed_form() -> None:
+    points = np.random.default_rng(0).uniform(-2.0, 2.0, (500, 2))
+    np.testing.assert_allclose(distort(points, -0.4, (0.0, 1e-300)), distort(points, -0.4), rtol=1e-12)
+
+
+def test_no_distortion_reaches_as_far_as_the_model_is_used() -> None:
+    assert valid_radius(0.0) == np.inf
+    assert valid_radius(-0.25) == pytest.approx(2.0)
+    assert valid_radius(0.25) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("coefficients", [(0.3, -0.9, 0.2), (-0.4, 0.5, -0.6), (0.1, 0.1, 0.1), (-0.6, -0.1, 0.8)])
+def test_what_lies_beyond_the_domain_is_masked_and_never_folded(coefficients: tuple[float, float, float]) -> None:
+    distortion, *higher = coefficients
+    limit = valid_radius(distortion, tuple(higher))
+    radii = np.linspace(1e-3, 1.5 * limit, 400)
+    straight = undistort(np.column_stack([radii, np.zeros_like(radii)]), distortion, higher)[:, 0]
+    assert np.isfinite(straight[radii < limit]).all()
+    assert np.isnan(straight[radii > limit]).all()
+    seen = straight[np.isfinite(straight)]
+    assert (np.diff(seen) > 0.0).all()
+    back = distort(np.column_stack([seen, np.zeros_like(seen)]), distortion, higher)[:, 0]
+    np.testing.assert_allclose(back, radii[: len(seen)], atol=1e-7)
+    assert not (distort([[x, 0.0] for x in np.geomspace(1e-3, 1e6, 300)], distortion, higher) > limit).any()
+
+
+def test_a_camera_that_folds_anywhere_in_the_picture_is_refused() -> None:
+    # At the corner itself the divisor is positive again: the fold is within.
+    assert 1.0 - 3.0 + 2.2 > 0.0
+    with pytest.raises(ArgumentError, match="folds"):
+        Camera((640, 480), -3.0, 2.2)
+
+
+def test_nearest_lambda_is_what_a_fit_of_measured_points_gives() -> None:
+    lens = Camera((640, 480), -0.45, -0.06, (330.0, 230.0), distortion3=-0.01)
+    nearest, rms, largest = lens.one_parameter_fit()
+    radii = np.sqrt(lens._radii2())
+    assert nearest_one_parameter(radii**2, nearest)[0] == pytest.approx(nearest, abs=1e-12)
+
+    def misfit(distortion: float, scale: float) -> float:
+        straight = undistort(np.column_stack([radii, 0.0 * radii]), lens.distortion, lens.higher) * scale
+        return float(np.mean((distort(straight, distortion)[:, 0] - radii) ** 2))
+
+    scale = 1.0 / nearest_one_parameter(radii**2, lens.distortion, lens.higher)[1]
+    best = misfit(nearest, scale)
+    assert rms == pytest.approx(np.sqrt(best) * lens.half_diagonal, rel=1e-6)
+    assert rms < largest
+    for distortion, factor in ((nearest + 0.002, scale), (nearest - 0.002, scale), (nearest, 1.002 * scale)):
+        assert misfit(distortion, factor) > best
+
+
+def test_three_coefficients_describe_an_equidistant_fisheye() -> None:
+    # r cot r = 1 - r²/3 - r⁴/45 - 2 r⁶/945 - …, with r the angle to the axis.
+    half = np.radians(60.0)
+    fisheye = FisheyeLens((640, 480), 400.0 / half)
+    lens = Camera((640, 480), -(half**2) / 3, -(half**4) / 45, distortion3=-2.0 * half**6 / 945)
+    points = np.random.default_rng(0).uniform((0, 0), (639, 479), (300, 2))
+    assert np.linalg.norm(lens.distort(fisheye.undistort(points)) - points, axis=1).max() < 0.1
