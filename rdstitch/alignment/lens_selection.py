@@ -34,13 +34,6 @@ LENSES: dict[str, tuple[str, ...]] = {
 CENTER = np.array([name.startswith("center") for name in LENS_PARAMETERS])
 """Which of :data:`rdstitch.camera.LENS_PARAMETERS` are the distortion centre, shape (5,)."""
 
-_REFINEMENTS: dict[str, tuple[BoolArray, ...]] = {
-    "division": (CENTER,),
-    "division2": (np.array([name == "distortion3" for name in LENS_PARAMETERS]),),
-}
-"""What the motion model may show besides. A centre that is off the middle looks like motion that is less regular; where
-μ is needed ν may be, by less than single pairs show. That μ is needed only pairs can say: it could stand for relief."""
-
 _WORDS = {
     "division": "λ",
     "division-center": "λ and the distortion centre",
@@ -54,8 +47,9 @@ _EXACTNESS = 0.1
 _FARTHEST_CENTER = 0.08
 """Half diagonals: a distortion centre farther off is no lens, but something else that it takes the blame for."""
 
-_SHARED_GAIN = 2.5
-"""Standard deviations of the mean gain of the parts that the observations fall into, by which it must exceed 0."""
+_SHARED_GAIN, _SHARED_GAIN_OF_SERIES = 2.5, 1.0
+"""Standard deviations of the mean gain of the parts that the observations fall into, by which it must exceed 0; and
+where μ is needed already, so that it is certain that λ alone does not describe the lens."""
 
 _CELLS = 4
 """Cells per side of a link's overlap, each of which is a part where there are few links."""
@@ -79,7 +73,8 @@ class LensChoice:
     reason : str
         One sentence.
     refinements : tuple of ndarray of shape (5,), bool
-        What may still be freed, where the motion model shows it.
+        What may still be freed, where the motion model shows it: a distortion centre that is off the middle looks like
+        motion that is less regular. That μ is needed only pairs can say: it could stand for relief.
     """
 
     name: str
@@ -132,7 +127,7 @@ def choose_lens(
             best = index
     name = names[best]
     reason = _reason(names, fits, judge, best)
-    return LensChoice(name, free_parameters(name), fits[best], reason, _REFINEMENTS.get(name, ()))
+    return LensChoice(name, free_parameters(name), fits[best], reason, (CENTER,) if name == "division" else ())
 
 
 def is_plausible(adjusted: BundleAdjustmentResult) -> bool:
@@ -187,10 +182,16 @@ class _Judge:
         return robust
 
     def prefers(self, richer: BundleAdjustmentResult, name: str, simpler: BundleAdjustmentResult, other: str) -> bool:
-        """Whether a richer lens gains more than its parameters cost, and all over the pictures."""
+        """Whether a richer lens gains more than its parameters cost, and all over the pictures.
+
+        A lens that λ does not describe is a series that has been cut off: beyond μ a parameter costs what Akaike's
+        criterion takes for it, not Schwarz's, which takes the simpler lens for the true one.
+        """
         gain = self.misfit(simpler) - self.misfit(richer)
-        price = (len(LENSES[name]) - len(LENSES[other])) * math.log(self.effective)
-        return float(gain.sum()) > price and self.significance(gain) > _SHARED_GAIN
+        series = other == "division2"
+        each, shared = (2.0, _SHARED_GAIN_OF_SERIES) if series else (math.log(self.effective), _SHARED_GAIN)
+        price = (len(LENSES[name]) - len(LENSES[other])) * each
+        return float(gain.sum()) > price and self.significance(gain) > shared
 
     def significance(self, gain: FloatArray) -> float:
         """Mean gain of the parts in its standard deviations."""

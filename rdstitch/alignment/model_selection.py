@@ -21,6 +21,7 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.bundle_adjustment import WIDTH_PER_SIGMA, sigma_of
 from rdstitch.alignment.cycle_consistency import misfitting_links
+from rdstitch.alignment.lens_selection import is_plausible
 from rdstitch.alignment.motion_models import HOMOGRAPHY, LOG_HEIGHT, MODELS, POSE, PSI, THETA, Model, metric_poses
 from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.planarity import coherence
@@ -34,9 +35,6 @@ _LEAST_RATIO = 1.5
 
 _TYPICAL_TILT_SPREAD = math.radians(3.0)
 """Spread of tilts from which on a wider one costs: Occam's factor of the hierarchical prior on the tilts."""
-
-_FARTHEST_CENTRE = 0.08
-"""Half diagonals: a distortion centre farther off is no lens, but something else that it takes the blame for."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +112,7 @@ def _beyond_one_camera(problem: Problem, camera: Fit, free: Fit) -> bool:
 
 def within_reason(fit: Fit) -> bool:
     """Whether the distortion centre is where lenses have it."""
-    return bool(np.abs(fit.adjusted.parameters.lens[2:]).max() < _FARTHEST_CENTRE)
+    return is_plausible(fit.adjusted)
 
 
 @dataclass(frozen=True)
