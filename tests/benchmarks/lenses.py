@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from examples.judging import AlignmentError, alignment_error
 from rdstitch.alignment import Alignment
 from rdstitch.camera import Camera
 from rdstitch.inputs.source import read_sources
@@ -19,11 +20,9 @@ from rdstitch.options import StitchOptions
 from rdstitch.pipeline.register import register
 from rdstitch.radial_homography import to_plane
 from rdstitch.synthetic import (
-    AlignmentError,
     BrownLens,
     FisheyeLens,
     Sequence,
-    alignment_error,
     grid_poses,
     ground,
     sequence_over,
