@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from rdstitch.alignment.lens_selection import CENTER, free_parameters
+from rdstitch.alignment.lens_selection import CENTER
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import LENS_PARAMETERS, Camera
@@ -21,7 +21,7 @@ def describe_lens(alignment: Alignment) -> tuple[str, ...]:
         return ("λ is not observable",)
     if alignment.distortion_std == 0.0 and camera.lens_covariance is None:
         return (f"λ = {alignment.distortion:.6f}, given",)
-    std, free = _std(camera), free_parameters(alignment.lens)
+    std, free = _std(camera), np.array([name in alignment.parameters for name in LENS_PARAMETERS])
     first = f"λ = {alignment.distortion:.6f} ± {alignment.distortion_std:.6f}"
     if camera.higher:
         largest = camera.one_parameter_fit()[2]
@@ -35,7 +35,7 @@ def describe_lens(alignment: Alignment) -> tuple[str, ...]:
         off = float(np.linalg.norm(camera.center - middle))
         lines.append(f"centre {x:.1f} ± {dx:.1f}, {y:.1f} ± {dy:.1f} pixels, {off:.1f} off the middle of the picture")
     else:
-        lines.append("distortion centre: the middle of the picture will do")
+        lines.append("distortion centre: the middle of the picture")
     return (*lines, alignment.lens_reason)
 
 

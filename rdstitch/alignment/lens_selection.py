@@ -34,13 +34,6 @@ LENSES: dict[str, tuple[str, ...]] = {
 CENTER = np.array([name.startswith("center") for name in LENS_PARAMETERS])
 """Which of :data:`rdstitch.camera.LENS_PARAMETERS` are the distortion centre, shape (5,)."""
 
-_WORDS = {
-    "division": "λ",
-    "division-center": "λ and the distortion centre",
-    "division2": "λ, μ and the distortion centre",
-    "division3": "λ, μ, ν and the distortion centre",
-}
-
 _EXACTNESS = 0.1
 """Pixels: how exactly a lens and a plane can be described at all."""
 
@@ -53,6 +46,11 @@ where μ is needed already, so that it is certain that λ alone does not describ
 
 _CELLS = 4
 """Cells per side of a link's overlap, each of which is a part where there are few links."""
+
+_ENOUGH_PICTURES = 4
+"""Pictures from which on the distortion centre is freed. In fewer a tilt and a change of height stand for it: with it
+free, two of the pairs of ``examples.paper figure5`` have 95 % of the errors within 4.1 and 1.1 pixels, without
+it within 0.6 and 0.2."""
 
 _ENOUGH_LINKS = 8
 """Links from which on each is a part."""
@@ -88,7 +86,7 @@ class LensChoice:
         if (free == self.free).all():
             return self
         name = next(name for name in LENSES if not (free & ~free_parameters(name)).any())
-        return replace(self, name=name, free=free, reason=f"{_WORDS[name]}: the motion is more regular with that")
+        return replace(self, name=name, free=free, reason=f"{name}: the motion is more regular with that")
 
 
 def free_parameters(name: str) -> BoolArray:
@@ -112,22 +110,31 @@ def choose_lens(
     """
     if not names:
         return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), apart, "given")
+    few = len(names) > 1 and _pictures(observations) < _ENOUGH_PICTURES
+    if few:
+        names = [name for name in names if name != "division-center"]
+    free = [free_parameters(name) & ~(CENTER & few) for name in names]
     fits = [apart] if names[0] == "division" else []
-    for name in names[len(fits) :]:
+    for own in free[len(fits) :]:
         start = fits[-1] if fits else apart
-        fits.append(
-            homography_apart(observations, start.homographies, start.parameters.lens, free_parameters(name), known)
-        )
+        fits.append(homography_apart(observations, start.homographies, start.parameters.lens, own, known))
     if len(names) == 1:
-        return LensChoice(names[0], free_parameters(names[0]), fits[0], "as requested")
+        return LensChoice(names[0], free[0], fits[0], "as requested")
     judge = _Judge.of(observations, fits[-1])
     best = 0
     for index in range(1, len(names)):
-        if judge.prefers(fits[index], names[index], fits[best], names[best]) and is_plausible(fits[index]):
+        added = int(free[index].sum() - free[best].sum())
+        if judge.prefers(fits[index], fits[best], added, names[best]) and is_plausible(fits[index]):
             best = index
-    name = names[best]
-    reason = _reason(names, fits, judge, best)
-    return LensChoice(name, free_parameters(name), fits[best], reason, (CENTER,) if name == "division" else ())
+    reason = _reason(names, fits, best)
+    if few:
+        reason += "; too few pictures to find the distortion centre, which is taken to be the middle"
+    refinements = (CENTER,) if best == 0 and not few else ()
+    return LensChoice(names[best], free[best], fits[best], reason, refinements)
+
+
+def _pictures(observations: Observations) -> int:
+    return len(np.unique(np.concatenate([observations.image1, observations.image2])))
 
 
 def is_plausible(adjusted: BundleAdjustmentResult) -> bool:
@@ -181,17 +188,18 @@ class _Judge:
         robust: FloatArray = WIDTH_PER_SIGMA**2 * np.log1p(ratio / WIDTH_PER_SIGMA**2) / self.overdispersion
         return robust
 
-    def prefers(self, richer: BundleAdjustmentResult, name: str, simpler: BundleAdjustmentResult, other: str) -> bool:
+    def prefers(
+        self, richer: BundleAdjustmentResult, simpler: BundleAdjustmentResult, added: int, simpler_name: str
+    ) -> bool:
         """Whether a richer lens gains more than its parameters cost, and all over the pictures.
 
         A lens that λ does not describe is a series that has been cut off: beyond μ a parameter costs what Akaike's
         criterion takes for it, not Schwarz's, which takes the simpler lens for the true one.
         """
         gain = self.misfit(simpler) - self.misfit(richer)
-        series = other == "division2"
+        series = simpler_name == "division2"
         each, shared = (2.0, _SHARED_GAIN_OF_SERIES) if series else (math.log(self.effective), _SHARED_GAIN)
-        price = (len(LENSES[name]) - len(LENSES[other])) * each
-        return float(gain.sum()) > price and self.significance(gain) > shared
+        return float(gain.sum()) > added * each and self.significance(gain) > shared
 
     def significance(self, gain: FloatArray) -> float:
         """Mean gain of the parts in its standard deviations."""
@@ -217,10 +225,10 @@ def _parts(observations: Observations) -> IntArray:
     return link * _CELLS**2 + cell
 
 
-def _reason(names: Sequence[str], fits: Sequence[BundleAdjustmentResult], judge: _Judge, best: int) -> str:
+def _reason(names: Sequence[str], fits: Sequence[BundleAdjustmentResult], best: int) -> str:
     """Why a lens was chosen, one sentence."""
     errors = [f"{name} {fit.sigma:.3f} pixels" for name, fit in zip(names, fits, strict=True)]
-    text = f"{_WORDS[names[best]]}: pairs on their own leave an error of {fits[best].sigma:.3f} pixels"
+    text = f"{names[best]}: pairs on their own leave an error of {fits[best].sigma:.3f} pixels"
     if best:
         text += f", simpler lenses more ({', '.join(errors[:best])})"
     if best + 1 < len(names):

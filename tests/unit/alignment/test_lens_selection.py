@@ -98,6 +98,17 @@ def test_a_lens_that_is_requested_is_estimated(name: str) -> None:
     assert not (set(LENS_PARAMETERS) - set(LENSES[name])) & set(found.parameters)
 
 
+def test_a_pair_keeps_the_centre_in_the_middle_and_says_so() -> None:
+    lens = replace(FISHEYE, center=(319.5, 239.5))
+    rng = np.random.default_rng(6)
+    given = scene(grid(2, 1, (0.35, 0.35), 0.5, rng), lens=lens, rng=rng, noise=0.1, per_link=400, focal=420.0)
+    found = _align(given)
+    assert found.lens in ("division2", "division3")
+    assert found.cameras[0].center == (319.5, 239.5)
+    assert "too few pictures to find the distortion centre" in found.lens_reason
+    assert "distortion centre: the middle of the picture" in describe_lens(found)
+
+
 def test_a_known_lens_is_kept_whole() -> None:
     given = _scene(FISHEYE, 5, columns=3, rows=2)
     cameras = [
