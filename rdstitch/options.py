@@ -59,6 +59,9 @@ class StitchOptions:
         Picture, or folder of them, that is dark where the pictures do not count.
     channel_order : str
         Order of the channels of arrays that come in or go out: "bgr", as OpenCV has it, or "rgb".
+    exclude, include_only : tuple of str
+        Names, or patterns with ``*``, ``?`` and ``[...]``, of pictures that are not used, and of those that alone are
+        used; empty for all.
     reference : str, optional
         Name of the picture whose frame is kept; None: the best connected.
     composite : CompositeOptions
@@ -103,6 +106,8 @@ class StitchOptions:
     attitude_std: float = math.radians(1.0)
     mask: str | Path | None = None
     channel_order: ChannelOrder = "bgr"
+    exclude: tuple[str, ...] = ()
+    include_only: tuple[str, ...] = ()
     reference: str | None = None
     composite: CompositeOptions = field(default_factory=CompositeOptions)
     cache: Path | None = None

@@ -121,6 +121,18 @@ workers = click.option(
 estimation = together(
     mask,
     click.option(
+        "--exclude",
+        multiple=True,
+        metavar="NAME",
+        help="Leave out the picture of this name, or all that fit a pattern like 'img_49*'; repeatable.",
+    ),
+    click.option(
+        "--include-only",
+        multiple=True,
+        metavar="NAME",
+        help="Use only the pictures of this name or pattern; repeatable.",
+    ),
+    click.option(
         "--features", type=click.Choice(FEATURES), default="rootsift", show_default=True, help="Features to match."
     ),
     click.option("--aliked-model", type=PICTURE, metavar="FILE", help="ONNX file of the network of --features aliked."),
@@ -260,6 +272,14 @@ compositing = together(
         default=1.0,
         show_default=True,
         help="Factor to the size of the output; 1 keeps resolution.",
+    ),
+    click.option(
+        "--max-stretch",
+        type=click.FloatRange(1.0, min_open=True),
+        default=3.0,
+        show_default=True,
+        metavar="N",
+        help="What an oblique picture shows N times coarser than the reference picture is not drawn.",
     ),
     click.option(
         "--max-size",

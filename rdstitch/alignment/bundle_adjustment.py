@@ -210,6 +210,11 @@ class BundleAdjuster:
         squared: FloatArray = self._evaluate(parameters, 1.0, 1.0).equations.squared
         return squared
 
+    def normal_equations(self, adjusted: BundleAdjustmentResult) -> NormalEquations:
+        """At a solution, priors included."""
+        state = self._evaluate(adjusted.parameters, adjusted.sigma, WIDTH_PER_SIGMA * adjusted.sigma)
+        return self._normal_equations(state, adjusted.sigma)
+
     def _descend(self, parameters: Parameters, sigma: float, width: float, most: int) -> tuple[_State, int, bool]:
         """Levenberg-Marquardt at one width of the loss; the state reached, linearizations, whether converged."""
         state = self._evaluate(parameters, sigma, width)
@@ -245,14 +250,14 @@ class BundleAdjuster:
         matrices = self.model.matrices(parameters.poses, parameters.shared)
         homographies = self._of_links(matrices)
         equations = link_equations(self.observations, homographies, parameters.lens, width)
-        cost = float(robust_cost(equations.squared, width).sum()) * self._weight(sigma)
+        cost = float(robust_cost(equations.squared, width).sum()) * self.weight(sigma)
         return _State(parameters, matrices, homographies, equations, cost + self._prior_cost(parameters))
 
     def _cost_at(self, parameters: Parameters, whitening: FloatArray, sigma: float, width: float) -> float:
         """The cost at other parameters, with the whitening held."""
         homographies = self._of_links(self.model.matrices(parameters.poses, parameters.shared))
         squared = squared_errors(self.observations, homographies, parameters.lens, whitening)
-        return float(robust_cost(squared, width).sum()) * self._weight(sigma) + self._prior_cost(parameters)
+        return float(robust_cost(squared, width).sum()) * self.weight(sigma) + self._prior_cost(parameters)
 
     def _of_links(self, matrices: ModelMatrices) -> FloatArray:
         """``H_ij = P_j P_i⁻¹`` of each link, shape (L, 3, 3)."""
@@ -264,7 +269,8 @@ class BundleAdjuster:
     def _sigma(self, state: _State) -> float:
         return sigma_of(state.equations.squared[self.observations.scale_inliers_mask])
 
-    def _weight(self, sigma: float) -> float:
+    def weight(self, sigma: float) -> float:
+        """Of squared errors of this scatter: one over their variance, as far as they are independent."""
         return 1.0 / (sigma**2 * self.overdispersion)
 
     def _prior_cost(self, parameters: Parameters) -> float:
@@ -286,7 +292,7 @@ class BundleAdjuster:
             state.homographies,
             self.freedom.poses,
             self.freedom.lens,
-            self._weight(sigma),
+            self.weight(sigma),
         )
         p, free, lens = self.priors, self.freedom.poses, self.freedom.lens
         precision = np.concatenate([p.shared_precision, p.lens_precision[lens]])

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box
+from rdstitch.compositing.near_part import NearPart, near_parts
 from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.radial_homography import to_plane
@@ -36,12 +37,14 @@ class Canvas:
     matrix : ndarray of shape (3, 3)
         Affine, from plane coordinates to canvas px (centre of the top-left pixel at (0, 0)).
     footprints : tuple of ndarray of shape (K, 2)
-        Outline of each picture, canvas px, clockwise from the picture's top-left corner. Of a canvas that goes all the
-        way round, one of its places; it may reach beyond the canvas.
+        Outline of what is drawn of each picture, canvas px, clockwise. Of a canvas that goes all the way round, one of
+        its places; it may reach beyond the canvas.
     projection : Projection
         What ``matrix`` is applied to: the places that it gives to directions.
     period : float or None
         Width of a full turn, px, where the pictures go all the way round; None where they do not.
+    near : tuple of NearPart or None
+        What of each picture is drawn; None for all of it, empty for all of all pictures.
     """
 
     size: tuple[int, int]
@@ -49,6 +52,7 @@ class Canvas:
     footprints: tuple[FloatArray, ...]
     projection: Projection = PLANE
     period: float | None = None
+    near: tuple[NearPart | None, ...] = ()
 
     def boxes(self) -> list[Box]:
         """Bounds (x0, y0, x1, y1) of every picture, whole px inside the canvas, end exclusive.
@@ -105,7 +109,7 @@ class Canvas:
         to_reduced = np.array([[1.0 / factor, 0.0, shift], [0.0, 1.0 / factor, shift], [0.0, 0.0, 1.0]])
         footprints = tuple(outline / factor + shift for outline in self.footprints)
         period = None if self.period is None else self.period / factor
-        return Canvas((width, height), to_reduced @ self.matrix, footprints, self.projection, period)
+        return Canvas((width, height), to_reduced @ self.matrix, footprints, self.projection, period, self.near)
 
 
 def plan_canvas(
@@ -116,6 +120,7 @@ def plan_canvas(
     rotate: float = 0.0,
     reference: int | None = None,
     names: Sequence[str] | None = None,
+    max_stretch: float = math.inf,
 ) -> Canvas:
     """Plan the smallest upright canvas that holds every picture.
 
@@ -132,6 +137,9 @@ def plan_canvas(
         Picture whose resolution counts.
     names : sequence of str, optional
         What to call the pictures in messages.
+    max_stretch : float
+        What a picture shows so many times coarser than the reference picture has no place on the canvas; see
+        :mod:`rdstitch.compositing.near_part`. Without a limit, a picture that shows the horizon is refused.
 
     Returns
     -------
@@ -147,11 +155,15 @@ def plan_canvas(
     matrices = np.asarray(homographies, dtype=np.float64)
     called = [f"picture {k + 1}" for k in range(len(cameras))] if names is None else list(names)
     _check(cameras, matrices, scale, rotate, called)
-    to_plane = [_oriented(g) for g in matrices]
-    outlines = [_outline_on_plane(c, g, name) for c, g, name in zip(cameras, to_plane, called, strict=True)]
+    to_plane = [_oriented(c, g) for c, g in zip(cameras, matrices, strict=True)]
     px_per_unit = np.array([_resolution(c, g) for c, g in zip(cameras, to_plane, strict=True)])
+    usual = abs(px_per_unit[reference]) if reference is not None else np.nanmedian(np.abs(px_per_unit))
+    near = near_parts(cameras, to_plane, float(usual), max_stretch)
+    outlines = [
+        _outline_on_plane(c, g, part, name) for c, g, part, name in zip(cameras, to_plane, near, called, strict=True)
+    ]
     _refuse_mirrored(px_per_unit, called)
-    resolution = scale * abs(px_per_unit[reference] if reference is not None else np.median(np.abs(px_per_unit)))
+    resolution = scale * float(usual)
 
     angle = math.radians(rotate)
     cos, sin = resolution * math.cos(angle), resolution * math.sin(angle)
@@ -165,7 +177,7 @@ def plan_canvas(
     size = np.maximum(np.ceil(high - low - 1e-6), 1).astype(int)
     matrix = np.eye(3)
     matrix[:2, :2], matrix[:2, 2] = linear, -low - 0.5
-    return Canvas((int(size[0]), int(size[1])), matrix, tuple(p - low - 0.5 for p in placed))
+    return Canvas((int(size[0]), int(size[1])), matrix, tuple(p - low - 0.5 for p in placed), near=tuple(near))
 
 
 def _check(cameras: Sequence[Camera], matrices: FloatArray, scale: float, rotate: float, names: Sequence[str]) -> None:
@@ -181,16 +193,17 @@ def _check(cameras: Sequence[Camera], matrices: FloatArray, scale: float, rotate
             raise ArgumentError(f"{name}: the homography is singular or not finite")
 
 
-def _oriented(matrix: FloatArray) -> FloatArray:
-    """The homography with the sign that puts the picture's centre in front of the camera."""
-    return matrix if matrix[2, 2] > 0 else -matrix
+def _oriented(camera: Camera, matrix: FloatArray) -> FloatArray:
+    """The homography with the sign that puts the picture, or a part of it, in front of the camera."""
+    flat = camera.normalize(camera.undistort(camera.outline(1)))
+    return matrix if (flat @ matrix[2, :2] + matrix[2, 2] > 0).any() else -matrix
 
 
-def _outline_on_plane(camera: Camera, matrix: FloatArray, name: str) -> FloatArray:
-    """Densely sampled outline in plane coordinates."""
-    outline = to_plane(camera, matrix, camera.outline(_POINTS_PER_SIDE))
+def _outline_on_plane(camera: Camera, matrix: FloatArray, near: NearPart | None, name: str) -> FloatArray:
+    """Densely sampled outline of what is drawn, in plane coordinates."""
+    outline = to_plane(camera, matrix, camera.outline(_POINTS_PER_SIDE) if near is None else near.outline())
     # What is in front of the horizon on the outline is so inside.
-    if not np.isfinite(outline).all():
+    if not len(outline) or not np.isfinite(outline).all():
         raise LimitError(f"{name}: the horizon crosses the picture; leave it out, or choose another reference picture")
     return outline
 

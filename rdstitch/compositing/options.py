@@ -45,6 +45,8 @@ class CompositeOptions:
         Longest side of the output, pixels; None: as ``scale`` makes it.
     quality : int
         Quality of JPEG and WebP, 1 to 100.
+    max_stretch : float
+        What a picture shows so many times coarser than the reference picture is not drawn.
     rotate : float
         Degrees that the output is turned clockwise.
     max_memory : int, optional
@@ -76,6 +78,7 @@ class CompositeOptions:
     scale: float = 1.0
     max_size: int | None = None
     quality: int = 95
+    max_stretch: float = 3.0
     rotate: float = 0.0
     max_memory: int | None = None
     interpolation: Interpolation = "cubic"
@@ -98,6 +101,8 @@ class CompositeOptions:
             raise ArgumentError(f"max_size must be at least 1, not {self.max_size}")
         if not 1 <= self.quality <= 100:
             raise ArgumentError(f"quality must be from 1 to 100, not {self.quality}")
+        if not self.max_stretch > 1:
+            raise ArgumentError(f"max_stretch must be greater than 1, not {self.max_stretch}")
         if not math.isfinite(self.rotate):
             raise ArgumentError(f"rotate must be an angle in degrees, not {self.rotate}")
         if self.max_memory is not None and self.max_memory <= 0:

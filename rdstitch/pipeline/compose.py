@@ -1,6 +1,6 @@
 """The last stage of every picture: from registered pictures to pixels, in memory or in a file."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,7 @@ from rdstitch.compositing import (
     plan_composite,
     plan_panorama,
 )
+from rdstitch.compositing.near_part import NearPart
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference, georeference, has_place, world_file_paths
 from rdstitch.inputs.source import Source, readers
@@ -28,6 +29,7 @@ from rdstitch.io.atomic import check_output, text_bytes
 from rdstitch.io.deepzoom import LARGEST_TILE_PROFILE
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.io.outputs import Outputs
+from rdstitch.io.read import Picture
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
 from rdstitch.pipeline.memory import release_free_heap
@@ -126,7 +128,10 @@ def compose_pictures(
         check_size(output, canvas.size)
         check_memory(output, canvas.size, options.max_memory)
     options = replace(options, workers=threads)
-    read = readers(sources)
+    read = [
+        reader if part is None else partial(_read_near, reader, part)
+        for reader, part in zip(readers(sources), canvas.near or [None] * len(sources), strict=True)
+    ]
     if dry_run:
         pixels = read[0](_SMALLEST).pixels
         channels = 1 if pixels.ndim == 2 else pixels.shape[2]
@@ -194,7 +199,15 @@ def _plan(
             f"the {options.projection} projection is for pictures taken by turning on the spot; these were not, "
             "leave out --projection"
         )
-    return plan_canvas(cameras, homographies, scale=scale, rotate=options.rotate, reference=reference, names=names)
+    return plan_canvas(
+        cameras,
+        homographies,
+        scale=scale,
+        rotate=options.rotate,
+        reference=reference,
+        names=names,
+        max_stretch=options.max_stretch,
+    )
 
 
 def _profile_notes(source: Source, output: Path) -> list[str]:
@@ -203,3 +216,8 @@ def _profile_notes(source: Source, output: Path) -> list[str]:
     if output.suffix.lower() == ".dzi" and size > LARGEST_TILE_PROFILE:
         lost = f"its colour profile of {size / 1e3:.0f} kB is too large to be in every tile"
     return [f"{source.name}: {lost}; colours are as if it had none"] if lost else []
+
+
+def _read_near(read: Callable[..., Picture], part: NearPart, reduction: int = 1) -> Picture:
+    """A picture, whole or reduced, of which only its near part is drawn."""
+    return part.masked(read(reduction))

@@ -13,7 +13,7 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.path_plot import path_as_svg
 from rdstitch.inputs.attitudes import with_attitudes
 from rdstitch.inputs.find import FoundPictures, found_pictures
-from rdstitch.inputs.frame import Images, Named, as_inputs, files_of
+from rdstitch.inputs.frame import Frame, Images, as_inputs, files_of
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.masks import with_masks
 from rdstitch.inputs.source import Source, read_sources
@@ -23,7 +23,7 @@ from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.accept import accept
 from rdstitch.pipeline.compose import compose_pictures
-from rdstitch.pipeline.register import in_frame_of_reference, register
+from rdstitch.pipeline.register import register, with_frontal_reference
 from rdstitch.progress import Progress, silent
 from rdstitch.registration import Registration
 from rdstitch.sidecar.write import sidecar
@@ -79,8 +79,8 @@ def pano(
         _check_outputs(output, options, files_of(found.frames))
         sources, _ = _read(found.frames, options, skip_bad=False)
         registration = register(sources, options, skip_bad=False, progress=progress)
-        registration = in_frame_of_reference(registration).with_messages(found.messages)
-        return _composite(registration, output, options, progress)
+        registration = registration.with_messages(found.messages)
+        return _composite(registration, output, options, progress, frontal=True)
 
 
 def mosaic(
@@ -231,9 +231,9 @@ def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Se
         check_distinct([options.save_camera, *([] if output is None else [f"{output}.json"])])
 
 
-def _read(inputs: Sequence[Named], options: StitchOptions, *, skip_bad: bool) -> tuple[list[Source], list[Message]]:
+def _read(frames: Sequence[Frame], options: StitchOptions, *, skip_bad: bool) -> tuple[list[Source], list[Message]]:
     sources, unread = read_sources(
-        inputs,
+        selected(frames, options.exclude, options.include_only),
         camera=options.camera,
         focal=options.focal,
         distortion=options.distortion,
@@ -249,10 +249,18 @@ def _read(inputs: Sequence[Named], options: StitchOptions, *, skip_bad: bool) ->
 
 
 def _composite(
-    registration: Registration, output: str | Path | None, options: StitchOptions, progress: Progress
+    registration: Registration,
+    output: str | Path | None,
+    options: StitchOptions,
+    progress: Progress,
+    *,
+    frontal: bool = False,
 ) -> StitchResult:
-    """Judge, then compose into memory, or into a file that is published with all that belongs to it."""
-    registration = accept(registration, options)
+    """Check, then compose into memory, or into a file that is published with all that belongs to it.
+
+    ``frontal`` takes the undistorted reference picture for the plane.
+    """
+    registration = with_frontal_reference(accept(registration, options), options, always=frontal)
     alignment = registration.alignment
     used = np.flatnonzero(alignment.used)
     with Outputs(options.overwrite) as outputs:

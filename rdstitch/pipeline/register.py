@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from rdstitch.alignment import Alignment
+from rdstitch.alignment.reference_frame import frontal_reference, in_frame_of
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.cache import Cache
 from rdstitch.features import LightGlue, Matcher, match
@@ -101,13 +102,26 @@ def register(
     )
 
 
-def in_frame_of_reference(registration: Registration) -> Registration:
-    """The same registration with the undistorted reference picture as its plane; directions stay as they are."""
+def with_frontal_reference(registration: Registration, options: StitchOptions, *, always: bool) -> Registration:
+    """The same registration with an undistorted picture as its plane; directions of a turn on the spot stay.
+
+    That is the reference picture, unless another one crosses its horizon and nobody named it: then one that, if
+    possible, no picture crosses the horizon of.
+
+    Parameters
+    ----------
+    registration : Registration
+    options : StitchOptions
+    always : bool
+        Whether a rectified plane, that of one camera's poses, gives way too.
+    """
     alignment = registration.alignment
-    if alignment.on_sphere:
+    if alignment.on_sphere or (not always and alignment.poses is not None):
         return registration
-    homographies = np.linalg.inv(alignment.homographies[alignment.reference]) @ alignment.homographies
-    return replace(registration, alignment=replace(alignment, homographies=homographies))
+    reference = alignment.reference if options.reference is not None else frontal_reference(alignment)
+    if not always and reference == alignment.reference:
+        return registration
+    return replace(registration, alignment=in_frame_of(alignment, reference))
 
 
 def _matcher(options: StitchOptions) -> Matcher:

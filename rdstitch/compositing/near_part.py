@@ -1,0 +1,134 @@
+"""What of an oblique picture is drawn: its near part, which is not much coarser than the reference picture.
+
+A plane seen obliquely gets coarser towards the horizon, along the line of sight with the square of the distance. The
+distance is one over the third coordinate of ``G p``, undistorted points p of the picture mapped to the plane; so a
+limit on the stretch is, in undistorted coordinates, a straight line parallel to the horizon. Beyond it nothing is
+drawn. What the lens itself stretches, towards the corners of a wide-angle picture, does not count.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
+from rdstitch.io.read import Picture
+
+_PROBES = 33
+"""Points of a grid over the picture, a side, at which the stretch is measured."""
+
+_POINTS_PER_SIDE = 64
+"""As the canvas samples outlines: undistorted, straight sides are curved."""
+
+_ROWS = 256
+"""Rows of a mask that are computed at a time."""
+
+
+@dataclass(frozen=True)
+class NearPart:
+    """The part of a picture that is drawn.
+
+    Attributes
+    ----------
+    camera : Camera
+    depth : ndarray of shape (3,)
+        What is drawn has ``depth · (x, y, 1) > 0``; x, y undistorted, in half diagonals from the distortion centre.
+    """
+
+    camera: Camera
+    depth: FloatArray
+
+    def outline(self) -> FloatArray:
+        """Its border, measured pixels (K, 2), clockwise; empty where nothing is drawn."""
+        border = self.camera.outline(_POINTS_PER_SIDE)
+        flat = self.camera.normalize(self.camera.undistort(border))
+        inside = self._value(flat) > 0.0
+        if inside.all() or not inside.any():
+            return border if inside.all() else np.empty((0, 2))
+        # Begin where the border comes back from beyond the limit, so that the drawn part is in one piece.
+        start = int(np.flatnonzero(inside & ~np.roll(inside, 1))[0])
+        border, flat, inside = np.roll(border, -start, axis=0), np.roll(flat, -start, axis=0), np.roll(inside, -start)
+        last = int(np.flatnonzero(inside)[-1])
+        ends = [self._crossing(flat[last], flat[(last + 1) % len(flat)]), self._crossing(flat[-1], flat[0])]
+        cut = ends[0] + np.linspace(0.0, 1.0, _POINTS_PER_SIDE)[:, None] * (ends[1] - ends[0])
+        measured = np.asarray(self.camera.distort(self.camera.denormalize(cut)))
+        kept = border[: last + 1][inside[: last + 1]]
+        return np.concatenate([kept, measured[np.isfinite(measured).all(axis=1)]])
+
+    def masked(self, picture: Picture) -> Picture:
+        """The picture, whole or reduced, with the rest transparent."""
+        height, width = picture.pixels.shape[:2]
+        shown = self._shown(width, height)
+        alpha = np.where(shown, np.uint8(255) if picture.alpha is None else picture.alpha, np.uint8(0))
+        return replace(picture, alpha=alpha)
+
+    def _shown(self, width: int, height: int) -> NDArray[np.bool_]:
+        """Which pixels of the picture at a size are drawn; in measured coordinates the limit is a conic."""
+        camera = self.camera.resized((width, height))
+        x = (np.arange(width) - camera.center[0]) / camera.half_diagonal
+        shown = np.empty((height, width), dtype=np.bool_)
+        for top in range(0, height, _ROWS):
+            y = ((np.arange(top, min(top + _ROWS, height)) - camera.center[1]) / camera.half_diagonal)[:, None]
+            radius2 = x**2 + y**2
+            lens = 1.0 + radius2 * np.polynomial.polynomial.polyval(radius2, np.array(camera.coefficients))
+            shown[top : top + _ROWS] = self.depth[0] * x + self.depth[1] * y + self.depth[2] * lens > 0.0
+        return shown
+
+    def _value(self, flat: FloatArray) -> FloatArray:
+        """What is positive where undistorted points (K, 2) are drawn."""
+        value: FloatArray = flat @ self.depth[:2] + self.depth[2]
+        return value
+
+    def _crossing(self, inside: FloatArray, outside: FloatArray) -> FloatArray:
+        """Where the line between two undistorted points meets the limit."""
+        a, b = self._value(np.stack([inside, outside]))
+        crossing: FloatArray = inside + (outside - inside) * (a / (a - b))
+        return crossing
+
+
+def near_parts(
+    cameras: Sequence[Camera], homographies: Sequence[FloatArray], resolution: float, max_stretch: float
+) -> list[NearPart | None]:
+    """What of each picture is drawn; None for all of it.
+
+    Parameters
+    ----------
+    cameras : sequence of Camera
+    homographies : sequence of ndarray of shape (3, 3)
+        Normalized undistorted coordinates to the plane, with positive third coordinates in front of the camera.
+    resolution : float
+        Canvas pixels per unit of the plane at which the reference picture keeps its size.
+    max_stretch : float
+        How many times coarser than the reference picture, or than its own finest part where that is coarser, a picture
+        may be.
+    """
+    parts: list[NearPart | None] = []
+    if max_stretch == np.inf:
+        return [None] * len(cameras)
+    for camera, matrix in zip(cameras, homographies, strict=True):
+        stretch, depth = _stretch(camera, matrix, resolution)
+        finest = max(1.0, float(stretch.min()))
+        beyond = depth[stretch > max_stretch * finest]
+        if not len(beyond):
+            parts.append(None)
+            continue
+        parts.append(NearPart(camera, matrix[2] - np.array([0.0, 0.0, max(float(beyond.max()), 0.0)])))
+    return parts
+
+
+def _stretch(camera: Camera, matrix: FloatArray, resolution: float) -> tuple[FloatArray, FloatArray]:
+    """Canvas pixels per undistorted pixel, in the direction in which they are most, and depth, over a picture (K,)."""
+    width, height = camera.image_size
+    sides = np.linspace(-0.5, width - 0.5, _PROBES), np.linspace(-0.5, height - 0.5, _PROBES)
+    points = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
+    flat = camera.normalize(camera.undistort(points))
+    moved = flat @ matrix[:, :2].T + matrix[:, 2]
+    depth: FloatArray = moved[:, 2]
+    with np.errstate(all="ignore"):
+        plane = moved[:, :2] / depth[:, None]
+        jacobian = (matrix[None, :2, :2] - plane[:, :, None] * matrix[None, 2:, :2]) / depth[:, None, None]
+        jacobian = np.where((depth > 0.0)[:, None, None], jacobian, 0.0)
+        largest = np.linalg.norm(jacobian, 2, axis=(1, 2)) * resolution / camera.half_diagonal
+    return np.where(depth > 0.0, largest, np.inf), depth
