@@ -37,6 +37,9 @@ SOLVABLE = ("pair", "chain", "grid")
 ODD = ("odd lens",)
 """Solvable too, but only where asked for: the pictures of one lens that is no division model about their centre."""
 
+SPOILED = ("spoiled",)
+"""Ten pictures of which one to three show other ground or were zoomed: solved from the rest, and those named."""
+
 HOPELESS = (
     "apart", "textureless", "repeated", "turning", "mixed lenses", "mixed by one", "little overlap", "mixed ground"
 )  # fmt: skip
@@ -141,7 +144,7 @@ def trust_set(seed: int, kind: str | None = None) -> TrustSet:
     elif kind == "repeated":
         plane = partial(repeated, seed=seed, period=int(rng.integers(48, 140)))
     sequence = sequence_over(plane, taken_with, poses, photometry=photometry, seed=seed, margin=60)
-    if kind.startswith("mixed"):
+    if kind.startswith("mixed") or kind in SPOILED:
         sequence = _mixed(kind, sequence, rng, seed)
     return TrustSet(kind, sequence)
 
@@ -177,6 +180,8 @@ def _poses(kind: str, lens: Lens, tilt: tuple[float, float], rng: np.random.Gene
     columns, rows = (4, 1) if kind == "chain" else (2, 2) if kind == "grid" else (3, 1)
     if kind == "mixed lenses":
         columns, rows = 5, 1
+    elif kind in SPOILED:
+        columns, rows = 5, 2
     elif kind in ("mixed by one", *ODD):
         columns, rows = 2 + seed % 4, 1
     return grid_poses(lens, columns, rows, overlap=overlap, yaw=0.2, shift=0.05, tilt=tilt, seed=seed)
@@ -200,6 +205,14 @@ def _mixed(kind: str, sequence: Sequence, rng: np.random.Generator, seed: int) -
         changed = replace(lens, distortion=lens.distortion / zoom**2 - bend, focal=zoom * lens.focal)
         other = replace(sequence, lens=changed)
         taken = frozenset({int(rng.choice([0, len(sequence) // 2, len(sequence) - 1]))})
+    elif kind in SPOILED:
+        assert isinstance(lens, Camera)
+        assert lens.focal is not None
+        if rng.random() < 0.5:
+            other = replace(sequence, lens=replace(lens, distortion=lens.distortion / 2, focal=1.4 * lens.focal))
+        else:
+            other = replace(sequence, texture=ground(sequence.texture.size, seed + 1))
+        taken = frozenset(rng.choice(len(sequence), int(rng.integers(1, 4)), replace=False).tolist())
     else:
         other, taken = replace(sequence, texture=ground(sequence.texture.size, seed + 1)), frozenset({2})
     return MixedSequence(
@@ -221,7 +234,9 @@ def judge_set(item: TrustSet, folder: Path, options: StitchOptions | None = None
     error, worst = measure(item.sequence, registration)
     text = "; ".join(map(str, registration.messages))
     right = error < LARGEST_MEDIAN and worst < LARGEST_OF_A_PICTURE
-    return Judged(item.kind, 0, right, not registration.left_out, error, text)
+    spoiled = item.sequence.taken if item.kind in SPOILED and isinstance(item.sequence, MixedSequence) else frozenset()
+    complete = {_number(message.images[0]) for message in registration.left_out} == spoiled
+    return Judged(item.kind, 0, right, complete, error, text)
 
 
 def registration_error(sequence: Sequence, registration: Registration) -> tuple[float, float]:
@@ -251,10 +266,15 @@ def overlap_error(sequence: Sequence, registration: Registration) -> tuple[float
     return float(np.median(np.concatenate(errors))), max(float(np.median(own)) for own in errors)
 
 
+def _number(path: str) -> int:
+    """The number of a picture in its sequence."""
+    return int(Path(path).stem.split("_")[-1])
+
+
 def _used(registration: Registration) -> dict[int, int]:
     """The number in its sequence of every picture that was used, by its position in the registration."""
     return {
-        position: int(source.path.stem.split("_")[-1])
+        position: _number(str(source.path))
         for position, source in enumerate(registration.sources)
         if registration.alignment.used[position]
     }

@@ -178,7 +178,7 @@ class Problem:
 
     def squared(self, model: Model, parameters: Parameters) -> FloatArray:
         """``|r|²`` of each correspondence (M,) at some parameters, px², whitened."""
-        return self._adjuster(model).squared(parameters)
+        return self.adjuster(model).squared(parameters)
 
     def refine(self, model: Model, start: Parameters, tilt_spread: float | None = None) -> Fit:
         """Adjust a model from a given start."""
@@ -208,13 +208,14 @@ class Problem:
         return PSI in getattr(model, "free", ())
 
     def _run(self, model: Model, start: Parameters, tilt_spread: float) -> BundleAdjustmentResult:
-        adjuster = self._adjuster(model, tilt_spread)
+        adjuster = self.adjuster(model, tilt_spread)
         medians = link_medians(adjuster.squared(start), self.observations)
         widest = _WIDEST_START * float(np.median(self.observations.scale2))
         width = min(1.5 * float(np.quantile(np.where(np.isfinite(medians), medians, 1e9), 0.95)), widest)
         return adjuster.run(start, width)
 
-    def _adjuster(self, model: Model, tilt_spread: float = _TILT_SPREAD_START) -> BundleAdjuster:
+    def adjuster(self, model: Model, tilt_spread: float = _TILT_SPREAD_START) -> BundleAdjuster:
+        """Of one model, with the priors on it."""
         freedom = FreeParameters.fixing(model, self.count, [self.reference], self.free_lens)
         priors = self.knowledge.priors(model, self.count, tilt_spread)
         return BundleAdjuster(model, self.observations, freedom, priors, self.overdispersion)
@@ -296,7 +297,7 @@ class Problem:
         """The start with the smallest errors, those far away counting alike."""
         if len(starts) == 1:
             return starts[0]
-        adjuster = self._adjuster(model)
+        adjuster = self.adjuster(model)
         width = _WIDEST_START * float(np.median(self.observations.scale2))
         return min(starts, key=lambda start: float(robust_cost(adjuster.squared(start), width).sum()))
 

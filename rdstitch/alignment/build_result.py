@@ -17,6 +17,7 @@ from rdstitch.alignment.planarity import coherence, judge_relief
 from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, Poses
 from rdstitch.alignment.rotation_frame import levelled
 from rdstitch.alignment.rotation_model import ROTATION
+from rdstitch.alignment.sandwich import sandwich_std
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS, Camera
 from rdstitch.matching.distortion_consensus import Consensus
@@ -66,7 +67,7 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
     problem, fit = found.problem, found.choice.fit
     adjusted, planar = fit.adjusted, isinstance(fit.model, PlanarModel)
     shared, lens = fit.model.natural(adjusted.parameters.shared)[0], adjusted.parameters.lens
-    covariance = adjusted.covariance
+    covariance = adjusted.covariance * _inflation(found)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     names = (*fit.model.shared_names, *(n for n, free in zip(LENS_PARAMETERS, problem.free_lens, strict=True) if free))
     focal = float(np.exp(shared[-1])) if fit.model.shared_names else None
@@ -105,6 +106,17 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
         relief=relief,
         messages=_warnings(found),
     )
+
+
+def _inflation(found: AdjustedPictures) -> float:
+    """How much larger variances are than the normal equations say, since errors are no independent noise."""
+    fit, adjusted = found.choice.fit, found.choice.fit.adjusted
+    if not (found.observable and found.problem.free_lens[0]):
+        return 1.0
+    distortion = len(fit.model.shared_names)
+    stated = float(adjusted.covariance[distortion, distortion])
+    adjuster = found.problem.adjuster(fit.model, fit.tilt_spread or 1.0)
+    return max(1.0, sandwich_std(adjuster, adjusted) ** 2 / max(stated, 1e-300))
 
 
 def _lens_covariance(names: Sequence[str], covariance: FloatArray) -> FloatArray:

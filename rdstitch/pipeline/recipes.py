@@ -16,6 +16,7 @@ from rdstitch.inputs.find import FoundPictures, found_pictures
 from rdstitch.inputs.frame import Frame, Images, as_inputs, files_of
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.masks import with_masks
+from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.atomic import check_distinct, check_output, json_bytes, text_bytes
 from rdstitch.io.outputs import Outputs

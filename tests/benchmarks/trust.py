@@ -12,9 +12,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from tests.adverse_sets import ADVERSE, SOLVABLE_ADVERSE
-from tests.trust_sets import HOPELESS, ODD, SOLVABLE, Judged, judge_set, trust_set
+from tests.trust_sets import HOPELESS, ODD, SOLVABLE, SPOILED, Judged, judge_set, trust_set
 
-_SOLVABLE = (*SOLVABLE, *ODD, *SOLVABLE_ADVERSE)
+_SOLVABLE = (*SOLVABLE, *ODD, *SPOILED, *SOLVABLE_ADVERSE)
 _OTHERS = (*HOPELESS, *(kind for kind in ADVERSE if kind not in SOLVABLE_ADVERSE))
 
 
