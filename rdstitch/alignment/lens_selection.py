@@ -34,7 +34,7 @@ LENSES: dict[str, tuple[str, ...]] = {
 CENTER = np.array([name.startswith("center") for name in LENS_PARAMETERS])
 """Which of :data:`rdstitch.camera.LENS_PARAMETERS` are the distortion centre, shape (5,)."""
 
-_EXACTNESS = 0.1
+EXACTNESS = 0.1
 """Pixels: how exactly a lens and a plane can be described at all."""
 
 _FARTHEST_CENTER = 0.08
@@ -179,7 +179,7 @@ class _Judge:
         counted = ~misfitting_links(squared, observations)[observations.link]
         freedom = max(1.0 - 4.0 * len(observations) / max(len(errors), 1), 0.1)
         effective = max(2.0 * float((counted & inliers).sum()) / overdispersion, 2.0)
-        noise = math.hypot(sigma / math.sqrt(freedom), _EXACTNESS)
+        noise = math.hypot(sigma / math.sqrt(freedom), EXACTNESS)
         return cls(observations, noise, overdispersion, counted, effective, _parts(observations))
 
     def misfit(self, fit: BundleAdjustmentResult) -> FloatArray:

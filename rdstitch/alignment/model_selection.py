@@ -21,14 +21,11 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.bundle_adjustment import WIDTH_PER_SIGMA, sigma_of
 from rdstitch.alignment.cycle_consistency import misfitting_links
-from rdstitch.alignment.lens_selection import is_plausible
+from rdstitch.alignment.lens_selection import EXACTNESS, is_plausible
 from rdstitch.alignment.motion_models import HOMOGRAPHY, LOG_HEIGHT, MODELS, POSE, PSI, THETA, Model, metric_poses
 from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.planarity import coherence
 from rdstitch.arrays import BoolArray, FloatArray
-
-_EXACTNESS = 0.1
-"""px: how exactly a lens and a plane can be described at all."""
 
 _LEAST_RATIO = 1.5
 """Times by which the errors of one camera must exceed those of free homographies."""
@@ -92,7 +89,7 @@ def _cannot_gain(bound: "NoiseModel", problem: Problem, fits: Sequence[Fit], mod
     """Whether free homographies could not leave errors so much smaller that they would be taken."""
     if model is not HOMOGRAPHY or not fits or problem.count == 2:
         return False
-    least = min(math.hypot(fit.adjusted.sigma, _EXACTNESS) for fit in fits)
+    least = min(math.hypot(fit.adjusted.sigma, EXACTNESS) for fit in fits)
     return least < _LEAST_RATIO * bound.noise
 
 
@@ -103,7 +100,7 @@ def _beyond_one_camera(problem: Problem, camera: Fit, free: Fit) -> bool:
     ``n log σ² + k log n`` decides (Schwarz's criterion). Two pictures need no more than one homography.
     """
     noise = NoiseModel.of_fit(problem, camera)
-    variance = [fit.adjusted.sigma**2 + _EXACTNESS**2 for fit in (camera, free)]
+    variance = [fit.adjusted.sigma**2 + EXACTNESS**2 for fit in (camera, free)]
     count = [NoiseModel.parameters(problem, fit.model, fit.free_lens) for fit in (camera, free)]
     gain = noise.effective * math.log(variance[0] / variance[1])
     earned = gain > (count[1] - count[0]) * math.log(noise.effective)
@@ -158,7 +155,7 @@ class NoiseModel:
         overdispersion = coherence(problem.observations, errors, inliers).overdispersion
         counted = ~misfitting_links(squared, problem.observations)[problem.observations.link]
         effective = max(2.0 * float((counted & inliers).sum()) / overdispersion, 2.0)
-        return cls(math.hypot(sigma * enlarged, _EXACTNESS), overdispersion, counted, effective)
+        return cls(math.hypot(sigma * enlarged, EXACTNESS), overdispersion, counted, effective)
 
     def misfit(self, squared: FloatArray) -> float:
         """Robust sum of squared errors in units of the noise."""
