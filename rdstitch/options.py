@@ -11,6 +11,7 @@ from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.frame import ChannelOrder
+from rdstitch.local_alignment import MOST_CELLS, Choice
 from rdstitch.matching.options import MatchingOptions, PairOptions
 from rdstitch.robust import SOLVERS
 
@@ -64,6 +65,9 @@ class StitchOptions:
         used; empty for all.
     reference : str, optional
         Name of the picture whose frame is kept; None: the best connected.
+    local_alignment : "auto", "off" or int
+        Smooth displacements of the pictures where the ground is rough: where held-out matches come nearer by them,
+        never, or always, with so many cells along the longer side of a picture.
     composite : CompositeOptions
         How the pictures are put together.
     cache : path, optional
@@ -109,6 +113,7 @@ class StitchOptions:
     exclude: tuple[str, ...] = ()
     include_only: tuple[str, ...] = ()
     reference: str | None = None
+    local_alignment: Choice = "auto"
     composite: CompositeOptions = field(default_factory=CompositeOptions)
     cache: Path | None = None
     seed: int = 0
@@ -143,6 +148,10 @@ class StitchOptions:
             raise ArgumentError("threshold and max_iterations must be positive, confidence between 0 and 1")
         if not self.threshold <= _MAX_THRESHOLD:
             raise ArgumentError(f"the threshold of an inlier must be at most {_MAX_THRESHOLD:g} pixels")
+        if isinstance(self.local_alignment, int) and not 2 <= self.local_alignment <= MOST_CELLS:
+            raise ArgumentError(f"local_alignment has from 2 to {MOST_CELLS} cells, not {self.local_alignment}")
+        if isinstance(self.local_alignment, str) and self.local_alignment not in ("auto", "off"):
+            raise ArgumentError(f"local_alignment is auto, off or a number of cells, not {self.local_alignment!r}")
         if self.workers < 0 or self.seed < 0:
             raise ArgumentError("workers and seed must not be negative")
         if self.workers > _MAX_WORKERS:

@@ -1,11 +1,13 @@
 """What stitching gives."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from rdstitch.compositing import Canvas, Composite, CompositePlan
 from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.io.fingerprint import Fingerprint
+from rdstitch.local_alignment import LocalAlignment, no_local_alignment
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.output_image import OutputImage
@@ -31,6 +33,8 @@ class StitchResult(OutputImage):
         Of a dry run.
     fingerprint : Fingerprint or None
         Size and digest of the file.
+    local_alignment : LocalAlignment
+        Displacement fields of the pictures that are used, in their order.
     """
 
     registration: Registration
@@ -40,6 +44,7 @@ class StitchResult(OutputImage):
     composite: Composite | None = None
     plan: CompositePlan | None = None
     fingerprint: Fingerprint | None = None
+    local_alignment: LocalAlignment = field(default_factory=partial(no_local_alignment, "not tried"))
 
     @property
     def ok(self) -> bool:

@@ -38,6 +38,7 @@ _GROUPS = {
         "rotate",
         "crop",
         "max_size",
+        "local_alignment",
         "exposure",
         "seam",
         "blend",

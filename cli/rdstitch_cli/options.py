@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import click
 from click.core import ParameterSource
 
-from rdstitch_cli.parameter_types import Angle, Angles, Bytes, FileOr, UserPath
+from rdstitch_cli.parameter_types import Angle, Angles, Bytes, FileOr, UserPath, WordOrNumber
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 Decorator = Callable[[Command], Command]
@@ -206,6 +206,16 @@ preview = click.option(
     is_flag=True,
     help="A quick small picture: at most 1200 pixels, few features of small versions of the pictures, straight seams; "
     "options that are given stay as they are.",
+)
+
+local_alignment = click.option(
+    "--local-alignment",
+    type=WordOrNumber(("auto", "off"), 2, 100),
+    metavar="auto|off|N",
+    default="auto",
+    show_default=True,
+    help="Where the ground is not quite a plane, bring pictures together by a smooth displacement of each: auto where "
+    "matches that took no part in it come nearer; a number of cells along the longer side of a picture: always.",
 )
 
 compositing = together(

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -54,6 +55,31 @@ class FileOr(UserPath):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Keep the word; of anything else, make a path."""
         return value if value == self.word else super().convert(value, param, ctx)
+
+
+class WordOrNumber(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
+    """One of some words, or a whole number within limits."""
+
+    name = "integer"
+
+    def __init__(self, words: Sequence[str], least: int, most: int) -> None:
+        self.words, self.least, self.most = words, least, most
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str | int:
+        """Parse the text."""
+        if value in self.words:
+            return str(value)
+        try:
+            number = int(str(value))
+        except ValueError:
+            number = self.least - 1
+        if not self.least <= number <= self.most:
+            self.fail(
+                f"{value!r} is neither {' nor '.join(self.words)} nor a number from {self.least} to {self.most}",
+                param,
+                ctx,
+            )
+        return number
 
 
 class Bytes(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only

@@ -36,9 +36,6 @@ _ROUNDS = 5
 # distance of the first by the third, in pictures.
 _OWN_SIGMA, _GAIN_SIGMA = 0.02, 0.3
 _RISE_SIGMA, _BEND_SIGMA = 0.1, 0.5
-# Own brightness is that of a picture and its neighbours, weighted by a Gaussian of this standard deviation, in
-# pictures: what one picture alone is brighter by is to vanish.
-_NEIGHBOURHOOD = 0.3
 # From here on, as a share of the full range, brightened samples are compressed instead of clipped.
 _KNEE = 0.75
 _MEDIAN_SAMPLES, _MEDIAN_ROUNDS = 2000, 4
@@ -68,7 +65,7 @@ def estimate_exposure(
     if cells is not None:
         wanted, sigma = np.zeros_like(exposure.log_gain), _GAIN_SIGMA
         if choice == "balanced":
-            wanted, sigma = -_brightness_around(survey, exposure.log_gain), _OWN_SIGMA
+            wanted, sigma = -_brightness_around(cells, exposure.log_gain), _OWN_SIGMA
         exposure = replace(exposure, fields=_fit_fields(cells, exposure, cameras, wanted, sigma))
     if choice == "balanced" and any(t is not None and t.pixels.dtype.kind == "u" for t in survey.tiles):
         exposure = replace(exposure, knee=_KNEE)
@@ -79,7 +76,8 @@ def estimate_exposure(
 class _Cells:
     """Cells that two pictures show: pictures (M,), measured px of the middle in either (M, 2), difference (M, C).
 
-    The difference is what the first picture is brighter by, log units.
+    The difference is what the first picture is brighter by, log units; the overlap (N, N) of two pictures the share of
+    the smaller one.
     """
 
     first: NDArray[np.intp]
@@ -87,17 +85,20 @@ class _Cells:
     point1: FloatArray
     point2: FloatArray
     difference: FloatArray
+    overlap: FloatArray
 
 
 def _compare(survey: Survey, exposure: Exposure) -> _Cells | None:
     """Means of the cells of every overlap, clipped samples included: a burnt-out sky must not end in a step either."""
     tiles = survey.tiles
     found: list[tuple[Any, ...]] = []
+    overlap = np.zeros((len(tiles), len(tiles)))
     for i, a in enumerate(tiles):
         for j, b in enumerate(tiles[:i]):
             if a is None or b is None or (box := intersection(a.box, b.box)) is None:
                 continue
             seen = cut(a.inside, a.box, box) & cut(b.inside, b.box, box)
+            overlap[i, j] = overlap[j, i] = seen.sum() / min(a.inside.sum(), b.inside.sum())
             side = max(2, round(max(*seen.shape, *a.inside.shape, *b.inside.shape) / _CELLS))
             count, x, y = _cell_means(seen, box, side)
             means = [_cell_values(tile, box, seen, side) for tile in (a, b)]
@@ -111,7 +112,8 @@ def _compare(survey: Survey, exposure: Exposure) -> _Cells | None:
         return None
     cells = [np.concatenate([entry[k] for entry in found]) for k in range(5)]
     good = np.isfinite(cells[2]).all(axis=1) & np.isfinite(cells[3]).all(axis=1)
-    return _Cells(*(values[good] for values in cells))
+    first, second, point1, point2, difference = (values[good] for values in cells)
+    return _Cells(first, second, point1, point2, difference, overlap)
 
 
 def _cell_means(seen: NDArray[np.bool_], box: Box, side: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -136,14 +138,14 @@ def _cell_sums(values: FloatArray, side: int) -> FloatArray:
     return np.asarray(np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1), dtype=np.float64)
 
 
-def _brightness_around(survey: Survey, log_gain: FloatArray) -> FloatArray:
-    """What each picture and its neighbours are brighter by than the average, (N, C)."""
-    boxes = np.array([(0, 0, 0, 0) if tile is None else tile.box for tile in survey.tiles], dtype=np.float64)
-    centers, present = (boxes[:, :2] + boxes[:, 2:]) / 2.0, np.array([tile is not None for tile in survey.tiles])
-    size = float(np.median(np.sqrt(np.prod(boxes[present, 2:] - boxes[present, :2], axis=1))))
-    distance = np.linalg.norm(centers[:, None] - centers, axis=-1) / (_NEIGHBOURHOOD * size)
-    weight = np.exp(-0.5 * distance**2) * present
-    return np.asarray(weight @ log_gain / np.maximum(weight.sum(axis=1), 1e-12)[:, None])
+def _brightness_around(cells: _Cells, log_gain: FloatArray) -> FloatArray:
+    """What each picture and its neighbours are brighter by than the average, (N, C).
+
+    Neighbours count by the share that they have in common with the picture: what one picture alone is brighter by is to
+    vanish.
+    """
+    weight = cells.overlap + np.eye(len(log_gain))
+    return np.asarray(weight @ log_gain / weight.sum(axis=1)[:, None])
 
 
 def _fit_fields(

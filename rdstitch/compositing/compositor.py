@@ -16,6 +16,7 @@ from rdstitch.compositing.photo_sphere import photo_sphere_xmp
 from rdstitch.compositing.photometric import Exposure
 from rdstitch.compositing.preparation import OutputStrip, Progress, prepare
 from rdstitch.compositing.source_images import Preview, Source
+from rdstitch.compositing.warp import Displacement
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.io.layout import Layout
 from rdstitch.io.metadata import Metadata
@@ -87,6 +88,7 @@ def compose(
     progress: Progress | None = None,
     previews: Sequence[Preview] | None = None,
     exposures: Sequence[float | None] | None = None,
+    displacements: Sequence[Displacement | None] | None = None,
 ) -> Composite:
     """Put pictures together on a canvas, in memory.
 
@@ -108,6 +110,8 @@ def compose(
         otherwise the whole pictures are read once more, for what is decided on small versions of them.
     exposures : sequence of float or None, optional
         Exposure of each picture as the camera wrote it down (time x sensitivity / f-number²), up to a common factor.
+    displacements : sequence of callables or None, optional
+        Of each picture, what local alignment adds to its measured px; see :class:`rdstitch.compositing.warp.Warp`.
 
     Returns
     -------
@@ -122,7 +126,9 @@ def compose(
     LimitError
         When the memory limit is too low.
     """
-    with prepare(sources, cameras, homographies, canvas, options, progress, previews, exposures) as prepared:
+    with prepare(
+        sources, cameras, homographies, canvas, options, progress, previews, exposures, displacements
+    ) as prepared:
         renderer, (width, height) = prepared.renderer, prepared.canvas.size
         pixels = np.zeros((height, width, renderer.channels), dtype=renderer.dtype)
         alpha = np.zeros((height, width), dtype=np.uint8)
@@ -147,6 +153,7 @@ def compose_to_file(
     extra_tags: Callable[[Canvas], Iterable[ExtraTag]] | None = None,
     previews: Sequence[Preview] | None = None,
     exposures: Sequence[float | None] | None = None,
+    displacements: Sequence[Displacement | None] | None = None,
     *,
     outputs: Outputs | None = None,
 ) -> FileComposite:
@@ -157,7 +164,7 @@ def compose_to_file(
     path
         ``.tif`` (tiled, with overviews, BigTIFF where needed), ``.dzi`` (Deep Zoom), ``.png``, ``.jpg``, or ``.webp``
         (held in memory whole).
-    sources, cameras, homographies, canvas, options, progress, previews, exposures
+    sources, cameras, homographies, canvas, options, progress, previews, exposures, displacements
         As for :func:`compose`.
     metadata : Metadata, optional
         Colour profile, EXIF and resolution to keep.
@@ -181,7 +188,9 @@ def compose_to_file(
             covered += int(np.count_nonzero(alpha))
             yield samples, alpha
 
-    with prepare(sources, cameras, homographies, canvas, options, progress, previews, exposures) as prepared:
+    with prepare(
+        sources, cameras, homographies, canvas, options, progress, previews, exposures, displacements
+    ) as prepared:
         renderer, size = prepared.renderer, prepared.canvas.size
         layout = Layout(
             size,

@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.survey import Survey
-from rdstitch.compositing.warp import locate, plan_warp
+from rdstitch.compositing.warp import Warp, locate, plan_warps
 
 # Coverage is looked at with this many px along the longer side of the canvas.
 _RESOLUTION = 1500
@@ -20,7 +19,7 @@ _LEAST_KEPT = 0.25
 
 
 def coverage_map(
-    cameras: Sequence[Camera], homographies: FloatArray, canvas: Canvas, survey: Survey | None = None
+    warps: Sequence[Warp], homographies: FloatArray, canvas: Canvas, survey: Survey | None = None
 ) -> tuple[NDArray[np.bool_], int]:
     """Which px of a reduced canvas are covered, and the reduction; with the masks of a survey where there is one."""
     if survey is not None:
@@ -34,8 +33,8 @@ def coverage_map(
     factor = max(1, -(-max(canvas.size) // _RESOLUTION))
     small = canvas.reduced(factor)
     covered = np.zeros(small.size[::-1], dtype=np.bool_)
-    for index, (camera, matrix) in enumerate(zip(cameras, homographies, strict=True)):
-        warp = plan_warp(camera, matrix, small, index)
+    cameras, displacements = [warp.camera for warp in warps], [warp.displacement for warp in warps]
+    for warp in plan_warps(cameras, homographies, small, displacements):
         x0, y0, x1, y1 = warp.box
         covered[y0:y1, x0:x1] |= locate(warp, warp.box).inside
     return covered, factor

@@ -29,7 +29,7 @@ from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seam_finder import find_seams
 from rdstitch.compositing.source_images import PictureReader, Preview, Source
 from rdstitch.compositing.survey import survey_factor, survey_pictures
-from rdstitch.compositing.warp import plan_warp
+from rdstitch.compositing.warp import Displacement, plan_warps
 from rdstitch.errors import ArgumentError
 from rdstitch.io.layout import STRIP_ROWS
 from rdstitch.opencv_state import one_opencv_thread
@@ -133,6 +133,7 @@ def prepare(
     progress: Progress | None = None,
     previews: Sequence[Preview] | None = None,
     exposures: Sequence[float | None] | None = None,
+    displacements: Sequence[Displacement | None] | None = None,
 ) -> Iterator[Prepared]:
     """Decide on exposure, seams and cropping, from one small look at each picture; see :func:`compose`.
 
@@ -147,7 +148,7 @@ def prepare(
     plan = plan_composite(cameras, canvas, options, channels, dtype.itemsize)
     if canvas.period is not None:
         canvas = canvas.widened(_wrap_margin(canvas, plan.bands))
-    warps = [plan_warp(c, g, canvas, k) for k, (c, g) in enumerate(zip(cameras, matrices, strict=True))]
+    warps = plan_warps(cameras, matrices, canvas, displacements)
     pictures = PictureCache(reader, [w.shrink for w in warps], plan.cache_bytes, ahead=plan.workers > 1)
     with closing(pictures):
         same = no_exposure(len(cameras), channels)
@@ -171,7 +172,13 @@ def _decided(
     seams = survey = None
     if len(cameras) > 1 and (options.exposure != "none" or options.seam != "none"):
         survey = survey_pictures(
-            reader, cameras, homographies, canvas, min(plan.workers, _READERS), _part_of(progress, 0.0, 0.7)
+            reader,
+            cameras,
+            homographies,
+            canvas,
+            min(plan.workers, _READERS),
+            _part_of(progress, 0.0, 0.7),
+            [warp.displacement for warp in warps],
         )
         # The first tiles will ask for most of them, however the seams run.
         topmost = [index for index, warp in enumerate(warps) if warp.box[1] < plan.tile_size]
@@ -186,7 +193,7 @@ def _decided(
                 seams = replace(seams, softness=max(1, (1 << plan.bands) // (2 * seams.factor)))
     box, note = _unwidened(canvas), ""
     if options.crop == "auto":
-        covered, factor = coverage_map(cameras, homographies, canvas, survey)
+        covered, factor = coverage_map(warps, homographies, canvas, survey)
         find = crop_box if box is None else partial(crop_rows, whole=box)
         found, note = find(covered, factor, canvas.size)
         box = found or box

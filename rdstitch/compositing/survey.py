@@ -15,10 +15,11 @@ from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.source_images import PictureReader
 from rdstitch.compositing.warp import (
+    Displacement,
     Warp,
     border_weight,
     locate,
-    plan_warp,
+    plan_warps,
     sample,
     sample_opacity,
 )
@@ -86,11 +87,12 @@ def survey_pictures(
     canvas: Canvas,
     workers: int = 1,
     progress: Callable[[float], None] | None = None,
+    displacements: Sequence[Displacement | None] | None = None,
 ) -> Survey:
     """Read every picture once, ``workers`` at a time, and lay it, small, on the reduced canvas."""
     factor = survey_factor(canvas)
     small = canvas.reduced(factor)
-    warps = tuple(plan_warp(c, g, small, k) for k, (c, g) in enumerate(zip(cameras, homographies, strict=True)))
+    warps = tuple(plan_warps(cameras, homographies, small, displacements))
     tiles = []
     with ThreadPoolExecutor(workers) as pool:
         for tile in pool.map(partial(_survey_tile, reader), range(len(warps)), warps):

@@ -1,6 +1,7 @@
 """One resampling from the original: canvas px → plane → undistorted → measured px of one picture."""
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.compositing.boxes import Box, Float32Array, encloses
+from rdstitch.compositing.boxes import Box, Float32Array, encloses, grown, intersection
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.lattice import LATTICE_STEPS, Lattice
 from rdstitch.compositing.projection import PLANE, Projection
@@ -27,6 +28,10 @@ _LATTICE_ERROR = 0.01
 _TOO_LONG = 32767
 _PROBES = 16
 _LEAST_WEIGHT = np.float32(1e-6)
+
+
+Displacement = Callable[[FloatArray], FloatArray]
+"""Displacement of a picture's content, px (..., 2), at measured px (..., 2): what local alignment found."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +75,8 @@ class Warp:
         Picture px per canvas px (median over the picture); above 1 the picture gets smaller.
     surface : Surface or None
         What gives directions to canvas px; None where the canvas is a plane.
+    displacement : callable, optional
+        Added to the measured px.
     """
 
     camera: Camera
@@ -78,6 +85,7 @@ class Warp:
     step: int
     shrink: float
     surface: "Surface | None" = None
+    displacement: Displacement | None = None
 
     def source_points(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Measured px (..., 2) of the picture at canvas px ``x``, ``y``; NaN where there are none."""
@@ -93,7 +101,8 @@ class Warp:
             z = np.where(z > 0.0, z, np.nan)
             u = (m[0, 0] * dx + m[0, 1] * dy + m[0, 2] * dz) / z
             v = (m[1, 0] * dx + m[1, 1] * dy + m[1, 2] * dz) / z
-        return self.camera.distort(self.camera.denormalize(np.stack([u, v], axis=-1)))
+        points = self.camera.distort(self.camera.denormalize(np.stack([u, v], axis=-1)))
+        return points if self.displacement is None else points + self.displacement(points)
 
     def contains(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
         """Which measured px lie in the picture; NaN does not."""
@@ -147,14 +156,16 @@ class Geometry:
         return locate(self.warp, box)
 
 
-def plan_warp(camera: Camera, homography: FloatArray, canvas: Canvas, index: int) -> Warp:
+def plan_warp(
+    camera: Camera, homography: FloatArray, canvas: Canvas, index: int, displacement: Displacement | None = None
+) -> Warp:
     """Everything about the resampling of picture ``index`` that does not depend on the tile."""
     if canvas.projection != PLANE:
         surface = Surface(canvas.projection, np.asarray(np.linalg.inv(canvas.matrix), dtype=np.float64))
         from_directions = np.asarray(np.linalg.inv(homography), dtype=np.float64)
-        draft = Warp(camera, from_directions, canvas.boxes()[index], 1, 1.0, surface)
+        draft = Warp(camera, from_directions, canvas.boxes()[index], 1, 1.0, surface, displacement)
         probes = canvas.place(camera, homography, np.concatenate([_grid(camera), camera.outline(_PROBES)]))
-        return replace(draft, step=_lattice_step(draft, probes), shrink=_shrink(draft, probes))
+        return _measured(draft, probes, canvas)
     to_canvas = canvas.matrix @ homography
     from_canvas = np.asarray(np.linalg.inv(to_canvas), dtype=np.float64)
     outline = canvas.footprints[index]
@@ -162,9 +173,34 @@ def plan_warp(camera: Camera, homography: FloatArray, canvas: Canvas, index: int
     if from_canvas[2] @ np.array([*outline.mean(axis=0), 1.0]) < 0:
         to_canvas, from_canvas = -to_canvas, -from_canvas
     box = canvas.boxes()[index]
-    draft = Warp(camera, from_canvas, box, 1, 1.0)
+    draft = Warp(camera, from_canvas, box, 1, 1.0, None, displacement)
     probes = _probes(camera, to_canvas, outline)
-    return Warp(camera, from_canvas, box, _lattice_step(draft, probes), _shrink(draft, probes))
+    return _measured(draft, probes, canvas)
+
+
+def _measured(draft: Warp, probes: FloatArray, canvas: Canvas) -> Warp:
+    """The warp with its box, and with the spacing and the shrinkage that it has at canvas px all over the picture."""
+    draft = replace(draft, shrink=_shrink(draft, probes))
+    return replace(draft, box=_reached(draft, canvas), step=_lattice_step(draft, probes))
+
+
+def _reached(warp: Warp, canvas: Canvas) -> Box:
+    """The warp's box with room for what a displacement moves beyond it."""
+    if warp.displacement is None:
+        return warp.box
+    moved = np.abs(warp.displacement(warp.camera.outline(_PROBES))).max() / warp.shrink
+    return intersection(grown(warp.box, int(np.ceil(moved)) + 1), (0, 0, *canvas.size)) or warp.box
+
+
+def plan_warps(
+    cameras: Sequence[Camera],
+    homographies: FloatArray,
+    canvas: Canvas,
+    displacements: Sequence[Displacement | None] | None = None,
+) -> list[Warp]:
+    """The warps of all pictures."""
+    each = zip(cameras, homographies, displacements or [None] * len(cameras), strict=True)
+    return [plan_warp(camera, matrix, canvas, k, moved) for k, (camera, matrix, moved) in enumerate(each)]
 
 
 def locate(warp: Warp, box: Box) -> Geometry:

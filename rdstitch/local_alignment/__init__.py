@@ -1,7 +1,23 @@
 """Local alignment: a smooth residual warp per picture, where the ground is not quite a plane."""
 
-from rdstitch.local_alignment.estimate import LocalAlignment, align_locally, no_local_alignment
+from rdstitch.local_alignment.estimate import (
+    MOST_CELLS,
+    Choice,
+    HeldOut,
+    LocalAlignment,
+    align_locally,
+    no_local_alignment,
+)
 from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.matches import Match
 
-__all__ = ["DisplacementField", "LocalAlignment", "Match", "align_locally", "no_local_alignment"]
+__all__ = [
+    "MOST_CELLS",
+    "Choice",
+    "DisplacementField",
+    "HeldOut",
+    "LocalAlignment",
+    "Match",
+    "align_locally",
+    "no_local_alignment",
+]

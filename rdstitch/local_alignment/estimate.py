@@ -14,9 +14,10 @@ from rdstitch.local_alignment.matches import Match, PlaneMatches, place_matches,
 
 Choice = Literal["auto", "off"] | int
 
+MOST_CELLS = 100
 _CELLS = 12
 # The stiffest fields first: they are taken unless freer ones are better by a share that matters.
-_SLOPES = (0.005, 0.02, 0.06)
+_SLOPES = (0.02, 0.06, 0.2)
 _HELD_OUT = 5  # every so many-th match
 # Share by which held-out residuals must get smaller for local alignment to be worth while, and for freer fields.
 _WORTHWHILE, _BETTER = 0.15, 0.03

@@ -19,6 +19,7 @@ from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.atomic import check_output, json_bytes
 from rdstitch.io.decoding import check_readable
 from rdstitch.io.outputs import Outputs
+from rdstitch.local_alignment import DisplacementField
 from rdstitch.messages import Message
 from rdstitch.messages import left_out as left_out_message
 from rdstitch.options import StitchOptions
@@ -113,6 +114,7 @@ def apply(
             options,
             threads,
             progress,
+            displacements=[_displacement(saved, index, source) for index, source in used.items()],
             overwrite=overwrite,
             outputs=outputs,
             dry_run=dry_run,
@@ -149,6 +151,12 @@ def _used(
         first = next(iter(left_out.values()))
         raise InputError(f"{saved.path}: none of its pictures can be used; {first.images[0]}: {first.text}")
     return dict(zip(used, with_masks(list(used.values()), mask), strict=True))
+
+
+def _displacement(saved: SavedRegistration, index: int, source: Source) -> DisplacementField | None:
+    """The displacement of a picture of the registration for the one that takes its place."""
+    field = saved.pictures[index].displacement
+    return None if field is None else field.resized(source.camera.image_size)
 
 
 def _check_outputs(output: Path, overwrite: bool, inputs: Sequence[Path], sidecar: Path) -> None:

@@ -22,6 +22,7 @@ from rdstitch.compositing import (
     plan_panorama,
 )
 from rdstitch.compositing.near_part import NearPart
+from rdstitch.compositing.warp import Displacement
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference, georeference, has_place, world_file_paths
 from rdstitch.inputs.source import Source, readers
@@ -74,6 +75,7 @@ def compose_pictures(
     threads: int,
     progress: Progress,
     *,
+    displacements: Sequence[Displacement | None] | None = None,
     overwrite: bool,
     outputs: Outputs,
     dry_run: bool = False,
@@ -95,6 +97,8 @@ def compose_pictures(
     options : CompositeOptions
     threads : int
     progress : callable
+    displacements : sequence of callables or None, optional
+        What local alignment adds to the measured pixels of each picture.
     overwrite : bool
         Replace an existing world file.
     outputs : Outputs
@@ -143,7 +147,7 @@ def compose_pictures(
         progress("compositing", round(100 * share), 100)
 
     if output is None:
-        composite = compose(read, cameras, homographies, canvas, options, told, read, exposures)
+        composite = compose(read, cameras, homographies, canvas, options, told, read, exposures, displacements)
         return Composed(composite.canvas, composite, notes=composite.notes)
     placed: list[tuple[Georeference | None, str]] = []
 
@@ -163,6 +167,7 @@ def compose_pictures(
         tags,
         read,
         exposures,
+        displacements,
         outputs=outputs,
     )
     place, note = placed[0]

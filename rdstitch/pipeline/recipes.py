@@ -23,6 +23,7 @@ from rdstitch.io.outputs import Outputs
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.accept import accept
+from rdstitch.pipeline.align_locally import align_registration_locally
 from rdstitch.pipeline.compose import compose_pictures
 from rdstitch.pipeline.register import register, with_frontal_reference
 from rdstitch.progress import Progress, silent
@@ -264,6 +265,7 @@ def _composite(
     registration = with_frontal_reference(accept(registration, options), options, always=frontal)
     alignment = registration.alignment
     used = np.flatnonzero(alignment.used)
+    local = align_registration_locally(registration, options.local_alignment)
     with Outputs(options.overwrite) as outputs:
         composed = compose_pictures(
             [registration.sources[i] for i in used],
@@ -274,6 +276,7 @@ def _composite(
             options.composite,
             options.threads,
             progress,
+            displacements=local.fields or None,
             overwrite=options.overwrite,
             outputs=outputs,
             dry_run=options.dry_run,
@@ -288,6 +291,7 @@ def _composite(
             composed.composite,
             composed.plan,
             composed.fingerprint,
+            local,
         )
         if not options.dry_run:
             _save_camera(registration, options, outputs)

@@ -10,6 +10,7 @@ from rdstitch.registration import Registration
 from rdstitch.report.camera_path import path_over_plane
 from rdstitch.report.grid import grid
 from rdstitch.report.lens_curve import lens_curve
+from rdstitch.report.local_alignment import local_alignment
 from rdstitch.report.match_graph import match_graph
 from rdstitch.report.matched import matched
 from rdstitch.report.mosaic import mosaic
@@ -71,6 +72,7 @@ def report_page(result: StitchResult | Registration, stages: Sequence[tuple[str,
         lens_curve(registration),
         matched(registration),
         residual_map(registration),
+        "" if stitched is None or stitched.plan is not None else local_alignment(stitched),
         path_over_plane(registration),
         timings(stages),
     ]

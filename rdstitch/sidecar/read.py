@@ -5,6 +5,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
+import numpy as np
+
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import FOCAL_LOG_STD, Camera, read_coefficients
 from rdstitch.compositing import CompositeOptions
@@ -12,6 +14,7 @@ from rdstitch.compositing.options import PROJECTIONS
 from rdstitch.errors import ArgumentError
 from rdstitch.io.deepzoom import tiles_folder
 from rdstitch.io.fingerprint import Fingerprint, fingerprint
+from rdstitch.local_alignment import DisplacementField
 from rdstitch.records import Record, read_json
 from rdstitch.sidecar.write import VERSION
 
@@ -31,6 +34,8 @@ class SavedPicture:
         was left out.
     reason : str
         Why it was left out; empty where it was used.
+    displacement : DisplacementField or None
+        What local alignment found; None where the picture was not aligned locally.
     """
 
     name: str
@@ -38,6 +43,7 @@ class SavedPicture:
     camera: Camera | None
     to_plane: FloatArray | None
     reason: str
+    displacement: DisplacementField | None = None
 
 
 @dataclass(frozen=True)
@@ -129,7 +135,24 @@ def _picture(record: Record) -> SavedPicture:
     if used and camera is None:
         record["size"].expected("width and height of a picture that was used")
     to_plane = record["to_plane"].matrix() if used else None
-    return SavedPicture(name, path, camera, to_plane, record["reason"].text())
+    field = record.get("displacement")
+    moved = None if field is None or not used or camera is None else _displacement(field, camera)
+    return SavedPicture(name, path, camera, to_plane, record["reason"].text(), moved)
+
+
+def _displacement(record: Record, camera: Camera) -> DisplacementField:
+    columns, rows = (item.integer(least=2) for item in _two(record["grid"]))
+    nodes = [item.pair() for item in record["px"].items()]
+    if len(nodes) != rows * columns:
+        record["px"].expected(f"{rows * columns} displacements")
+    return DisplacementField(camera.image_size, np.array(nodes, dtype=np.float64).reshape(rows, columns, 2))
+
+
+def _two(record: Record) -> list[Record]:
+    items = list(record.items())
+    if len(items) != 2:
+        record.expected("two numbers")
+    return items
 
 
 def _camera(record: Record) -> Camera:

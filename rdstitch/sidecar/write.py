@@ -15,6 +15,7 @@ from rdstitch.compositing import Canvas
 from rdstitch.compositing.photo_sphere import center_of_view, field_of_view
 from rdstitch.compositing.projection import PLANE
 from rdstitch.io.fingerprint import Fingerprint
+from rdstitch.local_alignment import DisplacementField, LocalAlignment
 from rdstitch.stitch_result import StitchResult
 
 VERSION = 2
@@ -54,6 +55,7 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
             **identity_fields(result.output, result.fingerprint),
             **output_geometry(result.canvas, turned=alignment.on_sphere),
         },
+        "local_alignment": _local_alignment(result.local_alignment),
         "images": _images(result),
         "pairs": _pairs(result),
         "verdict": {
@@ -73,6 +75,7 @@ def _images(result: StitchResult) -> list[dict[str, Any]]:
     registration, alignment = result.registration, result.registration.alignment
     reasons = {Path(missing.images[0]): missing.text for missing in registration.left_out}
     entries = []
+    fields = iter(result.local_alignment.fields)
     for index, source in enumerate(registration.sources):
         used, poses = bool(alignment.used[index]), alignment.poses
         entry: dict[str, Any] = {
@@ -85,6 +88,7 @@ def _images(result: StitchResult) -> list[dict[str, Any]]:
             **lens_fields(alignment.cameras[index]),
             "to_plane": alignment.homographies[index] if used else None,
             "to_output": to_output(result.canvas, alignment.homographies[index]) if used else None,
+            "displacement": displacement(next(fields, None) if used else None),
             "pose": None,
         }
         if used and poses is not None:
@@ -127,6 +131,24 @@ def identity_fields(output: Path | None, written: Fingerprint | None) -> dict[st
         "bytes": None if written is None else written.size,
         "sha256": None if written is None else written.sha256,
     }
+
+
+def _local_alignment(local: LocalAlignment) -> dict[str, Any]:
+    """What local alignment found, beside the displacements, which are with their pictures."""
+    return {
+        "used": bool(local.fields),
+        "reason": local.reason,
+        "cells": local.cells,
+        "held_out_px": {"before": local.before, "after": local.after},
+    }
+
+
+def displacement(field: DisplacementField | None) -> dict[str, Any] | None:
+    """Displacement of one picture: columns and rows of its grid, and px at its nodes, row by row."""
+    if field is None:
+        return None
+    rows, columns, _ = field.values.shape
+    return {"grid": (columns, rows), "px": field.values.reshape(-1, 2)}
 
 
 def lens_fields(camera: Camera) -> dict[str, Any]:

@@ -44,6 +44,16 @@ class Relief:
         if self.height.dtype != np.float32 or not np.isfinite(self.height).all():
             raise ArgumentError("heights must be finite and float32")
 
+    def at(self, points: FloatArray) -> FloatArray:
+        """Heights (N,) at texels (N, 2)."""
+        x, y = np.clip(points, 0.0, np.array(self.height.shape[::-1]) - 1.0).T
+        column, row = (
+            np.minimum(v.astype(np.intp), n - 2) for v, n in zip((x, y), self.height.shape[::-1], strict=True)
+        )
+        a, b = x - column, y - row
+        above, below = ((1.0 - a) * self.height[row + k, column] + a * self.height[row + k, column + 1] for k in (0, 1))
+        return np.asarray((1.0 - b) * above + b * below, dtype=np.float64)
+
     def seen_from(self, position: FloatArray, height: float, foot: FloatArray) -> FloatArray:
         """Texels (..., 2) at which rays first meet the ground, which is interpolated linearly between texels.
 
@@ -67,6 +77,8 @@ class Relief:
         top, bottom = float(self.height.max()), float(self.height.min())
         if top >= height:
             raise ArgumentError(f"the ground is {top:.0f} texels high, the camera only {height:.0f}")
+        if not foot.size:
+            return foot
         # In rows that OpenCV can resample, whatever the shape; the last is filled with rays that meet nothing.
         flat = np.full((-(-foot.size // 2 // _ROW), _ROW, 2), np.nan)
         flat.reshape(-1, 2)[: foot.size // 2] = foot.reshape(-1, 2)

@@ -25,6 +25,8 @@ _PIXELS_PER_STRIP = 400_000
 _MAX_SAMPLES_PER_SIDE = 6
 # A place that is in no picture, for rays that meet nothing.
 _NOWHERE = -1e6
+# A ray that ends so far from a point, texels, does not see it.
+_HIDDEN = 0.5
 # What cubic interpolation needs around a sample, texels.
 _APRON = 3
 
@@ -110,6 +112,17 @@ class Sequence:
     def to_ground(self, index: int, points: ArrayLike) -> FloatArray:
         """Measured px (N, 2) of one picture to the texels that they show; on a plane the same as :meth:`to_plane`."""
         return self._on_ground(index, self.to_plane(index, points))
+
+    def ground_to_picture(self, index: int, points: ArrayLike) -> FloatArray:
+        """Points of the ground, texels (N, 2), to measured px of one picture; NaN where something hides them."""
+        ground = np.asarray(points, dtype=np.float64)
+        if self.relief is None:
+            return self.to_picture(index, ground)
+        position, camera_height = self.poses.position[index], float(self.poses.height[index])
+        share = 1.0 - self.relief.at(ground) / camera_height
+        foot = position + (ground - position) / share[:, None]
+        hidden = np.linalg.norm(self._on_ground(index, foot) - ground, axis=1) > _HIDDEN
+        return np.where(hidden[:, None], np.nan, self.to_picture(index, foot))
 
     def to_picture(self, index: int, points: ArrayLike) -> FloatArray:
         """Points of the plane, texels (N, 2), to measured px of one picture, also outside its border.

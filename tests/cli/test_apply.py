@@ -46,6 +46,36 @@ def test_same_pictures_give_the_same_bytes(rdstitch: Run, frames: list[Path], st
     assert third.read_bytes() == stitched.read_bytes()
 
 
+def test_local_alignment_is_applied_again(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    """With a number of cells it is used on a plane too; there, "auto" is the same as "off", byte for byte."""
+    made = {}
+    for choice in ("auto", "off", "5"):
+        made[choice] = tmp_path / f"{choice}.png"
+        done = rdstitch("mosaic", *frames, "-o", made[choice], "--local-alignment", choice, *FAST)
+        assert done.status == 0
+    assert made["auto"].read_bytes() == made["off"].read_bytes() != made["5"].read_bytes()
+    content = json.loads(_sidecar(made["5"]).read_text(encoding="utf-8"))
+    assert content["local_alignment"]["used"]
+    assert content["images"][0]["displacement"]["grid"] == [6, 5]
+    assert json.loads(_sidecar(made["auto"]).read_text(encoding="utf-8"))["images"][0]["displacement"] is None
+    again = tmp_path / "again.png"
+    assert _apply(rdstitch, _sidecar(made["5"]), frames[0].parent, again).status == 0
+    assert again.read_bytes() == made["5"].read_bytes()
+
+    content["images"][0]["displacement"]["px"].pop()
+    _sidecar(made["5"]).write_text(json.dumps(content), encoding="utf-8")
+    refused = _apply(rdstitch, _sidecar(made["5"]), frames[0].parent, tmp_path / "no.png")
+    assert refused.status == 3
+    assert "displacement.px" in refused.err
+
+
+@pytest.mark.parametrize("text", ["1", "101", "much"])
+def test_what_is_no_grid_is_refused(rdstitch: Run, frames: list[Path], tmp_path: Path, text: str) -> None:
+    done = rdstitch("mosaic", *frames, "-o", tmp_path / "x.png", "--local-alignment", text)
+    assert done.status == 2
+    assert "from 2 to 100" in done.err
+
+
 def test_given_options_win_over_those_of_the_sidecar(
     rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path
 ) -> None:

@@ -5,6 +5,7 @@ import io
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -24,7 +25,8 @@ from tests.cli.running import FAST, Run
 
 _VOID = {"meta", "img"}
 _SECTIONS = ["Summary", "Warnings and left-out pictures", "Mosaic", "Match graph", "Votes on λ", "Lens", "Lens curve"]
-_SECTIONS += ["Matches", "Residuals", "Trajectory", "Timings"]
+_SECTIONS += ["Matches", "Residuals", "Local alignment", "Trajectory", "Timings"]
+_OF_PICTURES = ("Mosaic", "Local alignment")
 
 
 class _Page(HTMLParser):
@@ -97,6 +99,18 @@ def test_a_mosaic_has_every_section(reported: Path, stranger: Path, frames: list
     assert all(frame.name in page.text for frame in frames)
 
 
+def test_displacements_are_drawn_for_each_picture(frames: list[Path]) -> None:
+    options = StitchOptions(workers=1, local_alignment=6)
+    result = pano(frames[:2], options=options)
+    drawn = report_page(result).split("<h2>Local alignment</h2>")[1].split("</section>")[0]
+    assert all(f"{frame.name}: up to {field.largest:.1f} px" in drawn
+               for frame, field in zip(frames, result.local_alignment.fields, strict=False))  # fmt: skip
+    assert drawn.count("<rect") == 2
+    assert "matches held out of the fit" in drawn
+    off = report_page(pano(frames[:2], options=replace(options, local_alignment="off")))
+    assert "the alignment puts them: switched off" in off
+
+
 def test_the_numbers_are_those_of_the_result(frames: list[Path]) -> None:
     result = pano(frames[:2], options=StitchOptions(workers=1))
     page = _checked(report_page(result))
@@ -117,7 +131,7 @@ def test_calibrate_has_no_mosaic(rdstitch: Run, frames: list[Path], tmp_path: Pa
     report = tmp_path / "lens.html"
     done = rdstitch("calibrate", *frames, "-o", tmp_path / "camera.json", "--report", report, *FAST)
     assert done.status == 0
-    headings = [heading for heading in _SECTIONS if heading != "Mosaic"]
+    headings = [heading for heading in _SECTIONS if heading not in _OF_PICTURES]
     assert _checked(report.read_text(encoding="utf-8")).headings == headings
     again = rdstitch("calibrate", *frames, "-o", tmp_path / "b.json", "--report", report, *FAST)
     assert (again.status, str(report) in again.line) == (6, True)
@@ -139,7 +153,7 @@ def test_what_is_refused_is_shown(
     assert rdstitch(*arguments).status == 4
     assert not (tmp_path / output).exists()
     refused = _checked(report.read_text(encoding="utf-8"))
-    assert refused.headings == [heading for heading in _SECTIONS if heading != "Mosaic"]
+    assert refused.headings == [heading for heading in _SECTIONS if heading not in _OF_PICTURES]
     assert "Not to be relied on: the pictures <disagree>" in refused.text
     assert "look at that seam" in refused.text
     assert rdstitch(*arguments, "--force", "--overwrite").status == 0

@@ -1,6 +1,7 @@
 """Tiles, their order, the cache and the number of workers never show in the result."""
 
 import functools
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from rdstitch.compositing import CompositeOptions
 from rdstitch.compositing.blender import MultibandBlender, margin, rounding_constant
 from rdstitch.compositing.boxes import aligned, grown
 from rdstitch.compositing.preparation import Prepared, prepare
+from rdstitch.local_alignment import DisplacementField
 from rdstitch.synthetic.rendering import Photometry
 from tests.compositing_scenes import Scene, render
 
@@ -49,6 +51,24 @@ def test_any_box_is_a_part_of_the_whole(blend: str, seam: str, bits: int, data: 
     pixels, inside = ready.renderer.tile(box)
     np.testing.assert_array_equal(inside, covered[y : box[3], x : box[2]])
     np.testing.assert_array_equal(pixels, whole[y : box[3], x : box[2]])
+
+
+@pytest.mark.parametrize("seam", ["graphcut", "none"])
+def test_any_box_of_locally_aligned_pictures_is_a_part_of_the_whole(seam: str) -> None:
+    scene, rng = _scene(8), np.random.default_rng(5)
+    fields = [DisplacementField((240, 180), rng.normal(0.0, 1.5, (6, 8, 2))) for _ in scene.frames]
+    options = CompositeOptions(seam=seam, max_memory=2**28)  # type: ignore[arg-type]
+    pictures = (scene.sources, scene.cameras, scene.homographies, scene.canvas)
+    with prepare(*pictures, options, displacements=fields) as ready:
+        whole, covered = ready.renderer.tile((0, 0, *scene.canvas.size))
+        for x, y in ((3, 7), (130, 64), (200, 90)):
+            pixels, inside = ready.renderer.tile((x, y, x + 61, y + 43))
+            np.testing.assert_array_equal(inside, covered[y : y + 43, x : x + 61])
+            np.testing.assert_array_equal(pixels, whole[y : y + 43, x : x + 61])
+        moved, straight = (warp.source_points(np.array([200.0]), np.array([150.0])) for warp in
+                           (ready.renderer.warps[0], replace(ready.renderer.warps[0], displacement=None)))  # fmt: skip
+    np.testing.assert_allclose(moved, straight + fields[0](straight))
+    assert (whole != _prepared("multiband", seam, 8)[1]).any()
 
 
 @pytest.mark.parametrize("workers", [1, 3])

@@ -29,6 +29,7 @@ Examples:
 @options.preview
 @options.known
 @options.estimation
+@options.local_alignment
 @options.compositing
 @click.option(
     "--save-camera",

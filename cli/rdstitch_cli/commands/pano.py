@@ -28,6 +28,7 @@ Examples:
 @options.preview
 @options.known
 @options.estimation
+@options.local_alignment
 @options.compositing
 @click.option(
     "--save-camera",

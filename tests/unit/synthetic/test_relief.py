@@ -101,6 +101,17 @@ def test_a_wall_hides_what_is_behind_it_from_one_side_only() -> None:
     np.testing.assert_allclose(from_right, behind, atol=1e-6)
 
 
+@pytest.mark.parametrize("kind", sorted(RELIEFS))
+def test_points_of_the_ground_are_seen_where_rays_meet_them(kind: str) -> None:
+    sequence = over(kind, 0.1)
+    points = np.random.default_rng(7).uniform((5, 5), (314, 234), (200, 2))
+    seen = sequence.ground_to_picture(1, sequence.to_ground(1, points))
+    error = np.linalg.norm(seen - points, axis=1)
+    # Walls have one texel of ground for all their height.
+    assert np.isfinite(error).mean() > 0.8
+    assert np.nanmedian(error) < 0.05
+
+
 def test_ground_as_high_as_the_camera_is_refused() -> None:
     relief = hills((100, 100), 1, height=50.0)
     with pytest.raises(ArgumentError, match="the camera only 40"):

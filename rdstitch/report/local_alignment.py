@@ -1,0 +1,68 @@
+"""What local alignment moved, picture by picture."""
+
+import numpy as np
+
+from rdstitch.local_alignment import DisplacementField
+from rdstitch.report.svg import BLUE, GREY, drawing, element, label, section
+from rdstitch.stitch_result import StitchResult
+
+_WIDTH, _COLUMNS, _GAP, _TEXT = 940.0, 4, 12.0, 18.0
+_ARROWS = 9  # along the longer side of a picture
+_LONGEST = 0.8  # of the distance between arrows, for the largest displacement of all pictures
+_MOST_PICTURES = 60
+
+
+def local_alignment(result: StitchResult) -> str:
+    """A section with the displacement field of each picture, and how much all of them mended."""
+    local = result.local_alignment
+    title = "Local alignment"
+    if not local.fields:
+        return section(title, f"Pictures are where the alignment puts them: {local.reason}.")
+    used = np.flatnonzero(result.registration.alignment.used)
+    names = [result.registration.sources[index].name for index in used]
+    # The largest first: they are what one wants to look at.
+    order = sorted(range(len(names)), key=lambda k: -local.fields[k].largest)[:_MOST_PICTURES]
+    largest = max(max(field.largest for field in local.fields), 1e-9)
+    side = (_WIDTH - (_COLUMNS - 1) * _GAP) / _COLUMNS
+    row = side + _TEXT + _GAP
+    corners = [(k % _COLUMNS * (side + _GAP), k // _COLUMNS * row) for k in range(len(order))]
+    parts = [
+        _picture(local.fields[k], names[k], *corner, side, largest) for k, corner in zip(order, corners, strict=True)
+    ]
+    hidden = f" {len(names) - len(order)} pictures with smaller ones are not drawn." if len(order) < len(names) else ""
+    spread = ""
+    if local.before is not None and local.after is not None:
+        spread = f" (95 %: {local.before.percentile95:.2f} and {local.after.percentile95:.2f} px)"
+    return section(
+        title,
+        f"The ground is not quite a plane, so that each picture's content is moved a little; {local.reason}{spread}. "
+        f"The longest arrow of all stands for {largest:.1f} px.{hidden}",
+        drawing(_WIDTH, -(-len(order) // _COLUMNS) * row, parts, "displacement of each picture"),
+    )
+
+
+def _picture(field: DisplacementField, name: str, x: float, y: float, side: float, largest: float) -> str:
+    """One picture's arrows in a square of ``side`` with its top-left corner at x, y."""
+    width, height = field.image_size
+    scale = side / max(width, height)
+    spacing = max(width, height) / _ARROWS
+    u, v = (np.arange(0.5, max(1, round(n / spacing))) * n / max(1, round(n / spacing)) for n in (width, height))
+    places = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    moved = field(places)
+    tips = moved * (_LONGEST * spacing / largest)
+    frame = element("rect", x=x, y=y, width=width * scale, height=height * scale, fill="none", stroke=GREY)
+    arrows = [
+        element(
+            "line",
+            element("title", f"{np.linalg.norm(by):.2f} px"),
+            x1=float(x + p[0] * scale),
+            y1=float(y + p[1] * scale),
+            x2=float(x + (p[0] + tip[0]) * scale),
+            y2=float(y + (p[1] + tip[1]) * scale),
+            stroke=BLUE,
+            stroke_width=1.5,
+        )
+        + element("circle", cx=float(x + p[0] * scale), cy=float(y + p[1] * scale), r=1.2, fill=BLUE)
+        for p, tip, by in zip(places, tips, moved, strict=True)
+    ]
+    return frame + "".join(arrows) + label(x, y + height * scale + 13.0, f"{name}: up to {field.largest:.1f} px")

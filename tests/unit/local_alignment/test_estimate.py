@@ -1,0 +1,147 @@
+"""Local alignment mends what relief leaves over, and nothing else."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
+from rdstitch.local_alignment import LocalAlignment, Match, align_locally
+from rdstitch.local_alignment.fit import Stiffness, fit_fields, picture_fields
+from rdstitch.local_alignment.matches import place_matches, plane_scale
+from rdstitch.radial_homography import from_plane, to_plane
+from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
+
+LENS = Camera((640, 480), -0.2, focal=520.0)
+CAMERAS = [LENS] * 6
+
+
+@lru_cache
+def scene(kind: str | None, height: float = 0.05, seed: int = 1) -> Sequence:
+    poses = grid_poses(LENS, 3, 2, overlap=0.5, yaw=0.1, shift=0.05, seed=seed)
+    relief = None if kind is None else lambda size: RELIEFS[kind](size, seed, height=height * 520.0)
+    return sequence_over(lambda size: blank(size), LENS, poses, relief=relief)
+
+
+def homographies(sequence: Sequence) -> FloatArray:
+    """Of the pictures to the plane at the mean height of the ground."""
+    poses, relief = sequence.poses, sequence.relief
+    level = 0.0 if relief is None else float(relief.height.mean())
+    share = (poses.height - level) / poses.height
+    # A plane parallel to that of the texture: similar to it from each camera's foot.
+    lowered = np.stack([np.array([[s, 0, (1 - s) * x], [0, s, (1 - s) * y], [0, 0, 1.0]])
+                        for s, (x, y) in zip(share, poses.position, strict=True)])  # fmt: skip
+    scale = np.diag([LENS.half_diagonal / 520.0] * 2 + [1.0])
+    return np.stack([lowered[k] @ np.linalg.inv(sequence.from_plane(k)) @ scale for k in range(len(poses))])
+
+
+def matches(sequence: Sequence, noise: float = 0.2, wrong: float = 0.0, count: int = 400) -> list[Match]:
+    """Matches of all pairs that overlap, with noise and a share of wrong ones among them."""
+    rng = np.random.default_rng(3)
+    found = []
+    for i in range(len(sequence)):
+        for j in range(i + 1, len(sequence)):
+            first = rng.uniform((0, 0), (639, 479), (count, 2))
+            second = sequence.ground_to_picture(j, sequence.to_ground(i, first))
+            seen = ((second >= 0) & (second <= (639, 479))).all(axis=1)
+            if seen.sum() < 40:
+                continue
+            first, second = first[seen], second[seen] + rng.normal(0.0, noise, (int(seen.sum()), 2))
+            lost = rng.random(len(second)) < wrong
+            second[lost] += rng.uniform(-20.0, 20.0, (int(lost.sum()), 2))
+            found.append(Match(i, j, first, second))
+    return found
+
+
+def displacements(sequence: Sequence, matrices: FloatArray, local: LocalAlignment) -> FloatArray:
+    """How far two pictures are apart on the ground, texels, where both show the same place of the output."""
+    rng = np.random.default_rng(4)
+    found = []
+    for i in range(len(sequence)):
+        for j in range(i + 1, len(sequence)):
+            first = rng.uniform((20, 20), (619, 459), (200, 2))
+            second = from_plane(LENS, matrices[j], to_plane(LENS, matrices[i], first))
+            both = ((second >= 20) & (second <= (619, 459))).all(axis=1)
+            places = [first[both], second[both]]
+            if local.fields:
+                places = [p + local.fields[k](p) for k, p in zip((i, j), places, strict=True)]
+            grounds = [sequence.to_ground(k, p) for k, p in zip((i, j), places, strict=True)]
+            found.append(np.linalg.norm(grounds[0] - grounds[1], axis=1))
+    return np.concatenate(found)
+
+
+@pytest.mark.parametrize("kind", ["bumps", "slopes"])
+@pytest.mark.parametrize("wrong", [0.0, 0.1])
+def test_what_relief_moves_apart_comes_together(kind: str, wrong: float) -> None:
+    sequence = scene(kind)
+    matrices = homographies(sequence)
+    local = align_locally(matches(sequence, wrong=wrong), CAMERAS, matrices)
+    assert local.before is not None
+    assert local.after is not None
+    assert local.after.median < 0.5 * local.before.median
+    off, on = (displacements(sequence, matrices, which) for which in (replace(local, fields=()), local))
+    assert np.median(on) < 0.3 * np.median(off)
+    assert np.percentile(on, 95) < 0.5 * np.percentile(off, 95)
+    assert max(field.steepest for field in local.fields) <= 0.25
+
+
+@pytest.mark.parametrize("noise", [0.1, 1.0])
+def test_on_a_plane_nothing_is_moved(noise: float) -> None:
+    sequence = scene(None)
+    local = align_locally(matches(sequence, noise), CAMERAS, homographies(sequence))
+    assert local.fields == ()
+    assert "not worth while" in local.reason
+
+
+def test_a_number_of_cells_is_used_in_any_case_and_off_in_none() -> None:
+    sequence = scene(None)
+    found = matches(sequence)
+    local = align_locally(found, CAMERAS, homographies(sequence), 7)
+    assert [field.values.shape for field in local.fields] == [(6, 8, 2)] * 6
+    assert max(field.largest for field in local.fields) < 0.5
+    assert align_locally(found, CAMERAS, homographies(sequence), "off").fields == ()
+
+
+def test_the_whole_does_not_move_and_fields_fade_where_nothing_supports_them() -> None:
+    sequence = scene("bumps", 0.1)
+    matrices = homographies(sequence)
+    scale = plane_scale(CAMERAS, matrices)
+    placed = place_matches(matches(sequence), CAMERAS, matrices, scale)
+    assert placed is not None
+    fields = fit_fields(placed, CAMERAS, Stiffness(12, 0.02))
+    values = np.concatenate(fields.values)
+    assert np.abs(values.mean(axis=0)).max() < 0.02 * np.abs(values).max()
+    # The first picture alone shows its outer corner.
+    corner, inner = fields.values[0].reshape(*fields.shapes[0], 2)[[0, -1], [0, -1]]
+    assert np.linalg.norm(corner) < 0.3 * np.abs(fields.values[0]).max()
+    assert np.linalg.norm(corner) < np.linalg.norm(inner) + 1.0
+
+
+def test_nothing_folds_even_where_matches_say_so() -> None:
+    sequence = scene(None)
+    torn = [
+        Match(m.image1, m.image2, m.points1, m.points2 + 14.0 * np.sign(np.sin(m.points2[:, ::-1] / 15.0)))
+        for m in matches(sequence, count=3000)
+    ]
+    matrices = homographies(sequence)
+    scale = plane_scale(CAMERAS, matrices)
+    placed = place_matches(torn, CAMERAS, matrices, scale)
+    assert placed is not None
+    fields = picture_fields(fit_fields(placed, CAMERAS, Stiffness(60, 5.0)), CAMERAS, matrices, scale)
+    assert 0.2 < max(field.steepest for field in fields) <= 0.2501
+
+
+def test_equal_matches_give_equal_fields() -> None:
+    sequence = scene("bumps")
+    matrices = homographies(sequence)
+    first, again = (align_locally(matches(sequence), CAMERAS, matrices) for _ in range(2))
+    for a, b in zip(first.fields, again.fields, strict=True):
+        np.testing.assert_array_equal(a.values, b.values)
+
+
+def test_too_few_matches_are_said() -> None:
+    sequence = scene(None)
+    few = [Match(m.image1, m.image2, m.points1[:9], m.points2[:9]) for m in matches(sequence)[:2]]
+    assert align_locally(few, CAMERAS, homographies(sequence)).reason == "there are too few matches"
