@@ -134,6 +134,20 @@ def test_tiff_has_overviews_of_half_the_size(tmp_path: Path) -> None:
     assert (half[:100, :, 3] == 0).all()
 
 
+@pytest.mark.parametrize("writes", [8, pytest.param(200, marks=pytest.mark.slow)])
+def test_tiff_has_the_same_bytes_every_time(tmp_path: Path, writes: int) -> None:
+    pixels = _picture(600, 700, 3, np.uint8)
+    alpha = np.full(pixels.shape[:2], 255, np.uint8)
+    alpha[:90], alpha[:, 640:] = 0, 0
+    written = set()
+    for write in range(writes):
+        write_image(tmp_path / "a.tif", pixels, alpha)
+        written.add((tmp_path / "a.tif").read_bytes())
+        # Whatever the compressor finds in memory must not matter.
+        np.random.default_rng(write).bytes(300_000 + 10_000 * write)
+    assert len(written) == 1
+
+
 def test_floats_need_tiff(tmp_path: Path) -> None:
     pixels = _picture(40, 50, 3, np.float32)
     write_image(tmp_path / "a.tif", pixels)
