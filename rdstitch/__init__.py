@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rdstitch.camera import Camera
     from rdstitch.camera_files import load_camera, save_camera
     from rdstitch.compositing import CompositeOptions
+    from rdstitch.doctor import Examination, examine
     from rdstitch.features import FeatureOptions
     from rdstitch.messages import Message
     from rdstitch.pipeline import (
@@ -38,6 +39,7 @@ _HOMES = {
     "Alignment": "rdstitch.alignment",
     "Camera": "rdstitch.camera",
     "CompositeOptions": "rdstitch.compositing",
+    "Examination": "rdstitch.doctor",
     "FeatureOptions": "rdstitch.features",
     "Message": "rdstitch.messages",
     "RadialHomography": "rdstitch.radial_homography",
@@ -46,6 +48,7 @@ _HOMES = {
     "StitchOptions": "rdstitch.pipeline",
     "StitchResult": "rdstitch.pipeline",
     "Trajectory": "rdstitch.alignment.trajectory",
+    "examine": "rdstitch.doctor",
     "apply": "rdstitch.pipeline",
     "calibrate": "rdstitch.pipeline",
     "errors": "rdstitch",
@@ -65,6 +68,7 @@ __all__ = [
     "Alignment",
     "Camera",
     "CompositeOptions",
+    "Examination",
     "FeatureOptions",
     "Message",
     "RadialHomography",
@@ -77,6 +81,7 @@ __all__ = [
     "calibrate",
     "errors",
     "estimate_radial_homography",
+    "examine",
     "load_camera",
     "mosaic",
     "pano",

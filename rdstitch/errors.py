@@ -22,6 +22,8 @@ class RdstitchError(Exception):
     """Base of all errors that rdstitch raises on purpose; its text is one line for the user."""
 
     exit_status: ClassVar[int] = 1
+    code: ClassVar[str] = ""
+    """Heading in docs/troubleshooting.md."""
 
 
 class ArgumentError(RdstitchError, ValueError):
@@ -38,27 +40,32 @@ class InputError(RdstitchError):
     """A file cannot be read, or is not what it should be."""
 
     exit_status = 3
+    code = "unreadable"
 
 
 class RegistrationError(RdstitchError):
     """The pictures do not overlap, or nothing reliable came out of them."""
 
     exit_status = 4
+    code = "no-overlap"
 
 
 class PartialResultError(RdstitchError):
     """Pictures were left out although the caller asked for all of them."""
 
     exit_status = 5
+    code = "left-out"
 
 
 class OutputError(RdstitchError):
     """A file cannot be written, or exists and may not be replaced."""
 
     exit_status = 6
+    code = "output"
 
 
 class LimitError(RdstitchError):
     """Refused: the result would be too large for memory, for the format, or for common sense."""
 
     exit_status = 7
+    code = "too-large"

@@ -24,17 +24,21 @@ class Message:
     severity : str
         "warning": there is a result, to be looked at. "left out": the one picture named is not in the result, for the
         reason that the text gives. "failure": the result cannot be relied on.
+    code : str
+        Heading in docs/troubleshooting.md; empty where the text says it all.
     """
 
     text: str
     images: tuple[str, ...] = ()
     severity: Severity = "warning"
+    code: str = ""
 
     def __str__(self) -> str:
         """The line for standard error."""
+        code = f" [{self.code}]" if self.code else ""
         if self.severity == "left out":
-            return f"left out {self.images[0]}: {self.text}"
-        return f"not reliable: {self.clause}" if self.severity == "failure" else self.clause
+            return f"left out {self.images[0]}: {self.text}{code}"
+        return f"not reliable: {self.clause}{code}" if self.severity == "failure" else f"{self.clause}{code}"
 
     @property
     def clause(self) -> str:
@@ -44,7 +48,7 @@ class Message:
 
 def left_out(path: str | Path, reason: str) -> Message:
     """A picture that is not in the result."""
-    return Message(reason, (str(path),), "left out")
+    return Message(reason, (str(path),), "left out", "left-out")
 
 
 def of_severity(messages: Iterable[Message], *severities: Severity) -> tuple[Message, ...]:

@@ -63,6 +63,8 @@ class StitchOptions:
     exclude, include_only : tuple of str
         Names, or patterns with ``*``, ``?`` and ``[...]``, of pictures that are not used, and of those that alone are
         used; empty for all.
+    topic : str, optional
+        Topic of the images in ROS bags; None: the only one.
     reference : str, optional
         Name of the picture whose frame is kept; None: the best connected.
     local_alignment : "auto", "off" or int
@@ -112,6 +114,7 @@ class StitchOptions:
     channel_order: ChannelOrder = "bgr"
     exclude: tuple[str, ...] = ()
     include_only: tuple[str, ...] = ()
+    topic: str | None = None
     reference: str | None = None
     local_alignment: Choice = "auto"
     composite: CompositeOptions = field(default_factory=CompositeOptions)

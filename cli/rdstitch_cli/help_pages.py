@@ -22,8 +22,8 @@ _GROUPS = {
         "view",
         "quiet",
     ),
-    "Input": ("every", "match", "topic", "timestamps"),
-    "Camera": ("distortion", "tilt", "attitude", "attitude_std", "save_camera"),
+    "Input": ("every", "exclude", "include_only", "match", "topic", "timestamps"),
+    "Camera": ("distortion", "lens_model", "lens", "tilt", "attitude", "attitude_std", "save_camera"),
     "Features and registration": (
         "features",
         "aliked_model",

@@ -19,6 +19,7 @@ from click.shell_completion import shell_complete
 from rdstitch.errors import OutputError, RdstitchError
 from rdstitch_cli.commands.apply import apply
 from rdstitch_cli.commands.calibrate import calibrate
+from rdstitch_cli.commands.doctor import doctor
 from rdstitch_cli.commands.mosaic import mosaic
 from rdstitch_cli.commands.pano import pano
 from rdstitch_cli.commands.trajectory import trajectory
@@ -70,7 +71,7 @@ def cli(context: click.Context, debug: bool) -> None:
     context.obj = debug
 
 
-for command in (pano, mosaic, apply, calibrate, trajectory, undistort):
+for command in (pano, mosaic, apply, calibrate, trajectory, undistort, doctor):
     command.params.append(config_option())
     command.epilog = f"{command.epilog or ''}\n\n{EXIT_STATUSES}"
     cli.add_command(command)
@@ -130,7 +131,8 @@ def run(arguments: list[str]) -> int:
     except click.ClickException as error:
         return _complain(_usage(error), error.exit_code, debug)
     except RdstitchError as error:
-        return _complain(str(error), error.exit_status, debug)
+        code = f" [{error.code}]" if error.code else ""
+        return _complain(f"{error}{code}", error.exit_status, debug)
     except MemoryError:
         return _complain(_OUT_OF_MEMORY, 7, debug)
     except Exception as error:  # noqa: BLE001 - the last line of defence: no traceback for users

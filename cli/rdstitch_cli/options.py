@@ -58,8 +58,15 @@ inputs = click.argument(
 )
 
 every = click.option(
-    "--every", type=click.IntRange(1), default=1, show_default=True, metavar="N", help="Of a video, every N-th frame."
+    "--every",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    metavar="N",
+    help="Of a video or ROS bag, every N-th frame.",
 )
+
+topic = click.option("--topic", metavar="NAME", help="Of a ROS bag, the topic of its images.")
 
 output = click.option(
     "-o", "--output", type=PICTURE, required=True, help="Picture to write: .jpg, .png, .tif, .webp or .dzi."
@@ -68,7 +75,7 @@ output = click.option(
 overwrite = click.option("--overwrite", is_flag=True, help="Replace existing output files.")
 
 as_json = click.option(
-    "--json", "as_json", is_flag=True, help="Print all that was estimated as JSON, the sidecar or camera, not only λ."
+    "--json", "as_json", is_flag=True, help="Print everything as JSON: the sidecar, the camera, or what doctor found."
 )
 
 verbosity = together(

@@ -1,6 +1,8 @@
 """What the stitching commands share: from flags to options, from a result to lines."""
 
 import math
+import shlex
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -86,16 +88,28 @@ class Report:
     inputs : sequence of Path
         Files that it must not be written over.
     overwrite : bool
+    output : Path, optional
+        Picture that is made, beside which there may be a page.
     """
 
-    def __init__(self, file: Path | None, reporter: Reporter, inputs: Sequence[Path], overwrite: bool) -> None:
+    def __init__(
+        self,
+        file: Path | None,
+        reporter: Reporter,
+        inputs: Sequence[Path],
+        overwrite: bool,
+        output: Path | None = None,
+    ) -> None:
         from rdstitch.pipeline.timing import StageTimer
 
         self._file, self.progress = file, StageTimer(reporter)
         if file is not None:
-            from rdstitch.io.atomic import check_output
+            from rdstitch.io.atomic import check_distinct, check_output
+            from rdstitch.viewer import viewer_path
 
             check_output(file, overwrite, inputs, suffixes=(".html", ".htm"))
+            page = None if output is None else viewer_path(output)
+            check_distinct([file] if page is None else [file, page])
 
     @contextmanager
     def explaining(self) -> Iterator[None]:
@@ -108,7 +122,7 @@ class Report:
             if self._file is not None:
                 from rdstitch.report import write_report
 
-                write_report(self._file, refused.registration, self.progress.stages)
+                write_report(self._file, refused.registration, self.progress.stages, _command_line())
             raise
 
     def write(self, result: "StitchResult | Registration") -> None:
@@ -116,7 +130,12 @@ class Report:
         if self._file is not None and getattr(result, "plan", None) is None:
             from rdstitch.report import write_report
 
-            write_report(self._file, result, self.progress.stages)
+            write_report(self._file, result, self.progress.stages, _command_line())
+
+
+def _command_line() -> str:
+    """As it may be typed again."""
+    return shlex.join(["rdstitch", *sys.argv[1:]])
 
 
 def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = False) -> None:

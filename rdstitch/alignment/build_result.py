@@ -223,18 +223,20 @@ def _link_fits(found: AdjustedPictures, inliers: BoolArray) -> tuple[LinkFit, ..
 
 def _warnings(found: AdjustedPictures) -> tuple[Message, ...]:
     """What the user should know of the whole."""
-    result = []
+    result: list[Message] = []
     if not found.observable:
-        result.append(
+        text = (
             "λ is not observable: the pictures hardly move, or only turn about the optical axis; "
             "give λ, a camera file, or pictures that overlap by less"
         )
+        result.append(Message(text, code="lambda-not-observable"))
     if found.votes.groups:
         (low, few), (high, many) = found.votes.groups
-        result.append(
+        text = (
             f"{few} pairs see λ = {low:+.3f}, {many} pairs {high:+.3f}: two cameras, or a zoom; "
             "stitch their pictures on their own"
         )
+        result.append(Message(text, code="mixed-lenses"))
     if not found.choice.fit.adjusted.converged:
-        result.append("the adjustment did not converge; judge the result with care")
-    return tuple(map(Message, result))
+        result.append(Message("the adjustment did not converge; judge the result with care"))
+    return tuple(result)

@@ -6,7 +6,8 @@ the direction ``Rz(φ) (X - t)``.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -31,12 +32,31 @@ class Trajectory:
         φ, radians, continuous from frame to frame.
     height : ndarray of shape (F,)
         Above the plane, in the unit of the positions.
+    name : tuple of str
+        Of each frame's picture; empty where not known.
+    source_frame : ndarray of shape (F,), intp, or None
+        Number of each frame in the video or bag that it was taken from, else in the sequence.
+    timestamp : ndarray of shape (F,), or None
+        s; NaN where not known.
     """
 
     frame: NDArray[np.intp]
     position: FloatArray
     yaw: FloatArray
     height: FloatArray
+    name: tuple[str, ...] = ()
+    source_frame: NDArray[np.intp] | None = None
+    timestamp: FloatArray | None = None
+
+    def labelled(self, names: Sequence[str], numbers: ArrayLike, timestamps: ArrayLike) -> Self:
+        """The same with name, number and time stamp of each picture of the whole sequence."""
+        chosen = self.frame
+        return replace(
+            self,
+            name=tuple(names[k] for k in chosen),
+            source_frame=np.asarray(numbers, dtype=np.intp)[chosen],
+            timestamp=np.asarray(timestamps, dtype=np.float64)[chosen],
+        )
 
     @classmethod
     def from_alignment(cls, alignment: Alignment, height: float = 1.0) -> Self:
@@ -89,29 +109,6 @@ class Trajectory:
     def length(self) -> float:
         """Length of the path."""
         return float(np.linalg.norm(np.diff(self.position, axis=0), axis=1).sum())
-
-    def as_csv(self) -> str:
-        """Lines ``frame,x,y,phi_deg,height`` with a header."""
-        rows = zip(self.frame, self.position, np.degrees(self.yaw), self.height, strict=True)
-        lines = [f"{frame},{x:.9g},{y:.9g},{yaw:.9g},{height:.9g}" for frame, (x, y), yaw, height in rows]
-        return "\n".join(["frame,x,y,phi_deg,height", *lines]) + "\n"
-
-    def as_tum(self, timestamps: ArrayLike | None = None) -> str:
-        """Lines ``timestamp tx ty tz qx qy qz qw`` of the TUM RGB-D benchmark.
-
-        The quaternion turns the frame of the camera, its tilt removed, into the plane's: ``Rz(-φ)``. z points at the
-        plane, which lies at z = 0, so that the camera is at minus its height. Without timestamps the number of the
-        frame stands for it.
-        """
-        times = np.asarray(self.frame if timestamps is None else timestamps, dtype=np.float64)
-        if times.shape != self.frame.shape:
-            raise ArgumentError(f"expected {len(self)} timestamps, not an array of shape {times.shape}")
-        half = -self.yaw / 2
-        rows = zip(times, self.position, self.height, np.sin(half), np.cos(half), strict=True)
-        lines = [
-            f"{time:.6f} {x:.9g} {y:.9g} {-height:.9g} 0 0 {qz:.9g} {qw:.9g}" for time, (x, y), height, qz, qw in rows
-        ]
-        return "\n".join(lines) + "\n"
 
     def relative(self, step: int = 1) -> tuple[FloatArray, FloatArray]:
         """Motion from each frame to the ``step``-th after it, as the earlier one sees it.

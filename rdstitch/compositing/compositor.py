@@ -15,6 +15,7 @@ from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photo_sphere import photo_sphere_xmp
 from rdstitch.compositing.photometric import Exposure
 from rdstitch.compositing.preparation import OutputStrip, Progress, prepare
+from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.compositing.source_images import Preview, Source
 from rdstitch.compositing.warp import Displacement
 from rdstitch.io.fingerprint import Fingerprint
@@ -65,6 +66,10 @@ class FileComposite:
         Share of the output that pictures cover.
     fingerprint : Fingerprint
         Size and digest of the file.
+    seams : SeamMap or None
+        Which picture owns what of the canvas before cropping; None without seams.
+    origin : (int, int)
+        Where the output begins in that canvas, px.
     """
 
     path: Path
@@ -73,6 +78,8 @@ class FileComposite:
     coverage: float
     fingerprint: Fingerprint
     notes: tuple[str, ...] = ()
+    seams: SeamMap | None = None
+    origin: tuple[int, int] = (0, 0)
 
     def __repr__(self) -> str:
         """One line: its file and size."""
@@ -208,4 +215,13 @@ def compose_to_file(
         with closing(prepared.strips(progress)) as strips:
             written = write_strips(path, layout, counted(strips), tags, outputs=outputs)
     share = covered / (size[0] * size[1])
-    return FileComposite(Path(path), prepared.canvas, renderer.exposure, share, written, prepared.notes)
+    return FileComposite(
+        Path(path),
+        prepared.canvas,
+        renderer.exposure,
+        share,
+        written,
+        prepared.notes,
+        renderer.seams,
+        prepared.origin,
+    )

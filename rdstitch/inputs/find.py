@@ -12,7 +12,8 @@ from pathlib import Path
 
 from rdstitch.errors import InputError
 from rdstitch.inputs.frame import Frame, Named
-from rdstitch.io.decoding import FOREIGN_SUFFIXES
+from rdstitch.inputs.rosbag import extract_images, is_bag
+from rdstitch.io.optional_readers import HEIF_SUFFIXES, RAW_SUFFIXES
 from rdstitch.io.staging import temporary_folder
 from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames
 from rdstitch.messages import Message, names_of, shortened
@@ -20,7 +21,7 @@ from rdstitch.records import LARGEST_FILE, read_text
 from rdstitch.regular_files import read_limited
 
 PICTURE_SUFFIXES = frozenset(
-    (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".jp2", ".ppm", ".pgm", ".pnm", ".gif")
+    [".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".bmp", ".tga", ".jp2", ".ppm", ".pgm", ".pnm", ".gif"]
 )
 """What counts as a picture in a folder; a file that is named is tried whatever it is called."""
 
@@ -52,7 +53,7 @@ class FoundPictures:
 
 @contextmanager
 def found_pictures(
-    arguments: Iterable[Named], *, output: str | Path | None = None, every: int = 1
+    arguments: Iterable[Named], *, output: str | Path | None = None, every: int = 1, topic: str | None = None
 ) -> Iterator[FoundPictures]:
     """The pictures of :func:`find_pictures`, of videos too, whose frames exist only inside the block."""
     with ExitStack() as stack:
@@ -62,7 +63,7 @@ def found_pictures(
             return stack.enter_context(temporary_folder())
 
         exclude = [] if output is None else [output]
-        yield find_pictures(arguments, exclude=exclude, frames_folder=frames_folder, every=every)
+        yield find_pictures(arguments, exclude=exclude, frames_folder=frames_folder, every=every, topic=topic)
 
 
 def find_pictures(
@@ -71,6 +72,7 @@ def find_pictures(
     exclude: Iterable[str | Path] = (),
     frames_folder: Callable[[], Path] | None = None,
     every: int = 1,
+    topic: str | None = None,
 ) -> FoundPictures:
     """The frames that the arguments stand for.
 
@@ -78,14 +80,16 @@ def find_pictures(
     ----------
     arguments : iterable of path or Frame
         Each a picture file, a folder, a pattern (``*``, ``?``, ``[...]``), ``@FILE`` with one argument a line or
-        separated by NUL, a video file, or a frame, which stays as it is.
+        separated by NUL, a video file, a ROS bag, or a frame, which stays as it is.
     exclude : iterable of path
         Files that are no input, such as the output, where they come from a folder or pattern or rdstitch wrote them.
         Any other picture that is named stays: its user must hear that it would be written over.
     frames_folder : callable, optional
         Gives the folder where frames of videos are written, losslessly; without it a video is refused.
     every : int
-        Use every n-th video frame.
+        Use every n-th frame of videos and ROS bags.
+    topic : str, optional
+        Topic of the images in ROS bags; without one, the only topic of images.
 
     Raises
     ------
@@ -95,7 +99,7 @@ def find_pictures(
     unwanted = {_entry(Path(path)) for path in exclude}
     frames: list[Frame] = []
     outputs: list[Path] = []
-    for frame, named in _expand(arguments, frames_folder, every):
+    for frame, named in _expand(arguments, frames_folder, every, topic):
         is_output = frame.picture is None and _is_rdstitch_output(frame.path)
         if _entry(frame.path) in unwanted and (is_output or not named):
             continue
@@ -120,7 +124,11 @@ def natural_key(path: Path) -> list[tuple[int, str | int]]:
 
 
 def _expand(
-    arguments: Iterable[Named], frames_folder: Callable[[], Path] | None, every: int, lists: tuple[Path, ...] = ()
+    arguments: Iterable[Named],
+    frames_folder: Callable[[], Path] | None,
+    every: int,
+    topic: str | None,
+    lists: tuple[Path, ...] = (),
 ) -> Iterator[tuple[Frame, bool]]:
     """Every frame, and whether it was named one by one; ``lists`` are those that the arguments come from."""
     for argument in arguments:
@@ -135,11 +143,15 @@ def _expand(
                     raise InputError(f"{file}: the list of pictures names itself")
                 # Another program may write the list while we read it: @<(find ...) in a shell.
                 names = names_in(read_text(file, regular=False))
-                yield from _expand(names, frames_folder, every, (*lists, file))
+                yield from _expand(names, frames_folder, every, topic, (*lists, file))
             elif glob.has_magic(text):
                 yield from ((Frame(found), False) for found in _matching(text))
             else:
                 yield Frame(path), True
+        elif is_bag(path):
+            if frames_folder is None:
+                raise InputError(f"{path}: a ROS bag is no picture here; use 'rdstitch mosaic'")
+            yield from ((frame, True) for frame in extract_images(path, frames_folder(), every, topic))
         elif path.is_dir():
             yield from ((Frame(found), False) for found in _in_folder(path))
         elif path.suffix.lower() in VIDEO_SUFFIXES:
@@ -171,9 +183,11 @@ def _in_folder(folder: Path) -> list[Path]:
     except OSError as error:
         raise InputError(f"{folder}: cannot read the folder: {error.strerror}") from error
     found = [path for path in entries if path.suffix.lower() in PICTURE_SUFFIXES]
-    # Many cameras write a raw file beside each picture.
+    # Many cameras write a raw file beside each picture, and phones that export JPEG leave the HEIC there.
     stems = {path.stem for path in found}
-    found += [path for path in entries if path.suffix.lower() in FOREIGN_SUFFIXES and path.stem not in stems]
+    found += [
+        path for path in entries if path.suffix.lower() in HEIF_SUFFIXES | RAW_SUFFIXES and path.stem not in stems
+    ]
     if not found:
         raise InputError(f"{folder}: there are no pictures in this folder")
     return sorted(found, key=natural_key)

@@ -60,6 +60,10 @@ class Source:
         """File name, for messages and reports."""
         return self.path.name
 
+    def number(self, position: int) -> int:
+        """Its number in the video or bag that it was taken from, else its position in the sequence."""
+        return position if self.frame is None or self.frame.number is None else self.frame.number
+
     def content(self, cache: Cache) -> str:
         """Hash of what the image is made from, for keys of the cache."""
         if self.frame is None or self.frame.picture is None:

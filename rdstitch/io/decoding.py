@@ -17,11 +17,7 @@ import tifffile
 from PIL import Image
 
 from rdstitch.errors import InputError
-
-FOREIGN_SUFFIXES = frozenset(
-    (".heic", ".heif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
-)
-"""Pictures of phones and cameras that nothing here can read; what TIFF readers see in raw files is their thumbnail."""
+from rdstitch.io.optional_readers import check_reader
 
 # What Pillow, tifffile and OpenCV have been seen to raise on damaged files; warnings, where filters make them errors.
 _DAMAGE = (
@@ -67,8 +63,7 @@ def check_readable(path: Path) -> None:
         raise InputError(f"{path}: is not a regular file; copy it to one first")
     if status.st_size == 0:
         raise InputError(f"{path}: is empty (0 bytes); copy it again from its source")
-    if path.suffix.lower() in FOREIGN_SUFFIXES:
-        raise InputError(f"{path}: {path.suffix} is not read here; convert it to JPEG or TIFF first")
+    check_reader(path)
     if not os.access(path, os.R_OK):
         raise InputError(f"{path}: permission denied; make it readable")
 

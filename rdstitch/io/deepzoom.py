@@ -24,7 +24,9 @@ from rdstitch.io.reduction import halved, reduced_size
 LARGEST_TILE_PROFILE = 2**16
 """Bytes of a colour profile that is written into every tile; the larger ones of RGB pictures have 60 kB."""
 
-_TILE, _OVERLAP = 254, 1
+TILE, OVERLAP = 254, 1
+"""Side of the tiles and how far they reach into their neighbours, pixels."""
+
 _LEVEL_NAME, _TILE_NAME = re.compile(r"[0-9]{1,2}"), re.compile(r"[0-9]+_[0-9]+\.jpg")
 _DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 <Image xmlns="http://schemas.microsoft.com/deepzoom/2008" Format="jpg" Overlap="{overlap}" TileSize="{tile}">
@@ -87,7 +89,7 @@ def write_deep_zoom(description: Path, folder: Path, layout: Layout, strips: Ite
     for samples, alpha in strips:
         largest.take(with_alpha(as_eight_bit(samples), alpha))
     description.write_text(
-        _DESCRIPTION.format(overlap=_OVERLAP, tile=_TILE, width=width, height=height), encoding="utf-8"
+        _DESCRIPTION.format(overlap=OVERLAP, tile=TILE, width=width, height=height), encoding="utf-8"
     )
 
 
@@ -101,12 +103,12 @@ def read_deep_zoom(path: Path, size: tuple[int, int], side: int) -> NDArray[np.u
     """
     sizes = _sizes(size)
     level = next((k for k, level_size in enumerate(sizes) if max(level_size) >= side), len(sizes) - 1)
-    columns, rows = (range(-(-n // _TILE)) for n in sizes[level])
+    columns, rows = (range(-(-n // TILE)) for n in sizes[level])
     folder = tiles_folder(path) / str(level)
 
     def tile(column: int, row: int) -> NDArray[np.uint8]:
         pixels: NDArray[np.uint8] = read_image(folder / f"{column}_{row}.jpg").pixels
-        return pixels[_OVERLAP if row else 0 :][:_TILE, _OVERLAP if column else 0 :][:, :_TILE]
+        return pixels[OVERLAP if row else 0 :][:TILE, OVERLAP if column else 0 :][:, :TILE]
 
     return np.concatenate([np.concatenate([tile(c, r) for c in columns], axis=1) for r in rows])
 
@@ -156,14 +158,14 @@ class _Level:
         self._received += len(rows)
         self._rows.append(rows)
         height = self.layout.size[1]
-        while self._tile_row * _TILE < height:
+        while self._tile_row * TILE < height:
             top, bottom = _tile_span(self._tile_row, height)
             if bottom > self._received:
                 break
             held = np.concatenate(self._rows)
             self._write_tiles(held[top - self._top : bottom - self._top])
             self._tile_row += 1
-            next_top = max(0, self._tile_row * _TILE - _OVERLAP)
+            next_top = max(0, self._tile_row * TILE - OVERLAP)
             self._rows, self._top = [held[next_top - self._top :]], next_top
         if self.smaller is not None:
             self._pass_on(self.smaller, rows)
@@ -180,7 +182,7 @@ class _Level:
     def _write_tiles(self, rows: NDArray[np.uint8]) -> None:
         """One row of tiles."""
         width = self.layout.size[0]
-        for column in range(-(-width // _TILE)):
+        for column in range(-(-width // TILE)):
             left, right = _tile_span(column, width)
             tile: NDArray[Any] = rows[:, left:right]
             layout = replace(self.layout, size=(right - left, len(rows)))
@@ -190,4 +192,4 @@ class _Level:
 
 def _tile_span(number: int, length: int) -> tuple[int, int]:
     """First and last but one px of a tile with its overlap, along one axis of a level."""
-    return max(0, number * _TILE - _OVERLAP), min(length, (number + 1) * _TILE + _OVERLAP)
+    return max(0, number * TILE - OVERLAP), min(length, (number + 1) * TILE + OVERLAP)

@@ -3,7 +3,9 @@
 import math
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from rdstitch.camera import is_focal_length
 from rdstitch.io.attitude import Attitude, read_attitude
 from rdstitch.io.decoding import check_readable, decoding
 from rdstitch.io.opening import check_megapixels, opened_picture
+from rdstitch.io.optional_readers import is_raw, raw_exif, raw_size
 from rdstitch.io.orientation import SIDEWAYS, turned_direction
 from rdstitch.io.xmp import finite, xmp_number, xmp_text
 
@@ -26,6 +29,7 @@ LARGEST_PROFILE = 2**20 - 2**10
 
 _COLOUR_SPACE = slice(16, 20)  # of a profile's header
 _UNWRITABLE = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, struct.error)
+_HEADER = 16
 _ORIENTATION, _PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE = 0x0112, 0xA002, 0xA003, 0x927C
 
 
@@ -63,6 +67,8 @@ class Metadata:
     dpi : (float, float) or None
     exposure : float or None
         Exposure time x sensitivity / f-number²: what the samples' light is proportional to, for the same scene.
+    timestamp : float or None
+        When it was taken, s since 1970; where EXIF has no time zone, its local time is taken for UTC.
     exif : bytes
         EXIF block with orientation 1, without maker note and thumbnail; empty where there is none.
     icc_profile : bytes
@@ -85,6 +91,7 @@ class Metadata:
     serial: str = ""
     dpi: tuple[float, float] | None = None
     exposure: float | None = None
+    timestamp: float | None = None
     exif: bytes = b""
     icc_profile: bytes = b""
     xmp: bytes = b""
@@ -111,6 +118,8 @@ def read_metadata(path: str | Path) -> Metadata:
     file = Path(path)
     check_readable(file)
     with decoding(file):
+        if is_raw(file):
+            return _raw_metadata(file)
         try:
             with opened_picture(file) as image:
                 return metadata_of(image)
@@ -123,6 +132,17 @@ def read_metadata(path: str | Path) -> Metadata:
                     raise ValueError("no pixels") from None
                 check_megapixels(file, size)
                 return Metadata(size, bit_depth=page.bitspersample, channels=page.samplesperpixel)
+
+
+def _raw_metadata(file: Path) -> Metadata:
+    """Metadata of a raw file, which is read upright."""
+    size = raw_size(file)
+    # A small picture carries the tags; its focal length is in its own pixels.
+    header = Image.new("L", (max(1, size[0] // _HEADER), max(1, size[1] // _HEADER)))
+    header.info["exif"] = raw_exif(file).tobytes()
+    found = metadata_of(header)
+    focal = None if found.focal_px is None else found.focal_px * size[0] / header.width
+    return replace(found, size=size, bit_depth=16, orientation=1, focal_px=focal)
 
 
 def metadata_of(image: Image.Image) -> Metadata:
@@ -150,6 +170,7 @@ def metadata_of(image: Image.Image) -> Metadata:
         serial=_text(photo.get(ExifTags.Base.BodySerialNumber)) or _text(exif.get(ExifTags.Base.CameraSerialNumber)),
         dpi=(float(dpi[0]), float(dpi[1])) if dpi and all(finite(d) for d in dpi) else None,
         exposure=_exposure(photo),
+        timestamp=_timestamp(photo),
         exif=_clean_exif(exif),
         icc_profile=profile,
         profile_lost=profile_lost,
@@ -231,6 +252,17 @@ def _focal_px(
     if equivalent and is_focal_length(equivalent, (36, 24)):
         return equivalent / _DIAGONAL_35MM * math.hypot(*size), "FocalLengthIn35mmFilm"
     return None, None
+
+
+def _timestamp(photo: Mapping[int, Any]) -> float | None:
+    """Seconds since 1970 by the EXIF tags of when the picture was taken."""
+    text, zone = _text(photo.get(ExifTags.Base.DateTimeOriginal)), _text(photo.get(ExifTags.Base.OffsetTimeOriginal))
+    fraction = _text(photo.get(ExifTags.Base.SubsecTimeOriginal))
+    for zoned in (f"{text}{zone or '+00:00'}", f"{text}+00:00"):
+        with suppress(ValueError, OverflowError):
+            whole = datetime.strptime(zoned, "%Y:%m:%d %H:%M:%S%z").timestamp()
+            return whole + (float(f"0.{fraction}") if fraction.isdecimal() else 0.0)
+    return None
 
 
 def _gps(tags: dict[int, Any]) -> GpsPosition | None:

@@ -13,11 +13,13 @@ from PIL import (
     JpegImagePlugin,
     PngImagePlugin,
     PpmImagePlugin,
+    TgaImagePlugin,
     TiffImagePlugin,
     WebPImagePlugin,
 )
 
 from rdstitch.errors import InputError
+from rdstitch.io.optional_readers import avif_factory, heif_factory
 from rdstitch.regular_files import open_regular
 
 TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -36,7 +38,7 @@ _FORMATS: dict[bytes, Callable[[IO[bytes], str], ImageFile.ImageFile]] = {
     **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6"), PpmImagePlugin.PpmImageFile),
 }
 _LONGEST_MAGIC = max(map(len, _FORMATS))
-_NAMES = "JPEG, PNG, TIFF, WebP, BMP, GIF, JPEG 2000, PBM, PGM, PPM"
+_NAMES = "JPEG, PNG, TIFF, WebP, AVIF, HEIC, BMP, TGA, GIF, JPEG 2000, PBM, PGM, PPM"
 _MOST_MEGAPIXELS = 178
 
 
@@ -80,4 +82,8 @@ def _factory(file: Path, stream: BinaryIO) -> Callable[[IO[bytes], str], ImageFi
     for magic, factory in _FORMATS.items():
         if beginning.startswith(magic):
             return factory
+    if beginning[4:8] == b"ftyp":
+        return avif_factory(file) if beginning[8:12] in (b"avif", b"avis") else heif_factory(file)
+    if file.suffix.lower() == ".tga":  # has no magic
+        return TgaImagePlugin.TgaImageFile
     raise InputError(f"{file}: is no picture in a format that is read here: {_NAMES}")

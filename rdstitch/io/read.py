@@ -18,6 +18,7 @@ from rdstitch.io.decoding import check_readable, decoding
 from rdstitch.io.jpeg_decoding import decoded_jpeg
 from rdstitch.io.metadata import Metadata, metadata_of, read_metadata
 from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, opened_picture
+from rdstitch.io.optional_readers import is_raw, read_raw
 from rdstitch.io.orientation import turned
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
 from rdstitch.opencv_state import silent_opencv
@@ -62,9 +63,10 @@ class Picture:
 def read_image(path: str | Path, reduction: int = 1) -> Picture:
     """Read a picture file.
 
-    JPEG, PNG, TIFF, WebP and whatever else Pillow reads, with 8 or 16 bit or floating-point samples. Of an animated
-    or multi-page file the first picture counts. CMYK and palette colours become RGB. NaN or infinite samples of a
-    floating-point file become transparent zeros.
+    JPEG, PNG, TIFF, WebP and whatever else Pillow reads, with 8 or 16 bit or floating-point samples; with optional
+    packages also HEIC, and raw files, which become 16-bit sRGB. Of an animated or multi-page file the first picture
+    counts. CMYK and palette colours become RGB. NaN or infinite samples of a floating-point file become transparent
+    zeros.
 
     Parameters
     ----------
@@ -83,6 +85,8 @@ def read_image(path: str | Path, reduction: int = 1) -> Picture:
     with decoding(file):
         with open_regular(file) as stream:
             magic = stream.read(len(PNG_MAGIC))
+        if is_raw(file):
+            return reduced(as_picture(file, read_raw(file), None, read_metadata(file)), reduction)
         if magic[:4] in TIFF_MAGIC:
             return reduced(as_picture(file, *_read_tiff(file), read_metadata(file)), reduction)
         with opened_picture(file) as image:

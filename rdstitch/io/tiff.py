@@ -1,4 +1,7 @@
-"""TIFF from strips: tiled, compressed, BigTIFF where needed, with overviews of half the size again and again.
+"""TIFF from strips: compressed, BigTIFF where needed, with overviews of half the size again and again.
+
+Pictures are tiled, but for grey ones with alpha: OpenCV (4.11 to 5.0) reads tiles of two samples as stripes, and strips
+of them rightly.
 
 Overviews are made while the strips pass, and wait in temporary files beside the output until their turn; memory is that
 of one strip, whatever the size of the picture.
@@ -21,6 +24,7 @@ from rdstitch.io.metadata import Metadata
 from rdstitch.io.reduction import halved
 
 _TILE = 256
+_STRIP = 64  # rows
 # Smaller pictures need no overview.
 _SMALLEST_OVERVIEW = 256
 # Rows that are reduced at a time, even.
@@ -74,14 +78,16 @@ def _write_page(
     colour = 3 if layout.channels == 3 else 1
     extra = ["unspecified"] * (layout.channels - colour) + ["unassalpha"] * layout.transparent
     dpi = None if reduced else layout.metadata.dpi
+    tiled = samples != 2
     tiff.write(
-        (_encoded(tile) for tile in _tiles(strips)),
+        (_encoded(block) for block in (_tiles(strips) if tiled else _short_strips(strips))),
         shape=(height, width, samples) if samples > 1 else (height, width),
         dtype=layout.dtype,
         photometric="rgb" if colour == 3 else "minisblack",
         planarconfig="contig" if samples > 1 else None,
         extrasamples=extra or None,
-        tile=(_TILE, _TILE),
+        tile=(_TILE, _TILE) if tiled else None,
+        rowsperstrip=None if tiled else _STRIP,
         compression="zlib",
         predictor=_has_predictor(layout.dtype),
         # Tiles that tifffile holds before it writes them; 256 MB if not told.
@@ -104,6 +110,11 @@ def _tiles(strips: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
                 tile = strip[y : y + _TILE, x : x + _TILE]
                 missing = [(0, _TILE - n) for n in tile.shape[:2]] + [(0, 0)]
                 yield np.pad(tile, missing) if any(b for _, b in missing) else tile
+
+
+def _short_strips(strips: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
+    for strip in strips:
+        yield from (strip[y : y + _STRIP] for y in range(0, strip.shape[0], _STRIP))
 
 
 def _has_predictor(dtype: np.dtype[Any]) -> bool:
@@ -151,7 +162,9 @@ def _copied_tags(metadata: Metadata) -> Iterator[ExtraTag]:
         exif.load(metadata.exif)
         for tag in _COPIED_TAGS:
             text = exif.get(tag)
-            if isinstance(text, str) and text.isascii() and text:
+            # Cameras pad with zeros, of which GDAL warns.
+            text = text.split("\0")[0].strip() if isinstance(text, str) else ""
+            if text and text.isascii():
                 yield int(tag), 2, 0, text, True
 
 

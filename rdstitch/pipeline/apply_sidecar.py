@@ -24,6 +24,7 @@ from rdstitch.messages import Message
 from rdstitch.messages import left_out as left_out_message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.compose import compose_pictures
+from rdstitch.pipeline.page import plainly_viewed, write_page
 from rdstitch.pipeline.recomposition import Recomposition, applied_sidecar
 from rdstitch.progress import Progress, silent
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_picture, read_sidecar
@@ -135,6 +136,8 @@ def apply(
             composed.fingerprint,
         )
         if output is not None and not dry_run:
+            names = [source.name for source in used.values()]
+            write_page(outputs, output, composed, plainly_viewed(composed.canvas, names))
             outputs.write(f"{output}.json", json_bytes(applied_sidecar(result)))
         return result
 

@@ -15,6 +15,7 @@ from rdstitch.compositing import (
     Composite,
     CompositeOptions,
     CompositePlan,
+    FileComposite,
     compose,
     compose_to_file,
     plan_canvas,
@@ -35,6 +36,7 @@ from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
 from rdstitch.pipeline.memory import release_free_heap
 from rdstitch.progress import Progress
+from rdstitch.viewer import viewer_path
 
 # Reduction of a picture of which only the kind of its samples is wanted.
 _SMALLEST = 8
@@ -56,6 +58,8 @@ class Composed:
         What the user should know, such as why nothing was cropped.
     fingerprint : Fingerprint or None
         Size and digest of the file.
+    written : FileComposite or None
+        The picture in its file.
     """
 
     canvas: Canvas
@@ -63,6 +67,7 @@ class Composed:
     plan: CompositePlan | None = None
     notes: tuple[str, ...] = ()
     fingerprint: Fingerprint | None = None
+    written: FileComposite | None = None
 
 
 def compose_pictures(
@@ -117,7 +122,8 @@ def compose_pictures(
     # A camera that turned on the spot was at one place, and its pictures show no plane.
     positions = [None if turned else source.metadata.gps for source in sources]
     beside = world_file_paths(output) if output is not None and has_place(positions) else ()
-    for file in beside:
+    page = None if output is None else viewer_path(output)
+    for file in (*beside, *([] if page is None else [page])):
         check_output(file, overwrite, suffixes=())
     matrices = np.asarray(homographies, dtype=np.float64)
     plan = partial(_plan, cameras, matrices, reference, [s.name for s in sources], options, turned)
@@ -175,7 +181,7 @@ def compose_pictures(
         for file, text in zip(beside, place.world_file_texts(), strict=True):
             outputs.write(file, text_bytes(text))
     notes = (*written.notes, *([note] if note else []), *_profile_notes(sources[0], Path(output)))
-    return Composed(written.canvas, notes=notes, fingerprint=written.fingerprint)
+    return Composed(written.canvas, notes=notes, fingerprint=written.fingerprint, written=written)
 
 
 def _plan(

@@ -11,6 +11,7 @@ from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.camera_files import CAMERA_SUFFIXES, camera_file_text
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.path_plot import path_as_svg
+from rdstitch.export.trajectory_files import WRITERS, has_times
 from rdstitch.inputs.attitudes import with_attitudes
 from rdstitch.inputs.find import FoundPictures, found_pictures
 from rdstitch.inputs.frame import Frame, Images, as_inputs, files_of
@@ -18,6 +19,7 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.masks import with_masks
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source, read_sources
+from rdstitch.inputs.timestamps import timestamps_of
 from rdstitch.io.atomic import check_distinct, check_output, json_bytes, text_bytes
 from rdstitch.io.outputs import Outputs
 from rdstitch.messages import Message
@@ -25,15 +27,19 @@ from rdstitch.options import StitchOptions
 from rdstitch.pipeline.accept import accept
 from rdstitch.pipeline.align_locally import align_registration_locally
 from rdstitch.pipeline.compose import compose_pictures
+from rdstitch.pipeline.page import viewed_pictures, write_page
 from rdstitch.pipeline.register import register, with_frontal_reference
 from rdstitch.progress import Progress, silent
 from rdstitch.registration import Registration
 from rdstitch.sidecar.write import sidecar
 from rdstitch.stitch_result import StitchResult
 
-Layout = Literal["csv", "tum"]
+Layout = Literal["csv", "tum", "kitti"]
 
 _MAX_SCALE_UNCERTAINTY = 0.05  # share that lengths may be off by, as far as the focal length is, without a word
+_NO_TIMES = Message(
+    "not every picture has a time stamp: numbers of frames stand for them; give --timestamps", code="no-time-stamps"
+)
 
 
 def pano(
@@ -77,7 +83,9 @@ def pano(
     (3, True)
     """
     options = options or StitchOptions()
-    with found_pictures(as_inputs(inputs, options.channel_order), output=output, every=every) as found:
+    with found_pictures(
+        as_inputs(inputs, options.channel_order), output=output, every=every, topic=options.topic
+    ) as found:
         _check_outputs(output, options, files_of(found.frames))
         sources, _ = _read(found.frames, options, skip_bad=False)
         registration = register(sources, options, skip_bad=False, progress=progress)
@@ -127,7 +135,9 @@ def mosaic(
     ('small.tif', np.True_)
     """
     options = options or StitchOptions()
-    with found_pictures(as_inputs(inputs, options.channel_order), output=output, every=every) as found:
+    with found_pictures(
+        as_inputs(inputs, options.channel_order), output=output, every=every, topic=options.topic
+    ) as found:
         _check_outputs(output, options, files_of(found.frames))
         registration = _register_all(found, options, progress)
         return _composite(registration, output, options, progress)
@@ -154,7 +164,7 @@ def calibrate(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = options or StitchOptions()
-    with found_pictures(as_inputs(inputs, options.channel_order), every=every) as found:
+    with found_pictures(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as found:
         _check_outputs(None, options, files_of(found.frames))
         registration = _register_all(found, options, progress)
         registration = accept(registration, options, lens_only=True)
@@ -170,6 +180,7 @@ def trajectory(
     options: StitchOptions | None = None,
     *,
     layout: Layout = "csv",
+    timestamps: str | Path | None = None,
     plot: str | Path | None = None,
     height: float = 1.0,
     every: int = 1,
@@ -184,7 +195,10 @@ def trajectory(
     output : path, optional
         File to write.
     layout : str
-        "csv" or "tum".
+        "csv", "tum" or "kitti"; see :mod:`rdstitch.export.trajectory_files`.
+    timestamps : path, optional
+        File of the time stamps of the pictures; see :func:`rdstitch.inputs.timestamps.timestamps_of`. Without it, they
+        are those of the video, the bag, or EXIF.
     plot : path, optional
         SVG file to draw the path to.
     height : float
@@ -196,30 +210,34 @@ def trajectory(
         The path, and the registration that it comes from.
     """
     options = options or StitchOptions()
-    with found_pictures(as_inputs(inputs, options.channel_order), every=every) as found:
+    with found_pictures(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as found:
         files = [file for file in (output, plot) if file is not None]
         for file in files:
             check_output(file, options.overwrite, files_of(found.frames), suffixes=())
         check_distinct(files)
-        registration = _register_all(found, options, progress, metric=True)
+        sources, unread = _read(found.frames, options, skip_bad=True)
+        times = timestamps_of(sources, timestamps)
+        registration = register(sources, options, skip_bad=True, metric=True, progress=progress)
+        registration = registration.with_messages([*unread, *found.messages])
         registration = accept(registration, options)
     _release_decoded_images(registration)
     registration = _with_damage(registration).with_messages(_scale_uncertainty(registration.alignment))
     path = Trajectory.from_alignment(registration.alignment, height)
+    path = path.labelled([s.name for s in sources], [s.number(k) for k, s in enumerate(sources)], times)
+    if layout == "tum" and not has_times(path):
+        registration = registration.with_messages([_NO_TIMES])
     with Outputs(options.overwrite) as outputs:
         if output is not None:
-            outputs.write(output, text_bytes(path.as_csv() if layout == "csv" else path.as_tum()))
+            outputs.write(output, text_bytes(WRITERS[layout](path)))
         if plot is not None:
             outputs.write(plot, text_bytes(path_as_svg(path)))
     return path, registration
 
 
-def _register_all(
-    found: FoundPictures, options: StitchOptions, progress: Progress, *, metric: bool = False
-) -> Registration:
+def _register_all(found: FoundPictures, options: StitchOptions, progress: Progress) -> Registration:
     """Register a sequence, leaving out what cannot be read."""
     sources, unread = _read(found.frames, options, skip_bad=True)
-    registration = register(sources, options, skip_bad=True, metric=metric, progress=progress)
+    registration = register(sources, options, skip_bad=True, progress=progress)
     return registration.with_messages([*unread, *found.messages])
 
 
@@ -295,6 +313,8 @@ def _composite(
         )
         if not options.dry_run:
             _save_camera(registration, options, outputs)
+            if output is not None:
+                write_page(outputs, output, composed, viewed_pictures(result))
             # Last: whoever finds it finds what it belongs to.
             if output is not None:
                 outputs.write(f"{output}.json", json_bytes(sidecar(result)))
@@ -320,7 +340,8 @@ def _scale_uncertainty(alignment: Alignment) -> list[Message]:
         return []
     return [
         Message(
-            f"all lengths may be off together by {unsure:.0%}: the pictures hardly show the focal length; give --focal"
+            f"all lengths may be off together by {unsure:.0%}: the pictures hardly show the focal length; give --focal",
+            code="focal-unknown",
         )
     ]
 

@@ -6,10 +6,10 @@ import numpy as np
 
 from rdstitch.registration import Registration
 from rdstitch.report.geometry import footprint, middle
-from rdstitch.report.svg import BLUE, GREEN, GREY, RED, drawing, element, fit_into, label, path, section
+from rdstitch.report.svg import BLUE, GREEN, GREY, RED, counted, drawing, element, fit_into, label, path, section
 
 _SIDE, _MARGIN = 900.0, 20.0
-_MOST_LABELS = 60
+_LINE = 11.0  # height of a name
 
 
 def match_graph(registration: Registration) -> str:
@@ -40,18 +40,30 @@ def match_graph(registration: Registration) -> str:
                 stroke_width=float(np.clip(np.log10(fit.inliers + 1.0), 0.5, 4.0)),
             )
         )
+    named: list[tuple[float, float, float]] = []  # left, baseline, width
     for index, center in centers.items():
         x, y = (center + shift) * scale
         fill = RED if index == alignment.reference else GREY
         parts.append(element("circle", cx=float(x), cy=float(y), r=4, fill=fill))
-        if len(centers) <= _MOST_LABELS:
-            parts.append(label(float(x) + 6, float(y) - 6, registration.sources[index].name, font_size=10))
+        name = registration.sources[index].name
+        # A name that would lie on another one is left out; the picture's own line has it as its title.
+        box = (float(x) + 6, float(y) - 6, 5.6 * len(name))
+        if not any(_overlap(box, other) for other in named):
+            named.append(box)
+            parts.append(label(box[0], box[1], name, font_size=10))
     return section(
         "Match graph",
-        f"{len(links)} pairs over the outlines of {len(used)} pictures. Thicker lines have more matches; green ones "
+        f"{counted(len(links), 'pair')} over the outlines of {counted(len(used), 'picture')}. Thicker lines have more "
+        "matches; green ones "
         "fit well into the whole, red ones badly. The red dot is the reference picture.",
         drawing(width, height, parts, "match graph"),
     )
+
+
+def _overlap(first: tuple[float, float, float], second: tuple[float, float, float]) -> bool:
+    """Whether two names (left, baseline, width) lie on one another."""
+    apart = first[0] > second[0] + second[2] or second[0] > first[0] + first[2]
+    return not apart and abs(first[1] - second[1]) <= _LINE
 
 
 def _mixed(share: float) -> str:

@@ -18,11 +18,15 @@ _FADED = 0.6  # opacity of the pictures, so that lines can be seen on them
 
 
 def matched(registration: Registration) -> str:
-    """The used pairs with the smallest and the largest error."""
+    """The used pairs with the smallest and the largest error; the best one is among those with many matches."""
     links = sorted((fit for fit in registration.alignment.links if fit.used), key=lambda fit: fit.rms)
     if not links:
         return section("Matches", "No pair was used.")
-    shown = {"Best pair": links[0], "Worst pair": links[-1]} if len(links) > 1 else {"The pair": links[0]}
+    # A few matches fit anything.
+    usual = np.median([fit.inliers for fit in links])
+    best = next(fit for fit in links if fit.inliers >= usual)
+    others = [fit for fit in links if fit is not best]
+    shown = {"Best pair": best, "Worst pair": others[-1]} if others else {"The pair": best}
     return section(
         "Matches",
         f"Inliers are green, matches that were taken for wrong red; at most {_MOST_LINES} of each are drawn.",

@@ -15,6 +15,7 @@ from rdstitch.report.match_graph import match_graph
 from rdstitch.report.matched import matched
 from rdstitch.report.mosaic import mosaic
 from rdstitch.report.residual_map import residual_map
+from rdstitch.report.run import run
 from rdstitch.report.summary import notices, summary
 from rdstitch.report.timings import timings
 from rdstitch.report.votes import votes
@@ -29,7 +30,13 @@ h2 { font-size: 1.25em; margin-top: 2em; border-bottom: 1px solid #ddd; }
 h3 { font-size: 1em; }
 p, li, td { overflow-wrap: anywhere; } table { border-collapse: collapse; }
 td, th { padding: 0.2em 1em 0.2em 0; vertical-align: top; text-align: left; } td:first-child { white-space: nowrap; }
-img, svg { display: block; width: 100%; height: auto; } .beside { display: flex; gap: 1em; }
+img, svg { display: block; width: 100%; height: auto; }
+.beside { display: flex; flex-wrap: wrap; gap: 1em; } .beside > * { flex: 1 1 20em; }
+.thumbnails { display: flex; flex-wrap: wrap; gap: 1em; } figure { margin: 0; flex: 0 1 12em; }
+figcaption { font-size: 0.9em; overflow-wrap: anywhere; }
+@media (max-width: 600px) {
+  body { margin: 0.5em auto; } td, th { display: block; padding: 0; } td:first-child { color: #666; }
+}
 .good { color: #1c7a36; font-weight: bold; } .bad { color: #b3261e; font-weight: bold; }
 """
 
@@ -38,6 +45,7 @@ def write_report(
     path: str | Path,
     result: StitchResult | Registration,
     stages: Sequence[tuple[str, float]] = (),
+    command: str = "",
 ) -> None:
     """Write the report of a result: one HTML file without anything outside of it.
 
@@ -47,6 +55,8 @@ def write_report(
     result : StitchResult or Registration
     stages : sequence of (str, float)
         Name and seconds of each stage; see :class:`rdstitch.pipeline.timing.StageTimer`.
+    command : str
+        The command line that made the result, if any.
 
     Raises
     ------
@@ -54,10 +64,12 @@ def write_report(
         When the file cannot be written.
     """
     # Names of files need not be UTF-8.
-    write_bytes_atomic(path, report_page(result, stages).encode("utf-8", "backslashreplace"))
+    write_bytes_atomic(path, report_page(result, stages, command).encode("utf-8", "backslashreplace"))
 
 
-def report_page(result: StitchResult | Registration, stages: Sequence[tuple[str, float]] = ()) -> str:
+def report_page(
+    result: StitchResult | Registration, stages: Sequence[tuple[str, float]] = (), command: str = ""
+) -> str:
     """The report as HTML; see :func:`write_report`."""
     stitched = result if isinstance(result, StitchResult) else None
     registration = result.registration if isinstance(result, StitchResult) else result
@@ -75,9 +87,11 @@ def report_page(result: StitchResult | Registration, stages: Sequence[tuple[str,
         "" if stitched is None or stitched.plan is not None else local_alignment(stitched),
         path_over_plane(registration),
         timings(stages),
+        run(None if stitched is None else stitched.options, command),
     ]
     return (
-        f'<!DOCTYPE html>\n<html lang="en">\n<head><meta charset="utf-8"><title>{escape(title)}</title>'
+        f'<!DOCTYPE html>\n<html lang="en">\n<head><meta charset="utf-8">'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><title>{escape(title)}</title>'
         f"<style>{_STYLE}</style></head>\n<body>\n<h1>{escape(title)}</h1>\n"
         + "\n".join(body)
         + f"\n<footer><p>rdstitch {version('rdstitch')}</p></footer>\n</body>\n</html>\n"

@@ -8,7 +8,10 @@ import numpy as np
 
 from rdstitch.registration import Registration
 from rdstitch.report.svg import element, section, table
+from rdstitch.report.thumbnails import of_source
 from rdstitch.stitch_result import StitchResult
+
+_THUMBNAIL = 200  # pixels of the longer side
 
 
 def summary(registration: Registration, result: StitchResult | None) -> str:
@@ -18,9 +21,9 @@ def summary(registration: Registration, result: StitchResult | None) -> str:
         ("λ (half diagonal)", _lambda(registration)),
         ("λ per px²", f"{camera.distortion_px:.4e}"),
         ("pictures", f"{int(alignment.used.sum())} of {len(alignment.used) + _unread(registration)}"),
-        ("pairs", f"{sum(fit.used for fit in alignment.links)} used of {len(registration.pairs)} looked at"),
+        ("pairs", f"{sum(fit.used for fit in alignment.links)} used of {len(registration.pairs)} compared"),
         ("error", f"{alignment.rms:.3f} px rms of all inliers"),
-        ("motion", f"{alignment.model}: {alignment.model_reason}"),
+        ("motion", _motion(alignment.model, alignment.model_reason)),
         ("scene", alignment.relief.explanation),
         ("reference", registration.sources[alignment.reference].name),
     ]
@@ -36,13 +39,32 @@ def summary(registration: Registration, result: StitchResult | None) -> str:
 def notices(registration: Registration) -> str:
     """Warnings, and pictures that were left out, each with the reason."""
     warnings = [message.clause for message in registration.warnings]
-    missing = [f"{message.images[0]}: {message.text}" for message in registration.left_out]
     return section(
         "Warnings and left-out pictures",
         "",
         _list("What to look at", warnings, "No warnings."),
-        _list("Left out", missing, "Every picture is in the result."),
+        _left_out(registration),
     )
+
+
+def _left_out(registration: Registration) -> str:
+    """Small versions of the pictures that are not in the result, each with the reason."""
+    if not registration.left_out:
+        return element("p", "Every picture is in the result.")
+    sources = {str(source.path): source for source in registration.sources}
+    shown = []
+    for message in registration.left_out:
+        source = sources.get(message.images[0])
+        picture = None if source is None else of_source(source, _THUMBNAIL)
+        drawn = "" if picture is None else element("img", src=picture, alt="")
+        caption = element("figcaption", escape(f"{message.images[0]}: {message.text}"))
+        shown.append(element("figure", drawn + caption))
+    return element("h3", "Left out") + element("div", "".join(shown), class_="thumbnails")
+
+
+def _motion(model: str, reason: str) -> str:
+    """The model with the reason for it, which may begin with its name."""
+    return reason if reason.startswith(f"{model}:") else f"{model}: {reason}"
 
 
 def _verdict(registration: Registration) -> str:

@@ -55,6 +55,11 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return element("table", (element("tr", top) if head else "") + body)
 
 
+def counted(count: int, one: str, many: str = "") -> str:
+    """A number with its noun: "1 pair", "2 pairs"."""
+    return f"{count} {one if count == 1 else many or one + 's'}"
+
+
 def section(title: str, explanation: str, *content: str) -> str:
     """A part of the page with its heading."""
     return element("section", element("h2", escape(title)) + element("p", escape(explanation)) + "".join(content))

@@ -6,7 +6,7 @@ import numpy as np
 
 from rdstitch.matching.distortion_consensus import Consensus, vote
 from rdstitch.registration import Registration
-from rdstitch.report.svg import BLUE, GREY, RED, drawing, element, label, section
+from rdstitch.report.svg import BLUE, GREY, RED, counted, drawing, element, label, section
 
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 720.0, 280.0, 50.0, 40.0, 20.0
 _TICKS = 6
@@ -22,8 +22,9 @@ def votes(registration: Registration) -> str:
         return section("Votes on λ", f"No pair voted: {consensus.reason}.")
     return section(
         "Votes on λ",
-        f"λ of {consensus.votes} pairs, weighted by the inverse of its variance ({consensus.reason}, scatter "
-        f"{consensus.scatter:.4f}). The red line is λ after the adjustment of all pictures, grey ticks single pairs.",
+        f"λ of {counted(consensus.votes, 'pair')}, weighted by the inverse of its variance ({consensus.reason}, "
+        f"scatter {consensus.scatter:.4f}). The red line is λ after the adjustment of all pictures, grey ticks "
+        "single pairs.",
         _histogram(registration, consensus, [r.distortion for r in relations if math.isfinite(r.distortion_std)]),
     )
 

@@ -33,14 +33,16 @@ def _several_cameras(sources: Sequence[Source]) -> list[Message]:
     if len(bodies) > 1:
         commonest = sorted(bodies.items(), key=lambda body: -len(body[1]))[:MOST_NAMED]
         listed = "; ".join(f"{body} ({len(names)}: {shortened(names)})" for body, names in commonest)
-        return [Message(f"the pictures come from {len(bodies)} cameras: {listed}; stitch those of each on their own")]
+        text = f"the pictures come from {len(bodies)} cameras: {listed}; stitch those of each on their own"
+        return [Message(text, code="mixed-lenses")]
     focal = {s.name: s.metadata.focal_px / max(s.metadata.size) for s in known if s.metadata.focal_px is not None}
     if focal and max(focal.values()) > _FOCAL_SPREAD * min(focal.values()):
         near, far = min(focal, key=lambda name: focal[name]), max(focal, key=lambda name: focal[name])
         return [
             Message(
                 f"the lens was zoomed between the pictures, by up to {focal[far] / focal[near]:.2f} "
-                f"(between {near} and {far}); stitch those of one zoom on their own"
+                f"(between {near} and {far}); stitch those of one zoom on their own",
+                code="mixed-lenses",
             )
         ]
     return []

@@ -37,6 +37,8 @@ class RefusedError(RegistrationError):
     registration : Registration
     """
 
+    code = "not-reliable"
+
     def __init__(self, registration: Registration) -> None:
         reasons = "; ".join(message.clause for message in registration.failures)
         super().__init__(f"no reliable result: {reasons} (--force writes it all the same)")
@@ -125,7 +127,7 @@ def _relief(paths: Sequence[str], alignment: Alignment) -> list[Message]:
     images = (paths[worst.image1], paths[worst.image2])
     first, second = names_of(images)
     text = f"{alignment.relief.explanation}; most of all between {first} and {second} ({worst.rms:.1f} pixels)"
-    return [Message(text, images)]
+    return [Message(text, images, code="relief")]
 
 
 def _agreement_of_all(used: Sequence[LinkFit]) -> list[Message]:
@@ -155,7 +157,8 @@ def _outvoted(paths: Sequence[str], pairs: Sequence[Pair]) -> list[Message]:
         return []
     named = shortened([" and ".join(names_of([paths[i], paths[j]])) for i, j in pairs])
     text = f"{len(pairs)} of the pairs fit badly, and little depends on them: {named}; look at the seams between them"
-    return [Message(text, tuple(paths[k] for k in sorted({k for pair in pairs for k in pair})))]
+    images = tuple(paths[k] for k in sorted({k for pair in pairs for k in pair}))
+    return [Message(text, images, code="doubtful-seam")]
 
 
 def _mixed(paths: Sequence[str], registration: Registration) -> list[Message]:
@@ -198,7 +201,8 @@ def _decisive(suspicions: Mapping[Pair, Message], used: Sequence[LinkFit], count
 def _of_pair(paths: Sequence[str], link: LinkFit, text: str, severity: Severity = "failure") -> Message:
     """A message on two pictures; ``text`` follows their names."""
     both = paths[link.image1], paths[link.image2]
-    return Message(f"{' and '.join(names_of(both))}{text}", both, severity)
+    code = "doubtful-seam" if severity == "warning" else ""
+    return Message(f"{' and '.join(names_of(both))}{text}", both, severity, code)
 
 
 def _disagreeing(paths: Sequence[str], used: Sequence[LinkFit]) -> dict[Pair, Message]:

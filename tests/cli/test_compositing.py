@@ -134,7 +134,7 @@ def test_deep_zoom_is_the_same_picture(rdstitch: Run, frames: list[Path], tmp_pa
     assert rdstitch(*command, "--dry-run").status == 0
     assert not list(tmp_path.iterdir())
     assert rdstitch(*command).status == 0
-    assert {path.name for path in tmp_path.iterdir()} == {"a.dzi", "a_files", "a.dzi.json", "report.html"}
+    assert {path.name for path in tmp_path.iterdir()} == {"a.dzi", "a_files", "a.dzi.json", "a.html", "report.html"}
     assert rdstitch("mosaic", *frames, "-o", tmp_path / "a.png", *FAST).status == 0
     whole = read_image(tmp_path / "a.png")
     assert whole.alpha is not None
@@ -149,6 +149,7 @@ def test_deep_zoom_is_replaced_only_when_told(rdstitch: Run, sidecar: Path, fram
     assert rdstitch(*command).status == 0
     (tmp_path / "a.dzi").unlink()
     (tmp_path / "a.dzi.json").unlink()
+    (tmp_path / "a.html").unlink()
     done = rdstitch(*command)
     assert done.status == 6
     assert "a_files: exists already" in done.line

@@ -61,7 +61,11 @@ def test_mistakes_are_told_in_one_line(rdstitch: Run, place: Path, command: str,
     assert sorted(place.rglob("*")) == before
 
 
-def test_pictures_that_nobody_here_can_read_are_named(rdstitch: Run, place: Path) -> None:
+def test_pictures_that_nobody_here_can_read_are_named(
+    rdstitch: Run, place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for package in ("pillow_heif", "rawpy"):
+        monkeypatch.setitem(sys.modules, package, None)
     for name in ("new.HEIC", "a.dng", "frame_0000.dng"):
         (place / "more" / name).write_bytes(b"raw")
     done = rdstitch("mosaic", "more", "-o", "out.png", *FAST)

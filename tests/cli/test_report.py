@@ -21,11 +21,14 @@ from rdstitch.options import StitchOptions
 from rdstitch.pipeline import accept, calibrate, pano
 from rdstitch.pipeline.timing import StageTimer
 from rdstitch.report import report_page, thumbnails, write_report
+from rdstitch.report.matched import matched
+from rdstitch.report.summary import _motion
+from rdstitch.report.svg import counted
 from tests.cli.running import FAST, Run
 
 _VOID = {"meta", "img"}
 _SECTIONS = ["Summary", "Warnings and left-out pictures", "Mosaic", "Match graph", "Votes on λ", "Lens", "Lens curve"]
-_SECTIONS += ["Matches", "Residuals", "Local alignment", "Trajectory", "Timings"]
+_SECTIONS += ["Matches", "Residuals", "Local alignment", "Trajectory", "Timings", "Run"]
 _OF_PICTURES = ("Mosaic", "Local alignment")
 
 
@@ -94,8 +97,10 @@ def test_a_mosaic_has_every_section(reported: Path, stranger: Path, frames: list
     assert re.search(r"-0\.(19|20)\d+ ± 0\.0", page.text)
     for stage in ("detecting features", "matching", "registering pairs", "compositing"):
         assert re.search(rf"{stage} +\d+\.\d\d s", page.text)
-    # Mosaic; the lens; two pairs of pictures.
-    assert (page.counts["img"], page.counts["image"]) == (1, 5)
+    # The picture left out; mosaic; the lens; two pairs of pictures.
+    assert (page.counts["img"], page.counts["image"]) == (1, 6)
+    assert "command" in page.text
+    assert "features.max_features = 600" in page.text  # of the options, what was chosen
     assert all(frame.name in page.text for frame in frames)
 
 
@@ -224,3 +229,20 @@ def test_a_browser_shows_it(reported: Path, tmp_path: Path) -> None:
     colourful = np.ptp(pixels, axis=2).mean(axis=1) > 4.0
     assert colourful[:2000].sum() > 200
     assert colourful[2000:].sum() > 300
+
+
+def test_words_of_the_page() -> None:
+    assert [counted(n, "pair") for n in (0, 1, 2)] == ["0 pairs", "1 pair", "2 pairs"]
+    assert _motion("tilting", "tilting: explains more") == "tilting: explains more"
+    assert _motion("tilting", "explains more") == "tilting: explains more"
+
+
+def test_the_best_pair_has_many_matches(frames: list[Path]) -> None:
+    result = pano(frames, options=StitchOptions(workers=1))
+    links = result.registration.alignment.links
+    few = replace(links[0], inliers=22, rms=0.001)
+    alignment = replace(result.registration.alignment, links=(few, *links[1:]))
+    shown = matched(replace(result.registration, alignment=alignment))
+    names = [frames[k].name for k in (few.image1, few.image2)]
+    assert f"Best pair: {' and '.join(names)}" not in shown
+    assert "Best pair: " in shown

@@ -32,6 +32,7 @@ Examples:
 )
 @options.overwrite
 @options.every
+@options.topic
 @options.known
 @options.estimation
 @options.report

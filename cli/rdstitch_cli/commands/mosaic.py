@@ -25,6 +25,7 @@ Examples:
 @options.output
 @options.overwrite
 @options.every
+@options.topic
 @click.option("--reference", metavar="NAME", help="Picture that sets the frame; otherwise the best connected one.")
 @options.preview
 @options.known
@@ -54,13 +55,13 @@ def mosaic(
     """Stitch a whole sequence over one plane, seen straight from above.
 
     INPUT is a folder, a picture, a quoted pattern, @FILE with one input a line (or separated by NUL), - for such a
-    list on standard input, or a video. Pictures that do not fit are left out and named on standard error.
+    list on standard input, a video, or a ROS bag. Pictures that do not fit are left out and named on standard error.
     """
     from rdstitch.pipeline import mosaic as recipe
 
     with Reporter(-quiet + verbose) as reporter:
         paths = options.resolve(inputs)
-        told = Report(report, reporter, paths, given["overwrite"])
+        told = Report(report, reporter, paths, given["overwrite"], output)
         with told.explaining():
             result = recipe(paths, output, stitch_options(reporter, **given), every=every, progress=told.progress)
         summarize(result, reporter, as_json=as_json)

@@ -24,6 +24,7 @@ Examples:
 @options.output
 @options.overwrite
 @options.every
+@options.topic
 @click.option("--reference", metavar="NAME", help="Picture whose frame is kept; otherwise the best connected one.")
 @options.preview
 @options.known
@@ -59,7 +60,7 @@ def pano(
 
     with Reporter(-quiet + verbose) as reporter:
         paths = options.resolve(inputs)
-        told = Report(report, reporter, paths, given["overwrite"])
+        told = Report(report, reporter, paths, given["overwrite"], output)
         with told.explaining():
             result = recipe(paths, output, stitch_options(reporter, **given), every=every, progress=told.progress)
         summarize(result, reporter, as_json=as_json)

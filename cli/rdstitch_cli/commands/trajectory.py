@@ -17,6 +17,7 @@ from rdstitch_cli.stitching import report_registration, stitch_options
 Examples:
   rdstitch trajectory floor/ -o poses.csv
   rdstitch trajectory floor/ -o poses.txt --format tum --height 0.42
+  rdstitch trajectory drive.bag --topic /camera/image_raw -o poses.csv
 """,
 )
 @options.inputs
@@ -24,10 +25,11 @@ Examples:
 @click.option(
     "--format",
     "layout",
-    type=click.Choice(["csv", "tum"]),
+    type=click.Choice(["csv", "tum", "kitti"]),
     default="csv",
     show_default=True,
-    help="csv: frame, x, y, yaw in degrees, height. tum: number, position and quaternion a line.",
+    help="csv: a table with names, time stamps, x, y, yaw in degrees and height. tum: time, position and quaternion. "
+    "kitti: matrices.",
 )
 @click.option(
     "--height",
@@ -36,9 +38,17 @@ Examples:
     show_default=True,
     help="Height of the first frame above the plane, in the unit that positions shall have.",
 )
+@click.option(
+    "--timestamps",
+    type=options.PICTURE,
+    metavar="FILE",
+    help="Time stamps of the pictures: CSV name,timestamp, lines TIME NAME, or a time a line; "
+    "otherwise those of the video, bag or EXIF.",
+)
 @click.option("--plot", type=options.PICTURE, metavar="FILE", help="Draw the path to FILE (SVG).")
 @options.overwrite
 @options.every
+@options.topic
 @options.known
 @options.estimation
 @options.trust
@@ -46,8 +56,9 @@ Examples:
 def trajectory(
     inputs: tuple[Path, ...],
     output: Path,
-    layout: Literal["csv", "tum"],
+    layout: Literal["csv", "tum", "kitti"],
     height: float,
+    timestamps: Path | None,
     plot: Path | None,
     every: int,
     quiet: bool,
@@ -67,6 +78,7 @@ def trajectory(
             output,
             stitch_options(reporter, **given),
             layout=layout,
+            timestamps=timestamps,
             plot=plot,
             height=height,
             every=every,

@@ -6,6 +6,7 @@ import pytest
 from rdstitch.alignment.result import Poses
 from rdstitch.alignment.trajectory import Trajectory, compare
 from rdstitch.errors import ArgumentError
+from rdstitch.export.trajectory_files import as_csv, as_tum
 
 
 def _poses() -> Poses:
@@ -29,12 +30,12 @@ def test_a_path_starts_at_the_origin_with_the_height_given() -> None:
 
 def test_files() -> None:
     path = Trajectory.from_poses(_poses())
-    header, *rows = path.as_csv().splitlines()
-    assert header == "frame,x,y,phi_deg,height"
-    numbers = np.array([[float(value) for value in row.split(",")] for row in rows])
-    np.testing.assert_allclose(numbers[:, 1:3], path.position, atol=1e-8)
-    np.testing.assert_allclose(numbers[:, 3], np.degrees(path.yaw), atol=1e-6)
-    tum = np.array([[float(value) for value in row.split()] for row in path.as_tum([0.0, 0.1, 0.3, 0.4]).splitlines()])
+    header, *rows = as_csv(path).splitlines()
+    assert header == "frame,name,source_frame,timestamp,x,y,phi_deg,height"
+    numbers = np.array([[float(value or "nan") for value in row.split(",")] for row in rows])
+    np.testing.assert_allclose(numbers[:, 4:6], path.position, atol=1e-8)
+    np.testing.assert_allclose(numbers[:, 6], np.degrees(path.yaw), atol=1e-6)
+    tum = np.array([[float(value) for value in row.split()] for row in as_tum(path, [0.0, 0.1, 0.3, 0.4]).splitlines()])
     assert tum.shape == (4, 8)
     np.testing.assert_allclose(tum[:, 0], [0.0, 0.1, 0.3, 0.4])
     np.testing.assert_allclose(tum[:, 3], -path.height, atol=1e-8)
@@ -42,7 +43,7 @@ def test_files() -> None:
         np.remainder(2 * np.arctan2(tum[:, 6], tum[:, 7]) + path.yaw, 2 * np.pi) % 6.28318, 0, atol=1e-4
     )
     with pytest.raises(ArgumentError, match="timestamps"):
-        path.as_tum([1.0])
+        as_tum(path, [1.0])
 
 
 def test_neither_frame_nor_unit_matter_to_the_error() -> None:

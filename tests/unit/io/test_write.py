@@ -2,7 +2,9 @@
 
 import itertools
 import os
+import shutil
 import stat
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 
 from rdstitch.errors import ArgumentError, LimitError, OutputError
 from rdstitch.io import (
@@ -261,3 +263,44 @@ class TestCheckOutput:
         (tmp_path / "a.jpg").mkdir()
         with pytest.raises(OutputError, match="folder"):
             check_output(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_grey_with_alpha_is_shown_by_other_readers(tmp_path: Path, dtype: type[np.unsignedinteger[Any]]) -> None:
+    full = np.iinfo(dtype).max
+    pixels = (np.add.outer(np.arange(500), np.arange(700)) % 256 * (full // 255)).astype(dtype)
+    alpha = np.full(pixels.shape, 255, np.uint8)
+    alpha[:90] = 0
+    file = tmp_path / "grey.tif"
+    write_image(file, pixels, alpha)
+    seen = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)  # tiles would be read as stripes
+    assert seen is not None
+    np.testing.assert_allclose(seen[90:].astype(float), pixels[90:] / (full / 255), atol=1.0)
+    with tifffile.TiffFile(file) as tiff:
+        stored = tiff.pages.first.asarray()
+        np.testing.assert_array_equal(stored[..., 0], pixels)
+        np.testing.assert_array_equal(stored[..., 1], alpha * dtype(full // 255))
+        assert len(tiff.series[0].levels) > 1
+    if dtype is np.uint8:  # Pillow has no 16-bit grey with alpha
+        with Image.open(file) as image:
+            assert image.mode == "LA"
+            np.testing.assert_array_equal(np.asarray(image)[..., 0], pixels)
+    ours = read_image(file)
+    np.testing.assert_array_equal(ours.pixels, pixels)
+    assert ours.alpha is not None
+    np.testing.assert_array_equal(ours.alpha, alpha)
+    if shutil.which("gdalinfo"):
+        told = subprocess.run(["gdalinfo", "-stats", file], capture_output=True, text=True, check=True)
+        assert told.stderr == ""
+
+
+def test_padding_of_camera_names_is_not_copied(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "Maker\0\0\0", "Camera 1\0"
+    metadata = Metadata((8, 8), exif=exif.tobytes())
+    write_image(tmp_path / "a.tif", np.zeros((8, 8), np.uint8), metadata=metadata)
+    with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
+        tags = tiff.pages.first.tags
+        assert (tags["Make"].value, tags["Model"].value) == ("Maker", "Camera 1")
+    data = (tmp_path / "a.tif").read_bytes()
+    assert b"Maker\0\0" not in data

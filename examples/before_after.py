@@ -1,0 +1,61 @@
+"""The picture at the top of README: what goes in, and what comes out.
+
+``python -m examples.before_after PHOTO docs/images/before_after.jpg`` lays a photograph flat, takes six pictures of it
+through a lens with λ = -0.35, stitches them, and puts them beside the result. The photograph in README is
+IMG_161122_163239_0001_RGB.JPG of OpenDroneMap's odm_data_garfield_msp, in the public domain (CC0).
+"""
+
+import sys
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+import rdstitch
+from rdstitch.camera import Camera
+from rdstitch.synthetic import Photometry, PictureTexture, Texture, grid_poses, sequence_over
+
+_DISTORTION = -0.35
+_TALL, _GAP = 700, 12
+
+
+def main(photo: str, output: str) -> None:
+    """Render, stitch, and lay out."""
+    with Image.open(photo) as image:
+        original = image.convert("RGB")
+
+    def texture(plane: tuple[int, int]) -> Texture:
+        # The part of the photo that has the plane's shape.
+        height = round(original.width * plane[1] / plane[0])
+        top = (original.height - height) // 2
+        return PictureTexture(np.asarray(original.resize(plane, box=(0, top, original.width, top + height))))
+
+    lens = Camera((960, 720), distortion=_DISTORTION, focal=900.0)
+    poses = grid_poses(lens, 3, 2, overlap=0.45, yaw=0.12, shift=0.05, tilt=(0.06, -0.04), seed=3)
+    sequence = sequence_over(texture, lens, poses, photometry=Photometry(vignetting=0.2, noise=0.01), seed=3)
+    options = rdstitch.StitchOptions(
+        channel_order="rgb", composite=rdstitch.CompositeOptions(background=255), workers=2
+    )
+    pictures = sequence.frames()
+    result = rdstitch.mosaic(pictures, options=options)
+    print(f"{result!r}; the truth is {_DISTORTION}")
+    mosaic = Image.fromarray(np.where(result.alpha[..., None] > 0, result.image, 255).astype(np.uint8))
+    side_by_side(pictures, mosaic).save(output, quality=88)
+
+
+def side_by_side(pictures: list[NDArray[np.uint8]], mosaic: Image.Image) -> Image.Image:
+    """Six pictures in two columns, and what became of them."""
+    small = (_TALL - 2 * _GAP) // 3
+    wide = small * 4 // 3
+    right = mosaic.resize((round(mosaic.width * _TALL / mosaic.height), _TALL), Image.Resampling.LANCZOS)
+    page = Image.new("RGB", (2 * wide + 4 * _GAP + right.width, _TALL), "white")
+    for index, picture in enumerate(pictures):
+        row, column = divmod(index, 2)
+        thumbnail = Image.fromarray(picture).resize((wide, small), Image.Resampling.LANCZOS)
+        page.paste(thumbnail, (column * (wide + _GAP), row * (small + _GAP)))
+    page.paste(right, (2 * wide + 4 * _GAP, 0))
+    return page
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:3])

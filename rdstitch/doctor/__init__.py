@@ -1,0 +1,6 @@
+"""What a run will meet, found out at a glance: pictures, lenses, sharpness, exposure, overlap, effort."""
+
+from rdstitch.doctor.examination import Examination
+from rdstitch.doctor.examine import examine
+
+__all__ = ["Examination", "examine"]

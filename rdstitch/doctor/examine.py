@@ -1,0 +1,212 @@
+"""The examination of a set of pictures; nothing is registered."""
+
+import os
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from rdstitch.compositing.plan import DEFAULT_MEMORY
+from rdstitch.doctor.examination import Examination
+from rdstitch.doctor.glance import Glance, glance_at, overlap_of
+from rdstitch.errors import InputError
+from rdstitch.features import FeatureOptions, Features, detect
+from rdstitch.features.options import WORK_MEGAPIXELS
+from rdstitch.inputs.find import found_pictures
+from rdstitch.inputs.frame import ChannelOrder, Images, as_inputs
+from rdstitch.inputs.source import Source, read_sources
+from rdstitch.matching.match_graph import connected_components
+from rdstitch.progress import Progress, silent
+
+_GLANCE = FeatureOptions(max_features=500, work_megapixels=None)
+_MEGAPIXELS = 0.3  # of the versions that are examined
+_ALL_PAIRS = 24  # pictures of which every pair is compared; of more, those up to three apart
+_APART = 3
+_BLURRED = 0.6  # of the median sharpness
+_DARK, _BURNT = 0.06, 0.05  # mean brightness; share of burnt-out pixels
+_LEAST_OVERLAP = 0.3
+_ZOOMED = 1.03  # ratio of focal lengths by EXIF
+_BASE_MEMORY = 200 * 2**20  # interpreter and libraries
+_FEATURES_MEMORY = 3 * 2**20  # keypoints, descriptors and matches of a picture
+# Of processor time, s: per pair of 4000 features matched and estimated, and per megapixel composited.
+_SECONDS_PAIR, _SECONDS_MEGAPIXEL = 0.35, 0.2
+_PAIRS_PER_PICTURE = 4
+
+
+@dataclass(frozen=True)
+class _Examined:
+    glance: Glance
+    features: Features
+    seconds: float
+
+
+def examine(
+    inputs: Images, *, every: int = 1, channel_order: ChannelOrder = "bgr", progress: Progress = silent
+) -> Examination:
+    """Find out at a glance what a run will meet.
+
+    Every picture is decoded once, small; neighbours are compared by a few features. It says what is likely, and decides
+    nothing.
+
+    Parameters
+    ----------
+    inputs, every, channel_order, progress
+        As for :func:`rdstitch.mosaic`.
+
+    Raises
+    ------
+    InputError
+        When an input names nothing, or nothing can be read.
+    """
+    with found_pictures(as_inputs(inputs, channel_order), every=every) as pictures:
+        sources, unread = read_sources(pictures.frames, camera=None, focal=None, distortion=None, skip_bad=True)
+        unreadable = [str(message) for message in unread]
+        found: dict[int, _Examined] = {}
+        workers = os.cpu_count() or 1
+        with ThreadPoolExecutor(workers) as pool:
+            waiting = [pool.submit(_examine_one, source) for source in sources]
+            for index, future in enumerate(waiting):
+                try:
+                    found[index] = future.result()
+                except InputError as error:
+                    unreadable.append(str(error))
+                progress("examining", index + 1, len(sources))
+    if not found:
+        raise InputError(unreadable[0] if unreadable else "there is nothing to examine")
+    return _conclude([sources[k] for k in found], list(found.values()), tuple(unreadable), workers)
+
+
+def _examine_one(source: Source) -> _Examined:
+    began = time.thread_time()
+    reduction = max(1, round(np.sqrt(np.prod(source.camera.image_size) / (_MEGAPIXELS * 1e6))))
+    picture = source.read(reduction)
+    features = detect(picture.pixels, _GLANCE, picture.alpha)
+    return _Examined(glance_at(picture), features, time.thread_time() - began)
+
+
+def _conclude(
+    sources: Sequence[Source], examined: Sequence[_Examined], unreadable: tuple[str, ...], workers: int
+) -> Examination:
+    names, count = [source.name for source in sources], len(sources)
+    sharpness = np.array([item.glance.sharpness for item in examined])
+    blurred = tuple(
+        name for name, value in zip(names, sharpness, strict=True) if value < _BLURRED * np.median(sharpness)
+    )
+    dark = tuple(n for n, item in zip(names, examined, strict=True) if item.glance.brightness < _DARK)
+    burnt = tuple(n for n, item in zip(names, examined, strict=True) if item.glance.clipped > _BURNT)
+    shares = _overlaps([item.features for item in examined])
+    best = np.zeros(count)
+    for (i, j), share in shares.items():
+        best[[i, j]] = np.maximum(best[[i, j]], share)
+    joined = [pair for pair, share in shares.items() if share > 0.0]
+    groups = connected_components(count, [i for i, _ in joined], [j for _, j in joined])
+    alone = tuple(name for name, share in zip(names, best, strict=True) if share == 0.0)
+    overlap = float(np.median(best[best > 0])) if (best > 0).any() else None
+    sizes = _common("{} x {}".format(*source.metadata.size) for source in sources)
+    cameras = _common(_camera(source) for source in sources)
+    focal, zoomed = _focal(sources)
+    megapixels = sum(np.prod(source.metadata.size) for source in sources) / 1e6
+    return Examination(
+        count,
+        unreadable,
+        sizes,
+        cameras,
+        focal,
+        blurred,
+        dark,
+        burnt,
+        alone,
+        len(groups),
+        overlap,
+        float(megapixels),
+        _memory(sources),
+        _seconds(sources, examined, overlap or 0.5, workers),
+        tuple(_advice(count, unreadable, cameras, zoomed, blurred, dark, burnt, alone, groups, overlap)),
+    )
+
+
+def _overlaps(features: Sequence[Features]) -> dict[tuple[int, int], float]:
+    """Share of overlap of the pairs that are compared: all of a few pictures, neighbours of many."""
+    count = len(features)
+    reach = count if count <= _ALL_PAIRS else _APART
+    pairs = [(i, j) for i in range(count) for j in range(i + 1, min(i + reach + 1, count))]
+    return {(i, j): overlap_of(features[i], features[j]) for i, j in pairs}
+
+
+def _common(items: Iterable[str]) -> tuple[tuple[str, int], ...]:
+    return tuple(Counter(items).most_common())
+
+
+def _camera(source: Source) -> str:
+    m = source.metadata
+    return " ".join(filter(None, (m.make, m.model, m.serial))) or "unknown"
+
+
+def _focal(sources: Sequence[Source]) -> tuple[str, bool]:
+    """What is known of the focal length, and whether the lens was zoomed."""
+    known = [s.metadata.focal_px / max(s.metadata.size) for s in sources if s.metadata.focal_px is not None]
+    if not known:
+        return "not known from EXIF; it is guessed, which matters for trajectory only", False
+    zoomed = max(known) > _ZOOMED * min(known)
+    pixels = [s.metadata.focal_px for s in sources if s.metadata.focal_px is not None]
+    low, high = min(pixels), max(pixels)
+    text = f"{low:.0f} pixels" if not zoomed else f"{low:.0f} to {high:.0f} pixels"
+    return f"{text} by EXIF in {len(known)} of {len(sources)} pictures", zoomed
+
+
+def _memory(sources: Sequence[Source]) -> int:
+    largest = max(int(np.prod(source.metadata.size)) * source.metadata.bit_depth // 8 * 3 for source in sources)
+    return _BASE_MEMORY + max(DEFAULT_MEMORY, 6 * largest) + _FEATURES_MEMORY * len(sources)
+
+
+def _seconds(sources: Sequence[Source], examined: Sequence[_Examined], overlap: float, workers: int) -> float:
+    """From the time that the glance took: features of larger versions, pairs, and the composite."""
+    detecting = sum(
+        item.seconds * min(WORK_MEGAPIXELS, np.prod(source.metadata.size) / 1e6) / _MEGAPIXELS
+        for source, item in zip(sources, examined, strict=True)
+    )
+    pairs = min(_PAIRS_PER_PICTURE * len(sources), len(sources) * (len(sources) - 1) / 2)
+    composite = sum(np.prod(source.metadata.size) for source in sources) / 1e6 * (1.0 - overlap / 2.0)
+    total = detecting + _SECONDS_PAIR * pairs + _SECONDS_MEGAPIXEL * composite
+    return float(total / workers)
+
+
+def _advice(
+    count: int,
+    unreadable: Sequence[str],
+    cameras: Sequence[tuple[str, int]],
+    zoomed: bool,
+    blurred: Sequence[str],
+    dark: Sequence[str],
+    burnt: Sequence[str],
+    alone: Sequence[str],
+    groups: Sequence[Sequence[int]],
+    overlap: float | None,
+) -> list[str]:
+    """What to change, most important first."""
+    advice = []
+    if count < 2:
+        advice.append("stitching needs two pictures or more; name another one")
+    elif overlap is None:
+        advice.append("no overlap was found: take pictures that overlap by a half, of something with texture")
+    if len(cameras) > 1:
+        advice.append(f"the pictures come from {len(cameras)} cameras: stitch those of each on their own")
+    if zoomed:
+        advice.append("the lens was zoomed between the pictures: stitch those of one zoom on their own")
+    if unreadable:
+        advice.append(f"{len(unreadable)} files cannot be read: {unreadable[0]}")
+    if overlap is not None and overlap < _LEAST_OVERLAP:
+        advice.append(f"pictures overlap by about {overlap:.0%} only: take more pictures, a third is the least")
+    if overlap is not None and alone:
+        named = ", ".join(alone[:3]) + ", …" * (len(alone) > 3)
+        advice.append(f"no overlap with a neighbour was seen, and may lead to being left out: {named}")
+    elif len(groups) > 1:
+        advice.append(f"the pictures fall into {len(groups)} groups: only the largest becomes the mosaic")
+    if blurred:
+        advice.append(f"leave blurred pictures out if their neighbours overlap without them: {', '.join(blurred[:3])}")
+    if dark or burnt:
+        advice.append("dark or burnt-out pictures have few features: fix the exposure if you can take them again")
+    return advice

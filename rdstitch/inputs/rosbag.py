@@ -1,0 +1,128 @@
+"""Images of a ROS bag, of version 1 or 2, as picture files with time stamps; no ROS is needed, only ``rosbags``."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.errors import InputError, OutputError
+from rdstitch.inputs.frame import Frame
+from rdstitch.io.video import write_frame
+
+_SUFFIXES = (".bag", ".db3", ".mcap")
+_DESCRIPTION = "metadata.yaml"
+_IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_TYPES = {
+    **dict.fromkeys(("mono8", "8UC1", "rgb8", "bgr8", "8UC3", "rgba8", "bgra8", "8UC4"), np.uint8),
+    **dict.fromkeys(("mono16", "16UC1", "rgb16", "bgr16", "16UC3", "rgba16", "bgra16"), np.uint16),
+    **dict.fromkeys(("bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"), np.uint8),
+}
+_TO_BGR = {
+    "rgb8": cv2.COLOR_RGB2BGR,
+    "rgb16": cv2.COLOR_RGB2BGR,
+    "rgba8": cv2.COLOR_RGBA2BGR,
+    "rgba16": cv2.COLOR_RGBA2BGR,
+    "bgra8": cv2.COLOR_BGRA2BGR,
+    "bgra16": cv2.COLOR_BGRA2BGR,
+    "8UC4": cv2.COLOR_BGRA2BGR,
+    # OpenCV names a pattern by its second row.
+    "bayer_rggb8": cv2.COLOR_BayerBG2BGR,
+    "bayer_bggr8": cv2.COLOR_BayerRG2BGR,
+    "bayer_gbrg8": cv2.COLOR_BayerGR2BGR,
+    "bayer_grbg8": cv2.COLOR_BayerGB2BGR,
+}
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path is a bag: a file by its suffix, or a folder that ROS 2 wrote."""
+    return path.suffix.lower() in _SUFFIXES or (path.is_dir() and (path / _DESCRIPTION).is_file())
+
+
+def extract_images(path: Path, folder: Path, every: int = 1, topic: str | None = None) -> list[Frame]:
+    """Write every n-th image of a topic to a folder, losslessly, with number and time stamp (s) of its header.
+
+    Parameters
+    ----------
+    path : Path
+        File of ROS 1, folder of ROS 2 or a file in it.
+    folder : Path
+    every : int
+    topic : str, optional
+        Without one, the only topic of images.
+
+    Raises
+    ------
+    InputError
+        When ``rosbags`` is missing, the bag cannot be read, or there is not one such topic.
+    """
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise InputError(f'{path}: reading ROS bags needs the extra ros: pip install "rdstitch[ros]"') from None
+    # A bag of ROS 2 is a folder; its files may be named as well.
+    bag = path.parent if path.suffix.lower() in (".db3", ".mcap") and (path.parent / _DESCRIPTION).is_file() else path
+    try:
+        with AnyReader([bag], default_typestore=get_typestore(Stores.LATEST)) as reader:
+            connections = [c for c in reader.connections if c.msgtype in (_IMAGE, _COMPRESSED)]
+            chosen = _chosen_topic(path, sorted({c.topic for c in connections}), topic)
+            return list(_frames(reader, [c for c in connections if c.topic == chosen], path, folder, every))
+    except (InputError, OutputError):
+        raise
+    except Exception as error:  # rosbags raises many kinds on damaged files
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: cannot be read as a ROS bag ({reason[:160]})") from error
+
+
+def _chosen_topic(path: Path, topics: list[str], wanted: str | None) -> str:
+    listed = ", ".join(topics)
+    if not topics:
+        raise InputError(f"{path}: the bag has no images")
+    if wanted is None and len(topics) > 1:
+        raise InputError(f"{path}: the bag has several topics of images; choose one by --topic: {listed}")
+    if wanted is not None and wanted not in topics:
+        raise InputError(f"{path}: the bag has no images of the topic {wanted}; it has {listed}")
+    return wanted or topics[0]
+
+
+def _frames(reader: Any, connections: list[Any], path: Path, folder: Path, every: int) -> Iterator[Frame]:
+    for number, (connection, time_ns, data) in enumerate(reader.messages(connections=connections)):
+        if number % every:
+            continue
+        message = reader.deserialize(data, connection.msgtype)
+        stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+        name = f"{path.stem}_{number:06d}"
+        if connection.msgtype == _COMPRESSED:
+            file = folder / f"{name}{_suffix(message.data)}"
+            file.write_bytes(message.data.tobytes())
+        else:
+            file = write_frame(folder / f"{name}.png", _pixels(path, message))
+        # Drivers that do not set the stamp leave it 0; the recorder's time is then the best that is known.
+        yield Frame(file, number, stamp or time_ns * 1e-9)
+
+
+def _suffix(data: NDArray[np.uint8]) -> str:
+    """Of a compressed image, by its first bytes: the format field is free text."""
+    return ".png" if bytes(data[:4]) == b"\x89PNG" else ".jpg"
+
+
+def _pixels(path: Path, message: Any) -> NDArray[Any]:
+    """Samples of an uncompressed image, grey or BGR; rows may be padded, and bytes swapped."""
+    kind = _TYPES.get(message.encoding)
+    if kind is None:
+        known = ", ".join(_TYPES)
+        raise InputError(f"{path}: images have the encoding {message.encoding}, which is none of {known}")
+    dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
+    rows = np.asarray(message.data, dtype=np.uint8)[: message.height * message.step].reshape(message.height, -1)
+    channels = 1 if message.encoding.startswith(("mono", "bayer")) else None
+    samples = np.ascontiguousarray(rows).view(dtype).astype(kind)
+    if channels is None:
+        channels = {"1": 1, "3": 3, "4": 4}.get(message.encoding[-1] if "C" in message.encoding else "", 0)
+        channels = channels or (4 if "a" in message.encoding else 3)
+    samples = samples[:, : message.width * channels].reshape(message.height, message.width, channels)
+    code = _TO_BGR.get(message.encoding)
+    samples = samples[..., 0] if channels == 1 else samples
+    return samples if code is None else np.asarray(cv2.cvtColor(samples, code))

@@ -1,0 +1,122 @@
+"""The page: OpenSeadragon's released file, our script, and the data, all in one HTML file beside the tiles."""
+
+import base64
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from rdstitch.arrays import FloatArray
+from rdstitch.compositing.seam_finder import SeamMap
+from rdstitch.io.deepzoom import OVERLAP, TILE, tiles_folder
+from rdstitch.viewer.seams import seam_picture
+
+_CORNERS = 64  # of an outline, at most
+
+
+@dataclass(frozen=True)
+class ViewedPicture:
+    """What the page says of a picture.
+
+    Attributes
+    ----------
+    name : str
+    outline : ndarray of shape (K, 2)
+        Pixels of the mosaic, centre of the top-left one at (0, 0).
+    facts : tuple of (str, str)
+        What is shown when the picture is clicked.
+    """
+
+    name: str
+    outline: FloatArray
+    facts: tuple[tuple[str, str], ...]
+
+
+def viewer_path(output: str | Path) -> Path | None:
+    """The page that belongs to an output; None where that is no pyramid of tiles."""
+    path = Path(output)
+    return path.with_suffix(".html") if path.suffix.lower() == ".dzi" else None
+
+
+def viewer_page(
+    output: str | Path,
+    size: tuple[int, int],
+    pictures: Sequence[ViewedPicture],
+    seams: SeamMap | None = None,
+    origin: tuple[int, int] = (0, 0),
+) -> str:
+    """The page of a ``.dzi`` file, as HTML.
+
+    Parameters
+    ----------
+    output : path
+        The ``.dzi`` file.
+    size : (int, int)
+        Width and height of the mosaic, pixels.
+    pictures : sequence of ViewedPicture
+    seams : SeamMap, optional
+    origin : (int, int)
+        Where the mosaic begins in the canvas of the seams, pixels.
+    """
+    output = Path(output)
+    data: dict[str, Any] = {
+        "size": size,
+        # As the .dzi file says; a page from the disk may not read it.
+        "tiles": {
+            "Image": {
+                "xmlns": "http://schemas.microsoft.com/deepzoom/2008",
+                "Url": quote(tiles_folder(output).name, errors="surrogateescape") + "/",
+                "Format": "jpg",
+                "Overlap": str(OVERLAP),
+                "TileSize": str(TILE),
+                "Size": {"Width": str(size[0]), "Height": str(size[1])},
+            }
+        },
+        "pictures": [_described(picture) for picture in pictures],
+    }
+    if seams is not None:
+        shown, box = seam_picture(seams, origin, size)
+        data["seams"] = "data:image/png;base64," + base64.b64encode(shown).decode("ascii")
+        data["seamsBox"] = box
+    title = escape(output.name)
+    # Inside a script, "</" would end it.
+    text = json.dumps(data, ensure_ascii=True).replace("</", "<\\/")
+    boxes = "".join(
+        f'<label><input type="checkbox" id="show-{name}"{checked}> {name}</label>'
+        for name, checked in (("outlines", " checked"), ("names", " checked"), ("seams", ""))
+        if name != "seams" or seams is not None
+    )
+    if seams is None:
+        boxes += '<input type="checkbox" id="show-seams" hidden>'
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<style>{_file('viewer.css')}</style></head><body>\n<!--\n{_file('openseadragon.LICENSE.txt')}-->\n"
+        f'<div id="view"></div><div id="names"></div><div id="controls"><b>{title}</b>{boxes}<span><button id="in" '
+        'title="larger">+</button> <button id="out" title="smaller">-</button> <button id="home" title="all">all'
+        '</button></span></div><div id="facts"></div>\n'
+        f'<script type="application/json" id="data">{text}</script>\n'
+        f"<script>{_file('openseadragon.min.js')}</script>\n<script>{_file('viewer.js')}</script>\n</body></html>\n"
+    )
+
+
+def _described(picture: ViewedPicture) -> dict[str, Any]:
+    """For the script, which counts pixels from the corner of the first one."""
+    step = max(1, len(picture.outline) // _CORNERS)
+    outline = picture.outline[::step] + 0.5
+    return {
+        "name": picture.name.encode("utf-8", "backslashreplace").decode("utf-8"),
+        "outline": np.round(outline, 1).tolist(),
+        "center": np.round(outline.mean(axis=0), 1).tolist(),
+        "facts": [list(fact) for fact in picture.facts],
+    }
+
+
+def _file(name: str) -> str:
+    return files("rdstitch.viewer").joinpath(name).read_text(encoding="utf-8")

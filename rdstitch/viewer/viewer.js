@@ -1,0 +1,82 @@
+"use strict";
+const data = JSON.parse(document.getElementById("data").textContent);
+const [width, height] = data.size;
+// The canvas drawer shows tiles that a browser loads from the disk, where WebGL refuses them.
+const viewer = OpenSeadragon({
+  element: document.getElementById("view"), tileSources: data.tiles, drawer: "canvas", showNavigationControl: false,
+  gestureSettingsMouse: { clickToZoom: false }, gestureSettingsTouch: { clickToZoom: false }, maxZoomPixelRatio: 4,
+});
+const make = (name, parent, attributes) => {
+  const node = document.createElementNS("http://www.w3.org/2000/svg", name);
+  for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
+  return parent.appendChild(node);
+};
+const svg = make("svg", document.body, {});
+const drawing = make("g", svg, {});
+const seams = make("g", drawing, {});
+if (data.seams) make("image", seams, { href: data.seams, x: data.seamsBox[0], y: data.seamsBox[1],
+  width: data.seamsBox[2], height: data.seamsBox[3], preserveAspectRatio: "none" });
+const outlines = make("g", drawing, {});
+const names = document.getElementById("names");
+const pictures = data.pictures.map((picture) => ({
+  ...picture,
+  path: make("path", outlines, { d: "M" + picture.outline.map((point) => point.join(",")).join("L") + "Z" }),
+  label: names.appendChild(Object.assign(document.createElement("span"), { textContent: picture.name })),
+}));
+
+// Pixels of the mosaic to pixels of the page: one unit of the viewport is the width of the mosaic.
+const place = () => {
+  const at = (x, y) => viewer.viewport.pixelFromPoint(new OpenSeadragon.Point(x / width, y / width), true);
+  const origin = at(0, 0), scale = (at(width, 0).x - origin.x) / width;
+  drawing.setAttribute("transform", `translate(${origin.x},${origin.y}) scale(${scale})`);
+  const taken = [];
+  for (const { label, center } of pictures) {
+    const x = origin.x + center[0] * scale, y = origin.y + center[1] * scale;
+    label.style.left = `${x}px`; label.style.top = `${y}px`;
+    const half = label.textContent.length * 3.6 + 6;
+    const free = taken.every(([a, b, c]) => Math.abs(a - x) > half + c || Math.abs(b - y) > 18);
+    label.style.visibility = free ? "visible" : "hidden";
+    if (free) taken.push([x, y, half]);
+  }
+};
+viewer.addHandler("open", place);
+viewer.addHandler("update-viewport", place);
+viewer.addHandler("resize", place);
+
+const inside = ([x, y], outline) => outline.reduce((odd, [x1, y1], k) => {
+  const [x2, y2] = outline[(k + 1) % outline.length];
+  return (y1 > y) !== (y2 > y) && x < ((x2 - x1) * (y - y1)) / (y2 - y1) + x1 ? !odd : odd;
+}, false);
+const facts = document.getElementById("facts");
+const show = (chosen) => {
+  for (const picture of pictures) picture.path.classList.toggle("chosen", picture === chosen);
+  facts.replaceChildren();
+  if (!chosen) return;
+  facts.appendChild(Object.assign(document.createElement("h2"), { textContent: chosen.name }));
+  const table = facts.appendChild(document.createElement("table"));
+  for (const [key, value] of chosen.facts) {
+    const row = table.insertRow();
+    row.insertCell().textContent = key;
+    row.insertCell().textContent = value;
+  }
+};
+viewer.addHandler("canvas-click", (event) => {
+  if (!event.quick) return;
+  const point = viewer.viewport.pointFromPixel(event.position);
+  const at = [point.x * width, point.y * width];
+  const distance = ({ center }) => Math.hypot(center[0] - at[0], center[1] - at[1]);
+  // Of several pictures that show a place, the one whose centre is nearest.
+  show(pictures.filter((p) => inside(at, p.outline)).sort((a, b) => distance(a) - distance(b))[0]);
+});
+const toggle = (id, node) => {
+  const box = document.getElementById(id);
+  const apply = () => { node.style.display = box.checked ? "" : "none"; };
+  box.addEventListener("change", apply);
+  apply();
+};
+toggle("show-outlines", outlines);
+toggle("show-names", names);
+toggle("show-seams", seams);
+document.getElementById("in").onclick = () => viewer.viewport.zoomBy(1.5);
+document.getElementById("out").onclick = () => viewer.viewport.zoomBy(1 / 1.5);
+document.getElementById("home").onclick = () => viewer.viewport.goHome();

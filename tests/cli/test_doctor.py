@@ -1,0 +1,80 @@
+"""``rdstitch doctor``: what it says of sets with known faults."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+from rdstitch.doctor import examine
+from tests.cli.running import Run
+
+
+def test_nothing_is_amiss(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    done = rdstitch("doctor", frames[0].parent)
+    assert (done.status, done.err) == (0, "")
+    assert "pictures:   3\n" in done.out
+    assert "400 x 300 (3)" in done.out
+    assert "every picture has a partner; 1 group" in done.out
+    assert "none: go ahead" in done.out
+    found = json.loads(rdstitch("doctor", *frames, "--json").out)
+    assert found["pictures"] == 3
+    assert 0.35 < found["overlap"] < 0.7  # rendered with a half
+    assert found["seconds"] > 0
+    assert found["memory_bytes"] > 2**20
+
+
+def test_faults_are_found(frames: list[Path], stranger: Path, tmp_path: Path) -> None:
+    for frame in frames:
+        shutil.copy(frame, tmp_path)
+    shutil.copy(stranger, tmp_path / "stranger.png")
+    sharp = cv2.imread(str(frames[1]))
+    assert sharp is not None
+    cv2.imwrite(str(tmp_path / "blurred.png"), cv2.GaussianBlur(sharp, (0, 0), 3.0))
+    cv2.imwrite(str(tmp_path / "burnt.png"), np.minimum(sharp * 3.0, 255).astype(np.uint8))
+    cv2.imwrite(str(tmp_path / "dark.png"), sharp // 20)
+    (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8 no picture")
+    found = examine(tmp_path)
+    assert found.pictures == 7
+    assert len(found.unreadable) == 1
+    assert found.blurred == ("blurred.png",)
+    assert found.burnt == ("burnt.png",)
+    assert found.dark == ("dark.png",)
+    assert "stranger.png" in found.alone
+    assert not {frame.name for frame in frames} & set(found.alone)
+    text = found.as_text()
+    assert "broken.jpg" in text
+    assert "leave blurred pictures out" in text
+
+
+def test_zooms_and_cameras_are_told_apart(frames: list[Path], tmp_path: Path) -> None:
+    for number, (frame, focal, model) in enumerate(zip(frames, (24, 24, 50), ("A", "A", "B"), strict=True)):
+        exif = Image.Exif()
+        exif[ExifTags.Base.Model] = model
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = focal
+        with Image.open(frame) as image:
+            image.save(tmp_path / f"{number}.jpg", exif=exif, quality=95)
+    found = examine(tmp_path)
+    assert found.cameras == (("A", 2), ("B", 1))
+    assert "by EXIF in 3 of 3" in found.focal
+    assert any("2 cameras" in item for item in found.advice)
+    assert any("zoomed" in item for item in found.advice)
+
+
+def test_pictures_that_have_nothing_in_common(frames: list[Path], stranger: Path, rdstitch: Run) -> None:
+    found = examine([frames[0], stranger])
+    assert found.overlap is None
+    assert found.groups == 2
+    assert "no overlap was found" in found.advice[0]
+    assert rdstitch("doctor", "no_such_file.jpg").status == 3
+
+
+@pytest.mark.parametrize("single", [True, False])
+def test_arrays(frames: list[Path], single: bool) -> None:
+    pictures = [np.asarray(Image.open(frame)) for frame in frames]
+    found = examine(pictures[0] if single else pictures, channel_order="rgb")
+    assert found.pictures == (1 if single else 3)
+    assert ("needs two pictures" in " ".join(found.advice)) == single

@@ -1,0 +1,217 @@
+"""What robots bring and take: time stamps, formats of trajectories, ROS bags."""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+import rdstitch
+from rdstitch.synthetic import Sequence
+from tests.cli.running import DISTORTION, FAST, Run
+
+
+def _rows(file: Path) -> list[dict[str, str]]:
+    with file.open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+@pytest.fixture
+def video(frames: list[Path], tmp_path: Path) -> Path:
+    """Each frame twice, at 5 frames a second."""
+    file = tmp_path / "drive.avi"
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, (400, 300))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no videos")
+    for frame in frames:
+        picture = cv2.imread(str(frame))
+        assert picture is not None
+        writer.write(picture)
+        writer.write(picture)
+    writer.release()
+    return file
+
+
+def test_frames_of_a_video_keep_their_numbers_and_times(rdstitch: Run, video: Path, tmp_path: Path) -> None:
+    output = tmp_path / "path.csv"
+    assert rdstitch("trajectory", video, "--every", "2", "-o", output, "--focal", "380", *FAST).status == 0
+    rows = _rows(output)
+    assert [row["source_frame"] for row in rows] == ["0", "2", "4"]
+    assert [row["frame"] for row in rows] == ["0", "1", "2"]
+    np.testing.assert_allclose([float(row["timestamp"]) for row in rows], [0.0, 0.4, 0.8], atol=1e-6)
+    assert rows[1]["name"] == "drive_000002.png"
+
+    (tmp_path / "times.txt").write_text("".join(f"{100 + k}\n" for k in range(6)), encoding="utf-8")
+    arguments = ("--every", "2", "--timestamps", tmp_path / "times.txt", "--format", "tum", "--focal", "380")
+    assert rdstitch("trajectory", video, *arguments, "-o", tmp_path / "path.tum", *FAST).err == ""
+    assert np.loadtxt(tmp_path / "path.tum")[:, 0].tolist() == [100.0, 102.0, 104.0]
+
+
+def test_exif_tells_the_time(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    folder = tmp_path / "flight"
+    folder.mkdir()
+    for number, frame in enumerate(frames):
+        exif = Image.Exif()
+        photo = exif.get_ifd(ExifTags.IFD.Exif)
+        photo[ExifTags.Base.DateTimeOriginal] = f"2024:05:01 12:00:0{number}"
+        photo[ExifTags.Base.SubsecTimeOriginal] = "25"
+        photo[ExifTags.Base.OffsetTimeOriginal] = "+02:00"
+        with Image.open(frame) as image:
+            image.save(folder / f"{number}.jpg", exif=exif, quality=97)
+    output = tmp_path / "path.tum"
+    done = rdstitch("trajectory", folder, "-o", output, "--format", "tum", "--focal", "380", *FAST)
+    assert (done.status, done.err) == (0, "")
+    # date -d '2024-05-01 12:00:00 +02:00' +%s
+    np.testing.assert_allclose(np.loadtxt(output)[:, 0], 1714557600.25 + np.arange(3), atol=1e-5)
+
+
+@pytest.mark.parametrize("header", ["name,timestamp\n", "# timestamp filename\n"])
+def test_lists_of_time_stamps(rdstitch: Run, frames: list[Path], tmp_path: Path, header: str) -> None:
+    times = tmp_path / "times.txt"
+    lines = [
+        f"{frame.name},{10 + k}.5\n" if "," in header else f"{10 + k}.5 rgb/{frame.name}\n"
+        for k, frame in enumerate(frames)
+    ]
+    times.write_text(header + "".join(lines), encoding="utf-8")
+    known = ("--timestamps", times, "--focal", "380", *FAST)
+    assert rdstitch("trajectory", *frames, "-o", tmp_path / "path.csv", *known).status == 0
+    assert [row["timestamp"] for row in _rows(tmp_path / "path.csv")] == ["10.500000", "11.500000", "12.500000"]
+    times.write_text(header + lines[0], encoding="utf-8")
+    lacking = rdstitch("trajectory", *frames, "-o", tmp_path / "lacking.csv", *known)
+    assert lacking.status == 3
+    assert frames[1].name in lacking.line
+
+
+def test_without_times_numbers_stand_for_them_and_that_is_said(
+    rdstitch: Run, frames: list[Path], tmp_path: Path
+) -> None:
+    output = tmp_path / "path.tum"
+    done = rdstitch("trajectory", *frames, "-o", output, "--format", "tum", "--focal", "380", *FAST)
+    assert "give --timestamps" in done.line
+    assert np.loadtxt(output)[:, 0].tolist() == [0.0, 1.0, 2.0]
+
+
+def test_kitti_is_the_same_path(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    known = ("--focal", "380", *FAST)
+    assert rdstitch("trajectory", *frames, "-o", tmp_path / "a.txt", "--format", "kitti", *known).status == 0
+    assert rdstitch("trajectory", *frames, "-o", tmp_path / "b.csv", *known).status == 0
+    poses = np.loadtxt(tmp_path / "a.txt").reshape(-1, 3, 4)
+    rows = _rows(tmp_path / "b.csv")
+    np.testing.assert_allclose(poses[:, :2, 3], [[float(r["x"]), float(r["y"])] for r in rows], atol=1e-8)
+    np.testing.assert_allclose(
+        poses[:, :, :3] @ poses[:, :, :3].transpose(0, 2, 1), np.tile(np.eye(3), (3, 1, 1)), atol=1e-8
+    )
+    turn = np.arctan2(poses[:, 0, 1], poses[:, 0, 0])
+    np.testing.assert_allclose(np.degrees(turn), [float(r["phi_deg"]) for r in rows], atol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_evo_reads_it_and_agrees_with_the_truth(
+    rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path
+) -> None:
+    file_interface = pytest.importorskip("evo.tools.file_interface")
+    metrics, sync = pytest.importorskip("evo.core.metrics"), pytest.importorskip("evo.core.sync")
+    times = tmp_path / "times.txt"
+    times.write_text("".join(f"{0.5 * k}\n" for k in range(3)), encoding="utf-8")
+    known = ("--focal", str(sequence.lens.focal), "--timestamps", times, "--format", "tum")
+    assert rdstitch("trajectory", *frames, "-o", tmp_path / "found.tum", *known, *FAST).status == 0
+    poses = sequence.poses
+    lines = [
+        f"{0.5 * k} {x} {y} {-height} 0 0 {np.sin(-yaw / 2)} {np.cos(-yaw / 2)}"
+        for k, ((x, y), yaw, height) in enumerate(zip(poses.position, poses.yaw, poses.height, strict=True))
+    ]
+    (tmp_path / "true.tum").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    truth, found = (file_interface.read_tum_trajectory_file(str(tmp_path / f"{n}.tum")) for n in ("true", "found"))
+    truth, found = sync.associate_trajectories(truth, found)
+    found.align(truth, correct_scale=True)
+    error = metrics.APE(metrics.PoseRelation.translation_part)
+    error.process_data((truth, found))
+    assert error.get_statistic(metrics.StatisticsType.rmse) < 0.01 * truth.path_length
+
+
+def _write_bag(folder: Path, frames: list[Path], version: int, kind: str) -> Path:
+    """A bag with the frames on /camera at 2 Hz from 1000 s on."""
+    typesys = pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if version == 1 else typesys.Stores.LATEST)
+    time_type, header_type = store.types["builtin_interfaces/msg/Time"], store.types["std_msgs/msg/Header"]
+    writer: Any
+    if version == 1:
+        from rosbags.rosbag1 import Writer as Writer1
+
+        path = folder / "drive.bag"
+        writer = Writer1(path)
+    else:
+        from rosbags.rosbag2 import Writer as Writer2
+
+        path = folder / "drive"
+        writer = Writer2(path, version=9)
+    name = "sensor_msgs/msg/CompressedImage" if kind == "compressed" else "sensor_msgs/msg/Image"
+    with writer:
+        connection = writer.add_connection("/camera", name, typestore=store)
+        for number, frame in enumerate(frames):
+            sec, nanosec = divmod(500_000_000 * number, 10**9)
+            stamp = time_type(sec=1000 + sec, nanosec=nanosec)
+            header = header_type(stamp=stamp, frame_id="", **({"seq": number} if version == 1 else {}))
+            message = _message(store.types[name], header, frame, kind)
+            data = (store.serialize_ros1 if version == 1 else store.serialize_cdr)(message, name)
+            writer.write(connection, 10**12 + number, data)
+    return path
+
+
+def _message(message: Any, header: Any, frame: Path, kind: str) -> Any:
+    if kind == "compressed":
+        return message(header=header, format="png", data=np.frombuffer(frame.read_bytes(), np.uint8))
+    picture = cv2.imread(str(frame))
+    assert picture is not None
+    if kind == "rgb8":
+        picture = picture[..., ::-1]
+    height, width, _ = picture.shape
+    padded = np.pad(picture.reshape(height, -1), ((0, 0), (0, 4)))  # rows may be longer than their pixels
+    return message(
+        header=header,
+        height=height,
+        width=width,
+        encoding=kind,
+        is_bigendian=0,
+        step=3 * width + 4,
+        data=padded.ravel(),
+    )
+
+
+@pytest.mark.parametrize(("version", "kind"), [(1, "bgr8"), (1, "compressed"), (2, "rgb8"), (2, "compressed")])
+def test_a_bag_is_as_good_as_its_frames(
+    rdstitch: Run, frames: list[Path], tmp_path: Path, version: int, kind: str
+) -> None:
+    bag = _write_bag(tmp_path, frames, version, kind)
+    output = tmp_path / "path.csv"
+    done = rdstitch("trajectory", bag, "-o", output, "--focal", "380", *FAST)
+    assert (done.status, done.err) == (0, "")
+    of_files = rdstitch("trajectory", *frames, "-o", tmp_path / "files.csv", "--focal", "380", *FAST)
+    assert done.out == of_files.out
+    assert abs(float(done.out) - DISTORTION) < 0.01
+    assert [row["timestamp"] for row in _rows(output)] == ["1000.000000", "1000.500000", "1001.000000"]
+    wrong = rdstitch("mosaic", bag, "--topic", "/other", "-o", tmp_path / "out.png", *FAST)
+    assert wrong.status == 3
+    assert "/camera" in wrong.line
+
+
+def test_what_is_no_bag_is_named(rdstitch: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bag = tmp_path / "broken.bag"
+    bag.write_bytes(b"#ROSBAG V2.0\nbroken")
+    done = rdstitch("mosaic", bag, "-o", tmp_path / "out.png", *FAST)
+    assert done.status == 3
+    assert "broken.bag" in done.line
+    monkeypatch.setitem(__import__("sys").modules, "rosbags.highlevel", None)
+    assert "rdstitch[ros]" in rdstitch("mosaic", bag, "-o", tmp_path / "out.png", *FAST).line
+
+
+def test_python_gets_labels_too(frames: list[Path]) -> None:
+    path, _ = rdstitch.trajectory(frames, options=rdstitch.StitchOptions(focal=380.0, workers=1))
+    assert path.name == tuple(frame.name for frame in frames)
+    assert path.source_frame is not None
+    assert path.source_frame.tolist() == [0, 1, 2]
+    assert path.timestamp is not None
+    assert np.isnan(path.timestamp).all()
