@@ -22,6 +22,7 @@ from rdstitch.alignment.model_family import MODELS
 from rdstitch.alignment.model_selection import Choice
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import Alignment
+from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.alignment.turn_or_plane import choose_motion
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_STD, Camera
@@ -33,6 +34,9 @@ from rdstitch.matching.match_graph import connected_components, spanning_tree
 
 _UNCONFIRMED = 0.1
 """How much a link without a triangle that closes is relied on, relative to one with."""
+
+_MATCHES_OF_A_TURN = 5000
+"""Correspondences of all links together that the final adjustment of a turn on the spot uses at least, if there are."""
 
 _ROUNDS = 3
 """Times that wrong pairs are looked for."""
@@ -182,6 +186,9 @@ def align(
     choice, pictures, wrong = _drop_wrong_pairs(graph, problem, pictures, choice, wrong)
 
     say("adjustment")
+    if choice.fit.model is ROTATION and len(links) * options.most < _MATCHES_OF_A_TURN:
+        # Few pictures of a turn show the focal length by a hair's breadth; all their matches count.
+        everything = Observations.from_links(links, cameras, _MATCHES_OF_A_TURN // len(links))
     full = replace(graph, observations=everything)
     problem, _ = full.problem(~wrong, pictures, choice.overdispersion)
     fit = problem.refine(choice.fit.model, choice.fit.adjusted.parameters, choice.fit.tilt_spread)

@@ -105,7 +105,10 @@ def judge_relief(found: Coherence, model: str) -> Relief:
     """
     agreement = f"errors of neighbours agree (correlation {found.correlation:.2f}, {found.size:.1f} px in common)"
     relief = found.correlation > _COHERENT and found.relative_size > _LARGE
-    if relief:
+    if model == "rotation":
+        moved = "the camera moved between the pictures (parallax): what is near does not fit; turn about the lens"
+        text = f"{agreement}: {moved}" if relief else f"the camera hardly moved (correlation {found.correlation:.2f})"
+    elif relief:
         text = (
             f"{agreement}: the scene is not one plane, or the {model} model does not describe the camera; λ may be off"
         )

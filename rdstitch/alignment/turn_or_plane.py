@@ -5,13 +5,19 @@ pictures, models over a plane do so too, with more parameters: a camera that sta
 as of anything else. So the turn is taken where it fits, and a plane where there is translation.
 """
 
+import math
 from collections.abc import Sequence
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
+from rdstitch.alignment.lens_selection import EXACTNESS
 from rdstitch.alignment.model_selection import Choice, NoiseModel, choose_model, link_errors, within_reason
 from rdstitch.alignment.motion_models import RIGID
 from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.arrays import BoolArray
+
+_FAR, _AS_GOOD = math.radians(45.0), 1.2
+"""Angle between optical axes, and errors in units of those of pairs on their own, from and up to which a plane is not
+tried: of a plane, a camera that turns as far sees the horizon."""
 
 _POSSIBLE = 4.0
 """Times the noise that pairs may be off from a turn on the spot for it to be tried on all of them."""
@@ -37,6 +43,8 @@ def choose_motion(problem: Problem, names: Sequence[str], lenses: Sequence[BoolA
         "the camera turned on the spot, so that the pictures say nothing of the scene's shape (a plane seen from one "
         f"place would look the same); it leaves an error of {turned.adjusted.sigma:.2f} px"
     )
+    if _turns_far(turned) and math.hypot(turned.adjusted.sigma, EXACTNESS) < _AS_GOOD * bound.noise:
+        return _choice(problem, bound, turned, lenses, explained)
     least = bound.misfit(link_errors(problem, problem.homographies, problem.lens))
     if _cost(bound, problem, turned) <= least + bound.price(problem, RIGID, problem.free_lens):
         return _choice(problem, bound, turned, lenses, f"{explained}, and nothing is left for more freedom to gain")
@@ -46,6 +54,12 @@ def choose_motion(problem: Problem, names: Sequence[str], lenses: Sequence[BoolA
     other = over_plane.fit
     gains = f"{explained}, more freedom gains too little ({other.model.name} {other.adjusted.sigma:.2f} px)"
     return _choice(problem, bound, turned, lenses, gains)
+
+
+def _turns_far(turned: Fit) -> bool:
+    """Whether the camera looks in directions that no camera over a plane looks in."""
+    axes = turned.adjusted.parameters.poses.reshape(-1, 3, 3)[:, 2]
+    return float((axes @ axes.T).min()) < math.cos(_FAR)
 
 
 def _choice(problem: Problem, noise: NoiseModel, turned: Fit, lenses: Sequence[BoolArray], reason: str) -> Choice:

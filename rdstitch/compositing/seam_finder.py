@@ -118,7 +118,8 @@ def find_seams(
             else:
                 corrected = exposure.correct(index, locate(survey.warps[index], tile.box), tile.pixels)
                 pixels = corrected * np.float32(1.0 / full_scale(corrected.dtype))
-                won = _cut(tile, pixels, composite[cut], labels[cut] != NOBODY, weights[cut])
+                apart = survey.canvas.period is not None
+                won = _cut(tile, pixels, composite[cut], labels[cut] != NOBODY, weights[cut], apart=apart)
                 composite[cut][won] = pixels[won]
             labels[cut][won] = index
             weights[cut][won] = tile.weight[won]
@@ -128,9 +129,15 @@ def find_seams(
 
 
 def _cut(
-    tile: SurveyTile, pixels: Float32Array, below: Float32Array, covered: NDArray[np.bool_], weights: Float32Array
+    tile: SurveyTile,
+    pixels: Float32Array,
+    below: Float32Array,
+    covered: NDArray[np.bool_],
+    weights: Float32Array,
+    *,
+    apart: bool,
 ) -> NDArray[np.bool_]:
-    """Where a new picture replaces what lies below it."""
+    """Where a new picture replaces what lies below it; ``apart``: in several places, one by one."""
     both = tile.inside & covered
     share = tile.weight / np.maximum(tile.weight + weights, np.float32(1e-12))
     alone: NDArray[np.bool_] = tile.inside & ~covered
@@ -143,12 +150,23 @@ def _cut(
         return np.asarray(surely_new | free)
     if not surely_new.any():
         return surely_new
-    part = _around(free)
-    masks = [(free | sure)[part].astype(np.uint8) * np.uint8(255) for sure in (surely_old, surely_new)]
-    images = [_three_channels(image[part]) for image in (below, pixels)]
     won = surely_new.copy()
-    won[part] |= free[part] & _graph_cut(images, masks)
+    for part in _parts(free) if apart else [_around(free)]:
+        masks = [(free | sure)[part].astype(np.uint8) * np.uint8(255) for sure in (surely_old, surely_new)]
+        images = [_three_channels(image[part]) for image in (below, pixels)]
+        won[part] |= free[part] & _graph_cut(images, masks)
     return won
+
+
+def _parts(free: NDArray[np.bool_]) -> list[tuple[slice, slice]]:
+    """Where cuts are free to run, column by column apart: a picture across the edge of a full turn has both ends."""
+    columns = np.flatnonzero(free.any(axis=0))
+    groups = np.split(columns, np.flatnonzero(np.diff(columns) > 2 * _AROUND_FREE + 1) + 1)
+    parts = []
+    for group in groups:
+        rows, _ = _around(free[:, group[0] : group[-1] + 1])
+        parts.append((rows, slice(max(0, int(group[0]) - _AROUND_FREE), int(group[-1]) + 1 + _AROUND_FREE)))
+    return parts
 
 
 def _around(free: NDArray[np.bool_]) -> tuple[slice, slice]:

@@ -6,10 +6,13 @@ from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.export.path_plot import path_as_svg
 from rdstitch.registration import Registration
 from rdstitch.report.svg import section
+from rdstitch.report.view_directions import view_directions
 
 
 def path_over_plane(registration: Registration) -> str:
-    """The path of the camera over the plane, where the model has metric poses."""
+    """The path of the camera over the plane, where the model has metric poses; where it looked, if it only turned."""
+    if registration.alignment.on_sphere:
+        return view_directions(registration)
     if registration.alignment.poses is None:
         return section("Trajectory", "The general model has a homography for each picture, but no poses.")
     path = Trajectory.from_alignment(registration.alignment)

@@ -4,6 +4,7 @@ import numpy as np
 
 from rdstitch.alignment.result import LinkFit
 from rdstitch.arrays import FloatArray
+from rdstitch.compositing.projection import Projection
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.radial_homography import to_plane
 from rdstitch.registration import Registration
@@ -12,13 +13,13 @@ _POINTS_PER_SIDE = 16
 
 
 def footprint(registration: Registration, index: int) -> FloatArray:
-    """Outline (K, 2) of a picture on the plane."""
+    """Outline (K, 2) of a picture on the plane; where the camera only turned, longitude and latitude, radians."""
     camera = registration.alignment.cameras[index]
     return _on_plane(registration, index, camera.outline(_POINTS_PER_SIDE))
 
 
 def middle(registration: Registration, index: int) -> FloatArray:
-    """Centre (2,) of a picture on the plane."""
+    """Centre (2,) of a picture, as :func:`footprint`."""
     width, height = registration.alignment.cameras[index].image_size
     return _on_plane(registration, index, np.array([[(width - 1) / 2, (height - 1) / 2]])).reshape(2)
 
@@ -43,4 +44,12 @@ def residuals(registration: Registration, fit: LinkFit) -> tuple[FloatArray, Flo
 
 
 def _on_plane(registration: Registration, index: int, points: FloatArray) -> FloatArray:
-    return to_plane(registration.alignment.cameras[index], registration.alignment.homographies[index], points)
+    camera, matrix = registration.alignment.cameras[index], registration.alignment.homographies[index]
+    if not registration.alignment.on_sphere:
+        return to_plane(camera, matrix, points)
+    flat = camera.normalize(camera.undistort(points))
+    places = Projection("sphere").project(np.column_stack([flat, np.ones(len(flat))]) @ matrix.T)
+    # Longitudes of one picture have no jump.
+    own = np.arctan2(matrix[0, 2], matrix[2, 2])
+    places[:, 0] = own + np.mod(places[:, 0] - own + np.pi, 2.0 * np.pi) - np.pi
+    return places

@@ -49,7 +49,9 @@ def test_a_full_turn_becomes_a_sphere_that_viewers_turn(rdstitch: Run, around: l
     again = tmp_path / "again.jpg"
     assert rdstitch("apply", f"{output}.json", "--images", around[0].parent, "-o", again).status == 0
     assert again.read_bytes() == output.read_bytes()
-    assert "turned on the spot" in report.read_text(encoding="utf-8")
+    page = report.read_text(encoding="utf-8")
+    assert "<h2>Directions</h2>" in page
+    assert "9 pictures show 360 x" in page
 
 
 def test_the_projection_is_the_users(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
