@@ -109,11 +109,14 @@ def test_what_a_projection_cannot_show_is_refused_by_name() -> None:
         plan_panorama([LENS] * 9, around, projection="plane")
 
 
+# "balanced" keeps regions near the brightness of their own pictures, and so depends on which of them the extension of
+# the canvas shows twice; what it may not do is to leave a step at the edge.
 OPTIONS = {
-    "multiband": CompositeOptions(),
-    "feather": CompositeOptions(blend="feather", seam="voronoi"),
+    "balanced": CompositeOptions(),
+    "multiband": CompositeOptions(exposure="gain"),
+    "feather": CompositeOptions(blend="feather", seam="voronoi", exposure="gain"),
     "no seam": CompositeOptions(seam="none", exposure="none"),
-    "small tiles": CompositeOptions(tile_size=256, workers=2),
+    "small tiles": CompositeOptions(tile_size=256, workers=2, exposure="gain"),
 }
 
 
@@ -131,6 +134,8 @@ def test_a_full_turn_is_joined_without_a_seam(options: CompositeOptions) -> None
     rows = (found.alpha > 0).all(axis=1)
     steps = np.abs(values[rows] - np.roll(values[rows], 1, axis=1)).mean(axis=0)
     assert steps[0] < np.quantile(steps, 0.99)
+    if options.exposure == "balanced":
+        return
     # Shown from another heading, the same sphere is the same picture, moved.
     turn = 2 * np.pi * 96 / canvas.size[0]
     turned = _directions(rotations @ camera_rotations(turn)[0].T)
