@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rdstitch.alignment.result import Poses
+from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.camera import Camera
 from rdstitch.synthetic import Photometry, Sequence, ground, line_poses, parking_poses, sequence_over, turn_poses
@@ -42,7 +42,7 @@ def floor_drive(
 def true_path(sequence: Sequence) -> Trajectory:
     """The path of a sequence's camera, in units of its first height."""
     p, unit = sequence.poses, sequence.poses.height[0]
-    return Trajectory.from_poses(Poses(p.yaw, p.position / unit, p.height / unit, p.tilt))
+    return Trajectory.from_poses(PlanarPoses(p.yaw, p.position / unit, p.height / unit, p.tilt))
 
 
 def read_path(file: Path) -> Trajectory:

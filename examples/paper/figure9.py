@@ -23,7 +23,7 @@ from rdstitch.alignment.bundle_adjustment import (
 )
 from rdstitch.alignment.motion_models import RIGID, YAW, X, Y
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.result import Poses
+from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory, compare
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import LENS_PARAMETERS
@@ -149,9 +149,9 @@ def _any_relation(d: Drive) -> RadialHomography:
     return RadialHomography(np.eye(3), d.camera, d.camera, np.ones(0, dtype=np.bool_))
 
 
-def _plane_poses(poses: FloatArray, log_focal: float) -> Poses:
+def _plane_poses(poses: FloatArray, log_focal: float) -> PlanarPoses:
     count = len(poses)
-    return Poses(poses[:, YAW], poses[:, [X, Y]] / np.exp(log_focal), np.ones(count), np.zeros((count, 2)))
+    return PlanarPoses(poses[:, YAW], poses[:, [X, Y]] / np.exp(log_focal), np.ones(count), np.zeros((count, 2)))
 
 
 def _recipe(d: Drive) -> _Path:

@@ -40,6 +40,7 @@ POSE_TILT_SPREAD = math.radians(35.0)
 _TILT_SPREAD_START = math.radians(3.0)
 _TILT_SPREAD_LEAST = math.radians(0.05)
 _TILT_SPREAD_ROUNDS = 3
+_EXACT = 1e12  # precision of what is known: a standard deviation of 1e-6 radians
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,7 @@ class CameraPriors:
         Of the logarithm of the focal length in half diagonals.
     tilt : (float, float)
         (ψ, θ), radians.
-    tilt_std : float
-        inf where the tilt is not known.
+    tilt_known : bool
     attitudes : ndarray of shape (N, 2)
         How the tilt of each picture differs from the shared one, radians; zeros where that is not known.
     attitudes_std : float or None
@@ -65,7 +65,7 @@ class CameraPriors:
     log_focal: float
     log_focal_std: float
     tilt: tuple[float, float]
-    tilt_std: float
+    tilt_known: bool
     attitudes: FloatArray
     attitudes_std: float | None
     lens: FloatArray
@@ -81,7 +81,7 @@ class CameraPriors:
             return replace(
                 known, shared=np.array([self.log_focal]), shared_precision=np.array([self.log_focal_std**-2.0])
             )
-        tilt_precision = 0.0 if math.isinf(self.tilt_std) else max(self.tilt_std, 1e-6) ** -2.0
+        tilt_precision = _EXACT if self.tilt_known else 0.0
         poses, precision = np.zeros_like(none.poses), np.zeros_like(none.poses)
         free = list(getattr(model, "free", ()))
         for axis, column in enumerate((PSI, THETA)):
@@ -280,7 +280,7 @@ class Problem:
         if model is ROTATION:
             return [np.array([log_focal]) for log_focal in (*natural, *FOCAL_STARTS)]
         steps = np.array([(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2)])
-        if np.isfinite(self.knowledge.tilt_std):
+        if self.knowledge.tilt_known:
             steps = steps[:1]
         return [model.shared_from(natural + np.array([*step, 0.0])) for step in steps]
 

@@ -56,8 +56,6 @@ class AlignmentOptions:
         Whether the lens is that of the cameras; estimated otherwise.
     tilt : (float, float), optional
         (ψ, θ), radians, where it is known.
-    tilt_std : float
-        Its standard deviation, radians; 0 for an exact one.
     attitudes : ndarray of shape (N, 2), optional
         (ψ, θ) of each picture, radians, where an IMU or a gimbal has measured them; ``tilt`` is then how the camera
         is mounted on that.
@@ -73,7 +71,6 @@ class AlignmentOptions:
     model: str = "auto"
     lens_known: bool = False
     tilt: tuple[float, float] | None = None
-    tilt_std: float = 0.0
     attitudes: ArrayLike | None = None
     attitudes_std: float = 0.0
     lens: str = "auto"
@@ -85,12 +82,12 @@ class AlignmentOptions:
             raise ArgumentError(f"model must be auto, {', '.join(MODELS)}, not {self.model}")
         if self.lens != "auto" and self.lens not in LENSES:
             raise ArgumentError(f"lens must be auto, {', '.join(LENSES)}, not {self.lens}")
-        if self.tilt_std < 0 or self.attitudes_std < 0:
+        if self.attitudes_std < 0:
             raise ArgumentError("a standard deviation cannot be negative")
 
     def exact_tilts(self, count: int) -> list[tuple[float, float]] | None:
         """(ψ, θ), radians, of each of ``count`` pictures, where they are known exactly; None where not."""
-        if self.tilt is None or self.tilt_std > 0.0 or (self.attitudes is not None and self.attitudes_std > 0.0):
+        if self.tilt is None or (self.attitudes is not None and self.attitudes_std > 0.0):
             return None
         attitudes = np.zeros((count, 2)) if self.attitudes is None else np.asarray(self.attitudes, dtype=np.float64)
         return [(psi, theta) for psi, theta in (attitudes + self.tilt).tolist()]
@@ -104,7 +101,7 @@ class AlignmentOptions:
         return CameraPriors(
             *focal_prior(cameras),
             tilt=self.tilt or (0.0, 0.0),
-            tilt_std=np.inf if self.tilt is None else self.tilt_std,
+            tilt_known=self.tilt is not None,
             attitudes=attitudes,
             attitudes_std=None if self.attitudes is None else self.attitudes_std,
             lens=np.zeros(len(LENS_STD)),

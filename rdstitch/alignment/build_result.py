@@ -14,7 +14,7 @@ from rdstitch.alignment.model_selection import Choice
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y, metric_poses
 from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.planarity import coherence, judge_relief
-from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, Poses
+from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPoses
 from rdstitch.alignment.rotation_frame import levelled
 from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.alignment.sandwich import sandwich_std
@@ -159,7 +159,7 @@ def _nearest_distortion_std(camera: Camera, covariance: FloatArray) -> float:
     return math.sqrt(max(float(gradient @ covariance @ gradient), 0.0))
 
 
-def _in_frame_of_reference(found: AdjustedPictures) -> tuple[FloatArray, Poses | None]:
+def _in_frame_of_reference(found: AdjustedPictures) -> tuple[FloatArray, PlanarPoses | None]:
     """Picture-to-plane homographies of all pictures, and their poses where the model has them.
 
     The adjustment may have held the reference picture anywhere; here it comes to the origin, with yaw zero and, as
@@ -184,7 +184,9 @@ def _in_frame_of_reference(found: AdjustedPictures) -> tuple[FloatArray, Poses |
     homographies[found.pictures] = np.linalg.inv(fit.model.matrices(poses, shared).matrices)
     every = np.full((count, 6), np.nan)
     every[found.pictures] = metric_poses(poses, shared)
-    return homographies, Poses(every[:, YAW], every[:, [X, Y]], np.exp(every[:, LOG_HEIGHT]), every[:, [PSI, THETA]])
+    return homographies, PlanarPoses(
+        every[:, YAW], every[:, [X, Y]], np.exp(every[:, LOG_HEIGHT]), every[:, [PSI, THETA]]
+    )
 
 
 def _groups(found: AdjustedPictures) -> tuple[tuple[int, ...], ...]:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.result import Relief
+from rdstitch.alignment.result import ReliefTest
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 
 _CELLS = (2, 3, 4)
@@ -94,7 +94,7 @@ def _overdispersion(link: IntArray, points: FloatArray, residual: FloatArray, co
     return max(1.0, float((sums[several] ** 2).sum() / power[several].sum()))
 
 
-def judge_relief(found: Coherence, model: str) -> Relief:
+def judge_relief(found: Coherence, model: str) -> ReliefTest:
     """What the agreement of neighbours means for the scene.
 
     Parameters
@@ -116,4 +116,4 @@ def judge_relief(found: Coherence, model: str) -> Relief:
         text = f"{agreement}, as over a scene that is nearly flat"
     else:
         text = f"errors of neighbours hardly agree (correlation {found.correlation:.2f}): the scene is flat"
-    return Relief(relief, found.correlation, found.size, text)
+    return ReliefTest(relief, found.correlation, found.size, text)

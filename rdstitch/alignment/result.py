@@ -43,7 +43,7 @@ class LinkFit:
 
 
 @dataclass(frozen=True)
-class Poses:
+class PlanarPoses:
     """Where the camera was for each picture, in a metric plane.
 
     Attributes
@@ -65,7 +65,7 @@ class Poses:
 
 
 @dataclass(frozen=True)
-class Relief:
+class ReliefTest:
     """Whether the scene is the plane that it is taken for.
 
     Attributes
@@ -109,7 +109,7 @@ class Alignment:
         "rigid", "similarity", "tilting", "pose", "homography" or "rotation".
     model_reason : str
         Why this model was taken.
-    poses : Poses or None
+    poses : PlanarPoses or None
         None for the general model; NaN for pictures left out.
     tilt : (float, float) or None
         (ψ, θ), radians, shared by all pictures (the mean one where the tilt varies).
@@ -134,7 +134,7 @@ class Alignment:
         Root mean square error of the inliers of all links, px.
     links : tuple of LinkFit
         In the order of the links given.
-    relief : Relief
+    relief : ReliefTest
     messages : tuple of Message
         What the user should know of the whole: λ not observable, two cameras, ….
     """
@@ -146,7 +146,7 @@ class Alignment:
     reference: int
     model: str
     model_reason: str
-    poses: Poses | None
+    poses: PlanarPoses | None
     tilt: tuple[float, float] | None
     tilt_spread: float
     focal: float | None
@@ -159,7 +159,7 @@ class Alignment:
     covariance: FloatArray
     rms: float
     links: tuple[LinkFit, ...]
-    relief: Relief
+    relief: ReliefTest
     messages: tuple[Message, ...] = ()
 
     def __repr__(self) -> str:

@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rdstitch.alignment.result import Alignment, Poses
+from rdstitch.alignment.result import Alignment, PlanarPoses
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 
@@ -82,7 +82,7 @@ class Trajectory:
         return cls.from_poses(alignment.poses, height)
 
     @classmethod
-    def from_poses(cls, poses: Poses, height: float = 1.0) -> Self:
+    def from_poses(cls, poses: PlanarPoses, height: float = 1.0) -> Self:
         """The path through the poses that are not NaN; see :meth:`from_alignment`."""
         if not (math.isfinite(height) and height > 0.0):
             raise ArgumentError(f"height must be positive, not {height}")

@@ -89,7 +89,7 @@ class MultibandBlender:
                 level = coarser
             height, width = share.shape
             cut = np.s_[y >> band : (y >> band) + height, x >> band : (x >> band) + width]
-            band_pixels *= spread(share, self.channels)
+            band_pixels *= per_channel(share, self.channels)
             self._sums[band][cut] += band_pixels
             self._weights[band][cut] += share
             if band < self.bands:
@@ -103,7 +103,7 @@ class MultibandBlender:
             weights = self._weights[band]
             np.maximum(weights, 1.0 / _WEIGHT_STEPS, out=weights)
             blended = self._sums[band]
-            blended /= spread(weights, self.channels)
+            blended /= per_channel(weights, self.channels)
             rounded(blended, self.constant)
             if band < self.bands:
                 blended += rounded(_up(result), self.constant)
@@ -111,7 +111,7 @@ class MultibandBlender:
         return result
 
 
-def spread(plane: Float32Array, channels: int) -> Float32Array:
+def per_channel(plane: Float32Array, channels: int) -> Float32Array:
     """A plane (h, w) repeated for every channel, (h, w, C): a product with that is several times faster than with a
     last axis of length 1.
     """

@@ -14,9 +14,9 @@ from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photo_sphere import photo_sphere_xmp
 from rdstitch.compositing.photometric import Exposure
-from rdstitch.compositing.preparation import OutputStrip, Progress, prepare
+from rdstitch.compositing.preparation import OutputStrip, ShareProgress, prepare
 from rdstitch.compositing.seam_finder import SeamMap
-from rdstitch.compositing.source_images import Preview, Source
+from rdstitch.compositing.source_images import PictureLoader, Preview
 from rdstitch.compositing.warp import Displacement
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.io.layout import Layout
@@ -87,12 +87,12 @@ class FileComposite:
 
 
 def compose(
-    sources: Sequence[Source],
+    sources: Sequence[PictureLoader],
     cameras: Sequence[Camera],
     homographies: ArrayLike,
     canvas: Canvas,
     options: CompositeOptions | None = None,
-    progress: Progress | None = None,
+    progress: ShareProgress | None = None,
     previews: Sequence[Preview] | None = None,
     exposures: Sequence[float | None] | None = None,
     displacements: Sequence[Displacement | None] | None = None,
@@ -150,13 +150,13 @@ def compose(
 
 def compose_to_file(
     path: str | Path,
-    sources: Sequence[Source],
+    sources: Sequence[PictureLoader],
     cameras: Sequence[Camera],
     homographies: ArrayLike,
     canvas: Canvas,
     options: CompositeOptions | None = None,
     metadata: Metadata | None = None,
-    progress: Progress | None = None,
+    progress: ShareProgress | None = None,
     extra_tags: Callable[[Canvas], Iterable[ExtraTag]] | None = None,
     previews: Sequence[Preview] | None = None,
     exposures: Sequence[float | None] | None = None,

@@ -27,7 +27,7 @@ from rdstitch.compositing.photometric import no_exposure
 from rdstitch.compositing.plan import CompositePlan, plan_composite
 from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seam_finder import find_seams
-from rdstitch.compositing.source_images import PictureReader, Preview, Source
+from rdstitch.compositing.source_images import PictureLoader, PictureReader, Preview
 from rdstitch.compositing.survey import survey_factor, survey_pictures
 from rdstitch.compositing.warp import Displacement, plan_warps
 from rdstitch.errors import ArgumentError
@@ -37,7 +37,7 @@ from rdstitch.opencv_state import one_opencv_thread
 # Samples (h, W, C) and alpha (h, W).
 OutputStrip = tuple[NDArray[Any], NDArray[np.uint8]]
 # Called with the share of the work done, 0 to 1.
-Progress = Callable[[float], None]
+ShareProgress = Callable[[float], None]
 
 _PREPARATION = 0.25
 # Pictures that the survey reads at one time: what the tiles need is not there yet.
@@ -71,7 +71,7 @@ class Prepared:
     shown: Sequence[ShownPart]
     around: int
 
-    def strips(self, progress: Progress | None = None) -> Generator[OutputStrip]:
+    def strips(self, progress: ShareProgress | None = None) -> Generator[OutputStrip]:
         """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
         progress = _part_of(progress, _PREPARATION, 1.0)
         if self.plan.workers == 1:
@@ -80,7 +80,7 @@ class Prepared:
         with one_opencv_thread(), ThreadPoolExecutor(self.plan.workers) as pool:
             yield from self._strips(pool.map, progress)
 
-    def _strips(self, run: Callable[..., Iterator[Any]], progress: Progress | None) -> Iterator[OutputStrip]:
+    def _strips(self, run: Callable[..., Iterator[Any]], progress: ShareProgress | None) -> Iterator[OutputStrip]:
         """The same, with tiles computed by ``run``, which works like ``map`` and may work ahead."""
         (width, height), side = self.canvas.size, self.plan.tile_size
         tops = iter(range(0, height, side))
@@ -125,12 +125,12 @@ class Prepared:
 
 @contextmanager
 def prepare(
-    sources: Sequence[Source],
+    sources: Sequence[PictureLoader],
     cameras: Sequence[Camera],
     homographies: ArrayLike,
     canvas: Canvas,
     options: CompositeOptions | None = None,
-    progress: Progress | None = None,
+    progress: ShareProgress | None = None,
     previews: Sequence[Preview] | None = None,
     exposures: Sequence[float | None] | None = None,
     displacements: Sequence[Displacement | None] | None = None,
@@ -165,7 +165,7 @@ def _decided(
     canvas: Canvas,
     plan: CompositePlan,
     exposures: Sequence[float | None] | None,
-    progress: Progress | None,
+    progress: ShareProgress | None,
 ) -> Prepared:
     """Decide for a renderer that knows of no exposure and no seams yet."""
     options, warps, exposure = renderer.options, renderer.warps, renderer.exposure
@@ -224,7 +224,7 @@ def _unwidened(canvas: Canvas) -> Box | None:
     return left, 0, left + turn, height
 
 
-def _part_of(progress: Progress | None, start: float, stop: float) -> Progress | None:
+def _part_of(progress: ShareProgress | None, start: float, stop: float) -> ShareProgress | None:
     """A progress that fills a part of another."""
     if progress is None:
         return None

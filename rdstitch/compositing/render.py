@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.compositing.blender import MultibandBlender, margin, rounding_constant, spread
+from rdstitch.compositing.blender import MultibandBlender, margin, per_channel, rounding_constant
 from rdstitch.compositing.boxes import Box, Float32Array, aligned, bounds, cut, grown, intersection, without
 from rdstitch.compositing.image_cache import PictureCache
 from rdstitch.compositing.options import CompositeOptions
@@ -131,9 +131,9 @@ class Renderer:
             return
         total, weights = np.zeros(pixels.shape, dtype=np.float32), np.zeros(pixels.shape[:2], dtype=np.float32)
         for part in parts:
-            cut(total, box, part.box)[...] += self._samples(part, part.box) * spread(part.weight, self.channels)
+            cut(total, box, part.box)[...] += self._samples(part, part.box) * per_channel(part.weight, self.channels)
             cut(weights, box, part.box)[...] += part.weight
-        total /= spread(np.where(weights > 0, weights, np.float32(1.0)), self.channels)
+        total /= per_channel(np.where(weights > 0, weights, np.float32(1.0)), self.channels)
         pixels[...] = self._as_samples(total)
 
     def _multiband(self, layers: Sequence[Layer], box: Box) -> NDArray[Any]:

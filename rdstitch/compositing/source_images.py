@@ -14,7 +14,7 @@ from rdstitch.errors import InputError
 from rdstitch.io.read import Picture
 from rdstitch.io.reduction import block_mean, fitting_reduction, reduced_size
 
-Source = Callable[[], Picture]
+PictureLoader = Callable[[], Picture]
 Preview = Callable[[int], Picture]
 NOTHING: Box = (0, 0, 0, 0)
 
@@ -154,7 +154,7 @@ class PictureReader:
 
     def __init__(
         self,
-        sources: Sequence[Source],
+        sources: Sequence[PictureLoader],
         sizes: Sequence[tuple[int, int]],
         previews: Sequence[Preview] | None = None,
     ) -> None:

@@ -13,19 +13,19 @@ from rdstitch.errors import ArgumentError
 from rdstitch.features.detection import Detection, find
 from rdstitch.features.keypoints import Features
 from rdstitch.features.options import CLOSER, KINDS, FeatureOptions
-from rdstitch.features.picture import Image, Mask, Picture, View, prepare
+from rdstitch.features.picture import Image, Mask, PreparedPicture, View, prepare
 from rdstitch.features.spread import spread, strongest
 from rdstitch.opencv_state import one_opencv_thread
 
-__all__ = ["KINDS", "FeatureOptions", "Features", "Recall", "Source", "View", "detect", "detect_all"]
+__all__ = ["KINDS", "DetectionCache", "FeatureOptions", "Features", "View", "ViewLoader", "detect", "detect_all"]
 
 Found = TypeVar("Found")
 
-Recall = Callable[[int, Callable[[], Features]], Found]
+DetectionCache = Callable[[int, Callable[[], Features]], Found]
 """Called with a picture's index and what detects its features; gives these, perhaps from an earlier run, or what
 stands for them where the picture cannot be read."""
 
-Source = Callable[[float | None], View]
+ViewLoader = Callable[[float | None], View]
 """Loads one picture when it is called with the 10⁶ pixels that are needed of it; None: all. More pixels may come."""
 
 _FEW = 0.5  # of the keypoints wanted: where a reduced picture shows fewer, a larger one is used
@@ -57,7 +57,7 @@ def detect(image: Image, options: FeatureOptions | None = None, mask: Mask | Non
     return _detect(lambda _: View(image, mask), options or FeatureOptions())
 
 
-def _detect(source: Source, options: FeatureOptions) -> Features:
+def _detect(source: ViewLoader, options: FeatureOptions) -> Features:
     """The same for a picture that is loaded as large as it is needed."""
     picture, detection, usable = _look(source, options, options.work_megapixels)
     if options.work_megapixels is not None and picture.reduced and len(usable) < _FEW * options.max_features:
@@ -76,8 +76,8 @@ def _detect(source: Source, options: FeatureOptions) -> Features:
 
 
 def _look(
-    source: Source, options: FeatureOptions, megapixels: float | None
-) -> tuple[Picture, Detection, NDArray[np.intp]]:
+    source: ViewLoader, options: FeatureOptions, megapixels: float | None
+) -> tuple[PreparedPicture, Detection, NDArray[np.intp]]:
     """The picture at most so large, what is found in it, and which of that may count."""
     picture = prepare(source(megapixels), megapixels)
     detection = find(picture.grey, options)
@@ -87,7 +87,7 @@ def _look(
 
 @overload
 def detect_all(
-    sources: Sequence[Source],
+    sources: Sequence[ViewLoader],
     options: FeatureOptions | None = None,
     workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
@@ -96,34 +96,35 @@ def detect_all(
 
 @overload
 def detect_all(
-    sources: Sequence[Source],
+    sources: Sequence[ViewLoader],
     options: FeatureOptions | None,
     workers: int,
     progress: Callable[[int, int], None] | None,
-    recall: Recall[Found],
+    recall: DetectionCache[Found],
 ) -> list[Found]: ...
 
 
 def detect_all(
-    sources: Sequence[Source],
+    sources: Sequence[ViewLoader],
     options: FeatureOptions | None = None,
     workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
-    recall: Recall[Found] | None = None,
+    recall: DetectionCache[Found] | None = None,
 ) -> list[Features] | list[Found]:
     """Detect the features of many pictures, several at a time; at most ``workers`` pictures are in memory.
 
     Parameters
     ----------
     sources : sequence of callable
-        Each loads one picture; see :data:`Source`.
+        Each loads one picture; see :data:`ViewLoader`.
     options : FeatureOptions, optional
     workers : int
         Pictures to work on at the same time, each in one thread.
     progress : callable, optional
         Called in this thread with the number of pictures done and their total.
     recall : callable, optional
-        Stands between this function and the detection of each picture; see :data:`Recall`. Called in other threads.
+        Stands between this function and the detection of each picture; see :data:`DetectionCache`. Called in other
+        threads.
 
     Returns
     -------

@@ -46,7 +46,7 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class PreparedPicture:
     """A grey picture of working size.
 
     Attributes
@@ -93,7 +93,7 @@ def halving(image_size: tuple[int, int], megapixels: float) -> int:
     return factor
 
 
-def prepare(view: View, work_megapixels: float | None) -> Picture:
+def prepare(view: View, work_megapixels: float | None) -> PreparedPicture:
     """Make a picture ready for detection; see :func:`rdstitch.features.detect.detect` for what it may be."""
     image, mask = view.image, view.mask
     if image.ndim not in (2, 3) or image.size == 0 or (image.ndim == 3 and image.shape[2] > 4):
@@ -109,7 +109,7 @@ def prepare(view: View, work_megapixels: float | None) -> Picture:
             usable = cv2.resize(usable.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
     grey = _eight_bits(_grey(image), usable)
     shrink = view.reduction * np.array([width / grey.shape[1], height / grey.shape[0]])
-    return Picture(grey, None if usable is None else _clearance(usable), shrink, view.full_size)
+    return PreparedPicture(grey, None if usable is None else _clearance(usable), shrink, view.full_size)
 
 
 def _usable(image: Image, mask: Mask | None) -> NDArray[np.bool_] | None:

@@ -19,9 +19,9 @@ Value = TypeVar("Value")
 
 Pair = tuple[int, int]
 
-Progress = Callable[[int, int], None]
+PairProgress = Callable[[int, int], None]
 
-Recall = Callable[[int, Callable[[], Value]], Value]
+PairCache = Callable[[int, Callable[[], Value]], Value]
 """Called with the position of a pair and what computes something of it; gives that, perhaps from an earlier run."""
 
 
@@ -67,8 +67,8 @@ def match_pairs(
     matcher: Matcher,
     *,
     known_matches: Sequence[Correspondences | None] | None = None,
-    progress: Progress | None = None,
-    recall: Recall[Correspondences] | None = None,
+    progress: PairProgress | None = None,
+    recall: PairCache[Correspondences] | None = None,
     workers: int = 1,
 ) -> list[Correspondences]:
     """Match the features of pairs of pictures, several pairs at a time.
@@ -87,7 +87,7 @@ def match_pairs(
     progress : callable, optional
         Called with the number of pairs done and their total.
     recall : callable, optional
-        Stands between this function and the matching of each pair; see :data:`Recall`.
+        Stands between this function and the matching of each pair; see :data:`PairCache`.
     workers : int
         Threads; more than one only for a matcher that may be called from several.
     """
@@ -117,7 +117,7 @@ def estimate_pairs(
     options: PairOptions,
     *,
     tilts: Sequence[tuple[float, float] | None] | None = None,
-    progress: Progress | None = None,
+    progress: PairProgress | None = None,
     recall: RecallMany = lambda pairs, compute: compute(list(range(len(pairs)))),
 ) -> list[PairRegistration]:
     """Estimate the two-view geometry of every pair, many at a time, but in one thread.

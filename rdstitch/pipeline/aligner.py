@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
-from rdstitch.alignment.result import LinkFit, Poses, Relief
+from rdstitch.alignment.result import LinkFit, PlanarPoses, ReliefTest
 from rdstitch.cache import Cache
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, RegistrationError
@@ -85,7 +85,7 @@ class Aligner:
             raise RegistrationError(_no_overlap(self.paths, pairs))
         inputs = (self.cameras, self.cache.digest(links), self.options)
         compute = partial(align, self.cameras, links, self.options)
-        kinds = (Alignment, Camera, LinkFit, Poses, Relief, Message)
+        kinds = (Alignment, Camera, LinkFit, PlanarPoses, ReliefTest, Message)
 
         def valid(alignment: Alignment) -> bool:
             count = len(self.cameras)

@@ -29,7 +29,7 @@ from rdstitch.pipeline.recomposition import Recomposition, applied_sidecar
 from rdstitch.progress import Progress, silent
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_picture, read_sidecar
 
-Match = Literal["auto", "name", "order"]
+MatchBy = Literal["auto", "name", "order"]
 _MATCHES = ("auto", "name", "order")
 
 
@@ -39,7 +39,7 @@ def apply(
     output: str | Path | None = None,
     composite: CompositeOptions | None = None,
     *,
-    match: Match = "auto",
+    match: MatchBy = "auto",
     mask: str | Path | None = None,
     every: int = 1,
     workers: int = 0,
@@ -171,7 +171,7 @@ def _check_outputs(output: Path, overwrite: bool, inputs: Sequence[Path], sideca
     check_output(beside, overwrite, inputs, suffixes=())
 
 
-def _match(saved: SavedRegistration, frames: Sequence[Frame], match: Match) -> tuple[list[Frame | None], str]:
+def _match(saved: SavedRegistration, frames: Sequence[Frame], match: MatchBy) -> tuple[list[Frame | None], str]:
     """For each picture of the registration the frame that takes its place, and by what it was found."""
     # Arrays have no names of their own.
     if match != "order" and any(frame.picture is None for frame in frames):

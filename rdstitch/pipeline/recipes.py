@@ -34,7 +34,7 @@ from rdstitch.registration import Registration
 from rdstitch.sidecar.write import sidecar
 from rdstitch.stitch_result import StitchResult
 
-Layout = Literal["csv", "tum", "kitti"]
+TrajectoryFormat = Literal["csv", "tum", "kitti"]
 
 _MAX_SCALE_UNCERTAINTY = 0.05  # share that lengths may be off by, as far as the focal length is, without a word
 _NO_TIMES = Message(
@@ -179,7 +179,7 @@ def trajectory(
     output: str | Path | None = None,
     options: StitchOptions | None = None,
     *,
-    layout: Layout = "csv",
+    layout: TrajectoryFormat = "csv",
     timestamps: str | Path | None = None,
     plot: str | Path | None = None,
     height: float = 1.0,

@@ -19,7 +19,7 @@ from rdstitch.io.read import Picture
 from rdstitch.io.write import write_image
 from rdstitch.progress import Progress, silent
 
-View = Literal["same", "all", "valid"]
+Framing = Literal["same", "all", "valid"]
 
 _POINTS_PER_SIDE = 256
 
@@ -31,7 +31,7 @@ def undistort(
     *,
     camera: Camera | None = None,
     distortion: float | None = None,
-    view: View = "same",
+    view: Framing = "same",
     overwrite: bool = False,
     channel_order: ChannelOrder = "bgr",
     progress: Progress = silent,
@@ -45,7 +45,7 @@ def undistort(
     *,
     camera: Camera | None = None,
     distortion: float | None = None,
-    view: View = "same",
+    view: Framing = "same",
     overwrite: bool = False,
     channel_order: ChannelOrder = "bgr",
     progress: Progress = silent,
@@ -58,7 +58,7 @@ def undistort(
     *,
     camera: Camera | None = None,
     distortion: float | None = None,
-    view: View = "same",
+    view: Framing = "same",
     overwrite: bool = False,
     channel_order: ChannelOrder = "bgr",
     progress: Progress = silent,
@@ -106,7 +106,7 @@ def undistort(
         return outputs
 
 
-def _undistorted(source: Source, view: View) -> Composite:
+def _undistorted(source: Source, view: Framing) -> Composite:
     plain = CompositeOptions(exposure="none", seam="none", blend="none")
     canvas = undistorted_canvas(source.camera, view)
     read: Callable[[], Picture] = source.read
@@ -136,7 +136,7 @@ def _output_name(source: Source) -> str:
     return f"{source.name}.png" if fits_png else f"{source.name}.tif"
 
 
-def undistorted_canvas(camera: Camera, view: View) -> Canvas:
+def undistorted_canvas(camera: Camera, view: Framing) -> Canvas:
     """Where the undistorted picture lies in the output, at the scale that it has at its distortion centre."""
     outline = camera.undistort(camera.outline(_POINTS_PER_SIDE))
     if view == "same":

@@ -44,13 +44,10 @@ class Agreement:
         Cells with texture in both pictures.
     confirming : int
         Cells that correlate best, and well, where the registration says.
-    contradicting : int
-        Cells that correlate well, but elsewhere.
     """
 
     cells: int
     confirming: int
-    contradicting: int
 
     @property
     def share(self) -> float:
@@ -122,8 +119,8 @@ def overlap_agreement(first: PlacedPicture, second: PlacedPicture) -> Agreement:
     windows = _cells(second.grey, looked_at, _REACH)
     inner = windows[:, _REACH:-_REACH, _REACH:-_REACH]
     known = np.isfinite(windows).all(axis=(1, 2)) & _have_texture(inner)
-    votes = [_vote(cell, window) for cell, window in zip(_cells(seen, looked_at[known]), windows[known], strict=True)]
-    return Agreement(len(votes), votes.count(1), votes.count(-1))
+    cells = _cells(seen, looked_at[known])
+    return Agreement(len(cells), sum(_confirms(*both) for both in zip(cells, windows[known], strict=True)))
 
 
 def _cells(picture: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:
@@ -141,10 +138,8 @@ def _have_texture(cells: Grey) -> NDArray[np.bool_]:
     return np.asarray(cells.std(axis=(1, 2)) > _LEAST_TEXTURE)
 
 
-def _vote(cell: Grey, window: Grey) -> int:
-    """1 for, -1 against, 0 neither."""
+def _confirms(cell: Grey, window: Grey) -> bool:
+    """Whether a cell correlates best, and well, with the middle of a window."""
     scores = np.asarray(cv2.matchTemplate(window, cell, cv2.TM_CCOEFF_NORMED))
     row, column = np.unravel_index(int(scores.argmax()), scores.shape)
-    if scores[row, column] < _ALIKE:
-        return 0
-    return 1 if np.hypot(row - _REACH, column - _REACH) <= _SLACK else -1
+    return bool(scores[row, column] >= _ALIKE and np.hypot(row - _REACH, column - _REACH) <= _SLACK)

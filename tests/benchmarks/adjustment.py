@@ -12,7 +12,7 @@ import numpy as np
 
 from rdstitch.alignment.align import AlignmentOptions, align
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
-from rdstitch.alignment.result import Poses
+from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory, compare
 from tests.alignment_scenes import robot_path, scene
 
@@ -37,7 +37,7 @@ def main(counts: Sequence[int] = (40, 80, 160, 320), models: Sequence[str] = ("a
             if found.poses is not None:
                 p = given.poses
                 heights = np.exp(p[:, LOG_HEIGHT])
-                truth = Trajectory.from_poses(Poses(p[:, YAW], p[:, [X, Y]], heights, p[:, [PSI, THETA]]))
+                truth = Trajectory.from_poses(PlanarPoses(p[:, YAW], p[:, [X, Y]], heights, p[:, [PSI, THETA]]))
                 error = compare(Trajectory.from_alignment(found), truth)
                 row += f"{100 * error.translation_in_own_unit:11.4f}{math.degrees(error.rotation):11.4f}"
                 row += f"{100 * error.drift:11.4f}"

@@ -37,7 +37,7 @@ from rdstitch_cli.config import read_config
 from rdstitch_cli.main import cli
 from rdstitch_cli.progress import one_line
 
-from rdstitch.alignment.result import Poses, Relief
+from rdstitch.alignment.result import PlanarPoses, ReliefTest
 from rdstitch.camera import Camera
 from rdstitch.camera_files import load_camera
 from rdstitch.errors import RdstitchError
@@ -125,7 +125,7 @@ def _entries() -> tuple[bytes, ...]:
     numbers = rng.random(9)
     descriptors = rng.random((9, 8)).astype(np.float32)
     features = Features(rng.random((9, 2)), descriptors, numbers, numbers, numbers, None, "sift", (400, 300))
-    poses = Poses(rng.random(3), rng.random((3, 2)), rng.random(3), rng.random((3, 2)))
+    poses = PlanarPoses(rng.random(3), rng.random((3, 2)), rng.random(3), rng.random((3, 2)))
     values = ("name", features), {"cameras": (camera, camera), "poses": poses, "file": Path("a/b"), "none": None}
     return tuple(packing.pack(value)[packing._HEAD - 8 :] for value in values)
 
@@ -134,7 +134,7 @@ def _entry(file: Path) -> Any:
     body = file.read_bytes()
     data = packing._MAGIC + sha256(body).digest() + body
     # The cache computes again; nobody is told.
-    return _by_name(file, partial(packing.unpack, data, (Camera, Features, Poses, Relief)))
+    return _by_name(file, partial(packing.unpack, data, (Camera, Features, PlanarPoses, ReliefTest)))
 
 
 def _xmp(file: Path) -> Any:

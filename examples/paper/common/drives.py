@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.alignment import Link
-from rdstitch.alignment.result import Poses as PlanePoses
+from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
@@ -58,7 +58,7 @@ class Drive:
         """The true path."""
         unit = self.poses.height[0]
         p = self.poses
-        return Trajectory.from_poses(PlanePoses(p.yaw, p.position / unit, p.height / unit, p.tilt))
+        return Trajectory.from_poses(PlanarPoses(p.yaw, p.position / unit, p.height / unit, p.tilt))
 
     @property
     def blank_cameras(self) -> list[Camera]:

@@ -10,7 +10,7 @@ import pytest
 from rdstitch.alignment.align import AlignmentOptions, align
 from rdstitch.alignment.build_result import AdjustedPictures, build_alignment
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
-from rdstitch.alignment.result import CONTRADICTS, Alignment, Poses
+from rdstitch.alignment.result import CONTRADICTS, Alignment, PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory, compare
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.camera import Camera
@@ -43,7 +43,7 @@ def _pair_errors(found: Alignment, truth: Scene) -> np.ndarray:
 
 def _true_path(truth: Scene) -> Trajectory:
     p = truth.poses
-    return Trajectory.from_poses(Poses(p[:, YAW], p[:, [X, Y]], np.exp(p[:, LOG_HEIGHT]), p[:, [PSI, THETA]]))
+    return Trajectory.from_poses(PlanarPoses(p[:, YAW], p[:, [X, Y]], np.exp(p[:, LOG_HEIGHT]), p[:, [PSI, THETA]]))
 
 
 def _wrong_link(given: Scene, i: int, j: int, rng: np.random.Generator) -> Link:

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from rdstitch.alignment.result import Poses
+from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory, compare
 from rdstitch.errors import ArgumentError
 from rdstitch.export.trajectory_files import as_csv, as_tum
 
 
-def _poses() -> Poses:
+def _poses() -> PlanarPoses:
     yaw = np.array([0.3, 0.5, np.nan, 3.0, -3.0])
     position = np.array([[1.0, 2.0], [2.0, 2.5], [np.nan, np.nan], [3.0, 2.0], [4.0, 1.0]])
     height = np.array([2.0, 2.2, np.nan, 1.8, 2.0])
-    return Poses(yaw, position, height, np.zeros((5, 2)))
+    return PlanarPoses(yaw, position, height, np.zeros((5, 2)))
 
 
 def test_a_path_starts_at_the_origin_with_the_height_given() -> None:
@@ -49,7 +49,7 @@ def test_files() -> None:
 def test_neither_frame_nor_unit_matter_to_the_error() -> None:
     truth = Trajectory.from_poses(_poses())
     p, c, s = _poses(), np.cos(0.7), np.sin(0.7)
-    moved = Poses(p.yaw - 0.7, p.position @ np.array([[c, -s], [s, c]]).T * 3 + 5, p.height * 3, p.tilt)
+    moved = PlanarPoses(p.yaw - 0.7, p.position @ np.array([[c, -s], [s, c]]).T * 3 + 5, p.height * 3, p.tilt)
     error = compare(Trajectory.from_poses(moved, height=4.0), truth)
     assert error.translation < 1e-12
     assert error.rotation < 1e-12
@@ -61,8 +61,8 @@ def test_known_errors_are_measured() -> None:
     count = 20
     along = np.stack([np.arange(count) * 0.2, np.zeros(count)], axis=1)
     level, height = np.zeros((count, 2)), np.ones(count)
-    straight = Poses(np.zeros(count), along, height, level)
-    bent = Poses(np.linspace(0.0, 0.001 * (count - 1), count), 1.01 * along, height, level)
+    straight = PlanarPoses(np.zeros(count), along, height, level)
+    bent = PlanarPoses(np.linspace(0.0, 0.001 * (count - 1), count), 1.01 * along, height, level)
     error = compare(Trajectory.from_poses(bent), Trajectory.from_poses(straight))
     assert error.rotation == pytest.approx(0.001)
     assert error.scale == pytest.approx(1 / 1.01)
@@ -71,7 +71,7 @@ def test_known_errors_are_measured() -> None:
 
 
 def test_what_makes_no_path() -> None:
-    nothing = Poses(np.full(3, np.nan), np.full((3, 2), np.nan), np.full(3, np.nan), np.zeros((3, 2)))
+    nothing = PlanarPoses(np.full(3, np.nan), np.full((3, 2), np.nan), np.full(3, np.nan), np.zeros((3, 2)))
     with pytest.raises(ArgumentError, match="at least one frame"):
         Trajectory.from_poses(nothing)
     with pytest.raises(ArgumentError, match="height"):

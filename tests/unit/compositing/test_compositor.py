@@ -16,7 +16,7 @@ from rdstitch.compositing import CompositeOptions, compose, compose_to_file, pla
 from rdstitch.compositing.crop import largest_rectangle
 from rdstitch.compositing.options import Exposure
 from rdstitch.compositing.preparation import prepare
-from rdstitch.compositing.source_images import Source
+from rdstitch.compositing.source_images import PictureLoader
 from rdstitch.errors import ArgumentError, InputError, LimitError
 from rdstitch.io import Metadata, read_image
 from rdstitch.synthetic.rendering import Photometry
@@ -83,7 +83,7 @@ def test_brightness_stays_near_that_of_the_pictures() -> None:
         along = scene.rendering.to_plane(k, np.stack([u, v], axis=-1))[..., 0] - scene.rendering.poses.position[k, 0]
         brighter = np.exp(1.6 * along / scene.rendering.texture.size[0])[..., None]
         frames.append(np.clip(np.rint(frame * brighter), 0, 255).astype(np.uint8))
-    sources: list[Source] = [partial(as_picture, frame) for frame in frames]
+    sources: list[PictureLoader] = [partial(as_picture, frame) for frame in frames]
     white, middle = {}, {}
     choices: tuple[Exposure, ...] = ("gain", "balanced")
     for choice in choices:
@@ -100,7 +100,7 @@ def test_brightness_stays_near_that_of_the_pictures() -> None:
 def test_brightness_that_drifts_becomes_a_slope_without_steps() -> None:
     scene = render(6, 1, size=(300, 220), seed=6)
     grey_wall = [np.full_like(frame, round(110 * gain)) for frame, gain in zip(scene.frames, DRIFT, strict=True)]
-    sources: list[Source] = [partial(as_picture, frame) for frame in grey_wall]
+    sources: list[PictureLoader] = [partial(as_picture, frame) for frame in grey_wall]
     row = {}
     choices: tuple[Exposure, ...] = ("none", "gain", "balanced")
     for choice in choices:
@@ -123,7 +123,7 @@ def test_a_clipped_sky_ends_in_no_step() -> None:
     scene = render(2, 1, size=(320, 240), overlap=0.6, photometry=Photometry(gain=np.array([1.0, 1.0])), seed=8)
     sky = [frame.copy() for frame in scene.frames]
     sky[0][:100], sky[1][:100] = 255, 215
-    sources: list[Source] = [partial(as_picture, frame) for frame in sky]
+    sources: list[PictureLoader] = [partial(as_picture, frame) for frame in sky]
     steps = {}
     choices: tuple[Exposure, ...] = ("gain", "balanced")
     for choice in choices:
@@ -286,10 +286,10 @@ def test_grey_among_colours_becomes_coloured() -> None:
 
 def test_pictures_that_do_not_fit() -> None:
     scene = render(2, 1)
-    wrong: list[Source] = [scene.sources[0], partial(as_picture, np.zeros((10, 10, 3), np.uint8))]
+    wrong: list[PictureLoader] = [scene.sources[0], partial(as_picture, np.zeros((10, 10, 3), np.uint8))]
     with pytest.raises(InputError, match="picture 2"):
         compose(wrong, scene.cameras, scene.homographies, scene.canvas)
-    deep: list[Source] = [scene.sources[0], partial(as_picture, np.zeros((240, 320, 3), np.uint16))]
+    deep: list[PictureLoader] = [scene.sources[0], partial(as_picture, np.zeros((240, 320, 3), np.uint16))]
     with pytest.raises(InputError, match="uint16"):
         compose(deep, scene.cameras, scene.homographies, scene.canvas)
     with pytest.raises(ArgumentError):
