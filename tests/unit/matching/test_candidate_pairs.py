@@ -138,3 +138,11 @@ def test_neighbours_with_partners_in_common_are_not_tried_again_but_loops_are_cl
     found = neighbours([Camera((640, 480))] * count, homographies, tried)
     assert found
     assert all(j - i > 12 or i < 6 or j > count - 7 for i, j in found)
+
+
+def test_too_few_features_for_words_look_like_none() -> None:
+    """Sixty-four words are learned from ten times as many descriptors, or not at all."""
+    rng = np.random.default_rng(0)
+    pictures = [_features(rng.normal(size=(16, 64)).astype(np.float32)) for _ in range(39)]
+    assert lookalikes(pictures, seed=1) == set()
+    assert lookalikes([*pictures, pictures[0]], seed=1) != set()

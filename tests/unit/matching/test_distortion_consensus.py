@@ -50,3 +50,31 @@ def test_pairs_that_cannot_see_it_have_no_vote() -> None:
     assert math.isnan(none.distortion)
     assert math.isinf(none.std)
     assert "none of 2 pairs" in none.reason
+
+
+@pytest.mark.parametrize(
+    ("gap", "few", "groups"),
+    [
+        (0.20, 9, True),
+        (0.04, 9, True),  # eight standard deviations
+        (0.02, 9, False),  # four: one lens
+        (0.20, 3, False),  # less than a fifth of the votes
+    ],
+)
+def test_two_groups_are_large_and_far_apart(gap: float, few: int, groups: bool) -> None:
+    rng = np.random.default_rng(4)
+    votes = np.concatenate([-0.30 + 0.005 * rng.normal(size=14), -0.30 + gap + 0.005 * rng.normal(size=few)])
+    assert bool(vote(votes, np.full(14 + few, 0.005)).groups) is groups
+
+
+def test_votes_that_know_little_make_no_group() -> None:
+    rng = np.random.default_rng(5)
+    votes = np.concatenate([-0.30 + 0.005 * rng.normal(size=14), np.full(9, 0.1)])
+    assert vote(votes, np.append(np.full(14, 0.005), np.full(9, 0.05))).groups == ()
+
+
+def test_two_votes_have_no_scatter_and_equal_ones_a_histogram() -> None:
+    assert vote([-0.2, -0.1], [0.01, 0.01]).scatter == 0.0
+    same = vote([-0.2, -0.2, -0.2], [0.01] * 3)
+    assert same.scatter == pytest.approx(0.0, abs=1e-6)
+    assert same.edges[0] < -0.2 < same.edges[-1]
