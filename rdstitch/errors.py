@@ -1,4 +1,4 @@
-"""What can go wrong, as a tree; each leaf knows the exit status that the command line gives it.
+"""What can go wrong, as a tree; each leaf has the exit status that the command line gives it.
 
 ::
 
@@ -51,7 +51,7 @@ class RegistrationError(RdstitchError):
 
 
 class PartialResultError(RdstitchError):
-    """Pictures were left out although the caller asked for all of them."""
+    """Pictures were left out although the caller requires all of them."""
 
     exit_status = 5
     code = "left-out"

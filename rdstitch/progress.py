@@ -1,4 +1,4 @@
-"""How recipes tell what they are doing."""
+"""How recipes report their progress."""
 
 from collections.abc import Callable
 

@@ -33,7 +33,7 @@ def project(homogeneous: FloatArray) -> FloatArray:
 
 
 def to_plane(camera: Camera, homography: FloatArray, points: ArrayLike) -> FloatArray:
-    """Where measured points of a picture, px (N, 2), lie on the plane; NaN at and beyond the horizon.
+    """Where measured points of a picture, pixels (N, 2), lie on the plane; NaN at and beyond the horizon.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def to_plane(camera: Camera, homography: FloatArray, points: ArrayLike) -> Float
 
 
 def from_plane(camera: Camera, homography: FloatArray, points: ArrayLike) -> FloatArray:
-    """Where a picture shows points (N, 2) of the plane, px: the inverse of :func:`to_plane`; NaN where it cannot."""
+    """Pixels where a picture shows points (N, 2) of the plane: the inverse of :func:`to_plane`; NaN where it cannot."""
     back = np.asarray(np.linalg.inv(homography), dtype=np.float64)
     return camera.distort(camera.denormalize(_mapped(back, np.asarray(points, dtype=np.float64))))
 
@@ -208,7 +208,7 @@ def measurement_whitening(by_point: FloatArray) -> FloatArray:
     Parameters
     ----------
     by_point : ndarray of shape (N, 2, 2)
-        Derivative of the transferred by the original point, both in px.
+        Derivative of the transferred by the original point, both in pixels.
 
     Returns
     -------
@@ -260,7 +260,7 @@ class RadialHomography:
     motion : PlanarMotion or None
         The motion where the model is one of planar motion.
     rms : float
-        Root mean square error of the inliers, px of picture 2.
+        Root mean square error of the inliers, pixels of picture 2.
     solver : str
         Minimal solver that found the model.
     iterations : int
@@ -310,7 +310,7 @@ class RadialHomography:
 
     @property
     def distortion_observable(self) -> bool:
-        """Whether the pictures say anything about λ."""
+        """Whether the pictures determine λ."""
         return self.ok and bool(np.isfinite(self.distortion_std))
 
     @property
@@ -320,7 +320,7 @@ class RadialHomography:
         return to_px @ self.homography @ np.linalg.inv(_pixel_matrix(self.camera))
 
     def transfer(self, points1: ArrayLike) -> FloatArray:
-        """Measured px of picture 1 (N, 2) to measured px of picture 2; NaN where there is no such point."""
+        """Measured pixels of picture 1 (N, 2) to measured pixels of picture 2; NaN where there is no such point."""
         normalized = self.camera.normalize(points1)
         moved = transfer(self.homography, self.camera.distortion, normalized, self.camera.higher)
         return self.camera2.denormalize(moved)

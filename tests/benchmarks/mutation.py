@@ -40,7 +40,7 @@ MAPPED = {
     "matching.lens_votes": ("unit/matching/test_mixed_lenses.py",),
     "matching.match_graph": ("unit/matching/test_match_graph.py",),
     "matching.mixed_lenses": ("unit/matching/test_mixed_lenses.py",),
-    "matching.static_background": ("unit/matching/test_static_background.py",),
+    "matching.static_background": ("unit/matching/test_static_background.py", "unit/matching/test_two_view_rounds.py"),
     "matching.thinning": ("unit/matching/test_thinning.py",),
     "alignment.cycle_consistency": ("unit/alignment/test_cycle_consistency.py", "unit/alignment/test_align.py"),
     "alignment.model_selection": ("unit/alignment/test_align.py",),

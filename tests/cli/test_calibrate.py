@@ -51,7 +51,7 @@ def test_camera_files_of_others(rdstitch: Run, frames: list[Path], tmp_path: Pat
     assert (straight.status, straight.err) == (0, "")
 
 
-def test_the_residual_of_a_foreign_lens_is_told(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+def test_the_residual_of_a_foreign_lens_is_reported(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     entry = {"projection_type": "perspective", "width": 400, "height": 300, "focal": 0.95, "k1": -0.2, "k2": 0.02}
     file = tmp_path / "cameras.json"
     file.write_text(json.dumps({"lens": entry}), encoding="utf-8")

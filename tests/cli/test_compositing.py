@@ -103,7 +103,7 @@ def test_amounts_of_memory() -> None:
     assert {text: Bytes().convert(text, None, None) for text in amounts} == amounts
 
 
-def test_dry_run_tells_and_writes_nothing(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+def test_dry_run_reports_and_writes_nothing(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     done = rdstitch("mosaic", *frames, "-o", tmp_path / "a.tif", "--dry-run", *FAST)
     assert (done.status, done.err) == (0, "")
     assert not list(tmp_path.iterdir())
@@ -144,7 +144,9 @@ def test_deep_zoom_is_the_same_picture(rdstitch: Run, frames: list[Path], tmp_pa
     assert np.abs(tiles - whole.pixels)[sure].mean() < 0.5 * np.abs(np.roll(tiles, 1, 1) - whole.pixels)[sure].mean()
 
 
-def test_deep_zoom_is_replaced_only_when_told(rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path) -> None:
+def test_deep_zoom_is_replaced_only_on_request(
+    rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path
+) -> None:
     command = ("apply", sidecar, "--images", frames[0].parent, "-o", tmp_path / "a.dzi", "--scale", "0.3")
     assert rdstitch(*command).status == 0
     (tmp_path / "a.dzi").unlink()

@@ -16,7 +16,7 @@ from rdstitch_cli.main import cli
 from rdstitch.camera import Camera
 from rdstitch.errors import InputError
 from tests.cli.running import FAST, Run
-from tests.mutations import damaged_text
+from tests.damaged_texts import damaged_text
 
 _DOCUMENT = Path(__file__).parents[2] / "docs" / "configuration.md"
 

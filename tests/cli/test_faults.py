@@ -414,7 +414,7 @@ def test_nobody_reads_the_output(place: Path) -> None:
 
 
 @pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
-def test_an_asked_for_end_leaves_nothing_behind(place: Path, signal_number: int) -> None:
+def test_termination_leaves_nothing_behind(place: Path, signal_number: int) -> None:
     before = _state(place)
     process = start("pano", place / "a.png", place / "b.png", "-o", place / "out.png", "-v", *FAST)
     assert process.stderr is not None

@@ -80,7 +80,7 @@ def test_masks_help_where_nothing_is_composited(
     assert abs(float(done.out) - DISTORTION) < 0.01
 
 
-def test_pictures_without_a_mask_are_told(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+def test_pictures_without_a_mask_are_reported(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     (tmp_path / "masks").mkdir()
     assert cv2.imwrite(str(tmp_path / "masks" / f"{frames[0].stem}.bmp"), np.full((30, 40), 255, np.uint8))
     done = rdstitch("pano", *frames, "-o", tmp_path / "out.png", "--mask", tmp_path / "masks", *FAST)

@@ -81,7 +81,7 @@ def test_a_camera_that_stands_still_for_a_while(rdstitch: Run, frames: list[Path
     ],
     ids=["everything looks promising", "nothing does", "one picture does not"],
 )
-def test_whatever_a_glance_says_every_picture_finds_its_place(
+def test_every_picture_finds_its_place_whatever_the_prescreen_does(
     rdstitch: Run,
     frames: list[Path],
     tmp_path: Path,

@@ -84,7 +84,7 @@ def test_a_picture_without_overlap_is_named(rdstitch: Run, frames: list[Path], s
     assert not (tmp_path / "strict.jpg").exists()
 
 
-def test_quiet_says_nothing_and_verbose_says_more(
+def test_quiet_prints_nothing_and_verbose_prints_more(
     rdstitch: Run, frames: list[Path], stranger: Path, tmp_path: Path
 ) -> None:
     arguments = ("pano", *frames[:2], stranger, "-o", tmp_path / "pano.jpg", "--overwrite", *FAST)

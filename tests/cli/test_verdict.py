@@ -22,7 +22,7 @@ def _pretend(monkeypatch: pytest.MonkeyPatch, *found: Message) -> None:
 
 
 @pytest.mark.parametrize("command", OUTPUTS)
-def test_doubts_are_told(
+def test_warnings_are_printed(
     rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
     _pretend(monkeypatch, Message("look at that seam"))
@@ -32,7 +32,7 @@ def test_doubts_are_told(
 
 
 @pytest.mark.parametrize("command", OUTPUTS)
-def test_what_fails_is_not_written_unless_forced_and_then_told(
+def test_what_fails_is_written_with_force_only_and_then_reported(
     rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
     _pretend(monkeypatch, Message("the pictures disagree", severity="failure"))
@@ -102,7 +102,7 @@ def test_pictures_of_two_lenses_are_parted(rdstitch: Run, frames: list[Path], tm
         ),
     ],
 )
-def test_what_pictures_say_of_their_cameras_is_told(
+def test_pictures_of_several_cameras_are_reported(
     rdstitch: Run, frames: list[Path], tmp_path: Path, models: tuple[str], lengths: tuple[int], told: str
 ) -> None:
     for number, (frame, model, length) in enumerate(zip(frames, models, lengths, strict=True)):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rdstitch.camera import Camera
 from rdstitch.camera_files import load_camera, save_camera
 from rdstitch.errors import InputError
-from tests.mutations import damaged, damaged_text
+from tests.damaged_texts import damaged, damaged_text
 
 
 def _good(name: str, own: bool) -> str:

@@ -57,7 +57,7 @@ def test_inverses_are_inverses(poses: np.ndarray, natural: np.ndarray) -> None:
 
 
 @given(arrays(float, st.tuples(st.integers(1, 60), st.just(2)), elements=_numbers(-1.0, 1.0)), st.integers(1, 40))
-def test_thinning_takes_as_many_as_asked_for(points: np.ndarray, most: int) -> None:
+def test_thinning_keeps_the_requested_number(points: np.ndarray, most: int) -> None:
     kept = spread_choice(points, most)
     assert len(kept) == min(most, len(points))
     assert (np.diff(kept) > 0).all()

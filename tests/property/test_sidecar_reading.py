@@ -13,7 +13,7 @@ from rdstitch.errors import InputError
 from rdstitch.options import StitchOptions
 from rdstitch.sidecar.read import read_sidecar
 from rdstitch.sidecar.write import plain
-from tests.mutations import damaged, damaged_text
+from tests.damaged_texts import damaged, damaged_text
 
 _IMAGE = {
     "name": "a.jpg",

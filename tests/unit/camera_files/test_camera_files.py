@@ -59,7 +59,9 @@ def test_a_camera_comes_back_as_it_was(tmp_path: Path, name: str, camera: Camera
 
 @pytest.mark.parametrize("camera", CAMERAS[:3])
 @pytest.mark.parametrize("name", FOREIGN)
-def test_of_a_foreign_file_the_lens_is_fitted_and_the_residual_told(tmp_path: Path, name: str, camera: Camera) -> None:
+def test_of_a_foreign_file_the_lens_is_fitted_and_the_residual_reported(
+    tmp_path: Path, name: str, camera: Camera
+) -> None:
     save_camera(camera, tmp_path / name)
     text = _without_own_node((tmp_path / name).read_text(encoding="utf-8"))
     assert "lambda" not in text

@@ -144,7 +144,7 @@ def test_the_room_for_a_picture_is_known_before(shrink: float, masked: bool) -> 
         assert reader.nbytes(0, shrink) >= reader.prepared(0, shrink).nbytes
 
 
-def test_what_cannot_be_read_ahead_is_told_to_who_asks_for_it() -> None:
+def test_a_failed_prefetch_raises_where_the_picture_is_read() -> None:
     decoded_images = DecodedImageCache()
     cache = decoded_images.cache(limit=80_000, ahead=True)
     decoded_images.frames[1] = decoded_images.frames[1][:50]
@@ -155,7 +155,7 @@ def test_what_cannot_be_read_ahead_is_told_to_who_asks_for_it() -> None:
 
 
 @pytest.mark.parametrize("shrink", [1.0, 5.0])
-def test_a_cut_holds_what_was_asked_for(shrink: float) -> None:
+def test_a_cut_holds_what_was_requested(shrink: float) -> None:
     frame = np.random.default_rng(1).integers(0, 256, (300, 400, 3), dtype=np.uint8)
     whole = prepare_picture(as_picture(frame), shrink)
     part = whole.cut((101, 53, 222, 177))

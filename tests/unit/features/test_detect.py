@@ -67,7 +67,7 @@ def test_a_picture_that_was_read_smaller_is_worked_on_at_the_same_size(size: tup
 
 
 @pytest.mark.parametrize("kind", ["rootsift", "orb"])
-def test_a_picture_that_shows_too_little_is_looked_at_more_closely(picture: NDArray[np.uint8], kind: str) -> None:
+def test_a_picture_with_few_features_is_detected_at_a_larger_size(picture: NDArray[np.uint8], kind: str) -> None:
     options = FeatureOptions(kind=kind, work_megapixels=0.02)
     small = cv2.resize(picture, (90, 75), interpolation=cv2.INTER_AREA)
     found = len(detect(small, FeatureOptions(kind=kind, work_megapixels=None)))

@@ -26,7 +26,7 @@ def _repeating(seed: int) -> tuple[Features, Features, FloatArray]:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_repeating_points_are_told_apart(seed: int) -> None:
+def test_repeating_points_are_distinguished(seed: int) -> None:
     features1, features2, shift = _repeating(seed)
     alone = match(features1, features2)
     truth = [np.argmin(np.abs(features2.points - point - shift).sum(axis=1)) for point in features1.points]

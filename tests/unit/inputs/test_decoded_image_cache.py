@@ -51,7 +51,7 @@ def _picture(values: NDArray[np.uint8]) -> Picture:
     return Picture(values, None, Metadata(values.shape[::-1]))
 
 
-def test_a_picture_is_decoded_once_for_all_who_look_at_it(source: Source, read: list[int]) -> None:
+def test_a_picture_is_decoded_once_for_all_stages(source: Source, read: list[int]) -> None:
     shelved = replace(source, decoded_images=DecodedImageCache())
     looks = [shelved.read(reduction, keep=True).pixels for reduction in (2, 4, 8)]
     last = shelved.read(8).pixels
@@ -69,7 +69,7 @@ def test_what_is_on_the_shelf_changes_no_px(source: Source) -> None:
         np.testing.assert_array_equal(with_shelf, without)
 
 
-def test_a_look_at_more_px_is_at_the_file(source: Source, read: list[int]) -> None:
+def test_a_larger_size_is_read_from_the_file(source: Source, read: list[int]) -> None:
     shelved = replace(source, decoded_images=DecodedImageCache())
     shelved.read(2, keep=True)
     assert shelved.read().pixels.shape == (SIZE[1], SIZE[0], 3)

@@ -50,7 +50,7 @@ def _divided(
         (_FIELD, [-0.15] * 40 + [-0.2] * 60),
     ],
 )
-def test_two_lenses_are_told_apart(pairs: list[tuple[int, int]], lenses: list[float]) -> None:
+def test_two_lenses_are_separated(pairs: list[tuple[int, int]], lenses: list[float]) -> None:
     found = _divided(pairs, lenses)
     assert found is not None
     assert found.certain

@@ -6,7 +6,13 @@ import pytest
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features
-from rdstitch.matching.static_background import has_static_background, is_static_pair, moving_features, show_motion
+from rdstitch.matching.static_background import (
+    StaticPlaces,
+    has_static_background,
+    is_static_pair,
+    moving_features,
+    show_motion,
+)
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.radial_homography import RadialHomography
 
@@ -58,7 +64,7 @@ def test_what_moves_by_less_than_the_threshold_is_taken_out_of_static_pairs_only
     assert left == [list(range(30, 40)), list(range(10)), list(range(40))]
 
 
-def test_most_pairs_rest_by_their_majority() -> None:
+def test_most_pairs_are_static_by_their_majority() -> None:
     rest, move = _pair(np.zeros(40)), _pair(np.full(40, 30.0))
     assert has_static_background([rest, rest, move], THRESHOLD)
     assert not has_static_background([rest, move], THRESHOLD)
@@ -94,3 +100,29 @@ def test_static_matches_besides_motion_are_a_background_where_several_pairs_have
     assert not has_static_background([_overlaid(7), _overlaid(7), move], THRESHOLD)
     assert not has_static_background([_overlaid(8), move, move], THRESHOLD)
     assert not has_static_background([_overlaid(8), _overlaid(8), *[move] * 9], THRESHOLD)
+
+
+def _with_overlay(static: int, image1: int = 0, image2: int = 1, *, seed: int = 0) -> PairRegistration:
+    """A pair that moves by 30 pixels, with so many static outliers at the same places of every such pair."""
+    pair = _pair(np.append(np.full(40, 30.0), np.full(static, 0.2)), image1, image2)
+    pair.relation.inliers[40:] = False
+    pair.correspondences.points1[:40] += np.random.default_rng(seed).uniform(0.0, 100.0, (40, 2))
+    return pair
+
+
+def test_of_a_pair_that_moves_only_static_outliers_are_taken_out() -> None:
+    one, numbers = np.ones(48), np.arange(48.0)
+    features = [Features(np.zeros((48, 2)), np.zeros((48, 8), np.float32), numbers, one, one, None, "made up")] * 2
+    first, second = moving_features(features, [_with_overlay(8)], THRESHOLD)
+    assert first.scale.tolist() == list(range(40))
+    assert second.scale.tolist() == list(range(8, 48))
+
+
+@pytest.mark.parametrize(("pairs", "left"), [(3, 40), (2, 48)])
+def test_a_place_is_static_from_three_static_matches_on(pairs: int, left: int) -> None:
+    seen = [_with_overlay(8, 0, 1 + k, seed=k) for k in range(pairs)]
+    places = StaticPlaces.of(seen, THRESHOLD)
+    assert len(places.without_static(seen[0].correspondences)) == left
+    # What moves from such a place is kept.
+    moving = _pair(np.full(48, 30.0)).correspondences
+    assert len(places.without_static(moving)) == 48

@@ -59,7 +59,7 @@ def _pairing(resting: int, moving: int, repeated: int = 0, seed: int = 0) -> Pai
 ALL = [(i, j) for i in range(PICTURES) for j in range(i + 1, PICTURES)]
 
 
-def test_a_moving_board_is_found_before_a_resting_background() -> None:
+def test_a_moving_board_is_found_before_a_static_background() -> None:
     pairing = _pairing(400, 150)
     alone = pairing.estimate(ALL)
     assert all(is_static_pair(pair, 3.0) for pair in alone)
@@ -70,7 +70,7 @@ def test_a_moving_board_is_found_before_a_resting_background() -> None:
     assert abs(distortion - LENS.distortion) < 0.02
 
 
-def test_pictures_that_really_rest_stay_together() -> None:
+def test_pictures_that_are_really_static_stay_together() -> None:
     pairing = _pairing(400, 0)
     alone = pairing.estimate(ALL)
     assert pairing.remove_static_background(alone) == MovingPairs(pairing, alone, found=False)
@@ -106,7 +106,7 @@ def test_static_matches_of_features_that_were_matched_otherwise_are_dropped_too(
         assert len(kept) == (~static).sum()
 
 
-def test_pictures_that_hang_on_little_find_what_repeats_where_it_must_be() -> None:
+def test_weakly_linked_pictures_find_what_repeats_where_it_must_be() -> None:
     pairing = _pairing(0, 160, repeated=120)
     alone = pairing.estimate(ALL)
     assert all(pair.relation for pair in alone)
@@ -128,13 +128,13 @@ def test_pictures_with_many_matches_are_left_as_they_are() -> None:
     assert pairing.guided_rematch(alone, alignment.support, alignment.transfer) == {}
 
 
-def test_pictures_that_share_nothing_are_told_at_a_glance() -> None:
+def test_pictures_that_share_nothing_are_rejected_by_the_prescreen() -> None:
     one, other = _pairing(0, 400), _pairing(0, 400, seed=1)
     together = replace(one, features=[*one.features[:2], *other.features[:2]])
     assert list(together.prescreen_pairs(ALL)) == [(0, 1), (2, 3)]
 
 
-def test_a_few_matches_beside_hundreds_are_not_worth_a_closer_look() -> None:
+def test_a_few_matches_beside_hundreds_do_not_pass_the_prescreen() -> None:
     shared = {(0, 1): 300, (0, 2): 16, (0, 3): 14, (1, 2): 400, (1, 3): 7, (2, 3): 200}
     pairing = _pairing(0, 400)
     # Told apart by their number of features.

@@ -63,7 +63,7 @@ def test_one_lens_is_one_wherever_its_centre_is(other: Camera | None) -> None:
         assert abs(difference) < 5.0 * std
 
 
-def test_pictures_that_only_turn_about_the_axis_do_not_tell_which_lens() -> None:
+def test_rotation_about_the_axis_does_not_show_the_lens() -> None:
     rng = np.random.default_rng(3)
     lens = Camera((640, 480), -0.2)
     points1 = rng.uniform((0, 0), (639, 479), (300, 2))

@@ -43,7 +43,7 @@ def _normals(tilt: np.ndarray) -> np.ndarray:
     return np.column_stack([np.sin(theta), -np.sin(psi) * np.cos(theta), np.cos(psi) * np.cos(theta)])
 
 
-def test_seed_decides_and_noise_has_the_size_asked_for() -> None:
+def test_seed_decides_and_noise_has_the_requested_size() -> None:
     clean, again = planar_instances(2000, 3, seed=4), planar_instances(2000, 3, seed=4)
     np.testing.assert_array_equal(clean.x2, again.x2)
     noisy = planar_instances(2000, 3, seed=4, noise=1e-3)
@@ -74,7 +74,7 @@ def test_impossible_ranges_are_refused() -> None:
 
 
 @pytest.mark.parametrize("motion", ["rigid", "similarity", "homography"])
-def test_correspondences_are_as_asked_for(motion: str) -> None:
+def test_correspondences_are_as_requested(motion: str) -> None:
     clean = correspondences(300, seed=7, motion=motion, noise=0.0, outliers=0.4)
     error = np.linalg.norm(clean.truth.transfer(clean.points1) - clean.points2, axis=1)
     assert clean.inliers.sum() == 180

@@ -34,7 +34,7 @@ LENS = Camera((320, 240), -0.25, focal=260.0)
 
 @pytest.mark.parametrize("direction", [0.0, 0.5 * np.pi])
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.1, -0.08)])
-def test_pairs_overlap_as_asked_for(direction: float, tilt: tuple[float, float]) -> None:
+def test_pairs_overlap_as_requested(direction: float, tilt: tuple[float, float]) -> None:
     """Along the middle row (or column), 70 % of the first picture is not in the second."""
     poses, _ = fit_to_plane(LENS, pair_poses(LENS, 0.3, direction=direction, tilt=tilt))
     sequence = sequence_over(blank, LENS, poses)

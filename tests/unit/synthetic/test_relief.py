@@ -61,7 +61,7 @@ def test_a_ray_ends_where_it_first_meets_the_ground(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", sorted(RELIEFS))
-def test_relief_is_as_high_as_asked_for_and_follows_its_seed(kind: str) -> None:
+def test_relief_has_the_requested_height_and_follows_its_seed(kind: str) -> None:
     made = RELIEFS[kind]((700, 500), 3, height=26.0)
     assert made.height.shape == (500, 700)
     assert made.height.min() == pytest.approx(0.0, abs=0.2)

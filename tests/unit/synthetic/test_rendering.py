@@ -102,7 +102,7 @@ def test_rendering_does_not_alias() -> None:
     assert picture.std() < 8.0
 
 
-def test_exposure_is_what_was_asked_for() -> None:
+def test_exposure_is_what_was_requested() -> None:
     lens = Camera(SIZE, 0.0, focal=260.0)
     grey = PictureTexture(np.full((400, 500), 100, np.uint8))
     poses = Poses.of([(0.0, 0.0), (5.0, 3.0)], 260.0)
