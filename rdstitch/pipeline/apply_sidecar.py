@@ -90,7 +90,6 @@ def apply(
     """
     if match not in _MATCHES:
         raise ArgumentError(f"unknown way to match {match!r}; choose one of {', '.join(_MATCHES)}")
-    threads = StitchOptions(workers=workers).threads
     saved = read_sidecar(sidecar)
     options = composite or saved.composite
     doubts = [mismatch] if (mismatch := mismatch_with_picture(saved)) else []
@@ -103,9 +102,7 @@ def apply(
         chosen, matched = _match(saved, found.frames, match)
         guard = InputGuard(strict)
         sources, left_out = _sources(saved, chosen, guard, options.max_memory)
-        if strict and left_out:
-            raise PartialResultError("; ".join(map(str, left_out.values())))
-        used = _used(saved, sources, left_out, mask)
+        used = _used(saved, sources, left_out, mask, strict=strict)
         composed = compose_pictures(
             list(used.values()),
             [source.camera for source in used.values()],
@@ -113,7 +110,7 @@ def apply(
             list(used).index(saved.reference) if saved.reference in used else None,
             output,
             options,
-            threads,
+            StitchOptions(workers=workers).threads,
             progress,
             displacements=[_displacement(saved, index, source) for index, source in used.items()],
             overwrite=overwrite,
@@ -147,8 +144,12 @@ def _used(
     sources: Sequence[Source | None],
     left_out: Mapping[int, Message],
     mask: str | Path | None,
+    *,
+    strict: bool,
 ) -> dict[int, Source]:
-    """The pictures of the output, with their masks, by their number in the registration; at least one."""
+    """The pictures of the output, with their masks, by their number in the registration; at least one, or all."""
+    if strict and left_out:
+        raise PartialResultError("; ".join(map(str, left_out.values())))
     used = {index: source for index, source in enumerate(sources) if source is not None}
     if not used:
         first = next(iter(left_out.values()))
