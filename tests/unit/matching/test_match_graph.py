@@ -28,6 +28,13 @@ def test_the_root_is_the_middle_of_a_chain() -> None:
     assert spanning_tree(9, chain, chain + 1, np.ones(8), root=0).parent.tolist() == list(range(8))
 
 
+def test_the_root_is_the_middle_of_the_longest_path_wherever_the_numbers_begin() -> None:
+    # 5 - 3 - 0 - 1 - 6 - 4 - 2, and 7 hangs on 0.
+    path = np.array([5, 3, 0, 1, 6, 4, 2])
+    i, j = np.append(path[:-1], 0), np.append(path[1:], 7)
+    assert spanning_tree(8, i, j, np.ones(7)).root == 1
+
+
 def test_chaining_goes_along_links_in_either_direction() -> None:
     rng = np.random.default_rng(0)
     truth = np.eye(3) + 0.2 * rng.normal(size=(4, 3, 3))
