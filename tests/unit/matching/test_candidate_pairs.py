@@ -146,3 +146,23 @@ def test_too_few_features_for_words_look_like_none() -> None:
     pictures = [_features(rng.normal(size=(16, 64)).astype(np.float32)) for _ in range(39)]
     assert lookalikes(pictures, seed=1) == set()
     assert lookalikes([*pictures, pictures[0]], seed=1) != set()
+
+
+def test_pictures_that_look_like_none_are_paired_with_the_three_that_follow() -> None:
+    count = 40
+    pairs = first_pairs([_features(np.zeros((0, 64), dtype=np.float32))] * count, seed=0)
+    assert pairs == [(i, j) for i in range(count) for j in range(i + 1, min(i + 4, count))]
+
+
+def test_no_picture_is_paired_with_itself() -> None:
+    assert all(i < j for i, j in first_pairs(_drive(40), seed=0))
+
+
+def test_ten_neighbours_of_each_picture_are_candidates() -> None:
+    lens = Camera((640, 480))
+    places = np.stack([np.eye(3)] * 11)
+    places[:, 0, 2] = np.linspace(0.0, 0.1, 11)
+    everything = {(i, j) for i in range(11) for j in range(i + 1, 11)}
+    assert set(neighbours([lens] * 11, places, set())) == everything
+    far = np.concatenate([places, places + [[[0, 0, 50.0], [0, 0, 0], [0, 0, 0]]]])
+    assert len(neighbours([lens] * 22, far, everything)) == 55
