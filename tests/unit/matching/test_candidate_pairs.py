@@ -164,5 +164,6 @@ def test_ten_neighbours_of_each_picture_are_candidates() -> None:
     places[:, 0, 2] = np.linspace(0.0, 0.1, 11)
     everything = {(i, j) for i in range(11) for j in range(i + 1, 11)}
     assert set(neighbours([lens] * 11, places, set())) == everything
-    far = np.concatenate([places, places + [[[0, 0, 50.0], [0, 0, 0], [0, 0, 0]]]])
+    far = np.concatenate([places, places])
+    far[11:, 0, 2] += 50.0
     assert len(neighbours([lens] * 22, far, everything)) == 55
