@@ -49,7 +49,8 @@ def test_a_link_far_worse_than_the_others_misfits() -> None:
     ("shift", "noise", "suspected"),
     [
         (0.0, 0.3, False),
-        (0.06, 0.3, True),  # a wrong pair: some twenty standard deviations, as a neighbouring tile gives
+        (0.06, 0.3, True),  # a wrong pair, as a neighbouring tile gives
+        (0.06, 1.2, True),  # the same, by some twenty standard deviations
         (0.06, 6.0, False),  # the same where the links are hardly known
         (0.01, 0.01, False),  # hundreds of standard deviations, but what relief or a rolling shutter does
     ],
