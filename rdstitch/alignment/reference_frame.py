@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rdstitch.alignment.result import Alignment, Poses
+from rdstitch.alignment.result import Alignment, PlanarPoses
 from rdstitch.arrays import FloatArray, IntArray
 
 _POINTS_PER_SIDE = 8
@@ -19,7 +19,7 @@ def in_frame_of(alignment: Alignment, reference: int) -> Alignment:
         unit = poses.height[reference]
         position = (poses.position - poses.position[reference]) @ np.array([[c, -s], [s, c]]).T / unit
         yaw = np.remainder(poses.yaw - poses.yaw[reference] + np.pi, 2.0 * np.pi) - np.pi
-        poses = Poses(yaw, position, poses.height / unit, poses.tilt)
+        poses = PlanarPoses(yaw, position, poses.height / unit, poses.tilt)
     return replace(alignment, homographies=homographies, reference=reference, poses=poses)
 
 
