@@ -48,9 +48,8 @@ _CELLS = 4
 """Cells per side of a link's overlap, each of which is a part where there are few links."""
 
 _ENOUGH_PICTURES = 4
-"""Pictures from which on the distortion centre is freed. In fewer a tilt and a change of height stand for it: with it
-free, two of the pairs of ``examples.paper figure5`` have 95 % of the errors within 4.1 and 1.1 pixels, without
-it within 0.6 and 0.2."""
+"""Pictures from which on the distortion centre is freed. In fewer a tilt and a change of height stand for it, and pairs
+like those of ``examples.paper figure5`` are registered worse with it free."""
 
 _ENOUGH_LINKS = 8
 """Links from which on each is a part."""
