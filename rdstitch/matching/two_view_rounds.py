@@ -105,14 +105,21 @@ class Pairing:
         pairs = self.estimate(prescreened, shared=prescreened)
         return pairs if any(pair.relation for pair in pairs) else self.estimate(candidates)
 
-    def remove_static_background(self, pairs: list[PairRegistration]) -> "MovingPairs":
-        """Where most pairs seem to rest, the pairing and pairs of what moves; the same again where nothing does."""
+    def remove_static_background(self, pairs: list[PairRegistration], candidates: Sequence[Pair] = ()) -> "MovingPairs":
+        """Where a part of the pictures is static, the pairing and pairs of what moves; the same again where none is.
+
+        What the pictures have in common was static then, so that it says nothing of which of the candidate pairs
+        matter: all of them are compared.
+        """
         threshold = self.options.pair.threshold
         if not has_static_background(pairs, threshold):
             return MovingPairs(self, pairs, found=False)
-        chosen = [(pair.image1, pair.image2) for pair in pairs]
-        moving = replace(self, features=moving_features(self.features, pairs, threshold))
-        strict = replace(moving, static=StaticPlaces.of(pairs, threshold))
+        compared = [(pair.image1, pair.image2) for pair in pairs]
+        others = sorted(set(candidates).difference(compared))
+        everything = [*pairs, *self.estimate(others)]
+        chosen = sorted([*compared, *others])
+        moving = replace(self, features=moving_features(self.features, everything, threshold))
+        strict = replace(moving, static=StaticPlaces.of(everything, threshold))
         again, fewer = moving.estimate(chosen), strict.estimate(chosen)
         count = len(self.features)
         if moving_images(fewer, count, threshold) >= moving_images(again, count, threshold):

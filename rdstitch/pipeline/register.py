@@ -79,7 +79,7 @@ def register(
         cache,
         aligner.options.exact_tilts(len(sources)),
     )
-    moving = pairing.remove_static_background(pairing.estimate_candidates(candidates))
+    moving = pairing.remove_static_background(pairing.estimate_candidates(candidates), candidates)
     lenses = separate_lenses(aligner.cameras, moving.pairs, options.threshold, options.known_distortion)
     pairs = moving.pairing.retry_with_consensus_distortion(lenses.pairs)
     aligned = aligner.align(pairs)
