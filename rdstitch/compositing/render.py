@@ -14,16 +14,9 @@ from rdstitch.compositing.boxes import Box, Float32Array, aligned, bounds, cut, 
 from rdstitch.compositing.image_cache import PictureCache
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photometric import Exposure, full_scale
+from rdstitch.compositing.sampling import border_weight, read_part, sample, sample_opacity
 from rdstitch.compositing.seam_finder import NOBODY, SeamMap
-from rdstitch.compositing.warp import (
-    Geometry,
-    Warp,
-    border_weight,
-    locate,
-    read_part,
-    sample,
-    sample_opacity,
-)
+from rdstitch.compositing.warp import Geometry, Warp, locate
 
 
 @dataclass(frozen=True)

@@ -13,16 +13,9 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.compositing.canvas import Canvas
+from rdstitch.compositing.sampling import border_weight, sample, sample_opacity
 from rdstitch.compositing.source_images import PictureReader
-from rdstitch.compositing.warp import (
-    Displacement,
-    Warp,
-    border_weight,
-    locate,
-    plan_warps,
-    sample,
-    sample_opacity,
-)
+from rdstitch.compositing.warp import Displacement, Warp, locate, plan_warps
 
 _LARGEST_PICTURE = 150_000
 _LARGEST_TOTAL = 16_000_000

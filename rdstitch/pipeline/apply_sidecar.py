@@ -25,6 +25,7 @@ from rdstitch.messages import left_out as left_out_message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.compose import compose_pictures
 from rdstitch.pipeline.page import plainly_viewed, write_page
+from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.recomposition import Recomposition, applied_sidecar
 from rdstitch.progress import Progress, silent
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_picture, read_sidecar
@@ -104,19 +105,14 @@ def apply(
         sources, left_out = _sources(saved, chosen, guard, options.max_memory)
         used = _used(saved, sources, left_out, mask, strict=strict)
         composed = compose_pictures(
-            list(used.values()),
-            [source.camera for source in used.values()],
-            np.array([saved.pictures[index].to_plane for index in used]),
-            list(used).index(saved.reference) if saved.reference in used else None,
+            _placed(saved, used),
             output,
             options,
             StitchOptions(workers=workers).threads,
             progress,
-            displacements=[_displacement(saved, index, source) for index, source in used.items()],
             overwrite=overwrite,
             outputs=outputs,
             dry_run=dry_run,
-            turned=saved.turned,
         )
         result = Recomposition(
             saved,
@@ -137,6 +133,18 @@ def apply(
             write_page(outputs, output, composed, plainly_viewed(composed.canvas, names))
             outputs.write(f"{output}.json", json_bytes(applied_sidecar(result)))
         return result
+
+
+def _placed(saved: SavedRegistration, used: Mapping[int, Source]) -> PlacedImages:
+    """The pictures at the places that the sidecar has for them."""
+    return PlacedImages(
+        list(used.values()),
+        [source.camera for source in used.values()],
+        np.array([saved.pictures[index].to_plane for index in used], dtype=np.float64),
+        list(used).index(saved.reference) if saved.reference in used else None,
+        [_displacement(saved, index, source) for index, source in used.items()],
+        saved.turned,
+    )
 
 
 def _used(

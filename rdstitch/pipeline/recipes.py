@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.camera_files import CAMERA_SUFFIXES, camera_file_text
@@ -28,6 +26,7 @@ from rdstitch.pipeline.accept import accept
 from rdstitch.pipeline.align_locally import align_registration_locally
 from rdstitch.pipeline.compose import compose_pictures
 from rdstitch.pipeline.page import viewed_pictures, write_page
+from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.register import register, with_frontal_reference
 from rdstitch.progress import Progress, silent
 from rdstitch.registration import Registration
@@ -281,24 +280,18 @@ def _composite(
     ``frontal`` takes the undistorted reference picture for the plane.
     """
     registration = with_frontal_reference(accept(registration, options), options, always=frontal)
-    alignment = registration.alignment
-    used = np.flatnonzero(alignment.used)
     local = align_registration_locally(registration, options.local_alignment)
+    placed = PlacedImages.of(registration, local.fields or None)
     with Outputs(options.overwrite) as outputs:
         composed = compose_pictures(
-            [registration.sources[i] for i in used],
-            [alignment.cameras[i] for i in used],
-            alignment.homographies[used],
-            int(np.flatnonzero(used == alignment.reference)[0]),
+            placed,
             output,
             options.composite,
             options.threads,
             progress,
-            displacements=local.fields or None,
             overwrite=options.overwrite,
             outputs=outputs,
             dry_run=options.dry_run,
-            turned=alignment.on_sphere,
         )
         _release_decoded_images(registration)
         result = StitchResult(

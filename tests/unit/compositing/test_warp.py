@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, compose, plan_canvas
+from rdstitch.compositing.sampling import sample
 from rdstitch.compositing.source_images import prepare_picture
-from rdstitch.compositing.warp import locate, plan_warp, sample
+from rdstitch.compositing.warp import locate, plan_warp
 from tests.compositing_scenes import as_picture, grey, inner, render
 
 PLAIN = CompositeOptions(exposure="none", seam="none", blend="none")

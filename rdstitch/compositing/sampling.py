@@ -1,0 +1,134 @@
+"""Pixels and weights of one picture at the places that a warp gives."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.compositing.boxes import Box, Float32Array
+from rdstitch.compositing.source_images import KERNEL_MARGIN, LoadedPicture
+from rdstitch.compositing.warp import Geometry
+
+INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos": cv2.INTER_LANCZOS4}
+
+# OpenCV resamples from no side as long as this, pixels.
+_TOO_LONG = 32767
+_LEAST_WEIGHT = np.float32(1e-6)
+
+
+def read_part(geometry: Geometry) -> Box:
+    """The part of the picture that :func:`sample` takes px from."""
+    (map_x, map_y), (width, height) = geometry.maps, geometry.warp.camera.image_size
+    left, right = _mirrored_extent(map_x, width)
+    top, bottom = _mirrored_extent(map_y, height)
+    return left, top, right, bottom
+
+
+def border_weight(geometry: Geometry) -> Float32Array:
+    """1 at the picture's centre, falling to 0 at its border (measured in the picture) and outside."""
+    (map_x, map_y), (width, height) = geometry.maps, geometry.warp.camera.image_size
+    one, half = np.float32(1.0), np.float32(0.5)
+    weight: Float32Array = (map_x + half) * np.float32(2.0 / width) - one
+    weight = one - np.abs(weight, out=weight)
+    down = (map_y + half) * np.float32(2.0 / height) - one
+    weight *= one - np.abs(down, out=down)
+    # Never 0 inside: a border px that one picture alone covers must not get lost.
+    np.maximum(weight, _LEAST_WEIGHT, out=weight)
+    weight[~geometry.inside] = 0.0
+    return weight
+
+
+def sample(picture: LoadedPicture, geometry: Geometry, interpolation: str = "cubic") -> NDArray[Any]:
+    """Resample a picture; content is mirrored outside of it, so that filters find no edge there.
+
+    Parameters
+    ----------
+    picture : LoadedPicture
+        Prepared for ``geometry.warp.shrink``; it holds what :func:`read_part` says.
+    geometry : Geometry
+        From :func:`locate`.
+    interpolation : str
+        "linear", "cubic" or "lanczos".
+
+    Returns
+    -------
+    ndarray of shape (h, w) or (h, w, C)
+        In the picture's sample type.
+    """
+    map_x, map_y = _mirrored(picture, geometry)
+    return _remap_from(picture.pixels, picture.origin, map_x, map_y, INTERPOLATION[interpolation])
+
+
+def sample_opacity(picture: LoadedPicture, geometry: Geometry) -> Float32Array | None:
+    """Opacity (h, w), 0 where the picture is masked out; None for a picture without a mask."""
+    if picture.opacity is None:
+        return None
+    map_x, map_y = _mirrored(picture, geometry)
+    opacity = _remap_from(picture.opacity, picture.origin, map_x, map_y, cv2.INTER_LINEAR)
+    # The outer half of the last opaque px is outside.
+    return np.where(opacity >= 0.5 * picture.opacity_step, opacity, 0.0).astype(np.float32)
+
+
+def _mirrored(picture: LoadedPicture, geometry: Geometry) -> tuple[Float32Array, Float32Array]:
+    """Px of the (reduced) picture, all inside it."""
+    map_x, map_y = geometry.maps
+    if not geometry.inside.all():
+        # Mirroring rounds: what is inside keeps its coordinates, whatever else the box holds.
+        mirrored = [_mirror(m, n) for m, n in zip((map_x, map_y), geometry.warp.camera.image_size, strict=True)]
+        for values, own in zip(mirrored, (map_x, map_y), strict=True):
+            np.copyto(values, own, where=geometry.inside)
+        map_x, map_y = mirrored
+    if picture.reduction > 1:
+        map_x, map_y = (_reduce(m, picture.reduction) for m in (map_x, map_y))
+    return map_x, map_y
+
+
+def _mirrored_extent(values: Float32Array, length: int) -> tuple[int, int]:
+    """First and last but one px that coordinates come to lie on when they are mirrored at both borders."""
+    low, high = float(values.min()), float(values.max())
+    start, stop = min(low, 2.0 * length - high), max(high, -low) + 2.0
+    return (0 if low < 0.0 else max(0, int(start))), (length if high > length else min(length, int(stop)))
+
+
+def _remap_from(
+    pixels: NDArray[Any], origin: tuple[int, int], map_x: Float32Array, map_y: Float32Array, interpolation: int
+) -> NDArray[Any]:
+    """``cv2.remap`` from a picture whose first px is at ``origin``; of a very long one, from the piece that counts."""
+    left, top = origin
+    if max(pixels.shape[:2]) >= _TOO_LONG:
+        x, y = (max(0, int(m.min()) - o - KERNEL_MARGIN) for m, o in zip((map_x, map_y), origin, strict=True))
+        right, bottom = (int(m.max()) - o + 2 + KERNEL_MARGIN for m, o in zip((map_x, map_y), origin, strict=True))
+        pixels, left, top = pixels[y:bottom, x:right], left + x, top + y
+    # Whole px are subtracted exactly, so the piece does not change the result.
+    if left:
+        map_x = map_x - np.float32(left)
+    if top:
+        map_y = map_y - np.float32(top)
+    return _remap(pixels, map_x, map_y, interpolation)
+
+
+def _remap(piece: NDArray[Any], map_x: Float32Array, map_y: Float32Array, interpolation: int) -> NDArray[Any]:
+    """``cv2.remap`` for any number of channels."""
+    channels = 1 if piece.ndim == 2 else piece.shape[2]
+    if channels <= 4:
+        done = cv2.remap(piece, map_x, map_y, interpolation, borderMode=cv2.BORDER_REFLECT)
+        return np.asarray(done).reshape(*map_x.shape, *piece.shape[2:])
+    bands = [_remap(np.ascontiguousarray(piece[..., k]), map_x, map_y, interpolation) for k in range(channels)]
+    return np.stack(bands, axis=-1)
+
+
+def _mirror(values: Float32Array, length: int) -> Float32Array:
+    """Coordinates mirrored at the picture's borders; far outside, those of the border."""
+    half, turn = np.float32(0.5), np.float32(2 * length)
+    mirrored = values + half
+    np.abs(mirrored, out=mirrored)
+    np.minimum(mirrored, turn - mirrored, out=mirrored)
+    np.maximum(mirrored, np.float32(0.0), out=mirrored)
+    mirrored -= half
+    return mirrored
+
+
+def _reduce(values: Float32Array, reduction: int) -> Float32Array:
+    """Px of the original to px of the picture reduced by a whole factor."""
+    return (values + np.float32(0.5)) / np.float32(reduction) - np.float32(0.5)
