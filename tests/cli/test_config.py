@@ -110,8 +110,10 @@ def _plausible(option: click.Option) -> Any:
     if isinstance(option.type, click.Choice):
         return str(option.type.choices[0])
     if isinstance(option.type, (click.types.IntParamType, click.types.FloatParamType)):
-        return 1
-    return {"tilt": "1,2", "attitude_std": "0.5", "max_memory": "1G"}.get(option.name or "", "name")
+        return 2
+    return {"tilt": "1,2", "attitude_std": "0.5", "max_memory": "1G", "local_alignment": "auto"}.get(
+        option.name or "", "name"
+    )
 
 
 @pytest.mark.parametrize("name", sorted(cli.commands))

@@ -28,7 +28,7 @@ def test_height_scales_positions_and_tum_has_eight_columns(rdstitch: Run, frames
     arguments = ("trajectory", *frames, "--format", "tum", *FAST)
     one = rdstitch(*arguments, "-o", tmp_path / "one.txt")
     assert one.status == 0
-    assert "lengths may be off" in one.line  # by a common factor, where nothing tells the focal length
+    assert "lengths may be off" in one.err  # by a common factor, where nothing tells the focal length
     assert rdstitch(*arguments, "-o", tmp_path / "two.txt", "--height", "2").status == 0
     first, second = (np.loadtxt(tmp_path / name) for name in ("one.txt", "two.txt"))
     assert first.shape == (3, 8)

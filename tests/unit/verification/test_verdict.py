@@ -98,3 +98,16 @@ def test_pictures_without_texture_are_not_called_unlike(good: Registration, tmp_
         sources.append(replace(source, path=path))
     found = _texts(_moved(replace(good, sources=tuple(sources)), 2, 0.3))
     assert not any("do not look alike" in text for text in found)
+
+
+def test_relief_is_a_warning_that_names_the_pair_where_it_is_largest(good: Registration) -> None:
+    alignment = good.alignment
+    links = list(alignment.links)
+    position = next(k for k, fit in enumerate(links) if fit.used)
+    links[position] = replace(links[position], rms=9.0)
+    rough = replace(alignment, relief=replace(alignment.relief, found=True), links=tuple(links))
+    worst = links[position]
+    names = [good.sources[k].name for k in (worst.image1, worst.image2)]
+    (message,) = [m for m in judge(replace(good, alignment=rough), 3.0) if "most of all between" in m.text]
+    assert message.severity == "warning"
+    assert f"between {names[0]} and {names[1]} (9.0 pixels)" in message.text
