@@ -16,6 +16,7 @@ from rdstitch.robust.own_lenses import OwnLenses, own_lenses
 _FARTHEST = 10.0  # thresholds from where one λ puts them, within which correspondences may fit with two
 _MOST = 250  # matches of a pair that are used
 _LEAST_STD = 2e-4  # λ; no pair knows it better than that the division model holds
+_LEAST_INLIERS = 30  # of a pair that votes: three times the parameters of a homography and two λ
 _COMMON_STD = 0.05  # λ; by so much relief and lenses of another kind change what a pair sees, of both pictures alike
 _ROUNDS = 6
 _PAIRS_AT_ONCE = 64
@@ -42,7 +43,13 @@ class Votes:
     @classmethod
     def of(cls, pairs: Sequence[PairRegistration], threshold: float) -> Self:
         """The votes of the pairs that see λ; ``threshold``, pixels, as they were estimated with."""
-        registered = [pair for pair in pairs if pair.relation and np.isfinite(pair.relation.distortion_std)]
+        registered = [
+            pair
+            for pair in pairs
+            if pair.relation
+            and np.isfinite(pair.relation.distortion_std)
+            and int(pair.relation.inliers.sum()) >= _LEAST_INLIERS
+        ]
         found = list(zip(registered, _votes(registered, threshold), strict=True))
         seen = [(pair, vote) for pair, vote in found if np.isfinite(vote.covariance).all()]
         return cls(
