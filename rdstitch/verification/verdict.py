@@ -83,7 +83,7 @@ def judge(
     geometric = [
         *_mixed(paths, registration),
         *_agreement_of_all(used),
-        *([] if resting else _misfits(paths, used)),
+        *([] if resting else _misfits(paths, [fit for fit in used if (fit.image1, fit.image2) not in disagreeing])),
         *([] if resting else (disagreeing[pair] for pair in _decisive(disagreeing, used, len(paths)))),
     ]
     if geometric:  # what the pixels say of pictures that may be left out need not be known
@@ -176,7 +176,7 @@ def _mixed(paths: Sequence[str], registration: Registration) -> list[Message]:
 
 
 def _misfits(paths: Sequence[str], used: Sequence[LinkFit]) -> list[Message]:
-    """Pictures of whose matches too many, over all their pairs, do not fit into the whole."""
+    """Pictures of whose matches too many do not fit into the whole, over all their pairs but those that disagree."""
     given, kept = np.zeros(len(paths), dtype=np.intp), np.zeros(len(paths), dtype=np.intp)
     for fit in used:
         given[[fit.image1, fit.image2]] += fit.count
