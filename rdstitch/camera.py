@@ -1,7 +1,7 @@
 """The camera: image size, distortion centre, focal length and division-model distortion λ.
 
 Points are in pixels ``(u, v)`` with the centre of the top-left pixel at ``(0, 0)``, or *normalized*:
-``x = (u - c) / s`` with ``c`` the distortion centre and ``s`` the scale in px. λ belongs to its scale;
+``x = (u - c) / s`` with ``c`` the distortion centre and ``s`` the scale in pixels. λ belongs to its scale;
 :class:`Camera` keeps it for ``s`` = half the image diagonal, so that ``1 + λ`` is the factor at the image
 corner.
 
@@ -41,7 +41,7 @@ _GUESSED_FOCAL = 1.2  # half diagonals: a 26 mm lens on 36 x 24 mm, in the middl
 
 
 def is_focal_length(focal: float, image_size: tuple[int, int]) -> bool:
-    """Whether a number can be a focal length, px, of pictures of a size; damaged files hold others."""
+    """Whether a number can be a focal length, pixels, of pictures of a size; damaged files hold others."""
     low, high = _FOCAL_LIMITS
     return low < focal / (math.hypot(*image_size) / 2) < high
 
@@ -53,15 +53,15 @@ class Camera:
     Attributes
     ----------
     image_size : (int, int)
-        Width and height, px.
+        Width and height, pixels.
     distortion : float
         λ of the division model for ``s`` = half the image diagonal; negative is barrel distortion.
     distortion2, distortion3 : float
         μ and ν, coefficients of r⁴ and r⁶, in the same frame; 0 for the one-parameter model.
     center : (float, float), optional
-        Distortion centre and principal point, px; the image centre if not given.
+        Distortion centre and principal point, pixels; the image centre if not given.
     focal : float or None
-        Focal length, px, or None where nothing is known of it.
+        Focal length, pixels, or None where nothing is known of it.
     focal_source : str or None
         Where the focal length comes from, a key of :data:`FOCAL_LOG_STD`.
     distortion_std : float or None
@@ -162,7 +162,7 @@ class Camera:
 
     @property
     def half_diagonal(self) -> float:
-        """Half the image diagonal, px: the scale ``s`` of the frame that λ is given in."""
+        """Half the image diagonal, pixels: the scale ``s`` of the frame that λ is given in."""
         return math.hypot(*self.image_size) / 2
 
     @property
@@ -208,7 +208,7 @@ class Camera:
         return self.denormalize(distort(self.normalize(points), self.distortion, self.higher))
 
     def outline(self, points_per_side: int) -> FloatArray:
-        """Outer border of the picture, clockwise from the top-left corner, px, shape (4 points_per_side, 2)."""
+        """Outer border of the picture, clockwise from the top-left corner, pixels, shape (4 points_per_side, 2)."""
         width, height = self.image_size
         corners = np.array([(0, 0), (width, 0), (width, height), (0, height)], dtype=np.float64) - 0.5
         steps = np.arange(points_per_side)[:, None] / points_per_side

@@ -13,7 +13,7 @@ from rdstitch.errors import InputError
 from rdstitch.regular_files import read_limited
 
 LARGEST_FILE = 256 * 2**20  # bytes; a sidecar of ten thousand pictures has about 30 MB
-_LARGEST_SIDE = 10**7  # px
+_LARGEST_SIDE = 10**7  # pixels
 _SMALLEST_ENTRY, _LARGEST_ENTRY = 1e-30, 1e30  # of matrices
 _DEEPEST = 50  # objects and lists within one another
 
@@ -187,14 +187,14 @@ class Record:
         return first, second
 
     def size(self) -> tuple[int, int]:
-        """Width and height of a picture, px."""
+        """Width and height of a picture, pixels."""
         values = [item.side() for item in self.items()]
         if len(values) != 2:
             self.expected("width and height in px")
         return values[0], values[1]
 
     def side(self) -> int:
-        """Width or height of a picture, px."""
+        """Width or height of a picture, pixels."""
         value = self.integer(1)
         if value > _LARGEST_SIDE:
             self.expected("a width or height in px")

@@ -122,7 +122,7 @@ class BundleAdjustmentResult:
     homographies : ndarray of shape (L, 3, 3)
         Of each link.
     sigma : float
-        Standard deviation of an error's coordinate, px, from the median.
+        Standard deviation of an error's coordinate, pixels, from the median.
     squared : ndarray of shape (M,)
         ``|r|²`` of each correspondence, px², whitened; inf where it cannot be transferred.
     equations : LinkEquations
@@ -188,7 +188,7 @@ class BundleAdjuster:
         ----------
         start : Parameters
         width : float, optional
-            Of the robust loss at the start, px; the scatter of the first errors decides if not given. It narrows to
+            Of the robust loss at the start, pixels; the scatter of the first errors decides if not given. It narrows to
             what the scatter of the errors asks for.
         """
         sigma = self._sigma(self._evaluate(start, 1.0, 1.0))
@@ -333,7 +333,7 @@ class BundleAdjuster:
 
 
 def sigma_of(squared: FloatArray) -> float:
-    """Standard deviation of an error's coordinate, px, from the median of the squared lengths (M,)."""
+    """Standard deviation of an error's coordinate, pixels, from the median of the squared lengths (M,)."""
     if not len(squared):
         return _SMALLEST_SIGMA
     median = float(np.sqrt(np.median(squared)))

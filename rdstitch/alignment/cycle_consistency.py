@@ -167,7 +167,7 @@ def misfitting_links(squared: FloatArray, observations: Observations) -> BoolArr
 
 
 def link_medians(squared: FloatArray, observations: Observations) -> FloatArray:
-    """Median length of the errors of each link, px, shape (L,)."""
+    """Median length of the errors of each link, pixels, shape (L,)."""
     edges = observations.start
     lengths = np.sqrt(squared)
     return np.array([np.median(lengths[a:b]) if b > a else np.inf for a, b in itertools.pairwise(edges)])

@@ -119,7 +119,7 @@ class NoiseModel:
     Attributes
     ----------
     noise : float
-        Standard deviation of an error's coordinate when the model is right, px.
+        Standard deviation of an error's coordinate when the model is right, pixels.
     overdispersion : float
     counted : ndarray of shape (M,), bool
         Correspondences of links that fit.

@@ -89,7 +89,7 @@ def link_equations(
     lens : ndarray of shape (5,)
         λ, μ, ν and the shift of the distortion centre, in the half-diagonal frame.
     width : float
-        Of :func:`robust_weight`, px.
+        Of :func:`robust_weight`, pixels.
     """
     count = len(observations)
     gram, gradient = np.zeros((count, _ENTRIES, _ENTRIES)), np.zeros((count, _ENTRIES))
@@ -138,7 +138,7 @@ def squared_errors(
 
 
 def whitened_errors(observations: Observations, homographies: FloatArray, lens: FloatArray) -> FloatArray:
-    """Whitened transfer errors of all correspondences, px, shape (M, 2); NaN where there is none."""
+    """Whitened transfer errors of all correspondences, pixels, shape (M, 2); NaN where there is none."""
     errors = [_whitened(observations, homographies, lens, *chunk)[1] for chunk in _chunks(observations.start)]
     return np.concatenate([np.empty((0, 2)), *errors])
 
@@ -153,7 +153,7 @@ def _chunks(start: NDArray[np.intp]) -> list[tuple[int, int]]:
 def _whitened(
     observations: Observations, homographies: FloatArray, lens: FloatArray, first: int, last: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Jacobian (m, 2, 14) and error (m, 2) of the correspondences of some links, whitened, px; the whitening."""
+    """Jacobian (m, 2, 14) and error (m, 2) of the correspondences of some links, whitened, pixels; the whitening."""
     rows = slice(observations.start[first], observations.start[last])
     counts = np.diff(observations.start[first : last + 1])
     scale1 = np.repeat(observations.scale1[first:last], counts)[:, None, None]

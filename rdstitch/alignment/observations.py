@@ -31,7 +31,7 @@ class Observations:
     points1, points2 : ndarray of shape (M, 2)
         Measured, in half diagonals from the camera's distortion centre.
     scale1, scale2 : ndarray of shape (L,)
-        Half the diagonal of each link's pictures, px.
+        Half the diagonal of each link's pictures, pixels.
     matches : ndarray of shape (L,), intp
         Correspondences that each link had before thinning.
     """

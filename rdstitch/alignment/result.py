@@ -27,7 +27,7 @@ class LinkFit:
     inliers : int
         Correspondences that agree with the alignment.
     rms : float
-        Root mean square error of those, px; NaN where the link was not used.
+        Root mean square error of those, pixels; NaN where the link was not used.
     used : bool
     reason : str
         Why the link was not used; empty otherwise.
@@ -75,7 +75,7 @@ class ReliefTest:
     coherence : float
         Mean correlation of the residuals of neighbouring points, 0 for noise, 1 for a smooth surface.
     size : float
-        Root mean square of the coherent part of the residuals, px.
+        Root mean square of the coherent part of the residuals, pixels.
     explanation : str
         One sentence; what it means for λ.
     """
@@ -131,7 +131,7 @@ class Alignment:
         "distortion2", "distortion3", "center_x", "center_y".
     covariance : ndarray of shape (P, P)
     rms : float
-        Root mean square error of the inliers of all links, px.
+        Root mean square error of the inliers of all links, pixels.
     links : tuple of LinkFit
         In the order of the links given.
     relief : ReliefTest
@@ -183,7 +183,7 @@ class Alignment:
         return {(fit.image1, fit.image2): fit.inliers for fit in self.links if fit.used}
 
     def transfer(self, image1: int, image2: int, points: FloatArray) -> FloatArray:
-        """Where points (N, 2) of one picture, px, are in another; NaN where its lens cannot see them."""
+        """Where points (N, 2) of one picture, pixels, are in another; NaN where its lens cannot see them."""
         if self.on_sphere:
             # What both pictures show may lie behind the plane that is before them.
             seen = to_plane(self.cameras[image1], self.relation(image1, image2), points)

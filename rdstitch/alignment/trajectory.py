@@ -137,7 +137,7 @@ class TrajectoryError:
     translation_rms : float
         Root mean square error of the relative translations over their root mean square length.
     translation_in_own_unit : float
-        As ``translation``, after the best scale: the height in px is known only as well as the focal length.
+        As ``translation``, after the best scale: the height in pixels is known only as well as the focal length.
     rotation : float
         Median error of the relative rotations, radians.
     rotation_rms : float

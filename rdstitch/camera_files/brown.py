@@ -21,9 +21,9 @@ class Brown:
     Attributes
     ----------
     focal : (float, float)
-        Along x and y, px.
+        Along x and y, pixels.
     center : (float, float)
-        px.
+        pixels.
     radial : tuple of float
         k1, k2, k3.
     tangential : (float, float)
@@ -40,11 +40,11 @@ class Brown:
 
     @property
     def mean_focal(self) -> float:
-        """One focal length for both directions, px."""
+        """One focal length for both directions, pixels."""
         return float(np.sqrt(self.focal[0] * self.focal[1]))
 
     def distort(self, points: FloatArray) -> FloatArray:
-        """Px (N, 2) of a lens without distortion and with square pixels to measured px."""
+        """Px (N, 2) of a lens without distortion and with square pixels to measured pixels."""
         x, y = ((points - self.center) / self.mean_focal).T
         r2 = x * x + y * y
         ratio = _series(self.radial, r2) / _series(self.denominator, r2)

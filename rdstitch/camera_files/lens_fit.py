@@ -30,7 +30,7 @@ class LensFit:
     Attributes
     ----------
     rms, largest : float
-        Of the distances between the px that both models give, over the whole picture, px.
+        Of the distances between the pixels that both models give, over the whole picture, pixels.
     """
 
     rms: float

@@ -17,7 +17,7 @@ _WEIGHT_STEPS = np.float32(4096.0)
 
 
 def margin(bands: int) -> int:
-    """How far, px, a result can depend on the px around it.
+    """How far, pixels, a result can depend on the pixels around it.
 
     A px of band l reaches, up and down the pyramid, 2 (2^l - 1) px; the Laplacian adds as much of the next band.
     """

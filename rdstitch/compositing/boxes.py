@@ -1,4 +1,4 @@
-"""Boxes of px, on the canvas or in a picture, and arrays of values on them."""
+"""Boxes of pixels, on the canvas or in a picture, and arrays of values on them."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Box = tuple[int, int, int, int]
-"""x0, y0, x1, y1, px, end exclusive."""
+"""x0, y0, x1, y1, pixels, end exclusive."""
 
 Float32Array = NDArray[np.float32]
 
@@ -24,7 +24,7 @@ def encloses(outer: Box, inner: Box) -> bool:
 
 
 def grown(box: Box, by: int) -> Box:
-    """``box`` with ``by`` px more on each side."""
+    """``box`` with ``by`` pixels more on each side."""
     return box[0] - by, box[1] - by, box[2] + by, box[3] + by
 
 

@@ -74,7 +74,7 @@ def estimate_exposure(
 
 @dataclass(frozen=True)
 class _Cells:
-    """Cells that two pictures show: pictures (M,), measured px of the middle in either (M, 2), difference (M, C).
+    """Cells that two pictures show: pictures (M,), measured pixels of the middle in either (M, 2), difference (M, C).
 
     The difference is what the first picture is brighter by, log units; the overlap (N, N) of two pictures the share of
     the smaller one.
@@ -117,7 +117,7 @@ def _compare(survey: Survey, exposure: Exposure) -> _Cells | None:
 
 
 def _cell_means(seen: NDArray[np.bool_], box: Box, side: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Number of px that count in each cell of a box, and their mean place on the reduced canvas."""
+    """Number of pixels that count in each cell of a box, and their mean place on the reduced canvas."""
     count = _cell_sums(seen.astype(np.float64), side)
     x, y = np.arange(box[0], box[2], dtype=np.float64), np.arange(box[1], box[3], dtype=np.float64)[:, None]
     with np.errstate(invalid="ignore"):
@@ -133,7 +133,7 @@ def _cell_values(tile: SurveyTile, box: Box, seen: NDArray[np.bool_], side: int)
 
 
 def _cell_sums(values: FloatArray, side: int) -> FloatArray:
-    """Sums over cells of ``side`` x ``side`` px; the last ones may be cut off."""
+    """Sums over cells of ``side`` x ``side`` pixels; the last ones may be cut off."""
     rows, columns = (np.arange(0, n, side) for n in values.shape[:2])
     return np.asarray(np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1), dtype=np.float64)
 

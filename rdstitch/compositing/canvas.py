@@ -20,10 +20,10 @@ from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.radial_homography import to_plane
 
-# Straight sides are curved after undistortion: 64 points a side put the extremes within 0.02 px on 4000 px.
+# Straight sides are curved after undistortion: 64 points a side put the extremes within 0.02 pixels on 4000 pixels.
 _POINTS_PER_SIDE = 64
 _LARGEST_GROWTH = 100.0
-_LARGEST_ENLARGEMENT = 400.0  # px of the canvas for each of the pictures, where --scale asks for it
+_LARGEST_ENLARGEMENT = 400.0  # pixels of the canvas for each of the pictures, where --scale asks for it
 
 
 @dataclass(frozen=True)
@@ -33,16 +33,16 @@ class Canvas:
     Attributes
     ----------
     size : (int, int)
-        Width and height, px.
+        Width and height, pixels.
     matrix : ndarray of shape (3, 3)
-        Affine, from plane coordinates to canvas px (centre of the top-left pixel at (0, 0)).
+        Affine, from plane coordinates to canvas pixels (centre of the top-left pixel at (0, 0)).
     footprints : tuple of ndarray of shape (K, 2)
         Outline of what is drawn of each picture, canvas px, clockwise. Of a canvas that goes all the way round, one of
         its places; it may reach beyond the canvas.
     projection : Projection
         What ``matrix`` is applied to: the places that it gives to directions.
     period : float or None
-        Width of a full turn, px, where the pictures go all the way round; None where they do not.
+        Width of a full turn, pixels, where the pictures go all the way round; None where they do not.
     near : tuple of NearPart or None
         What of each picture is drawn; None for all of it, empty for all of all pictures.
     """
@@ -55,7 +55,7 @@ class Canvas:
     near: tuple[NearPart | None, ...] = ()
 
     def boxes(self) -> list[Box]:
-        """Bounds (x0, y0, x1, y1) of every picture, whole px inside the canvas, end exclusive.
+        """Bounds (x0, y0, x1, y1) of every picture, whole pixels inside the canvas, end exclusive.
 
         A picture that lies across the edge of a canvas that goes all the way round has the whole width.
         """
@@ -70,7 +70,7 @@ class Canvas:
         return boxes
 
     def areas(self) -> list[int]:
-        """Of the bounds of every picture, as if it had only one place on the canvas, square px."""
+        """Of the bounds of every picture, as if it had only one place on the canvas, square pixels."""
         if self.period is None:
             return [(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in self.boxes()]
         sizes = [np.minimum(np.ptp(outline, axis=0) + 1, self.size) for outline in self.footprints]
@@ -83,7 +83,7 @@ class Canvas:
         return low + min(turns), high + max(turns)
 
     def place(self, camera: Camera, homography: FloatArray, points: ArrayLike) -> FloatArray:
-        """Canvas px (N, 2) of measured px (N, 2) of a picture; NaN where it has no place."""
+        """Canvas pixels (N, 2) of measured pixels (N, 2) of a picture; NaN where it has no place."""
         if self.projection == PLANE:
             return to_plane(camera, self.matrix @ homography, points)
         flat = camera.normalize(camera.undistort(points))
@@ -99,11 +99,11 @@ class Canvas:
         return replace(self, size=(x1 - x0, y1 - y0), matrix=shift @ self.matrix, footprints=footprints)
 
     def widened(self, margin: int) -> "Canvas":
-        """The same with ``margin`` px more on the left and on the right."""
+        """The same with ``margin`` pixels more on the left and on the right."""
         return self.cropped((-margin, 0, self.size[0] + margin, self.size[1]))
 
     def reduced(self, factor: int) -> "Canvas":
-        """The same canvas with px ``factor`` times as large."""
+        """The same canvas with pixels ``factor`` times as large."""
         width, height = (-(-n // factor) for n in self.size)
         shift = 0.5 / factor - 0.5
         to_reduced = np.array([[1.0 / factor, 0.0, shift], [0.0, 1.0 / factor, shift], [0.0, 0.0, 1.0]])
@@ -209,7 +209,7 @@ def _outline_on_plane(camera: Camera, matrix: FloatArray, near: NearPart | None,
 
 
 def _resolution(camera: Camera, matrix: FloatArray) -> float:
-    """Picture px per plane unit at the picture's centre, negative where the picture is mirrored."""
+    """Picture pixels per plane unit at the picture's centre, negative where the picture is mirrored."""
     width, height = camera.image_size
     middle = np.array([(width - 1) / 2, (height - 1) / 2])
     left, right, top, bottom = to_plane(camera, matrix, middle + np.array([(-0.5, 0), (0.5, 0), (0, -0.5), (0, 0.5)]))

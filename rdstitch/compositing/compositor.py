@@ -69,7 +69,7 @@ class FileComposite:
     seams : SeamMap or None
         Which picture owns what of the canvas before cropping; None without seams.
     origin : (int, int)
-        Where the output begins in that canvas, px.
+        Where the output begins in that canvas, pixels.
     """
 
     path: Path
@@ -118,7 +118,7 @@ def compose(
     exposures : sequence of float or None, optional
         Exposure of each picture as the camera wrote it down (time x sensitivity / f-number²), up to a common factor.
     displacements : sequence of callables or None, optional
-        Of each picture, what local alignment adds to its measured px; see :class:`rdstitch.compositing.warp.Warp`.
+        Of each picture, what local alignment adds to its measured pixels; see :class:`rdstitch.compositing.warp.Warp`.
 
     Returns
     -------

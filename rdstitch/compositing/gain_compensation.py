@@ -80,7 +80,7 @@ def _gain_prior(exposures: Sequence[float | None], count: int, offset: float) ->
 
 @dataclass(frozen=True)
 class _Samples:
-    """Points that two pictures see: picture, weight, value (share of full), px and r² of either; S of each.
+    """Points that two pictures see: picture, weight, value (share of full), pixels and r² of either; S of each.
 
     They are sorted by pair; ``start`` is where those of each begin.
     """

@@ -19,7 +19,7 @@ class PictureCache:
     ----------
     reader : PictureReader
     shrinks : sequence of float
-        Picture px per output px.
+        Picture pixels per output pixels.
     limit : int
         Bytes.
     ahead : bool

@@ -10,7 +10,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import Box, Float32Array
 
 LATTICE_STEPS = (32, 16, 8, 4, 2, 1)
-"""Spacings of lattices, canvas px; all have the nodes of the first."""
+"""Spacings of lattices, canvas pixels; all have the nodes of the first."""
 
 _NOWHERE = np.float32(-1e6)
 
@@ -19,16 +19,16 @@ _NOWHERE = np.float32(-1e6)
 class Lattice:
     """Px of a picture at the nodes of a lattice around a box of the canvas.
 
-    It is anchored to the canvas: every node, and every px between them, is the same bit for bit in every box.
+    It is anchored to the canvas: every node, and every pixels between them, is the same bit for bit in every box.
 
     Attributes
     ----------
     box : (int, int, int, int)
-        x0, y0, x1, y1, canvas px, end exclusive.
+        x0, y0, x1, y1, canvas pixels, end exclusive.
     step : int
         Spacing, one of ``LATTICE_STEPS``.
     points : ndarray of shape (m, n, 2), float32
-        At the nodes, which enclose the box, those of the widest spacing too; far outside where there are no px.
+        At the nodes, which enclose the box, those of the widest spacing too; far outside where there are no pixels.
     """
 
     box: Box
@@ -37,7 +37,7 @@ class Lattice:
 
     @classmethod
     def over(cls, box: Box, step: int, places: Callable[[FloatArray, FloatArray], FloatArray]) -> Self:
-        """Nodes by what maps x (1, n) and y (m, 1), canvas px, to px (m, n, 2) of a picture."""
+        """Nodes by what maps x (1, n) and y (m, 1), canvas pixels, to pixels (m, n, 2) of a picture."""
         (x0, x1), (y0, y1) = _enclosing(box, LATTICE_STEPS[0])
         x, y = (np.arange(start, stop + 1, step, dtype=np.float64) for start, stop in ((x0, x1), (y0, y1)))
         points = places(x[None, :], y[:, None]).astype(np.float32)
@@ -55,13 +55,13 @@ class Lattice:
         return self.points[rows, columns]
 
     def maps(self, box: Box) -> tuple[Float32Array, Float32Array]:
-        """Measured px of every canvas px of a box within this one's: two arrays (h, w)."""
+        """Measured pixels of every canvas pixels of a box within this one's: two arrays (h, w)."""
         points = self.nodes(box, self.step)
         return interpolated(points[..., 0], box, self.step), interpolated(points[..., 1], box, self.step)
 
 
 def interpolated(nodes: Float32Array, box: Box, step: int) -> Float32Array:
-    """Linear interpolation of node values (m, n) to the px (h, w) of the box that they enclose.
+    """Linear interpolation of node values (m, n) to the pixels (h, w) of the box that they enclose.
 
     Every value depends on its four nodes alone, bit for bit, whatever the box.
     """
@@ -79,7 +79,7 @@ def interpolated(nodes: Float32Array, box: Box, step: int) -> Float32Array:
 
 
 def _enclosing(box: Box, step: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """First and last node that enclose a box, across and down, canvas px."""
+    """First and last node that enclose a box, across and down, canvas pixels."""
     x0, y0, x1, y1 = box
     across, down = ((start // step * step, ((stop - 1) // step + 1) * step) for start, stop in ((x0, x1), (y0, y1)))
     return across, down

@@ -17,7 +17,7 @@ _POINTS_PER_SIDE = 64
 _PLANE_VIEW = math.radians(90.0)
 _CYLINDER_HEIGHT = math.radians(70.0)
 # A full turn is a multiple of this many px, or of less than 1/256 of it, so that both ends of a canvas have the same
-# lattices, reduced px and bands.
+# lattices, reduced pixels and bands.
 _UNIT, _UNITS_PER_TURN = 32, 256
 
 
@@ -134,7 +134,7 @@ def _lay_out(view: View, projection: Projection, resolution: float, rotate: floa
     projection : Projection
         Not the plane.
     resolution : float
-        px per radian at the horizon.
+        pixels per radian at the horizon.
     rotate : float
         Degrees that the output is turned clockwise.
     names : sequence of str

@@ -19,7 +19,7 @@ _PROPERTIES = (
 
 
 def directions_on(canvas: Canvas, points: FloatArray) -> FloatArray:
-    """Directions (N, 3), of length 1, of canvas px (N, 2) of pictures taken by turning on the spot."""
+    """Directions (N, 3), of length 1, of canvas pixels (N, 2) of pictures taken by turning on the spot."""
     places = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(canvas.matrix).T
     parts = canvas.projection.directions(places[:, 0], places[:, 1])
     directions = np.stack(np.broadcast_arrays(*parts), axis=-1)

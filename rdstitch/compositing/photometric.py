@@ -22,7 +22,7 @@ from rdstitch.compositing.boxes import Float32Array
 from rdstitch.compositing.lattice import LATTICE_STEPS, interpolated
 from rdstitch.compositing.warp import Geometry
 
-# The correction is smooth: it is computed at this spacing, canvas px, and interpolated.
+# The correction is smooth: it is computed at this spacing, canvas pixels, and interpolated.
 _LATTICE = LATTICE_STEPS[0]
 _ROWS = 128  # that are corrected at a time
 _DEPTHS = {"uint8": cv2.CV_8U, "uint16": cv2.CV_16U, "float32": cv2.CV_32F}
@@ -58,7 +58,7 @@ class Exposure:
     rms_after: float = 0.0
 
     def smooth_part(self, index: int, camera: Camera, points: FloatArray) -> FloatArray:
-        """Vignetting and field at measured px (..., 2), log units, shape (..., 1) or (..., C)."""
+        """Vignetting and field at measured pixels (..., 2), log units, shape (..., 1) or (..., C)."""
         r2 = squared_radius(camera, points)
         log = (r2 * (self.vignetting[0] + r2 * (self.vignetting[1] + r2 * self.vignetting[2])))[..., None]
         if self.fields.size:

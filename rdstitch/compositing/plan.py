@@ -31,10 +31,10 @@ class CompositePlan:
     Attributes
     ----------
     canvas_size : (int, int)
-        px, before cropping.
+        pixels, before cropping.
     pictures : int
     tile_size : int
-        px.
+        pixels.
     workers : int
         Tiles at one time.
     bands : int

@@ -54,13 +54,13 @@ class Prepared:
     canvas : Canvas
         After cropping.
     origin : (int, int)
-        Its top-left px on the canvas that the renderer knows.
+        Its top-left pixels on the canvas that the renderer knows.
     plan : CompositePlan
     notes : tuple of str
     shown : sequence of ShownPart
         Which part of each picture shows, where that is known before; else empty.
     around : int
-        How far from there pictures are asked for too, canvas px.
+        How far from there pictures are asked for too, canvas pixels.
     """
 
     renderer: Renderer
@@ -207,9 +207,9 @@ def _decided(
 
 
 def _wrap_margin(canvas: Canvas, bands: int) -> int:
-    """What a canvas that goes all the way round needs of its other end on each side, px, for blending to join them.
+    """What a canvas that goes all the way round needs of its other end on each side, pixels, for blending to join them.
 
-    A multiple of the spacings of lattices, bands and reduced px, so that both ends are computed alike.
+    A multiple of the spacings of lattices, bands and reduced pixels, so that both ends are computed alike.
     """
     needed, unit = margin(bands) + (2 << bands), max(LATTICE_STEPS[0], 2 << bands, survey_factor(canvas))
     return min(-(-needed // unit) * unit, canvas.size[0] // unit * unit)

@@ -28,7 +28,7 @@ class Layer:
     index : int
         Of the picture.
     box : (int, int, int, int)
-        Part of the canvas: x0, y0, x1, y1, px, end exclusive.
+        Part of the canvas: x0, y0, x1, y1, pixels, end exclusive.
     weight : ndarray of shape (h, w), float32
         0 where the picture has no say.
     geometry : Geometry
@@ -83,7 +83,7 @@ class Renderer:
     def tile(self, box: Box) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Samples (h, w, C) and coverage (h, w) of one box of the canvas.
 
-        What a px gets does not depend on the box.
+        What a pixels gets does not depend on the box.
         """
         blended = self.options.blend == "multiband"
         around = self._blend_support(box) if blended else box
@@ -118,7 +118,7 @@ class Renderer:
         """Fill ``pixels``, which are those of ``box``, with the layers, or with their weighted mean."""
         parts = [part for layer in layers if (part := layer.weighted_part(box)) is not None]
         if self.options.blend != "feather":
-            # One owner per px: a product and a quotient would cost the last bit.
+            # One owner per pixels: a product and a quotient would cost the last bit.
             for part in parts:
                 cv2.copyTo(self._samples(part, part.box), _as_mask(part.weight > 0), cut(pixels, box, part.box))
             return
@@ -189,7 +189,7 @@ class Renderer:
         return sample_opacity(self.pictures.get(index, read_part(geometry)), geometry)
 
     def _owned(self, box: Box) -> list[Layer]:
-        """Layers where each px has one owner, or, for feathering along a seam, shares of its owners.
+        """Layers where each pixels has one owner, or, for feathering along a seam, shares of its owners.
 
         The owner is the picture with the largest share in the seam map among those that cover the px; where the map,
         being coarse, has none of them, the one whose border is farthest.
@@ -228,7 +228,7 @@ class Renderer:
 
 
 def _claim(owner: NDArray[np.int32], best: Float32Array, box: Box, layer: Layer) -> None:
-    """Give a layer's picture the px where its weight is the largest so far."""
+    """Give a layer's picture the pixels where its weight is the largest so far."""
     previous = cut(best, box, layer.box)
     better = layer.weight > previous
     np.copyto(previous, layer.weight, where=better)
@@ -236,9 +236,9 @@ def _claim(owner: NDArray[np.int32], best: Float32Array, box: Box, layer: Layer)
 
 
 def _won(owner: NDArray[np.int32], box: Box, layer: Layer) -> Layer:
-    """The layer with weight 1 where its picture owns the px, and 0 elsewhere."""
+    """The layer with weight 1 where its picture owns the pixels, and 0 elsewhere."""
     owned = cut(owner, box, layer.box) == layer.index
-    # A picture may have a layer from the seam map and one for what the map left over: each gets its own px.
+    # A picture may have a layer from the seam map and one for what the map left over: each gets its own pixels.
     owned &= layer.weight > 0
     return replace(layer, weight=owned.astype(np.float32))
 

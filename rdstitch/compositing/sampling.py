@@ -18,7 +18,7 @@ _LEAST_WEIGHT = np.float32(1e-6)
 
 
 def read_part(geometry: Geometry) -> Box:
-    """The part of the picture that :func:`sample` takes px from."""
+    """The part of the picture that :func:`sample` takes pixels from."""
     (map_x, map_y), (width, height) = geometry.maps, geometry.warp.camera.image_size
     left, right = _mirrored_extent(map_x, width)
     top, bottom = _mirrored_extent(map_y, height)
@@ -33,7 +33,7 @@ def border_weight(geometry: Geometry) -> Float32Array:
     weight = one - np.abs(weight, out=weight)
     down = (map_y + half) * np.float32(2.0 / height) - one
     weight *= one - np.abs(down, out=down)
-    # Never 0 inside: a border px that one picture alone covers must not get lost.
+    # Never 0 inside: a border pixels that one picture alone covers must not get lost.
     np.maximum(weight, _LEAST_WEIGHT, out=weight)
     weight[~geometry.inside] = 0.0
     return weight
@@ -66,7 +66,7 @@ def sample_opacity(picture: LoadedPicture, geometry: Geometry) -> Float32Array |
         return None
     map_x, map_y = _mirrored(picture, geometry)
     opacity = _remap_from(picture.opacity, picture.origin, map_x, map_y, cv2.INTER_LINEAR)
-    # The outer half of the last opaque px is outside.
+    # The outer half of the last opaque pixels is outside.
     return np.where(opacity >= 0.5 * picture.opacity_step, opacity, 0.0).astype(np.float32)
 
 
@@ -85,7 +85,7 @@ def _mirrored(picture: LoadedPicture, geometry: Geometry) -> tuple[Float32Array,
 
 
 def _mirrored_extent(values: Float32Array, length: int) -> tuple[int, int]:
-    """First and last but one px that coordinates come to lie on when they are mirrored at both borders."""
+    """First and last but one pixels that coordinates come to lie on when they are mirrored at both borders."""
     low, high = float(values.min()), float(values.max())
     start, stop = min(low, 2.0 * length - high), max(high, -low) + 2.0
     return (0 if low < 0.0 else max(0, int(start))), (length if high > length else min(length, int(stop)))
@@ -100,7 +100,7 @@ def _remap_from(
         x, y = (max(0, int(m.min()) - o - KERNEL_MARGIN) for m, o in zip((map_x, map_y), origin, strict=True))
         right, bottom = (int(m.max()) - o + 2 + KERNEL_MARGIN for m, o in zip((map_x, map_y), origin, strict=True))
         pixels, left, top = pixels[y:bottom, x:right], left + x, top + y
-    # Whole px are subtracted exactly, so the piece does not change the result.
+    # Whole pixels are subtracted exactly, so the piece does not change the result.
     if left:
         map_x = map_x - np.float32(left)
     if top:
@@ -130,5 +130,5 @@ def _mirror(values: Float32Array, length: int) -> Float32Array:
 
 
 def _reduce(values: Float32Array, reduction: int) -> Float32Array:
-    """Px of the original to px of the picture reduced by a whole factor."""
+    """Px of the original to pixels of the picture reduced by a whole factor."""
     return (values + np.float32(0.5)) / np.float32(reduction) - np.float32(0.5)

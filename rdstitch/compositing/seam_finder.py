@@ -1,9 +1,9 @@
-"""Seams: which picture each px of the output comes from, decided on the reduced canvas.
+"""Seams: which picture each pixels of the output comes from, decided on the reduced canvas.
 
 "voronoi": where the borders of two pictures are equally far, so that each picture gives its middle. "graphcut": round
 that line, within a band, along the path on which the two pictures differ least (Kwatra et al. 2003, with OpenCV's
 cut), so that what moved or stands out of the plane is taken from one of them whole. Pictures are added one after the
-other, so that memory is that of one label per px of the reduced canvas.
+other, so that memory is that of one label per pixels of the reduced canvas.
 """
 
 from collections.abc import Callable
@@ -25,23 +25,23 @@ NOBODY = -1
 # Band in which a seam may wander: the new picture's share of both border weights.
 _LEAST_SHARE, _LARGEST_SHARE = 0.2, 0.8
 _AROUND_FREE = 2
-# px from which on a cut is found at half the size first, and by how much it may then move.
+# pixels from which on a cut is found at half the size first, and by how much it may then move.
 _LARGEST_CUT = 30_000
 _MOVED = 3
 
 
 @dataclass(frozen=True)
 class SeamMap:
-    """Owner of each px of the reduced canvas.
+    """Owner of each pixels of the reduced canvas.
 
     Attributes
     ----------
     labels : ndarray of shape (h, w), int32
         Index of the picture, or -1 where there is none.
     factor : int
-        Canvas px per reduced px, even or 1.
+        Canvas pixels per reduced pixels, even or 1.
     softness : int
-        Shares pass from one owner to the next over so many reduced px on either side of a seam, for feathering.
+        Shares pass from one owner to the next over so many reduced pixels on either side of a seam, for feathering.
     """
 
     labels: NDArray[np.int32]
@@ -49,14 +49,14 @@ class SeamMap:
     softness: int = 0
 
     def owners(self, box: Box) -> list[int]:
-        """Pictures that own anything on a box (canvas px), ascending; -1 first where nobody owns a part of it."""
+        """Pictures that own anything on a box (canvas pixels), ascending; -1 first where nobody owns a part of it."""
         return [int(owner) for owner in np.unique(self._window(box))]
 
     def share(self, owner: int, box: Box) -> Float32Array:
-        """How much of each px of a box (canvas px) a picture owns: labels interpolated linearly, (h, w).
+        """How much of each pixels of a box (canvas pixels) a picture owns: labels interpolated linearly, (h, w).
 
         Every value depends on the labels around it alone, bit for bit, whatever the box: sums of ones and of shares of
-        an even number of px are exact.
+        an even number of pixels are exact.
         """
         owned = (self._window(box) == owner).astype(np.float32)
         if owned.all():
@@ -71,7 +71,7 @@ class SeamMap:
         return share * np.float32(1.0 / side**2)
 
     def repeated(self, period: int) -> "SeamMap":
-        """The map of a canvas that goes all the way round, wider than a full turn of ``period`` canvas px.
+        """The map of a canvas that goes all the way round, wider than a full turn of ``period`` canvas pixels.
 
         Both ends, where it shows the same again, have the owners of the middle.
         """
@@ -92,7 +92,7 @@ class SeamMap:
 def find_seams(
     survey: Survey, exposure: Exposure, graphcut: bool, progress: Callable[[float], None] | None = None
 ) -> SeamMap:
-    """Owner of every px.
+    """Owner of every pixels.
 
     Parameters
     ----------
@@ -179,9 +179,9 @@ def _around(free: NDArray[np.bool_]) -> tuple[slice, slice]:
 
 
 def _graph_cut(images: list[Float32Array], masks: list[NDArray[np.uint8]]) -> NDArray[np.bool_]:
-    """Where the second of two images wins; the px that one mask alone has are what the cut must separate.
+    """Where the second of two images wins; the pixels that one mask alone has are what the cut must separate.
 
-    A large cut is found at half the size first, and then only moved by a few px.
+    A large cut is found at half the size first, and then only moved by a few pixels.
     """
     if masks[0].size > _LARGEST_CUT:
         masks = _near_cut(_graph_cut([_halved(i) for i in images], [m[::2, ::2] for m in masks]), masks)

@@ -23,13 +23,13 @@ _OPAQUE_FROM = 128
 _NEGLIGIBLE_SHRINK = 1.05
 # Share of the shorter side over which the weight rises from the border of a mask.
 _MASK_FEATHER = 0.125
-# Room around a part of a picture for the kernel of the resampling, px.
+# Room around a part of a picture for the kernel of the resampling, pixels.
 KERNEL_MARGIN = 8
 # Px that are read for one of the output, at least: a Gaussian needs two, or nearly so, to make it smooth.
 _PX_PER_OUTPUT_PX = 1.9
 # Largest reduction at which previews are asked for, a power of two.
 _LARGEST_PREVIEW = 8
-# Share of the px below which a part is cut out.
+# Share of the pixels below which a part is cut out.
 _WORTH_CUTTING = 0.8
 
 
@@ -48,9 +48,9 @@ class LoadedPicture:
     reduction : int
         The picture is smaller than the original by this factor.
     part : (int, int, int, int) or None
-        What can be resampled from it, px of the original; None for all of it. It holds more, for the kernel.
+        What can be resampled from it, pixels of the original; None for all of it. It holds more, for the kernel.
     origin : (int, int)
-        Where its first px lies in the whole reduced picture.
+        Where its first pixels lies in the whole reduced picture.
     """
 
     pixels: NDArray[Any]
@@ -103,7 +103,7 @@ def prepare_picture(picture: Picture, shrink: float, reduction: int = 1) -> Load
     if picture.alpha is not None:
         opaque = picture.alpha >= _OPAQUE_FROM
         pixels = _filled(pixels, opaque)
-    # Blocks alone alias; a Gaussian on at least two px per output px does not.
+    # Blocks alone alias; a Gaussian on at least two pixels per output pixels does not.
     further = max(1, int(shrink / reduction / 2))
     if further > 1:
         pixels = block_mean(pixels, further)
@@ -147,7 +147,7 @@ class PictureReader:
     sources : sequence of callables
         Each reads one picture.
     sizes : sequence of (int, int)
-        Width and height, px, that each picture must have.
+        Width and height, pixels, that each picture must have.
     previews : sequence of callables, optional
         Each reads one picture reduced by a factor; see :func:`rdstitch.io.read_image`.
     """

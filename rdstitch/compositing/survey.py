@@ -49,7 +49,7 @@ class Survey:
     Attributes
     ----------
     factor : int
-        Canvas px per reduced px, a power of two.
+        Canvas pixels per reduced pixels, a power of two.
     canvas : Canvas
         The reduced canvas.
     warps : tuple of Warp

@@ -1,4 +1,4 @@
-"""One resampling from the original: canvas px → plane → undistorted → measured px of one picture."""
+"""One resampling from the original: canvas pixels → plane → undistorted → measured pixels of one picture."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -17,14 +17,14 @@ from rdstitch.compositing.lattice import LATTICE_STEPS, Lattice
 from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.radial_homography import to_plane
 
-# Coordinates are computed on a lattice of the canvas and interpolated linearly, to this many px of the picture.
-# OpenCV rounds them to 1/32 px afterwards.
+# Coordinates are computed on a lattice of the canvas and interpolated linearly, to this many pixels of the picture.
+# OpenCV rounds them to 1/32 pixels afterwards.
 _LATTICE_ERROR = 0.01
 _PROBES = 16
 
 
 Displacement = Callable[[FloatArray], FloatArray]
-"""Displacement of a picture's content, px (..., 2), at measured px (..., 2): what local alignment found."""
+"""Displacement of a picture's content, pixels (..., 2), at measured pixels (..., 2): what local alignment found."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,14 @@ class Surface:
     ----------
     projection : Projection
     from_canvas : ndarray of shape (3, 3)
-        Canvas px to places of the projection, affine.
+        Canvas pixels to places of the projection, affine.
     """
 
     projection: Projection
     from_canvas: FloatArray
 
     def directions(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Directions at canvas px, by coordinate."""
+        """Directions at canvas pixels, by coordinate."""
         a = self.from_canvas
         # Upright, as nearly all canvases are, each coordinate stays a single row or column of numbers.
         across = a[0, 0] * x + a[0, 2] if a[0, 1] == 0.0 else a[0, 0] * x + a[0, 1] * y + a[0, 2]
@@ -61,15 +61,15 @@ class Warp:
         Canvas px, or the directions of a projection, to normalized undistorted coordinates; third coordinate positive
         in front of the camera.
     box : (int, int, int, int)
-        Where the picture can lie on the canvas: x0, y0, x1, y1, px, end exclusive.
+        Where the picture can lie on the canvas: x0, y0, x1, y1, pixels, end exclusive.
     step : int
-        Spacing of the coordinate lattice, canvas px.
+        Spacing of the coordinate lattice, canvas pixels.
     shrink : float
-        Picture px per canvas px (median over the picture); above 1 the picture gets smaller.
+        Picture pixels per canvas pixels (median over the picture); above 1 the picture gets smaller.
     surface : Surface or None
-        What gives directions to canvas px; None where the canvas is a plane.
+        What gives directions to canvas pixels; None where the canvas is a plane.
     displacement : callable, optional
-        Added to the measured px.
+        Added to the measured pixels.
     """
 
     camera: Camera
@@ -81,7 +81,7 @@ class Warp:
     displacement: Displacement | None = None
 
     def source_points(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Measured px (..., 2) of the picture at canvas px ``x``, ``y``; NaN where there are none."""
+        """Measured pixels (..., 2) of the picture at canvas pixels ``x``, ``y``; NaN where there are none."""
         m = self.from_canvas
         if self.surface is None:
             z = m[2, 0] * x + m[2, 1] * y + m[2, 2]
@@ -98,20 +98,20 @@ class Warp:
         return points if self.displacement is None else points + self.displacement(points)
 
     def contains(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
-        """Which measured px lie in the picture; NaN does not."""
+        """Which measured pixels lie in the picture; NaN does not."""
         width, height = self.camera.image_size
         return (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
 
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Where the px of one box of the canvas come from in one picture; computed when it is asked for.
+    """Where the pixels of one box of the canvas come from in one picture; computed when it is asked for.
 
     Attributes
     ----------
     warp : Warp
     box : (int, int, int, int)
-        x0, y0, x1, y1 on the canvas, px, end exclusive; it may reach beyond the canvas.
+        x0, y0, x1, y1 on the canvas, pixels, end exclusive; it may reach beyond the canvas.
     lattice : Lattice
         Of this box or of a larger one.
     """
@@ -127,7 +127,7 @@ class Geometry:
 
     @cached_property
     def maps(self) -> tuple[Float32Array, Float32Array]:
-        """Measured px x and y, (h, w) each, far outside where there are none."""
+        """Measured pixels x and y, (h, w) each, far outside where there are none."""
         return self.lattice.maps(self.box)
 
     @cached_property
@@ -139,7 +139,7 @@ class Geometry:
 
     @cached_property
     def inside(self) -> NDArray[np.bool_]:
-        """Which px (h, w) lie in the picture."""
+        """Which pixels (h, w) lie in the picture."""
         return np.ones(self.shape, dtype=np.bool_) if self.filled else self.warp.contains(*self.maps)
 
     def on(self, box: Box) -> "Geometry":
@@ -197,17 +197,17 @@ def plan_warps(
 
 
 def locate(warp: Warp, box: Box) -> Geometry:
-    """Where the px of a box come from, and which of them lie in the picture."""
+    """Where the pixels of a box come from, and which of them lie in the picture."""
     return Geometry(warp, box, Lattice.over(box, warp.step, warp.source_points))
 
 
 def _probes(camera: Camera, to_canvas: FloatArray, outline: FloatArray) -> FloatArray:
-    """Canvas px (K, 2) spread over the picture, its outline included."""
+    """Canvas pixels (K, 2) spread over the picture, its outline included."""
     return np.concatenate([to_plane(camera, to_canvas, _grid(camera)), outline])
 
 
 def _grid(camera: Camera) -> FloatArray:
-    """Measured px (K, 2) spread over a picture."""
+    """Measured pixels (K, 2) spread over a picture."""
     width, height = camera.image_size
     grid = np.stack(np.meshgrid(np.linspace(0, width - 1, _PROBES), np.linspace(0, height - 1, _PROBES)), axis=-1)
     return grid.reshape(-1, 2)
@@ -230,7 +230,7 @@ def _lattice_step(warp: Warp, probes: FloatArray) -> int:
 
 
 def _shrink(warp: Warp, probes: FloatArray) -> float:
-    """Median over the picture of picture px per canvas px."""
+    """Median over the picture of picture pixels per canvas pixels."""
     offsets = np.array([(-0.5, 0.0), (0.5, 0.0), (0.0, -0.5), (0.0, 0.5)])
     around = probes[:, None] + offsets
     left, right, top, bottom = np.moveaxis(warp.source_points(around[..., 0], around[..., 1]), 1, 0)

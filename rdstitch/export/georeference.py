@@ -30,16 +30,16 @@ _SHORT, _DOUBLE = 3, 12
 
 @dataclass(frozen=True)
 class Georeference:
-    """A similarity from px of the output to UTM on WGS 84.
+    """A similarity from pixels of the output to UTM on WGS 84.
 
     Attributes
     ----------
     zone : int
         1 to 60; negative in the south.
     scale : complex
-        Metres per px times the turn: easting + i northing = ``scale`` (x - i y) + ``origin``.
+        Metres per pixels times the turn: easting + i northing = ``scale`` (x - i y) + ``origin``.
     origin : complex
-        Easting + i northing of the centre of the top-left px, m.
+        Easting + i northing of the centre of the top-left pixels, m.
     error : float
         Root mean square distance of the cameras' positions from where the picture puts them, m.
     """
@@ -55,7 +55,7 @@ class Georeference:
         return (32600 if self.zone > 0 else 32700) + abs(self.zone)
 
     def to_utm(self, points: ArrayLike) -> FloatArray:
-        """Easting and northing (N, 2), m, of px (N, 2) of the output."""
+        """Easting and northing (N, 2), m, of pixels (N, 2) of the output."""
         x, y = np.asarray(points, dtype=np.float64).T
         place = self.scale * (x - 1j * y) + self.origin
         return np.stack([place.real, place.imag], axis=-1)
@@ -63,10 +63,10 @@ class Georeference:
     def tiff_tags(self) -> list[ExtraTag]:
         """What makes a TIFF file a GeoTIFF."""
         a, b = self.scale.real, self.scale.imag
-        # GeoTIFF counts from the corner of the first px.
+        # GeoTIFF counts from the corner of the first pixels.
         corner = self.origin - self.scale * (0.5 - 0.5j)
         matrix = (a, b, 0.0, corner.real, b, -a, 0.0, corner.imag, *(0.0,) * 7, 1.0)
-        # Version 1.1.0 and three keys: projected, px are areas, which system.
+        # Version 1.1.0 and three keys: projected, pixels are areas, which system.
         keys = (1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, self.epsg)
         return [
             (_MODEL_TRANSFORMATION, _DOUBLE, len(matrix), matrix, True),
@@ -119,7 +119,7 @@ def georeference(
         Of each picture.
     cameras : sequence of Camera
     to_output : ndarray of shape (N, 3, 3)
-        Normalized undistorted coordinates of each picture to px of the output.
+        Normalized undistorted coordinates of each picture to pixels of the output.
 
     Returns
     -------
@@ -179,6 +179,6 @@ def _central_meridian(zone: int) -> float:
 
 
 def _middle(camera: Camera, to_output: FloatArray) -> FloatArray:
-    """Where the centre of a picture lies in the output, px."""
+    """Where the centre of a picture lies in the output, pixels."""
     width, height = camera.image_size
     return to_plane(camera, to_output, np.array([[(width - 1) / 2, (height - 1) / 2]])).reshape(2)

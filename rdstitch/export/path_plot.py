@@ -4,8 +4,8 @@ import numpy as np
 
 from rdstitch.alignment.trajectory import Trajectory
 
-_SIDE = 800.0  # px of the drawing's longer side
-_MARGIN = 60.0  # px
+_SIDE = 800.0  # pixels of the drawing's longer side
+_MARGIN = 60.0  # pixels
 _ARROWS = 40  # at most so many headings are drawn
 
 

@@ -21,7 +21,7 @@ def spread(points: FloatArray, response: FloatArray, count: int, cell: float) ->
     Parameters
     ----------
     points : ndarray of shape (N, 2)
-        px.
+        pixels.
     response : ndarray of shape (N,)
     count : int
         Keypoints to keep at most.

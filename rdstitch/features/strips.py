@@ -1,4 +1,4 @@
-"""SIFT of a large picture in strips, in a third of the memory: its finest octave has four times the picture's px.
+"""SIFT of a large picture in strips, in a third of the memory: its finest octave has four times the picture's pixels.
 
 The two finest octaves, most of the memory and most of the keypoints, are found in overlapping strips, where they are
 what they would be in the whole; the coarser ones are those of the picture at half its size.
@@ -20,7 +20,7 @@ from rdstitch.features.options import FeatureOptions
 LARGE = 1_500_000
 """Px from which on a picture is taken in strips."""
 
-_STRIP = 400_000  # px of a strip without its overlap, about
+_STRIP = 400_000  # pixels of a strip without its overlap, about
 # How far the descriptors of the two finest octaves reach, pixels: sigma of 4, times 3 a cell, 2.5 cells, diagonally,
 # and what is smoothed there.
 _OVERLAP = 64

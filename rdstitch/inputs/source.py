@@ -75,7 +75,7 @@ class Source:
         return 1 if megapixels is None else fitting_reduction(halving(self.camera.image_size, megapixels))
 
     def read(self, reduction: int = 1, *, keep: bool = False) -> Picture:
-        """The pixels, of blocks of so many px a side; what the mask excludes is transparent.
+        """The pixels, of blocks of so many pixels a side; what the mask excludes is transparent.
 
         Parameters
         ----------
@@ -162,7 +162,7 @@ def read_sources(
     camera : Camera or None
         Known camera; adapted to the size of each picture.
     focal : float or None
-        Known focal length, px.
+        Known focal length, pixels.
     distortion : float or None
         Known λ, half-diagonal frame.
     skip_bad : bool

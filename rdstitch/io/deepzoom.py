@@ -94,7 +94,7 @@ def write_deep_zoom(description: Path, folder: Path, layout: Layout, strips: Ite
 
 
 def read_deep_zoom(path: Path, size: tuple[int, int], side: int) -> NDArray[np.uint8]:
-    """Read the smallest level whose longer side has ``side`` px, or else the largest, of a picture of ``size``.
+    """Read the smallest level whose longer side has ``side`` pixels, or else the largest, of a picture of ``size``.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def read_deep_zoom(path: Path, size: tuple[int, int], side: int) -> NDArray[np.u
 
 
 def _sizes(size: tuple[int, int]) -> list[tuple[int, int]]:
-    """Width and height of every level, from a single px up."""
+    """Width and height of every level, from a single pixels up."""
     sizes = [size]
     while max(sizes[-1]) > 1:
         sizes.append(reduced_size(sizes[-1], 2))
@@ -122,7 +122,7 @@ def _sizes(size: tuple[int, int]) -> list[tuple[int, int]]:
 
 
 def _levels(folder: Path, layout: Layout) -> "_Level":
-    """The largest level, each with the next smaller one, down to a single px."""
+    """The largest level, each with the next smaller one, down to a single pixels."""
     level = None
     for number, size in enumerate(_sizes(layout.size)):
         place = folder / str(number)
@@ -191,5 +191,5 @@ class _Level:
 
 
 def _tile_span(number: int, length: int) -> tuple[int, int]:
-    """First and last but one px of a tile with its overlap, along one axis of a level."""
+    """First and last but one pixels of a tile with its overlap, along one axis of a level."""
     return max(0, number * TILE - OVERLAP), min(length, (number + 1) * TILE + OVERLAP)

@@ -13,7 +13,7 @@ from rdstitch.regular_files import open_regular
 
 _END_OF_IMAGE = b"\xff\xd9"
 _PADDING = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
-_SMALLEST = 8  # px a side; below, different reductions give pictures of the same size
+_SMALLEST = 8  # pixels a side; below, different reductions give pictures of the same size
 
 
 def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) -> tuple[NDArray[Any] | None, str]:

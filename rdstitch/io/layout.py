@@ -25,7 +25,7 @@ class Layout:
     Attributes
     ----------
     size : (int, int)
-        Width and height, px.
+        Width and height, pixels.
     channels : int
         Colour channels, without alpha.
     dtype : dtype

@@ -20,7 +20,7 @@ def check_mask(path: str | Path, picture: str | Path, size: tuple[int, int]) -> 
     path, picture : path
         The mask, and the picture that it is for.
     size : (int, int)
-        Width and height of the picture, px.
+        Width and height of the picture, pixels.
 
     Raises
     ------
@@ -28,7 +28,7 @@ def check_mask(path: str | Path, picture: str | Path, size: tuple[int, int]) -> 
         When the mask cannot be read, or has another shape than the picture; the text names it.
     """
     (width, height), (w, h) = size, read_metadata(path).size
-    # Sizes are whole px, so that the shape may differ by one px of the larger.
+    # Sizes are whole pixels, so that the shape may differ by one pixels of the larger.
     if abs(width * h - height * w) > max(width, height, w, h):
         raise InputError(
             f"{path}: a mask of {w} x {h} px does not fit on {picture}, which has {width} x {height} px; "
@@ -46,7 +46,7 @@ def read_mask(path: str | Path, size: tuple[int, int]) -> NDArray[np.uint8]:
     ----------
     path : path
     size : (int, int)
-        Width and height, px, that the mask is brought to; nearest pixels.
+        Width and height, pixels, that the mask is brought to; nearest pixels.
 
     Returns
     -------

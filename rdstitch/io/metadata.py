@@ -49,7 +49,7 @@ class Metadata:
     Attributes
     ----------
     size : (int, int)
-        Width and height, px, after the EXIF orientation is applied.
+        Width and height, pixels, after the EXIF orientation is applied.
     bit_depth : int
         Bits per sample.
     channels : int
@@ -57,7 +57,7 @@ class Metadata:
     orientation : int
         EXIF orientation (1 to 8) stored in the file; readers of this project have applied it already.
     focal_px : float or None
-        Focal length, px, where the file tells it.
+        Focal length, pixels, where the file tells it.
     focal_source : str or None
         Tag that ``focal_px`` comes from.
     gps : GpsPosition or None
@@ -235,7 +235,7 @@ def _text(value: Any) -> str:
 def _focal_px(
     exif: Image.Exif, photo: dict[int, Any], xmp: str, size: tuple[int, int]
 ) -> tuple[float | None, str | None]:
-    """Focal length in px and the tag it comes from, the most direct tag first."""
+    """Focal length in pixels and the tag it comes from, the most direct tag first."""
     calibrated = xmp_number(xmp, "CalibratedFocalLength")
     if calibrated and is_focal_length(calibrated, size):
         return calibrated, "CalibratedFocalLength"

@@ -13,12 +13,12 @@ def fitting_reduction(shrink: float) -> int:
 
 
 def reduced_size(size: tuple[int, int], factor: int) -> tuple[int, int]:
-    """Width and height, px, of a picture that is reduced by ``factor``; the last block need not be whole."""
+    """Width and height, pixels, of a picture that is reduced by ``factor``; the last block need not be whole."""
     return -(-size[0] // factor), -(-size[1] // factor)
 
 
 def block_mean(samples: NDArray[Any], factor: int) -> NDArray[Any]:
-    """Mean over blocks of ``factor`` x ``factor`` px of samples (h, w) or (h, w, C); borders repeat themselves."""
+    """Mean over blocks of ``factor`` x ``factor`` pixels of samples (h, w) or (h, w, C); borders repeat themselves."""
     if factor == 1:
         return samples
     height, width = samples.shape[:2]
@@ -30,7 +30,7 @@ def block_mean(samples: NDArray[Any], factor: int) -> NDArray[Any]:
 
 
 def block_minimum(alpha: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
-    """Least value in blocks of ``factor`` x ``factor`` px of a plane (h, w): opaque where all of a block is."""
+    """Least value in blocks of ``factor`` x ``factor`` pixels of a plane (h, w): opaque where all of a block is."""
     if factor == 1:
         return alpha
     height, width = alpha.shape

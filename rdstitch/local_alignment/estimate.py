@@ -26,7 +26,7 @@ _FEWEST_MATCHES = 100
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Residuals of matches that took no part in a fit, px of the median picture: median and 95 %."""
+    """Residuals of matches that took no part in a fit, pixels of the median picture: median and 95 %."""
 
     median: float
     percentile95: float

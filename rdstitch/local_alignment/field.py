@@ -12,19 +12,19 @@ from scipy import ndimage
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 
-_DECIMALS = 3  # px; what a sidecar stores is what was used
+_DECIMALS = 3  # pixels; what a sidecar stores is what was used
 
 
 @dataclass(frozen=True, eq=False)
 class DisplacementField:
     """Displacements of one picture.
 
-    What the alignment expects at the measured px ``q`` is at ``q + field(q)``.
+    What the alignment expects at the measured pixels ``q`` is at ``q + field(q)``.
 
     Attributes
     ----------
     image_size : (int, int)
-        Width and height of the picture, px.
+        Width and height of the picture, pixels.
     values : ndarray of shape (m, n, 2)
         Displacement, px, at nodes that are spread evenly from the first to the last px of each row and column, m rows
         of n.
@@ -48,7 +48,7 @@ class DisplacementField:
         return cls(image_size, np.round(values, _DECIMALS) + 0.0)
 
     def __call__(self, points: FloatArray) -> FloatArray:
-        """Displacement (..., 2) at measured px (..., 2); outside the picture that of its border, 0 at NaN."""
+        """Displacement (..., 2) at measured pixels (..., 2); outside the picture that of its border, 0 at NaN."""
         place = np.moveaxis(self._grid_coordinates(points), -1, 0)[::-1]
         return np.stack([ndimage.map_coordinates(c, place, order=3, mode="mirror", prefilter=False)
                          for c in self._coefficients], axis=-1)  # fmt: skip
@@ -60,12 +60,12 @@ class DisplacementField:
 
     @cached_property
     def largest(self) -> float:
-        """Length of the largest displacement of a node, px."""
+        """Length of the largest displacement of a node, pixels."""
         return float(np.linalg.norm(self.values, axis=-1).max())
 
     @cached_property
     def steepest(self) -> float:
-        """Largest change of the displacement per px, between nodes; from 1 on a picture may fold."""
+        """Largest change of the displacement per pixels, between nodes; from 1 on a picture may fold."""
         spacing = (np.array(self.image_size) - 1.0) / (self.values.shape[1] - 1, self.values.shape[0] - 1)
         across = np.linalg.norm(np.diff(self.values, axis=1), axis=-1) / spacing[0]
         down = np.linalg.norm(np.diff(self.values, axis=0), axis=-1) / spacing[1]
@@ -85,7 +85,7 @@ class DisplacementField:
 def bilinear(
     points: FloatArray, image_size: tuple[int, int], shape: Sequence[int]
 ) -> tuple[NDArray[np.intp], FloatArray]:
-    """Nodes (N, 4) around measured px (N, 2), counted row by row, and their shares (N, 4)."""
+    """Nodes (N, 4) around measured pixels (N, 2), counted row by row, and their shares (N, 4)."""
     rows, columns = shape
     last = np.array([columns - 1, rows - 1])
     place = np.clip(points * (last / (np.array(image_size) - 1.0)), 0.0, last)
@@ -104,7 +104,7 @@ def grid_shape(image_size: tuple[int, int], cells: int) -> tuple[int, int]:
 
 
 def node_points(image_size: tuple[int, int], shape: Sequence[int]) -> FloatArray:
-    """Measured px (m n, 2) of the nodes, row by row."""
+    """Measured pixels (m n, 2) of the nodes, row by row."""
     rows, columns = shape
     x, y = np.linspace(0, image_size[0] - 1, columns), np.linspace(0, image_size[1] - 1, rows)
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

@@ -20,11 +20,11 @@ from rdstitch.local_alignment.field import DisplacementField, bilinear, grid_sha
 from rdstitch.local_alignment.matches import PlaneMatches, jacobians
 
 _ROUNDS = 5
-# Residuals are trusted up to about this many times their median, but at least so many px.
+# Residuals are trusted up to about this many times their median, but at least so many pixels.
 _ROBUST, _LEAST_SCALE = 2.0, 0.3
 # A field vanishes over about this share of a picture where nothing supports it.
 _FADE = 0.2
-# Limit of the displacement's change per px: far from 1, where a picture would fold.
+# Limit of the displacement's change per pixels: far from 1, where a picture would fold.
 _STEEPEST = 0.25
 
 
@@ -37,7 +37,7 @@ class Stiffness:
     cells : int
         Of the grid, along the longer side of a picture.
     slope : float
-        Change of the displacement per px that is as likely as a residual of one robust scale.
+        Change of the displacement per pixels that is as likely as a residual of one robust scale.
     """
 
     cells: int
@@ -60,7 +60,7 @@ class PlaneFields:
     values: tuple[FloatArray, ...]
 
     def at(self, cameras: Sequence[Camera], images: NDArray[np.intp], points: FloatArray) -> FloatArray:
-        """Displacements (M, 2) of one picture each at its measured px (M, 2)."""
+        """Displacements (M, 2) of one picture each at its measured pixels (M, 2)."""
         found = np.empty((len(points), 2))
         for k in np.unique(images):
             chosen = images == k
@@ -133,7 +133,7 @@ def _differences(count: int, order: int) -> Any:
 def picture_fields(
     fields: PlaneFields, cameras: Sequence[Camera], homographies: FloatArray, scale: float
 ) -> tuple[DisplacementField, ...]:
-    """The displacements in measured px of each picture, limited so that nothing folds."""
+    """The displacements in measured pixels of each picture, limited so that nothing folds."""
     done = []
     for shape, values, camera, matrix in zip(fields.shapes, fields.values, cameras, homographies, strict=True):
         points = node_points(camera.image_size, shape)

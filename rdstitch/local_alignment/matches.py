@@ -17,7 +17,7 @@ _FEWEST_MATCHES = 8
 
 @dataclass(frozen=True)
 class Match:
-    """Putative matches of one pair of pictures: measured px (N, 2) of either."""
+    """Putative matches of one pair of pictures: measured pixels (N, 2) of either."""
 
     image1: int
     image2: int
@@ -29,14 +29,14 @@ class Match:
 class PlaneMatches:
     """Matches of all pairs, one after the other.
 
-    Lengths on the plane are in px of the median picture.
+    Lengths on the plane are in pixels of the median picture.
 
     Attributes
     ----------
     images : ndarray of shape (M, 2)
         The two pictures of each match.
     points : ndarray of shape (M, 2, 2)
-        Measured px in either.
+        Measured pixels in either.
     residual : ndarray of shape (M, 2)
         From where the second picture puts it to where the first does, on the plane.
     """
@@ -64,7 +64,7 @@ def plane_scale(cameras: Sequence[Camera], homographies: FloatArray) -> float:
 
 
 def jacobians(camera: Camera, homography: FloatArray, points: FloatArray) -> FloatArray:
-    """Derivative of the plane coordinates by the measured px, (N, 2, 2), by central differences."""
+    """Derivative of the plane coordinates by the measured pixels, (N, 2, 2), by central differences."""
     steps = np.array([(0.5, 0.0), (0.0, 0.5)])
     ahead, behind = (to_plane(camera, homography, points[:, None] + sign * steps) for sign in (1.0, -1.0))
     return np.asarray(np.swapaxes(ahead - behind, -1, -2), dtype=np.float64)

@@ -12,7 +12,7 @@ def align_registration_locally(registration: Registration, choice: Choice) -> Lo
     Parameters
     ----------
     registration : Registration
-        In px of the pictures.
+        In pixels of the pictures.
     choice : "auto", "off" or int
         See :func:`rdstitch.local_alignment.align_locally`.
     """

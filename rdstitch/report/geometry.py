@@ -30,7 +30,7 @@ def pairs_of(registration: Registration) -> dict[tuple[int, int], PairRegistrati
 
 
 def residuals(registration: Registration, fit: LinkFit) -> tuple[FloatArray, FloatArray]:
-    """Where the matches of a link are in the second picture, and how far from there the alignment puts them, px.
+    """Where the matches of a link are in the second picture, and how far from there the alignment puts them, pixels.
 
     Matches that the pair itself takes for wrong are left out, and those that miss by more than four times the link's
     error.

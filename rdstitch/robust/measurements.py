@@ -28,7 +28,7 @@ class Measurements:
         Which are matches; the rest is padding, or matches that are left out.
     count : ndarray of shape (B,), intp
         Matches of each pair: they come before the padding.
-    px : ndarray of shape (B,)
+    pixels : ndarray of shape (B,)
         Pixels of image 2 in one normalized unit.
     px_ratio : ndarray of shape (B,)
         Pixels of image 2 that one pixel of image 1 becomes when normalized coordinates are kept.

@@ -42,7 +42,7 @@ def rejection_reason(
     image_size : (int, int)
         Of picture 2, pixels.
     threshold : float
-        px.
+        pixels.
     """
     count = int(inliers.sum())
     cells = places(points1[inliers], points2[inliers], image_size)

@@ -120,7 +120,7 @@ def output_geometry(canvas: Canvas, *, turned: bool) -> dict[str, Any]:
 
 
 def to_output(canvas: Canvas, homography: FloatArray) -> FloatArray | None:
-    """From undistorted coordinates to px of the output, where one matrix can say that: on a plane."""
+    """From undistorted coordinates to pixels of the output, where one matrix can say that: on a plane."""
     return canvas.matrix @ homography if canvas.projection == PLANE else None
 
 
@@ -144,7 +144,7 @@ def _local_alignment(local: LocalAlignment) -> dict[str, Any]:
 
 
 def displacement(field: DisplacementField | None) -> dict[str, Any] | None:
-    """Displacement of one picture: columns and rows of its grid, and px at its nodes, row by row."""
+    """Displacement of one picture: columns and rows of its grid, and pixels at its nodes, row by row."""
     if field is None:
         return None
     rows, columns, _ = field.values.shape

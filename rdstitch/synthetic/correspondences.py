@@ -19,7 +19,7 @@ class SyntheticMatches:
     Attributes
     ----------
     points1, points2 : ndarray of shape (N, 2)
-        Measured px.
+        Measured pixels.
     quality : ndarray of shape (N,)
         What a matcher would say of each match, higher is better: right matches tend to score above wrong ones.
     truth : RadialHomography
@@ -60,9 +60,9 @@ def correspondences(
     seed : int
         Equal seeds give equal matches.
     image_size : (int, int)
-        Width and height, px.
+        Width and height, pixels.
     focal : float, optional
-        Focal length, px; 1.2 times half the diagonal if not given.
+        Focal length, pixels; 1.2 times half the diagonal if not given.
     distortion : float
         λ in the half-diagonal frame.
     motion : str
@@ -73,7 +73,7 @@ def correspondences(
     overlap : float
         Least share of picture 1 that picture 2 sees, roughly.
     noise : float
-        Standard deviation in px of the normal noise on both pictures' points.
+        Standard deviation in pixels of the normal noise on both pictures' points.
     outliers : float
         Share of wrong matches: points that lie anywhere in both pictures.
 

@@ -19,18 +19,18 @@ class Lens(Protocol):
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """Width and height, px."""
+        """Width and height, pixels."""
 
     @property
     def center(self) -> tuple[float, float]:
-        """Principal point, px."""
+        """Principal point, pixels."""
 
     @property
     def focal(self) -> float | None:
-        """Focal length at the centre, px."""
+        """Focal length at the centre, pixels."""
 
     def undistort(self, points: ArrayLike) -> FloatArray:
-        """Measured px (..., 2) to px of a pinhole camera with the same focal length and centre, or NaN."""
+        """Measured pixels (..., 2) to pixels of a pinhole camera with the same focal length and centre, or NaN."""
 
     def distort(self, points: ArrayLike) -> FloatArray:
         """The inverse of :meth:`undistort`."""
@@ -43,11 +43,11 @@ class _FixedFocalLens:
     Attributes
     ----------
     image_size : (int, int)
-        Width and height, px.
+        Width and height, pixels.
     focal : float
-        Focal length at the centre, px.
+        Focal length at the centre, pixels.
     offset : (float, float)
-        From the image centre to the principal point, px.
+        From the image centre to the principal point, pixels.
     """
 
     image_size: tuple[int, int]
@@ -56,7 +56,7 @@ class _FixedFocalLens:
 
     @property
     def center(self) -> tuple[float, float]:
-        """Principal point, px."""
+        """Principal point, pixels."""
         return (self.image_size[0] - 1) / 2 + self.offset[0], (self.image_size[1] - 1) / 2 + self.offset[1]
 
     def _normalize(self, points: ArrayLike) -> FloatArray:
@@ -71,14 +71,14 @@ class FisheyeLens(_FixedFocalLens):
     """Equidistant fisheye: a ray at angle θ from the axis is measured ``focal * θ`` from the centre."""
 
     def undistort(self, points: ArrayLike) -> FloatArray:
-        """Measured px to pinhole px; NaN for rays at 90° and more."""
+        """Measured pixels to pinhole pixels; NaN for rays at 90° and more."""
         x = self._normalize(points)
         angle = np.linalg.norm(x, axis=-1, keepdims=True)
         inside = np.where(angle < np.pi / 2, angle, np.nan)
         return self._denormalize(x * np.tan(inside) / np.where(angle > 0.0, angle, 1.0) + x * (angle == 0.0))
 
     def distort(self, points: ArrayLike) -> FloatArray:
-        """Pinhole px to measured px."""
+        """Pinhole pixels to measured pixels."""
         x = self._normalize(points)
         radius = np.linalg.norm(x, axis=-1, keepdims=True)
         return self._denormalize(x * np.where(radius > 0.0, np.arctan(radius) / np.maximum(radius, 1e-300), 1.0))
@@ -142,7 +142,7 @@ class BrownLens(_FixedFocalLens):
 
 
 def focal_length(lens: Lens) -> float:
-    """Focal length of a lens, px.
+    """Focal length of a lens, pixels.
 
     Raises
     ------
@@ -157,14 +157,14 @@ def focal_length(lens: Lens) -> float:
 def best_division_model(lens: Lens, samples: int = 400) -> tuple[Camera, float]:
     """The division model nearest to a lens, and how far it is from it.
 
-    λ minimises the distance in measured px between the two lenses, over the same pinhole rays evenly spread in the
+    λ minimises the distance in measured pixels between the two lenses, over the same pinhole rays evenly spread in the
     picture's radius up to its corners, up to the focal length, which is free.
 
     Returns
     -------
     camera : Camera
     rms : float
-        What is left, px.
+        What is left, pixels.
     """
     # Imported late: rendering, which needs the lenses, should not wait for SciPy's optimizers.
     from scipy.optimize import least_squares

@@ -143,14 +143,14 @@ def plane_outline(lens: Lens, from_plane: FloatArray, points_per_side: int = 32)
 
 
 def to_plane(lens: Lens, from_plane: FloatArray, points: ArrayLike) -> FloatArray:
-    """Measured px (N, 2) to texels (..., N, 2); NaN beyond the horizon and outside the lens's domain."""
+    """Measured pixels (N, 2) to texels (..., N, 2); NaN beyond the horizon and outside the lens's domain."""
     pinhole = (lens.undistort(points) - np.asarray(lens.center)) / focal_length(lens)
     rays = np.concatenate([pinhole, np.ones((*pinhole.shape[:-1], 1))], axis=-1)
     return project(rays @ np.swapaxes(np.linalg.inv(from_plane), -2, -1))
 
 
 def to_picture(lens: Lens, from_plane: FloatArray, points: ArrayLike) -> FloatArray:
-    """Texels (N, 2) to measured px (..., N, 2), also outside the picture; NaN where the camera cannot see them."""
+    """Texels (N, 2) to measured pixels (..., N, 2), also outside the picture; NaN where the camera cannot see them."""
     x = np.asarray(points, dtype=np.float64)
     homogeneous = np.concatenate([x, np.ones((*x.shape[:-1], 1))], axis=-1)
     pinhole = project(homogeneous @ np.swapaxes(from_plane, -2, -1))

@@ -44,7 +44,7 @@ class Photometry:
     gamma : float
         Gain and vignetting act on ``value ** gamma``: 1 on the values themselves, 2.2 in linear light.
     blur : float
-        Standard deviation of the lens's blur, px.
+        Standard deviation of the lens's blur, pixels.
     noise : float
         Standard deviation of the noise, in units of full range; 0.01 is 2.5 grey levels of 8 bit.
     bits : int
@@ -106,7 +106,7 @@ class Sequence:
         return np.asarray(self._from_plane[index])
 
     def to_plane(self, index: int, points: ArrayLike) -> FloatArray:
-        """Measured px (N, 2) of one picture to points of the plane, texels; NaN beyond the horizon or the lens."""
+        """Measured pixels (N, 2) of one picture to points of the plane, texels; NaN beyond the horizon or the lens."""
         return to_plane(self.lens, self.from_plane(index), points)
 
     def to_ground(self, index: int, points: ArrayLike) -> FloatArray:
@@ -114,7 +114,7 @@ class Sequence:
         return self._on_ground(index, self.to_plane(index, points))
 
     def ground_to_picture(self, index: int, points: ArrayLike) -> FloatArray:
-        """Points of the ground, texels (N, 2), to measured px of one picture; NaN where something hides them."""
+        """Points of the ground, texels (N, 2), to measured pixels of one picture; NaN where something hides them."""
         ground = np.asarray(points, dtype=np.float64)
         if self.relief is None:
             return self.to_picture(index, ground)
@@ -125,7 +125,7 @@ class Sequence:
         return np.where(hidden[:, None], np.nan, self.to_picture(index, foot))
 
     def to_picture(self, index: int, points: ArrayLike) -> FloatArray:
-        """Points of the plane, texels (N, 2), to measured px of one picture, also outside its border.
+        """Points of the plane, texels (N, 2), to measured pixels of one picture, also outside its border.
 
         NaN where it cannot see them. Relief does not matter: the points lie on the plane.
         """
@@ -228,7 +228,7 @@ class Sequence:
         u, v = np.arange(-1, self.lens.image_size[0] + 1), np.arange(top - 1, bottom + 1)
         wide = self.to_plane(index, np.stack(np.meshgrid(u, v), axis=-1))
         foot = wide[1:-1, 1:-1]
-        # Within a pixel the lens and the perspective are linear to a few 1e-4 px.
+        # Within a pixel the lens and the perspective are linear to a few 1e-4 pixels.
         along = (wide[1:-1, 2:] - wide[1:-1, :-2]) / 2.0
         down = (wide[2:, 1:-1] - wide[:-2, 1:-1]) / 2.0
         count = self.samples or _samples_per_side(along, down)

@@ -23,15 +23,15 @@ from rdstitch.radial_homography import from_plane, to_plane
 
 Grey = NDArray[np.float32]
 
-COMPARED_SIDE = 512  # px of the longer side of the pictures that are compared
-_CELL = 24  # px
-_REACH = 8  # px
+COMPARED_SIDE = 512  # pixels of the longer side of the pictures that are compared
+_CELL = 24  # pixels
+_REACH = 8  # pixels
 _LEAST_TEXTURE = 0.012  # standard deviation in a cell, of full range
 _ALIKE = 0.5  # correlation from which on two cells show the same
-_SLACK = 2.5  # px
+_SLACK = 2.5  # pixels
 _MOST_CELLS = 120
 _OPAQUE = 250
-_LATTICE = 8  # px between the places that are computed; those between are interpolated
+_LATTICE = 8  # pixels between the places that are computed; those between are interpolated
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def overlap_agreement(first: PlacedPicture, second: PlacedPicture) -> Agreement:
 
 
 def _cells(picture: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:
-    """Cells (N, side, side) with these top-left px (N, 2), row and column, and so much around them."""
+    """Cells (N, side, side) with these top-left pixels (N, 2), row and column, and so much around them."""
     side = _CELL + 2 * margin
     if not len(corners):
         return np.zeros((0, side, side), dtype=np.float32)
@@ -134,7 +134,7 @@ def _cells(picture: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:
 
 
 def _have_texture(cells: Grey) -> NDArray[np.bool_]:
-    """Which cells (N, h, w) can be told from others; not those with transparent px, whose deviation is NaN."""
+    """Which cells (N, h, w) can be told from others; not those with transparent pixels, whose deviation is NaN."""
     return np.asarray(cells.std(axis=(1, 2)) > _LEAST_TEXTURE)
 
 

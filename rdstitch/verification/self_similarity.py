@@ -15,12 +15,12 @@ from rdstitch.arrays import FloatArray
 from rdstitch.radial_homography import to_plane
 from rdstitch.verification.photometric_agreement import Grey, PlacedPicture
 
-_LONGEST_SIDE = 256  # px of the pictures that are compared
+_LONGEST_SIDE = 256  # pixels of the pictures that are compared
 _MOST_PX = 4  # times the sides of a picture that its outline on the plane may have
-_COARSEST = 8.0  # px, standard deviation of the blur that brightness is measured by
-_NEAR = 14  # px: shifts that are none
-_SLACK = 3  # px by which the registration may be off
-_LEAST_NORM = 1e-4  # of the largest: where fewer px overlap, rounding decides
+_COARSEST = 8.0  # pixels, standard deviation of the blur that brightness is measured by
+_NEAR = 14  # pixels: shifts that are none
+_SLACK = 3  # pixels by which the registration may be off
+_LEAST_NORM = 1e-4  # of the largest: where fewer pixels overlap, rounding decides
 _LEAST_SHARE = 0.5  # of the overlap that a shift must keep
 _ALIKE = 0.5  # correlation from which on two pictures look alike
 _AS_GOOD = 0.9  # of the correlation here; a repeated pattern reaches 0.97, other pictures seldom 0.5
@@ -58,7 +58,7 @@ class Drawing:
     pixels : ndarray of shape (h, w), float32
         NaN where the picture is not.
     origin : ndarray of shape (2,)
-        Where their first px lies, px of the plane.
+        Where their first pixels lies, pixels of the plane.
     """
 
     pixels: Grey
@@ -76,7 +76,7 @@ def drawing_scale(picture: PlacedPicture) -> float:
 
 
 def draw(picture: PlacedPicture, scale: float) -> Drawing:
-    """Draw a picture on the plane with so many px a unit."""
+    """Draw a picture on the plane with so many pixels a unit."""
     outline = to_plane(picture.camera, picture.homography, picture.camera.outline(16)) * scale
     if not np.isfinite(outline).any():  # all of it behind the horizon
         return Drawing(np.full((1, 1), np.nan, dtype=np.float32), np.zeros(2))

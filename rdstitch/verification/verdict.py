@@ -63,7 +63,7 @@ def judge(
     ----------
     registration : Registration
     threshold : float
-        Largest transfer error of an inlier of a pair, px.
+        Largest transfer error of an inlier of a pair, pixels.
     workers : int
         Pictures read at the same time.
     cache : Cache

@@ -25,7 +25,7 @@ def describe_patches(
     levels : list of ndarray
         The picture's pyramid.
     points : ndarray of shape (N, 2)
-        px.
+        pixels.
     scale : ndarray of shape (N,)
         The s of the paper, pixels.
     angle : ndarray of shape (N,)

@@ -11,7 +11,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.features.surf.pyramid import Grey, from_level, pyramid
 from rdstitch.features.surf.quadric import vertex
 
-# The box filter of 9 px stands for a Gaussian of σ = 1.2 px; larger ones in proportion (§3.3).
+# The box filter of 9 pixels stands for a Gaussian of σ = 1.2 pixels; larger ones in proportion (§3.3).
 SIGMA_PER_SIZE = 1.2 / 9
 _SMALLEST_LOBE = 3
 # Weight of the mixed derivative, which the box filters get relatively wrong (§3.2).
@@ -71,7 +71,7 @@ def find_blobs(grey: Grey, threshold: float, octaves: int, layers: int) -> Blobs
     octaves : int
         Octaves of scale, each on the picture of half the size of the one before.
     layers : int
-        Scales per octave at which there can be blobs; filters grow by 6 px from one to the next.
+        Scales per octave at which there can be blobs; filters grow by 6 pixels from one to the next.
     """
     parts = []
     for octave, level in enumerate(pyramid(grey, octaves)):

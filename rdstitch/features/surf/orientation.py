@@ -30,7 +30,7 @@ def orientations(levels: list[Grey], points: FloatArray, scale: FloatArray) -> F
     levels : list of ndarray
         The picture's pyramid.
     points : ndarray of shape (N, 2)
-        px.
+        pixels.
     scale : ndarray of shape (N,)
         The s of the paper, pixels.
     """

@@ -24,10 +24,10 @@ def pyramid(grey: Grey, levels: int) -> list[Grey]:
 
 
 def to_level(points: FloatArray, level: int) -> FloatArray:
-    """Pixels of the picture to px of a level; (0, 0) is the centre of the first pixel in both."""
+    """Pixels of the picture to pixels of a level; (0, 0) is the centre of the first pixel in both."""
     return (points + 0.5) / float(2**level) - 0.5
 
 
 def from_level(points: FloatArray, level: int) -> FloatArray:
-    """Pixels of a level to px of the picture."""
+    """Pixels of a level to pixels of the picture."""
     return (points + 0.5) * float(2**level) - 0.5

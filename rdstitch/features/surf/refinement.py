@@ -17,7 +17,7 @@ from rdstitch.features.surf.patches import sample_patches
 from rdstitch.features.surf.pyramid import Grey
 from rdstitch.features.surf.quadric import vertex
 
-# The box filters' maximum over scale is at s = σ / 1.43 for a Gaussian blob of σ px.
+# The box filters' maximum over scale is at s = σ / 1.43 for a Gaussian blob of σ pixels.
 _SIGMA = 1.43  # units of s
 _SPACING = 0.5  # of samples, units of s
 _SAMPLES = 24  # along each side of a patch
