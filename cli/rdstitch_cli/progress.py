@@ -57,7 +57,7 @@ class Reporter:
             self._line(f"rdstitch: {text}")
 
     def log(self, text: str) -> None:
-        """Say what is going on, for those who asked."""
+        """Log what is going on, under ``-v``."""
         if self._verbosity >= 1:
             self._line(f"rdstitch: {text}")
 

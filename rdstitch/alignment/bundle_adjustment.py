@@ -189,7 +189,7 @@ class BundleAdjuster:
         start : Parameters
         width : float, optional
             Of the robust loss at the start, pixels; the scatter of the first errors decides if not given. It narrows to
-            what the scatter of the errors asks for.
+            what the scatter of the errors calls for.
         """
         sigma = self._sigma(self._evaluate(start, 1.0, 1.0))
         wide = max(width or 0.0, WIDTH_PER_SIGMA * sigma)

@@ -201,7 +201,7 @@ def _reason(fits: Sequence[Fit], best: int, names: Sequence[str]) -> str:
         else "two pictures need no more",
     }[name]
     if len(names) == 1:
-        return f"{name}: as asked for; it leaves an error of {own:.2f} px"
+        return f"{name}: as requested; it leaves an error of {own:.2f} px"
     less = ", ".join(f"{fit.model.name} {fit.adjusted.sigma:.2f} px" for fit in fits[:best])
     more = ", ".join(f"{fit.model.name} {fit.adjusted.sigma:.2f} px" for fit in fits[best + 1 :])
     return (

@@ -37,7 +37,7 @@ def choose_motion(problem: Problem, names: Sequence[str], lenses: Sequence[BoolA
         return choose_model(problem, planar, lenses)
     turned = problem.fit(ROTATION, shared=trial.parameters.shared)
     if not planar:
-        reason = f"as asked for; it leaves an error of {turned.adjusted.sigma:.2f} px"
+        reason = f"as requested; it leaves an error of {turned.adjusted.sigma:.2f} px"
         return _choice(problem, bound, turned, lenses, reason)
     explained = (
         "the camera turned on the spot, so that the pictures say nothing of the scene's shape (a plane seen from one "

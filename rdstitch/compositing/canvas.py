@@ -23,7 +23,7 @@ from rdstitch.radial_homography import to_plane
 # Straight sides are curved after undistortion: 64 points a side put the extremes within 0.02 pixels on 4000 pixels.
 _POINTS_PER_SIDE = 64
 _LARGEST_GROWTH = 100.0
-_LARGEST_ENLARGEMENT = 400.0  # pixels of the canvas for each of the pictures, where --scale asks for it
+_LARGEST_ENLARGEMENT = 400.0  # pixels of the canvas for each of the pictures, where --scale requests it
 
 
 @dataclass(frozen=True)

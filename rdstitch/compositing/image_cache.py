@@ -1,6 +1,6 @@
-"""Pictures for the tiles, read before they are asked for, in bounded memory.
+"""Pictures for the tiles, prefetched, in bounded memory.
 
-Most of a picture is often hidden by its neighbours: where room is short, only the part that is asked for is kept.
+Most of a picture is often hidden by its neighbours: where room is short, only the requested part is kept.
 """
 
 from collections import OrderedDict
@@ -23,7 +23,7 @@ class PictureCache:
     limit : int
         Bytes.
     ahead : bool
-        Read pictures in a thread of its own before they are asked for.
+        Read pictures ahead of their use, in a thread of its own.
     """
 
     def __init__(self, reader: PictureReader, shrinks: Sequence[float], limit: int, *, ahead: bool = False) -> None:
@@ -40,9 +40,9 @@ class PictureCache:
         return self._reader.masked(index)
 
     def expect(self, parts: Sequence[Box]) -> None:
-        """Keep no more of each picture than the part that will be asked for from now on, where room is short.
+        """Keep no more of each picture than the part that will be requested from now on, where room is short.
 
-        It is a guess: a picture that more is asked of is read again, and from then on kept whole.
+        It is a guess: a picture of which more is requested is read again, and from then on kept whole.
         """
         with self._lock:
             for index, part in enumerate(parts):
@@ -52,7 +52,7 @@ class PictureCache:
                         self._held.pop(index, None)
 
     def get(self, index: int, part: Box) -> LoadedPicture:
-        """A part of picture ``index``, read unless it is held; may be asked for from several threads."""
+        """A part of picture ``index``, read unless it is held; callable from several threads."""
         if (held := self._find(index, part)) is not None:
             return held
         with self._reading:
@@ -68,11 +68,11 @@ class PictureCache:
             return self._read(index, expected)
 
     def prefetch(self, indices: Iterable[int]) -> None:
-        """Be told which pictures will be asked for next, in this order; those for which there is room are read."""
+        """Prefetch the pictures that come next, in this order, as far as there is room."""
         if self._ahead is None:
             return
         for index in indices:
-            # What cannot be read is told to who asks for it.
+            # Who requests a picture that cannot be read gets the error.
             self._ahead.submit(self._read_ahead, index)
 
     def close(self) -> None:
@@ -103,7 +103,7 @@ class PictureCache:
         return loaded
 
     def _make_room(self, nbytes: int) -> bool:
-        """Drop what will not be asked for of the pictures held, if need be; whether there is room for so much then."""
+        """Drop what will not be requested of the pictures held, if need be; whether there is room for so much then."""
         with self._lock:
             room, indices = self._limit - self._nbytes(), list(self._held)
         for index in indices if nbytes > room else ():
@@ -112,7 +112,7 @@ class PictureCache:
             return nbytes <= self._limit - self._nbytes()
 
     def _cut(self, index: int) -> None:
-        """Drop what will not be asked for of a picture that is held."""
+        """Drop what will not be requested of a picture that is held."""
         with self._lock:
             picture, expected = self._held.get(index), self._expected[index]
         if picture is None or expected is None:
@@ -126,7 +126,7 @@ class PictureCache:
                 self._held[index] = picture
 
     def _nbytes(self) -> int:
-        """Memory that is taken; asked with the lock held."""
+        """Memory in use; call with the lock held."""
         return sum(picture.nbytes for picture in self._held.values())
 
     def _find(self, index: int, part: Box) -> LoadedPicture | None:

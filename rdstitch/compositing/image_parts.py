@@ -27,7 +27,7 @@ class ShownPart:
     points : ndarray of shape (K, 2)
         ... and places in the picture, pixels: both ends of every run of the seam map that the picture owns.
     room : int
-        Px of the picture around them that may be asked for too.
+        Px of the picture around them that may be requested too.
     size : (int, int)
         Width and height of the picture, pixels.
     """
@@ -60,7 +60,7 @@ def shown_parts(warps: Sequence[Warp], seams: SeamMap, around: int) -> list[Show
     warps : sequence of Warp
     seams : SeamMap
     around : int
-        How far from what a picture owns it is asked for too, canvas pixels.
+        How far from what a picture owns it is requested too, canvas pixels.
     """
     labels, factor = seams.labels, seams.factor
     ends = np.ones((labels.shape[0], labels.shape[1] + 1), dtype=np.bool_)

@@ -12,7 +12,7 @@ from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.errors import LimitError
 
-# What the compositor takes without being told; more memory means that fewer pictures are read twice.
+# What the compositor takes by default; more memory means that fewer pictures are read twice.
 DEFAULT_MEMORY = 352 * 2**20
 _TILE_SIZES = (512, 256)
 _MOST_WORKERS = 4

@@ -60,7 +60,7 @@ class Prepared:
     shown : sequence of ShownPart
         Which part of each picture shows, where that is known before; else empty.
     around : int
-        How far from there pictures are asked for too, canvas pixels.
+        How far from there pictures are requested too, canvas pixels.
     """
 
     renderer: Renderer

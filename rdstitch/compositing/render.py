@@ -179,8 +179,8 @@ class Renderer:
 
     def _placed(self, index: int, part: Box, box: Box) -> Geometry:
         """The geometry of a picture on its part of a box, with a lattice for all that blending can ask of it there."""
-        asked = intersection(self._blend_support(part), box) if self.options.blend == "multiband" else part
-        return locate(self.warps[index], asked or part).on(part)
+        requested = intersection(self._blend_support(part), box) if self.options.blend == "multiband" else part
+        return locate(self.warps[index], requested or part).on(part)
 
     def _opacity(self, index: int, geometry: Geometry) -> Float32Array | None:
         """Opacity of a picture that has a mask."""

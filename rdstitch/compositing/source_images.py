@@ -27,7 +27,7 @@ _MASK_FEATHER = 0.125
 KERNEL_MARGIN = 8
 # Px that are read for one of the output, at least: a Gaussian needs two, or nearly so, to make it smooth.
 _PX_PER_OUTPUT_PX = 1.9
-# Largest reduction at which previews are asked for, a power of two.
+# Largest reduction at which previews are read, a power of two.
 _LARGEST_PREVIEW = 8
 # Share of the pixels below which a part is cut out.
 _WORTH_CUTTING = 0.8

@@ -105,7 +105,7 @@ class Warp:
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Where the pixels of one box of the canvas come from in one picture; computed when it is asked for.
+    """Where the pixels of one box of the canvas come from in one picture; computed on demand.
 
     Attributes
     ----------

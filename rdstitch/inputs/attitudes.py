@@ -12,7 +12,7 @@ from rdstitch.planar_motion import tilt_from_normal
 from rdstitch.records import read_text
 
 XMP = "xmp"
-"""What asks for the attitudes in the pictures' own XMP."""
+"""The value of ``attitude`` that stands for the pictures' own XMP."""
 
 _COLUMNS = ("name", "psi", "theta")
 _NAMED = 3  # pictures in a message

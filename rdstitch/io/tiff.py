@@ -90,7 +90,7 @@ def _write_page(
         rowsperstrip=None if tiled else _STRIP,
         compression="zlib",
         predictor=_has_predictor(layout.dtype),
-        # Tiles that tifffile holds before it writes them; 256 MB if not told.
+        # Tiles that tifffile holds before it writes them; 256 MB by default.
         buffersize=_BUFFER,
         metadata=None,
         software="rdstitch",

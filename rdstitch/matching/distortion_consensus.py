@@ -126,7 +126,7 @@ def _scatter(residual: FloatArray, errors: FloatArray) -> float:
 def _groups(values: FloatArray, errors: FloatArray) -> tuple[tuple[float, int], ...]:
     """Two groups of votes far apart, if the votes fall into two.
 
-    Votes that know little are not asked. The sorted votes are cut where that leaves the least scatter within the two
+    Uncertain votes do not count. The sorted votes are cut where that leaves the least scatter within the two
     parts; they are two groups when each has a fifth of the votes, and their means are farther apart than six times
     the scatter within either.
     """

@@ -6,7 +6,7 @@ from rdstitch.progress import Progress, silent
 
 
 class StageTimer:
-    """A progress that passes on what it is told, and keeps how long each stage took.
+    """A progress that passes everything on, and records how long each stage took.
 
     Parameters
     ----------

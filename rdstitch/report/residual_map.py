@@ -41,9 +41,9 @@ def residual_map(registration: Registration) -> str:
         y, x = divmod(int(index), _COLUMNS)
         shade = 255 - round(150 * rms[index] / max(darkest, 1e-9))
         tip = mean[index] / longest * _ARROW * side
-        told = f"{count[index]} matches, rms {rms[index]:.2f} px, mean {np.linalg.norm(mean[index]):.2f} px"
+        title = f"{count[index]} matches, rms {rms[index]:.2f} px, mean {np.linalg.norm(mean[index]):.2f} px"
         box = {"x": x * side, "y": y * side, "width": side, "height": side}
-        parts.append(element("rect", element("title", told), fill=f"rgb({shade},{shade},{shade})", **box))
+        parts.append(element("rect", element("title", title), fill=f"rgb({shade},{shade},{shade})", **box))
         start = np.array([(x + 0.5) * side, (y + 0.5) * side])
         parts.append(
             element(

@@ -137,7 +137,7 @@ def select_models(models: list[PairModel], pairs: PairSelection) -> list[PairFit
         if len(rows):
             result.update(finished(index, rows))
     # A camera that turns on the spot moves like one beside a plane seen edge on, where tilt, focal length and λ cannot
-    # be told apart; as a free homography the same images may show λ well.
+    # be distinguished; as a free homography the same images may show λ well.
     unseen = [row for row, fit in result.items() if chosen[row] < len(models) - 1 and np.isinf(fit.distortion_std)]
     if unseen:
         free_fits = finished(len(models) - 1, np.array(sorted(unseen), dtype=np.intp))

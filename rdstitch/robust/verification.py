@@ -30,7 +30,7 @@ def rejection_reason(
 ) -> str | None:
     """Why the inliers could be chance, or None.
 
-    Two questions are asked. Are there more inliers than wrong matches would give by chance? A wrong match lies within
+    Two tests. Are there more inliers than wrong matches would give by chance? A wrong match lies within
     the threshold with a probability of a disc's share of the picture. And do they lie in enough different places?
     Neighbouring matches go wrong together, on a moving object or on a repeated pattern, and count once.
 

@@ -76,7 +76,7 @@ class PlanarInstances(Instances):
     Attributes
     ----------
     tilt, tilt2 : ndarray of shape (B, 2)
-        (ψ, θ) of picture 1 and picture 2, radians; the same unless separate tilts were asked for.
+        (ψ, θ) of picture 1 and picture 2, radians; the same unless separate tilts were requested.
     yaw : ndarray of shape (B,)
         φ, radians.
     translation : ndarray of shape (B, 2)

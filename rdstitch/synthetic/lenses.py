@@ -15,7 +15,7 @@ _TOLERANCE = 1e-10
 
 
 class Lens(Protocol):
-    """What rendering asks of a lens; :class:`Camera` with a focal length fulfils it."""
+    """What rendering needs of a lens; :class:`Camera` with a focal length fulfils it."""
 
     @property
     def image_size(self) -> tuple[int, int]:

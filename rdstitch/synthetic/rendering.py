@@ -66,7 +66,7 @@ class Photometry:
 
 @dataclass(frozen=True)
 class Sequence:
-    """Pictures of a plane, rendered when asked for, and the truth about them.
+    """Pictures of a plane, rendered on demand, and their ground truth.
 
     Attributes
     ----------

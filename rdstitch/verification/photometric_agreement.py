@@ -134,7 +134,7 @@ def _cells(picture: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:
 
 
 def _have_texture(cells: Grey) -> NDArray[np.bool_]:
-    """Which cells (N, h, w) can be told from others; not those with transparent pixels, whose deviation is NaN."""
+    """Which cells (N, h, w) are distinctive; not those with transparent pixels, whose deviation is NaN."""
     return np.asarray(cells.std(axis=(1, 2)) > _LEAST_TEXTURE)
 
 

@@ -61,10 +61,12 @@ def mosaic(
 
     with Reporter(-quiet + verbose) as reporter:
         paths = options.resolve(inputs)
-        told = Report(report, reporter, paths, given["overwrite"], output)
-        with told.explaining():
-            result = recipe(paths, output, stitch_options(reporter, **given), every=every, progress=told.progress)
+        html_report = Report(report, reporter, paths, given["overwrite"], output)
+        with html_report.explaining():
+            result = recipe(
+                paths, output, stitch_options(reporter, **given), every=every, progress=html_report.progress
+            )
         summarize(result, reporter, as_json=as_json)
-        told.write(result)
+        html_report.write(result)
         if result.plan is None:
             reporter.made(result.summary)
