@@ -62,11 +62,11 @@ def calibrate(
     with Reporter(-quiet + verbose) as reporter:
         wanted = stitch_options(reporter, save_camera=output, **given)
         paths = options.resolve(inputs)
-        html_report = Report(report, reporter, paths, given["overwrite"])
-        with html_report.explaining():
-            registration = recipe(paths, wanted, every=every, progress=html_report.progress)
+        report_page = Report(report, reporter, paths, given["overwrite"])
+        with report_page.explaining():
+            registration = recipe(paths, wanted, every=every, progress=report_page.progress)
         report_registration(registration, reporter, as_json=as_json)
         for line in (*describe_lens(registration.alignment), *export_note(registration.camera, output)):
             reporter.note(line)
-        html_report.write(registration)
+        report_page.write(registration)
         reporter.made(f"{output}: {registration.summary}")

@@ -60,12 +60,12 @@ def pano(
 
     with Reporter(-quiet + verbose) as reporter:
         paths = options.resolve(inputs)
-        html_report = Report(report, reporter, paths, given["overwrite"], output)
-        with html_report.explaining():
+        report_page = Report(report, reporter, paths, given["overwrite"], output)
+        with report_page.explaining():
             result = recipe(
-                paths, output, stitch_options(reporter, **given), every=every, progress=html_report.progress
+                paths, output, stitch_options(reporter, **given), every=every, progress=report_page.progress
             )
         summarize(result, reporter, as_json=as_json)
-        html_report.write(result)
+        report_page.write(result)
         if result.plan is None:
             reporter.made(result.summary)

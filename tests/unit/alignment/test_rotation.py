@@ -123,4 +123,4 @@ def test_a_shift_over_a_plane_is_no_turn() -> None:
     assert align(cameras, links).model == "rigid"
     forced = align(cameras, links, AlignmentOptions(model="rotation"))
     assert forced.model == "rotation"
-    assert "as asked for" in forced.model_reason
+    assert "as requested" in forced.model_reason
