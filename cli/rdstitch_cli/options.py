@@ -88,7 +88,7 @@ lens = together(
         "--camera",
         type=PICTURE,
         metavar="FILE",
-        help="Camera file of rdstitch, OpenCV, OpenDroneMap or Hugin; its λ is kept.",
+        help="Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap or Hugin; its lens is kept.",
     ),
     click.option(
         "--lambda", "distortion", type=float, metavar="L", help="Known λ for half the image diagonal; it is kept."
@@ -97,7 +97,7 @@ lens = together(
 
 known = together(
     lens,
-    click.option("--focal", type=float, metavar="PX", help="Focal length, px; otherwise from EXIF, else guessed."),
+    click.option("--focal", type=float, metavar="PX", help="Focal length, pixels; otherwise from EXIF, else guessed."),
     click.option("--tilt", type=Angles(), help="Known tilt of the camera to the plane, degrees."),
     click.option(
         "--attitude",
@@ -182,7 +182,7 @@ estimation = together(
         default=3.0,
         show_default=True,
         metavar="PX",
-        help="Largest error of an inlier, px of the size that features are detected at (see --work-megapixels).",
+        help="Largest error of an inlier, pixels of the size that features are detected at (see --work-megapixels).",
     ),
     click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of random sampling."),
     click.option(

@@ -107,16 +107,28 @@ def read_shown(data: bytes) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     return np.asarray(np.asarray(Image.open(io.BytesIO(data)))[..., 3] > 0)
 
 
-def test_the_wheel_is_small() -> None:
-    size = 0
+def _packed_sizes() -> dict[str, int]:
+    """Bytes of every file of the wheel, each compressed on its own as a wheel does it."""
+    sizes = {}
     for folder in ("rdstitch", "cli/rdstitch_cli"):
         for file in (_ROOT / folder).rglob("*"):
             if file.is_file() and "__pycache__" not in file.parts:
                 packed = io.BytesIO()
                 with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
                     archive.write(file, str(file.relative_to(_ROOT)))
-                size += len(packed.getvalue())
-    assert 0 < size <= 1_000_000
+                sizes[file.name if file.suffix == ".js" else str(file)] = len(packed.getvalue())
+    return sizes
+
+
+def test_the_wheel_is_small() -> None:
+    assert 0 < sum(_packed_sizes().values()) <= 1_000_000
+
+
+@pytest.mark.xfail(reason="the package has grown to about 560 kB: CHANGELOG, known limits")
+def test_the_wheel_without_the_viewer_is_small() -> None:
+    sizes = _packed_sizes()
+    del sizes["openseadragon.min.js"]
+    assert 0 < sum(sizes.values()) <= 500_000
 
 
 def test_the_page_is_no_report(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ Examples:
     "--save-camera",
     type=options.PICTURE,
     metavar="FILE",
-    help="Write the estimated camera to FILE: .json, .yml (OpenCV), .pto (Hugin).",
+    help="Write the estimated camera to FILE: .json, .yml (OpenCV), .pto (Hugin), camera_info.yaml (ROS) and others.",
 )
 @options.report
 @options.trust

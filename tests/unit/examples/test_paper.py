@@ -160,12 +160,16 @@ def test_a_real_board_is_straightened_without_knowing_that_it_is_one(
 
 
 def test_figure9_adjustment_brings_every_start_to_the_same_trajectory() -> None:
+    uncorrected = []
     for table in figure9.run(TINY).tables:
         for name in ("2 points, tilt given", "3 points", "4 points", figure9.RECIPE):
             row = table.row(name)
             assert row["adjusted, %"] < min(1.0, row["translation, chained, %"] + 0.1), (table.title, name)
             assert row["λ error, adjusted"] < 5e-3, (table.title, name)
-        assert table.row("4 points, no distortion (DLT)")["translation, chained, %"] > 3.0
+        uncorrected.append(table.row("4 points, no distortion (DLT)")["translation, chained, %"])
+        assert uncorrected[-1] > 3.0, table.title
+    # By chance, few samples may come near the truth on one of the paths.
+    assert np.median(uncorrected) > 5.0
 
 
 def test_figure10_ignoring_the_distortion_makes_surveys_drift() -> None:
