@@ -157,3 +157,12 @@ def test_pictures_behind_the_horizon_have_no_neighbours() -> None:
     assert neighbours([LENS] * 3, np.stack([beyond] * 3), set()) == []
     assert neighbours([LENS] * 3, np.stack([np.eye(3), beyond, beyond]), set()) == []
     assert neighbours([LENS] * 3, np.stack([np.eye(3), np.eye(3), beyond]), set()) == [(0, 1)]
+
+
+def test_with_a_static_background_every_candidate_pair_is_compared() -> None:
+    pairing = _pairing(400, 150)
+    # What is static has chosen these.
+    few = [pair for pair in ALL if 0 in pair]
+    moving = pairing.remove_static_background(pairing.estimate(few), ALL)
+    assert moving.found
+    assert [(pair.image1, pair.image2) for pair in moving.pairs] == ALL
