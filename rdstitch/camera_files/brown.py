@@ -9,6 +9,7 @@ from rdstitch.camera import Camera
 from rdstitch.camera_files.lens_fit import LensFit, LensSamples, fit_polynomial
 
 _POWERS = (3, 5, 7)
+_NEWTON_STEPS, _NEWTON_TOLERANCE = 20, 1e-10
 
 CLOSE = 0.1
 """Pixels: a model that is nowhere farther from the lens needs no better one in its place."""
@@ -23,7 +24,7 @@ class Brown:
     focal : (float, float)
         Along x and y, pixels.
     center : (float, float)
-        pixels.
+        Pixels.
     radial : tuple of float
         k1, k2, k3.
     tangential : (float, float)
@@ -44,14 +45,42 @@ class Brown:
         return float(np.sqrt(self.focal[0] * self.focal[1]))
 
     def distort(self, points: FloatArray) -> FloatArray:
-        """Px (N, 2) of a lens without distortion and with square pixels to measured pixels."""
-        x, y = ((points - self.center) / self.mean_focal).T
+        """Pixels (..., 2) of a lens without distortion and with square pixels to measured pixels.
+
+        Beyond the radius at which the polynomial folds, the result has no meaning.
+        """
+        return self._forward((points - self.center) / self.mean_focal)[0] * self.focal + self.center
+
+    def undistort(self, points: FloatArray) -> FloatArray:
+        """The inverse of :meth:`distort` by Newton's method; NaN where the polynomial folds on the way."""
+        target = (points - self.center) / self.focal
+        x = target.copy()
+        for _ in range(_NEWTON_STEPS):
+            value, jacobian = self._forward(x)
+            (a, b), (c, d) = np.moveaxis(jacobian, (-2, -1), (0, 1))
+            determinant = a * d - b * c
+            ex, ey = np.moveaxis(target - value, -1, 0) / np.where(determinant > 0.0, determinant, np.nan)
+            step = np.stack([d * ex - b * ey, a * ey - c * ex], axis=-1)
+            x = x + step
+            if not np.nanmax(np.abs(step), initial=0.0) > _NEWTON_TOLERANCE:
+                break
+        return x * self.mean_focal + self.center
+
+    def _forward(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Distorted points (..., 2) and their derivatives (..., 2, 2) by the undistorted ones, focal-normalized."""
+        x, y = np.moveaxis(points, -1, 0)
         r2 = x * x + y * y
-        ratio = _series(self.radial, r2) / _series(self.denominator, r2)
+        above, below = _series(self.radial, r2), _series(self.denominator, r2)
+        ratio = above / below
+        slope = 2.0 * (_series_slope(self.radial, r2) - ratio * _series_slope(self.denominator, r2)) / below
         p1, p2 = self.tangential
         bent_x = x * ratio + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
         bent_y = y * ratio + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-        return np.stack([bent_x, bent_y], axis=1) * self.focal + self.center
+        xx = ratio + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+        yy = ratio + slope * y * y + 2.0 * p2 * x + 6.0 * p1 * y
+        xy = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
+        jacobian = np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-2)
+        return np.stack([bent_x, bent_y], axis=-1), jacobian
 
 
 def brown_of(camera: Camera, terms: int = 3) -> tuple[Brown, LensFit]:
@@ -91,3 +120,11 @@ def _series(coefficients: tuple[float, ...], r2: FloatArray) -> FloatArray:
     for coefficient in reversed(coefficients):
         total = (total + coefficient) * r2
     return 1.0 + total
+
+
+def _series_slope(coefficients: tuple[float, ...], r2: FloatArray) -> FloatArray:
+    """Derivative of :func:`_series` by ``r²``."""
+    total = np.zeros_like(r2)
+    for power in range(len(coefficients), 0, -1):
+        total = total * r2 + power * coefficients[power - 1]
+    return total

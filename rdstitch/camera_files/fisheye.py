@@ -33,13 +33,13 @@ class Fisheye:
         return float(np.sqrt(self.focal[0] * self.focal[1]))
 
     def distort(self, points: FloatArray) -> FloatArray:
-        """Pixels (N, 2) of a lens without distortion and with square pixels to measured pixels."""
+        """Pixels (..., 2) of a lens without distortion and with square pixels to measured pixels."""
         x = (points - self.center) / self.mean_focal
-        radius = np.linalg.norm(x, axis=1)
+        radius = np.linalg.norm(x, axis=-1)
         angle = np.arctan(radius)
         bent = angle * (1.0 + sum(k * angle ** (2 * i) for i, k in enumerate(self.coefficients, start=1)))
         ratio = np.where(radius > 0.0, bent / np.maximum(radius, 1e-300), 1.0)
-        return x * ratio[:, None] * self.focal + self.center
+        return x * ratio[..., None] * self.focal + self.center
 
 
 def fisheye_of(camera: Camera) -> tuple[Fisheye, LensFit]:

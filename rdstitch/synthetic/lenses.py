@@ -8,10 +8,9 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.camera_files.brown import Brown
+from rdstitch.camera_files.lens_fit import fit_lens
 from rdstitch.errors import ArgumentError
-
-_NEWTON_STEPS = 20
-_TOLERANCE = 1e-10
 
 
 class Lens(Protocol):
@@ -102,43 +101,18 @@ class BrownLens(_FixedFocalLens):
     p1: float = 0.0
     p2: float = 0.0
 
+    @property
+    def _model(self) -> Brown:
+        radial = (self.k1, self.k2, self.k3)
+        return Brown((self.focal, self.focal), self.center, radial, (self.p1, self.p2))
+
     def distort(self, points: ArrayLike) -> FloatArray:
-        """Pinhole px to measured px. Beyond the radius where the polynomial folds, the result has no meaning."""
-        return self._denormalize(self._forward(self._normalize(points))[0])
+        """Pinhole pixels to measured pixels; where the polynomial has folded, the result has no meaning."""
+        return self._model.distort(np.asarray(points, dtype=np.float64))
 
     def undistort(self, points: ArrayLike) -> FloatArray:
-        """Measured px to pinhole px by Newton's method; NaN where it does not converge or the polynomial folds."""
-        target = self._normalize(points)
-        x = target.copy()
-        for _ in range(_NEWTON_STEPS):
-            value, jacobian = self._forward(x)
-            determinant = np.linalg.det(jacobian)
-            adjugate = np.stack(
-                [
-                    np.stack([jacobian[..., 1, 1], -jacobian[..., 0, 1]], axis=-1),
-                    np.stack([-jacobian[..., 1, 0], jacobian[..., 0, 0]], axis=-1),
-                ],
-                axis=-2,
-            )
-            step = np.einsum("...ij,...j->...i", adjugate, target - value)
-            x = x + step / np.where(determinant > 0.0, determinant, np.nan)[..., None]
-            if not np.nanmax(np.abs(step), initial=0.0) > _TOLERANCE:
-                break
-        return self._denormalize(x)
-
-    def _forward(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Distorted points (..., 2) and the derivative (..., 2, 2) by the undistorted ones, focal-normalized."""
-        u, v = x[..., 0], x[..., 1]
-        r2 = u * u + v * v
-        radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        slope = 2.0 * (self.k1 + r2 * (2.0 * self.k2 + r2 * 3.0 * self.k3))
-        du = u * radial + 2.0 * self.p1 * u * v + self.p2 * (r2 + 2.0 * u * u)
-        dv = v * radial + 2.0 * self.p2 * u * v + self.p1 * (r2 + 2.0 * v * v)
-        uu = radial + slope * u * u + 2.0 * self.p1 * v + 6.0 * self.p2 * u
-        vv = radial + slope * v * v + 2.0 * self.p2 * u + 6.0 * self.p1 * v
-        uv = slope * u * v + 2.0 * self.p1 * u + 2.0 * self.p2 * v
-        jacobian = np.stack([np.stack([uu, uv], axis=-1), np.stack([uv, vv], axis=-1)], axis=-2)
-        return np.stack([du, dv], axis=-1), jacobian
+        """Measured pixels to pinhole pixels; NaN where the polynomial folds."""
+        return self._model.undistort(np.asarray(points, dtype=np.float64))
 
 
 def focal_length(lens: Lens) -> float:
@@ -154,35 +128,19 @@ def focal_length(lens: Lens) -> float:
     return lens.focal
 
 
-def best_division_model(lens: Lens, samples: int = 400) -> tuple[Camera, float]:
-    """The division model nearest to a lens, and how far it is from it.
+def best_division_model(lens: Lens) -> tuple[Camera, float]:
+    """The one-parameter division model nearest to a lens, and how far it is from it.
 
-    λ minimises the distance in measured pixels between the two lenses, over the same pinhole rays evenly spread in the
-    picture's radius up to its corners, up to the focal length, which is free.
+    As :meth:`rdstitch.camera.Camera.one_parameter_fit` has it, of the division model with as many coefficients as
+    describe the lens.
 
     Returns
     -------
     camera : Camera
+        With the focal length of the lens, from which the scale of the fit may differ.
     rms : float
-        What is left, pixels.
+        Of the distances in the picture, pixels.
     """
-    # Imported late: rendering, which needs the lenses, should not wait for SciPy's optimizers.
-    from scipy.optimize import least_squares
-
-    width, height = lens.image_size
-    corner = np.array([width - 0.5, height - 0.5])
-    center, f = np.array(lens.center), focal_length(lens)
-    measured = center + np.sqrt(np.linspace(0.0, 1.0, samples))[:, None] * (corner - center)
-    pinhole = lens.undistort(measured) - center
-    seen = np.isfinite(pinhole).all(axis=1)
-
-    def camera(distortion: float, scale: float) -> Camera:
-        return Camera(lens.image_size, float(distortion), center=lens.center, focal=f * float(scale))
-
-    def residual(parameters: FloatArray) -> FloatArray:
-        model = camera(*parameters)
-        offset: FloatArray = model.distort(center + parameters[1] * pinhole[seen]) - measured[seen]
-        return offset.ravel()
-
-    fit = least_squares(residual, [-0.05, 1.0], bounds=([-0.95, 0.3], [0.9, 3.0]))
-    return camera(*fit.x), float(np.sqrt(2.0 * np.mean(fit.fun**2)))
+    exact, _ = fit_lens(lens.distort, Camera(lens.image_size, center=lens.center, focal=focal_length(lens)))
+    distortion, rms, _ = exact.one_parameter_fit()
+    return exact.with_coefficients(distortion), rms

@@ -142,10 +142,34 @@ def _fisheye(text: str) -> Parsed:
     return [fx, fy, cx, cy], list(record["distortion_coefficients"]["data"].numbers()), "equi"
 
 
+def _opencv(text: str) -> Parsed:
+    if text.startswith("{"):
+        content = json.loads(text)
+        matrix, values = content["camera_matrix"]["data"], content["distortion_coefficients"]["data"]
+    else:
+        record = parse_yaml(text, "c.yml")
+        matrix, values = (record[name]["data"].numbers() for name in ("camera_matrix", "distortion_coefficients"))
+    return [matrix[0], matrix[4], matrix[2], matrix[5]], list(values), "opencv"
+
+
+def _opendronemap(text: str) -> Parsed:
+    (lens,) = json.loads(text).values()
+    width, height = lens["width"], lens["height"]
+    longer = max(width, height)
+    focals = [lens["focal_x"] * longer, lens["focal_y"] * longer]
+    center = [(width - 1) / 2 + lens["c_x"] * longer, (height - 1) / 2 + lens["c_y"] * longer]
+    fisheye = lens["projection_type"] == "fisheye_opencv"
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    return [*focals, *center], [lens[name] for name in names], "equi" if fisheye else "brown"
+
+
 @pytest.mark.parametrize("camera", [CAMERAS[0], CAMERAS[3], CAMERAS[4]])
 @pytest.mark.parametrize(
     ("name", "parse"),
     [
+        ("c.yml", _opencv),
+        ("opencv.json", _opencv),
+        ("cameras.json", _opendronemap),
         ("camera_info.yaml", _camera_info),
         ("camchain.yaml", _camera_chain),
         ("cameras.txt", _colmap),
@@ -220,24 +244,32 @@ def test_brown_is_what_opencv_calls_so(count: int) -> None:
     np.testing.assert_allclose(lens.distort(points), np.asarray(seen)[:, 0], atol=1e-9)
 
 
-@pytest.mark.parametrize(("distortion", "projection"), [(-0.02, 0), (-0.21, 3)])
-def test_hugin_means_what_its_manual_says(tmp_path: Path, distortion: float, projection: int) -> None:
-    camera = replace(CAMERAS[0], distortion=distortion)
+@pytest.mark.parametrize(
+    ("camera", "projection"),
+    [(replace(CAMERAS[0], distortion=-0.02), 0), (CAMERAS[0], 3), (CAMERAS[3], 3), (CAMERAS[4], 3)],
+)
+def test_hugin_means_what_its_manual_says(tmp_path: Path, camera: Camera, projection: int) -> None:
     save_camera(camera, tmp_path / "c.pto")
-    line = next(line for line in (tmp_path / "c.pto").read_text(encoding="utf-8").splitlines() if line[:2] == "i ")
+    text = (tmp_path / "c.pto").read_text(encoding="utf-8")
+    line = next(line for line in text.splitlines() if line[:2] == "i ")
     a, b, c, d, e, v = (float(re.findall(rf" {name}(-?[\d.e-]+)", line)[0]) for name in "abcdev")
     # r_src = (a r³ + b r² + c r + 1 - a - b - c) r, in halves of the shorter side; v spans the width.
     # A fisheye, f3, has angles where a rectilinear lens has tangents.
     assert f" f{projection} " in line
-    ideal = (camera.undistort(_points(camera)) - camera.center) / 3300.0
+    (width, height), unit = camera.image_size, min(camera.image_size) / 2
+    assert camera.focal is not None
+    ideal = (camera.undistort(_points(camera)) - camera.center) / camera.focal
     half_view = np.tan(np.radians(v) / 2)
     if projection:
         tangent = np.linalg.norm(ideal, axis=1, keepdims=True)
-        ideal, half_view = ideal * np.arctan(tangent) / tangent, np.radians(v) / 2
-    ideal *= 2000.0 / half_view / 1500.0
+        ideal, half_view = ideal * np.arctan(tangent) / np.maximum(tangent, 1e-12), np.radians(v) / 2
+    ideal *= width / 2 / half_view / unit
     r = np.linalg.norm(ideal, axis=1, keepdims=True)
-    seen = ideal * (a * r**3 + b * r**2 + c * r + 1 - a - b - c) * 1500.0 + [1999.5 + d, 1499.5 + e]
-    assert np.linalg.norm(seen - _points(camera), axis=1).max() < 0.3
+    center = (width - 1) / 2 + d, (height - 1) / 2 + e
+    seen = ideal * (a * r**3 + b * r**2 + c * r + 1 - a - b - c) * unit + center
+    apart = np.linalg.norm(seen - _points(camera), axis=1).max()
+    stated = float(re.findall(r"fit_largest_px\"?: ([-\d.e]+)", text)[-1])
+    assert 0.3 * stated < apart < 1.05 * stated + 1e-6
 
 
 def test_opendronemap_of_others(tmp_path: Path) -> None:
