@@ -11,7 +11,7 @@ from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.frame import ChannelOrder
-from rdstitch.local_alignment import MOST_CELLS, Choice
+from rdstitch.local_alignment import MOST_CELLS, LocalAlignmentMode
 from rdstitch.matching.options import MatchingOptions, PairOptions
 from rdstitch.robust import SOLVERS
 
@@ -116,7 +116,7 @@ class StitchOptions:
     include_only: tuple[str, ...] = ()
     topic: str | None = None
     reference: str | None = None
-    local_alignment: Choice = "auto"
+    local_alignment: LocalAlignmentMode = "auto"
     composite: CompositeOptions = field(default_factory=CompositeOptions)
     cache: Path | None = None
     seed: int = 0

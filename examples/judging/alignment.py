@@ -23,7 +23,7 @@ class AlignmentError:
     transform : ndarray of shape (3, 3)
         Mosaic px to texels.
     image : ndarray of shape (N,), intp
-        Picture of each point.
+        LinearPixels of each point.
     points : ndarray of shape (N, 2)
         Measured px in that picture.
     error : ndarray of shape (N,)

@@ -11,7 +11,7 @@ from examples.judging.fitting import FITS, apply, fit_similarity, quantile
 from examples.judging.patches import patch_displacements
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.synthetic.textures import Picture, PictureTexture, Texture
+from rdstitch.synthetic.textures import LinearPixels, PictureTexture, Texture
 
 _ROUNDS = 5
 # A transform that moves no patch by more than this, px, will not change any more.
@@ -181,14 +181,14 @@ def coverage(filled: NDArray[np.bool_], transform: ArrayLike, reachable: NDArray
     return float((shown[inner] > 0).mean())
 
 
-def sharpness(picture: Picture, reference: Picture, where: NDArray[np.bool_]) -> float:
+def sharpness(picture: LinearPixels, reference: LinearPixels, where: NDArray[np.bool_]) -> float:
     """Detail of a picture in units of the detail of another one that shows the same, both grey in [0, 1].
 
     Detail is the root mean square of the Laplacian of Gaussian (σ = 1 px) in units of the standard deviation of the
     picture blurred by σ = 4 px: it takes no notice of gain and offset, but noise counts as detail.
     """
 
-    def detail(grey: Picture) -> float:
+    def detail(grey: LinearPixels) -> float:
         fine = cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 1.0), cv2.CV_32F)
         coarse = cv2.GaussianBlur(grey, (0, 0), 4.0)
         return float(np.sqrt(np.mean(fine[where] ** 2)) / np.std(coarse[where]))
@@ -196,7 +196,7 @@ def sharpness(picture: Picture, reference: Picture, where: NDArray[np.bool_]) ->
     return detail(picture) / detail(reference)
 
 
-def plane_under(plane: Texture, transform: ArrayLike, size: tuple[int, int]) -> tuple[Picture, NDArray[np.bool_]]:
+def plane_under(plane: Texture, transform: ArrayLike, size: tuple[int, int]) -> tuple[LinearPixels, NDArray[np.bool_]]:
     """The true plane as a perfect mosaic of a given size (width, height) shows it: grey (h, w), and where there is any.
 
     ``transform`` is from mosaic px to texels.
@@ -206,7 +206,9 @@ def plane_under(plane: Texture, transform: ArrayLike, size: tuple[int, int]) -> 
     return _drawn_over(truth, np.asarray(transform, dtype=np.float64), (size[1], size[0]))
 
 
-def _drawn_over(truth: Picture, transform: FloatArray, shape: tuple[int, ...]) -> tuple[Picture, NDArray[np.bool_]]:
+def _drawn_over(
+    truth: LinearPixels, transform: FloatArray, shape: tuple[int, ...]
+) -> tuple[LinearPixels, NDArray[np.bool_]]:
     """The plane in the mosaic's place, low-passed as far as the mosaic is coarser, and where there is any plane."""
     scale = _texels_per_pixel(transform, shape)
     if scale > 1.0:
@@ -226,7 +228,7 @@ def _texels_per_pixel(transform: FloatArray, shape: tuple[int, ...]) -> float:
     return float(np.sqrt(np.abs(np.linalg.det(np.stack([right - here, down - here])))))
 
 
-def _place_by_features(grey: Picture, filled: NDArray[np.bool_], truth: Picture) -> FloatArray | None:
+def _place_by_features(grey: LinearPixels, filled: NDArray[np.bool_], truth: LinearPixels) -> FloatArray | None:
     """A rough similarity from mosaic px to texels, or None where there is nothing in common.
 
     Matches that agree only roughly take part on purpose: a mosaic that has drifted should be laid on the plane as a
@@ -249,7 +251,7 @@ def _place_by_features(grey: Picture, filled: NDArray[np.bool_], truth: Picture)
     return fit_similarity(a[agreed], b[agreed])
 
 
-def _features(grey: Picture, mask: NDArray[np.bool_] | None) -> tuple[FloatArray, NDArray[np.float32]]:
+def _features(grey: LinearPixels, mask: NDArray[np.bool_] | None) -> tuple[FloatArray, NDArray[np.float32]]:
     """SIFT points in px and descriptors, from a picture reduced to a moderate size."""
     factor = min(1.0, float(np.sqrt(_FEATURE_PIXELS / grey.size)))
     size = (max(1, round(grey.shape[1] * factor)), max(1, round(grey.shape[0] * factor)))
@@ -263,7 +265,7 @@ def _features(grey: Picture, mask: NDArray[np.bool_] | None) -> tuple[FloatArray
     return at_full_size, np.asarray(descriptors, dtype=np.float32)
 
 
-def _grey_and_filled(mosaic: NDArray[Any]) -> tuple[Picture, NDArray[np.bool_]]:
+def _grey_and_filled(mosaic: NDArray[Any]) -> tuple[LinearPixels, NDArray[np.bool_]]:
     """Grey levels in [0, 1] and which px are filled."""
     if mosaic.ndim not in (2, 3) or (mosaic.ndim == 3 and mosaic.shape[2] not in (3, 4)):
         raise ArgumentError(f"a mosaic has shape (h, w), (h, w, 3) or (h, w, 4), not {mosaic.shape}")
@@ -279,14 +281,14 @@ def _grey_and_filled(mosaic: NDArray[Any]) -> tuple[Picture, NDArray[np.bool_]]:
     return _grey(PictureTexture(colours).region(0, 0, width, height)), filled
 
 
-def _grey(picture: Picture) -> Picture:
+def _grey(picture: LinearPixels) -> LinearPixels:
     """Luma of RGB (h, w, 3), or the only channel of (h, w, 1); shape (h, w)."""
     if picture.shape[2] == 1:
         return np.ascontiguousarray(picture[:, :, 0])
     return np.asarray(cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2GRAY), dtype=np.float32)
 
 
-def _grey_agreement(grey: Picture, drawn: Picture, where: NDArray[np.bool_]) -> tuple[float, float]:
+def _grey_agreement(grey: LinearPixels, drawn: LinearPixels, where: NDArray[np.bool_]) -> tuple[float, float]:
     """Root mean square difference in grey levels after the best gain and offset, and correlation."""
     a, b = grey[where].astype(np.float64), drawn[where].astype(np.float64)
     if len(a) < 2 or a.std() == 0.0 or b.std() == 0.0:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.synthetic.textures import Picture
+from rdstitch.synthetic.textures import LinearPixels
 
 _ITERATIONS = 5
 _PATCHES = 5000
@@ -43,8 +43,8 @@ class Displacements:
 
 
 def patch_displacements(
-    picture: Picture,
-    other: Picture,
+    picture: LinearPixels,
+    other: LinearPixels,
     valid: NDArray[np.bool_],
     *,
     patch: int = 33,
@@ -107,7 +107,7 @@ def patch_displacements(
 
 
 def _refine(
-    templates: Picture, layers: list[Picture], center: FloatArray, start: FloatArray
+    templates: LinearPixels, layers: list[LinearPixels], center: FloatArray, start: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Displacement (P, 2) that minimises the squared difference up to gain and offset, and the correlation there.
 

@@ -24,7 +24,7 @@ from rdstitch.alignment.bundle_adjustment import (
 from rdstitch.alignment.motion_models import RIGID, YAW, X, Y
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import PlanarPoses
-from rdstitch.alignment.trajectory import Trajectory, compare
+from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import LENS_PARAMETERS
 from rdstitch.matching.links import Link
@@ -141,7 +141,7 @@ def _adjusted(d: Drive, start: Trajectory, tilt: tuple[float, float], distortion
     adjuster = BundleAdjuster(RIGID, Observations.from_links(links, cameras), free, known)
     lens = np.zeros(len(LENS_PARAMETERS))
     lens[0] = distortion
-    return adjuster.run(Parameters(poses, RIGID.shared_from(natural), lens))
+    return adjuster.run(Parameters(poses, RIGID.shared_from_physical(natural), lens))
 
 
 def _any_relation(d: Drive) -> RadialHomography:
@@ -168,7 +168,7 @@ def _recipe(d: Drive) -> _Path:
 def _table(name: str, d: Drive, paths: list[_Path]) -> Table:
     rows = []
     for path in paths:
-        before, after = compare(path.before, d.truth), compare(path.after, d.truth)
+        before, after = compare_trajectories(path.before, d.truth), compare_trajectories(path.after, d.truth)
         rows.append(
             (
                 path.solver,

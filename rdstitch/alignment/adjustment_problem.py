@@ -17,7 +17,7 @@ from rdstitch.alignment.bundle_adjustment import (
 from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.initialization import adjust_pairs_independently
 from rdstitch.alignment.metric_upgrade import metric_upgrade
-from rdstitch.alignment.motion_models import HOMOGRAPHY, POSE, PSI, SIMILARITY, THETA, Model
+from rdstitch.alignment.motion_models import HOMOGRAPHY, POSE, PSI, SIMILARITY, THETA, MotionModel
 from rdstitch.alignment.normal_equations import robust_cost
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.rotation_model import FOCAL_STARTS, ROTATION
@@ -71,7 +71,7 @@ class CameraPriors:
     lens: FloatArray
     lens_std: FloatArray
 
-    def priors(self, model: Model, count: int, tilt_spread: float) -> Priors:
+    def priors(self, model: MotionModel, count: int, tilt_spread: float) -> Priors:
         """For ``count`` pictures whose tilts scatter by ``tilt_spread`` where nothing else is known of them."""
         none = Priors.none(model, count)
         known = replace(none, lens=self.lens, lens_precision=self.lens_std**-2.0)
@@ -114,7 +114,7 @@ class Fit:
 
     Attributes
     ----------
-    model : Model
+    model : MotionModel
     adjusted : BundleAdjustmentResult
     free_lens : ndarray of shape (5,), bool
         Lens parameters that were estimated.
@@ -122,7 +122,7 @@ class Fit:
         Standard deviation of the pictures' own tilts, radians; 0 where the model has none.
     """
 
-    model: Model
+    model: MotionModel
     adjusted: BundleAdjustmentResult
     free_lens: BoolArray
     tilt_spread: float = 0.0
@@ -162,7 +162,7 @@ class Problem:
     knowledge: CameraPriors
     overdispersion: float = 1.0
 
-    def fit(self, model: Model, others: Sequence[Fit] = (), shared: FloatArray | None = None) -> Fit:
+    def fit(self, model: MotionModel, others: Sequence[Fit] = (), shared: FloatArray | None = None) -> Fit:
         """Adjust a model from the chained links or from the solution of a less free model, whichever is nearer.
 
         The links start from ``shared`` parameters where these are known, otherwise from the best of several.
@@ -176,11 +176,11 @@ class Problem:
             starts.append(self._chained(model, others, shared))
         return self.refine(model, self._nearest(model, starts))
 
-    def squared(self, model: Model, parameters: Parameters) -> FloatArray:
+    def squared(self, model: MotionModel, parameters: Parameters) -> FloatArray:
         """``|r|²`` of each correspondence (M,) at some parameters, px², whitened."""
         return self.adjuster(model).squared(parameters)
 
-    def refine(self, model: Model, start: Parameters, tilt_spread: float | None = None) -> Fit:
+    def refine(self, model: MotionModel, start: Parameters, tilt_spread: float | None = None) -> Fit:
         """Adjust a model from a given start."""
         if model is POSE and self.knowledge.attitudes_std is None:
             return Fit(model, self._run(model, start, POSE_TILT_SPREAD), self.free_lens, POSE_TILT_SPREAD)
@@ -204,23 +204,23 @@ class Problem:
         return wider.refine(fit.model, fit.adjusted.parameters, fit.tilt_spread)
 
     @staticmethod
-    def _tilts_are_free(model: Model) -> bool:
+    def _tilts_are_free(model: MotionModel) -> bool:
         return PSI in getattr(model, "free", ())
 
-    def _run(self, model: Model, start: Parameters, tilt_spread: float) -> BundleAdjustmentResult:
+    def _run(self, model: MotionModel, start: Parameters, tilt_spread: float) -> BundleAdjustmentResult:
         adjuster = self.adjuster(model, tilt_spread)
         medians = link_medians(adjuster.squared(start), self.observations)
         widest = _WIDEST_START * float(np.median(self.observations.scale2))
         width = min(1.5 * float(np.quantile(np.where(np.isfinite(medians), medians, 1e9), 0.95)), widest)
         return adjuster.run(start, width)
 
-    def adjuster(self, model: Model, tilt_spread: float = _TILT_SPREAD_START) -> BundleAdjuster:
+    def adjuster(self, model: MotionModel, tilt_spread: float = _TILT_SPREAD_START) -> BundleAdjuster:
         """Of one model, with the priors on it."""
         freedom = FreeParameters.fixing(model, self.count, [self.reference], self.free_lens)
         priors = self.knowledge.priors(model, self.count, tilt_spread)
         return BundleAdjuster(model, self.observations, freedom, priors, self.overdispersion)
 
-    def _chained(self, model: Model, others: Sequence[Fit], start: FloatArray | None) -> Parameters:
+    def _chained(self, model: MotionModel, others: Sequence[Fit], start: FloatArray | None) -> Parameters:
         """Every link on its own, chained along the tree of the links trusted most."""
         o, attitudes = self.observations, self.knowledge.attitudes
         shared, lens, homographies = np.zeros(0), self.lens, self.homographies
@@ -230,7 +230,7 @@ class Problem:
         tree = spanning_tree(self.count, o.image1, o.image2, self.trust, self.reference)
         origin = model.origins(shared, attitudes[[tree.root]])[0]
         chained = tree.chained(homographies, o.image1, origin)
-        return Parameters(model.poses_from(chained, shared, attitudes), shared, lens)
+        return Parameters(model.nearest_poses(chained, shared, attitudes), shared, lens)
 
     def _upgraded(self) -> Parameters:
         """Chained homographies with the metric of the plane that makes them pictures of one camera."""
@@ -238,10 +238,12 @@ class Problem:
         tree = spanning_tree(self.count, o.image1, o.image2, self.trust, self.reference)
         chained = tree.chained(self.homographies, o.image1, np.eye(3))
         upgraded = metric_upgrade(chained, tree.root, prior.log_focal, prior.log_focal_std)
-        shared = POSE.shared_from(np.array([*upgraded.tilt, upgraded.log_focal]))
+        shared = POSE.shared_from_physical(np.array([*upgraded.tilt, upgraded.log_focal]))
         return Parameters(upgraded.poses, shared, self.lens)
 
-    def _links_apart(self, model: Model, others: Sequence[Fit], start: FloatArray | None) -> BundleAdjustmentResult:
+    def _links_apart(
+        self, model: MotionModel, others: Sequence[Fit], start: FloatArray | None
+    ) -> BundleAdjustmentResult:
         """Every link on its own, from given shared parameters, those of another planar model or the best of several."""
         priors = self.knowledge.priors(model, self.count, _TILT_SPREAD_START)
         planar = [other for other in others if other.model.shared_names]
@@ -259,7 +261,7 @@ class Problem:
             self.knowledge.attitudes,
         )
 
-    def trial(self, model: Model) -> BundleAdjustmentResult:
+    def trial(self, model: MotionModel) -> BundleAdjustmentResult:
         """A few links on their own, from the best of several shared parameters."""
         priors = self.knowledge.priors(model, self.count, _TILT_SPREAD_START)
         links = len(self.observations)
@@ -275,25 +277,25 @@ class Problem:
         cost = [float(robust_cost(trial.squared, width).sum()) for trial in trials]
         return trials[int(np.argmin(cost))]
 
-    def _shared_to_try(self, model: Model, natural: FloatArray) -> list[FloatArray]:
+    def _shared_to_try(self, model: MotionModel, natural: FloatArray) -> list[FloatArray]:
         """Focal lengths; or shared parameters for the known or zero tilt, and for four around it, 0.2 radians away."""
         if model is ROTATION:
             return [np.array([log_focal]) for log_focal in (*natural, *FOCAL_STARTS)]
         steps = np.array([(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2)])
         if self.knowledge.tilt_known:
             steps = steps[:1]
-        return [model.shared_from(natural + np.array([*step, 0.0])) for step in steps]
+        return [model.shared_from_physical(natural + np.array([*step, 0.0])) for step in steps]
 
-    def _taken_over(self, model: Model, other: Fit) -> Parameters:
+    def _taken_over(self, model: MotionModel, other: Fit) -> Parameters:
         """Another model's solution as this model's start."""
         parameters = other.adjusted.parameters
         if model.shared_names and other.model.shared_names:
             return parameters
         shared = parameters.shared if model.shared_names else np.empty(0)
-        poses = model.poses_from(other.adjusted.matrices.matrices, shared, self.knowledge.attitudes)
+        poses = model.nearest_poses(other.adjusted.matrices.matrices, shared, self.knowledge.attitudes)
         return Parameters(poses, shared, parameters.lens)
 
-    def _nearest(self, model: Model, starts: Sequence[Parameters]) -> Parameters:
+    def _nearest(self, model: MotionModel, starts: Sequence[Parameters]) -> Parameters:
         """The start with the smallest errors, those far away counting alike."""
         if len(starts) == 1:
             return starts[0]

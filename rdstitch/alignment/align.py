@@ -19,7 +19,7 @@ from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_l
 from rdstitch.alignment.initialization import relations_at
 from rdstitch.alignment.lens_selection import LENSES, choose_lens
 from rdstitch.alignment.model_family import MODELS
-from rdstitch.alignment.model_selection import Choice
+from rdstitch.alignment.model_selection import ModelChoice
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.rotation_model import ROTATION
@@ -283,8 +283,8 @@ class _Graph:
 
 
 def _drop_wrong_pairs(
-    graph: _Graph, problem: Problem, pictures: IntArray, choice: Choice, wrong: BoolArray
-) -> tuple[Choice, IntArray, BoolArray]:
+    graph: _Graph, problem: Problem, pictures: IntArray, choice: ModelChoice, wrong: BoolArray
+) -> tuple[ModelChoice, IntArray, BoolArray]:
     """Judge all links by the adjusted poses, and adjust again without those that do not fit."""
     for _ in range(_ROUNDS):
         adjusted, model = choice.fit.adjusted, choice.fit.model

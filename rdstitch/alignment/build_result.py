@@ -10,7 +10,7 @@ from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.bundle_adjustment import WIDTH_PER_SIGMA
 from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.lens_selection import CENTER, LensChoice
-from rdstitch.alignment.model_selection import Choice
+from rdstitch.alignment.model_selection import ModelChoice
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y, metric_poses
 from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.planarity import coherence, judge_relief
@@ -43,7 +43,7 @@ class AdjustedPictures:
         Links not taken for wrong.
     problem : Problem
         The final one.
-    choice : Choice
+    choice : ModelChoice
     votes : Consensus
     lens : LensChoice
         The lens, with the distortion centre if the motion model freed it.
@@ -56,7 +56,7 @@ class AdjustedPictures:
     pictures: IntArray
     right: BoolArray
     problem: Problem
-    choice: Choice
+    choice: ModelChoice
     votes: Consensus
     lens: LensChoice
     observable: bool
@@ -66,7 +66,7 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
     """The alignment, in the frame of the reference picture."""
     problem, fit = found.problem, found.choice.fit
     adjusted, planar = fit.adjusted, isinstance(fit.model, PlanarModel)
-    shared, lens = fit.model.natural(adjusted.parameters.shared)[0], adjusted.parameters.lens
+    shared, lens = fit.model.physical_parameters(adjusted.parameters.shared)[0], adjusted.parameters.lens
     covariance = adjusted.covariance * _inflation(found)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     names = (*fit.model.shared_names, *(n for n, free in zip(LENS_PARAMETERS, problem.free_lens, strict=True) if free))

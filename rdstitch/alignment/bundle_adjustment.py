@@ -9,10 +9,10 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment.motion_models import Model, ModelMatrices, inverses
+from rdstitch.alignment.motion_models import ModelMatrices, MotionModel, inverses
 from rdstitch.alignment.normal_equations import (
     LinkEquations,
-    NormalEquations,
+    SparseNormalEquations,
     chain,
     link_equations,
     robust_cost,
@@ -50,14 +50,16 @@ class Parameters:
     shared: FloatArray
     lens: FloatArray
 
-    def moved(self, model: Model, step_poses: FloatArray, step_shared: FloatArray, free_lens: BoolArray) -> Self:
+    def retract(
+        self, model: MotionModel, step_poses: FloatArray, step_shared: FloatArray, free_lens: BoolArray
+    ) -> Self:
         """After a step."""
         lens = self.lens.copy()
         size = len(self.shared)
         lens[free_lens] += step_shared[size:]
         return replace(
             self,
-            poses=model.moved(self.poses, step_poses),
+            poses=model.retract(self.poses, step_poses),
             shared=self.shared + step_shared[:size],
             lens=lens,
         )
@@ -70,7 +72,7 @@ class Priors:
     Attributes
     ----------
     shared, shared_precision : ndarray of shape (S,)
-        Of what the model names, see :meth:`Model.natural`.
+        Of what the model names, see :meth:`MotionModel.physical_parameters`.
     lens, lens_precision : ndarray of shape (5,)
     poses, poses_precision : ndarray of shape (N, D)
     """
@@ -83,7 +85,7 @@ class Priors:
     poses_precision: FloatArray
 
     @classmethod
-    def none(cls, model: Model, count: int) -> Self:
+    def none(cls, model: MotionModel, count: int) -> Self:
         """Nothing known of ``count`` pictures."""
         shared, poses = np.zeros(len(model.shared_names)), np.zeros((count, model.pose_size))
         lens = np.zeros(len(LENS_PARAMETERS))
@@ -104,7 +106,7 @@ class FreeParameters:
     lens: BoolArray
 
     @classmethod
-    def fixing(cls, model: Model, count: int, references: FloatArray | list[int], lens: BoolArray) -> Self:
+    def fixing(cls, model: MotionModel, count: int, references: FloatArray | list[int], lens: BoolArray) -> Self:
         """All but the gauge of the reference pictures, one for each connected part of the graph."""
         poses = np.ones((count, model.pose_size), dtype=np.bool_)
         poses[np.asarray(references, dtype=np.intp)] = ~model.gauge
@@ -161,7 +163,7 @@ class BundleAdjuster:
 
     Attributes
     ----------
-    model : Model
+    model : MotionModel
     observations : Observations
     freedom : FreeParameters
     priors : Priors
@@ -173,7 +175,7 @@ class BundleAdjuster:
         Relative decrease of the cost, as a step promises it, that is not worth the step.
     """
 
-    model: Model
+    model: MotionModel
     observations: Observations
     freedom: FreeParameters
     priors: Priors
@@ -210,7 +212,7 @@ class BundleAdjuster:
         squared: FloatArray = self._evaluate(parameters, 1.0, 1.0).equations.squared
         return squared
 
-    def normal_equations(self, adjusted: BundleAdjustmentResult) -> NormalEquations:
+    def normal_equations(self, adjusted: BundleAdjustmentResult) -> SparseNormalEquations:
         """At a solution, priors included."""
         state = self._evaluate(adjusted.parameters, adjusted.sigma, WIDTH_PER_SIGMA * adjusted.sigma)
         return self._normal_equations(state, adjusted.sigma)
@@ -232,7 +234,7 @@ class BundleAdjuster:
             )  # of the quadratic model, to first order twice the decrease
             if not np.isfinite(predicted) or predicted <= self.tolerance * max(state.cost, 1e-12):
                 return state, used, True
-            moved = state.parameters.moved(self.model, step_poses, step_shared, self.freedom.lens)
+            moved = state.parameters.retract(self.model, step_poses, step_shared, self.freedom.lens)
             cost = self._cost_at(moved, state.equations.whitening, sigma, width)
             used += 1
             if cost < state.cost:
@@ -275,15 +277,15 @@ class BundleAdjuster:
 
     def _prior_cost(self, parameters: Parameters) -> float:
         p = self.priors
-        offsets = self.model.offsets(parameters.poses)
+        offsets = self.model.prior_coordinates(parameters.poses)
         parts = (
-            p.shared_precision * (self.model.natural(parameters.shared)[0] - p.shared) ** 2,
+            p.shared_precision * (self.model.physical_parameters(parameters.shared)[0] - p.shared) ** 2,
             p.lens_precision * (parameters.lens - p.lens) ** 2,
             p.poses_precision * (offsets - p.poses) ** 2,
         )
         return float(sum(part.sum() for part in parts))
 
-    def _normal_equations(self, state: _State, sigma: float) -> NormalEquations:
+    def _normal_equations(self, state: _State, sigma: float) -> SparseNormalEquations:
         """Of the data at ``state``, and of the priors."""
         normal = chain(
             state.equations,
@@ -298,7 +300,7 @@ class BundleAdjuster:
         precision = np.concatenate([p.shared_precision, p.lens_precision[lens]])
         natural, derivative = self._natural(state.parameters.shared)
         error = np.concatenate([natural - p.shared, (state.parameters.lens - p.lens)[lens]])
-        poses = self.model.offsets(state.parameters.poses) - p.poses
+        poses = self.model.prior_coordinates(state.parameters.poses) - p.poses
         return normal.with_priors(
             p.poses_precision[free],
             poses[free],
@@ -308,7 +310,7 @@ class BundleAdjuster:
 
     def _natural(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """What the shared parameters mean (S,), and its derivatives by them and by the lens (S', S')."""
-        natural, derivative = self.model.natural(shared)
+        natural, derivative = self.model.physical_parameters(shared)
         size, lens = len(natural), int(self.freedom.lens.sum())
         whole = np.eye(size + lens)
         whole[:size, :size] = derivative

@@ -15,7 +15,7 @@ from rdstitch.alignment.bundle_adjustment import (
     Parameters,
     Priors,
 )
-from rdstitch.alignment.motion_models import Model
+from rdstitch.alignment.motion_models import MotionModel
 from rdstitch.alignment.normal_equations import split_lens
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray
@@ -58,7 +58,7 @@ def _direct_linear(x1: FloatArray, x2: FloatArray) -> FloatArray:
 
 
 def adjust_pairs_independently(
-    model: Model,
+    model: MotionModel,
     observations: Observations,
     homographies: FloatArray,
     shared: FloatArray,
@@ -86,7 +86,7 @@ def adjust_pairs_independently(
     tilts = np.stack([attitudes[observations.image1], attitudes[observations.image2]], axis=1).reshape(-1, 2)
     matrices[0::2] = model.origins(shared, tilts[0::2])
     matrices[1::2] = homographies @ matrices[0::2]
-    start = Parameters(model.poses_from(matrices, shared, tilts), shared, lens)
+    start = Parameters(model.nearest_poses(matrices, shared, tilts), shared, lens)
     none = Priors.none(model, count)
     known = Priors(
         priors.shared,

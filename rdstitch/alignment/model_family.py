@@ -1,7 +1,7 @@
 """All motion models by name: those over a plane, from the least to the most free, and the turn on the spot."""
 
 from rdstitch.alignment.motion_models import MODELS as PLANAR_MODELS
-from rdstitch.alignment.motion_models import Model
+from rdstitch.alignment.motion_models import MotionModel
 from rdstitch.alignment.rotation_model import ROTATION
 
-MODELS: dict[str, Model] = {**PLANAR_MODELS, ROTATION.name: ROTATION}
+MODELS: dict[str, MotionModel] = {**PLANAR_MODELS, ROTATION.name: ROTATION}

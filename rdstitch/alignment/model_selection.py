@@ -22,7 +22,7 @@ from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.bundle_adjustment import WIDTH_PER_SIGMA, sigma_of
 from rdstitch.alignment.cycle_consistency import misfitting_links
 from rdstitch.alignment.lens_selection import EXACTNESS, is_plausible
-from rdstitch.alignment.motion_models import HOMOGRAPHY, LOG_HEIGHT, MODELS, POSE, PSI, THETA, Model, metric_poses
+from rdstitch.alignment.motion_models import HOMOGRAPHY, LOG_HEIGHT, MODELS, POSE, PSI, THETA, MotionModel, metric_poses
 from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.planarity import coherence
 from rdstitch.arrays import BoolArray, FloatArray
@@ -35,7 +35,7 @@ _TYPICAL_TILT_SPREAD = math.radians(3.0)
 
 
 @dataclass(frozen=True)
-class Choice:
+class ModelChoice:
     """The model chosen.
 
     Attributes
@@ -51,7 +51,7 @@ class Choice:
     overdispersion: float
 
 
-def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolArray] = ()) -> Choice:
+def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolArray] = ()) -> ModelChoice:
     """Adjust models from the least to the most free, and take the best.
 
     The best two are then tried with more of the lens free: an off-centre lens looks like motion that is less regular.
@@ -82,10 +82,10 @@ def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolAr
     best = int(np.argmin(costs[: max(len(cameras), 1)]))
     if cameras and len(fits) > len(cameras) and _beyond_one_camera(problem, fits[best], fits[-1]):
         best = len(fits) - 1
-    return Choice(fits[best], _reason(fits, best, list(names)), noise.overdispersion)
+    return ModelChoice(fits[best], _reason(fits, best, list(names)), noise.overdispersion)
 
 
-def _cannot_gain(bound: "NoiseModel", problem: Problem, fits: Sequence[Fit], model: Model) -> bool:
+def _cannot_gain(bound: "NoiseModel", problem: Problem, fits: Sequence[Fit], model: MotionModel) -> bool:
     """Whether free homographies could not leave errors so much smaller that they would be taken."""
     if model is not HOMOGRAPHY or not fits or problem.count == 2:
         return False
@@ -163,12 +163,12 @@ class NoiseModel:
         return float((WIDTH_PER_SIGMA**2 * np.log1p(ratio / WIDTH_PER_SIGMA**2)).sum()) / self.overdispersion
 
     @staticmethod
-    def parameters(problem: Problem, model: Model, free_lens: BoolArray) -> int:
+    def parameters(problem: Problem, model: MotionModel, free_lens: BoolArray) -> int:
         """Number of free parameters; in the pose model the shared tilt is only the mean of those of the pictures."""
         poses = problem.count * model.pose_size - int(model.gauge.sum())
         return poses + len(model.shared_names) + int(free_lens.sum()) - (2 if model is POSE else 0)
 
-    def price(self, problem: Problem, model: Model, free_lens: BoolArray) -> float:
+    def price(self, problem: Problem, model: MotionModel, free_lens: BoolArray) -> float:
         """What the parameters of a model cost."""
         return self.parameters(problem, model, free_lens) * math.log(self.effective)
 

@@ -52,7 +52,7 @@ class ModelMatrices:
     ----------
     matrices : ndarray of shape (N, 3, 3)
     by_pose : ndarray of shape (N, D, 3, 3)
-        By a step of the D pose parameters, as :meth:`Model.moved` takes it.
+        By a step of the D pose parameters, as :meth:`MotionModel.retract` takes it.
     by_shared : ndarray of shape (N, S, 3, 3)
         By the S shared parameters.
     """
@@ -62,7 +62,7 @@ class ModelMatrices:
     by_shared: FloatArray
 
 
-class Model(Protocol):
+class MotionModel(Protocol):
     """What the adjustment needs to know of a motion model."""
 
     @property
@@ -84,22 +84,22 @@ class Model(Protocol):
     def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
         """Homographies from the plane to the pictures, with derivatives."""
 
-    def natural(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def physical_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """What :attr:`shared_names` names (S,), and its derivatives by the shared parameters (S, S)."""
 
-    def shared_from(self, natural: FloatArray) -> FloatArray:
-        """The inverse of :meth:`natural`."""
+    def shared_from_physical(self, natural: FloatArray) -> FloatArray:
+        """The inverse of :meth:`physical_parameters`."""
 
-    def moved(self, poses: FloatArray, step: FloatArray) -> FloatArray:
+    def retract(self, poses: FloatArray, step: FloatArray) -> FloatArray:
         """Poses after a step of shape (N, D)."""
 
-    def offsets(self, poses: FloatArray) -> FloatArray:
+    def prior_coordinates(self, poses: FloatArray) -> FloatArray:
         """The D parameters of each picture (N, D) that a prior speaks of; zeros where none can."""
 
     def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """Homographies (N, 3, 3) of pictures at the origin of the plane, with the tilts (N, 2) given."""
 
-    def poses_from(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+    def nearest_poses(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """The poses with these tilts (N, 2) that come nearest to plane-to-picture homographies (N, 3, 3)."""
 
 
@@ -151,7 +151,7 @@ class PlanarModel:
         by_shared = np.concatenate([by_tilt * focal, by_focal[:, None]], axis=1)
         return ModelMatrices(matrices, by_columns[:, list(self.free)].reshape(count, -1, 3, 3), by_shared)
 
-    def natural(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def physical_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """ψ, θ and log f, with derivatives."""
         focal = float(np.exp(shared[2]))
         natural = np.array([shared[0] * focal, shared[1] * focal, shared[2]])
@@ -159,18 +159,18 @@ class PlanarModel:
         derivative[:2, 2] = natural[:2]
         return natural, derivative
 
-    def shared_from(self, natural: FloatArray) -> FloatArray:
+    def shared_from_physical(self, natural: FloatArray) -> FloatArray:
         """ψ/f, θ/f and log f."""
         return np.append(natural[:2] / np.exp(natural[2]), natural[2])
 
-    def moved(self, poses: FloatArray, step: FloatArray) -> FloatArray:
+    def retract(self, poses: FloatArray, step: FloatArray) -> FloatArray:
         """Poses after a step of shape (N, D)."""
         result = poses.copy()
         result[:, list(self.free)] += step
         result[:, LOG_HEIGHT] = np.clip(result[:, LOG_HEIGHT], -_LARGEST_LOG_HEIGHT, _LARGEST_LOG_HEIGHT)
         return result
 
-    def offsets(self, poses: FloatArray) -> FloatArray:
+    def prior_coordinates(self, poses: FloatArray) -> FloatArray:
         """The free parameters themselves."""
         return poses[:, list(self.free)]
 
@@ -181,7 +181,7 @@ class PlanarModel:
         matrices: FloatArray = self.matrices(poses, shared).matrices
         return matrices
 
-    def poses_from(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+    def nearest_poses(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """The nearest poses, given how the tilts of the pictures differ from the shared one."""
         motion = np.linalg.inv(self.origins(shared, attitudes)) @ homographies
         area = motion[:, 0, 0] * motion[:, 1, 1] - motion[:, 0, 1] * motion[:, 1, 0]
@@ -249,21 +249,21 @@ class HomographyModel:
         matrices = poses.reshape(-1, 3, 3)
         return ModelMatrices(matrices, _TRACELESS @ matrices[:, None], np.zeros((len(poses), 0, 3, 3)))
 
-    def natural(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def physical_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Nothing."""
         return np.zeros(0), np.zeros((0, 0))
 
-    def shared_from(self, natural: FloatArray) -> FloatArray:
+    def shared_from_physical(self, natural: FloatArray) -> FloatArray:
         """Nothing."""
         return np.zeros(0)
 
-    def moved(self, poses: FloatArray, step: FloatArray) -> FloatArray:
+    def retract(self, poses: FloatArray, step: FloatArray) -> FloatArray:
         """Poses after a step of shape (N, 8)."""
         change = np.einsum("nk,kij->nij", step, _TRACELESS)
         growth = np.eye(3) + change @ (np.eye(3) + change / 2.0)  # exp to second order
         return _unit_determinant(growth @ poses.reshape(-1, 3, 3))
 
-    def offsets(self, poses: FloatArray) -> FloatArray:
+    def prior_coordinates(self, poses: FloatArray) -> FloatArray:
         """Zeros: no prior speaks of a homography."""
         return np.zeros((len(poses), 8))
 
@@ -271,7 +271,7 @@ class HomographyModel:
         """The identity."""
         return np.tile(np.eye(3), (len(attitudes), 1, 1))
 
-    def poses_from(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+    def nearest_poses(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """The homographies themselves."""
         return _unit_determinant(homographies)
 
@@ -297,5 +297,5 @@ SIMILARITY = PlanarModel("similarity", (YAW, X, Y, LOG_HEIGHT))
 TILTING = PlanarModel("tilting", (YAW, X, Y, LOG_HEIGHT, PSI, THETA))
 POSE = PlanarModel("pose", (YAW, X, Y, LOG_HEIGHT, PSI, THETA))
 HOMOGRAPHY = HomographyModel()
-MODELS: dict[str, Model] = {model.name: model for model in (RIGID, SIMILARITY, TILTING, POSE, HOMOGRAPHY)}
+MODELS: dict[str, MotionModel] = {model.name: model for model in (RIGID, SIMILARITY, TILTING, POSE, HOMOGRAPHY)}
 """The family by name, from the least to the most free."""

@@ -168,7 +168,7 @@ def _whitened(
 
 
 @dataclass(frozen=True)
-class NormalEquations:
+class SparseNormalEquations:
     """``[A B; B' C] step = -gradient`` for poses and shared parameters, in that order.
 
     Attributes
@@ -257,7 +257,7 @@ def chain(
     free: BoolArray,
     free_lens: BoolArray,
     weight: float,
-) -> NormalEquations:
+) -> SparseNormalEquations:
     """Chain the equations of the links with the derivatives of the model.
 
     Parameters
@@ -307,6 +307,6 @@ def chain(
     np.add.at(coupling, column.reshape(-1), local[:, :pair, pair:].reshape(count * pair, -1))
     gradient_poses = np.zeros(total + 1)
     np.add.at(gradient_poses, column.reshape(-1), gradient[:, :pair].reshape(-1))
-    return NormalEquations(
+    return SparseNormalEquations(
         poses, coupling[:-1], local[:, pair:, pair:].sum(axis=0), gradient_poses[:-1], gradient[:, pair:].sum(axis=0)
     )

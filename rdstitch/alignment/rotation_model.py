@@ -51,20 +51,20 @@ class RotationModel:
         by_focal = np.array([[focal], [focal], [0.0]]) * rotations
         return ModelMatrices(matrices, by_pose, by_focal[:, None])
 
-    def natural(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def physical_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Log f itself."""
         return shared, np.eye(1)
 
-    def shared_from(self, natural: FloatArray) -> FloatArray:
+    def shared_from_physical(self, natural: FloatArray) -> FloatArray:
         """Log f."""
         return np.asarray(natural[-1:], dtype=np.float64)
 
-    def moved(self, poses: FloatArray, step: FloatArray) -> FloatArray:
+    def retract(self, poses: FloatArray, step: FloatArray) -> FloatArray:
         """Poses after a step of shape (N, 3), radians."""
         turned: FloatArray = rotation_from_vector(step) @ poses.reshape(-1, 3, 3)
         return turned.reshape(-1, 9)
 
-    def offsets(self, poses: FloatArray) -> FloatArray:
+    def prior_coordinates(self, poses: FloatArray) -> FloatArray:
         """Zeros: no prior speaks of a rotation."""
         return np.zeros((len(poses), 3))
 
@@ -73,7 +73,7 @@ class RotationModel:
         focal = _focal(shared)
         return np.tile(np.diag([focal, focal, 1.0]), (len(attitudes), 1, 1))
 
-    def poses_from(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+    def nearest_poses(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """The nearest rotations."""
         focal = _focal(shared)
         matrices = homographies / np.array([[focal], [focal], [1.0]])

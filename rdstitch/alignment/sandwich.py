@@ -77,7 +77,7 @@ def _errors(
     adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult, poses: FloatArray, shared: FloatArray
 ) -> FloatArray:
     """Whitened errors (M, 2) after a step."""
-    moved = adjusted.parameters.moved(adjuster.model, poses, shared, adjuster.freedom.lens)
+    moved = adjusted.parameters.retract(adjuster.model, poses, shared, adjuster.freedom.lens)
     matrices = adjuster.model.matrices(moved.poses, moved.shared).matrices
     i, j = adjuster.observations.image1, adjuster.observations.image2
     return whitened_errors(adjuster.observations, matrices[j] @ inverses(matrices)[i], moved.lens)

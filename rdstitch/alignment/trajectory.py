@@ -158,7 +158,7 @@ class TrajectoryError:
     scale: float
 
 
-def compare(estimate: Trajectory, truth: Trajectory, step: int = 1) -> TrajectoryError:
+def compare_trajectories(estimate: Trajectory, truth: Trajectory, step: int = 1) -> TrajectoryError:
     """Compare a trajectory with the true one, over the frames that both have.
 
     Relative motions are compared as the earlier frame sees them, in units of its height, so that neither the frame

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.lens_selection import EXACTNESS
-from rdstitch.alignment.model_selection import Choice, NoiseModel, choose_model, link_errors, within_reason
+from rdstitch.alignment.model_selection import ModelChoice, NoiseModel, choose_model, link_errors, within_reason
 from rdstitch.alignment.motion_models import RIGID
 from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.arrays import BoolArray
@@ -23,7 +23,7 @@ _POSSIBLE = 4.0
 """Times the noise that pairs may be off from a turn on the spot for it to be tried on all of them."""
 
 
-def choose_motion(problem: Problem, names: Sequence[str], lenses: Sequence[BoolArray] = ()) -> Choice:
+def choose_motion(problem: Problem, names: Sequence[str], lenses: Sequence[BoolArray] = ()) -> ModelChoice:
     """The turn on the spot, or the best of the models over a plane; see :func:`choose_model`.
 
     Where no model over a plane could explain the pictures better than a turn does, none is tried.
@@ -62,13 +62,13 @@ def _turns_far(turned: Fit) -> bool:
     return float((axes @ axes.T).min()) < math.cos(_FAR)
 
 
-def _choice(problem: Problem, noise: NoiseModel, turned: Fit, lenses: Sequence[BoolArray], reason: str) -> Choice:
+def _choice(problem: Problem, noise: NoiseModel, turned: Fit, lenses: Sequence[BoolArray], reason: str) -> ModelChoice:
     """The turn, with more of the lens free where that pays."""
     for lens in lenses:
         wider = problem.extend(turned, lens | turned.free_lens)
         if noise.cost(problem, wider) < noise.cost(problem, turned) and within_reason(wider):
             turned = wider
-    return Choice(turned, f"{ROTATION.name}: {reason}", noise.overdispersion)
+    return ModelChoice(turned, f"{ROTATION.name}: {reason}", noise.overdispersion)
 
 
 def _cost(noise: NoiseModel, problem: Problem, turned: Fit) -> float:

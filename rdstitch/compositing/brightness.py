@@ -20,7 +20,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box, cut, intersection
 from rdstitch.compositing.gain_compensation import estimate_gains
-from rdstitch.compositing.options import Exposure as ExposureChoice
+from rdstitch.compositing.options import ExposureMethod
 from rdstitch.compositing.photometric import Exposure, bilinear_weights, full_scale
 from rdstitch.compositing.survey import Survey, SurveyTile
 
@@ -44,7 +44,7 @@ _MEDIAN_SAMPLES, _MEDIAN_ROUNDS = 2000, 4
 def estimate_exposure(
     survey: Survey,
     cameras: Sequence[Camera],
-    choice: ExposureChoice = "balanced",
+    method: ExposureMethod = "balanced",
     exposures: Sequence[float | None] | None = None,
 ) -> Exposure:
     """What makes pictures agree where they overlap, with the median brightness of the set kept.
@@ -53,7 +53,7 @@ def estimate_exposure(
     ----------
     survey : Survey
     cameras : sequence of Camera
-    choice : str
+    method : str
         "gain": one factor per picture and channel, and one vignetting for all. "blocks": also a smooth field per
         picture. "balanced": gains and fields that stay near the pictures' own brightness at large scale, and nothing
         is clipped.
@@ -61,13 +61,13 @@ def estimate_exposure(
         See :func:`rdstitch.compositing.gain_compensation.estimate_gains`.
     """
     exposure = estimate_gains(survey, cameras, exposures)
-    cells = None if choice == "gain" else _compare(survey, exposure)
+    cells = None if method == "gain" else _compare(survey, exposure)
     if cells is not None:
         wanted, sigma = np.zeros_like(exposure.log_gain), _GAIN_SIGMA
-        if choice == "balanced":
+        if method == "balanced":
             wanted, sigma = -_brightness_around(cells, exposure.log_gain), _OWN_SIGMA
         exposure = replace(exposure, fields=_fit_fields(cells, exposure, cameras, wanted, sigma))
-    if choice == "balanced" and any(t is not None and t.pixels.dtype.kind == "u" for t in survey.tiles):
+    if method == "balanced" and any(t is not None and t.pixels.dtype.kind == "u" for t in survey.tiles):
         exposure = replace(exposure, knee=_KNEE)
     return _with_median_kept(exposure, survey, cameras)
 

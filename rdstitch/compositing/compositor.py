@@ -14,7 +14,7 @@ from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photo_sphere import photo_sphere_xmp
 from rdstitch.compositing.photometric import Exposure
-from rdstitch.compositing.preparation import OutputStrip, ShareProgress, prepare
+from rdstitch.compositing.preparation import OutputStrip, ShareProgress, prepare_composite
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.compositing.source_images import PictureLoader, Preview
 from rdstitch.compositing.warp import Displacement
@@ -133,7 +133,7 @@ def compose(
     LimitError
         When the memory limit is too low.
     """
-    with prepare(
+    with prepare_composite(
         sources, cameras, homographies, canvas, options, progress, previews, exposures, displacements
     ) as prepared:
         renderer, (width, height) = prepared.renderer, prepared.canvas.size
@@ -195,7 +195,7 @@ def compose_to_file(
             covered += int(np.count_nonzero(alpha))
             yield samples, alpha
 
-    with prepare(
+    with prepare_composite(
         sources, cameras, homographies, canvas, options, progress, previews, exposures, displacements
     ) as prepared:
         renderer, size = prepared.renderer, prepared.canvas.size

@@ -6,12 +6,12 @@ from typing import Literal, get_args, get_type_hints
 
 from rdstitch.errors import ArgumentError
 
-Exposure = Literal["none", "gain", "blocks", "balanced"]
+ExposureMethod = Literal["none", "gain", "blocks", "balanced"]
 Seam = Literal["none", "voronoi", "graphcut"]
 Blend = Literal["none", "feather", "multiband"]
 Crop = Literal["none", "auto"]
-Projection = Literal["auto", "plane", "cylinder", "sphere", "mercator"]
-PROJECTIONS: tuple[Projection, ...] = get_args(Projection)
+ProjectionName = Literal["auto", "plane", "cylinder", "sphere", "mercator"]
+PROJECTIONS: tuple[ProjectionName, ...] = get_args(ProjectionName)
 Interpolation = Literal["linear", "cubic", "lanczos"]
 
 
@@ -70,11 +70,11 @@ class CompositeOptions:
         When a value is not one of those listed.
     """
 
-    exposure: Exposure = "balanced"
+    exposure: ExposureMethod = "balanced"
     seam: Seam = "graphcut"
     blend: Blend = "multiband"
     crop: Crop = "none"
-    projection: Projection = "auto"
+    projection: ProjectionName = "auto"
     scale: float = 1.0
     max_size: int | None = None
     quality: int = 95

@@ -22,7 +22,7 @@ _UNIT, _UNITS_PER_TURN = 32, 256
 
 
 @dataclass(frozen=True)
-class View:
+class SeenDirections:
     """What pictures show of the directions around their centre.
 
     Attributes
@@ -38,7 +38,7 @@ class View:
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Width and height of the view, radians."""
+        """Width and height of the field of view, radians."""
         low, high = self.bounds
         return (TURN if self.around else float(high[0] - low[0])), float(high[1] - low[1])
 
@@ -49,7 +49,7 @@ class View:
         return everything.min(axis=0), everything.max(axis=0)
 
 
-def view_of(cameras: Sequence[Camera], directions: FloatArray) -> View:
+def seen_directions(cameras: Sequence[Camera], directions: FloatArray) -> SeenDirections:
     """What pictures show.
 
     Parameters
@@ -63,24 +63,24 @@ def view_of(cameras: Sequence[Camera], directions: FloatArray) -> View:
     high = np.array([outline[:, 0].max() for outline in outlines])
     gap = _widest_gap(low, high)
     if gap is None:
-        return View(tuple(outlines), True)
+        return SeenDirections(tuple(outlines), True)
     # From the middle of what nobody shows on, everything is in one piece.
     shifts = np.floor((0.5 * (low + high) - gap) / TURN) * TURN
     moved = [outline - (shift, 0.0) for outline, shift in zip(outlines, shifts, strict=True)]
     back = np.rint(np.mean([outline[:, 0].mean() for outline in moved]) / TURN) * TURN
-    return View(tuple(outline - (back, 0.0) for outline in moved), False)
+    return SeenDirections(tuple(outline - (back, 0.0) for outline in moved), False)
 
 
-def choose_projection(view: View) -> Projection:
+def choose_projection(seen: SeenDirections) -> Projection:
     """The plane for what fits on it, the cylinder for what is wide and low, the sphere for the rest.
 
     A full turn is always shown on the sphere, since viewers that turn it know no other projection.
     """
-    low, high = view.bounds
+    low, high = seen.bounds
     steepest = float(max(-low[1], high[1]))
-    if max(view.extent) <= _PLANE_VIEW and steepest <= _PLANE_VIEW / 2:
+    if max(seen.extent) <= _PLANE_VIEW and steepest <= _PLANE_VIEW / 2:
         return PLANE
-    return Projection("cylinder" if not view.around and 2.0 * steepest <= _CYLINDER_HEIGHT else "sphere")
+    return Projection("cylinder" if not seen.around and 2.0 * steepest <= _CYLINDER_HEIGHT else "sphere")
 
 
 def plan_panorama(
@@ -101,7 +101,7 @@ def plan_panorama(
     directions : ndarray of shape (N, 3, 3)
         From undistorted normalized coordinates of each picture to directions.
     projection : str
-        "plane", "cylinder", "sphere", "mercator", or "auto": what suits the view.
+        "plane", "cylinder", "sphere", "mercator", or "auto": what suits the field of view.
     scale, rotate, reference, names
         As for :func:`rdstitch.compositing.plan_canvas`.
 
@@ -112,25 +112,27 @@ def plan_panorama(
     LimitError
         When a picture looks farther than the projection shows, or the canvas would be absurd.
     """
-    view = view_of(cameras, directions)
-    chosen = choose_projection(view) if projection == "auto" else Projection(projection)
+    seen = seen_directions(cameras, directions)
+    chosen = choose_projection(seen) if projection == "auto" else Projection(projection)
     if chosen == PLANE:
         return plan_canvas(cameras, directions, scale=scale, rotate=rotate, reference=reference, names=names)
     called = [f"picture {k + 1}" for k in range(len(cameras))] if names is None else list(names)
     lengths = np.linalg.norm(directions, axis=1)
     focal = lengths[:, 2] / lengths[:, 0] * [camera.half_diagonal for camera in cameras]
     resolution = scale * float(np.median(focal) if reference is None else focal[reference])
-    canvas = _lay_out(view, chosen, resolution, rotate, called)
+    canvas = _lay_out(seen, chosen, resolution, rotate, called)
     refuse_scale(cameras, np.array(canvas.size, dtype=np.float64))
     return canvas
 
 
-def _lay_out(view: View, projection: Projection, resolution: float, rotate: float, names: Sequence[str]) -> Canvas:
-    """The canvas that holds a view.
+def _lay_out(
+    seen: SeenDirections, projection: Projection, resolution: float, rotate: float, names: Sequence[str]
+) -> Canvas:
+    """The canvas that holds a field of view.
 
     Parameters
     ----------
-    view : View
+    seen : SeenDirections
     projection : Projection
         Not the plane.
     resolution : float
@@ -140,16 +142,16 @@ def _lay_out(view: View, projection: Projection, resolution: float, rotate: floa
     names : sequence of str
         What to call the pictures in messages.
     """
-    for outline, name in zip(view.outlines, names, strict=True):
+    for outline, name in zip(seen.outlines, names, strict=True):
         if projection.name != "sphere" and np.abs(outline[:, 1]).max() > projection.largest_latitude:
             raise LimitError(
                 f"{name}: looks too far up or down for the {projection.name} projection; use --projection sphere"
             )
-    if view.around and rotate:
+    if seen.around and rotate:
         raise ArgumentError("a panorama that goes all the way round cannot be turned; leave out --rotate")
-    places = [_places(outline, projection) for outline in view.outlines]
+    places = [_places(outline, projection) for outline in seen.outlines]
     period = None
-    if view.around:
+    if seen.around:
         width = TURN * resolution
         unit = max(_UNIT, 1 << int(math.log2(max(width / _UNITS_PER_TURN, 1.0))))
         period = float(math.ceil(width / unit) * unit)

@@ -124,7 +124,7 @@ class Prepared:
 
 
 @contextmanager
-def prepare(
+def prepare_composite(
     sources: Sequence[PictureLoader],
     cameras: Sequence[Camera],
     homographies: ArrayLike,

@@ -13,7 +13,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.features.detection import Detection, find
 from rdstitch.features.keypoints import Features
 from rdstitch.features.options import CLOSER, KINDS, FeatureOptions
-from rdstitch.features.picture import Image, Mask, PreparedPicture, View, prepare
+from rdstitch.features.picture import Mask, PixelArray, PreparedPicture, View, prepare
 from rdstitch.features.spread import spread, strongest
 from rdstitch.opencv_state import one_opencv_thread
 
@@ -31,7 +31,7 @@ ViewLoader = Callable[[float | None], View]
 _FEW = 0.5  # of the keypoints wanted: where a reduced picture shows fewer, a larger one is used
 
 
-def detect(image: Image, options: FeatureOptions | None = None, mask: Mask | None = None) -> Features:
+def detect(image: PixelArray, options: FeatureOptions | None = None, mask: Mask | None = None) -> Features:
     """Detect and describe the features of one picture.
 
     Parameters

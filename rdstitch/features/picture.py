@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 
-Image = NDArray[Any]
+PixelArray = NDArray[Any]
 """Of uint8, uint16 or float."""
 
 Mask = NDArray[Any]
@@ -34,7 +34,7 @@ class View:
         Width and height of the whole picture, pixels; where it is not given, this is the whole.
     """
 
-    image: Image
+    image: PixelArray
     mask: Mask | None = None
     reduction: int = 1
     image_size: tuple[int, int] | None = None
@@ -112,7 +112,7 @@ def prepare(view: View, work_megapixels: float | None) -> PreparedPicture:
     return PreparedPicture(grey, None if usable is None else _clearance(usable), shrink, view.full_size)
 
 
-def _usable(image: Image, mask: Mask | None) -> NDArray[np.bool_] | None:
+def _usable(image: PixelArray, mask: Mask | None) -> NDArray[np.bool_] | None:
     """Where all of mask, alpha and finiteness allow features, or None for everywhere."""
     parts: list[NDArray[np.bool_]] = []
     if mask is not None:
@@ -127,7 +127,7 @@ def _usable(image: Image, mask: Mask | None) -> NDArray[np.bool_] | None:
     return np.logical_and.reduce(parts) if parts else None
 
 
-def _grey(image: Image) -> Image:
+def _grey(image: PixelArray) -> PixelArray:
     """Luminance of grey, grey with alpha, RGB and RGB with alpha; float64 counts as float32."""
     if image.dtype.kind == "f":
         image = image.astype(np.float32)
@@ -140,7 +140,7 @@ def _grey(image: Image) -> Image:
     return cv2.cvtColor(image[..., :3], cv2.COLOR_RGB2GRAY)
 
 
-def _eight_bits(grey: Image, usable: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
+def _eight_bits(grey: PixelArray, usable: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
     """Stretch deeper pictures to 8 bits by percentiles of the part that is used, not by single hot pixels."""
     if grey.dtype == np.uint8:
         return np.ascontiguousarray(grey, dtype=np.uint8)

@@ -2,9 +2,9 @@
 
 from rdstitch.local_alignment.estimate import (
     MOST_CELLS,
-    Choice,
     HeldOut,
     LocalAlignment,
+    LocalAlignmentMode,
     align_locally,
     no_local_alignment,
 )
@@ -13,10 +13,10 @@ from rdstitch.local_alignment.matches import Match
 
 __all__ = [
     "MOST_CELLS",
-    "Choice",
     "DisplacementField",
     "HeldOut",
     "LocalAlignment",
+    "LocalAlignmentMode",
     "Match",
     "align_locally",
     "no_local_alignment",

@@ -12,7 +12,7 @@ from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.fit import Stiffness, fit_fields, picture_fields
 from rdstitch.local_alignment.matches import Match, PlaneMatches, place_matches, plane_scale
 
-Choice = Literal["auto", "off"] | int
+LocalAlignmentMode = Literal["auto", "off"] | int
 
 MOST_CELLS = 100
 _CELLS = 12
@@ -67,7 +67,7 @@ def no_local_alignment(reason: str) -> LocalAlignment:
 
 
 def align_locally(
-    matches: Sequence[Match], cameras: Sequence[Camera], homographies: FloatArray, choice: Choice = "auto"
+    matches: Sequence[Match], cameras: Sequence[Camera], homographies: FloatArray, choice: LocalAlignmentMode = "auto"
 ) -> LocalAlignment:
     """Smooth displacement fields that bring matches of overlapping pictures together.
 

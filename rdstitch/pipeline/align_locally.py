@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from rdstitch.local_alignment import Choice, LocalAlignment, Match, align_locally, no_local_alignment
+from rdstitch.local_alignment import LocalAlignment, LocalAlignmentMode, Match, align_locally, no_local_alignment
 from rdstitch.registration import Registration
 
 
-def align_registration_locally(registration: Registration, choice: Choice) -> LocalAlignment:
+def align_registration_locally(registration: Registration, choice: LocalAlignmentMode) -> LocalAlignment:
     """Displacement fields of the pictures that are used, in their order, from the matches of all their pairs.
 
     Parameters

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.compositing.panorama_canvas import view_of
+from rdstitch.compositing.panorama_canvas import seen_directions
 from rdstitch.registration import Registration
 from rdstitch.report.geometry import middle
 from rdstitch.report.svg import BLUE, GREY, RED, drawing, element, label, path, section
@@ -18,7 +18,7 @@ def view_directions(registration: Registration) -> str:
     """The sphere around the camera, laid out by longitude and latitude, with the outline of every picture on it."""
     alignment = registration.alignment
     used = np.flatnonzero(alignment.used).tolist()
-    view = view_of([alignment.cameras[k] for k in used], alignment.homographies[used])
+    view = seen_directions([alignment.cameras[k] for k in used], alignment.homographies[used])
     scale = (_WIDTH - 2 * _MARGIN) / 360.0
     height = 180.0 * scale + 2 * _MARGIN
     parts = _grid(scale)

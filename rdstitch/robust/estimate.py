@@ -13,7 +13,7 @@ from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.model_selection import PairFit, PairSelection, rms_of, select_models
-from rdstitch.robust.pair_models import HomographyModel, PairModel, PlanarModel
+from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 from rdstitch.robust.ransac import RansacOptions, ransac
 from rdstitch.robust.verification import LEAST_PLACES, places, rejection_reason
 
@@ -279,8 +279,8 @@ def _solvers(options: EstimationOptions, focal: float, focal_std: float, tilts_k
 
 
 def _models(focal: float, focal_std: float, tilts_known: bool) -> list[PairModel]:
-    planar = [PlanarModel(focal, focal_std, tilts_known, height_free=free) for free in (False, True)]
-    return [*planar, HomographyModel()]
+    planar = [PlanarPairModel(focal, focal_std, tilts_known, height_free=free) for free in (False, True)]
+    return [*planar, HomographyPairModel()]
 
 
 def _result(
@@ -303,7 +303,7 @@ def _result(
         covariance=fit.covariance,
         distortion_std=fit.distortion_std,
         model=fit.model.name,
-        motion=fit.model.motion(fit.state) if isinstance(fit.model, PlanarModel) else None,
+        motion=fit.model.motion(fit.state) if isinstance(fit.model, PlanarPairModel) else None,
         rms=float(rms_of(errors[None], threshold)[0]),
         solver=solver,
         iterations=iterations,

@@ -15,7 +15,7 @@ _FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e-9, 1e4
 
 
 @dataclass
-class NormalEquations:
+class BatchedNormalEquations:
     """The loss of B problems at some parameters, and what a step from there takes.
 
     Attributes
@@ -39,7 +39,7 @@ class Problems(Protocol):
         """Some of them."""
         ...
 
-    def normal_equations(self, parameters: FloatArray) -> NormalEquations:
+    def normal_equations(self, parameters: FloatArray) -> BatchedNormalEquations:
         """At parameters (B, K)."""
         ...
 
@@ -63,14 +63,14 @@ def descend(problems: Problems, retract: Retract, start: FloatArray, iterations:
         if not going.all():
             rows, step, parameters, damping = rows[going], step[going], parameters[going], damping[going]
             problems = problems.take(going)
-            current = NormalEquations(current.cost[going], current.information[going], current.gradient[going])
+            current = BatchedNormalEquations(current.cost[going], current.information[going], current.gradient[going])
         if not len(rows):
             break
         moved, possible = retract(parameters, step)
         there = problems.normal_equations(moved)
         better = possible & (there.cost < current.cost)
         parameters = np.where(better[:, None], moved, parameters)
-        current = NormalEquations(
+        current = BatchedNormalEquations(
             np.where(better, there.cost, current.cost),
             np.where(better[:, None, None], there.information, current.information),
             np.where(better[:, None], there.gradient, current.gradient),
@@ -80,7 +80,7 @@ def descend(problems: Problems, retract: Retract, start: FloatArray, iterations:
     return result
 
 
-def _damped_step(equations: NormalEquations, damping: FloatArray) -> FloatArray:
+def _damped_step(equations: BatchedNormalEquations, damping: FloatArray) -> FloatArray:
     """Steps (B, P); NaN where the equations are singular or not finite."""
     diagonal = np.einsum("bpp->bp", equations.information)
     largest = diagonal.max(axis=1, keepdims=True)

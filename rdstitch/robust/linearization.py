@@ -23,7 +23,7 @@ _ENTRY[_PAIRS] = _ENTRY.T[_PAIRS] = np.arange(6)
 
 
 @dataclass(frozen=True)
-class Lens:
+class PairLenses:
     """The lens of each of B pairs, in the half-diagonal frame; shapes (B,), and (B, 2) for the centre.
 
     Where only ``distortion`` is given, it is that of both images, and nothing else is to be estimated.
@@ -72,7 +72,7 @@ class TransferDerivatives:
         return dx * (xx * dx + 2.0 * xy * dy) + yy * dy * dy
 
 
-def differentiate(homography: FloatArray, lens: Lens, data: Measurements) -> TransferDerivatives:
+def differentiate(homography: FloatArray, lens: PairLenses, data: Measurements) -> TransferDerivatives:
     """Transfer the matches of each pair from image 1 to image 2, with all derivatives.
 
     With ``u = z_xy / z_w`` and d the distorted point, ``g = 1 + λ ρ² + μ ρ⁴``, ``ρ = |d|``, ``k = g - (2λ + 4μρ²) ρ²``:
@@ -81,7 +81,7 @@ def differentiate(homography: FloatArray, lens: Lens, data: Measurements) -> Tra
     Parameters
     ----------
     homography : ndarray of shape (B, 3, 3)
-    lens : Lens
+    lens : PairLenses
     data : Measurements
     """
     first = lens.distortion[:, None]

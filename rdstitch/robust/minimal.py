@@ -8,7 +8,7 @@ import numpy as np
 
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
-from rdstitch.robust.pair_models import HomographyModel, PairModel, PlanarModel
+from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 from rdstitch.solvers.solutions import Solutions
 
 Solve = Callable[[FloatArray, FloatArray, FloatArray | None], Solutions]
@@ -56,15 +56,15 @@ def minimal_solvers(focal: float, focal_std: float, tilts_known: bool, distortio
     distortion : float or None
         Known λ in the half-diagonal frame.
     """
-    rigid = PlanarModel(focal, focal_std, tilts_known)
-    similarity = PlanarModel(focal, focal_std, tilts_known, height_free=True)
+    rigid = PlanarPairModel(focal, focal_std, tilts_known)
+    similarity = PlanarPairModel(focal, focal_std, tilts_known, height_free=True)
     if distortion is not None:
         known = distortion * focal**2
         points2 = partial(solvers.two_point_similarity, distortion=known)
         dlt = partial(solvers.four_point_dlt, distortion=distortion)
         return [
             MinimalSolver("two_point_similarity", 2, _tilted(points2, focal), similarity, True),
-            MinimalSolver("four_point_dlt", 4, _untilted(dlt), HomographyModel(), True),
+            MinimalSolver("four_point_dlt", 4, _untilted(dlt), HomographyPairModel(), True),
         ]
     low, high = DISTORTION_RANGE
     searched = {"distortion_range": (low * focal**2, high * focal**2)}
@@ -79,7 +79,7 @@ def minimal_solvers(focal: float, focal_std: float, tilts_known: bool, distortio
         planar,
         MinimalSolver("three_point_similarity", 3, _tilted(scaled, focal), similarity),
         MinimalSolver("four_point", 4, _untilted(four_point, focal), rigid),
-        MinimalSolver("five_point", 5, _untilted(five_point), HomographyModel()),
+        MinimalSolver("five_point", 5, _untilted(five_point), HomographyPairModel()),
     ]
 
 

@@ -10,8 +10,8 @@ from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.division_model import OBSERVABLE_STD
 from rdstitch.robust.covariance import covariances
 from rdstitch.robust.measurements import Measurements
-from rdstitch.robust.pair_models import HomographyModel, PairModel
-from rdstitch.robust.refinement import Fits, Inspection, PairProblems, refine
+from rdstitch.robust.pair_models import HomographyPairModel, PairModel
+from rdstitch.robust.refinement import Fits, Inspection, PairProblems, refine_pairs
 
 _LEAST_NOISE = 0.02  # pixels; below, noise-free data would reject every model over rounding
 _RAYLEIGH_MEDIAN = 1.1774  # median length of a two-dimensional normal vector of standard deviation 1
@@ -94,7 +94,7 @@ class PairSelection:
         """A model fitted to every pair from where it stands, with a loss of the given widths (B,), pixels."""
         start = Fits(model.initialize(self.homography, self.tilts), self.homography, self.distortion)
         problems = PairProblems(model, self.data, width, self.noise, self.fixed_distortion)
-        fits = refine(problems, start, steps)
+        fits = refine_pairs(problems, start, steps)
         return fits, problems.inspect(fits)
 
     def at(self, fits: Fits) -> Self:
@@ -111,12 +111,12 @@ def select_models(models: list[PairModel], pairs: PairSelection) -> list[PairFit
     Parameters
     ----------
     models : list of PairModel
-        From least to most free; the last one is a :class:`HomographyModel`.
+        From least to most free; the last one is a :class:`HomographyPairModel`.
     pairs : PairSelection
         ``noise`` is estimated anew.
     """
     threshold = pairs.threshold
-    free, seen = pairs.fit(HomographyModel(), np.full(len(pairs.data), threshold), _FREE_STEPS)
+    free, seen = pairs.fit(HomographyPairModel(), np.full(len(pairs.data), threshold), _FREE_STEPS)
     noise = noise_of(seen.errors, threshold)
     near = replace(pairs.at(free), noise=noise, data=pairs.data.only(seen.errors < _NEAR * threshold))
     inliers = np.maximum((seen.errors < threshold).sum(axis=1), 1)

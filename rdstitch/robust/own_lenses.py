@@ -16,13 +16,13 @@ from rdstitch.camera import LENS_STD
 from rdstitch.division_model import MAX_ABS_DISTORTION
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust.covariance import covariances
-from rdstitch.robust.levenberg_marquardt import NormalEquations, descend
-from rdstitch.robust.linearization import Lens, differentiate, entry_equations, influence
+from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations, descend
+from rdstitch.robust.linearization import PairLenses, differentiate, entry_equations, influence
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.model_selection import loss_width, noise_of
-from rdstitch.robust.pair_models import HomographyModel
+from rdstitch.robust.pair_models import HomographyPairModel
 
-_HOMOGRAPHY = HomographyModel()
+_HOMOGRAPHY = HomographyPairModel()
 _OWN_STD = LENS_STD[[0, 0, 1, 3, 4]]  # of λ of image 1, λ of image 2, μ, and the distortion centre
 _LENS = len(_OWN_STD)
 _ITERATIONS = 10
@@ -91,7 +91,7 @@ class _Problems:
         """Some of them."""
         return type(self)(self.data.take(rows), self.scale[rows], self.noise[rows])
 
-    def normal_equations(self, parameters: FloatArray) -> NormalEquations:
+    def normal_equations(self, parameters: FloatArray) -> BatchedNormalEquations:
         """Loss, normal matrix and gradient; the lens has priors."""
         found = differentiate(*_parts(parameters), self.data)
         entries = entry_equations(found, self.data.present, self.scale, True)
@@ -101,7 +101,7 @@ class _Problems:
         lens, weight = parameters[:, :_LENS] / _OWN_STD, self.noise**2
         information[:, :_LENS, :_LENS] += weight[:, None, None] * np.diag(_OWN_STD**-2.0)
         gradient[:, :_LENS] += weight[:, None] * lens / _OWN_STD
-        return NormalEquations(entries.cost + weight * (lens**2).sum(axis=1), information, gradient)
+        return BatchedNormalEquations(entries.cost + weight * (lens**2).sum(axis=1), information, gradient)
 
     def errors(self, parameters: FloatArray) -> FloatArray:
         """Whitened transfer errors, pixels, (B, N); inf where there is no transfer, or no match."""
@@ -116,10 +116,10 @@ class _Problems:
         return influence(found, self.data.present, self.scale, True) @ _chain(parameters)
 
 
-def _parts(parameters: FloatArray) -> tuple[FloatArray, Lens]:
+def _parts(parameters: FloatArray) -> tuple[FloatArray, PairLenses]:
     """Homographies and lenses."""
     first, second, mu = parameters[:, :3].T
-    return _HOMOGRAPHY.homography(parameters[:, _LENS:]), Lens(first, second, mu, parameters[:, 3:_LENS])
+    return _HOMOGRAPHY.homography(parameters[:, _LENS:]), PairLenses(first, second, mu, parameters[:, 3:_LENS])
 
 
 def _chain(parameters: FloatArray) -> FloatArray:

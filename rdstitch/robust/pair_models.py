@@ -50,7 +50,7 @@ class PairModel(Protocol):
 
 
 @dataclass(frozen=True)
-class HomographyModel:
+class HomographyPairModel:
     """Any homography, at unit norm: eight degrees of freedom orthogonal to H itself."""
 
     name: str = "homography"
@@ -82,7 +82,7 @@ class HomographyModel:
 
 
 @dataclass(frozen=True)
-class PlanarModel:
+class PlanarPairModel:
     """Planar motion ``H ~ K R2 Rz(φ) diag(1, 1, height) T R1' K⁻¹``, ``K = diag(focal, focal, 1)``.
 
     Attributes

@@ -10,8 +10,8 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
-from rdstitch.robust.pair_models import HomographyModel, PairModel
-from rdstitch.robust.refinement import Fits, PairProblems, refine
+from rdstitch.robust.pair_models import HomographyPairModel, PairModel
+from rdstitch.robust.refinement import Fits, PairProblems, refine_pairs
 from rdstitch.robust.sampling import Sampler
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
 from rdstitch.solvers.solutions import Solutions
@@ -242,10 +242,10 @@ class _Lane:
     def _optimized(self, start: Hypotheses, data: Measurements, rows: IntArray) -> Hypotheses:
         """The best of each hypothesis, its refinement in the model it assumes, and from there as a free homography."""
         best = self._refined(start, data, rows, self._solver.model, 3.0 * self._options.threshold)
-        if isinstance(self._solver.model, HomographyModel):
+        if isinstance(self._solver.model, HomographyPairModel):
             return self._refined(best, data, rows, self._solver.model, self._options.threshold)
         enough = best.inliers.sum(axis=1) >= _FREE_REFINEMENT
-        for chosen, model in ((enough, HomographyModel()), (~enough, self._solver.model)):
+        for chosen, model in ((enough, HomographyPairModel()), (~enough, self._solver.model)):
             part = np.flatnonzero(chosen)
             if len(part):
                 refined = self._refined(best.take(part), data.take(part), rows[part], model, self._options.threshold)
@@ -260,7 +260,7 @@ class _Lane:
             model, data, np.full(len(data), scale), np.ones(len(data)), self._solver.fixed_distortion
         )
         state = model.initialize(start.homography, None if self._tilts is None else self._tilts[rows])
-        fits = refine(problems, Fits(state, start.homography, start.distortion), _LOCAL_STEPS)
+        fits = refine_pairs(problems, Fits(state, start.homography, start.distortion), _LOCAL_STEPS)
         judged = Hypotheses.judged(fits.homography, fits.distortion, data, self._options.threshold, self._index)
         result = start.take(np.arange(len(data)))
         result.put(np.arange(len(data)), judged, judged.cost < start.cost)

@@ -7,8 +7,8 @@ import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.division_model import MAX_ABS_DISTORTION
-from rdstitch.robust.levenberg_marquardt import NormalEquations, descend
-from rdstitch.robust.linearization import Lens, TransferDerivatives, differentiate, entry_equations, influence
+from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations, descend
+from rdstitch.robust.linearization import PairLenses, TransferDerivatives, differentiate, entry_equations, influence
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import PairModel
 
@@ -67,13 +67,13 @@ class PairProblems:
         """Some of them."""
         return type(self)(self.model, self.data.take(rows), self.scale[rows], self.noise[rows], self.fixed_distortion)
 
-    def normal_equations(self, parameters: FloatArray) -> NormalEquations:
+    def normal_equations(self, parameters: FloatArray) -> BatchedNormalEquations:
         """Loss, normal matrix and gradient."""
         distortion, state = parameters[:, 0], parameters[:, 1:]
-        found = differentiate(self.model.homography(state), Lens(distortion), self.data)
+        found = differentiate(self.model.homography(state), PairLenses(distortion), self.data)
         return self._equations(found, state, self.chain(state))
 
-    def _equations(self, found: TransferDerivatives, state: FloatArray, chain: FloatArray) -> NormalEquations:
+    def _equations(self, found: TransferDerivatives, state: FloatArray, chain: FloatArray) -> BatchedNormalEquations:
         entries = entry_equations(found, self.data.present, self.scale, not self.fixed_distortion)
         information = np.swapaxes(chain, 1, 2) @ entries.information @ chain
         gradient = np.einsum("bkp,bk->bp", chain, entries.gradient)
@@ -85,7 +85,7 @@ class PairProblems:
             information[:, free:, free:] += weight[:, None, None] * (by_state.T @ by_state)
             gradient[:, free:] += weight[:, None] * (residual @ by_state)
             cost = cost + weight * (residual**2).sum(axis=1)
-        return NormalEquations(cost, information, gradient)
+        return BatchedNormalEquations(cost, information, gradient)
 
     def chain(self, state: FloatArray) -> FloatArray:
         """Derivative of the entries of H and λ by λ and the model's parameters, (B, 9 + E, E + P)."""
@@ -107,7 +107,7 @@ class PairProblems:
 
     def inspect(self, fits: Fits) -> Inspection:
         """Errors, loss and influence of the matches at fits."""
-        found = differentiate(fits.homography, Lens(fits.distortion), self.data)
+        found = differentiate(fits.homography, PairLenses(fits.distortion), self.data)
         chain = self.chain(fits.state)
         equations = self._equations(found, fits.state, chain)
         errors = np.sqrt(found.squared)
@@ -117,7 +117,7 @@ class PairProblems:
 
 
 @np.errstate(all="ignore")  # a wild step may leave the lens model
-def refine(problems: PairProblems, start: Fits, iterations: int) -> Fits:
+def refine_pairs(problems: PairProblems, start: Fits, iterations: int) -> Fits:
     """Fit the model and λ by at most so many steps.
 
     Parameters

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.synthetic.lenses import Lens, focal_length
-from rdstitch.synthetic.poses import Poses, to_plane
+from rdstitch.synthetic.poses import Poses, texels_of_pixels
 
 Tilt = tuple[float, float]
 
@@ -238,7 +238,7 @@ def _extent(lens: Lens, tilt: Tilt, texels_per_pixel: float) -> FloatArray:
     (cx, cy) = (width - 1) / 2, (height - 1) / 2
     ends = [(-0.5, cy), (width - 0.5, cy), (cx, -0.5), (cx, height - 0.5)]
     pose = Poses.of((0.0, 0.0), texels_per_pixel * focal_length(lens), 0.0, tilt)
-    left, right, top, bottom = to_plane(lens, pose.from_plane()[0], ends)
+    left, right, top, bottom = texels_of_pixels(lens, pose.from_plane()[0], ends)
     extent = np.array([np.linalg.norm(right - left), np.linalg.norm(bottom - top)])
     if not np.isfinite(extent).all():
         raise ArgumentError("the picture sees beyond the horizon or beyond its lens")

@@ -13,7 +13,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.synthetic.lenses import Lens, focal_length
 from rdstitch.synthetic.poses import Poses
 from rdstitch.synthetic.rendering import Photometry, Sequence
-from rdstitch.synthetic.textures import Picture, Texture, ground
+from rdstitch.synthetic.textures import LinearPixels, Texture, ground
 
 
 def camera_rotations(heading: ArrayLike, pitch: ArrayLike = 0.0, roll: ArrayLike = 0.0) -> FloatArray:
@@ -77,7 +77,7 @@ class _Around:
         """1 for grey, 3 for RGB."""
         return self.texture.channels
 
-    def region(self, left: int, top: int, right: int, bottom: int) -> Picture:
+    def region(self, left: int, top: int, right: int, bottom: int) -> LinearPixels:
         """See :class:`Texture`."""
         width = self.texture.size[0]
         rows = self.texture.region(0, top, width, bottom)

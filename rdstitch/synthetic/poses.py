@@ -139,17 +139,17 @@ def plane_outline(lens: Lens, from_plane: FloatArray, points_per_side: int = 32)
     corners = np.array([(0, 0), (width, 0), (width, height), (0, height)], dtype=np.float64) - 0.5
     steps = np.arange(points_per_side)[:, None] / points_per_side
     border = np.concatenate([a + steps * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
-    return to_plane(lens, from_plane, border)
+    return texels_of_pixels(lens, from_plane, border)
 
 
-def to_plane(lens: Lens, from_plane: FloatArray, points: ArrayLike) -> FloatArray:
+def texels_of_pixels(lens: Lens, from_plane: FloatArray, points: ArrayLike) -> FloatArray:
     """Measured pixels (N, 2) to texels (..., N, 2); NaN beyond the horizon and outside the lens's domain."""
     pinhole = (lens.undistort(points) - np.asarray(lens.center)) / focal_length(lens)
     rays = np.concatenate([pinhole, np.ones((*pinhole.shape[:-1], 1))], axis=-1)
     return project(rays @ np.swapaxes(np.linalg.inv(from_plane), -2, -1))
 
 
-def to_picture(lens: Lens, from_plane: FloatArray, points: ArrayLike) -> FloatArray:
+def pixels_of_texels(lens: Lens, from_plane: FloatArray, points: ArrayLike) -> FloatArray:
     """Texels (N, 2) to measured pixels (..., N, 2), also outside the picture; NaN where the camera cannot see them."""
     x = np.asarray(points, dtype=np.float64)
     homogeneous = np.concatenate([x, np.ones((*x.shape[:-1], 1))], axis=-1)

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.synthetic.lenses import Lens
-from rdstitch.synthetic.poses import Poses, fit_to_plane, plane_outline, to_picture, to_plane
+from rdstitch.synthetic.poses import Poses, fit_to_plane, pixels_of_texels, plane_outline, texels_of_pixels
 from rdstitch.synthetic.relief import Relief
-from rdstitch.synthetic.textures import Picture, Texture
+from rdstitch.synthetic.textures import LinearPixels, Texture
 
 _PIXELS_PER_STRIP = 400_000
 _MAX_SAMPLES_PER_SIDE = 6
@@ -107,7 +107,7 @@ class Sequence:
 
     def to_plane(self, index: int, points: ArrayLike) -> FloatArray:
         """Measured pixels (N, 2) of one picture to points of the plane, texels; NaN beyond the horizon or the lens."""
-        return to_plane(self.lens, self.from_plane(index), points)
+        return texels_of_pixels(self.lens, self.from_plane(index), points)
 
     def to_ground(self, index: int, points: ArrayLike) -> FloatArray:
         """Measured px (N, 2) of one picture to the texels that they show; on a plane the same as :meth:`to_plane`."""
@@ -129,7 +129,7 @@ class Sequence:
 
         NaN where it cannot see them. Relief does not matter: the points lie on the plane.
         """
-        return to_picture(self.lens, self.from_plane(index), points)
+        return pixels_of_texels(self.lens, self.from_plane(index), points)
 
     def frame(self, index: int) -> NDArray[Any]:
         """Render one picture.
@@ -206,7 +206,7 @@ class Sequence:
             cv2.fillPoly(mask, [np.rint(points * 16.0).astype(np.int32)], 1, cv2.LINE_8, 4)
         return mask.astype(np.bool_)
 
-    def _light(self, index: int, top: int, bottom: int) -> Picture:
+    def _light(self, index: int, top: int, bottom: int) -> LinearPixels:
         """Rows ``top`` to ``bottom`` of a picture without noise: what falls on the sensor."""
         settings = self.photometry
         width, height = self.lens.image_size
@@ -223,7 +223,7 @@ class Sequence:
         blurred = cv2.GaussianBlur(light, (0, 0), settings.blur, borderType=cv2.BORDER_REPLICATE)
         return np.asarray(blurred, dtype=np.float32).reshape(light.shape)[apron:-apron]
 
-    def _sharp(self, index: int, top: int, bottom: int) -> Picture:
+    def _sharp(self, index: int, top: int, bottom: int) -> LinearPixels:
         """Rows ``top`` to ``bottom`` of the plane as a perfect lens and sensor see it, in [0, 1]."""
         u, v = np.arange(-1, self.lens.image_size[0] + 1), np.arange(top - 1, bottom + 1)
         wide = self.to_plane(index, np.stack(np.meshgrid(u, v), axis=-1))
@@ -256,7 +256,7 @@ def _samples_per_side(along: FloatArray, down: FloatArray) -> int:
     return int(np.clip(np.ceil(np.quantile(longest, 0.9)), 2, _MAX_SAMPLES_PER_SIDE))
 
 
-def _sample(texture: Texture, place: FloatArray) -> Picture:
+def _sample(texture: Texture, place: FloatArray) -> LinearPixels:
     """Texture interpolated at texels (h, w, 2), shape (h, w, channels); 0 outside and at NaN."""
     # NaN, a ray that meets nothing, is sent where nothing is, and does not count for the region that is needed.
     axes = [np.ascontiguousarray(place[..., k]) for k in (0, 1)]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 
-Picture = NDArray[np.float32]
+LinearPixels = NDArray[np.float32]
 
 # Periods of the two layers of an endless texture: without a common divisor, so that together they repeat only after
 # more than three million texels along each axis.
@@ -34,7 +34,7 @@ class Texture(Protocol):
     def channels(self) -> int:
         """1 for grey, 3 for RGB."""
 
-    def region(self, left: int, top: int, right: int, bottom: int) -> Picture:
+    def region(self, left: int, top: int, right: int, bottom: int) -> LinearPixels:
         """Texels of a rectangle inside the texture, shape (bottom - top, right - left, channels), in [0, 1]."""
 
 
@@ -67,11 +67,11 @@ class PictureTexture:
         """1 for grey, 3 for RGB."""
         return 1 if self.pixels.ndim == 2 else self.pixels.shape[2]
 
-    def region(self, left: int, top: int, right: int, bottom: int) -> Picture:
+    def region(self, left: int, top: int, right: int, bottom: int) -> LinearPixels:
         """See :class:`Texture`."""
         part = self.pixels[top:bottom, left:right]
         full = 1.0 if part.dtype == np.float32 else float(np.iinfo(part.dtype).max)
-        scaled: Picture = part.astype(np.float32) / np.float32(full)
+        scaled: LinearPixels = part.astype(np.float32) / np.float32(full)
         return scaled[:, :, None] if scaled.ndim == 2 else scaled
 
 
@@ -93,7 +93,7 @@ class EndlessTexture:
     seed: int
     channels: int = 3
 
-    def region(self, left: int, top: int, right: int, bottom: int) -> Picture:
+    def region(self, left: int, top: int, right: int, bottom: int) -> LinearPixels:
         """See :class:`Texture`."""
         x, y = np.arange(left, right), np.arange(top, bottom)
         layers = [_periodic_ground(period, (self.seed, period), self.channels) for period in _PERIODS]
@@ -136,7 +136,7 @@ class LinedTexture:
         """1 for grey, 3 for RGB."""
         return self.texture.channels
 
-    def region(self, left: int, top: int, right: int, bottom: int) -> Picture:
+    def region(self, left: int, top: int, right: int, bottom: int) -> LinearPixels:
         """See :class:`Texture`."""
         painted = self.texture.region(left, top, right, bottom).copy()
         x, y = np.arange(left, right), np.arange(top, bottom)[:, None]
@@ -191,7 +191,7 @@ def repeated(size: tuple[int, int], seed: int, period: int = 96, channels: int =
 
 
 @lru_cache(maxsize=8)
-def _periodic_ground(period: int, seed: tuple[int, int], channels: int) -> Picture:
+def _periodic_ground(period: int, seed: tuple[int, int], channels: int) -> LinearPixels:
     """Ground of ``period`` x ``period`` texels that continues across its borders."""
     rng = np.random.default_rng(seed)
     ground = _grained(_dead_leaves(rng, (period, period), channels, wrap=True), rng)
@@ -269,7 +269,7 @@ def _wrapped(
     return places[owner, shift], owner
 
 
-def _grained(patches: NDArray[np.uint8], rng: np.random.Generator, strength: float = 0.05) -> Picture:
+def _grained(patches: NDArray[np.uint8], rng: np.random.Generator, strength: float = 0.05) -> LinearPixels:
     """Patches with periodic 1/f texture over them, in [0, 1]."""
     height, width = patches.shape[:2]
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :])
@@ -277,5 +277,5 @@ def _grained(patches: NDArray[np.uint8], rng: np.random.Generator, strength: flo
     white = rng.standard_normal((height, width), dtype=np.float32)
     grain = np.fft.irfft2(np.fft.rfft2(white) / frequency, s=(height, width))
     grain = (strength * grain / grain.std()).astype(np.float32)
-    picture: Picture = patches.astype(np.float32) / np.float32(255.0) + grain[:, :, None]
+    picture: LinearPixels = patches.astype(np.float32) / np.float32(255.0) + grain[:, :, None]
     return np.clip(picture, 0.0, 1.0, out=picture)

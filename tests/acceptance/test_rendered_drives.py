@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import rdstitch
-from rdstitch.alignment.trajectory import compare
+from rdstitch.alignment.trajectory import compare_trajectories
 from tests.cli.running import FAST, finished, start
 from tests.floor_drives import DISTORTION, PATHS, floor_drive, read_path, true_path
 
@@ -18,7 +18,7 @@ def test_drive(path: str, tmp_path: Path) -> None:
     sequence.write(tmp_path)
     found, registration = rdstitch.trajectory([tmp_path])
     assert len(found) == len(sequence)
-    error = compare(found, true_path(sequence))
+    error = compare_trajectories(found, true_path(sequence))
     assert error.translation_in_own_unit < 0.001
     assert np.degrees(error.rotation) < 0.02
     assert abs(registration.alignment.distortion - DISTORTION) < 0.001
@@ -34,7 +34,7 @@ def test_short_drive_by_the_command(tmp_path: Path) -> None:
     assert abs(float(done.out) - DISTORTION) < 0.001
     found = read_path(output)
     assert len(found) == len(sequence)
-    error = compare(found, true_path(sequence))
+    error = compare_trajectories(found, true_path(sequence))
     assert error.translation_in_own_unit < 0.003
     assert error.drift < 0.001
     assert np.degrees(error.rotation) < 0.02

@@ -13,7 +13,7 @@ import numpy as np
 from rdstitch.alignment.align import AlignmentOptions, align
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import PlanarPoses
-from rdstitch.alignment.trajectory import Trajectory, compare
+from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
 from tests.alignment_scenes import robot_path, scene
 
 
@@ -38,7 +38,7 @@ def main(counts: Sequence[int] = (40, 80, 160, 320), models: Sequence[str] = ("a
                 p = given.poses
                 heights = np.exp(p[:, LOG_HEIGHT])
                 truth = Trajectory.from_poses(PlanarPoses(p[:, YAW], p[:, [X, Y]], heights, p[:, [PSI, THETA]]))
-                error = compare(Trajectory.from_alignment(found), truth)
+                error = compare_trajectories(Trajectory.from_alignment(found), truth)
                 row += f"{100 * error.translation_in_own_unit:11.4f}{math.degrees(error.rotation):11.4f}"
                 row += f"{100 * error.drift:11.4f}"
             print(row)

@@ -23,7 +23,7 @@ import numpy as np
 from rdstitch.compositing import CompositeOptions, plan_canvas
 from rdstitch.compositing.boxes import Float32Array
 from rdstitch.compositing.photometric import full_scale
-from rdstitch.compositing.preparation import prepare
+from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.seam_finder import NOBODY, SeamMap
 from rdstitch.compositing.source_images import PictureReader
 from rdstitch.compositing.survey import Survey, survey_pictures
@@ -86,7 +86,7 @@ def main() -> None:
     print(f"{'':10} {'gain':>13} {'saturated %':>13} {'median':>13} {'seam mean':>10} {'95 %':>6}")
     for choice in arguments.exposure:
         options = CompositeOptions(exposure=choice)
-        with prepare(read, cameras, matrices, canvas, options, previews=read) as ready:
+        with prepare_composite(read, cameras, matrices, canvas, options, previews=read) as ready:
             corrected = [
                 ready.renderer.exposure.correct(k, locate(survey.warps[k], tile.box), tile.pixels).astype(np.float32)
                 for k, tile in enumerate(survey.tiles)

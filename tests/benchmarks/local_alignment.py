@@ -25,7 +25,7 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, plan_canvas
-from rdstitch.compositing.preparation import prepare
+from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.seam_finder import NOBODY
 from rdstitch.errors import RdstitchError
 from rdstitch.inputs.source import read_sources, readers
@@ -76,7 +76,9 @@ def across_seams(truth: Sequence, registration: Registration, local: LocalAlignm
     cameras, matrices = [alignment.cameras[k] for k in used], alignment.homographies[used]
     canvas, read = plan_canvas(cameras, matrices), readers(sources)
     fields = list(local.fields) or None
-    with prepare(read, cameras, matrices, canvas, CompositeOptions(), previews=read, displacements=fields) as ready:
+    with prepare_composite(
+        read, cameras, matrices, canvas, CompositeOptions(), previews=read, displacements=fields
+    ) as ready:
         seams, warps = ready.renderer.seams, ready.renderer.warps
     assert seams is not None
     distances = []

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from rdstitch.alignment.trajectory import Trajectory, compare
+from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
 from tests.floor_drives import DISTORTION, PATHS, floor_drive, read_path, true_path
 
 _PROGRAM = "from rdstitch_cli.main import main; main()"
@@ -69,7 +69,7 @@ def main() -> None:
                 frames.mkdir()
                 sequence.write(frames)
                 run = command(frames, Path(folder) / "path.csv")
-            error, each = compare(run.path, true_path(sequence)), run.processor / count
+            error, each = compare_trajectories(run.path, true_path(sequence)), run.processor / count
             least = each if math.isnan(least) else least
             row = f"{name:>12}{count:12d}{len(run.path):12d}"
             row += f"{100 * error.translation_in_own_unit:12.4f}{100 * error.drift:12.4f}"

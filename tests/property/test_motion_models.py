@@ -26,7 +26,7 @@ def test_a_change_of_the_planes_frame_leaves_all_relations(change: np.ndarray, g
     generators = poses @ frame @ np.linalg.inv(poses)
     basis = _TRACELESS.reshape(8, 9)
     step = np.linalg.lstsq(basis.T, generators.reshape(3, 9).T, rcond=None)[0].T
-    moved = HOMOGRAPHY.moved(poses.reshape(3, 9), step).reshape(3, 3, 3)
+    moved = HOMOGRAPHY.retract(poses.reshape(3, 9), step).reshape(3, 3, 3)
     np.testing.assert_allclose(_relations(moved), _relations(poses), atol=1e-8)
 
 
@@ -41,7 +41,7 @@ def test_moving_the_plane_rigidly_leaves_all_relations(
 ) -> None:
     """Position and yaw are relative: the whole path may be moved over the plane."""
     poses = np.column_stack([planar, np.zeros((3, 2))])
-    shared = SIMILARITY.shared_from(natural)
+    shared = SIMILARITY.shared_from_physical(natural)
     c, s = np.cos(turn), np.sin(turn)
     moved = poses.copy()
     moved[:, 1:3] = poses[:, 1:3] @ np.array([[c, -s], [s, c]]).T + shift
@@ -52,7 +52,7 @@ def test_moving_the_plane_rigidly_leaves_all_relations(
 
 @given(arrays(float, (2, 6), elements=_numbers(-0.5, 0.5)), arrays(float, 3, elements=_numbers(-0.3, 0.3)))
 def test_inverses_are_inverses(poses: np.ndarray, natural: np.ndarray) -> None:
-    matrices = TILTING.matrices(poses, TILTING.shared_from(natural)).matrices
+    matrices = TILTING.matrices(poses, TILTING.shared_from_physical(natural)).matrices
     np.testing.assert_allclose(inverses(matrices) @ matrices, np.broadcast_to(np.eye(3), (2, 3, 3)), atol=1e-9)
 
 

@@ -12,7 +12,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.robust import estimate_radial_homography
 from rdstitch.synthetic import Poses, line_poses, parking_poses, turn_poses
-from rdstitch.synthetic.poses import to_picture, to_plane
+from rdstitch.synthetic.poses import pixels_of_texels, texels_of_pixels
 
 PATHS = {"line": line_poses, "turn": turn_poses, "parallel parking": parking_poses}
 
@@ -126,7 +126,7 @@ def _matches(
     """Noisy matches between two pictures, some of them wrong."""
     limit = np.array(camera.image_size) - 1.0
     points1 = rng.uniform((0.0, 0.0), limit, (_PER_PICTURE, 2))
-    points2 = to_picture(camera, from_plane[1], to_plane(camera, from_plane[0], points1))
+    points2 = pixels_of_texels(camera, from_plane[1], texels_of_pixels(camera, from_plane[0], points1))
     seen = ((points2 >= 0.0) & (points2 <= limit)).all(axis=1)
     points1, points2 = points1[seen], points2[seen]
     wrong = rng.random(len(points2)) < _WRONG

@@ -12,7 +12,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver, Solve, minimal_solvers
-from rdstitch.robust.pair_models import HomographyModel
+from rdstitch.robust.pair_models import HomographyPairModel
 from rdstitch.robust.sampling import Sampler
 from rdstitch.robust.scoring import plausible, transfer_errors2
 from rdstitch.solvers import Solutions
@@ -49,7 +49,7 @@ def all_solvers(camera: Camera, tilt: tuple[float, float]) -> list[MinimalSolver
     for name, function, arguments in HOMLIB:
         solve = homlib_solver(function, *arguments)
         if solve is not None:
-            found.append(MinimalSolver(name, 5, _without_tilt(solve), HomographyModel()))
+            found.append(MinimalSolver(name, 5, _without_tilt(solve), HomographyPairModel()))
     return found
 
 

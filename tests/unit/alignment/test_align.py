@@ -11,7 +11,7 @@ from rdstitch.alignment.align import AlignmentOptions, align
 from rdstitch.alignment.build_result import AdjustedPictures, build_alignment
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import CONTRADICTS, Alignment, PlanarPoses
-from rdstitch.alignment.trajectory import Trajectory, compare
+from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, RegistrationError
@@ -90,7 +90,7 @@ def test_a_robots_grid_is_rigid(
     assert abs(found.distortion - distortion) < 5 * found.distortion_std
     assert found.tilt == pytest.approx(tilt, abs=math.radians(0.1))
     assert float(np.quantile(_pair_errors(found, given), 0.95)) < 0.2
-    assert compare(Trajectory.from_alignment(found), _true_path(given)).drift < 1e-3
+    assert compare_trajectories(Trajectory.from_alignment(found), _true_path(given)).drift < 1e-3
     assert not found.relief.found
     assert found.messages == ()
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters, Priors, sigma_of
-from rdstitch.alignment.motion_models import HOMOGRAPHY, MODELS, RIGID, TILTING, Model
+from rdstitch.alignment.motion_models import HOMOGRAPHY, MODELS, RIGID, TILTING, MotionModel
 from rdstitch.alignment.normal_equations import chain, link_equations, robust_cost, robust_weight, squared_errors
 from rdstitch.alignment.observations import Observations
 from tests.alignment_scenes import Scene, grid, jittered, scene
@@ -19,9 +19,9 @@ def _scene() -> Scene:
     return scene(poses, tilt=(0.05, -0.04), rng=rng, per_link=60)
 
 
-def _start(model: Model, truth: Scene) -> Parameters:
-    shared = model.shared_from(np.array([0.05, -0.04, np.log(1.3)])) if model.shared_names else np.zeros(0)
-    poses = model.poses_from(truth.truth, shared, np.zeros((len(truth.truth), 2)))
+def _start(model: MotionModel, truth: Scene) -> Parameters:
+    shared = model.shared_from_physical(np.array([0.05, -0.04, np.log(1.3)])) if model.shared_names else np.zeros(0)
+    poses = model.nearest_poses(truth.truth, shared, np.zeros((len(truth.truth), 2)))
     return Parameters(poses, shared, np.array([-0.23, 0.01, -0.02, 0.004, -0.006]))
 
 
@@ -34,7 +34,7 @@ def test_the_weight_of_an_error_is_the_derivative_of_its_loss() -> None:
 
 @pytest.mark.parametrize("width", [2.0, 20.0])  # px; the errors at the start are of some twenty
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
-def test_gradient_and_curvature_of_the_whole_cost(model: Model, width: float) -> None:
+def test_gradient_and_curvature_of_the_whole_cost(model: MotionModel, width: float) -> None:
     """Against differences of the robust cost, with the whitening held as the adjustment holds it."""
     truth = _scene()
     observations = Observations.from_links(truth.links, truth.cameras)
@@ -53,7 +53,7 @@ def test_gradient_and_curvature_of_the_whole_cost(model: Model, width: float) ->
     def cost(poses_step: np.ndarray, shared_step: np.ndarray) -> float:
         step = np.zeros((count, model.pose_size))
         step[free] = poses_step
-        moved = start.moved(model, step, shared_step, FREE_LENS)
+        moved = start.retract(model, step, shared_step, FREE_LENS)
         squared = squared_errors(observations, homographies(moved), moved.lens, equations.whitening)
         return 2.0 * float(robust_cost(squared, width).sum())
 
@@ -87,7 +87,7 @@ def test_information_on_shared_parameters_is_what_elimination_leaves() -> None:
     np.testing.assert_allclose(normal.shared_information(), expected, rtol=1e-5, atol=1e-5)
 
 
-def _adjust(model: Model, truth: Scene, seen: Observations) -> tuple[float, float]:
+def _adjust(model: MotionModel, truth: Scene, seen: Observations) -> tuple[float, float]:
     start = _start(model, truth)
     start = Parameters(start.poses, start.shared, np.array([-0.2, 0.0, 0.0, 0.0, 0.0]))
     freedom = FreeParameters.fixing(model, len(truth.cameras), [0], ONE_LENS)

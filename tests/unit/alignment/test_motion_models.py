@@ -11,7 +11,7 @@ from rdstitch.alignment.motion_models import (
     SIMILARITY,
     TILTING,
     YAW,
-    Model,
+    MotionModel,
     X,
     Y,
     metric_poses,
@@ -21,17 +21,17 @@ from rdstitch.planar_motion import PlanarMotion
 SIGNS = np.array([[1.0], [-1.0]])
 
 
-def _some(model: Model, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _some(model: MotionModel, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Poses and shared parameters."""
     if not model.shared_names:
         return (np.eye(3) + 0.2 * rng.normal(size=(count, 3, 3))).reshape(-1, 9), np.zeros(0)
     poses = np.zeros((count, 6))
-    shared = model.shared_from(np.array([0.05, -0.08, np.log(1.4)]))
-    return model.moved(poses, 0.3 * rng.normal(size=(count, model.pose_size))), shared
+    shared = model.shared_from_physical(np.array([0.05, -0.08, np.log(1.4)]))
+    return model.retract(poses, 0.3 * rng.normal(size=(count, model.pose_size))), shared
 
 
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
-def test_derivatives_are_those_of_the_matrices(model: Model) -> None:
+def test_derivatives_are_those_of_the_matrices(model: MotionModel) -> None:
     rng = np.random.default_rng(0)
     poses, shared = _some(model, 4, rng)
     found = model.matrices(poses, shared)
@@ -44,8 +44,8 @@ def test_derivatives_are_those_of_the_matrices(model: Model) -> None:
     for k in range(model.pose_size):
         change = np.zeros((4, model.pose_size))
         change[:, k] = step
-        high = model.matrices(model.moved(poses, change), shared).matrices
-        low = model.matrices(model.moved(poses, -change), shared).matrices
+        high = model.matrices(model.retract(poses, change), shared).matrices
+        low = model.matrices(model.retract(poses, -change), shared).matrices
         moved_high = direction(found.matrices + step * found.by_pose[:, k])
         moved_low = direction(found.matrices - step * found.by_pose[:, k])
         numeric = (direction(high) - direction(low)) / (2 * step)
@@ -56,21 +56,21 @@ def test_derivatives_are_those_of_the_matrices(model: Model) -> None:
 
 
 @pytest.mark.parametrize("model", [RIGID, SIMILARITY, TILTING], ids=lambda model: model.name)
-def test_natural_parameters_and_their_derivatives(model: Model) -> None:
+def test_natural_parameters_and_their_derivatives(model: MotionModel) -> None:
     natural = np.array([0.1, -0.2, 0.4])
-    shared = model.shared_from(natural)
-    np.testing.assert_allclose(model.natural(shared)[0], natural, atol=1e-15)
+    shared = model.shared_from_physical(natural)
+    np.testing.assert_allclose(model.physical_parameters(shared)[0], natural, atol=1e-15)
     for k in range(3):
         change = np.zeros(3)
         change[k] = 1e-6
-        numeric = (model.natural(shared + change)[0] - model.natural(shared - change)[0]) / 2e-6
-        np.testing.assert_allclose(model.natural(shared)[1][:, k], numeric, atol=1e-9)
+        numeric = (model.physical_parameters(shared + change)[0] - model.physical_parameters(shared - change)[0]) / 2e-6
+        np.testing.assert_allclose(model.physical_parameters(shared)[1][:, k], numeric, atol=1e-9)
 
 
 def test_two_pictures_are_related_by_the_planar_motion_between_them() -> None:
     tilt, focal = (0.1, -0.05), 1.3
     motion = PlanarMotion(tilt, 0.4, (0.3, -0.2), 1.2)
-    shared = SIMILARITY.shared_from(np.array([*tilt, np.log(focal)]))
+    shared = SIMILARITY.shared_from_physical(np.array([*tilt, np.log(focal)]))
     poses = np.zeros((2, 6))
     poses[1, [YAW, X, Y, LOG_HEIGHT]] = 0.4, 0.3 * focal, -0.2 * focal, np.log(1.2)
     first, second = SIMILARITY.matrices(poses, shared).matrices
@@ -83,16 +83,16 @@ def test_two_pictures_are_related_by_the_planar_motion_between_them() -> None:
 
 
 @pytest.mark.parametrize("model", [RIGID, SIMILARITY], ids=lambda model: model.name)
-def test_poses_come_back_from_their_homographies(model: Model) -> None:
+def test_poses_come_back_from_their_homographies(model: MotionModel) -> None:
     rng = np.random.default_rng(1)
     poses, shared = _some(model, 5, rng)
     attitudes = 0.05 * rng.normal(size=(5, 2))
     poses[:, 4:] = attitudes
     matrices = model.matrices(poses, shared).matrices * rng.uniform(0.5, 2.0, (5, 1, 1))
-    np.testing.assert_allclose(model.poses_from(matrices, shared, attitudes), poses, atol=1e-12)
+    np.testing.assert_allclose(model.nearest_poses(matrices, shared, attitudes), poses, atol=1e-12)
 
 
 def test_a_step_of_the_general_model_keeps_the_determinant() -> None:
     poses, _ = _some(HOMOGRAPHY, 3, np.random.default_rng(2))
-    moved = HOMOGRAPHY.moved(poses, np.full((3, 8), 0.01)).reshape(-1, 3, 3)
+    moved = HOMOGRAPHY.retract(poses, np.full((3, 8), 0.01)).reshape(-1, 3, 3)
     np.testing.assert_allclose(np.abs(np.linalg.det(moved)), 1.0, atol=1e-12)

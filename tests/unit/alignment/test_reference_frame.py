@@ -17,7 +17,7 @@ def test_an_oblique_reference_gives_way_to_one_whose_horizon_no_picture_crosses(
     given = scene(poses, rng=rng)
     found = align(given.cameras, given.links, AlignmentOptions(model="homography", reference=0))
     poses[0, PSI] = 1.1
-    to_pictures = POSE.matrices(poses, POSE.shared_from(np.array([0.0, 0.0, 0.26]))).matrices
+    to_pictures = POSE.matrices(poses, POSE.shared_from_physical(np.array([0.0, 0.0, 0.26]))).matrices
     tilted = replace(found, homographies=np.asarray(np.linalg.inv(to_pictures), dtype=np.float64))
     oblique = in_frame_of(tilted, 0)
     assert frontal_reference(oblique) in (1, 2)

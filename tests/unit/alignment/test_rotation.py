@@ -45,7 +45,7 @@ def test_derivatives_are_those_of_the_matrices() -> None:
     for k in range(3):
         change = np.zeros((2, 3))
         change[:, k] = step
-        high, low = (ROTATION.matrices(ROTATION.moved(poses, by), shared).matrices for by in (change, -change))
+        high, low = (ROTATION.matrices(ROTATION.retract(poses, by), shared).matrices for by in (change, -change))
         np.testing.assert_allclose(found.by_pose[:, k], (high - low) / (2 * step), atol=1e-8)
     high, low = (ROTATION.matrices(poses, shared + by).matrices for by in (step, -step))
     np.testing.assert_allclose(found.by_shared[:, 0], (high - low) / (2 * step), atol=1e-8)
@@ -57,7 +57,7 @@ def test_rotations_are_found_in_scaled_and_negated_matrices() -> None:
     shared = np.array([0.3])
     matrices = ROTATION.matrices(rotations.reshape(-1, 9), shared).matrices
     np.testing.assert_allclose(
-        ROTATION.poses_from(-3.0 * matrices, shared, np.zeros((3, 2))), rotations.reshape(-1, 9), atol=1e-12
+        ROTATION.nearest_poses(-3.0 * matrices, shared, np.zeros((3, 2))), rotations.reshape(-1, 9), atol=1e-12
     )
     turned = rotation_from_vector(np.array([[0.0, 0.2, 0.0], [0.0, 3.0, 0.0]]))
     np.testing.assert_allclose(turned[0] @ turned[0].T, np.eye(3), atol=1e-12)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rdstitch.alignment.result import PlanarPoses
-from rdstitch.alignment.trajectory import Trajectory, compare
+from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
 from rdstitch.errors import ArgumentError
 from rdstitch.export.trajectory_files import as_csv, as_tum
 
@@ -50,7 +50,7 @@ def test_neither_frame_nor_unit_matter_to_the_error() -> None:
     truth = Trajectory.from_poses(_poses())
     p, c, s = _poses(), np.cos(0.7), np.sin(0.7)
     moved = PlanarPoses(p.yaw - 0.7, p.position @ np.array([[c, -s], [s, c]]).T * 3 + 5, p.height * 3, p.tilt)
-    error = compare(Trajectory.from_poses(moved, height=4.0), truth)
+    error = compare_trajectories(Trajectory.from_poses(moved, height=4.0), truth)
     assert error.translation < 1e-12
     assert error.rotation < 1e-12
     assert error.drift < 1e-12
@@ -63,7 +63,7 @@ def test_known_errors_are_measured() -> None:
     level, height = np.zeros((count, 2)), np.ones(count)
     straight = PlanarPoses(np.zeros(count), along, height, level)
     bent = PlanarPoses(np.linspace(0.0, 0.001 * (count - 1), count), 1.01 * along, height, level)
-    error = compare(Trajectory.from_poses(bent), Trajectory.from_poses(straight))
+    error = compare_trajectories(Trajectory.from_poses(bent), Trajectory.from_poses(straight))
     assert error.rotation == pytest.approx(0.001)
     assert error.scale == pytest.approx(1 / 1.01)
     assert error.translation_in_own_unit == pytest.approx(0.0, abs=0.02)
@@ -78,4 +78,4 @@ def test_what_makes_no_path() -> None:
         Trajectory.from_poses(_poses(), height=0.0)
     path = Trajectory.from_poses(_poses())
     with pytest.raises(ArgumentError, match="only 4 frames"):
-        compare(path, path, step=4)
+        compare_trajectories(path, path, step=4)

@@ -14,8 +14,8 @@ from examples.judging.comparison import sharpness
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, compose, compose_to_file, plan_canvas
 from rdstitch.compositing.crop import largest_rectangle
-from rdstitch.compositing.options import Exposure
-from rdstitch.compositing.preparation import prepare
+from rdstitch.compositing.options import ExposureMethod
+from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.source_images import PictureLoader
 from rdstitch.errors import ArgumentError, InputError, LimitError
 from rdstitch.io import Metadata, read_image
@@ -29,7 +29,7 @@ def _compose(scene: Scene, **options: Any) -> Any:
 
 def _seams(scene: Scene, options: CompositeOptions) -> NDArray[np.bool_]:
     """Px within two of a seam."""
-    with prepare(scene.sources, scene.cameras, scene.homographies, scene.canvas, options) as ready:
+    with prepare_composite(scene.sources, scene.cameras, scene.homographies, scene.canvas, options) as ready:
         seams = ready.renderer.seams
     assert seams is not None
     box = (0, 0, *scene.canvas.size)
@@ -85,7 +85,7 @@ def test_brightness_stays_near_that_of_the_pictures() -> None:
         frames.append(np.clip(np.rint(frame * brighter), 0, 255).astype(np.uint8))
     sources: list[PictureLoader] = [partial(as_picture, frame) for frame in frames]
     white, middle = {}, {}
-    choices: tuple[Exposure, ...] = ("gain", "balanced")
+    choices: tuple[ExposureMethod, ...] = ("gain", "balanced")
     for choice in choices:
         options = CompositeOptions(exposure=choice)
         result = compose(sources, scene.cameras, scene.homographies, scene.canvas, options)
@@ -102,7 +102,7 @@ def test_brightness_that_drifts_becomes_a_slope_without_steps() -> None:
     grey_wall = [np.full_like(frame, round(110 * gain)) for frame, gain in zip(scene.frames, DRIFT, strict=True)]
     sources: list[PictureLoader] = [partial(as_picture, frame) for frame in grey_wall]
     row = {}
-    choices: tuple[Exposure, ...] = ("none", "gain", "balanced")
+    choices: tuple[ExposureMethod, ...] = ("none", "gain", "balanced")
     for choice in choices:
         options = CompositeOptions(exposure=choice, blend="none")
         result = compose(sources, scene.cameras, scene.homographies, scene.canvas, options)
@@ -125,7 +125,7 @@ def test_a_clipped_sky_ends_in_no_step() -> None:
     sky[0][:100], sky[1][:100] = 255, 215
     sources: list[PictureLoader] = [partial(as_picture, frame) for frame in sky]
     steps = {}
-    choices: tuple[Exposure, ...] = ("gain", "balanced")
+    choices: tuple[ExposureMethod, ...] = ("gain", "balanced")
     for choice in choices:
         options = CompositeOptions(exposure=choice, blend="none", seam="voronoi")
         result = compose(sources, scene.cameras, scene.homographies, scene.canvas, options)

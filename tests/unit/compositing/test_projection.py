@@ -7,7 +7,7 @@ import pytest
 
 from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, compose, plan_panorama
-from rdstitch.compositing.panorama_canvas import choose_projection, view_of
+from rdstitch.compositing.panorama_canvas import choose_projection, seen_directions
 from rdstitch.compositing.photo_sphere import center_of_view, field_of_view, photo_sphere_xmp
 from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.compositing.warp import plan_warp
@@ -60,13 +60,13 @@ def test_near_the_horizon_all_agree(name: str) -> None:
 
 def test_the_projection_follows_the_view() -> None:
     lens = [LENS]
-    narrow = view_of(lens, _directions(camera_rotations(0.0)))
+    narrow = seen_directions(lens, _directions(camera_rotations(0.0)))
     assert choose_projection(narrow) == PLANE
-    wide = view_of(lens * 4, _directions(camera_rotations(np.radians([-60, -20, 20, 60]))))
+    wide = seen_directions(lens * 4, _directions(camera_rotations(np.radians([-60, -20, 20, 60]))))
     assert choose_projection(wide).name == "cylinder"
-    high = view_of(lens * 2, _directions(camera_rotations([0.0, 0.0], np.radians([30.0, -30.0]))))
+    high = seen_directions(lens * 2, _directions(camera_rotations([0.0, 0.0], np.radians([30.0, -30.0]))))
     assert choose_projection(high).name == "sphere"
-    around = view_of(lens * 9, _directions(camera_rotations(np.arange(9) * 2 * np.pi / 9)))
+    around = seen_directions(lens * 9, _directions(camera_rotations(np.arange(9) * 2 * np.pi / 9)))
     assert around.around
     assert choose_projection(around).name == "sphere"
 
@@ -74,7 +74,7 @@ def test_the_projection_follows_the_view() -> None:
 @pytest.mark.parametrize("heading", [0.0, 2.0, np.pi])
 def test_the_edge_lies_where_nothing_is_shown(heading: float) -> None:
     headings = heading + np.radians([-100, -50, 0, 50, 100])
-    view = view_of([LENS] * 5, _directions(camera_rotations(headings)))
+    view = seen_directions([LENS] * 5, _directions(camera_rotations(headings)))
     assert not view.around
     width, _ = view.extent
     assert width < np.radians(290)
@@ -174,7 +174,7 @@ def test_viewers_are_told_which_part_of_the_sphere_it_is() -> None:
     assert f'GPano:FullPanoWidthPixels="{width}"' in text
     assert f'GPano:FullPanoHeightPixels="{width // 2}"' in text
     assert f'GPano:CroppedAreaImageHeightPixels="{height}"' in text
-    low, high = view_of([LENS] * 9, _directions(rotations)).bounds
+    low, high = seen_directions([LENS] * 9, _directions(rotations)).bounds
     top = (np.pi / 2 + low[1]) * width / (2 * np.pi)
     assert f'GPano:CroppedAreaTopPixels="{round(top)}"' in text
     across, down = field_of_view(canvas)

@@ -13,8 +13,8 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
 from rdstitch.synthetic import PictureTexture, blank, grid_poses, ground, sequence_over
-from rdstitch.synthetic.poses import to_plane
-from rdstitch.synthetic.textures import Picture
+from rdstitch.synthetic.poses import texels_of_pixels
+from rdstitch.synthetic.textures import LinearPixels
 
 SIMILARITY = np.array([[0.9, -0.3, 140.0], [0.3, 0.9, -50.0], [0.0, 0.0, 1.0]])
 HOMOGRAPHY = np.array([[0.95, -0.2, 110.0], [0.25, 1.0, -90.0], [5e-5, -8e-5, 1.0]])
@@ -96,7 +96,7 @@ def test_alignment_error_of_truth_and_of_a_shifted_picture() -> None:
 
     # A wrong λ is no similarity: it must show, in px of the pictures.
     bent = Camera((320, 240), -0.32, focal=260.0)
-    estimate: dict[int, Transfer] = {k: partial(to_plane, bent, sequence.from_plane(k)) for k in range(4)}
+    estimate: dict[int, Transfer] = {k: partial(texels_of_pixels, bent, sequence.from_plane(k)) for k in range(4)}
     error = alignment_error(sequence, estimate)
     assert 0.3 < error.median < error.percentile95 < error.max < 5.0
 
@@ -175,7 +175,7 @@ def test_coverage_counts_the_missing(plane: PictureTexture) -> None:
 
 
 def test_sharpness_falls_with_blur_and_ignores_gain(plane: PictureTexture) -> None:
-    grey: Picture = np.ascontiguousarray(plane.pixels[:, :, 1])
+    grey: LinearPixels = np.ascontiguousarray(plane.pixels[:, :, 1])
     everywhere = np.ones(grey.shape, dtype=np.bool_)
     blurred = np.asarray(cv2.GaussianBlur(grey, (0, 0), 0.8), dtype=np.float32)
     assert sharpness(grey * np.float32(0.6) + np.float32(0.1), grey, everywhere) == pytest.approx(1.0, abs=1e-4)

@@ -11,7 +11,7 @@ from rdstitch.robust import (
     estimate_radial_homographies,
     estimate_radial_homography,
 )
-from rdstitch.robust.linearization import Lens, TransferDerivatives, differentiate, entry_equations, influence
+from rdstitch.robust.linearization import PairLenses, TransferDerivatives, differentiate, entry_equations, influence
 from rdstitch.robust.measurements import Measurements, padded_length
 from rdstitch.synthetic import correspondences
 
@@ -72,7 +72,7 @@ def test_normal_equations_are_those_of_the_jacobian(own: bool) -> None:
 
     def at(values: FloatArray) -> TransferDerivatives:
         (first, second, mu), center = values[9:12, None], values[None, 12:]
-        seen = Lens(first, second, mu, center) if own else Lens(first)
+        seen = PairLenses(first, second, mu, center) if own else PairLenses(first)
         return differentiate(values[:9].reshape(1, 3, 3), seen, data)
 
     values = np.concatenate([h.ravel(), lens])

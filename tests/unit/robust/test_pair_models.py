@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rdstitch.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
-from rdstitch.robust.pair_models import HomographyModel, PairModel, PlanarModel
+from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 
 MOTION = PlanarMotion((0.1, -0.15), 0.4, (0.3, -0.2), 1.15)
 K = np.diag([1.3, 1.3, 1.0])
@@ -13,12 +13,12 @@ H = K @ MOTION.homography() @ np.linalg.inv(K)
 TILTS = np.array([[[0.1, 0.0], [-0.05, 0.1]]])
 
 MODELS = [
-    PlanarModel(1.3),
-    PlanarModel(1.3, 0.3),
-    PlanarModel(1.3, 0.3, height_free=True),
-    PlanarModel(1.3, tilts_known=True, height_free=True),
-    PlanarModel(1.3, tilts_known=True),
-    HomographyModel(),
+    PlanarPairModel(1.3),
+    PlanarPairModel(1.3, 0.3),
+    PlanarPairModel(1.3, 0.3, height_free=True),
+    PlanarPairModel(1.3, tilts_known=True, height_free=True),
+    PlanarPairModel(1.3, tilts_known=True),
+    HomographyPairModel(),
 ]
 
 
@@ -34,7 +34,7 @@ def test_jacobian_is_the_derivative_of_a_step(model: PairModel) -> None:
 
 
 def test_free_models_start_at_the_homography_itself() -> None:
-    for model in (PlanarModel(1.3, height_free=True), HomographyModel()):
+    for model in (PlanarPairModel(1.3, height_free=True), HomographyPairModel()):
         found = model.homography(model.initialize(H[None]))[0]
         np.testing.assert_allclose(found / found[2, 2], H / H[2, 2], atol=1e-9)
 
@@ -42,14 +42,14 @@ def test_free_models_start_at_the_homography_itself() -> None:
 def test_known_tilts_are_kept() -> None:
     r1, r2 = rotation_from_tilt(TILTS[0])
     h = K @ r2 @ rigid_in_plane(0.3, (0.2, 0.1), 0.9) @ r1.T @ np.linalg.inv(K)
-    model = PlanarModel(1.3, tilts_known=True, height_free=True)
+    model = PlanarPairModel(1.3, tilts_known=True, height_free=True)
     state = model.initialize(h[None], TILTS)
     np.testing.assert_allclose(model.homography(state)[0], h, atol=1e-12)
     assert model.motion(state[0]).height == pytest.approx(0.9)
 
 
 def test_the_prior_pulls_the_focal_length_back() -> None:
-    model = PlanarModel(1.3, 0.2)
+    model = PlanarPairModel(1.3, 0.2)
     state = model.retract(model.initialize(H[None]), np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.1]]))
     residual, derivative = model.prior(state)
     assert residual == pytest.approx(np.array([[0.5]]))
