@@ -21,6 +21,13 @@ MAX_ABS_DISTORTION = 0.98
 PLAUSIBLE_DISTORTION = (-1.0, 0.5)
 """Limits of λ: below, the corners would see behind the camera; no lens pulls its corners in as far as above."""
 
+SEARCHED_DISTORTION = (-0.95, 0.5)
+"""Limits of λ that the sampling of pairs searches: from nearly folding barrel to strong pincushion distortion."""
+
+SOLVED_DISTORTION = (-1.5, 0.5)
+"""Limits of λ in which a minimal solver looks for roots unless others are given; in the frame of its points, which for
+focal-normalized points of a wide lens reaches further than half diagonals."""
+
 OBSERVABLE_STD = 0.1
 """Standard deviation of λ from which on it counts as not observable: a tenth of the radius at the corner."""
 

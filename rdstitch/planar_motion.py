@@ -14,6 +14,11 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 
+ABOUT_X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+ABOUT_Y = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+ABOUT_Z = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+"""Generators of rotations: with ``R = Rx(ψ) Ry(θ)`` the derivatives by ψ and θ are ``ABOUT_X R`` and ``R ABOUT_Y``."""
+
 
 def rotation_from_tilt(tilt: ArrayLike) -> FloatArray:
     """``R = Rx(ψ) Ry(θ)`` for tilts (ψ, θ) of shape (..., 2), radians; shape (..., 3, 3)."""
@@ -128,13 +133,7 @@ def _motions_for_normals(h: FloatArray, normal: FloatArray) -> FloatArray:
     normal = np.where(normal.any(axis=1, keepdims=True), normal, [0.0, 0.0, 1.0])
     tilt = tilt_from_normal(np.where(normal[:, 2:] >= 0.0, normal, -normal))
     rotation = rotation_from_tilt(tilt)
-    motion = np.swapaxes(rotation, 1, 2) @ h @ rotation
-    scale = np.copysign(np.sqrt(np.abs(np.linalg.det(motion[:, :2, :2]))), motion[:, 2, 2])
-    motion = motion / np.where(scale != 0.0, scale, 1.0)[:, None, None]
-    yaw = np.arctan2(motion[:, 1, 0] - motion[:, 0, 1], motion[:, 0, 0] + motion[:, 1, 1])
-    c, s = np.cos(yaw), np.sin(yaw)
-    x, y = motion[:, 0, 2], motion[:, 1, 2]
-    return np.column_stack([tilt, yaw, -c * x - s * y, s * x - c * y, motion[:, 2, 2]])
+    return np.column_stack([tilt, *nearest_in_plane(np.swapaxes(rotation, 1, 2) @ h @ rotation)])
 
 
 def rigid_in_plane(yaw: ArrayLike, translation: ArrayLike, height: ArrayLike = 1.0) -> FloatArray:
@@ -148,6 +147,19 @@ def rigid_in_plane(yaw: ArrayLike, translation: ArrayLike, height: ArrayLike = 1
     motion[..., 1, 2] = -(s * t[..., 0] + c * t[..., 1])
     motion[..., 2, 2] = height
     return motion
+
+
+def nearest_in_plane(motion: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Yaws (B,), translations (B, 2) and heights (B,) of :func:`rigid_in_plane` nearest to matrices (B, 3, 3).
+
+    The matrices may be of any scale and sign.
+    """
+    area = motion[:, 0, 0] * motion[:, 1, 1] - motion[:, 0, 1] * motion[:, 1, 0]
+    scale = np.copysign(np.sqrt(np.abs(area)), motion[:, 2, 2])
+    motion = motion / np.where(scale != 0.0, scale, 1.0)[:, None, None]
+    yaw = np.arctan2(motion[:, 1, 0] - motion[:, 0, 1], motion[:, 0, 0] + motion[:, 1, 1])
+    c, s, x, y = np.cos(yaw), np.sin(yaw), motion[:, 0, 2], motion[:, 1, 2]
+    return yaw, np.stack([-c * x - s * y, s * x - c * y], axis=1), motion[:, 2, 2]
 
 
 def constraint_residuals(homography: ArrayLike) -> tuple[FloatArray, FloatArray]:

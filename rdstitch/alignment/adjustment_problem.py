@@ -18,12 +18,12 @@ from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.initialization import adjust_pairs_independently
 from rdstitch.alignment.metric_upgrade import metric_upgrade
 from rdstitch.alignment.motion_models import HOMOGRAPHY, POSE, PSI, SIMILARITY, THETA, MotionModel
-from rdstitch.alignment.normal_equations import robust_cost
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.rotation_model import FOCAL_STARTS, ROTATION
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import Camera
 from rdstitch.matching.match_graph import spanning_tree
+from rdstitch.robust.loss import robust_cost
 
 _WIDEST_START = 0.05
 """Half diagonals: errors that a chain may have gathered before the adjustment, beyond which a link is doubted."""

@@ -15,21 +15,18 @@ from rdstitch.alignment.normal_equations import (
     SparseNormalEquations,
     chain,
     link_equations,
-    robust_cost,
     squared_errors,
 )
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import LENS_PARAMETERS
+from rdstitch.robust.loss import RAYLEIGH_MEDIAN, robust_cost
 
 WIDTH_PER_SIGMA = 3.5
 """Width of the robust loss in standard deviations of an error's coordinate."""
 
 _SMALLEST_SIGMA = 1e-3
 """px; less is not measurable, and zero would divide."""
-
-_MEDIAN_RADIUS = 1.1774
-"""Median length of a two-dimensional normal vector of unit variance."""
 
 
 @dataclass(frozen=True)
@@ -339,7 +336,7 @@ def sigma_of(squared: FloatArray) -> float:
     if not len(squared):
         return _SMALLEST_SIGMA
     median = float(np.sqrt(np.median(squared)))
-    return max(median / _MEDIAN_RADIUS, _SMALLEST_SIGMA) if np.isfinite(median) else 1e3
+    return max(median / RAYLEIGH_MEDIAN, _SMALLEST_SIGMA) if np.isfinite(median) else 1e3
 
 
 def _covariance(information: FloatArray) -> FloatArray:

@@ -15,11 +15,10 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import CameraPriors, homography_apart
-from rdstitch.alignment.bundle_adjustment import WIDTH_PER_SIGMA, BundleAdjustmentResult, sigma_of
-from rdstitch.alignment.cycle_consistency import misfitting_links
+from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
+from rdstitch.alignment.noise_model import NoiseModel
 from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.planarity import coherence
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS
 
@@ -33,9 +32,6 @@ LENSES: dict[str, tuple[str, ...]] = {
 
 CENTER = np.array([name.startswith("center") for name in LENS_PARAMETERS])
 """Which of :data:`rdstitch.camera.LENS_PARAMETERS` are the distortion centre, shape (5,)."""
-
-EXACTNESS = 0.1
-"""Pixels: how exactly a lens and a plane can be described at all."""
 
 _FARTHEST_CENTER = 0.08
 """Half diagonals: a distortion centre farther off is no lens, but something else that it takes the blame for."""
@@ -119,7 +115,8 @@ def choose_lens(
         fits.append(homography_apart(observations, start.homographies, start.parameters.lens, own, known))
     if len(names) == 1:
         return LensChoice(names[0], free[0], fits[0], "as requested")
-    judge = _Judge.of(observations, fits[-1])
+    errors = whitened_errors(observations, fits[-1].homographies, fits[-1].parameters.lens)
+    judge = _Judge(NoiseModel.of_independent_links(observations, errors), _parts(observations))
     best = 0
     for index in range(1, len(names)):
         added = int(free[index].sum() - free[best].sum())
@@ -147,45 +144,14 @@ class _Judge:
 
     Attributes
     ----------
-    observations : Observations
-    noise : float
-        Standard deviation of an error's coordinate with the richest lens, pixels.
-    overdispersion : float
-        See :class:`rdstitch.alignment.planarity.Coherence`.
-    counted : ndarray of shape (M,), bool
-        Correspondences of links that fit.
-    effective : float
-        Independent observations.
+    noise : NoiseModel
+        Of the errors that the richest lens leaves.
     part : ndarray of shape (M,), intp
         The part of the observations that each correspondence falls into: its link, or a cell of it.
     """
 
-    observations: Observations
-    noise: float
-    overdispersion: float
-    counted: BoolArray
-    effective: float
+    noise: NoiseModel
     part: IntArray
-
-    @classmethod
-    def of(cls, observations: Observations, richest: BundleAdjustmentResult) -> "_Judge":
-        """From the errors that the richest lens leaves."""
-        errors = whitened_errors(observations, richest.homographies, richest.parameters.lens)
-        squared = np.nan_to_num(np.einsum("mi,mi->m", errors, errors), nan=np.inf)
-        sigma = sigma_of(squared[observations.scale_inliers_mask])
-        inliers = squared <= (WIDTH_PER_SIGMA * sigma) ** 2
-        overdispersion = coherence(observations, errors, inliers).overdispersion
-        counted = ~misfitting_links(squared, observations)[observations.link]
-        freedom = max(1.0 - 4.0 * len(observations) / max(len(errors), 1), 0.1)
-        effective = max(2.0 * float((counted & inliers).sum()) / overdispersion, 2.0)
-        noise = math.hypot(sigma / math.sqrt(freedom), EXACTNESS)
-        return cls(observations, noise, overdispersion, counted, effective, _parts(observations))
-
-    def misfit(self, fit: BundleAdjustmentResult) -> FloatArray:
-        """Robust sum of squared errors in units of the noise, of each correspondence that counts."""
-        ratio = np.minimum(fit.squared[self.counted], 1e12) / self.noise**2
-        robust: FloatArray = WIDTH_PER_SIGMA**2 * np.log1p(ratio / WIDTH_PER_SIGMA**2) / self.overdispersion
-        return robust
 
     def prefers(
         self, richer: BundleAdjustmentResult, simpler: BundleAdjustmentResult, added: int, simpler_name: str
@@ -195,14 +161,14 @@ class _Judge:
         A lens that λ does not describe is a series that has been cut off: beyond μ a parameter costs what Akaike's
         criterion takes for it, not Schwarz's, which takes the simpler lens for the true one.
         """
-        gain = self.misfit(simpler) - self.misfit(richer)
+        gain = self.noise.misfit(simpler.squared) - self.noise.misfit(richer.squared)
         series = simpler_name == "division2"
-        each, shared = (2.0, _SHARED_GAIN_OF_SERIES) if series else (math.log(self.effective), _SHARED_GAIN)
+        each, shared = (2.0, _SHARED_GAIN_OF_SERIES) if series else (self.noise.price, _SHARED_GAIN)
         return float(gain.sum()) > added * each and self.significance(gain) > shared
 
     def significance(self, gain: FloatArray) -> float:
         """Mean gain of the parts in its standard deviations."""
-        part = self.part[self.counted]
+        part = self.part[self.noise.counted]
         sums = np.bincount(part, gain)[np.unique(part)]
         if len(sums) < 2:
             return 0.0

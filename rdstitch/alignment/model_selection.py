@@ -1,9 +1,7 @@
 """The least free model that the data allow; one camera, unless the pictures cannot come from one.
 
 Models of one camera are judged by a robust likelihood of their errors, with the scatter that the freest of them
-leaves, and pay for each parameter (Schwarz's criterion). Two things keep that honest on real pictures: errors of
-neighbours agree, so that there are fewer independent observations than correspondences; and no lens or plane is exact
-to better than about a tenth of a pixel, which therefore counts as noise.
+leaves, and pay for each parameter (Schwarz's criterion); see :mod:`rdstitch.alignment.noise_model`.
 
 One free homography a picture is a model of another kind: it fits relief better than any camera does, and its chains
 drift projectively. It is taken only for what one camera cannot explain, a zoom, a moving principal point or pictures of
@@ -14,18 +12,15 @@ over trees: 1.62 against 1.40 pixels; 42 aerial pictures along a river: 2.53 aga
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.bundle_adjustment import WIDTH_PER_SIGMA, sigma_of
-from rdstitch.alignment.cycle_consistency import misfitting_links
-from rdstitch.alignment.lens_selection import EXACTNESS, is_plausible
+from rdstitch.alignment.lens_selection import is_plausible
 from rdstitch.alignment.motion_models import HOMOGRAPHY, LOG_HEIGHT, MODELS, POSE, PSI, THETA, MotionModel, metric_poses
+from rdstitch.alignment.noise_model import EXACTNESS, NoiseModel, squared_lengths
 from rdstitch.alignment.normal_equations import whitened_errors
-from rdstitch.alignment.planarity import coherence
-from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.arrays import BoolArray
 
 _LEAST_RATIO = 1.5
 """Times by which the errors of one camera must exceed those of free homographies."""
@@ -59,25 +54,24 @@ def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolAr
     A homography for every link on its own leaves errors that no model of the family can undercut. Once freer models
     could not pay for their freedom even with those, they are not tried.
     """
-    bound = NoiseModel.of_links_apart(problem)
-    least = bound.misfit(link_errors(problem, problem.homographies, problem.lens))
+    bound, least = noise_of_links(problem)
     if problem.count == 2 and len(names) > 1:  # two pictures cannot tell one camera in any pose from a homography
         names = [name for name in names if name != POSE.name]
     fits: list[Fit] = []
     for name in names:
         model = MODELS[name]
-        cost = min((bound.cost(problem, fit) for fit in fits), default=math.inf)
-        if cost <= least + bound.price(problem, model, problem.free_lens) or _cannot_gain(bound, problem, fits, model):
+        cost = min((fit_cost(bound, problem, fit) for fit in fits), default=math.inf)
+        if cost <= least + price(bound, problem, model, problem.free_lens) or _cannot_gain(bound, problem, fits, model):
             break
         fits.append(problem.fit(model, fits[-1:]))
     cameras = [fit for fit in fits if fit.model is not HOMOGRAPHY]
-    noise = bound if len(fits) < len(names) else NoiseModel.of_fit(problem, fits[-1])
-    costs = np.array([noise.cost(problem, fit) for fit in fits])
+    noise = bound if len(fits) < len(names) else _noise_of_fit(problem, fits[-1])
+    costs = np.array([fit_cost(noise, problem, fit) for fit in fits])
     for lens in lenses:
         for index in np.argsort(costs, kind="stable")[:2].tolist():
             wider = problem.extend(fits[index], lens | fits[index].free_lens)
-            cost = noise.cost(problem, wider)
-            if cost < costs[index] and within_reason(wider):
+            cost = fit_cost(noise, problem, wider)
+            if cost < costs[index] and is_plausible(wider.adjusted):
                 fits[index], costs[index] = wider, cost
     best = int(np.argmin(costs[: max(len(cameras), 1)]))
     if cameras and len(fits) > len(cameras) and _beyond_one_camera(problem, fits[best], fits[-1]):
@@ -85,7 +79,7 @@ def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolAr
     return ModelChoice(fits[best], _reason(fits, best, list(names)), noise.overdispersion)
 
 
-def _cannot_gain(bound: "NoiseModel", problem: Problem, fits: Sequence[Fit], model: MotionModel) -> bool:
+def _cannot_gain(bound: NoiseModel, problem: Problem, fits: Sequence[Fit], model: MotionModel) -> bool:
     """Whether free homographies could not leave errors so much smaller that they would be taken."""
     if model is not HOMOGRAPHY or not fits or problem.count == 2:
         return False
@@ -99,92 +93,46 @@ def _beyond_one_camera(problem: Problem, camera: Fit, free: Fit) -> bool:
     The variance of the errors is unknown, and only as many of them are independent as those of the camera show:
     ``n log σ² + k log n`` decides (Schwarz's criterion). Two pictures need no more than one homography.
     """
-    noise = NoiseModel.of_fit(problem, camera)
+    noise = _noise_of_fit(problem, camera)
     variance = [fit.adjusted.sigma**2 + EXACTNESS**2 for fit in (camera, free)]
-    count = [NoiseModel.parameters(problem, fit.model, fit.free_lens) for fit in (camera, free)]
+    count = [parameter_count(problem, fit.model, fit.free_lens) for fit in (camera, free)]
     gain = noise.effective * math.log(variance[0] / variance[1])
-    earned = gain > (count[1] - count[0]) * math.log(noise.effective)
+    earned = gain > (count[1] - count[0]) * noise.price
     return earned and (count[1] <= count[0] or variance[0] > _LEAST_RATIO**2 * variance[1])
 
 
-def within_reason(fit: Fit) -> bool:
-    """Whether the distortion centre is where lenses have it."""
-    return is_plausible(fit.adjusted)
+def parameter_count(problem: Problem, model: MotionModel, free_lens: BoolArray) -> int:
+    """Number of free parameters; in the pose model the shared tilt is only the mean of those of the pictures."""
+    poses = problem.count * model.pose_size - int(model.gauge.sum())
+    return poses + len(model.shared_names) + int(free_lens.sum()) - (2 if model is POSE else 0)
 
 
-@dataclass(frozen=True)
-class NoiseModel:
-    """What the errors of a model are measured by.
-
-    Attributes
-    ----------
-    noise : float
-        Standard deviation of an error's coordinate when the model is right, pixels.
-    overdispersion : float
-    counted : ndarray of shape (M,), bool
-        Correspondences of links that fit.
-    effective : float
-        Independent observations.
-    """
-
-    noise: float
-    overdispersion: float
-    counted: BoolArray
-    effective: float
-
-    @classmethod
-    def of_links_apart(cls, problem: Problem) -> Self:
-        """From the errors of every link on its own."""
-        errors = whitened_errors(problem.observations, problem.homographies, problem.lens)
-        matches = len(errors)
-        freedom = max(1.0 - 4.0 * len(problem.observations) / max(matches, 1), 0.1)
-        return cls._from(problem, errors, freedom**-0.5)
-
-    @classmethod
-    def of_fit(cls, problem: Problem, fit: Fit) -> Self:
-        """From the errors of the freest model."""
-        adjusted = fit.adjusted
-        errors = whitened_errors(problem.observations, adjusted.homographies, adjusted.parameters.lens)
-        return cls._from(problem, errors, 1.0)
-
-    @classmethod
-    def _from(cls, problem: Problem, errors: FloatArray, enlarged: float) -> Self:
-        squared = np.nan_to_num(np.einsum("mi,mi->m", errors, errors), nan=np.inf)
-        sigma = sigma_of(squared[problem.observations.scale_inliers_mask])
-        inliers = squared <= (WIDTH_PER_SIGMA * sigma) ** 2
-        overdispersion = coherence(problem.observations, errors, inliers).overdispersion
-        counted = ~misfitting_links(squared, problem.observations)[problem.observations.link]
-        effective = max(2.0 * float((counted & inliers).sum()) / overdispersion, 2.0)
-        return cls(math.hypot(sigma * enlarged, EXACTNESS), overdispersion, counted, effective)
-
-    def misfit(self, squared: FloatArray) -> float:
-        """Robust sum of squared errors in units of the noise."""
-        ratio = np.minimum(squared[self.counted], 1e12) / self.noise**2
-        return float((WIDTH_PER_SIGMA**2 * np.log1p(ratio / WIDTH_PER_SIGMA**2)).sum()) / self.overdispersion
-
-    @staticmethod
-    def parameters(problem: Problem, model: MotionModel, free_lens: BoolArray) -> int:
-        """Number of free parameters; in the pose model the shared tilt is only the mean of those of the pictures."""
-        poses = problem.count * model.pose_size - int(model.gauge.sum())
-        return poses + len(model.shared_names) + int(free_lens.sum()) - (2 if model is POSE else 0)
-
-    def price(self, problem: Problem, model: MotionModel, free_lens: BoolArray) -> float:
-        """What the parameters of a model cost."""
-        return self.parameters(problem, model, free_lens) * math.log(self.effective)
-
-    def cost(self, problem: Problem, fit: Fit) -> float:
-        """Misfit and price of a fit; tilts that might be anything cost more than those that hardly differ."""
-        wide = 0.0
-        if fit.tilt_spread > 0.0:
-            wide = 4.0 * problem.count * math.log(max(fit.tilt_spread / _TYPICAL_TILT_SPREAD, 1.0))
-        return self.misfit(fit.adjusted.squared) + self.price(problem, fit.model, fit.free_lens) + wide
+def price(noise: NoiseModel, problem: Problem, model: MotionModel, free_lens: BoolArray) -> float:
+    """What the parameters of a model cost."""
+    return parameter_count(problem, model, free_lens) * noise.price
 
 
-def link_errors(problem: Problem, homographies: FloatArray, lens: FloatArray) -> FloatArray:
-    """``|r|²`` (M,) of the correspondences; inf where there is no transfer."""
-    errors = whitened_errors(problem.observations, homographies, lens)
-    squared: FloatArray = np.nan_to_num(np.einsum("mi,mi->m", errors, errors), nan=np.inf)
-    return squared
+def fit_cost(noise: NoiseModel, problem: Problem, fit: Fit) -> float:
+    """Misfit and price of a fit; tilts that might be anything cost more than those that hardly differ."""
+    wide = 0.0
+    if fit.tilt_spread > 0.0:
+        wide = 4.0 * problem.count * math.log(max(fit.tilt_spread / _TYPICAL_TILT_SPREAD, 1.0))
+    misfit = float(noise.misfit(fit.adjusted.squared).sum())
+    return misfit + price(noise, problem, fit.model, fit.free_lens) + wide
+
+
+def noise_of_links(problem: Problem) -> tuple[NoiseModel, float]:
+    """The noise that every link on its own leaves, and the misfit, which no model of the family can undercut."""
+    errors = whitened_errors(problem.observations, problem.homographies, problem.lens)
+    noise = NoiseModel.of_independent_links(problem.observations, errors)
+    return noise, float(noise.misfit(squared_lengths(errors)).sum())
+
+
+def _noise_of_fit(problem: Problem, fit: Fit) -> NoiseModel:
+    """The noise that a model leaves."""
+    adjusted = fit.adjusted
+    errors = whitened_errors(problem.observations, adjusted.homographies, adjusted.parameters.lens)
+    return NoiseModel.of_errors(problem.observations, errors)
 
 
 def _reason(fits: Sequence[Fit], best: int, names: Sequence[str]) -> str:

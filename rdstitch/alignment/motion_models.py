@@ -29,19 +29,17 @@ from typing import Protocol
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.planar_motion import rotation_from_tilt
+from rdstitch.planar_motion import ABOUT_X, ABOUT_Y, nearest_in_plane, rigid_in_plane, rotation_from_tilt
 
 YAW, X, Y, LOG_HEIGHT, PSI, THETA = range(6)
 """Columns of a planar model's poses."""
 
 _LARGEST_LOG_HEIGHT = 10.0  # where the motion is none of the model's, heights may run away
 
-_AROUND_X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _TRACELESS = np.zeros((8, 3, 3))
 _TRACELESS[[0, 1, 2, 3, 4, 5], [0, 0, 1, 1, 2, 2], [1, 2, 0, 2, 0, 1]] = 1.0
 _TRACELESS[6] = np.diag([1.0, -1.0, 0.0]) / np.sqrt(2.0)
 _TRACELESS[7] = np.diag([1.0, 1.0, -2.0]) / np.sqrt(6.0)
-_AROUND_Y = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
 
 
 @dataclass(frozen=True)
@@ -141,7 +139,7 @@ class PlanarModel:
         left = calibration @ rotation
         matrices = left @ motion
 
-        by_tilt = np.stack([calibration @ _AROUND_X @ rotation @ motion, left @ _AROUND_Y @ motion], axis=1)
+        by_tilt = np.stack([calibration @ ABOUT_X @ rotation @ motion, left @ ABOUT_Y @ motion], axis=1)
         by_columns = np.concatenate([left[:, None] @ by_motion, by_tilt], axis=1)
         by_focal = (
             matrices * np.array([1.0, 1.0, 0.0])[:, None]
@@ -183,20 +181,13 @@ class PlanarModel:
 
     def nearest_poses(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """The nearest poses, given how the tilts of the pictures differ from the shared one."""
-        motion = np.linalg.inv(self.origins(shared, attitudes)) @ homographies
-        area = motion[:, 0, 0] * motion[:, 1, 1] - motion[:, 0, 1] * motion[:, 1, 0]
-        scale = np.copysign(np.sqrt(np.maximum(np.abs(area), 1e-12)), motion[:, 2, 2])
-        motion = motion / scale[:, None, None]
-        yaw = np.arctan2(motion[:, 1, 0] - motion[:, 0, 1], motion[:, 0, 0] + motion[:, 1, 1])
-        c, s = np.cos(yaw), np.sin(yaw)
         poses = np.zeros((len(homographies), 6))
         poses[:, [PSI, THETA]] = attitudes
-        poses[:, YAW] = yaw
-        focal = np.exp(shared[2])
-        poses[:, X] = -(c * motion[:, 0, 2] + s * motion[:, 1, 2]) * focal
-        poses[:, Y] = -(-s * motion[:, 0, 2] + c * motion[:, 1, 2]) * focal
+        motion = np.linalg.inv(self.origins(shared, attitudes)) @ homographies
+        poses[:, YAW], translation, height = nearest_in_plane(motion)
+        poses[:, [X, Y]] = translation * np.exp(shared[2])
         if LOG_HEIGHT in self.free:
-            poses[:, LOG_HEIGHT] = np.log(np.clip(np.abs(motion[:, 2, 2]), 1e-3, 1e3))
+            poses[:, LOG_HEIGHT] = np.log(np.clip(np.abs(height), 1e-3, 1e3))
         return poses
 
 
@@ -211,18 +202,13 @@ def metric_poses(poses: FloatArray, shared: FloatArray) -> FloatArray:
 
 def _motion_in_plane(poses: FloatArray, focal: float) -> tuple[FloatArray, FloatArray]:
     """``Rz(φ) diag(1, 1, h) T`` (N, 3, 3) and its derivatives by φ, f tx, f ty, log h (N, 4, 3, 3)."""
-    c, s = np.cos(poses[:, YAW]), np.sin(poses[:, YAW])
-    x, y, height = poses[:, X] / focal, poses[:, Y] / focal, np.exp(poses[:, LOG_HEIGHT])
-    motion = np.zeros((len(poses), 3, 3))
-    motion[:, 0, 0] = motion[:, 1, 1] = c
-    motion[:, 0, 1], motion[:, 1, 0] = -s, s
-    motion[:, 0, 2], motion[:, 1, 2] = -(c * x - s * y), -(s * x + c * y)
-    motion[:, 2, 2] = height
+    motion = rigid_in_plane(poses[:, YAW], poses[:, [X, Y]] / focal, np.exp(poses[:, LOG_HEIGHT]))
+    c, s = motion[:, 0, 0], motion[:, 1, 0]
     derivatives = np.zeros((len(poses), 4, 3, 3))
     derivatives[:, 0, 0], derivatives[:, 0, 1] = -motion[:, 1], motion[:, 0]
     derivatives[:, 1, 0, 2], derivatives[:, 1, 1, 2] = -c / focal, -s / focal
     derivatives[:, 2, 0, 2], derivatives[:, 2, 1, 2] = s / focal, -c / focal
-    derivatives[:, 3, 2, 2] = height
+    derivatives[:, 3, 2, 2] = motion[:, 2, 2]
     return motion, derivatives
 
 

@@ -28,6 +28,7 @@ from rdstitch.radial_homography import (
     transfer_jacobian,
     whiten,
 )
+from rdstitch.robust.loss import robust_weight
 
 _CHUNK = 8192
 """Correspondences linearized at a time: what stays in cache."""
@@ -57,17 +58,6 @@ class LinkEquations:
     gradient: FloatArray
     squared: FloatArray
     whitening: FloatArray
-
-
-def robust_weight(squared: FloatArray, width: float) -> FloatArray:
-    """Geman and McClure's weight of an error: 1 for small ones, 1/4 at ``width``, 0 far beyond."""
-    ratio: FloatArray = 1.0 / (1.0 + squared / width**2)
-    return ratio**2
-
-
-def robust_cost(squared: FloatArray, width: float) -> FloatArray:
-    """Geman and McClure's loss: the square for small errors, ``width²`` at most."""
-    return width**2 * (1.0 - 1.0 / (1.0 + squared / width**2))
 
 
 def split_lens(lens: FloatArray) -> tuple[float, tuple[float, ...], FloatArray]:

@@ -16,12 +16,13 @@ import numpy as np
 
 from rdstitch.alignment.bundle_adjustment import WIDTH_PER_SIGMA, BundleAdjuster, BundleAdjustmentResult
 from rdstitch.alignment.motion_models import inverses
-from rdstitch.alignment.normal_equations import robust_weight, whitened_errors
+from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.planarity import coherence
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.division_model import undistort
 from rdstitch.radial_homography import project
+from rdstitch.robust.loss import robust_weight
 
 _STEP = 1e-3
 """Of the direction along which the errors are differentiated, in standard deviations of λ."""

@@ -9,9 +9,10 @@ import math
 from collections.abc import Sequence
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.lens_selection import EXACTNESS
-from rdstitch.alignment.model_selection import ModelChoice, NoiseModel, choose_model, link_errors, within_reason
+from rdstitch.alignment.lens_selection import is_plausible
+from rdstitch.alignment.model_selection import ModelChoice, choose_model, fit_cost, noise_of_links, price
 from rdstitch.alignment.motion_models import RIGID
+from rdstitch.alignment.noise_model import EXACTNESS, NoiseModel
 from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.arrays import BoolArray
 
@@ -31,7 +32,7 @@ def choose_motion(problem: Problem, names: Sequence[str], lenses: Sequence[BoolA
     planar = [name for name in names if name != ROTATION.name]
     if len(planar) == len(names):
         return choose_model(problem, names, lenses)
-    bound = NoiseModel.of_links_apart(problem)
+    bound, least = noise_of_links(problem)
     trial = problem.trial(ROTATION)
     if planar and trial.sigma > _POSSIBLE * bound.noise:
         return choose_model(problem, planar, lenses)
@@ -45,11 +46,10 @@ def choose_motion(problem: Problem, names: Sequence[str], lenses: Sequence[BoolA
     )
     if _turns_far(turned) and math.hypot(turned.adjusted.sigma, EXACTNESS) < _AS_GOOD * bound.noise:
         return _choice(problem, bound, turned, lenses, explained)
-    least = bound.misfit(link_errors(problem, problem.homographies, problem.lens))
-    if _cost(bound, problem, turned) <= least + bound.price(problem, RIGID, problem.free_lens):
+    if _cost(bound, problem, turned) <= least + price(bound, problem, RIGID, problem.free_lens):
         return _choice(problem, bound, turned, lenses, f"{explained}, and nothing is left for more freedom to gain")
     over_plane = choose_model(problem, planar, lenses)
-    if bound.cost(problem, over_plane.fit) < _cost(bound, problem, turned):
+    if fit_cost(bound, problem, over_plane.fit) < _cost(bound, problem, turned):
         return over_plane
     other = over_plane.fit
     gains = f"{explained}, more freedom gains too little ({other.model.name} {other.adjusted.sigma:.2f} px)"
@@ -66,7 +66,7 @@ def _choice(problem: Problem, noise: NoiseModel, turned: Fit, lenses: Sequence[B
     """The turn, with more of the lens free where that pays."""
     for lens in lenses:
         wider = problem.extend(turned, lens | turned.free_lens)
-        if noise.cost(problem, wider) < noise.cost(problem, turned) and within_reason(wider):
+        if fit_cost(noise, problem, wider) < fit_cost(noise, problem, turned) and is_plausible(wider.adjusted):
             turned = wider
     return ModelChoice(turned, f"{ROTATION.name}: {reason}", noise.overdispersion)
 
@@ -78,4 +78,4 @@ def _cost(noise: NoiseModel, problem: Problem, turned: Fit) -> float:
     counts.
     """
     log_focal, known = float(turned.adjusted.parameters.shared[0]), problem.knowledge
-    return noise.cost(problem, turned) + ((log_focal - known.log_focal) / known.log_focal_std) ** 2
+    return fit_cost(noise, problem, turned) + ((log_focal - known.log_focal) / known.log_focal_std) ** 2

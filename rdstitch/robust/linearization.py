@@ -1,7 +1,6 @@
 """The robust loss of matches under a homography and a lens, with its normal equations, for many pairs at once.
 
-The loss is Geman and McClure's ``e² / (1 + e²/c²)`` of the whitened transfer error in measured pixels, so that matches
-that do not fit lose their influence without ever being decided upon.
+The loss is that of :mod:`rdstitch.robust.loss`, of the whitened transfer error in measured pixels.
 
 With ``z = H p(λ)`` the derivative of the transferred point by H is ``(∂d/∂z) ⊗ p``. So a match enters ``J'J`` by a
 matrix of 3 x 3 times ``p p'``, and nothing of the size of a Jacobian is ever formed.
@@ -13,6 +12,7 @@ import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.division_model import distorted_ratio
+from rdstitch.robust.loss import loss_ratio
 from rdstitch.robust.measurements import Measurements
 
 _PAIRS = np.triu_indices(3)
@@ -166,7 +166,7 @@ def entry_equations(
 ) -> EntryEquations:
     """The loss with its scale ``c`` (B,), pixels, and its normal equations by the entries of H and the lens."""
     squared = found.squared
-    relative = 1.0 / (1.0 + squared / (scale**2)[:, None])
+    relative = loss_ratio(squared, scale[:, None])
     lost = found.lost & present
     relative[~present | lost] = 0.0
     cost = (squared * relative).sum(axis=1) + scale**2 * lost.sum(axis=1)
@@ -202,7 +202,7 @@ def entry_equations(
 
 def influence(found: TransferDerivatives, present: BoolArray, scale: FloatArray, free_lens: bool) -> FloatArray:
     """Each match's share of the gradient by the entries of H and the lens, (B, N, 9 + E)."""
-    relative = 1.0 / (1.0 + found.squared / (scale**2)[:, None])
+    relative = loss_ratio(found.squared, scale[:, None])
     relative[~present | found.lost] = 0.0
     xx, xy, yy = np.moveaxis(found.precision * (relative * relative)[:, None], 1, 0)
     dx, dy = found.error[:, 0], found.error[:, 1]

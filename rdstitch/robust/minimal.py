@@ -8,13 +8,11 @@ import numpy as np
 
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
+from rdstitch.division_model import SEARCHED_DISTORTION
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 from rdstitch.solvers.solutions import Solutions
 
 Solve = Callable[[FloatArray, FloatArray, FloatArray | None], Solutions]
-
-DISTORTION_RANGE = (-0.95, 0.5)
-"""λ in the half-diagonal frame that is searched: from nearly folding barrel to strong pincushion distortion."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,7 @@ def minimal_solvers(focal: float, focal_std: float, tilts_known: bool, distortio
             MinimalSolver("two_point_similarity", 2, _tilted(points2, focal), similarity, True),
             MinimalSolver("four_point_dlt", 4, _untilted(dlt), HomographyPairModel(), True),
         ]
-    low, high = DISTORTION_RANGE
+    low, high = SEARCHED_DISTORTION
     searched = {"distortion_range": (low * focal**2, high * focal**2)}
     if tilts_known:
         planar = MinimalSolver("two_point", 2, _tilted(partial(solvers.two_point, **searched), focal), rigid)
@@ -74,7 +72,7 @@ def minimal_solvers(focal: float, focal_std: float, tilts_known: bool, distortio
         planar = MinimalSolver("three_point", 3, _untilted(partial(solvers.three_point, **searched), focal), rigid)
     scaled = partial(solvers.three_point_similarity, **searched)
     four_point = partial(solvers.four_point, **searched)
-    five_point = partial(solvers.five_point, distortion_range=DISTORTION_RANGE)
+    five_point = partial(solvers.five_point, distortion_range=SEARCHED_DISTORTION)
     return [
         planar,
         MinimalSolver("three_point_similarity", 3, _tilted(scaled, focal), similarity),

@@ -9,12 +9,12 @@ import numpy as np
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.division_model import OBSERVABLE_STD
 from rdstitch.robust.covariance import covariances
+from rdstitch.robust.loss import RAYLEIGH_MEDIAN
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel
 from rdstitch.robust.refinement import Fits, Inspection, PairProblems, refine_pairs
 
 _LEAST_NOISE = 0.02  # pixels; below, noise-free data would reject every model over rounding
-_RAYLEIGH_MEDIAN = 1.1774  # median length of a two-dimensional normal vector of standard deviation 1
 _LOSS_WIDTH = 4.0  # scale of the loss in standard deviations of the noise
 _NEAR = 3.0  # errors, in thresholds, beyond which a match has no say in the choice
 _FREE_STEPS, _STEPS = 8, 15
@@ -215,7 +215,7 @@ def noise_of(errors: FloatArray, threshold: float) -> FloatArray:
     middle = np.stack([np.maximum(count - 1, 0) // 2, count // 2], axis=1)
     middle = np.minimum(middle, errors.shape[1] - 1)
     median = np.take_along_axis(ordered, middle, axis=1).mean(axis=1)
-    return np.where(count > 0, np.maximum(median / _RAYLEIGH_MEDIAN, _LEAST_NOISE), _LEAST_NOISE)
+    return np.where(count > 0, np.maximum(median / RAYLEIGH_MEDIAN, _LEAST_NOISE), _LEAST_NOISE)
 
 
 def loss_width(noise: FloatArray, threshold: float) -> FloatArray:

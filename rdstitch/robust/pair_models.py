@@ -14,7 +14,15 @@ from typing import Protocol
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.planar_motion import PlanarMotion, motions_from_homographies, rigid_in_plane, rotation_from_tilt
+from rdstitch.planar_motion import (
+    ABOUT_X,
+    ABOUT_Y,
+    ABOUT_Z,
+    PlanarMotion,
+    motions_from_homographies,
+    rigid_in_plane,
+    rotation_from_tilt,
+)
 
 _TILTS, _YAW, _TX, _TY, _HEIGHT, _FOCAL = slice(0, 4), 4, 5, 6, 7, 8
 _PSI, _THETA = (0, 2), (1, 3)
@@ -161,11 +169,11 @@ class PlanarPairModel:
         back = np.swapaxes(r1, 1, 2)
         columns = np.zeros((len(state), 9, 3, 3))
         after, before = r2 @ motion, motion @ back
-        columns[:, 0] = after @ np.swapaxes(_ABOUT_X @ r1, 1, 2)
-        columns[:, 1] = after @ np.swapaxes(r1 @ _ABOUT_Y, 1, 2)
-        columns[:, 2] = _ABOUT_X @ r2 @ before
-        columns[:, 3] = r2 @ _ABOUT_Y @ before
-        columns[:, _YAW] = r2 @ _ABOUT_Z @ before
+        columns[:, 0] = after @ np.swapaxes(ABOUT_X @ r1, 1, 2)
+        columns[:, 1] = after @ np.swapaxes(r1 @ ABOUT_Y, 1, 2)
+        columns[:, 2] = ABOUT_X @ r2 @ before
+        columns[:, 3] = r2 @ ABOUT_Y @ before
+        columns[:, _YAW] = r2 @ ABOUT_Z @ before
         for entry, axis in ((_TX, 0), (_TY, 1)):
             columns[:, entry] = -after[:, :, axis, None] * back[:, None, 2]
         columns[:, _HEIGHT] = r2[:, :, 2, None] * motion[:, 2, 2, None, None] * back[:, None, 2]
@@ -197,7 +205,3 @@ class PlanarPairModel:
 
 
 _IN_PLANE = np.array([1.0, 1.0, 0.0])
-_ABOUT_X = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-_ABOUT_Y = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
-_ABOUT_Z = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-"""Generators: with ``R = Rx(ψ) Ry(θ)`` the derivatives by ψ and θ are ``Gx R`` and ``R Gy``."""

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
+from rdstitch.division_model import SOLVED_DISTORTION
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.homography import Quadrangles
 from rdstitch.solvers.lines import determinants, squared_radii
@@ -17,7 +18,7 @@ from rdstitch.solvers.solutions import Solutions
 _DEGREE = 4
 
 
-def five_point(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, float] = (-1.5, 0.5)) -> Solutions:
+def five_point(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, float] = SOLVED_DISTORTION) -> Solutions:
     """Any homography, and λ, from five points; needs no focal length.
 
     For fixed λ four points give the homography (:mod:`rdstitch.solvers.homography`). The third row of the direct linear

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray
+from rdstitch.division_model import SOLVED_DISTORTION
 from rdstitch.solvers.batch import IndexArray, solve_in_blocks
 from rdstitch.solvers.plane import lens_range
 from rdstitch.solvers.solutions import Solutions
@@ -14,7 +15,9 @@ _REAL = 1e-7
 _SINGULAR = 1e-9
 
 
-def five_point_qep(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, float] = (-1.5, 0.5)) -> Solutions:
+def five_point_qep(
+    x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, float] = SOLVED_DISTORTION
+) -> Solutions:
     """Any homography, and λ, from five points by a quadratic eigenvalue problem (Fitzgibbon, CVPR 2001, §5).
 
     The two rows per point of the direct linear transformation that contain the lifted coordinate of picture 2 are

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
+from rdstitch.division_model import SOLVED_DISTORTION
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.homography import Quadrangles
 from rdstitch.solvers.lines import determinants, squared_radii
@@ -18,7 +19,7 @@ _QUARTIC_DEGREE = 18
 _SEXTIC_DEGREE = 16
 
 
-def four_point(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, float] = (-1.5, 0.5)) -> Solutions:
+def four_point(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, float] = SOLVED_DISTORTION) -> Solutions:
     """Planar motion with unknown tilt, and λ, from four points (the relaxation of Valtonen Örnhag et al., §4.1).
 
     For fixed λ the points give the homography (:mod:`rdstitch.solvers.homography`), and λ is a root of one

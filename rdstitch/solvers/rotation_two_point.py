@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
+from rdstitch.division_model import SOLVED_DISTORTION
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.plane import lens_range
 from rdstitch.solvers.rays import RayPairs, rotation_of_two, turned_solutions
@@ -15,7 +16,9 @@ from rdstitch.solvers.solutions import Solutions
 _DEGREE = 6
 
 
-def rotation_two_point(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, float] = (-1.5, 0.5)) -> Solutions:
+def rotation_two_point(
+    x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, float] = SOLVED_DISTORTION
+) -> Solutions:
     """Rotation about the camera's centre and λ from two points, for a known focal length.
 
     With focal-normalized points the rays are ``r = (x, 1 + λ |x|²)``. A rotation keeps the angle between two of them,

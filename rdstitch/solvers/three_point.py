@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.division_model import SOLVED_DISTORTION
 from rdstitch.errors import ArgumentError
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.lines import Lines, squared_radii, triangle_determinants
@@ -47,7 +48,7 @@ _STATES_IN_BLOCK = 9216
 def three_point(
     x1: ArrayLike,
     x2: ArrayLike,
-    distortion_range: tuple[float, float] = (-1.5, 0.5),
+    distortion_range: tuple[float, float] = SOLVED_DISTORTION,
     starts: ArrayLike = DEFAULT_STARTS,
 ) -> Solutions:
     """Planar motion with unknown tilt, and λ, from three points: as many equations as unknowns.

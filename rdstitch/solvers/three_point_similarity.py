@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
+from rdstitch.division_model import SOLVED_DISTORTION
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.lines import Lines, triangle_determinants
 from rdstitch.solvers.orientation import mirrored, oriented_samples
@@ -20,7 +21,7 @@ def three_point_similarity(
     x1: ArrayLike,
     x2: ArrayLike,
     tilt: ArrayLike = (0.0, 0.0),
-    distortion_range: tuple[float, float] = (-1.5, 0.5),
+    distortion_range: tuple[float, float] = SOLVED_DISTORTION,
 ) -> Solutions:
     """Planar motion with a change of height, and λ, from three points, for known tilt.
 

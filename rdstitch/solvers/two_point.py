@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
+from rdstitch.division_model import SOLVED_DISTORTION
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.lines import Lines
 from rdstitch.solvers.plane import TiltRotations, depths, differences, motion_homography, visible_range
@@ -19,7 +20,7 @@ def two_point(
     x1: ArrayLike,
     x2: ArrayLike,
     tilt: ArrayLike = (0.0, 0.0),
-    distortion_range: tuple[float, float] = (-1.5, 0.5),
+    distortion_range: tuple[float, float] = SOLVED_DISTORTION,
 ) -> Solutions:
     """Planar motion and λ from two points, for known tilt (Valtonen Örnhag et al., §4.2, extended to any tilt).
 

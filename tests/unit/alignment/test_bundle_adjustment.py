@@ -5,8 +5,9 @@ import pytest
 
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters, Priors, sigma_of
 from rdstitch.alignment.motion_models import HOMOGRAPHY, MODELS, RIGID, TILTING, MotionModel
-from rdstitch.alignment.normal_equations import chain, link_equations, robust_cost, robust_weight, squared_errors
+from rdstitch.alignment.normal_equations import chain, link_equations, squared_errors
 from rdstitch.alignment.observations import Observations
+from rdstitch.robust.loss import robust_cost, robust_weight
 from tests.alignment_scenes import Scene, grid, jittered, scene
 
 FREE_LENS = np.array([True, True, True, True, True])

@@ -1,0 +1,26 @@
+"""The robust loss of pairs and of the bundle adjustment, and the noise that its width follows.
+
+Geman and McClure's ``e² / (1 + e²/w²)`` of an error's length e: the square for small errors, the width's square at
+most, so that wrong matches lose their influence without ever being decided upon (Black and Rangarajan, IJCV 1996).
+"""
+
+from rdstitch.arrays import FloatArray
+
+RAYLEIGH_MEDIAN = 1.1774
+"""Median length of a two-dimensional normal vector of standard deviation 1: ``sqrt(2 log 2)``."""
+
+
+def loss_ratio(squared: FloatArray, width: FloatArray | float) -> FloatArray:
+    """The loss over the square of the error: 1 for small errors, 1/2 at ``width``, 0 for infinite ones."""
+    ratio: FloatArray = 1.0 / (1.0 + squared / width**2)
+    return ratio
+
+
+def robust_weight(squared: FloatArray, width: float) -> FloatArray:
+    """What an error counts in the normal equations: the derivative of the loss by the error's square."""
+    return loss_ratio(squared, width) ** 2
+
+
+def robust_cost(squared: FloatArray, width: float) -> FloatArray:
+    """The loss of errors, given their squares."""
+    return width**2 * (1.0 - loss_ratio(squared, width))
