@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rdstitch.alignment.bundle_adjustment import (
-    WIDTH_PER_SIGMA,
     BundleAdjuster,
     BundleAdjustmentResult,
     FreeParameters,
@@ -23,7 +22,7 @@ from rdstitch.alignment.rotation_model import FOCAL_STARTS, ROTATION
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import Camera
 from rdstitch.matching.match_graph import spanning_tree
-from rdstitch.robust.loss import robust_cost
+from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
 
 _WIDEST_START = 0.05
 """Half diagonals: errors that a chain may have gathered before the adjustment, beyond which a link is doubted."""
@@ -273,7 +272,7 @@ class Problem:
             )
             for shared in self._shared_to_try(model, priors.shared)
         ]
-        width = WIDTH_PER_SIGMA * min(trial.sigma for trial in trials)
+        width = ALIGNMENT_WIDTH * min(trial.sigma for trial in trials)
         cost = [float(robust_cost(trial.squared, width).sum()) for trial in trials]
         return trials[int(np.argmin(cost))]
 

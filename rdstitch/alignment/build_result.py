@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Problem
-from rdstitch.alignment.bundle_adjustment import WIDTH_PER_SIGMA
 from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.lens_selection import CENTER, LensChoice
 from rdstitch.alignment.model_selection import ModelChoice
@@ -24,6 +23,7 @@ from rdstitch.matching.distortion_consensus import Consensus
 from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.messages import Message
+from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 _STEP = 1e-5
 """Of differences of λ, μ and ν."""
@@ -77,7 +77,7 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
     groups = _groups(found)
     observations = problem.observations
     errors = whitened_errors(observations, adjusted.homographies, lens)
-    inliers = adjusted.squared <= (WIDTH_PER_SIGMA * adjusted.sigma) ** 2
+    inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
     relief = judge_relief(coherence(observations, errors, inliers), fit.model.name)
     used = np.zeros(len(found.cameras), dtype=np.bool_)
     used[found.pictures] = True

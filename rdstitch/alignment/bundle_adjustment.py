@@ -20,10 +20,8 @@ from rdstitch.alignment.normal_equations import (
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import LENS_PARAMETERS
-from rdstitch.robust.loss import RAYLEIGH_MEDIAN, robust_cost
-
-WIDTH_PER_SIGMA = 3.5
-"""Width of the robust loss in standard deviations of an error's coordinate."""
+from rdstitch.robust.levenberg_marquardt import FIRST_DAMPING, LARGEST_DAMPING, LEAST_GAIN, next_damping
+from rdstitch.robust.loss import ALIGNMENT_WIDTH, RAYLEIGH_MEDIAN, robust_cost
 
 _SMALLEST_SIGMA = 1e-3
 """px; less is not measurable, and zero would divide."""
@@ -168,8 +166,6 @@ class BundleAdjuster:
         How much less the correspondences say than if their errors were independent; weighs them against the priors.
     max_iterations : int
         Linearizations at most.
-    tolerance : float
-        Relative decrease of the cost, as a step promises it, that is not worth the step.
     """
 
     model: MotionModel
@@ -178,7 +174,6 @@ class BundleAdjuster:
     priors: Priors
     overdispersion: float = 1.0
     max_iterations: int = 60
-    tolerance: float = 1e-5
 
     def run(self, start: Parameters, width: float | None = None) -> BundleAdjustmentResult:
         """Adjust.
@@ -191,14 +186,14 @@ class BundleAdjuster:
             what the scatter of the errors calls for.
         """
         sigma = self._sigma(self._evaluate(start, 1.0, 1.0))
-        wide = max(width or 0.0, WIDTH_PER_SIGMA * sigma)
+        wide = max(width or 0.0, ALIGNMENT_WIDTH * sigma)
         parameters, used, converged = start, 0, False
         while used < self.max_iterations:
-            last = wide <= WIDTH_PER_SIGMA * sigma * 1.05
+            last = wide <= ALIGNMENT_WIDTH * sigma * 1.05
             state, iterations, converged = self._descend(parameters, sigma, wide, 12 if last else 4)
             parameters, used = state.parameters, used + iterations
             sigma, previous = self._sigma(state), sigma
-            wide = max(wide / 3.0, WIDTH_PER_SIGMA * sigma)
+            wide = max(wide / 3.0, ALIGNMENT_WIDTH * sigma)
             if last and converged and abs(sigma - previous) <= 0.02 * previous:
                 break
             converged = False
@@ -211,17 +206,17 @@ class BundleAdjuster:
 
     def normal_equations(self, adjusted: BundleAdjustmentResult) -> SparseNormalEquations:
         """At a solution, priors included."""
-        state = self._evaluate(adjusted.parameters, adjusted.sigma, WIDTH_PER_SIGMA * adjusted.sigma)
+        state = self._evaluate(adjusted.parameters, adjusted.sigma, ALIGNMENT_WIDTH * adjusted.sigma)
         return self._normal_equations(state, adjusted.sigma)
 
     def _descend(self, parameters: Parameters, sigma: float, width: float, most: int) -> tuple[_State, int, bool]:
         """Levenberg-Marquardt at one width of the loss; the state reached, linearizations, whether converged."""
         state = self._evaluate(parameters, sigma, width)
-        damping, used = 1e-5, 1
+        damping, used = np.asarray(FIRST_DAMPING), 1
         while used < most:
             normal = self._normal_equations(state, sigma)
             try:
-                flat, step_shared = normal.solve(damping)
+                flat, step_shared = normal.solve(float(damping))
             except RuntimeError:  # singular: some pictures are held by nothing but lost correspondences
                 return state, used, False
             step_poses = np.zeros(self.freedom.poses.shape)
@@ -229,19 +224,17 @@ class BundleAdjuster:
             predicted = -(
                 normal.gradient_poses @ flat + normal.gradient_shared @ step_shared
             )  # of the quadratic model, to first order twice the decrease
-            if not np.isfinite(predicted) or predicted <= self.tolerance * max(state.cost, 1e-12):
+            if not np.isfinite(predicted) or predicted <= LEAST_GAIN * max(state.cost, 1e-12):
                 return state, used, True
             moved = state.parameters.retract(self.model, step_poses, step_shared, self.freedom.lens)
             cost = self._cost_at(moved, state.equations.whitening, sigma, width)
             used += 1
-            if cost < state.cost:
-                gain = (state.cost - cost) / predicted
-                damping = max(damping * (0.1 if gain > 0.5 else 1.0), 1e-9)
+            better = cost < state.cost
+            damping = next_damping(damping, np.asarray(better))
+            if better:
                 state = self._evaluate(moved, sigma, width)
-            elif damping > 1e6:
+            elif damping > LARGEST_DAMPING:
                 return state, used, True
-            else:
-                damping *= 10.0
         return state, used, False
 
     def _evaluate(self, parameters: Parameters, sigma: float, width: float) -> _State:
@@ -315,7 +308,7 @@ class BundleAdjuster:
 
     def _finished(self, parameters: Parameters, sigma: float, used: int, converged: bool) -> BundleAdjustmentResult:
         """The result with its covariance."""
-        state = self._evaluate(parameters, sigma, WIDTH_PER_SIGMA * sigma)
+        state = self._evaluate(parameters, sigma, ALIGNMENT_WIDTH * sigma)
         derivative = self._natural(parameters.shared)[1]
         covariance = _covariance(self._normal_equations(state, sigma).shared_information())
         return BundleAdjustmentResult(

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.alignment.bundle_adjustment import WIDTH_PER_SIGMA, sigma_of
+from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.cycle_consistency import misfitting_links
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.planarity import coherence
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 EXACTNESS = 0.1
 """Pixels: how exactly a lens and a plane can be described at all."""
@@ -52,7 +53,7 @@ class NoiseModel:
         """From whitened errors (M, 2); ``freedom`` is the share of them that the parameters have not absorbed."""
         squared = squared_lengths(errors)
         sigma = sigma_of(squared[observations.scale_inliers_mask])
-        inliers = squared <= (WIDTH_PER_SIGMA * sigma) ** 2
+        inliers = squared <= (ALIGNMENT_WIDTH * sigma) ** 2
         overdispersion = coherence(observations, errors, inliers).overdispersion
         counted = ~misfitting_links(squared, observations)[observations.link]
         effective = max(2.0 * float((counted & inliers).sum()) / overdispersion, 2.0)
@@ -66,7 +67,7 @@ class NoiseModel:
     def misfit(self, squared: FloatArray) -> FloatArray:
         """Robust squares of the errors that count, in units of the noise, from the squares of all (M,)."""
         ratio = np.minimum(squared[self.counted], _LARGEST_ERROR2) / self.noise**2
-        misfit: FloatArray = WIDTH_PER_SIGMA**2 * np.log1p(ratio / WIDTH_PER_SIGMA**2) / self.overdispersion
+        misfit: FloatArray = ALIGNMENT_WIDTH**2 * np.log1p(ratio / ALIGNMENT_WIDTH**2) / self.overdispersion
         return misfit
 
 

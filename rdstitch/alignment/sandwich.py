@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rdstitch.alignment.bundle_adjustment import WIDTH_PER_SIGMA, BundleAdjuster, BundleAdjustmentResult
+from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult
 from rdstitch.alignment.motion_models import inverses
 from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.observations import Observations
@@ -22,7 +22,7 @@ from rdstitch.alignment.planarity import coherence
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.division_model import undistort
 from rdstitch.radial_homography import project
-from rdstitch.robust.loss import robust_weight
+from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_weight
 
 _STEP = 1e-3
 """Of the direction along which the errors are differentiated, in standard deviations of λ."""
@@ -68,7 +68,7 @@ def _influence(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> Fl
     size = _STEP / max(float(np.sqrt(abs(shared[len(adjusted.parameters.shared)]))), 1e-12)
     ahead, behind = (_errors(adjuster, adjusted, sign * size * step, sign * size * shared) for sign in (1.0, -1.0))
     errors = whitened_errors(observations, adjusted.homographies, adjusted.parameters.lens)
-    weight = robust_weight(adjusted.squared, WIDTH_PER_SIGMA * adjusted.sigma) * adjuster.weight(adjusted.sigma)
+    weight = robust_weight(adjusted.squared, ALIGNMENT_WIDTH * adjusted.sigma) * adjuster.weight(adjusted.sigma)
     change = (ahead - behind) / (2.0 * size)
     influence: FloatArray = np.nan_to_num(weight * np.einsum("mi,mi->m", errors, change))
     return influence
@@ -87,7 +87,7 @@ def _errors(
 def _absorbed(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult, influence: FloatArray) -> float:
     """Variance of λ by what neighbours have in common, as far as the parameters can have absorbed it."""
     errors = whitened_errors(adjuster.observations, adjusted.homographies, adjusted.parameters.lens)
-    inliers = adjusted.squared <= (WIDTH_PER_SIGMA * adjusted.sigma) ** 2
+    inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
     common = max(coherence(adjuster.observations, errors, inliers).correlation, 0.0)
     independent = _OBSERVATIONS_PER_LINK * len(adjuster.observations)
     return common * float((influence**2).sum()) * max(2.0 * float(inliers.sum()) / independent, 1.0)

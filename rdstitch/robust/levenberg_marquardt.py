@@ -8,10 +8,13 @@ import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 
-_LEAST_GAIN = 1e-5
+LEAST_GAIN = 1e-5
 """Expected relative fall of the loss that is worth another step: a hundredth of the noise."""
 
-_FIRST_DAMPING, _LEAST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e-9, 1e4
+FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e4
+"""Of the diagonal of the normal matrix: where a descent begins, and beyond which it has got stuck."""
+
+_LEAST_DAMPING = 1e-9
 
 
 @dataclass
@@ -55,11 +58,11 @@ def descend(problems: Problems, retract: Retract, start: FloatArray, iterations:
     """
     result = start.copy()
     current = problems.normal_equations(start)
-    parameters, damping, rows = start, np.full(len(start), _FIRST_DAMPING), np.arange(len(start))
+    parameters, damping, rows = start, np.full(len(start), FIRST_DAMPING), np.arange(len(start))
     for _ in range(iterations):
         step = _damped_step(current, damping)
         gain = -np.einsum("bp,bp->b", step, current.gradient)
-        going = (gain > _LEAST_GAIN * current.cost) & (damping <= _LARGEST_DAMPING)
+        going = (gain > LEAST_GAIN * current.cost) & (damping <= LARGEST_DAMPING)
         if not going.all():
             rows, step, parameters, damping = rows[going], step[going], parameters[going], damping[going]
             problems = problems.take(going)
@@ -75,9 +78,14 @@ def descend(problems: Problems, retract: Retract, start: FloatArray, iterations:
             np.where(better[:, None, None], there.information, current.information),
             np.where(better[:, None], there.gradient, current.gradient),
         )
-        damping = np.where(better, np.maximum(damping / 10.0, _LEAST_DAMPING), damping * 20.0)
+        damping = next_damping(damping, better)
         result[rows] = parameters
     return result
+
+
+def next_damping(damping: FloatArray, better: BoolArray) -> FloatArray:
+    """Damping of the next step, from that of a step and whether it made the loss smaller (Marquardt 1963)."""
+    return np.where(better, np.maximum(damping / 10.0, _LEAST_DAMPING), damping * 20.0)
 
 
 def _damped_step(equations: BatchedNormalEquations, damping: FloatArray) -> FloatArray:

@@ -9,6 +9,15 @@ from rdstitch.arrays import FloatArray
 RAYLEIGH_MEDIAN = 1.1774
 """Median length of a two-dimensional normal vector of standard deviation 1: ``sqrt(2 log 2)``."""
 
+PAIR_WIDTH, ALIGNMENT_WIDTH = 4.0, 3.5
+"""Widths of the loss in standard deviations of an error's coordinate.
+
+A pair's noise is estimated from its few matches alone, so that its loss is a little wider. It does not matter much: on
+60 pairs of ``rdstitch.synthetic.correspondences`` (300 matches, 35 % of them wrong, noise of 0.3 to 1 pixel) the median
+error of λ is 0.00074, 0.00069, 0.00062 and 0.00059 at widths of 2.5, 3.5, 4 and 5, and 90 % of the errors are below
+0.0031, 0.0029, 0.0029 and 0.0029.
+"""
+
 
 def loss_ratio(squared: FloatArray, width: FloatArray | float) -> FloatArray:
     """The loss over the square of the error: 1 for small errors, 1/2 at ``width``, 0 for infinite ones."""

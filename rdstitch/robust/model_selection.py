@@ -9,13 +9,12 @@ import numpy as np
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.division_model import OBSERVABLE_STD
 from rdstitch.robust.covariance import covariances
-from rdstitch.robust.loss import RAYLEIGH_MEDIAN
+from rdstitch.robust.loss import PAIR_WIDTH, RAYLEIGH_MEDIAN
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel
 from rdstitch.robust.refinement import Fits, Inspection, PairProblems, refine_pairs
 
 _LEAST_NOISE = 0.02  # pixels; below, noise-free data would reject every model over rounding
-_LOSS_WIDTH = 4.0  # scale of the loss in standard deviations of the noise
 _NEAR = 3.0  # errors, in thresholds, beyond which a match has no say in the choice
 _FREE_STEPS, _STEPS = 8, 15
 
@@ -220,7 +219,7 @@ def noise_of(errors: FloatArray, threshold: float) -> FloatArray:
 
 def loss_width(noise: FloatArray, threshold: float) -> FloatArray:
     """Scales of the loss, pixels, for errors of these standard deviations per axis."""
-    return np.minimum(threshold, _LOSS_WIDTH * noise)
+    return np.minimum(threshold, PAIR_WIDTH * noise)
 
 
 def rms_of(errors: FloatArray, threshold: float) -> FloatArray:
