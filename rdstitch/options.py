@@ -2,8 +2,9 @@
 
 import math
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Self
 
 from rdstitch.alignment import LENSES, MODELS
 from rdstitch.camera import Camera
@@ -159,6 +160,10 @@ class StitchOptions:
             raise ArgumentError("workers and seed must not be negative")
         if self.workers > _MAX_WORKERS:
             raise ArgumentError(f"workers must be at most {_MAX_WORKERS}, not {self.workers}")
+
+    def for_pictures(self, count: int) -> Self:
+        """The same with numbers for what depends on how many pictures there are."""
+        return replace(self, features=self.features.for_pictures(count))
 
     @property
     def known_distortion(self) -> float | None:

@@ -149,19 +149,16 @@ estimation = together(
     click.option(
         "--max-features",
         type=click.IntRange(1),
-        default=2000,
-        show_default=True,
         metavar="N",
-        help="At most so many features a picture.",
+        help="At most so many features a picture.  [default: 2000; of fewer than 8 pictures 16000 together, "
+        "at most 8000 each]",
     ),
     click.option(
         "--work-megapixels",
         type=click.FloatRange(0.0),
-        default=0.6,
-        show_default=True,
         metavar="MP",
         help="Pictures are halved until they have no more megapixels before features are detected, once less where "
-        "that shows too few; 0 is full size.",
+        "that shows too few; 0 is full size.  [default: 0.6; of fewer than 8 pictures 4.8 together, at most 2.4 each]",
     ),
     click.option(
         "--solver", type=click.Choice(SOLVERS), default="auto", show_default=True, help="Minimal solver of the pairs."

@@ -40,8 +40,8 @@ def stitch_options(
     camera: Path | None,
     features: str,
     aliked_model: Path | None,
-    max_features: int,
-    work_megapixels: float,
+    max_features: int | None,
+    work_megapixels: float | None,
     solver: str,
     preview: bool = False,
     **given: Any,
@@ -59,7 +59,10 @@ def stitch_options(
     return StitchOptions(
         camera=read_lens(camera, reporter),
         features=FeatureOptions(
-            features, max_features, work_megapixels=work_megapixels or None, aliked_model=aliked_model
+            features,
+            max_features,
+            work_megapixels="auto" if work_megapixels is None else work_megapixels or None,
+            aliked_model=aliked_model,
         ),
         composite=CompositeOptions(**composite),
         solver=solver.replace("-", "_"),
@@ -67,7 +70,9 @@ def stitch_options(
     )
 
 
-def _preview(max_features: int, work_megapixels: float, given: dict[str, Any]) -> tuple[int, float]:
+def _preview(
+    max_features: int | None, work_megapixels: float | None, given: dict[str, Any]
+) -> tuple[int | None, float | None]:
     """Features and megapixels of a quick result; changes the other options that the user did not set."""
     quick = {"max_size": 1200, "seam": "voronoi"}
     given |= {name: value for name, value in quick.items() if not is_given(name)}

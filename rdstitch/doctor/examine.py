@@ -14,7 +14,6 @@ from rdstitch.doctor.examination import Examination
 from rdstitch.doctor.glance import Glance, glance_at, overlap_of
 from rdstitch.errors import InputError
 from rdstitch.features import FeatureOptions, Features, detect
-from rdstitch.features.options import WORK_MEGAPIXELS
 from rdstitch.inputs.find import found_pictures
 from rdstitch.inputs.frame import ChannelOrder, Images, as_inputs
 from rdstitch.inputs.source import Source, read_sources
@@ -164,8 +163,9 @@ def _memory(sources: Sequence[Source]) -> int:
 
 def _seconds(sources: Sequence[Source], examined: Sequence[_Examined], overlap: float, workers: int) -> float:
     """From the time that the glance took: features of larger versions, pairs, and the composite."""
+    working = FeatureOptions().for_pictures(len(sources)).limits[1] or np.inf
     detecting = sum(
-        item.seconds * min(WORK_MEGAPIXELS, np.prod(source.metadata.size) / 1e6) / _MEGAPIXELS
+        item.seconds * min(working, np.prod(source.metadata.size) / 1e6) / _MEGAPIXELS
         for source, item in zip(sources, examined, strict=True)
     )
     pairs = min(_PAIRS_PER_PICTURE * len(sources), len(sources) * (len(sources) - 1) / 2)

@@ -59,15 +59,16 @@ def detect(image: PixelArray, options: FeatureOptions | None = None, mask: Mask 
 
 def _detect(source: ViewLoader, options: FeatureOptions) -> Features:
     """The same for a picture that is loaded as large as it is needed."""
-    picture, detection, usable = _look(source, options, options.work_megapixels)
-    if options.work_megapixels is not None and picture.reduced and len(usable) < _FEW * options.max_features:
-        picture, detection, usable = _look(source, options, CLOSER * options.work_megapixels)
+    most, megapixels = options.limits
+    picture, detection, usable = _look(source, options, megapixels)
+    if megapixels is not None and picture.reduced and len(usable) < _FEW * most:
+        picture, detection, usable = _look(source, options, CLOSER * megapixels)
     points, response = detection.points[usable], detection.response[usable]
     if options.spread:
         cell = options.spread_cell * float(np.hypot(*picture.grey.shape))
-        chosen = spread(points, response, options.max_features, cell)
+        chosen = spread(points, response, most, cell)
     else:
-        chosen = strongest(response, options.max_features)
+        chosen = strongest(response, most)
     features = detection.describe(usable[chosen])
     # Some detectors return them in an order of their own.
     features = features.take(strongest(features.response, len(features)))
@@ -138,7 +139,7 @@ def detect_all(
     Exception
         What a source raises; of several, that of the first source.
     """
-    options = options or FeatureOptions()
+    options = (options or FeatureOptions()).for_pictures(len(sources))
     if workers < 1:
         raise ArgumentError(f"workers must be at least 1, not {workers}")
 

@@ -134,7 +134,7 @@ def _sift(options: FeatureOptions) -> Any:
 
 def _orb(options: FeatureOptions) -> Any:
     # Many more than wanted, because ORB keeps the strongest of the whole picture and we spread them.
-    return cv2.ORB.create(nfeatures=8 * options.max_features, fastThreshold=options.orb_fast_threshold)
+    return cv2.ORB.create(nfeatures=8 * options.limits[0], fastThreshold=options.orb_fast_threshold)
 
 
 def _akaze(options: FeatureOptions) -> Any:

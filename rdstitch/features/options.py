@@ -1,15 +1,23 @@
 """Options of feature detection."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal, Self
 
 from rdstitch.errors import ArgumentError
 
 KINDS = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk", "aliked")
 WORK_MEGAPIXELS = 0.6
-"""10⁶ pixels to which pictures are halved unless it is said otherwise."""
+"""10⁶ pixels to which pictures of a large set are halved unless it is said otherwise."""
+MAX_FEATURES = 2000
+"""Keypoints kept per picture of a large set unless it is said otherwise."""
 CLOSER = 4.0
 """Times as many pixels are used where the working size shows too little."""
+
+_BUDGET = 8
+"""Pictures of a large set whose pixels and keypoints fewer pictures may share among them."""
+_MOST_OF_FEW = 4.0
+"""Times as many of either that a picture of a small set gets at most."""
 
 
 @dataclass(frozen=True)
@@ -20,10 +28,11 @@ class FeatureOptions:
     ----------
     kind : str
         "rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk" or "aliked".
-    max_features : int
-        Keypoints kept per picture.
-    work_megapixels : float, optional
-        Pictures are halved until they have no more megapixels than this before features are detected; None: never.
+    max_features : int, optional
+        Keypoints kept per picture; None: 2,000, and more where there are few pictures, see :meth:`for_pictures`.
+    work_megapixels : float or "auto", optional
+        Pictures are halved until they have no more megapixels than this before features are detected; None: never;
+        "auto": 0.6, and more where there are few pictures.
     spread : bool
         Keep the strongest of each cell of a grid in turn, rather than the strongest of the picture.
     spread_cell : float
@@ -60,8 +69,8 @@ class FeatureOptions:
     """
 
     kind: str = "rootsift"
-    max_features: int = 2000
-    work_megapixels: float | None = WORK_MEGAPIXELS
+    max_features: int | None = None
+    work_megapixels: float | Literal["auto"] | None = "auto"
     spread: bool = True
     spread_cell: float = 0.05
     sift_contrast: float = 0.02
@@ -85,11 +94,36 @@ class FeatureOptions:
             raise ArgumentError("features 'aliked' need the ONNX file of the network (--aliked-model)")
         if self.aliked_size < 1:
             raise ArgumentError(f"aliked_size must be at least 1, not {self.aliked_size}")
-        if self.max_features < 1:
+        if self.max_features is not None and self.max_features < 1:
             raise ArgumentError(f"max_features must be at least 1, not {self.max_features}")
-        if self.work_megapixels is not None and not self.work_megapixels > 0:
+        if isinstance(self.work_megapixels, str):
+            if self.work_megapixels != "auto":
+                raise ArgumentError(f"work_megapixels is a number, 'auto' or None, not {self.work_megapixels!r}")
+        elif self.work_megapixels is not None and not self.work_megapixels > 0:
             raise ArgumentError(f"work_megapixels must be positive, not {self.work_megapixels}")
         if self.surf_octaves < 1 or self.surf_layers < 1:
             raise ArgumentError("surf_octaves and surf_layers must be at least 1")
         if not 0 < self.spread_cell <= 1:
             raise ArgumentError(f"spread_cell must be in (0, 1], not {self.spread_cell}")
+
+    def for_pictures(self, count: int) -> Self:
+        """The same with numbers for what was left open, which depend on how many pictures there are.
+
+        A pair takes a second anyway, and all that is known of its lens comes from its own keypoints; hundreds of
+        pictures have enough together. Fewer than eight pictures share what eight would have, up to four times as many
+        pixels and keypoints each.
+        """
+        share = min(max(_BUDGET / max(count, 1), 1.0), _MOST_OF_FEW)
+        return replace(
+            self,
+            max_features=self.max_features or round(MAX_FEATURES * share),
+            work_megapixels=WORK_MEGAPIXELS * share if self.work_megapixels == "auto" else self.work_megapixels,
+        )
+
+    @property
+    def limits(self) -> tuple[int, float | None]:
+        """Keypoints of a picture, and its megapixels when they are detected; of many pictures where that is open."""
+        found = self.for_pictures(_BUDGET)
+        assert found.max_features is not None
+        assert found.work_megapixels != "auto"
+        return found.max_features, found.work_megapixels

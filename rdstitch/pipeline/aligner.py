@@ -68,7 +68,7 @@ class Aligner:
             When the reference picture is none of the pictures.
         """
         paths = tuple(str(source.path) for source in sources)
-        megapixels = options.features.work_megapixels
+        megapixels = options.features.for_pictures(len(sources)).limits[1]
         cameras = tuple(at_working_size(source.camera.with_focal(), megapixels) for source in sources)
         return cls(paths, cameras, _alignment_options(sources, options), cache)
 

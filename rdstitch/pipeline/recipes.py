@@ -297,7 +297,7 @@ def _composite(
         result = StitchResult(
             _with_damage(registration).with_messages(map(Message, composed.notes)),
             composed.canvas,
-            options,
+            options.for_pictures(len(registration.sources)),
             None if output is None else Path(output),
             composed.composite,
             composed.plan,

@@ -61,10 +61,11 @@ def register(
     RegistrationError
         When no two pictures overlap.
     """
+    options = options.for_pictures(len(sources))
     cache = Cache(options.cache)
     aligner = Aligner.of(sources, options, cache)
     detected = detect_features(sources, options.features, options.threads, cache, skip_bad=skip_bad, progress=progress)
-    cameras = [at_working_size(source.camera, options.features.work_megapixels) for source in sources]
+    cameras = [at_working_size(source.camera, options.features.limits[1]) for source in sources]
     features = [
         features_at(found, source.camera, camera)
         for found, source, camera in zip(detected.features, sources, cameras, strict=True)

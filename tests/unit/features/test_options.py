@@ -1,0 +1,30 @@
+"""What is left open in the options of detection depends on how many pictures share the work."""
+
+import pytest
+
+from rdstitch.errors import ArgumentError
+from rdstitch.features import FeatureOptions
+
+
+@pytest.mark.parametrize(("count", "share"), [(1, 4.0), (2, 4.0), (4, 2.0), (5, 1.6), (8, 1.0), (9, 1.0), (300, 1.0)])
+def test_few_pictures_share_what_eight_would_have(count: int, share: float) -> None:
+    features, megapixels = FeatureOptions().for_pictures(count).limits
+    assert features == round(2000 * share)
+    assert megapixels == pytest.approx(0.6 * share)
+
+
+def test_what_is_given_is_kept() -> None:
+    assert FeatureOptions(max_features=700).for_pictures(2).limits == (700, pytest.approx(2.4))
+    assert FeatureOptions(work_megapixels=None).for_pictures(2).limits == (8000, None)
+    assert FeatureOptions(work_megapixels=0.3).for_pictures(2).limits == (8000, 0.3)
+
+
+def test_numbers_stay_what_they_are() -> None:
+    """A run on seven of two pictures' options is that on two."""
+    two = FeatureOptions().for_pictures(2)
+    assert two.for_pictures(7) == two
+
+
+def test_other_words_are_refused() -> None:
+    with pytest.raises(ArgumentError, match="'auto' or None"):
+        FeatureOptions(work_megapixels="full")  # type: ignore[arg-type]
