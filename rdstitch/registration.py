@@ -29,6 +29,8 @@ class Registration:
         What the user should know: failed checks, warnings, and every picture that is not in the result.
     static_background : bool
         Whether a part of what the pictures show stays where it is in them, and only what moves was registered.
+    stretch : (float, float) or None
+        Grey levels of all pictures that count as black and white; None for those of 8 bits.
     mixed : TwoLenses or None
         Where pictures of two lenses are mixed. If it is clear which belong together, the others are left out.
     """
@@ -40,6 +42,7 @@ class Registration:
     messages: tuple[Message, ...]
     static_background: bool = False
     mixed: TwoLenses | None = None
+    stretch: tuple[float, float] | None = None
 
     def __repr__(self) -> str:
         """One line: of how many pictures, and λ."""

@@ -151,7 +151,7 @@ estimation = together(
         type=click.IntRange(1),
         metavar="N",
         help="At most so many features a picture.  [default: 2000; of fewer than 8 pictures 16000 together, "
-        "at most 8000 each]",
+        "at most 4000 each]",
     ),
     click.option(
         "--work-megapixels",

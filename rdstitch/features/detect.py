@@ -80,7 +80,7 @@ def _look(
     source: ViewLoader, options: FeatureOptions, megapixels: float | None
 ) -> tuple[PreparedPicture, Detection, NDArray[np.intp]]:
     """The picture at most so large, what is found in it, and which of that may count."""
-    picture = prepare(source(megapixels), megapixels)
+    picture = prepare(source(megapixels), megapixels, stretch=options.stretch, equalize=bool(options.equalize))
     detection = find(picture.grey, options)
     usable = np.flatnonzero(picture.covers(detection.points, detection.scale / 2))
     return picture, detection, usable

@@ -16,8 +16,9 @@ CLOSER = 4.0
 
 _BUDGET = 8
 """Pictures of a large set whose pixels and keypoints fewer pictures may share among them."""
-_MOST_OF_FEW = 4.0
-"""Times as many of either that a picture of a small set gets at most."""
+_MOST_PIXELS, _MOST_FEATURES = 4.0, 2.0
+"""Times as many pixels, and keypoints, that a picture of a small set gets at most: keypoints beyond the strongest 4,000
+made λ of single pairs of a flight less certain, not more."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,11 @@ class FeatureOptions:
         Keep the strongest of each cell of a grid in turn, rather than the strongest of the picture.
     spread_cell : float
         Side of a cell of that grid, fraction of the picture's diagonal.
+    stretch : (float, float), optional
+        Grey levels that become 0 and 255; None: those of the set where its pictures have more than 8 bits, see
+        :mod:`rdstitch.pipeline.contrast`, else none.
+    equalize : bool, optional
+        Equalize local contrast before detection; None: of a set whose pictures show too little otherwise.
     sift_contrast : float
         SIFT's contrast threshold; 0.04 is OpenCV's, too high for hazy pictures.
     surf_threshold : float
@@ -73,6 +79,8 @@ class FeatureOptions:
     work_megapixels: float | Literal["auto"] | None = "auto"
     spread: bool = True
     spread_cell: float = 0.05
+    stretch: tuple[float, float] | None = None
+    equalize: bool | None = None
     sift_contrast: float = 0.02
     surf_threshold: float = 100.0
     surf_octaves: int = 4
@@ -111,13 +119,15 @@ class FeatureOptions:
 
         A pair takes a second anyway, and all that is known of its lens comes from its own keypoints; hundreds of
         pictures have enough together. Fewer than eight pictures share what eight would have, up to four times as many
-        pixels and keypoints each.
+        pixels and twice as many keypoints each.
         """
-        share = min(max(_BUDGET / max(count, 1), 1.0), _MOST_OF_FEW)
+        share = max(_BUDGET / max(count, 1), 1.0)
         return replace(
             self,
-            max_features=self.max_features or round(MAX_FEATURES * share),
-            work_megapixels=WORK_MEGAPIXELS * share if self.work_megapixels == "auto" else self.work_megapixels,
+            max_features=self.max_features or round(MAX_FEATURES * min(share, _MOST_FEATURES)),
+            work_megapixels=WORK_MEGAPIXELS * min(share, _MOST_PIXELS)
+            if self.work_megapixels == "auto"
+            else self.work_megapixels,
         )
 
     @property

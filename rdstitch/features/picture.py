@@ -1,5 +1,6 @@
 """A picture as detectors want it: grey, 8 bits, of working size, with the distance to what is masked."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,11 @@ Mask = NDArray[Any]
 """Of bool or uint8."""
 
 _STRETCH_PERCENTILES = (0.1, 99.9)
+_CLIP_LIMIT, _CLIP_TILES = 4.0, 8
+"""Of contrast-limited adaptive histogram equalization (Zuiderveld 1994): largest slope, and tiles along a side."""
+
+Stretch = tuple[float, float]
+"""The two grey levels that become 0 and 255."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +99,9 @@ def halving(image_size: tuple[int, int], megapixels: float) -> int:
     return factor
 
 
-def prepare(view: View, work_megapixels: float | None) -> PreparedPicture:
+def prepare(
+    view: View, work_megapixels: float | None, *, stretch: Stretch | None = None, equalize: bool = False
+) -> PreparedPicture:
     """Make a picture ready for detection; see :func:`rdstitch.features.detect.detect` for what it may be."""
     image, mask = view.image, view.mask
     if image.ndim not in (2, 3) or image.size == 0 or (image.ndim == 3 and image.shape[2] > 4):
@@ -107,7 +115,9 @@ def prepare(view: View, work_megapixels: float | None) -> PreparedPicture:
         if usable is not None:
             # A pixel is usable if all that it was made of is.
             usable = cv2.resize(usable.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
-    grey = _eight_bits(_grey(image), usable)
+    grey = _eight_bits(_grey(image), usable, stretch)
+    if equalize:
+        grey = np.asarray(cv2.createCLAHE(_CLIP_LIMIT, (_CLIP_TILES, _CLIP_TILES)).apply(grey), np.uint8)
     shrink = view.reduction * np.array([width / grey.shape[1], height / grey.shape[0]])
     return PreparedPicture(grey, None if usable is None else _clearance(usable), shrink, view.full_size)
 
@@ -140,14 +150,36 @@ def _grey(image: PixelArray) -> PixelArray:
     return cv2.cvtColor(image[..., :3], cv2.COLOR_RGB2GRAY)
 
 
-def _eight_bits(grey: PixelArray, usable: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
-    """Stretch deeper pictures to 8 bits by percentiles of the part that is used, not by single hot pixels."""
-    if grey.dtype == np.uint8:
-        return np.ascontiguousarray(grey, dtype=np.uint8)
+def usual_stretch(view: View) -> Stretch | None:
+    """The stretch that uses 8 bits best for one picture; None where all of it is masked."""
+    return _stretch(_grey(view.image), _usable(view.image, view.mask))
+
+
+def common_stretch(usual: Iterable[Stretch | None]) -> Stretch | None:
+    """One for all pictures of a set; a tenth of them may be darker, or brighter, than the rest."""
+    found = np.array([stretch for stretch in usual if stretch is not None])
+    if not len(found):
+        return None
+    return float(np.quantile(found[:, 0], 0.1)), float(np.quantile(found[:, 1], 0.9))
+
+
+def _stretch(grey: PixelArray, usable: NDArray[np.bool_] | None) -> Stretch | None:
+    """By percentiles of the part that is used, not by single hot pixels."""
     inside = grey if usable is None else grey[usable]
     if inside.size == 0:
+        return None
+    low, high = np.percentile(inside, _STRETCH_PERCENTILES).tolist()
+    return low, high
+
+
+def _eight_bits(grey: PixelArray, usable: NDArray[np.bool_] | None, stretch: Stretch | None) -> NDArray[np.uint8]:
+    """Stretch pictures to 8 bits, those that have no more only by a given stretch."""
+    if grey.dtype == np.uint8 and stretch is None:
+        return np.ascontiguousarray(grey, dtype=np.uint8)
+    stretch = stretch or _stretch(grey, usable)
+    if stretch is None:
         return np.zeros(grey.shape, dtype=np.uint8)
-    low, high = (float(value) for value in np.percentile(inside, _STRETCH_PERCENTILES))
+    low, high = stretch
     finite = np.where(np.isfinite(grey), grey, low)
     scaled = (finite - low) * (255.0 / max(high - low, 1e-12))
     eight: NDArray[np.uint8] = np.clip(np.rint(scaled), 0, 255).astype(np.uint8)

@@ -18,7 +18,7 @@ from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.messages import Message, left_out
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner, close_loops, rematch_weak_pairs
-from rdstitch.pipeline.detect_features import detect_features
+from rdstitch.pipeline.contrast import detect_by_contrast
 from rdstitch.pipeline.estimates import impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_working_size, features_at
 from rdstitch.progress import Progress, silent
@@ -27,6 +27,11 @@ from rdstitch.registration import Registration
 _STATIC_BACKGROUND = Message(
     "a part of what the pictures show stays where it is in them (a vehicle's body, a background, dirt, a date); "
     "only what moves was registered"
+)
+
+
+_LOW_CONTRAST = Message(
+    "the pictures show little contrast: features were found after equalizing it locally", code="low-contrast"
 )
 
 
@@ -64,7 +69,10 @@ def register(
     options = options.for_pictures(len(sources))
     cache = Cache(options.cache)
     aligner = Aligner.of(sources, options, cache)
-    detected = detect_features(sources, options.features, options.threads, cache, skip_bad=skip_bad, progress=progress)
+    rendered = detect_by_contrast(
+        sources, options.features, options.threads, cache, skip_bad=skip_bad, progress=progress
+    )
+    detected = rendered.detected
     cameras = [at_working_size(source.camera, options.features.limits[1]) for source in sources]
     features = [
         features_at(found, source.camera, camera)
@@ -96,9 +104,11 @@ def register(
         (
             *aligned.alignment.messages,
             *([_STATIC_BACKGROUND] if moving.found else []),
+            *([_LOW_CONTRAST] if rendered.equalized else []),
             *_left_out(aligned.alignment, aligner.paths, {**lenses.left_out, **detected.damaged}),
         ),
         static_background=moving.found,
+        stretch=rendered.stretch,
         mixed=lenses.mixed,
     )
 

@@ -70,7 +70,7 @@ def check_overlaps(registration: Registration, workers: int = 1, cache: Cache = 
         return [link.pair for link in checked] == [(fit.image1, fit.image2) for fit in chosen]
 
     kinds = (CheckedLink, LinkFit, Agreement, Ambiguity)
-    return cache.recall("overlaps", kinds, (placed, chosen), compute, valid=valid)
+    return cache.recall("overlaps", kinds, (placed, chosen, registration.stretch), compute, valid=valid)
 
 
 def share_alike(checked: Sequence[CheckedLink]) -> float:
@@ -88,7 +88,7 @@ def _compare(
     def place(index: int) -> PlacedPicture:
         source = registration.sources[index]
         picture = source.read(fitting_reduction(max(source.camera.image_size) / COMPARED_SIDE), keep=True)
-        return PlacedPicture.of(picture, alignment.cameras[index], alignment.homographies[index])
+        return PlacedPicture.of(picture, alignment.cameras[index], alignment.homographies[index], registration.stretch)
 
     def compare(fit: LinkFit, scale: float) -> CheckedLink:
         i, j = fit.image1, fit.image2

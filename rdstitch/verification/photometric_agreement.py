@@ -74,9 +74,11 @@ class PlacedPicture:
     homography: FloatArray
 
     @classmethod
-    def of(cls, picture: Picture, camera: Camera, homography: FloatArray) -> Self:
-        """A picture with its camera and its place, made small."""
-        grey = _reduced_grey(picture)
+    def of(
+        cls, picture: Picture, camera: Camera, homography: FloatArray, stretch: tuple[float, float] | None = None
+    ) -> Self:
+        """A picture with its camera and its place, made small; ``stretch`` are the grey levels of black and white."""
+        grey = _reduced_grey(picture, stretch)
         return cls(grey, camera.resized((grey.shape[1], grey.shape[0])), homography)
 
     def sampled(self, plane: Callable[[FloatArray], FloatArray], box: Box) -> Grey:
@@ -93,9 +95,11 @@ class PlacedPicture:
         return np.asarray(found, dtype=np.float32)
 
 
-def _reduced_grey(picture: Picture) -> Grey:
+def _reduced_grey(picture: Picture, stretch: tuple[float, float] | None) -> Grey:
     pixels = picture.pixels
     full = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else max(float(pixels.max()), 1e-12)
+    if stretch is not None:  # black may be anywhere: only differences of grey levels are compared
+        full = max(stretch[1] - stretch[0], 1e-12)
     height, width = pixels.shape[:2]
     factor = min(1.0, COMPARED_SIDE / max(height, width))
     size = max(1, round(width * factor)), max(1, round(height * factor))

@@ -1,0 +1,62 @@
+"""How pictures are rendered for detection: alike if they have more than 8 bits, equalized if they show too little."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import rdstitch
+from rdstitch.features.picture import View, common_stretch, usual_stretch
+from tests.cli.running import flight
+
+_OPTIONS = rdstitch.StitchOptions(workers=1, channel_order="rgb", features=rdstitch.FeatureOptions(max_features=800))
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[NDArray[np.uint8]]:
+    """Three pictures in a chain."""
+    sequence = flight(3, 3)
+    return [sequence.frame(index) for index in range(3)]
+
+
+def test_a_tenth_of_the_contrast_with_noise_is_seen_and_said(frames: list[NDArray[np.uint8]]) -> None:
+    rng = np.random.default_rng(0)
+    hazy = [
+        np.clip(np.rint(150 + (frame - 128.0) / 10 + rng.normal(0.0, 0.7, frame.shape)), 0, 255).astype(np.uint8)
+        for frame in frames
+    ]
+    clear, found = (rdstitch.calibrate(pictures, _OPTIONS) for pictures in (frames, hazy))
+    assert found.alignment.used.all()
+    assert any(message.code == "low-contrast" for message in found.warnings)
+    assert not any(message.code == "low-contrast" for message in clear.warnings)
+    assert clear.stretch is None
+    deviation = np.hypot(clear.alignment.distortion_std, found.alignment.distortion_std)
+    assert abs(clear.alignment.distortion - found.alignment.distortion) < 3 * deviation
+    # Who says that nothing is to be equalized is obeyed.
+    plain = replace(_OPTIONS, features=replace(_OPTIONS.features, equalize=False))
+    try:
+        as_it_is = rdstitch.calibrate(hazy, plain)
+    except rdstitch.RdstitchError:
+        return
+    assert sum(as_it_is.keypoints) < sum(found.keypoints) / 2
+
+
+def test_deep_pictures_register_as_their_common_rendering_does(frames: list[NDArray[np.uint8]]) -> None:
+    """Each picture's own stretch would undo that the second one is darker."""
+    darker = [np.rint(f.mean(axis=2) * gain).astype(np.uint8) for f, gain in zip(frames, (1.0, 0.5, 0.9), strict=True)]
+    low, high = common_stretch(usual_stretch(View(frame)) for frame in darker) or (0.0, 255.0)
+    rendered = [np.clip(np.rint((f - low) * 255.0 / (high - low)), 0, 255).astype(np.uint8) for f in darker]
+    deep = [frame.astype(np.uint16) * 40 + 1000 for frame in darker]
+    first, second = (rdstitch.calibrate(pictures, _OPTIONS) for pictures in (rendered, deep))
+    assert second.stretch == pytest.approx((low * 40 + 1000, high * 40 + 1000))
+    assert first.keypoints == second.keypoints
+    np.testing.assert_allclose(first.alignment.homographies, second.alignment.homographies, atol=1e-9)
+
+
+def test_a_picture_unlike_the_rest_does_not_decide() -> None:
+    usual = [(100.0, 900.0)] * 19
+    assert common_stretch([*usual, (0.0, 65535.0)]) == (100.0, 900.0)
+    assert common_stretch([None, (5.0, 9.0)]) == (5.0, 9.0)
+    assert common_stretch([None]) is None
+    assert usual_stretch(View(np.zeros((4, 4), np.uint8), np.zeros((4, 4), np.bool_))) is None
