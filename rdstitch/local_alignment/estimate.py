@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
@@ -22,6 +23,10 @@ _HELD_OUT = 5  # every so many-th match
 # Share by which held-out residuals must get smaller for local alignment to be worth while, and for freer fields.
 _WORTHWHILE, _BETTER = 0.15, 0.03
 _FEWEST_MATCHES = 100
+# Correlation of the residuals of neighbouring matches below which no smooth field is worth while: one that brings the
+# median down by 15 % takes away a quarter of the variance, and that quarter neighbours would have in common.
+_LEAST_AGREEMENT = 0.1
+_OUTLYING = 3.0  # medians beyond which a residual counts no more than there
 
 
 @dataclass(frozen=True)
@@ -92,6 +97,8 @@ def align_locally(
     placed = place_matches(matches, cameras, homographies, scale)
     if placed is None or len(placed) < _FEWEST_MATCHES:
         return no_local_alignment("there are too few matches")
+    if choice == "auto" and (agreement := _agreement_of_neighbours(placed)) < _LEAST_AGREEMENT:
+        return no_local_alignment(f"not worth while; residuals of neighbouring matches agree by {agreement:.0%} only")
     cells = _CELLS if choice == "auto" else choice
     held_out = np.arange(len(placed)) % _HELD_OUT == 0
     stiffness, before, after = _choose(placed.take(~held_out), placed.take(held_out), cameras, cells)
@@ -100,6 +107,18 @@ def align_locally(
         return LocalAlignment((), f"not worth while; {text}", 0, before, after)
     fields = picture_fields(fit_fields(placed, cameras, stiffness), cameras, homographies, scale)
     return LocalAlignment(fields, text, cells, before, after)
+
+
+def _agreement_of_neighbours(matches: PlaneMatches) -> float:
+    """Correlation of the residuals of each match and the nearest one of the same pair of pictures, in [-1, 1]."""
+    # Pairs are so far apart along a third axis that no neighbour is of another pair.
+    pair = np.unique(matches.images, axis=0, return_inverse=True)[1].reshape(-1)
+    places = np.column_stack([matches.points[:, 0], pair * 2.0 * np.ptp(matches.points[:, 0])])
+    nearest = cKDTree(places).query(places, k=2)[1][:, 1]
+    length = np.linalg.norm(matches.residual, axis=1)
+    most = _OUTLYING * float(np.median(length))
+    residual = matches.residual * np.minimum(1.0, most / np.maximum(length, 1e-12))[:, None]
+    return float((residual * residual[nearest]).sum() / max((residual**2).sum(), 1e-300))
 
 
 def _choose(

@@ -93,6 +93,16 @@ def test_on_a_plane_nothing_is_moved(noise: float) -> None:
     local = align_locally(matches(sequence, noise), CAMERAS, homographies(sequence))
     assert local.fields == ()
     assert "not worth while" in local.reason
+    assert local.before is None  # what neighbours have nothing of in common needs no fit
+
+
+def test_relief_of_single_pictures_is_tried() -> None:
+    # A sixth of the pictures shows relief: their matches agree with their neighbours', those of the others do not.
+    sequence = scene(None)
+    found = matches(sequence)
+    bend = 3.0 * np.sin(found[0].points1 / 60.0)
+    found[0] = replace(found[0], points2=found[0].points2 + bend)
+    assert align_locally(found, CAMERAS, homographies(sequence)).before is not None
 
 
 def test_a_number_of_cells_is_used_in_any_case_and_off_in_none() -> None:
