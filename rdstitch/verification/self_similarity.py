@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from rdstitch.arrays import FloatArray
 from rdstitch.radial_homography import to_plane
@@ -98,20 +97,35 @@ def draw(picture: PlacedPicture, scale: float) -> Drawing:
 
 def placement_ambiguity(first: Drawing, second: Drawing) -> Ambiguity:
     """Compare two pictures, drawn at the same scale, at all shifts on the plane."""
-    score, area = _correlation(first.pixels, second.pixels)
+    overlaps = _Overlaps.of(first.pixels, second.pixels)
     # Position of the first picture within the second: rows and columns count from -(size - 1) of the first.
-    rows, columns = (np.arange(n) - (m - 1) for n, m in zip(score.shape, first.pixels.shape, strict=True))
+    rows, columns = (np.arange(n) - (m - 1) for n, m in zip(overlaps.area.shape, first.pixels.shape, strict=True))
     offset = np.rint(first.origin - second.origin).astype(int)
-    distance = np.hypot(rows[:, None] - offset[1], columns[None, :] - offset[0])
-    near = distance <= _SLACK
-    if not near.any() or not area[near].max() > 0:
+    down, right = (rows - offset[1]).astype(np.float32), (columns - offset[0]).astype(np.float32)
+    close = np.ix_(np.abs(down) <= _SLACK, np.abs(right) <= _SLACK)
+    within = np.hypot(down[close[0]], right[close[1][0]]) <= _SLACK
+    most = float(overlaps.area[close][within].max(initial=0.0))
+    if not most > 0:
         return Ambiguity(0.0, 0.0, 0.0)
+    enough = overlaps.area >= _LEAST_SHARE * most
+    box = _box_around(enough, _SLACK)
+    score, distance = overlaps.correlation(box), np.hypot(down[box[0], None], right[None, box[1]])
+    near = distance <= _SLACK
     # A peak of its own, not the flank of the one here.
     peak = score >= cv2.dilate(score, np.ones((2 * _SLACK + 1, 2 * _SLACK + 1), dtype=np.uint8))
-    other = np.where(peak & (distance > _NEAR) & (area >= _LEAST_SHARE * area[near].max()), score, 0.0)
+    other = np.where(peak & (distance > _NEAR) & enough[box], score, np.float32(0.0))
     best = int(other.argmax())
-    elsewhere = float(other.flat[best])
-    return Ambiguity(max(0.0, float(score[near].max())), elsewhere, float(distance.flat[best]) / _LONGEST_SIDE)
+    here = float(score[near].max(initial=0.0))
+    return Ambiguity(here, float(other.flat[best]), float(distance.flat[best]) / _LONGEST_SIDE)
+
+
+def _box_around(chosen: NDArray[np.bool_], margin: int) -> tuple[slice, slice]:
+    """Rows and columns in which something is chosen, and a margin."""
+    ranges = []
+    for axis in (1, 0):
+        places = np.flatnonzero(chosen.any(axis=axis))
+        ranges.append(slice(max(0, int(places[0]) - margin), int(places[-1]) + 1 + margin))
+    return ranges[0], ranges[1]
 
 
 def _without_brightness(picture: Grey) -> Grey:
@@ -122,20 +136,53 @@ def _without_brightness(picture: Grey) -> Grey:
     return np.where(seen, picture - coarse, np.float32(np.nan)).astype(np.float32)
 
 
-def _correlation(first: Grey, second: Grey) -> tuple[Grey, Grey]:
-    """Normalized correlation at every position of the first picture in the second, and the px that overlap there."""
-    shape = [a + b - 1 for a, b in zip(first.shape, second.shape, strict=True)]
-    fast = [fft.next_fast_len(n, real=True) for n in shape]
-    a, aa, am = _spectra(first[::-1, ::-1], fast)
-    b, bb, bm = _spectra(second, fast)
-    both, own1, own2, area = (fft.irfft2(p, fast)[: shape[0], : shape[1]] for p in (a * b, aa * bm, am * bb, am * bm))
-    norm = np.sqrt(np.maximum(own1, 0.0) * np.maximum(own2, 0.0))
-    floor = _LEAST_NORM * max(float(norm.max()), 1e-12)
-    return np.where(norm > floor, both / np.maximum(norm, floor), np.float32(0.0)), np.rint(area)
+@dataclass(frozen=True)
+class _Overlaps:
+    """Sums over the overlap of two pictures, the first at every position in the second, shape (h, w) each.
+
+    Attributes
+    ----------
+    products, squares1, squares2 : ndarray
+        Of the values of both pictures, and of either.
+    area : ndarray
+        Number of pixels.
+    """
+
+    products: Grey
+    squares1: Grey
+    squares2: Grey
+    area: Grey
+
+    @classmethod
+    def of(cls, first: Grey, second: Grey) -> "_Overlaps":
+        """By the convolution theorem."""
+        height, width = (a + b - 1 for a, b in zip(first.shape, second.shape, strict=True))
+        a, aa, am = _spectra(first[::-1, ::-1], height, width)
+        b, bb, bm = _spectra(second, height, width)
+        inverse = cv2.DFT_INVERSE | cv2.DFT_SCALE | cv2.DFT_REAL_OUTPUT
+        sums = [
+            np.asarray(cv2.dft(cv2.mulSpectrums(one, two, 0), flags=inverse), dtype=np.float32)[:height, :width]
+            for one, two in ((a, b), (aa, bm), (am, bb), (am, bm))
+        ]
+        products, squares1, squares2, area = sums
+        return cls(products, squares1, squares2, np.rint(area))
+
+    def correlation(self, box: tuple[slice, slice]) -> Grey:
+        """Normalized correlation at the positions in a box."""
+        norm = np.sqrt(np.maximum(self.squares1[box], 0.0) * np.maximum(self.squares2[box], 0.0))
+        floor = _LEAST_NORM * max(float(norm.max()), 1e-12)
+        correlation: Grey = np.where(norm > floor, self.products[box] / np.maximum(norm, floor), np.float32(0.0))
+        return correlation
 
 
-def _spectra(picture: Grey, shape: list[int]) -> list[NDArray[np.complex64]]:
-    """Of the values, their squares, and where there are any."""
+def _spectra(picture: Grey, height: int, width: int) -> list[Grey]:
+    """Of the values, their squares, and where there are any, in OpenCV's packed format."""
     seen = np.isfinite(picture)
     values = np.where(seen, picture, np.float32(0.0))
-    return [fft.rfft2(part, shape) for part in (values, values * values, seen.astype(np.float32))]
+    shape = (cv2.getOptimalDFTSize(height), cv2.getOptimalDFTSize(width))
+    spectra: list[Grey] = []
+    for part in (values, values * values, seen):
+        padded = np.zeros(shape, dtype=np.float32)
+        padded[: part.shape[0], : part.shape[1]] = part
+        spectra.append(np.asarray(cv2.dft(padded), dtype=np.float32))
+    return spectra
