@@ -114,7 +114,7 @@ def _agreement_of_neighbours(matches: PlaneMatches) -> float:
     # Pairs are so far apart along a third axis that no neighbour is of another pair.
     pair = np.unique(matches.images, axis=0, return_inverse=True)[1].reshape(-1)
     places = np.column_stack([matches.points[:, 0], pair * 2.0 * np.ptp(matches.points[:, 0])])
-    nearest = cKDTree(places).query(places, k=2)[1][:, 1]
+    nearest = np.asarray(cKDTree(places).query(places, k=2)[1], dtype=np.intp)[:, 1]
     length = np.linalg.norm(matches.residual, axis=1)
     most = _OUTLYING * float(np.median(length))
     residual = matches.residual * np.minimum(1.0, most / np.maximum(length, 1e-12))[:, None]
