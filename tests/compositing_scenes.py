@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from examples.judging.comparison import plane_under
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.compositing import Canvas, plan_canvas
+from rdstitch.compositing import Canvas, PlacedPicture, place_pictures, plan_canvas
 from rdstitch.io import Metadata, Picture
 from rdstitch.synthetic.layouts import grid_poses
 from rdstitch.synthetic.rendering import Photometry, sequence_over
@@ -34,6 +34,11 @@ class Scene:
     def sources(self) -> list[Callable[[], Picture]]:
         """What the compositor reads."""
         return [partial(as_picture, frame) for frame in self.frames]
+
+    @property
+    def pictures(self) -> list[PlacedPicture]:
+        """What the compositor takes."""
+        return place_pictures(self.sources, self.cameras, self.homographies)
 
     def truth(self, canvas: Canvas | None = None) -> NDArray[np.float32]:
         """The plane as a perfect composite shows it: grey (h, w), 0 to 1."""

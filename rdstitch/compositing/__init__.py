@@ -1,9 +1,10 @@
 """From registered pictures to one picture: canvas, resampling, exposure, seams, blending."""
 
 from rdstitch.compositing.canvas import Canvas, plan_canvas
-from rdstitch.compositing.compositor import Composite, FileComposite, compose, compose_to_file
+from rdstitch.compositing.compositor import Composite, FileComposite, OutputFile, compose, compose_to_file
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.panorama_canvas import plan_panorama
+from rdstitch.compositing.placed_picture import PlacedPicture, place_pictures
 from rdstitch.compositing.plan import CompositePlan, plan_composite
 
 __all__ = [
@@ -12,8 +13,11 @@ __all__ = [
     "CompositeOptions",
     "CompositePlan",
     "FileComposite",
+    "OutputFile",
+    "PlacedPicture",
     "compose",
     "compose_to_file",
+    "place_pictures",
     "plan_canvas",
     "plan_composite",
     "plan_panorama",

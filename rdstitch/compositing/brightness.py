@@ -22,6 +22,7 @@ from rdstitch.compositing.boxes import Box, cut, intersection
 from rdstitch.compositing.gain_compensation import estimate_gains
 from rdstitch.compositing.options import ExposureMethod
 from rdstitch.compositing.photometric import Exposure, bilinear_weights, full_scale
+from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.survey import Survey, SurveyTile
 
 _NODES = 7  # along each side of a picture
@@ -42,25 +43,20 @@ _MEDIAN_SAMPLES, _MEDIAN_ROUNDS = 2000, 4
 
 
 def estimate_exposure(
-    survey: Survey,
-    cameras: Sequence[Camera],
-    method: ExposureMethod = "balanced",
-    exposures: Sequence[float | None] | None = None,
+    survey: Survey, pictures: Sequence[PlacedPicture], method: ExposureMethod = "balanced"
 ) -> Exposure:
     """What makes pictures agree where they overlap, with the median brightness of the set kept.
 
     Parameters
     ----------
     survey : Survey
-    cameras : sequence of Camera
+    pictures : sequence of PlacedPicture
     method : str
         "gain": one factor per picture and channel, and one vignetting for all. "blocks": also a smooth field per
         picture. "balanced": gains and fields that stay near the pictures' own brightness at large scale, and nothing
         is clipped.
-    exposures : sequence of float or None, optional
-        See :func:`rdstitch.compositing.gain_compensation.estimate_gains`.
     """
-    exposure = estimate_gains(survey, cameras, exposures)
+    exposure, cameras = estimate_gains(survey, pictures), [picture.camera for picture in pictures]
     cells = None if method == "gain" else _compare(survey, exposure)
     if cells is not None:
         wanted, sigma = np.zeros_like(exposure.log_gain), _GAIN_SIGMA

@@ -7,23 +7,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from rdstitch.camera import Camera
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photo_sphere import photo_sphere_xmp
 from rdstitch.compositing.photometric import Exposure
+from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.preparation import OutputStrip, ShareProgress, prepare_composite
 from rdstitch.compositing.seam_finder import SeamMap
-from rdstitch.compositing.source_images import PictureLoader, Preview
-from rdstitch.compositing.warp import Displacement
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.io.layout import Layout
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.outputs import Outputs
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_format, check_memory, write_strips
+from rdstitch.messages import Message
 
 
 @dataclass(frozen=True, repr=False)
@@ -40,7 +39,7 @@ class Composite:
         Geometry of ``pixels``, after cropping.
     exposure : Exposure
         What the pictures were corrected by.
-    notes : tuple of str
+    messages : tuple of Message
         What the user should know, such as why nothing was cropped.
     """
 
@@ -48,7 +47,7 @@ class Composite:
     alpha: NDArray[np.uint8]
     canvas: Canvas
     exposure: Exposure
-    notes: tuple[str, ...] = ()
+    messages: tuple[Message, ...] = ()
 
     def __repr__(self) -> str:
         """One line: its size and sample type."""
@@ -77,7 +76,7 @@ class FileComposite:
     exposure: Exposure
     coverage: float
     fingerprint: Fingerprint
-    notes: tuple[str, ...] = ()
+    messages: tuple[Message, ...] = ()
     seams: SeamMap | None = None
     origin: tuple[int, int] = (0, 0)
 
@@ -86,39 +85,45 @@ class FileComposite:
         return f"<FileComposite {self.path}: {self.canvas.size[0]} x {self.canvas.size[1]} pixels>"
 
 
+@dataclass(frozen=True)
+class OutputFile:
+    """A file to compose into.
+
+    Attributes
+    ----------
+    path : path
+        ``.tif`` (tiled, with overviews, BigTIFF where needed), ``.dzi`` (Deep Zoom), ``.png``, ``.jpg``, or ``.webp``
+        (held in memory whole).
+    metadata : Metadata, optional
+        Colour profile, EXIF and resolution to keep.
+    extra_tags : callable, optional
+        Gives further tags of a TIFF file for the canvas after cropping.
+    outputs : Outputs, optional
+        Where the file is staged, to be published with what belongs to it; without, it replaces what is there.
+    """
+
+    path: str | Path
+    metadata: Metadata | None = None
+    extra_tags: Callable[[Canvas], Iterable[ExtraTag]] | None = None
+    outputs: Outputs | None = None
+
+
 def compose(
-    sources: Sequence[PictureLoader],
-    cameras: Sequence[Camera],
-    homographies: ArrayLike,
+    pictures: Sequence[PlacedPicture],
     canvas: Canvas,
     options: CompositeOptions | None = None,
     progress: ShareProgress | None = None,
-    previews: Sequence[Preview] | None = None,
-    exposures: Sequence[float | None] | None = None,
-    displacements: Sequence[Displacement | None] | None = None,
 ) -> Composite:
     """Put pictures together on a canvas, in memory.
 
     Parameters
     ----------
-    sources : sequence of callables
-        Each reads one picture (:func:`rdstitch.io.read_image`); called in other threads, before its tiles come, and
-        perhaps again later.
-    cameras : sequence of Camera
-    homographies : array_like of shape (N, 3, 3)
-        Normalized undistorted coordinates of each picture to plane coordinates.
+    pictures : sequence of PlacedPicture
     canvas : Canvas
         From :func:`rdstitch.compositing.plan_canvas` with the same cameras and homographies.
     options : CompositeOptions, optional
     progress : callable, optional
-        Told the share of the work done, 0 to 1.
-    previews : sequence of callables, optional
-        Each reads one picture reduced by the factor that it is given, 2, 4 or 8, which for JPEG files is much faster;
-        otherwise the whole pictures are read once more, for what is decided on small versions of them.
-    exposures : sequence of float or None, optional
-        Exposure of each picture as the camera wrote it down (time x sensitivity / f-number²), up to a common factor.
-    displacements : sequence of callables or None, optional
-        Of each picture, what local alignment adds to its measured pixels; see :class:`rdstitch.compositing.warp.Warp`.
+        Called with the share of the work done, 0 to 1.
 
     Returns
     -------
@@ -133,9 +138,7 @@ def compose(
     LimitError
         When the memory limit is too low.
     """
-    with prepare_composite(
-        sources, cameras, homographies, canvas, options, progress, previews, exposures, displacements
-    ) as prepared:
+    with prepare_composite(pictures, canvas, options, progress) as prepared:
         renderer, (width, height) = prepared.renderer, prepared.canvas.size
         pixels = np.zeros((height, width, renderer.channels), dtype=renderer.dtype)
         alpha = np.zeros((height, width), dtype=np.uint8)
@@ -145,40 +148,23 @@ def compose(
                 pixels[top : top + len(samples)], alpha[top : top + len(samples)] = samples, opaque
                 top += len(samples)
     shaped = pixels if renderer.channels > 1 else pixels[..., 0]
-    return Composite(shaped, alpha, prepared.canvas, renderer.exposure, prepared.notes)
+    return Composite(shaped, alpha, prepared.canvas, renderer.exposure, prepared.messages)
 
 
 def compose_to_file(
-    path: str | Path,
-    sources: Sequence[PictureLoader],
-    cameras: Sequence[Camera],
-    homographies: ArrayLike,
+    file: OutputFile,
+    pictures: Sequence[PlacedPicture],
     canvas: Canvas,
     options: CompositeOptions | None = None,
-    metadata: Metadata | None = None,
     progress: ShareProgress | None = None,
-    extra_tags: Callable[[Canvas], Iterable[ExtraTag]] | None = None,
-    previews: Sequence[Preview] | None = None,
-    exposures: Sequence[float | None] | None = None,
-    displacements: Sequence[Displacement | None] | None = None,
-    *,
-    outputs: Outputs | None = None,
 ) -> FileComposite:
     """Put pictures together straight into a file, whatever its size: memory is that of a strip of tiles.
 
     Parameters
     ----------
-    path
-        ``.tif`` (tiled, with overviews, BigTIFF where needed), ``.dzi`` (Deep Zoom), ``.png``, ``.jpg``, or ``.webp``
-        (held in memory whole).
-    sources, cameras, homographies, canvas, options, progress, previews, exposures, displacements
+    file : OutputFile
+    pictures, canvas, options, progress
         As for :func:`compose`.
-    metadata : Metadata, optional
-        Colour profile, EXIF and resolution to keep.
-    extra_tags : callable, optional
-        Gives further tags of a TIFF file for the canvas after cropping.
-    outputs : Outputs, optional
-        Where the file is staged, to be published with what belongs to it; without, it replaces what is there.
 
     Raises
     ------
@@ -195,33 +181,31 @@ def compose_to_file(
             covered += int(np.count_nonzero(alpha))
             yield samples, alpha
 
-    with prepare_composite(
-        sources, cameras, homographies, canvas, options, progress, previews, exposures, displacements
-    ) as prepared:
+    with prepare_composite(pictures, canvas, options, progress) as prepared:
         renderer, size = prepared.renderer, prepared.canvas.size
         layout = Layout(
             size,
             renderer.channels,
             renderer.dtype,
             transparent=True,
-            metadata=replace(metadata or Metadata(size), xmp=photo_sphere_xmp(prepared.canvas)),
+            metadata=replace(file.metadata or Metadata(size), xmp=photo_sphere_xmp(prepared.canvas)),
             quality=renderer.options.quality,
             background=renderer.options.background,
         )
-        check_format(path, layout)
-        check_memory(path, size, renderer.options.max_memory)
-        tags = () if extra_tags is None else extra_tags(prepared.canvas)
+        check_format(file.path, layout)
+        check_memory(file.path, size, renderer.options.max_memory)
+        tags = () if file.extra_tags is None else file.extra_tags(prepared.canvas)
         # Nothing goes on behind a writer that fails.
         with closing(prepared.strips(progress)) as strips:
-            written = write_strips(path, layout, counted(strips), tags, outputs=outputs)
+            written = write_strips(file.path, layout, counted(strips), tags, outputs=file.outputs)
     share = covered / (size[0] * size[1])
     return FileComposite(
-        Path(path),
+        Path(file.path),
         prepared.canvas,
         renderer.exposure,
         share,
         written,
-        prepared.notes,
+        prepared.messages,
         renderer.seams,
         prepared.origin,
     )

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.canvas import Canvas
+from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.survey import Survey
-from rdstitch.compositing.warp import Warp, locate, plan_warps
+from rdstitch.compositing.warp import locate, plan_warps
 
 # Coverage is looked at with this many pixels along the longer side of the canvas.
 _RESOLUTION = 1500
@@ -19,7 +19,7 @@ _LEAST_KEPT = 0.25
 
 
 def coverage_map(
-    warps: Sequence[Warp], homographies: FloatArray, canvas: Canvas, survey: Survey | None = None
+    pictures: Sequence[PlacedPicture], canvas: Canvas, survey: Survey | None = None
 ) -> tuple[NDArray[np.bool_], int]:
     """Which px of a reduced canvas are covered, and the reduction; with the masks of a survey where there is one."""
     if survey is not None:
@@ -33,8 +33,7 @@ def coverage_map(
     factor = max(1, -(-max(canvas.size) // _RESOLUTION))
     small = canvas.reduced(factor)
     covered = np.zeros(small.size[::-1], dtype=np.bool_)
-    cameras, displacements = [warp.camera for warp in warps], [warp.displacement for warp in warps]
-    for warp in plan_warps(cameras, homographies, small, displacements):
+    for warp in plan_warps(pictures, small):
         x0, y0, x1, y1 = warp.box
         covered[y0:y1, x0:x1] |= locate(warp, warp.box).inside
     return covered, factor

@@ -18,6 +18,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box, cut, intersection
 from rdstitch.compositing.photometric import Exposure, full_scale, no_exposure, squared_radius
+from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.survey import Survey, SurveyTile
 
 _SRGB_OFFSET = 0.055
@@ -38,37 +39,36 @@ _ROUNDS = 6
 _WORTHWHILE = 0.02
 
 
-def estimate_gains(
-    survey: Survey, cameras: Sequence[Camera], exposures: Sequence[float | None] | None = None
-) -> Exposure:
+def estimate_gains(survey: Survey, pictures: Sequence[PlacedPicture]) -> Exposure:
     """Least squares over all overlaps, robust against what differs for other reasons (parallax, people).
 
     Parameters
     ----------
     survey : Survey
-    cameras : sequence of Camera
-        Their distortion centre is the centre of the vignetting.
-    exposures : sequence of float or None, optional
-        Exposure of each picture as the camera wrote it down, up to a common factor: a weak prior of its gain.
+    pictures : sequence of PlacedPicture
+        The distortion centre is the centre of the vignetting, and the exposure that the camera wrote down is a weak
+        prior of the gain.
 
     Returns
     -------
     Exposure
         Without any correction where no pictures overlap.
     """
+    cameras, exposures = zip(*((picture.camera, picture.exposure) for picture in pictures), strict=True)
     present = [tile for tile in survey.tiles if tile is not None]
     channels = present[0].pixels.shape[2] if present else 1
     samples = _collect(survey, cameras)
     if samples is None:
         return no_exposure(len(cameras), channels)
     offsets = (_SRGB_OFFSET, 0.0) if present[0].pixels.dtype.kind == "u" else (0.0,)
-    priors = [_gain_prior(exposures or [], len(cameras), b) for b in offsets]
+    priors = [_gain_prior(exposures, b) for b in offsets]
     fits = (_fit_light(samples, b, prior) for b, prior in zip(offsets, priors, strict=True))
     return min(fits, key=lambda fit: fit.rms_after)
 
 
-def _gain_prior(exposures: Sequence[float | None], count: int, offset: float) -> tuple[FloatArray, FloatArray]:
+def _gain_prior(exposures: Sequence[float | None], offset: float) -> tuple[FloatArray, FloatArray]:
     """Expected log gain of each picture, and its precision (N,): from the exposures where two or more are known."""
+    count = len(exposures)
     mean, precision = np.zeros(count), np.full(count, _GAIN_SIGMA**-2)
     known = np.array([k for k, value in enumerate(exposures) if value is not None and value > 0.0], dtype=np.intp)
     if len(known) > 1:

@@ -10,10 +10,8 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.compositing.blender import margin
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.brightness import estimate_exposure
@@ -24,14 +22,16 @@ from rdstitch.compositing.image_parts import ShownPart, shown_parts
 from rdstitch.compositing.lattice import LATTICE_STEPS
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photometric import no_exposure
+from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.plan import CompositePlan, plan_composite
 from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seam_finder import find_seams
-from rdstitch.compositing.source_images import PictureLoader, PictureReader, Preview
+from rdstitch.compositing.source_images import PictureReader
 from rdstitch.compositing.survey import survey_factor, survey_pictures
-from rdstitch.compositing.warp import Displacement, plan_warps
+from rdstitch.compositing.warp import plan_warps
 from rdstitch.errors import ArgumentError
 from rdstitch.io.layout import STRIP_ROWS
+from rdstitch.messages import Message
 from rdstitch.opencv_state import one_opencv_thread
 
 # Samples (h, W, C) and alpha (h, W).
@@ -56,7 +56,7 @@ class Prepared:
     origin : (int, int)
         Its top-left pixels on the canvas that the renderer knows.
     plan : CompositePlan
-    notes : tuple of str
+    messages : tuple of Message
     shown : sequence of ShownPart
         Which part of each picture shows, where that is known before; else empty.
     around : int
@@ -67,7 +67,7 @@ class Prepared:
     canvas: Canvas
     origin: tuple[int, int]
     plan: CompositePlan
-    notes: tuple[str, ...]
+    messages: tuple[Message, ...]
     shown: Sequence[ShownPart]
     around: int
 
@@ -125,66 +125,50 @@ class Prepared:
 
 @contextmanager
 def prepare_composite(
-    sources: Sequence[PictureLoader],
-    cameras: Sequence[Camera],
-    homographies: ArrayLike,
+    pictures: Sequence[PlacedPicture],
     canvas: Canvas,
     options: CompositeOptions | None = None,
     progress: ShareProgress | None = None,
-    previews: Sequence[Preview] | None = None,
-    exposures: Sequence[float | None] | None = None,
-    displacements: Sequence[Displacement | None] | None = None,
 ) -> Iterator[Prepared]:
     """Decide on exposure, seams and cropping, from one small look at each picture; see :func:`compose`.
 
     Pictures are read ahead as long as it lasts.
     """
     options = options or CompositeOptions()
-    matrices = np.asarray(homographies, dtype=np.float64)
-    if not len(sources) == len(cameras) == len(matrices) == len(canvas.footprints):
-        raise ArgumentError("sources, cameras, homographies and footprints must be equally many")
-    reader = PictureReader(sources, [c.image_size for c in cameras], previews)
+    if len(pictures) != len(canvas.footprints):
+        raise ArgumentError(f"the canvas is for {len(canvas.footprints)} pictures, not for {len(pictures)}")
+    reader = PictureReader(pictures)
     channels, dtype = reader.samples
-    plan = plan_composite(cameras, canvas, options, channels, dtype.itemsize)
+    plan = plan_composite([picture.camera for picture in pictures], canvas, options, channels, dtype.itemsize)
     if canvas.period is not None:
         canvas = canvas.widened(_wrap_margin(canvas, plan.bands))
-    warps = plan_warps(cameras, matrices, canvas, displacements)
-    pictures = PictureCache(reader, [w.shrink for w in warps], plan.cache_bytes, ahead=plan.workers > 1)
-    with closing(pictures):
-        same = no_exposure(len(cameras), channels)
-        renderer = Renderer(warps, pictures, same, None, options, plan.bands, channels, dtype)
-        share = _part_of(progress, 0.0, _PREPARATION)
-        yield _decided(renderer, reader, cameras, matrices, canvas, plan, exposures, share)
+    warps = plan_warps(pictures, canvas)
+    cache = PictureCache(reader, [w.shrink for w in warps], plan.cache_bytes, ahead=plan.workers > 1)
+    with closing(cache):
+        same = no_exposure(len(pictures), channels)
+        renderer = Renderer(warps, cache, same, None, options, plan.bands, channels, dtype)
+        yield _decided(renderer, reader, pictures, canvas, plan, _part_of(progress, 0.0, _PREPARATION))
 
 
 def _decided(
     renderer: Renderer,
     reader: PictureReader,
-    cameras: Sequence[Camera],
-    homographies: FloatArray,
+    pictures: Sequence[PlacedPicture],
     canvas: Canvas,
     plan: CompositePlan,
-    exposures: Sequence[float | None] | None,
     progress: ShareProgress | None,
 ) -> Prepared:
     """Decide for a renderer that knows of no exposure and no seams yet."""
     options, warps, exposure = renderer.options, renderer.warps, renderer.exposure
     seams = survey = None
-    if len(cameras) > 1 and (options.exposure != "none" or options.seam != "none"):
-        survey = survey_pictures(
-            reader,
-            cameras,
-            homographies,
-            canvas,
-            min(plan.workers, _READERS),
-            _part_of(progress, 0.0, 0.7),
-            [warp.displacement for warp in warps],
-        )
+    if len(pictures) > 1 and (options.exposure != "none" or options.seam != "none"):
+        surveyed = _part_of(progress, 0.0, 0.7)
+        survey = survey_pictures(reader, pictures, canvas, min(plan.workers, _READERS), surveyed)
         # The first tiles will ask for most of them, however the seams run.
         topmost = [index for index, warp in enumerate(warps) if warp.box[1] < plan.tile_size]
         renderer.pictures.prefetch(sorted(topmost, key=lambda index: warps[index].box))
         if options.exposure != "none":
-            exposure = estimate_exposure(survey, cameras, options.exposure, exposures)
+            exposure = estimate_exposure(survey, pictures, options.exposure)
         if options.seam != "none":
             seams = find_seams(survey, exposure, options.seam == "graphcut", _part_of(progress, 0.7, 1.0))
             if canvas.period is not None:
@@ -193,7 +177,7 @@ def _decided(
                 seams = replace(seams, softness=max(1, (1 << plan.bands) // (2 * seams.factor)))
     box, note = _unwidened(canvas), ""
     if options.crop == "auto":
-        covered, factor = coverage_map(warps, homographies, canvas, survey)
+        covered, factor = coverage_map(pictures, canvas, survey)
         find = crop_box if box is None else partial(crop_rows, whole=box)
         found, note = find(covered, factor, canvas.size)
         box = found or box
@@ -201,9 +185,9 @@ def _decided(
     # What a tile's blending feels is aligned to the coarsest band.
     around = margin(plan.bands) + (2 << plan.bands)
     shown = [] if seams is None else shown_parts(warps, seams, around)
-    origin, notes = (0, 0) if box is None else box[:2], (note,) if note else ()
+    origin, messages = (0, 0) if box is None else box[:2], (Message(note),) if note else ()
     renderer = replace(renderer, exposure=exposure, seams=seams)
-    return Prepared(renderer, cropped, origin, plan, notes, shown, around)
+    return Prepared(renderer, cropped, origin, plan, messages, shown, around)
 
 
 def _wrap_margin(canvas: Canvas, bands: int) -> int:

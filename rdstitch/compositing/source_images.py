@@ -1,7 +1,7 @@
 """Pictures as the tiles need them: of one kind, smoothed for the output's resolution, whole or a part."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, encloses, intersection
+from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.errors import InputError
 from rdstitch.io.read import Picture
 from rdstitch.io.reduction import block_mean, fitting_reduction, reduced_size
 
-PictureLoader = Callable[[], Picture]
-Preview = Callable[[int], Picture]
 NOTHING: Box = (0, 0, 0, 0)
 
 _OPAQUE_FROM = 128
@@ -144,39 +143,30 @@ class PictureReader:
 
     Parameters
     ----------
-    sources : sequence of callables
-        Each reads one picture.
-    sizes : sequence of (int, int)
-        Width and height, pixels, that each picture must have.
-    previews : sequence of callables, optional
-        Each reads one picture reduced by a factor; see :func:`rdstitch.io.read_image`.
+    pictures : sequence of PlacedPicture
+        Each must have the size that its camera has.
     """
 
-    def __init__(
-        self,
-        sources: Sequence[PictureLoader],
-        sizes: Sequence[tuple[int, int]],
-        previews: Sequence[Preview] | None = None,
-    ) -> None:
-        self._sources, self._sizes, self._previews = sources, sizes, previews
+    def __init__(self, pictures: Sequence[PlacedPicture]) -> None:
+        self._pictures = pictures
         self._samples: tuple[tuple[int, ...], np.dtype[Any]] | None = None
         self._masked: dict[int, bool] = {}
 
     def prepared(self, index: int, shrink: float) -> LoadedPicture:
         """Read picture ``index``, no larger than needed, for an output that shrinks it so much."""
-        reduction = self._reduction(shrink)
+        reduction = self._reduction(index, shrink)
         return prepare_picture(self(index, reduction), shrink, reduction)
 
     def nbytes(self, index: int, shrink: float) -> int:
         """Memory that picture ``index`` takes at most when it is prepared for such an output, if it was read before."""
         channels, dtype = self.samples
-        width, height = reduced_size(self._sizes[index], self._reduction(shrink))
+        width, height = reduced_size(self._pictures[index].camera.image_size, self._reduction(index, shrink))
         opacity = np.dtype(np.float32).itemsize if self._masked.get(index, False) else 0
         return width * height * (channels * dtype.itemsize + opacity)
 
-    def _reduction(self, shrink: float) -> int:
+    def _reduction(self, index: int, shrink: float) -> int:
         """What a picture is read smaller by for an output that shrinks it so much; a Gaussian does the rest."""
-        return 1 if self._previews is None else fitting_reduction(shrink / _PX_PER_OUTPUT_PX)
+        return 1 if self._pictures[index].preview is None else fitting_reduction(shrink / _PX_PER_OUTPUT_PX)
 
     def __call__(self, index: int, reduction: int = 1) -> Picture:
         """Read picture ``index``; a grey picture among coloured ones becomes coloured.
@@ -186,12 +176,10 @@ class PictureReader:
         InputError
             When it cannot be read, has another size than its camera, or samples unlike the first picture's.
         """
-        if reduction > 1 and self._previews is not None:
-            picture = self._previews[index](reduction)
-        else:
-            picture = self._sources[index]()
+        placed = self._pictures[index]
+        picture = placed.preview(reduction) if reduction > 1 and placed.preview is not None else placed.read()
         height, width = picture.pixels.shape[:2]
-        wanted = reduced_size(self._sizes[index], reduction)
+        wanted = reduced_size(placed.camera.image_size, reduction)
         if (width, height) != wanted:
             expected = "{} x {}".format(*wanted)
             raise InputError(f"picture {index + 1} has {width} x {height} px, but its camera has {expected}")
@@ -214,14 +202,17 @@ class PictureReader:
     def masked(self, index: int) -> bool:
         """Whether a picture has transparent parts; reads it when that is not known yet."""
         if index not in self._masked:
-            self(index, _LARGEST_PREVIEW if self._previews is not None else 1)
+            self._read_small(index)
         return self._masked[index]
+
+    def _read_small(self, index: int) -> None:
+        self(index, 1 if self._pictures[index].preview is None else _LARGEST_PREVIEW)
 
     @property
     def samples(self) -> tuple[int, np.dtype[Any]]:
         """Number of channels and type of all pictures' samples; reads the first one when none has been read."""
         if self._samples is None:
-            self(0, _LARGEST_PREVIEW if self._previews is not None else 1)
+            self._read_small(0)
         assert self._samples is not None
         channels, dtype = self._samples
         return (channels[0] if channels else 1), dtype

@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.compositing.canvas import Canvas
+from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.sampling import border_weight, sample, sample_opacity
 from rdstitch.compositing.source_images import PictureReader
-from rdstitch.compositing.warp import Displacement, Warp, locate, plan_warps
+from rdstitch.compositing.warp import Warp, locate, plan_warps
 
 _LARGEST_PICTURE = 150_000
 _LARGEST_TOTAL = 16_000_000
@@ -75,17 +74,15 @@ def survey_factor(canvas: Canvas) -> int:
 
 def survey_pictures(
     reader: PictureReader,
-    cameras: Sequence[Camera],
-    homographies: FloatArray,
+    pictures: Sequence[PlacedPicture],
     canvas: Canvas,
     workers: int = 1,
     progress: Callable[[float], None] | None = None,
-    displacements: Sequence[Displacement | None] | None = None,
 ) -> Survey:
     """Read every picture once, ``workers`` at a time, and lay it, small, on the reduced canvas."""
     factor = survey_factor(canvas)
     small = canvas.reduced(factor)
-    warps = tuple(plan_warps(cameras, homographies, small, displacements))
+    warps = tuple(plan_warps(pictures, small))
     tiles = []
     with ThreadPoolExecutor(workers) as pool:
         for tile in pool.map(partial(_survey_tile, reader), range(len(warps)), warps):

@@ -1,7 +1,7 @@
 """One resampling from the original: canvas pixels → plane → undistorted → measured pixels of one picture."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -14,6 +14,7 @@ from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box, Float32Array, encloses, grown, intersection
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.lattice import LATTICE_STEPS, Lattice
+from rdstitch.compositing.placed_picture import Displacement, PlacedPicture
 from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.radial_homography import to_plane
 
@@ -21,10 +22,6 @@ from rdstitch.radial_homography import to_plane
 # OpenCV rounds them to 1/32 pixels afterwards.
 _LATTICE_ERROR = 0.01
 _PROBES = 16
-
-
-Displacement = Callable[[FloatArray], FloatArray]
-"""Displacement of a picture's content, pixels (..., 2), at measured pixels (..., 2): what local alignment found."""
 
 
 @dataclass(frozen=True)
@@ -185,15 +182,9 @@ def _reached(warp: Warp, canvas: Canvas) -> Box:
     return intersection(grown(warp.box, int(np.ceil(moved)) + 1), (0, 0, *canvas.size)) or warp.box
 
 
-def plan_warps(
-    cameras: Sequence[Camera],
-    homographies: FloatArray,
-    canvas: Canvas,
-    displacements: Sequence[Displacement | None] | None = None,
-) -> list[Warp]:
+def plan_warps(pictures: Sequence[PlacedPicture], canvas: Canvas) -> list[Warp]:
     """The warps of all pictures."""
-    each = zip(cameras, homographies, displacements or [None] * len(cameras), strict=True)
-    return [plan_warp(camera, matrix, canvas, k, moved) for k, (camera, matrix, moved) in enumerate(each)]
+    return [plan_warp(p.camera, p.homography, canvas, k, p.displacement) for k, p in enumerate(pictures)]
 
 
 def locate(warp: Warp, box: Box) -> Geometry:

@@ -93,9 +93,9 @@ def apply(
         raise ArgumentError(f"unknown way to match {match!r}; choose one of {', '.join(_MATCHES)}")
     saved = read_sidecar(sidecar)
     options = composite or saved.composite
-    doubts = [mismatch] if (mismatch := mismatch_with_picture(saved)) else []
+    doubts = [Message(mismatch)] if (mismatch := mismatch_with_picture(saved)) else []
     if strict and doubts:
-        raise InputError(doubts[0])
+        raise InputError(doubts[0].text)
     given = as_inputs(images, channel_order)
     with found_pictures(given, output=output, every=every) as found, Outputs(overwrite) as outputs:
         if output is not None:
@@ -124,7 +124,7 @@ def apply(
             None if output is None else Path(output),
             composed.composite,
             composed.plan,
-            (*doubts, *map(str, (*found.messages, *guard.messages)), *composed.notes),
+            (*doubts, *found.messages, *guard.messages, *composed.messages),
             channel_order,
             composed.fingerprint,
         )

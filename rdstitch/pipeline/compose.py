@@ -1,8 +1,6 @@
 """The last stage of every picture: from registered pictures to pixels, in memory or in a file."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 from rdstitch.compositing import (
@@ -11,20 +9,20 @@ from rdstitch.compositing import (
     CompositeOptions,
     CompositePlan,
     FileComposite,
+    OutputFile,
     compose,
     compose_to_file,
     plan_composite,
 )
-from rdstitch.compositing.near_part import NearPart
 from rdstitch.export.georeference import Georeference, georeference, has_place, world_file_paths
-from rdstitch.inputs.source import Source, readers
+from rdstitch.inputs.source import Source
 from rdstitch.io.atomic import check_output, text_bytes
 from rdstitch.io.deepzoom import LARGEST_TILE_PROFILE
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.io.outputs import Outputs
-from rdstitch.io.read import Picture
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
+from rdstitch.messages import Message
 from rdstitch.pipeline.memory import release_free_heap
 from rdstitch.pipeline.placed_images import PlacedImages, plan
 from rdstitch.progress import Progress
@@ -46,7 +44,7 @@ class Composed:
         The picture; None where it went to a file, or was only planned.
     plan : CompositePlan or None
         Of a dry run.
-    notes : tuple of str
+    messages : tuple of Message
         What the user should know, such as why nothing was cropped.
     fingerprint : Fingerprint or None
         Size and digest of the file.
@@ -57,7 +55,7 @@ class Composed:
     canvas: Canvas
     composite: Composite | None = None
     plan: CompositePlan | None = None
-    notes: tuple[str, ...] = ()
+    messages: tuple[Message, ...] = ()
     fingerprint: Fingerprint | None = None
     written: FileComposite | None = None
 
@@ -104,12 +102,11 @@ def compose_pictures(
         check_size(output, canvas.size)
         check_memory(output, canvas.size, options.max_memory)
     options = replace(options, workers=threads)
-    read = [
-        reader if part is None else partial(_read_near, reader, part)
-        for reader, part in zip(readers(placed.sources), canvas.near or [None] * len(placed.sources), strict=True)
-    ]
+    pictures = placed.pictures(canvas.near)
     if dry_run:
-        pixels = read[0](_SMALLEST).pixels
+        preview = pictures[0].preview
+        assert preview is not None
+        pixels = preview(_SMALLEST).pixels
         channels = 1 if pixels.ndim == 2 else pixels.shape[2]
         return Composed(canvas, plan=plan_composite(placed.cameras, canvas, options, channels, pixels.dtype.itemsize))
 
@@ -117,19 +114,22 @@ def compose_pictures(
         progress("compositing", round(100 * share), 100)
 
     if output is None:
-        composite = compose(
-            read,
-            placed.cameras,
-            placed.homographies,
-            canvas,
-            options,
-            report,
-            read,
-            placed.exposures,
-            placed.displacements,
-        )
-        return Composed(composite.canvas, composite, notes=composite.notes)
-    return _into_file(placed, read, canvas, output, options, report, outputs, world_files)
+        composite = compose(pictures, canvas, options, report)
+        return Composed(composite.canvas, composite, messages=composite.messages)
+    located: list[tuple[Georeference | None, str]] = []
+
+    def tags(final: Canvas) -> list[ExtraTag]:
+        located.append(georeference(placed.positions, placed.cameras, final.matrix @ placed.homographies))
+        return located[0][0].tiff_tags() if located[0][0] is not None else []
+
+    file = OutputFile(output, placed.sources[0].metadata, tags, outputs)
+    written = compose_to_file(file, pictures, canvas, options, report)
+    place, note = located[0]
+    if place is not None and world_files:
+        for path, text in zip(world_files, place.world_file_texts(), strict=True):
+            outputs.write(path, text_bytes(text))
+    messages = (*written.messages, *([Message(note)] if note else []), *_profile_lost(placed.sources[0], Path(output)))
+    return Composed(written.canvas, messages=messages, fingerprint=written.fingerprint, written=written)
 
 
 def _files_beside(output: str | Path | None, placed: PlacedImages, overwrite: bool) -> tuple[Path, ...]:
@@ -143,54 +143,9 @@ def _files_beside(output: str | Path | None, placed: PlacedImages, overwrite: bo
     return world_files
 
 
-def _into_file(
-    placed: PlacedImages,
-    read: Sequence[Callable[..., Picture]],
-    canvas: Canvas,
-    output: str | Path,
-    options: CompositeOptions,
-    report: Callable[[float], None],
-    outputs: Outputs,
-    world_files: Sequence[Path],
-) -> Composed:
-    """The picture in its file, with its place on the Earth where that is known."""
-    located: list[tuple[Georeference | None, str]] = []
-
-    def tags(final: Canvas) -> list[ExtraTag]:
-        located.append(georeference(placed.positions, placed.cameras, final.matrix @ placed.homographies))
-        return located[0][0].tiff_tags() if located[0][0] is not None else []
-
-    written = compose_to_file(
-        output,
-        read,
-        placed.cameras,
-        placed.homographies,
-        canvas,
-        options,
-        placed.sources[0].metadata,
-        report,
-        tags,
-        read,
-        placed.exposures,
-        placed.displacements,
-        outputs=outputs,
-    )
-    place, note = located[0]
-    if place is not None and world_files:
-        for file, text in zip(world_files, place.world_file_texts(), strict=True):
-            outputs.write(file, text_bytes(text))
-    notes = (*written.notes, *([note] if note else []), *_profile_notes(placed.sources[0], Path(output)))
-    return Composed(written.canvas, notes=notes, fingerprint=written.fingerprint, written=written)
-
-
-def _profile_notes(source: Source, output: Path) -> list[str]:
+def _profile_lost(source: Source, output: Path) -> list[Message]:
     """Why the output lacks the colour profile of the picture whose metadata it has."""
     lost, size = source.metadata.profile_lost, len(source.metadata.icc_profile)
     if output.suffix.lower() == ".dzi" and size > LARGEST_TILE_PROFILE:
         lost = f"its colour profile of {size / 1e3:.0f} kB is too large to be in every tile"
-    return [f"{source.name}: {lost}; colours are as if it had none"] if lost else []
-
-
-def _read_near(read: Callable[..., Picture], part: NearPart, reduction: int = 1) -> Picture:
-    """A picture, whole or reduced, of which only its near part is drawn."""
-    return part.masked(read(reduction))
+    return [Message(f"{lost}; colours are as if it had none", (str(source.path),))] if lost else []

@@ -1,7 +1,8 @@
 """Registered pictures, ready to be composited, and the canvas that they need."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Self
 
 import numpy as np
@@ -9,10 +10,12 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
-from rdstitch.compositing.warp import Displacement
+from rdstitch.compositing.near_part import NearPart
+from rdstitch.compositing.placed_picture import Displacement, PlacedPicture, place_pictures
 from rdstitch.errors import ArgumentError
-from rdstitch.inputs.source import Source
+from rdstitch.inputs.source import Source, readers
 from rdstitch.io.metadata import GpsPosition
+from rdstitch.io.read import Picture
 from rdstitch.registration import Registration
 
 
@@ -60,10 +63,22 @@ class PlacedImages:
         """Where each picture was taken; a camera that turned on the spot was at one place, and shows no plane."""
         return [None if self.turned else source.metadata.gps for source in self.sources]
 
-    @property
-    def exposures(self) -> list[float | None]:
-        """Exposure of each picture, where EXIF has it."""
-        return [source.metadata.exposure for source in self.sources]
+    def pictures(self, near: Sequence[NearPart | None]) -> list[PlacedPicture]:
+        """As the compositor takes them, with only the near parts of those that are not drawn whole."""
+        read = [
+            reader if part is None else partial(_read_near, reader, part)
+            for reader, part in zip(readers(self.sources), near or [None] * len(self.sources), strict=True)
+        ]
+        exposure = [source.metadata.exposure for source in self.sources]
+        moved = self.displacements or None
+        return place_pictures(
+            read, self.cameras, self.homographies, preview=read, exposure=exposure, displacement=moved
+        )
+
+
+def _read_near(read: Callable[..., Picture], part: NearPart, reduction: int = 1) -> Picture:
+    """A picture, whole or reduced, of which only its near part is drawn."""
+    return part.masked(read(reduction))
 
 
 def plan(placed: PlacedImages, options: CompositeOptions) -> Canvas:

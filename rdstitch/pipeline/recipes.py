@@ -295,7 +295,7 @@ def _composite(
         )
         _release_decoded_images(registration)
         result = StitchResult(
-            _with_damage(registration).with_messages(map(Message, composed.notes)),
+            _with_damage(registration).with_messages(composed.messages),
             composed.canvas,
             options.for_pictures(len(registration.sources)),
             None if output is None else Path(output),

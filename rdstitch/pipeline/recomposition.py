@@ -36,7 +36,7 @@ class Recomposition(OutputImage):
         The picture itself; None where it went to a file, or was only planned.
     plan : CompositePlan or None
         Of a dry run.
-    notes : tuple of str
+    messages : tuple of Message
         What the user should know of the compositing, and of the sidecar.
     channel_order : str
         Of :attr:`image`: "bgr" or "rgb".
@@ -53,7 +53,7 @@ class Recomposition(OutputImage):
     output: Path | None = None
     composite: Composite | None = None
     plan: CompositePlan | None = None
-    notes: tuple[str, ...] = ()
+    messages: tuple[Message, ...] = ()
     channel_order: ChannelOrder = "bgr"
     fingerprint: Fingerprint | None = None
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.compositing import Canvas, Composite, CompositeOptions, compose
+from rdstitch.compositing import Canvas, Composite, CompositeOptions, PlacedPicture, compose
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.inputs.find import found_pictures
 from rdstitch.inputs.frame import ChannelOrder, Images, as_inputs, files_of, in_order
@@ -110,7 +110,7 @@ def _undistorted(source: Source, view: Framing) -> Composite:
     plain = CompositeOptions(exposure="none", seam="none", blend="none")
     canvas = undistorted_canvas(source.camera, view)
     read: Callable[[], Picture] = source.read
-    return compose([read], [source.camera], np.eye(3)[None], canvas, plain)
+    return compose([PlacedPicture(read, source.camera, np.eye(3))], canvas, plain)
 
 
 def _outputs(sources: Sequence[Source], folder: Path, inputs: Sequence[Path], overwrite: bool) -> list[Path]:

@@ -23,6 +23,7 @@ import numpy as np
 from rdstitch.compositing import CompositeOptions, plan_canvas
 from rdstitch.compositing.boxes import Float32Array
 from rdstitch.compositing.photometric import full_scale
+from rdstitch.compositing.placed_picture import place_pictures
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.seam_finder import NOBODY, SeamMap
 from rdstitch.compositing.source_images import PictureReader
@@ -79,14 +80,15 @@ def main() -> None:
     cameras = [picture.camera for picture in used if picture.camera is not None]
     matrices = np.array([picture.to_plane for picture in used])
     canvas, read = plan_canvas(cameras, matrices), readers(sources)
-    survey = survey_pictures(PictureReader(read, [c.image_size for c in cameras], read), cameras, matrices, canvas, 2)
+    pictures = place_pictures(read, cameras, matrices, preview=read)
+    survey = survey_pictures(PictureReader(pictures), pictures, canvas, 2)
     tiles = [tile for tile in survey.tiles if tile is not None]
     full = full_scale(tiles[0].pixels.dtype)
     inputs = np.concatenate([tile.pixels[tile.inside].astype(np.float32) for tile in tiles])
     print(f"{'':10} {'gain':>13} {'saturated %':>13} {'median':>13} {'seam mean':>10} {'95 %':>6}")
     for choice in arguments.exposure:
         options = CompositeOptions(exposure=choice)
-        with prepare_composite(read, cameras, matrices, canvas, options, previews=read) as ready:
+        with prepare_composite(pictures, canvas, options) as ready:
             corrected = [
                 ready.renderer.exposure.correct(k, locate(survey.warps[k], tile.box), tile.pixels).astype(np.float32)
                 for k, tile in enumerate(survey.tiles)

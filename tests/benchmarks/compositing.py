@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.compositing import CompositeOptions, compose_to_file, plan_canvas
+from rdstitch.compositing import CompositeOptions, OutputFile, compose_to_file, place_pictures, plan_canvas
 from rdstitch.io import Metadata, Picture, read_image
 from rdstitch.synthetic import Photometry, grid_poses, ground, sequence_over
 
@@ -98,9 +98,8 @@ def composite_files(paths: list[Path], homographies: FloatArray, output: Path, *
     cameras = [LENS] * len(paths)
     sources = [partial(read_image, path) for path in paths]
     canvas = plan_canvas(cameras, homographies)
-    done = compose_to_file(
-        output, sources, cameras, homographies, canvas, CompositeOptions(**options), previews=sources
-    )
+    pictures = place_pictures(sources, cameras, homographies, preview=sources)
+    done = compose_to_file(OutputFile(output), pictures, canvas, CompositeOptions(**options))
     return done.canvas.size
 
 
@@ -190,7 +189,8 @@ def composite_flight(megapixels: float, channels: int, output: Path, options: di
     tile = np.asarray(cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
     canvas = plan_canvas(cameras, matrices)
     sources = [partial(made_frame, index, tile) for index in range(len(cameras))]
-    done = compose_to_file(output, sources, cameras, matrices, canvas, CompositeOptions(**options))
+    pictures = place_pictures(sources, cameras, matrices)
+    done = compose_to_file(OutputFile(output), pictures, canvas, CompositeOptions(**options))
     return {"pictures": len(cameras), "size": done.canvas.size, "coverage": done.coverage}
 
 

@@ -25,6 +25,7 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, plan_canvas
+from rdstitch.compositing.placed_picture import place_pictures
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.seam_finder import NOBODY
 from rdstitch.errors import RdstitchError
@@ -77,7 +78,7 @@ def across_seams(truth: Sequence, registration: Registration, local: LocalAlignm
     canvas, read = plan_canvas(cameras, matrices), readers(sources)
     fields = list(local.fields) or None
     with prepare_composite(
-        read, cameras, matrices, canvas, CompositeOptions(), previews=read, displacements=fields
+        place_pictures(read, cameras, matrices, preview=read, displacement=fields), canvas, CompositeOptions()
     ) as ready:
         seams, warps = ready.renderer.seams, ready.renderer.warps
     assert seams is not None

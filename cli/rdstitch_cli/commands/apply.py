@@ -90,8 +90,8 @@ def apply(
             reporter.warn(str(missing))
         if result.matched == "order" and match == "auto":
             reporter.warn("no picture has a name of the sidecar; they were taken in order")
-        for note in result.notes:
-            reporter.warn(note)
+        for message in result.messages:
+            reporter.warn(str(message))
         if result.plan is not None:
             show_plan(result.plan)
         else:

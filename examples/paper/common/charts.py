@@ -12,7 +12,7 @@ from examples.judging.fitting import apply
 from examples.paper.common.report import Pixels
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.compositing import Canvas, CompositeOptions, compose
+from rdstitch.compositing import Canvas, CompositeOptions, PlacedPicture, compose
 from rdstitch.io.read import read_image
 from rdstitch.synthetic import PictureTexture, Poses, sequence_over
 from rdstitch.synthetic import Sequence as RenderedSequence
@@ -90,7 +90,7 @@ def before_and_after(file: Path, camera: Camera, to_grid: FloatArray, size: tupl
     width, height = (round(px * extent) for extent in size)
     frame = np.array([(0.0, 0.0), (width - 1.0, 0.0), (width - 1.0, height - 1.0), (0.0, height - 1.0)])
     canvas = Canvas((width, height), np.diag([px, px, 1.0]), (frame,))
-    after = compose([partial(read_image, file)], [camera], to_grid[None], canvas, _AS_IT_IS)
+    after = compose([PlacedPicture(partial(read_image, file), camera, to_grid)], canvas, _AS_IT_IS)
     pixels = np.where(after.alpha[..., None] > 0, _as_rgb(after.pixels), np.uint8(255))
     measured = _as_rgb(np.asarray(read_image(file).pixels))
     shape = (round(measured.shape[1] * height / measured.shape[0]), height)

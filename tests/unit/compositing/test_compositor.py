@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from examples.judging.comparison import sharpness
 from rdstitch.camera import Camera
-from rdstitch.compositing import CompositeOptions, compose, compose_to_file, plan_canvas
+from rdstitch.compositing import CompositeOptions, OutputFile, compose, compose_to_file, plan_canvas
 from rdstitch.compositing.crop import largest_rectangle
 from rdstitch.compositing.options import ExposureMethod
+from rdstitch.compositing.placed_picture import PictureLoader, place_pictures
 from rdstitch.compositing.preparation import prepare_composite
-from rdstitch.compositing.source_images import PictureLoader
 from rdstitch.errors import ArgumentError, InputError, LimitError
 from rdstitch.io import Metadata, read_image
 from rdstitch.synthetic.rendering import Photometry
@@ -24,12 +24,12 @@ from tests.compositing_scenes import Scene, as_picture, gradient, grey, inner, r
 
 
 def _compose(scene: Scene, **options: Any) -> Any:
-    return compose(scene.sources, scene.cameras, scene.homographies, scene.canvas, CompositeOptions(**options))
+    return compose(scene.pictures, scene.canvas, CompositeOptions(**options))
 
 
 def _seams(scene: Scene, options: CompositeOptions) -> NDArray[np.bool_]:
     """Px within two of a seam."""
-    with prepare_composite(scene.sources, scene.cameras, scene.homographies, scene.canvas, options) as ready:
+    with prepare_composite(scene.pictures, scene.canvas, options) as ready:
         seams = ready.renderer.seams
     assert seams is not None
     box = (0, 0, *scene.canvas.size)
@@ -88,7 +88,7 @@ def test_brightness_stays_near_that_of_the_pictures() -> None:
     choices: tuple[ExposureMethod, ...] = ("gain", "balanced")
     for choice in choices:
         options = CompositeOptions(exposure=choice)
-        result = compose(sources, scene.cameras, scene.homographies, scene.canvas, options)
+        result = compose(place_pictures(sources, scene.cameras, scene.homographies), scene.canvas, options)
         lit = result.pixels[result.alpha > 0]
         white[choice], middle[choice] = _white(lit), float(np.median(lit))
     inputs = np.concatenate([frame.reshape(-1, 3) for frame in frames])
@@ -105,7 +105,7 @@ def test_brightness_that_drifts_becomes_a_slope_without_steps() -> None:
     choices: tuple[ExposureMethod, ...] = ("none", "gain", "balanced")
     for choice in choices:
         options = CompositeOptions(exposure=choice, blend="none")
-        result = compose(sources, scene.cameras, scene.homographies, scene.canvas, options)
+        result = compose(place_pictures(sources, scene.cameras, scene.homographies), scene.canvas, options)
         row[choice] = result.pixels[result.pixels.shape[0] // 2, 30:-30, 0].astype(int)
     largest = {choice: np.abs(np.diff(values)).max() for choice, values in row.items()}
     assert largest["none"] > 12
@@ -128,7 +128,7 @@ def test_a_clipped_sky_ends_in_no_step() -> None:
     choices: tuple[ExposureMethod, ...] = ("gain", "balanced")
     for choice in choices:
         options = CompositeOptions(exposure=choice, blend="none", seam="voronoi")
-        result = compose(sources, scene.cameras, scene.homographies, scene.canvas, options)
+        result = compose(place_pictures(sources, scene.cameras, scene.homographies), scene.canvas, options)
         row = grey(result.pixels)[60, 40:-40]
         steps[choice] = float(np.abs(np.diff(row)).max())
     assert steps["gain"] > 0.1
@@ -181,7 +181,9 @@ def test_what_moved_is_taken_from_one_picture(shift: int) -> None:
         x, y = truth.to_picture(index, place[None])[0]
         cv2.circle(frames[index], (round(float(x)), round(float(y))), 28, (255, 0, 255), -1)
     sources = [partial(as_picture, frame) for frame in frames]
-    result = compose(sources, scene.cameras, scene.homographies, scene.canvas, CompositeOptions(exposure="none"))
+    result = compose(
+        place_pictures(sources, scene.cameras, scene.homographies), scene.canvas, CompositeOptions(exposure="none")
+    )
     pink = (result.pixels[..., 0] > 200) & (result.pixels[..., 1] < 60) & (result.pixels[..., 2] > 200)
     for place in places:
         at = scene.canvas.matrix @ np.append(place, 1.0)
@@ -194,7 +196,7 @@ def test_crop_keeps_no_hole_and_most_of_the_picture() -> None:
     scene = render(3, 2)
     whole, cropped = _compose(scene), _compose(scene, crop="auto")
     assert (cropped.alpha == 255).all()
-    assert cropped.notes == ()
+    assert cropped.messages == ()
     assert cropped.alpha.size > 0.7 * (whole.alpha > 0).sum()
     # The crop is a part of the whole, px for px.
     dx, dy = np.round(whole.canvas.matrix[:2, 2] - cropped.canvas.matrix[:2, 2]).astype(int)
@@ -209,9 +211,9 @@ def test_crop_that_would_keep_little_is_not_done() -> None:
     matrices = np.stack([step @ np.diag([lens.half_diagonal] * 2 + [1.0]) for step in steps])
     canvas = plan_canvas([lens] * 6, matrices)
     sources = [partial(as_picture, np.full((80, 100), 50, np.uint8))] * 6
-    result = compose(sources, [lens] * 6, matrices, canvas, CompositeOptions(crop="auto"))
+    result = compose(place_pictures(sources, [lens] * 6, matrices), canvas, CompositeOptions(crop="auto"))
     assert result.canvas.size == canvas.size == (600, 480)
-    assert "not cropped" in result.notes[0]
+    assert "not cropped" in result.messages[0].text
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -237,13 +239,10 @@ def test_file_is_what_memory_is(tmp_path: Path, suffix: str) -> None:
     result = _compose(scene, tile_size=256)
     told: list[float] = []
     done = compose_to_file(
-        tmp_path / f"a.{suffix}",
-        scene.sources,
-        scene.cameras,
-        scene.homographies,
+        OutputFile(tmp_path / f"a.{suffix}", Metadata((1, 1), icc_profile=b"profile" * 30)),
+        scene.pictures,
         scene.canvas,
         CompositeOptions(tile_size=256),
-        Metadata((1, 1), icc_profile=b"profile" * 30),
         told.append,
     )
     back = read_image(tmp_path / f"a.{suffix}")
@@ -268,7 +267,7 @@ def test_sixteen_bits_grey_and_mixed_sizes() -> None:
     frames[1] = cv2.resize(frames[1], (160, 120), interpolation=cv2.INTER_AREA)
     cameras = [c if k != 1 else c.resized((160, 120)) for k, c in enumerate(scene.cameras)]
     sources = [partial(as_picture, frame) for frame in frames]
-    result = compose(sources, cameras, scene.homographies, scene.canvas, CompositeOptions())
+    result = compose(place_pictures(sources, cameras, scene.homographies), scene.canvas, CompositeOptions())
     assert result.pixels.dtype == np.uint16
     assert result.pixels.ndim == 2
     ok = inner(result.alpha)
@@ -280,7 +279,7 @@ def test_grey_among_colours_becomes_coloured() -> None:
     scene = render(2, 1)
     frames = [scene.frames[0], cv2.cvtColor(scene.frames[1], cv2.COLOR_RGB2GRAY)]
     sources = [partial(as_picture, np.asarray(frame)) for frame in frames]
-    result = compose(sources, scene.cameras, scene.homographies, scene.canvas)
+    result = compose(place_pictures(sources, scene.cameras, scene.homographies), scene.canvas)
     assert result.pixels.shape[2] == 3
 
 
@@ -288,12 +287,12 @@ def test_pictures_that_do_not_fit() -> None:
     scene = render(2, 1)
     wrong: list[PictureLoader] = [scene.sources[0], partial(as_picture, np.zeros((10, 10, 3), np.uint8))]
     with pytest.raises(InputError, match="picture 2"):
-        compose(wrong, scene.cameras, scene.homographies, scene.canvas)
+        compose(place_pictures(wrong, scene.cameras, scene.homographies), scene.canvas)
     deep: list[PictureLoader] = [scene.sources[0], partial(as_picture, np.zeros((240, 320, 3), np.uint16))]
     with pytest.raises(InputError, match="uint16"):
-        compose(deep, scene.cameras, scene.homographies, scene.canvas)
+        compose(place_pictures(deep, scene.cameras, scene.homographies), scene.canvas)
     with pytest.raises(ArgumentError):
-        compose(scene.sources[:1], scene.cameras, scene.homographies, scene.canvas)
+        compose(place_pictures(scene.sources[:1], scene.cameras, scene.homographies), scene.canvas)
 
 
 def test_memory_limit_is_checked_before_the_work() -> None:

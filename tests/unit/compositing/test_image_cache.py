@@ -10,8 +10,10 @@ from time import monotonic, sleep
 import numpy as np
 import pytest
 
+from rdstitch.camera import Camera
 from rdstitch.compositing.image_cache import PictureCache
 from rdstitch.compositing.image_parts import shown_parts
+from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.compositing.source_images import NOTHING, PictureReader, prepare_picture
 from rdstitch.compositing.warp import plan_warp
@@ -38,7 +40,8 @@ class DecodedImageCache:
 
     def cache(self, limit: int, *, ahead: bool = False) -> PictureCache:
         """All pictures, as they are."""
-        reader = PictureReader([lambda k=k: self.read(k) for k in range(4)], [(200, 100)] * 4)  # type: ignore[misc]
+        lens = Camera((200, 100))
+        reader = PictureReader([PlacedPicture(partial(self.read, k), lens, np.eye(3)) for k in range(4)])
         assert reader.samples[0] == 1
         self.reads.clear()
         return PictureCache(reader, [1.0] * 4, limit, ahead=ahead)
@@ -138,8 +141,8 @@ def test_the_room_for_a_picture_is_known_before(shrink: float, masked: bool) -> 
     picture = as_picture(np.zeros((300, 400), dtype=np.uint8))
     if masked:
         picture = replace(picture, alpha=np.eye(300, 400, dtype=np.uint8) * 255)
-    for previews in (None, [partial(reduced, picture)]):
-        reader = PictureReader([lambda: picture], [(400, 300)], previews)
+    for preview in (None, partial(reduced, picture)):
+        reader = PictureReader([PlacedPicture(lambda: picture, Camera((400, 300)), np.eye(3), preview)])
         assert reader.masked(0) is masked
         assert reader.nbytes(0, shrink) >= reader.prepared(0, shrink).nbytes
 

@@ -10,6 +10,7 @@ from rdstitch.camera import Camera
 from rdstitch.compositing.canvas import plan_canvas
 from rdstitch.compositing.gain_compensation import estimate_gains
 from rdstitch.compositing.photometric import Exposure, full_scale, no_exposure
+from rdstitch.compositing.placed_picture import place_pictures
 from rdstitch.compositing.source_images import PictureReader
 from rdstitch.compositing.survey import survey_pictures
 from rdstitch.compositing.warp import locate, plan_warp
@@ -65,8 +66,8 @@ def test_a_picture_without_overlap_has_the_gain_that_its_camera_wrote_down() -> 
     apart = scene.homographies.copy()
     apart[2] = np.array([[1.0, 0.0, 2000.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) @ apart[2]
     canvas = plan_canvas(scene.cameras, apart)
-    reader = PictureReader(scene.sources, [camera.image_size for camera in scene.cameras])
-    survey = survey_pictures(reader, scene.cameras, apart, canvas)
-    gains = [estimate_gains(survey, scene.cameras, exposures).log_gain for exposures in (None, [0.5, 0.5, 1.0])]
+    sets = [place_pictures(scene.sources, scene.cameras, apart, exposure=e) for e in (None, [0.5, 0.5, 1.0])]
+    survey = survey_pictures(PictureReader(sets[0]), sets[0], canvas)
+    gains = [estimate_gains(survey, pictures).log_gain for pictures in sets]
     assert np.abs(gains[0][2]).max() < 0.01
     np.testing.assert_allclose(gains[1][2] - gains[1][:2].mean(axis=0), np.log(2.0) / 2.4, atol=0.02)

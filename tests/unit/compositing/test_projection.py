@@ -9,6 +9,7 @@ from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, compose, plan_panorama
 from rdstitch.compositing.panorama_canvas import choose_projection, seen_directions
 from rdstitch.compositing.photo_sphere import center_of_view, field_of_view, photo_sphere_xmp
+from rdstitch.compositing.placed_picture import place_pictures
 from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.compositing.warp import plan_warp
 from rdstitch.errors import ArgumentError, LimitError
@@ -35,7 +36,11 @@ def _composed(
     sequence: TurningSequence, directions: np.ndarray, canvas: Canvas, options: CompositeOptions
 ) -> Composite:
     frames = sequence.frames()
-    return compose([partial(as_picture, frame) for frame in frames], [LENS] * len(frames), directions, canvas, options)
+    return compose(
+        place_pictures([partial(as_picture, frame) for frame in frames], [LENS] * len(frames), directions),
+        canvas,
+        options,
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)

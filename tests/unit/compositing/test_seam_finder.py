@@ -7,6 +7,7 @@ import pytest
 
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, compose, plan_canvas
+from rdstitch.compositing.placed_picture import place_pictures
 from tests.compositing_scenes import as_picture
 
 SIZE = (300, 200)
@@ -31,7 +32,9 @@ def test_a_seam_runs_where_two_pictures_look_alike(place: int, swapped: bool) ->
         frames, homographies = frames[::-1], homographies[::-1]
     canvas = plan_canvas([lens, lens], homographies)
     options = CompositeOptions(exposure="none", seam="graphcut", blend="none")
-    found = compose([partial(as_picture, frame) for frame in frames], [lens, lens], homographies, canvas, options)
+    found = compose(
+        place_pictures([partial(as_picture, frame) for frame in frames], [lens, lens], homographies), canvas, options
+    )
     assert canvas.size == (SIZE[0] + SHIFT, SIZE[1])
     assert (found.pixels[:, : place - 6] == LEFT).all()
     assert (found.pixels[:, place + 7 :] == RIGHT).all()

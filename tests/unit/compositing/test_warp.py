@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, compose, plan_canvas
+from rdstitch.compositing.placed_picture import place_pictures
 from rdstitch.compositing.sampling import sample
 from rdstitch.compositing.source_images import prepare_picture
 from rdstitch.compositing.warp import locate, plan_warp
@@ -19,7 +20,11 @@ PLAIN = CompositeOptions(exposure="none", seam="none", blend="none")
 def test_identity_gives_the_picture_back() -> None:
     frame = np.random.default_rng(0).integers(0, 256, (150, 200, 3), dtype=np.uint8)
     lens = Camera((200, 150))
-    result = compose([lambda: as_picture(frame)], [lens], np.eye(3)[None], plan_canvas([lens], np.eye(3)[None]), PLAIN)
+    result = compose(
+        place_pictures([lambda: as_picture(frame)], [lens], np.eye(3)[None]),
+        plan_canvas([lens], np.eye(3)[None]),
+        PLAIN,
+    )
     np.testing.assert_array_equal(result.pixels, frame)
     assert (result.alpha == 255).all()
 
@@ -28,7 +33,7 @@ def test_quarter_turn_gives_the_picture_turned() -> None:
     frame = np.random.default_rng(0).integers(0, 256, (150, 200), dtype=np.uint8)
     lens = Camera((200, 150))
     canvas = plan_canvas([lens], np.eye(3)[None], rotate=90)
-    result = compose([lambda: as_picture(frame)], [lens], np.eye(3)[None], canvas, PLAIN)
+    result = compose(place_pictures([lambda: as_picture(frame)], [lens], np.eye(3)[None]), canvas, PLAIN)
     np.testing.assert_array_equal(result.pixels, np.rot90(frame, -1))
 
 
@@ -84,7 +89,9 @@ def test_coverage_ends_half_a_pixel_outside() -> None:
         matrix = np.eye(3)
         matrix[0, 2] = shift / lens.half_diagonal
         canvas = type(base)((60, 40), base.matrix, (base.footprints[0] + (shift, 0.0),))
-        result = compose([lambda: as_picture(np.full((40, 50), 9, np.uint8))], [lens], matrix[None], canvas, PLAIN)
+        result = compose(
+            place_pictures([lambda: as_picture(np.full((40, 50), 9, np.uint8))], [lens], matrix[None]), canvas, PLAIN
+        )
         covered = np.flatnonzero(result.alpha[20])
         assert (covered[0], covered[-1]) == (first, first + 49)
         assert (result.pixels[result.alpha > 0] == 9).all()
@@ -97,7 +104,7 @@ def test_shrinking_does_not_alias() -> None:
     lens = Camera((800, 600))
     for scale in (0.5, 0.27, 0.1):
         canvas = plan_canvas([lens], np.eye(3)[None], scale=scale)
-        result = compose([lambda: as_picture(stripes)], [lens], np.eye(3)[None], canvas, PLAIN)
+        result = compose(place_pictures([lambda: as_picture(stripes)], [lens], np.eye(3)[None]), canvas, PLAIN)
         middle = result.pixels[5:-5, 5:-5].astype(float)
         assert middle.mean() == pytest.approx(85, abs=1.0)
         assert middle.std() < 12
@@ -105,7 +112,7 @@ def test_shrinking_does_not_alias() -> None:
 
 def test_shrunk_picture_stays_in_place() -> None:
     scene = render(1, 1, size=(640, 480), scale=0.23)
-    result = compose(scene.sources, scene.cameras, scene.homographies, scene.canvas, PLAIN)
+    result = compose(scene.pictures, scene.canvas, PLAIN)
     truth, mine, ok = scene.truth(), grey(result.pixels), inner(result.alpha)
     shifts = [np.mean((np.roll(mine, (dy, dx), (0, 1))[ok] - truth[ok]) ** 2) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
     assert int(np.argmin(shifts)) == 4
@@ -118,7 +125,7 @@ def test_any_samples(shape: tuple[int, ...], dtype: type) -> None:
     frame: NDArray[Any] = (np.random.default_rng(0).random(shape) * 200).astype(dtype)
     lens = Camera((120, 90), distortion=-0.1)
     canvas = plan_canvas([lens], np.eye(3)[None])
-    result = compose([lambda: as_picture(frame)], [lens], np.eye(3)[None], canvas, PLAIN)
+    result = compose(place_pictures([lambda: as_picture(frame)], [lens], np.eye(3)[None]), canvas, PLAIN)
     assert result.pixels.dtype == dtype
     assert result.pixels.shape[2:] == shape[2:]
     lit = result.pixels[result.alpha > 0]
@@ -132,7 +139,7 @@ def test_transparent_parts_leave_no_trace() -> None:
     alpha[40:80, 50:100] = 0
     lens = Camera((160, 120), distortion=-0.2)
     canvas = plan_canvas([lens], np.eye(3)[None])
-    result = compose([lambda: as_picture(frame, alpha)], [lens], np.eye(3)[None], canvas, PLAIN)
+    result = compose(place_pictures([lambda: as_picture(frame, alpha)], [lens], np.eye(3)[None]), canvas, PLAIN)
     assert (result.pixels[result.alpha > 0] == 200).all()
     hole = plan_warp(lens, np.eye(3), canvas, 0)
     middle = hole.source_points(np.array([result.alpha.shape[1] / 2]), np.array([result.alpha.shape[0] / 2]))
