@@ -240,5 +240,5 @@ def _warnings(found: AdjustedPictures) -> tuple[Message, ...]:
         )
         result.append(Message(text, code="mixed-lenses"))
     if not found.choice.fit.adjusted.converged:
-        result.append(Message("the adjustment did not converge; judge the result with care"))
+        result.append(Message("the adjustment did not converge; judge the result with care", code="not-converged"))
     return tuple(result)

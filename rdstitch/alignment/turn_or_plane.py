@@ -8,6 +8,8 @@ as of anything else. So the turn is taken where it fits, and a plane where there
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.lens_selection import is_plausible
 from rdstitch.alignment.model_selection import ModelChoice, choose_model, fit_cost, noise_of_links, price
@@ -19,6 +21,11 @@ from rdstitch.arrays import BoolArray
 _FAR, _AS_GOOD = math.radians(45.0), 1.2
 """Angle between optical axes, and errors in units of those of pairs on their own, from and up to which a plane is not
 tried: of a plane, a camera that turns as far sees the horizon."""
+
+_PARALLAX = 0.0015
+"""Of a picture's diagonal: errors up to which a camera that turned far, held by hand, still counts as having turned on
+the spot. More freedom would explain them, and stretch the pictures over a plane that is not there. A centre that moves
+by 8 % of the scene's distance leaves 0.0012; over a plane, a turn as far leaves 0.003 to 0.007."""
 
 _POSSIBLE = 4.0
 """Times the noise that pairs may be off from a turn on the spot for it to be tried on all of them."""
@@ -34,7 +41,9 @@ def choose_motion(problem: Problem, names: Sequence[str], lenses: Sequence[BoolA
         return choose_model(problem, names, lenses)
     bound, least = noise_of_links(problem)
     trial = problem.trial(ROTATION)
-    if planar and trial.sigma > _POSSIBLE * bound.noise:
+    parallax = _PARALLAX * 2.0 * float(np.median(problem.observations.scale2))
+    possible = trial.sigma <= _POSSIBLE * bound.noise
+    if planar and not possible and trial.sigma > parallax:
         return choose_model(problem, planar, lenses)
     turned = problem.fit(ROTATION, shared=trial.parameters.shared)
     if not planar:
@@ -44,8 +53,11 @@ def choose_motion(problem: Problem, names: Sequence[str], lenses: Sequence[BoolA
         "the camera turned on the spot, so that the pictures say nothing of the scene's shape (a plane seen from one "
         f"place would look the same); it leaves an error of {turned.adjusted.sigma:.2f} px"
     )
-    if _turns_far(turned) and math.hypot(turned.adjusted.sigma, EXACTNESS) < _AS_GOOD * bound.noise:
+    sigma = math.hypot(turned.adjusted.sigma, EXACTNESS)
+    if _turns_far(turned) and sigma < max(_AS_GOOD * bound.noise, parallax):
         return _choice(problem, bound, turned, lenses, explained)
+    if not possible:
+        return choose_model(problem, planar, lenses)
     if _cost(bound, problem, turned) <= least + price(bound, problem, RIGID, problem.free_lens):
         return _choice(problem, bound, turned, lenses, f"{explained}, and nothing is left for more freedom to gain")
     over_plane = choose_model(problem, planar, lenses)

@@ -48,7 +48,13 @@ class FoundPictures:
             return []
         paths = [str(path) for path in self.outputs]
         names = shortened(names_of(paths))
-        return [Message(f"not taken as input, since sidecars say that rdstitch wrote them: {names}", tuple(paths))]
+        return [
+            Message(
+                f"not taken as input, since sidecars say that rdstitch wrote them: {names}",
+                tuple(paths),
+                code="own-output",
+            )
+        ]
 
 
 @contextmanager

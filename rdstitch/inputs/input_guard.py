@@ -67,7 +67,9 @@ class InputGuard:
     @property
     def messages(self) -> list[Message]:
         """What the user should know of the files."""
-        return [Message(f"{path}: {self._damaged[path]}", (str(path),)) for path in sorted(self._damaged)]
+        return [
+            Message(f"{path}: {self._damaged[path]}", (str(path),), code="damaged") for path in sorted(self._damaged)
+        ]
 
     def __reduce__(self) -> tuple[type["InputGuard"], tuple[bool]]:
         """Copies and other processes begin anew."""

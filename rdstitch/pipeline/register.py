@@ -26,7 +26,8 @@ from rdstitch.registration import Registration
 
 _STATIC_BACKGROUND = Message(
     "a part of what the pictures show stays where it is in them (a vehicle's body, a background, dirt, a date); "
-    "only what moves was registered"
+    "only what moves was registered",
+    code="static-background",
 )
 
 

@@ -1,4 +1,4 @@
-"""Pictures of a camera that is turned on the spot: the scene is a sphere of texture around it.
+"""Pictures of a camera that is turned on the spot: the scene is a sphere of texture around it, and balls before it.
 
 The scene has x to the right, y down and z ahead, like a camera that looks straight ahead. Its texture is laid out by
 longitude, which grows to the right, and latitude, which grows downwards, both in equal steps.
@@ -94,16 +94,20 @@ class TurningSequence(Sequence):
         From the scene to each camera.
     position : ndarray of shape (N, 3)
         Where each camera's centre is, in radii of the sphere: zeros for a turn on the spot, other numbers for parallax.
+    near : ndarray of shape (K, 4)
+        Centres and radii of balls that stand before the sphere, in its radii. Their texture is that of the sphere
+        behind them, seen from its centre.
     """
 
     rotations: FloatArray = field(default_factory=lambda: np.empty((0, 3, 3)))
     position: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    near: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
 
     def to_plane(self, index: int, points: ArrayLike) -> FloatArray:
         """Measured pixels (..., 2) of one picture to texels of the sphere; NaN outside the lens."""
         rays = self.rays(index, points)
         if self.position[index].any():
-            rays = _where_it_meets_the_sphere(self.position[index], rays)
+            rays = _first_hit(self.position[index], rays, self.near)
         ahead = self.rotations[index][2]
         middle = np.arctan2(ahead[0], ahead[2])
         # The longitude relative to the picture's centre has no jump within the picture.
@@ -132,6 +136,7 @@ def turning_sequence(
     texels_per_pixel: float = 1.0,
     channels: int = 3,
     position: ArrayLike | None = None,
+    near: ArrayLike = (),
 ) -> TurningSequence:
     """Pictures that a camera takes of a sphere around it.
 
@@ -149,6 +154,8 @@ def turning_sequence(
         1 for grey, 3 for RGB.
     position : array_like of shape (N, 3), optional
         Of each camera's centre, in radii of the sphere; all at its centre if not given.
+    near : array_like of shape (K, 4)
+        See :class:`TurningSequence`.
     """
     circumference = round(2 * np.pi * focal_length(lens) * texels_per_pixel)
     texture = ground((circumference, circumference // 2), seed=seed, channels=channels)
@@ -156,12 +163,21 @@ def turning_sequence(
     where = np.zeros((count, 3)) if position is None else np.asarray(position, dtype=np.float64)
     unused = Poses.of(np.zeros((count, 2)), 1.0)
     settings = Photometry() if photometry is None else photometry
-    return TurningSequence(_Around(texture), lens, unused, settings, seed=seed, rotations=rotations, position=where)
+    balls = np.asarray(near, dtype=np.float64).reshape(-1, 4)
+    return TurningSequence(
+        _Around(texture), lens, unused, settings, seed=seed, rotations=rotations, position=where, near=balls
+    )
 
 
-def _where_it_meets_the_sphere(position: FloatArray, rays: FloatArray) -> FloatArray:
-    """Points (..., 3) of the unit sphere that unit rays (..., 3) from a position inside it meet."""
+def _first_hit(position: FloatArray, rays: FloatArray, near: FloatArray) -> FloatArray:
+    """First points (..., 3) of the balls, or else of the unit sphere, that unit rays (..., 3) from a position meet."""
     along = rays @ position
     distance = np.sqrt(along**2 + 1.0 - position @ position) - along
+    for x, y, z, radius in near:
+        from_ball = position - (x, y, z)
+        along = rays @ from_ball
+        with np.errstate(invalid="ignore"):
+            hit = -along - np.sqrt(along**2 + radius**2 - from_ball @ from_ball)
+        distance = np.where(hit > 0.0, np.minimum(hit, distance), distance)
     met: FloatArray = position + distance[..., None] * rays
     return met

@@ -9,6 +9,7 @@ from itertools import chain
 import numpy as np
 
 from rdstitch.alignment.result import LinkFit
+from rdstitch.alignment.rotation_model import nearest_rotation
 from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.io.reduction import fitting_reduction
 from rdstitch.registration import Registration
@@ -96,9 +97,12 @@ def _compare(
         return CheckedLink(fit, overlap_agreement(placed[i], placed[j]), ambiguity)
 
     def compare_around(fit: LinkFit) -> CheckedLink:
-        # No plane shows all pictures of a turn; the one before the second picture shows both.
-        first = replace(placed[fit.image1], homography=alignment.relation(fit.image1, fit.image2))
-        second = replace(placed[fit.image2], homography=np.eye(3))
+        # No plane shows all pictures of a turn; one between the two shows both, and stretches neither much.
+        both = alignment.homographies[[fit.image1, fit.image2]]
+        rotations = both / np.linalg.norm(both, axis=1, keepdims=True)
+        to_plane = nearest_rotation(rotations.sum(axis=0)).T @ both
+        first = replace(placed[fit.image1], homography=to_plane[0])
+        second = replace(placed[fit.image2], homography=to_plane[1])
         scale = drawing_scale(second)
         ambiguity = placement_ambiguity(draw(first, scale), draw(second, scale))
         return CheckedLink(fit, overlap_agreement(first, second), ambiguity)

@@ -131,11 +131,11 @@ def rival_messages(
         f"({u:.0f}, {v:.0f}) of {first} when compared with {second}, by {worst.disagreement:.0f} pixels"
     )
     if lens_only or (share < _CONTESTED_SHARE and not agreement < _LEAST_AGREEMENT):
-        return [Message(f"{what} (a vehicle, a second plane?); a mask keeps it out", images)]
+        return [Message(f"{what} (a vehicle, a second plane?); a mask keeps it out", images, code="rival-motion")]
     # It concerns all pictures: without the one that shows it best, the rival would only be harder to see.
     shown = sorted({k for rival in rivals for k in (rival.image1, rival.image2)})
     text = f"{what}, and it is not clear which of the two is the plane; mask what does not belong to it"
-    return [Message(text, tuple(paths[k] for k in shown), "failure")]
+    return [Message(text, tuple(paths[k] for k in shown), "failure", "rival-motion")]
 
 
 def _rival(alignment: Alignment, pair: PairRegistration, threshold: float, seed: int) -> RivalMotion:

@@ -12,6 +12,7 @@ from rdstitch.messages import Message, Severity, names_of, shortened
 from rdstitch.registration import Registration
 from rdstitch.verification.input_doubts import doubtful_inputs
 from rdstitch.verification.overlap_check import CheckedLink, check_overlaps, share_alike
+from rdstitch.verification.parallax import find_parallax, parallax_messages
 from rdstitch.verification.rival_motion import find_rival_motions, rival_messages
 
 Pair = tuple[int, int]
@@ -91,15 +92,16 @@ def judge(
     checked = [] if resting else check_overlaps(registration, workers, cache)
     ambiguous = _ambiguous(paths, checked)
     rivals = find_rival_motions(alignment, registration.pairs, threshold)
+    parallax = find_parallax(alignment, registration.pairs) if alignment.on_sphere else []
     suspicions = {**disagreeing, **_unlike(paths, checked), **ambiguous}
     decisive = [] if lens_only or resting else _decisive(suspicions, used, len(paths))
     return (
         *_error_of_the_whole(alignment, threshold, checked),
-        *_relief(paths, alignment),
+        *(parallax_messages(paths, parallax) or _relief(paths, alignment)),
         *([] if lens_only else _pattern(ambiguous, checked)),
         *(suspicions[pair] for pair in decisive),
         *_outvoted(paths, [pair for pair in suspicions if pair not in decisive]),
-        *rival_messages(paths, rivals, share_alike(checked), lens_only=lens_only),
+        *([] if parallax else rival_messages(paths, rivals, share_alike(checked), lens_only=lens_only)),
         *_little_alike(paths, checked),
         *doubtful_inputs(registration.sources),
     )
@@ -116,7 +118,7 @@ def _error_of_the_whole(alignment: Alignment, threshold: float, checked: Sequenc
         return []
     text = f"the pictures disagree by {rms:.1f} px, more than the threshold of {threshold:g} px"
     rough = alignment.relief.found and rms <= _LARGEST_RMS_OF_RELIEF * threshold and _look_alike(checked)
-    return [Message(f"{text}: the ground is rough") if rough else _failure(text)]
+    return [Message(f"{text}: the ground is rough", code="relief") if rough else _failure(text)]
 
 
 def _relief(paths: Sequence[str], alignment: Alignment) -> list[Message]:
@@ -127,7 +129,7 @@ def _relief(paths: Sequence[str], alignment: Alignment) -> list[Message]:
     images = (paths[worst.image1], paths[worst.image2])
     first, second = names_of(images)
     text = f"{alignment.relief.explanation}; most of all between {first} and {second} ({worst.rms:.1f} pixels)"
-    return [Message(text, images, code="relief")]
+    return [Message(text, images, code="parallax" if alignment.on_sphere else "relief")]
 
 
 def _agreement_of_all(used: Sequence[LinkFit]) -> list[Message]:
