@@ -1,4 +1,4 @@
-"""One connected set of pictures, what is known of its camera, and the adjustment of one model to it."""
+"""One connected set of pictures, the priors of its camera, and the adjustment of one model to it."""
 
 import math
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from rdstitch.matching.match_graph import spanning_tree
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
 
 _WIDEST_START = 0.05
-"""Half diagonals: errors that a chain may have gathered before the adjustment, beyond which a link is doubted."""
+"""Half diagonals: errors that a chain may have gathered before the adjustment, beyond which a link is down-weighted."""
 
 _LONG_CHAIN = 60
 """Pictures over which chained homographies drift so far that a planar model is the better start."""
@@ -44,7 +44,7 @@ _EXACT = 1e12  # precision of what is known: a standard deviation of 1e-6 radian
 
 @dataclass(frozen=True)
 class CameraPriors:
-    """What is known of the camera before anything is measured.
+    """Priors of the camera.
 
     Attributes
     ----------
@@ -171,7 +171,7 @@ class Problem:
         starts = [self._taken_over(model, other) for other in others]
         if model is POSE:
             starts.append(self._upgraded())
-        elif not (others and self._tilts_are_free(model)):
+        elif not (others and self._has_free_tilts(model)):
             starts.append(self._chained(model, others, shared))
         return self.refine(model, self._nearest(model, starts))
 
@@ -183,9 +183,9 @@ class Problem:
         """Adjust a model from a given start."""
         if model is POSE and self.knowledge.attitudes_std is None:
             return Fit(model, self._run(model, start, POSE_TILT_SPREAD), self.free_lens, POSE_TILT_SPREAD)
-        if not self._tilts_are_free(model) or self.knowledge.attitudes_std is not None:
+        if not self._has_free_tilts(model) or self.knowledge.attitudes_std is not None:
             spread = self.knowledge.attitudes_std or 0.0
-            own = spread if self._tilts_are_free(model) else 0.0
+            own = spread if self._has_free_tilts(model) else 0.0
             return Fit(model, self._run(model, start, spread), self.free_lens, own)
         spread = tilt_spread or _TILT_SPREAD_START
         adjusted = self._run(model, start, spread)
@@ -203,7 +203,7 @@ class Problem:
         return wider.refine(fit.model, fit.adjusted.parameters, fit.tilt_spread)
 
     @staticmethod
-    def _tilts_are_free(model: MotionModel) -> bool:
+    def _has_free_tilts(model: MotionModel) -> bool:
         return PSI in getattr(model, "free", ())
 
     def _run(self, model: MotionModel, start: Parameters, tilt_spread: float) -> BundleAdjustmentResult:
@@ -224,7 +224,7 @@ class Problem:
         o, attitudes = self.observations, self.knowledge.attitudes
         shared, lens, homographies = np.zeros(0), self.lens, self.homographies
         if model.shared_names:
-            apart = self._links_apart(SIMILARITY if self._tilts_are_free(model) else model, others, start)
+            apart = self._links_apart(SIMILARITY if self._has_free_tilts(model) else model, others, start)
             shared, lens, homographies = apart.parameters.shared, apart.parameters.lens, apart.homographies
         tree = spanning_tree(self.count, o.image1, o.image2, self.trust, self.reference)
         origin = model.origins(shared, attitudes[[tree.root]])[0]
@@ -276,14 +276,14 @@ class Problem:
         cost = [float(robust_cost(trial.squared, width).sum()) for trial in trials]
         return trials[int(np.argmin(cost))]
 
-    def _shared_to_try(self, model: MotionModel, natural: FloatArray) -> list[FloatArray]:
+    def _shared_to_try(self, model: MotionModel, physical: FloatArray) -> list[FloatArray]:
         """Focal lengths; or shared parameters for the known or zero tilt, and for four around it, 0.2 radians away."""
         if model is ROTATION:
-            return [np.array([log_focal]) for log_focal in (*natural, *FOCAL_STARTS)]
+            return [np.array([log_focal]) for log_focal in (*physical, *FOCAL_STARTS)]
         steps = np.array([(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2)])
         if self.knowledge.tilt_known:
             steps = steps[:1]
-        return [model.shared_from_physical(natural + np.array([*step, 0.0])) for step in steps]
+        return [model.shared_from_physical(physical + np.array([*step, 0.0])) for step in steps]
 
     def _taken_over(self, model: MotionModel, other: Fit) -> Parameters:
         """Another model's solution as this model's start."""

@@ -33,18 +33,18 @@ from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import connected_components, spanning_tree
 
 _UNCONFIRMED = 0.1
-"""How much a link without a triangle that closes is relied on, relative to one with."""
+"""Weight in the spanning tree of a link without a consistent triangle, relative to one with."""
 
 _MATCHES_OF_A_TURN = 5000
 """Correspondences of all links together that the final adjustment of a turn on the spot uses at least, if there are."""
 
 _ROUNDS = 3
-"""Times that wrong pairs are looked for."""
+"""Rounds of rejecting wrong pairs and adjusting again."""
 
 
 @dataclass(frozen=True)
 class AlignmentOptions:
-    """What the caller decides or knows.
+    """What the caller decides, and what is given of the camera.
 
     Attributes
     ----------
@@ -120,7 +120,7 @@ class AlignmentOptions:
         """Models to be tried, from the least to the most free."""
         if self.model != "auto":
             return [self.model]
-        # Measured attitudes say how far tilts may be from them; exact ones leave nothing of the tilts open.
+        # Measured attitudes are a prior of the tilts; exact ones leave nothing of the tilts free.
         measured, exact = self.attitudes is not None, self.attitudes is not None and self.attitudes_std == 0.0
         without = {"tilting": exact, "pose": measured}
         return [name for name in MODELS if not without.get(name, False)]
@@ -152,12 +152,12 @@ def align(
     RegistrationError
         When no two pictures are linked.
     """
-    say = progress or (lambda stage: None)
+    report = progress or (lambda stage: None)
     _check(cameras, links, options)
     known = options.knowledge(cameras)
     everything = Observations.from_links(links, cameras, options.most)
 
-    say("consensus of the pairs")
+    report("consensus of the pairs")
     votes = vote([k.relation.distortion for k in links], [k.relation.distortion_std for k in links])
     lens, free_lens = _lens_start(cameras, options, votes)
     few = everything.thinned(thin_for_selection(len(links)))
@@ -173,7 +173,7 @@ def align(
         apart = homography_apart(few, relations_at(few, [k.relation for k in links], lens), lens, free_lens, known)
         relations = apart.homographies
 
-    say("choice of the model")
+    report("choice of the model")
     wrong, confirmed = cycle_consistency(apart, few, len(cameras))
     trust = few.matches.astype(np.float64) * np.where(confirmed > 0, 1.0, _UNCONFIRMED)
     graph = _Graph(len(cameras), few, relations, trust, lens, free_lens, known, options)
@@ -182,9 +182,9 @@ def align(
     graph = replace(graph, free_lens=choice.fit.free_lens)
     choice, pictures, wrong = _drop_wrong_pairs(graph, problem, pictures, choice, wrong)
 
-    say("adjustment")
+    report("adjustment")
     if choice.fit.model is ROTATION and len(links) * options.most < _MATCHES_OF_A_TURN:
-        # Few pictures of a turn show the focal length by a hair's breadth; all their matches count.
+        # Few pictures of a turn hardly determine the focal length; all their matches are used.
         everything = Observations.from_links(links, cameras, _MATCHES_OF_A_TURN // len(links))
     full = replace(graph, observations=everything)
     problem, _ = full.problem(~wrong, pictures, choice.overdispersion)
@@ -263,9 +263,9 @@ class _Graph:
         number[pictures] = np.arange(len(pictures))
         links = np.flatnonzero(kept & (number[o.image1] >= 0) & (number[o.image2] >= 0))
         own = o.subset(links, number)
-        wanted = self.options.reference
-        if wanted is not None and number[wanted] >= 0:
-            reference = int(number[wanted])
+        chosen = self.options.reference
+        if chosen is not None and number[chosen] >= 0:
+            reference = int(number[chosen])
         else:
             reference = spanning_tree(len(pictures), own.image1, own.image2, self.trust[links]).root
         problem = Problem(
@@ -285,7 +285,7 @@ class _Graph:
 def _drop_wrong_pairs(
     graph: _Graph, problem: Problem, pictures: IntArray, choice: ModelChoice, wrong: BoolArray
 ) -> tuple[ModelChoice, IntArray, BoolArray]:
-    """Judge all links by the adjusted poses, and adjust again without those that do not fit."""
+    """Test all links against the adjusted poses, and adjust again without those that do not fit."""
     for _ in range(_ROUNDS):
         adjusted, model = choice.fit.adjusted, choice.fit.model
         everything, _ = graph.problem(np.ones_like(wrong), pictures)

@@ -48,7 +48,7 @@ class AdjustedPictures:
     lens : LensChoice
         The lens, with the distortion centre if the motion model freed it.
     observable : bool
-        Whether the pictures say anything about λ, or it is known.
+        Whether λ is observable, or known.
     """
 
     cameras: Sequence[Camera]
@@ -109,7 +109,7 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
 
 
 def _inflation(found: AdjustedPictures) -> float:
-    """How much larger variances are than the normal equations say, since errors are no independent noise."""
+    """Ratio of the variances to those of the normal equations, since errors are not independent."""
     fit, adjusted = found.choice.fit, found.choice.fit.adjusted
     if not (found.observable and found.problem.free_lens[0]):
         return 1.0

@@ -1,7 +1,7 @@
 """Global adjustment: all poses, the shared tilt and focal length, and the lens, from all correspondences at once.
 
-Levenberg-Marquardt on a robust loss of the transfer errors in measured px, generic in the motion model. The width of
-the loss follows the scatter of the errors, from wide to narrow, so that good links are not lost to a rough start.
+Levenberg-Marquardt on a robust loss of the transfer errors in measured pixels, generic in the motion model. The width
+of the loss follows the scatter of the errors, from wide to narrow, so that good links are not lost to a rough start.
 """
 
 from dataclasses import dataclass, replace
@@ -24,12 +24,12 @@ from rdstitch.robust.levenberg_marquardt import FIRST_DAMPING, LARGEST_DAMPING, 
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, RAYLEIGH_MEDIAN, robust_cost
 
 _SMALLEST_SIGMA = 1e-3
-"""px; less is not measurable, and zero would divide."""
+"""Pixels; a smaller one is not measurable, and errors are divided by it."""
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """Everything that the adjustment moves.
+    """The unknowns of the adjustment.
 
     Attributes
     ----------
@@ -62,12 +62,12 @@ class Parameters:
 
 @dataclass(frozen=True)
 class Priors:
-    """What is known beforehand, as means and inverse variances; 0 where nothing is known.
+    """Gaussian priors, as means and inverse variances; 0 where there is none.
 
     Attributes
     ----------
     shared, shared_precision : ndarray of shape (S,)
-        Of what the model names, see :meth:`MotionModel.physical_parameters`.
+        Of the model's named parameters, see :meth:`MotionModel.physical_parameters`.
     lens, lens_precision : ndarray of shape (5,)
     poses, poses_precision : ndarray of shape (N, D)
     """
@@ -81,7 +81,7 @@ class Priors:
 
     @classmethod
     def none(cls, model: MotionModel, count: int) -> Self:
-        """Nothing known of ``count`` pictures."""
+        """None, for ``count`` pictures."""
         shared, poses = np.zeros(len(model.shared_names)), np.zeros((count, model.pose_size))
         lens = np.zeros(len(LENS_PARAMETERS))
         return cls(shared, shared, lens, lens, poses, poses)
@@ -89,7 +89,7 @@ class Priors:
 
 @dataclass(frozen=True)
 class FreeParameters:
-    """Which parameters may move.
+    """Which parameters are estimated.
 
     Attributes
     ----------
@@ -125,7 +125,7 @@ class BundleAdjustmentResult:
     equations : LinkEquations
         At the solution.
     covariance : ndarray of shape (S', S')
-        Of what the model names and of the free parameters of the lens, priors included.
+        Of the model's named parameters and the free parameters of the lens, priors included.
     converged : bool
     iterations : int
     """
@@ -163,7 +163,7 @@ class BundleAdjuster:
     freedom : FreeParameters
     priors : Priors
     overdispersion : float
-        How much less the correspondences say than if their errors were independent; weighs them against the priors.
+        Variance of sums of errors over that of independent ones; weighs the correspondences against the priors.
     max_iterations : int
         Linearizations at most.
     """
@@ -217,7 +217,7 @@ class BundleAdjuster:
             normal = self._normal_equations(state, sigma)
             try:
                 flat, step_shared = normal.solve(float(damping))
-            except RuntimeError:  # singular: some pictures are held by nothing but lost correspondences
+            except RuntimeError:  # singular: no correspondence of some pictures can be transferred
                 return state, used, False
             step_poses = np.zeros(self.freedom.poses.shape)
             step_poses[self.freedom.poses] = flat
@@ -288,8 +288,8 @@ class BundleAdjuster:
         )
         p, free, lens = self.priors, self.freedom.poses, self.freedom.lens
         precision = np.concatenate([p.shared_precision, p.lens_precision[lens]])
-        natural, derivative = self._natural(state.parameters.shared)
-        error = np.concatenate([natural - p.shared, (state.parameters.lens - p.lens)[lens]])
+        physical, derivative = self._physical_parameters(state.parameters.shared)
+        error = np.concatenate([physical - p.shared, (state.parameters.lens - p.lens)[lens]])
         poses = self.model.prior_coordinates(state.parameters.poses) - p.poses
         return normal.with_priors(
             p.poses_precision[free],
@@ -298,18 +298,18 @@ class BundleAdjuster:
             derivative.T @ (precision * error),
         )
 
-    def _natural(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What the shared parameters mean (S,), and its derivatives by them and by the lens (S', S')."""
-        natural, derivative = self.model.physical_parameters(shared)
-        size, lens = len(natural), int(self.freedom.lens.sum())
+    def _physical_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The named parameters (S,), and their derivatives by the shared ones and by the lens (S', S')."""
+        physical, derivative = self.model.physical_parameters(shared)
+        size, lens = len(physical), int(self.freedom.lens.sum())
         whole = np.eye(size + lens)
         whole[:size, :size] = derivative
-        return natural, whole
+        return physical, whole
 
     def _finished(self, parameters: Parameters, sigma: float, used: int, converged: bool) -> BundleAdjustmentResult:
         """The result with its covariance."""
         state = self._evaluate(parameters, sigma, ALIGNMENT_WIDTH * sigma)
-        derivative = self._natural(parameters.shared)[1]
+        derivative = self._physical_parameters(parameters.shared)[1]
         covariance = _covariance(self._normal_equations(state, sigma).shared_information())
         return BundleAdjustmentResult(
             parameters,
@@ -333,7 +333,7 @@ def sigma_of(squared: FloatArray) -> float:
 
 
 def _covariance(information: FloatArray) -> FloatArray:
-    """Inverse of an information matrix; large, not infinite, for what it says nothing of."""
+    """Inverse of an information matrix; large, not infinite, for what is not determined."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12))
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     inverse: FloatArray = (vectors / np.maximum(values, 1e-14)) @ vectors.T * np.outer(scale, scale)

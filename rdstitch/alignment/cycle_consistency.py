@@ -1,7 +1,7 @@
 """Wrong pairs: links that fit well on their own but contradict the others (repeated structure).
 
-Before the adjustment, links are judged in triangles: going round three pictures must lead back to where one
-started, within what the links' covariances allow. After it, by the errors that the adjustment leaves them.
+Before the adjustment, links are judged in triangles: the composition of three transfers must
+be the identity, within what the links' covariances allow. After it, by the errors that the adjustment leaves them.
 """
 
 import itertools
@@ -18,7 +18,7 @@ from rdstitch.matching.thinning import spread_choice
 from rdstitch.radial_homography import transfer_jacobian
 
 _PROBES = 6
-"""Points of a link sent round each triangle."""
+"""Points of a link that are transferred round each triangle."""
 
 _MOST_TRIANGLES = 20_000
 
@@ -52,7 +52,7 @@ def triangles(count: int, image1: IntArray, image2: IntArray) -> IntArray:
 def cycle_consistency(
     apart: BundleAdjustmentResult, observations: Observations, count: int
 ) -> tuple[BoolArray, NDArray[np.intp]]:
-    """Which links most of their triangles speak against.
+    """Which links most of their triangles contradict.
 
     One after the other, the link with the most contradictions is taken out together with its triangles, until every
     link left is confirmed at least as often as it is contradicted.

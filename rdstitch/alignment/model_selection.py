@@ -49,13 +49,13 @@ class ModelChoice:
 def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolArray] = ()) -> ModelChoice:
     """Adjust models from the least to the most free, and take the best.
 
-    The best two are then tried with more of the lens free: an off-centre lens looks like motion that is less regular.
+    The best two are then tried with more of the lens free: an off-centre lens acts like less regular motion.
 
     A homography for every link on its own leaves errors that no model of the family can undercut. Once freer models
     could not pay for their freedom even with those, they are not tried.
     """
     bound, least = noise_of_links(problem)
-    if problem.count == 2 and len(names) > 1:  # two pictures cannot tell one camera in any pose from a homography
+    if problem.count == 2 and len(names) > 1:  # with two pictures, one camera in any pose is a homography
         names = [name for name in names if name != POSE.name]
     fits: list[Fit] = []
     for name in names:

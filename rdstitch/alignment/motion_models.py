@@ -1,7 +1,7 @@
 """How a picture's pose and the camera's shared parameters make a homography: the family of motion models.
 
 Every model gives, for each picture i, the homography ``P_i`` from the plane to the picture's undistorted coordinates
-(half diagonals from the distortion centre), and its derivatives; the adjustment knows nothing else of a model. Two
+(half diagonals from the distortion centre), and its derivatives; the adjustment uses nothing else of a model. Two
 pictures are related by ``H_ij = P_j P_i⁻¹``.
 
 From the least to the most free:
@@ -34,7 +34,7 @@ from rdstitch.planar_motion import ABOUT_X, ABOUT_Y, nearest_in_plane, rigid_in_
 YAW, X, Y, LOG_HEIGHT, PSI, THETA = range(6)
 """Columns of a planar model's poses."""
 
-_LARGEST_LOG_HEIGHT = 10.0  # where the motion is none of the model's, heights may run away
+_LARGEST_LOG_HEIGHT = 10.0  # where the model does not describe the motion, heights may diverge
 
 _TRACELESS = np.zeros((8, 3, 3))
 _TRACELESS[[0, 1, 2, 3, 4, 5], [0, 0, 1, 1, 2, 2], [1, 2, 0, 2, 0, 1]] = 1.0
@@ -61,7 +61,7 @@ class ModelMatrices:
 
 
 class MotionModel(Protocol):
-    """What the adjustment needs to know of a motion model."""
+    """A motion model, as the adjustment uses it."""
 
     @property
     def name(self) -> str:
@@ -77,7 +77,7 @@ class MotionModel(Protocol):
 
     @property
     def gauge(self) -> BoolArray:
-        """Which of the D parameters the choice of the plane's frame takes from the reference picture, shape (D,)."""
+        """Gauge: which of the D parameters of the reference picture the choice of the frame fixes, shape (D,)."""
 
     def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
         """Homographies from the plane to the pictures, with derivatives."""
@@ -85,14 +85,14 @@ class MotionModel(Protocol):
     def physical_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """What :attr:`shared_names` names (S,), and its derivatives by the shared parameters (S, S)."""
 
-    def shared_from_physical(self, natural: FloatArray) -> FloatArray:
+    def shared_from_physical(self, physical: FloatArray) -> FloatArray:
         """The inverse of :meth:`physical_parameters`."""
 
     def retract(self, poses: FloatArray, step: FloatArray) -> FloatArray:
         """Poses after a step of shape (N, D)."""
 
     def prior_coordinates(self, poses: FloatArray) -> FloatArray:
-        """The D parameters of each picture (N, D) that a prior speaks of; zeros where none can."""
+        """The D parameters of each picture (N, D) that priors are on; zeros where there can be none."""
 
     def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """Homographies (N, 3, 3) of pictures at the origin of the plane, with the tilts (N, 2) given."""
@@ -126,7 +126,7 @@ class PlanarModel:
 
     @property
     def gauge(self) -> BoolArray:
-        """A rigid motion of the plane, and its scale where heights are free; tilts are no matter of frame."""
+        """A rigid motion of the plane, and its scale where heights are free; tilts do not depend on the frame."""
         return np.array([column not in (PSI, THETA) for column in self.free])
 
     def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
@@ -152,14 +152,14 @@ class PlanarModel:
     def physical_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """ψ, θ and log f, with derivatives."""
         focal = float(np.exp(shared[2]))
-        natural = np.array([shared[0] * focal, shared[1] * focal, shared[2]])
+        physical = np.array([shared[0] * focal, shared[1] * focal, shared[2]])
         derivative = np.diag([focal, focal, 1.0])
-        derivative[:2, 2] = natural[:2]
-        return natural, derivative
+        derivative[:2, 2] = physical[:2]
+        return physical, derivative
 
-    def shared_from_physical(self, natural: FloatArray) -> FloatArray:
+    def shared_from_physical(self, physical: FloatArray) -> FloatArray:
         """ψ/f, θ/f and log f."""
-        return np.append(natural[:2] / np.exp(natural[2]), natural[2])
+        return np.append(physical[:2] / np.exp(physical[2]), physical[2])
 
     def retract(self, poses: FloatArray, step: FloatArray) -> FloatArray:
         """Poses after a step of shape (N, D)."""
@@ -239,7 +239,7 @@ class HomographyModel:
         """Nothing."""
         return np.zeros(0), np.zeros((0, 0))
 
-    def shared_from_physical(self, natural: FloatArray) -> FloatArray:
+    def shared_from_physical(self, physical: FloatArray) -> FloatArray:
         """Nothing."""
         return np.zeros(0)
 
@@ -250,7 +250,7 @@ class HomographyModel:
         return _unit_determinant(growth @ poses.reshape(-1, 3, 3))
 
     def prior_coordinates(self, poses: FloatArray) -> FloatArray:
-        """Zeros: no prior speaks of a homography."""
+        """Zeros: homographies have no prior."""
         return np.zeros((len(poses), 8))
 
     def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
@@ -263,7 +263,7 @@ class HomographyModel:
 
 
 def inverses(matrices: FloatArray) -> FloatArray:
-    """Inverses of (N, 3, 3) by cofactors; not finite, without complaint, where a wild step made a matrix singular."""
+    """Inverses of (N, 3, 3) by cofactors; not finite where a step made a matrix singular."""
     a, b, c = matrices[:, 0], matrices[:, 1], matrices[:, 2]
     with np.errstate(all="ignore"):
         cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)

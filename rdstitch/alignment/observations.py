@@ -14,8 +14,8 @@ from rdstitch.camera import Camera
 from rdstitch.matching.links import Link
 from rdstitch.matching.thinning import spread_choice
 
-_RESTING = 1.0
-"""px that most correspondences of a link stay below where the camera stood still."""
+_STATIC = 1.0
+"""Pixels that the displacements of most correspondences of a link stay below where the camera stood still."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Observations:
         brings: a camera that stands still for a while would make all other links look wrong.
         """
         px = np.linalg.norm(self.points2 - self.points1, axis=1) * self.scale1[self.link]
-        moves = [b > a and float(np.median(px[a:b])) > _RESTING for a, b in itertools.pairwise(self.start)]
+        moves = [b > a and float(np.median(px[a:b])) > _STATIC for a, b in itertools.pairwise(self.start)]
         telling = np.repeat(np.array(moves, dtype=np.bool_), np.diff(self.start))
         return telling if telling.any() else np.ones_like(telling)
 

@@ -1,8 +1,8 @@
-"""Is the scene a plane? Residuals of neighbouring points tell.
+"""Is the scene a plane? The correlation of residuals of neighbouring points decides.
 
 Noise differs from point to point; a hill moves all its points together. So residuals that agree between neighbours
 come from something that the model does not describe: relief, a lens of another kind, a moving object. The same
-agreement tells how much less the correspondences say than their number suggests.
+correlation gives the number of independent observations, which is smaller than that of correspondences.
 """
 
 from dataclasses import dataclass

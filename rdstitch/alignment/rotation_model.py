@@ -1,7 +1,7 @@
 """A camera that turns on the spot, as a motion model: ``P_i = diag(f, f, 1) R_i`` from directions to the picture.
 
-Two pictures are related by ``H_ij = P_j P_i⁻¹ = K R_j R_i' K⁻¹`` wherever both look: no plane is needed, and nothing
-ends at a horizon, so that a full circle closes. A step turns the camera in its own frame, ``R ← exp([δ]x) R``.
+Two pictures are related by ``H_ij = P_j P_i⁻¹ = K R_j R_i' K⁻¹`` in all directions: no plane is needed, and there is
+no horizon, so that a full circle closes. A step turns the camera in its own frame, ``R ← exp([δ]x) R``.
 """
 
 import math
@@ -16,7 +16,7 @@ FOCAL_STARTS = tuple(math.log(focal) for focal in (0.6, 0.9, 1.4, 2.2, 3.6, 6.0)
 """Logarithms of focal lengths in half diagonals: from fisheyes to long lenses, near enough to each other that the
 adjustment of pairs converges from the nearest."""
 
-_LARGEST_STEP = 0.5  # radians; where the motion is no rotation, steps may run away
+_LARGEST_STEP = 0.5  # radians; where the motion is no rotation, steps may diverge
 _LOG_FOCAL_LIMITS = math.log(0.2), math.log(50.0)
 
 _CROSS = np.zeros((3, 3, 3))
@@ -55,9 +55,9 @@ class RotationModel:
         """Log f itself."""
         return shared, np.eye(1)
 
-    def shared_from_physical(self, natural: FloatArray) -> FloatArray:
+    def shared_from_physical(self, physical: FloatArray) -> FloatArray:
         """Log f."""
-        return np.asarray(natural[-1:], dtype=np.float64)
+        return np.asarray(physical[-1:], dtype=np.float64)
 
     def retract(self, poses: FloatArray, step: FloatArray) -> FloatArray:
         """Poses after a step of shape (N, 3), radians."""
@@ -65,7 +65,7 @@ class RotationModel:
         return turned.reshape(-1, 9)
 
     def prior_coordinates(self, poses: FloatArray) -> FloatArray:
-        """Zeros: no prior speaks of a rotation."""
+        """Zeros: rotations have no prior."""
         return np.zeros((len(poses), 3))
 
     def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:

@@ -29,7 +29,7 @@ _STEP = 1e-3
 
 _OBSERVATIONS_PER_LINK = 0.5
 """Independent observations of λ by one link, of errors that neighbours have in common: the errors of λ over 45 windows
-of 2, 4, 8 and all pictures of three real flights ask for about as many (a median of 0.6 for pairs of pictures)."""
+of 2, 4, 8 and all pictures of three real flights agree with about as many (a median of 0.6 for pairs of pictures)."""
 
 _CELLS_PER_PICTURE = 3
 """Blocks of ground along a side of a picture."""

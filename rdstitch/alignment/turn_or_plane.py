@@ -69,7 +69,7 @@ def choose_motion(problem: Problem, names: Sequence[str], lenses: Sequence[BoolA
 
 
 def _turns_far(turned: Fit) -> bool:
-    """Whether the camera looks in directions that no camera over a plane looks in."""
+    """Whether the optical axes differ by more than those of a camera over a plane can."""
     axes = turned.adjusted.parameters.poses.reshape(-1, 3, 3)[:, 2]
     return float((axes @ axes.T).min()) < math.cos(_FAR)
 

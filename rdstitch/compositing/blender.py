@@ -19,7 +19,7 @@ _WEIGHT_STEPS = np.float32(4096.0)
 def margin(bands: int) -> int:
     """How far, pixels, a result can depend on the pixels around it.
 
-    A px of band l reaches, up and down the pyramid, 2 (2^l - 1) px; the Laplacian adds as much of the next band.
+    A pixel of band l reaches, up and down the pyramid, 2 (2^l - 1) pixels; the Laplacian adds as much of the next band.
     """
     return 4 << bands
 
@@ -36,7 +36,7 @@ def rounding_constant(full: float, integer: bool) -> np.float32:
 
 
 def rounded(values: Float32Array, constant: np.float32) -> Float32Array:
-    """Round in place to the multiples that the constant stands for."""
+    """Round in place to the multiples that the constant gives."""
     if constant:
         values += constant
         values -= constant
@@ -93,7 +93,7 @@ class MultibandBlender:
             self._sums[band][cut] += band_pixels
             self._weights[band][cut] += share
             if band < self.bands:
-                # Rounded up: where a weight is felt at all, it must not become 0.
+                # Rounded up: where a weight is not 0, it must not become 0.
                 share = np.ceil(_down(share[..., None])[..., 0] * _WEIGHT_STEPS) / _WEIGHT_STEPS
 
     def result(self) -> Float32Array:

@@ -12,16 +12,16 @@ from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.survey import Survey
 from rdstitch.compositing.warp import locate, plan_warps
 
-# Coverage is looked at with this many pixels along the longer side of the canvas.
+# Coverage is computed with this many pixels along the longer side of the canvas.
 _RESOLUTION = 1500
-# A rectangle that keeps less of what is covered is not what anybody wants.
+# A rectangle that keeps less of what is covered is not worth cropping to.
 _LEAST_KEPT = 0.25
 
 
 def coverage_map(
     pictures: Sequence[PlacedPicture], canvas: Canvas, survey: Survey | None = None
 ) -> tuple[NDArray[np.bool_], int]:
-    """Which px of a reduced canvas are covered, and the reduction; with the masks of a survey where there is one."""
+    """Which pixels of a reduced canvas are covered, and the reduction; with the masks of a survey if given."""
     if survey is not None:
         width, height = survey.canvas.size
         covered = np.zeros((height, width), dtype=np.bool_)
@@ -47,11 +47,11 @@ def crop_box(covered: NDArray[np.bool_], factor: int, size: tuple[int, int]) -> 
     covered : ndarray of shape (h, w), bool
         From :func:`coverage_map`.
     factor : int
-        Canvas pixels per pixels of ``covered``.
+        Canvas pixels per pixel of ``covered``.
     size : (int, int)
         Width and height of the canvas.
     """
-    # A reduced pixels stands for those around its centre: one more on each side makes sure of all of them.
+    # A reduced pixel stands for those around its centre: one more on each side makes sure of all of them.
     whole = cv2.erode(
         covered.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=(0,)
     )
@@ -80,7 +80,7 @@ def crop_rows(covered: NDArray[np.bool_], factor: int, size: tuple[int, int], wh
     full = np.concatenate([[False], covered[:, columns].all(axis=1), [False]])
     edges = np.flatnonzero(full[1:] != full[:-1]).reshape(-1, 2)
     first, last = edges[np.argmax(np.diff(edges, axis=1))] if len(edges) else (0, 0)
-    # A reduced pixels stands for those around its centre: one row less on each side makes sure of all of them.
+    # A reduced pixel stands for those around its centre: one row less on each side makes sure of all of them.
     first, last = first + (first > 0), last - (last < len(covered))
     kept = (last - first) * covered.shape[1] / max(1, int(covered.sum()))
     if kept < _LEAST_KEPT:

@@ -2,7 +2,7 @@
 
 Two pictures of one point of the plane differ by their gains and the vignetting alone, which are linear in the
 logarithm (:mod:`rdstitch.compositing.photometric`). Which response of the camera the pictures follow is decided by the
-residuals. What is left over, and how the whole is made to look, is up to :mod:`rdstitch.compositing.brightness`.
+residuals. What is left over, and the brightness of the whole, is left to :mod:`rdstitch.compositing.brightness`.
 """
 
 from collections.abc import Sequence
@@ -192,7 +192,7 @@ def _solve(
     """Weighted least squares of ``g_first - g_second + radial a = values``; shape (N + K, C)."""
     (mean, precision), extra = prior_gain, radial.shape[1]
     count = len(mean)
-    # All samples of a pair have the same gains: what they say of these is summed first.
+    # All samples of a pair have the same gains: their normal equations are summed first.
     ends = samples.first[samples.start], samples.second[samples.start]
     total, gain_radial, gain_value = (
         np.add.reduceat(weight[:, None] * v, samples.start, axis=0) for v in (np.ones((len(weight), 1)), radial, values)

@@ -19,7 +19,7 @@ class PictureCache:
     ----------
     reader : PictureReader
     shrinks : sequence of float
-        Picture pixels per output pixels.
+        Picture pixels per output pixel.
     limit : int
         Bytes.
     ahead : bool

@@ -19,7 +19,7 @@ _NOWHERE = np.float32(-1e6)
 class Lattice:
     """Px of a picture at the nodes of a lattice around a box of the canvas.
 
-    It is anchored to the canvas: every node, and every pixels between them, is the same bit for bit in every box.
+    It is anchored to the canvas: every node, and every pixel between them, is the same bit for bit in every box.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What viewers of panoramas need to know of a canvas: directions of its pixels, field of view, Photo Sphere XMP."""
+"""What viewers of panoramas need of a canvas: directions of its pixels, field of view, Photo Sphere XMP."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The photometric model: by what the samples of each picture are multiplied, so that all look exposed alike.
+"""The photometric model: by what the samples of each picture are multiplied, so that all have one exposure.
 
 Light ``L`` gives the sample ``v = full ((1 + b) L^(1/p) - b)``: sRGB above its toe for ``b`` = 0.055, any power law,
 and so also raw light, for ``b`` = 0. A factor on the light is then a factor ``q`` on ``v + b``, whatever the power, and
@@ -100,7 +100,7 @@ class Exposure:
             values: Any = pixels[rows] + offset
             values *= part(factors, rows)
             if self.knee >= 1.0 or not rates:
-                # Rounded and clipped to the type; the stubs know no scalars.
+                # Rounded and clipped to the type; the type stubs lack scalars.
                 cv2.subtract(values.reshape(len(values), -1), float(offset), flat[rows], dtype=depth)  # type: ignore[call-overload]
                 continue
             values -= offset

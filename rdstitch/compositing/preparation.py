@@ -54,7 +54,7 @@ class Prepared:
     canvas : Canvas
         After cropping.
     origin : (int, int)
-        Its top-left pixels on the canvas that the renderer knows.
+        Its top-left pixel on the canvas of the renderer.
     plan : CompositePlan
     messages : tuple of Message
     shown : sequence of ShownPart
@@ -84,7 +84,7 @@ class Prepared:
         """The same, with tiles computed by ``run``, which works like ``map`` and may work ahead."""
         (width, height), side = self.canvas.size, self.plan.tile_size
         tops = iter(range(0, height, side))
-        # Two rows at a time: nobody waits for the last tile of a row.
+        # Two rows at a time, so that no worker waits for the last tile of a row.
         under_way = deque(self._start(top, run) for top in islice(tops, 2))
         done = 0
         while under_way:
@@ -102,7 +102,7 @@ class Prepared:
         """Begin with a row of tiles, when all but one above are done: the strip they fill, and each once it is done."""
         (width, height), (x, y), side = self.canvas.size, self.origin, self.plan.tile_size
         bottom = min(top + side, height)
-        # To and fro, so that the pictures used last are the ones needed next.
+        # In alternating directions, so that the pictures used last are the ones needed next.
         backwards = top // side % 2 == 1
         if self.shown:
             pictures, warps = self.renderer.pictures, self.renderer.warps
@@ -130,7 +130,7 @@ def prepare_composite(
     options: CompositeOptions | None = None,
     progress: ShareProgress | None = None,
 ) -> Iterator[Prepared]:
-    """Decide on exposure, seams and cropping, from one small look at each picture; see :func:`compose`.
+    """Decide on exposure, seams and cropping, from a small version of each picture; see :func:`compose`.
 
     Pictures are read ahead as long as it lasts.
     """
@@ -158,13 +158,13 @@ def _decided(
     plan: CompositePlan,
     progress: ShareProgress | None,
 ) -> Prepared:
-    """Decide for a renderer that knows of no exposure and no seams yet."""
+    """Decide for a renderer that has neither exposure nor seams yet."""
     options, warps, exposure = renderer.options, renderer.warps, renderer.exposure
     seams = survey = None
     if len(pictures) > 1 and (options.exposure != "none" or options.seam != "none"):
         surveyed = _part_of(progress, 0.0, 0.7)
         survey = survey_pictures(reader, pictures, canvas, min(plan.workers, _READERS), surveyed)
-        # The first tiles will ask for most of them, however the seams run.
+        # The first tiles need most of them, however the seams run.
         topmost = [index for index, warp in enumerate(warps) if warp.box[1] < plan.tile_size]
         renderer.pictures.prefetch(sorted(topmost, key=lambda index: warps[index].box))
         if options.exposure != "none":
@@ -182,7 +182,7 @@ def _decided(
         found, note = find(covered, factor, canvas.size)
         box = found or box
     cropped = canvas if box is None else canvas.cropped(box)
-    # What a tile's blending feels is aligned to the coarsest band.
+    # The support of a tile's blending is aligned to the coarsest band.
     around = margin(plan.bands) + (2 << plan.bands)
     shown = [] if seams is None else shown_parts(warps, seams, around)
     origin, messages = (0, 0) if box is None else box[:2], (Message(note),) if note else ()

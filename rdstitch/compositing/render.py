@@ -1,4 +1,4 @@
-"""One tile of the output: which pictures have a say where, and their samples put together."""
+"""One tile of the output: which pictures contribute where, and their samples blended."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ from rdstitch.compositing.image_cache import PictureCache
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photometric import Exposure, full_scale
 from rdstitch.compositing.sampling import border_weight, read_part, sample, sample_opacity
-from rdstitch.compositing.seam_finder import NOBODY, SeamMap
+from rdstitch.compositing.seam_finder import NO_OWNER, SeamMap
 from rdstitch.compositing.warp import Geometry, Warp, locate
 
 
@@ -30,7 +30,7 @@ class Layer:
     box : (int, int, int, int)
         Part of the canvas: x0, y0, x1, y1, pixels, end exclusive.
     weight : ndarray of shape (h, w), float32
-        0 where the picture has no say.
+        0 where the picture contributes nothing.
     geometry : Geometry
         Of the same part.
     """
@@ -83,7 +83,7 @@ class Renderer:
     def tile(self, box: Box) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Samples (h, w, C) and coverage (h, w) of one box of the canvas.
 
-        What a pixels gets does not depend on the box.
+        What a pixel gets does not depend on the box.
         """
         blended = self.options.blend == "multiband"
         around = self._blend_support(box) if blended else box
@@ -101,9 +101,9 @@ class Renderer:
         return pixels, covered
 
     def _contact_zone(self, layers: Sequence[Layer], box: Box) -> Box | None:
-        """The part of a box in which blending can mix pictures; elsewhere it would give back the one that is there."""
-        felt = [self._blend_support(layer.box) for layer in layers]
-        shared = [common for pair in combinations(felt, 2) if (common := intersection(*pair)) is not None]
+        """The part of a box in which blending can mix pictures; elsewhere it would return the only one there."""
+        supports = [self._blend_support(layer.box) for layer in layers]
+        shared = [common for pair in combinations(supports, 2) if (common := intersection(*pair)) is not None]
         parts = [part for common in shared if (part := intersection(common, box)) is not None]
         if not parts:
             return None
@@ -111,14 +111,14 @@ class Renderer:
         return min(x0), min(y0), max(x1), max(y1)
 
     def _blend_support(self, box: Box) -> Box:
-        """Where multi-band blending feels weights on a box."""
+        """The box from which weights reach a box through multi-band blending."""
         return aligned(grown(box, margin(self.bands)), 1 << self.bands)
 
     def _lay(self, layers: Sequence[Layer], box: Box, pixels: NDArray[Any]) -> None:
         """Fill ``pixels``, which are those of ``box``, with the layers, or with their weighted mean."""
         parts = [part for layer in layers if (part := layer.weighted_part(box)) is not None]
         if self.options.blend != "feather":
-            # One owner per pixels: a product and a quotient would cost the last bit.
+            # One owner per pixel: a product and a quotient would cost the last bit.
             for part in parts:
                 cv2.copyTo(self._samples(part, part.box), _as_mask(part.weight > 0), cut(pixels, box, part.box))
             return
@@ -161,7 +161,7 @@ class Renderer:
         return self.exposure.correct(layer.index, geometry, pixels.reshape(*geometry.shape, self.channels))
 
     def _layers(self, box: Box) -> list[Layer]:
-        """Weights of all pictures that have a say in a box."""
+        """Weights of all pictures that contribute to a box."""
         if self.seams is None and self.options.blend != "none":
             return list(self._bordered(box))
         return self._owned(box)
@@ -178,7 +178,7 @@ class Renderer:
                 yield Layer(index, part, weight if opacity is None else weight * opacity, geometry)
 
     def _placed(self, index: int, part: Box, box: Box) -> Geometry:
-        """The geometry of a picture on its part of a box, with a lattice for all that blending can ask of it there."""
+        """The geometry of a picture on its part of a box, with a lattice for all that blending can need of it there."""
         requested = intersection(self._blend_support(part), box) if self.options.blend == "multiband" else part
         return locate(self.warps[index], requested or part).on(part)
 
@@ -189,20 +189,20 @@ class Renderer:
         return sample_opacity(self.pictures.get(index, read_part(geometry)), geometry)
 
     def _owned(self, box: Box) -> list[Layer]:
-        """Layers where each pixels has one owner, or, for feathering along a seam, shares of its owners.
+        """Layers where each pixel has one owner, or, for feathering along a seam, shares of its owners.
 
-        The owner is the picture with the largest share in the seam map among those that cover the px; where the map,
+        The owner is the picture with the largest share in the seam map among those that cover the pixel; where the map,
         being coarse, has none of them, the one whose border is farthest.
         """
         shape = (box[3] - box[1], box[2] - box[0])
         layers = list(self._shared(box))
         if len(layers) == 1 and layers[0].box == box and (layers[0].weight == 1).all():
             return layers
-        owner, best = np.full(shape, NOBODY, dtype=np.int32), np.zeros(shape, dtype=np.float32)
+        owner, best = np.full(shape, NO_OWNER, dtype=np.int32), np.zeros(shape, dtype=np.float32)
         for layer in layers:
             _claim(owner, best, box, layer)
         soft = layers if self.options.blend == "feather" else []
-        missing = owner == NOBODY
+        missing = owner == NO_OWNER
         if (left_over := bounds(missing, box)) is not None:
             best[...] = 0.0
             for layer in self._bordered(left_over):
@@ -210,13 +210,13 @@ class Renderer:
                 _claim(owner, best, box, layer)
                 layers.append(layer)
         if self.options.blend == "feather":
-            owner[~missing] = NOBODY
+            owner[~missing] = NO_OWNER
         return soft + [_won(owner, box, layer) for layer in layers]
 
     def _shared(self, box: Box) -> Iterator[Layer]:
         """Pictures that own part of a box in the seam map, with their shares where they cover it."""
         for index in [] if self.seams is None else self.seams.owners(box):
-            part = intersection(self.warps[index].box, box) if index != NOBODY else None
+            part = intersection(self.warps[index].box, box) if index != NO_OWNER else None
             if part is None or self.seams is None:
                 continue
             share, geometry = self.seams.share(index, part), self._placed(index, part, box)

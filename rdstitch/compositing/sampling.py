@@ -45,7 +45,7 @@ def sample(picture: LoadedPicture, geometry: Geometry, interpolation: str = "cub
     Parameters
     ----------
     picture : LoadedPicture
-        Prepared for ``geometry.warp.shrink``; it holds what :func:`read_part` says.
+        Prepared for ``geometry.warp.shrink``; it holds what :func:`read_part` gives.
     geometry : Geometry
         From :func:`locate`.
     interpolation : str
@@ -66,7 +66,7 @@ def sample_opacity(picture: LoadedPicture, geometry: Geometry) -> Float32Array |
         return None
     map_x, map_y = _mirrored(picture, geometry)
     opacity = _remap_from(picture.opacity, picture.origin, map_x, map_y, cv2.INTER_LINEAR)
-    # The outer half of the last opaque pixels is outside.
+    # The outer half of the last opaque pixel is outside.
     return np.where(opacity >= 0.5 * picture.opacity_step, opacity, 0.0).astype(np.float32)
 
 
@@ -85,7 +85,7 @@ def _mirrored(picture: LoadedPicture, geometry: Geometry) -> tuple[Float32Array,
 
 
 def _mirrored_extent(values: Float32Array, length: int) -> tuple[int, int]:
-    """First and last but one pixels that coordinates come to lie on when they are mirrored at both borders."""
+    """First and last but one pixel that coordinates come to lie on when they are mirrored at both borders."""
     low, high = float(values.min()), float(values.max())
     start, stop = min(low, 2.0 * length - high), max(high, -low) + 2.0
     return (0 if low < 0.0 else max(0, int(start))), (length if high > length else min(length, int(stop)))
@@ -94,7 +94,7 @@ def _mirrored_extent(values: Float32Array, length: int) -> tuple[int, int]:
 def _remap_from(
     pixels: NDArray[Any], origin: tuple[int, int], map_x: Float32Array, map_y: Float32Array, interpolation: int
 ) -> NDArray[Any]:
-    """``cv2.remap`` from a picture whose first px is at ``origin``; of a very long one, from the piece that counts."""
+    """``cv2.remap`` from a picture whose first pixel is at ``origin``; of a very long one, from a piece of it."""
     left, top = origin
     if max(pixels.shape[:2]) >= _TOO_LONG:
         x, y = (max(0, int(m.min()) - o - KERNEL_MARGIN) for m, o in zip((map_x, map_y), origin, strict=True))

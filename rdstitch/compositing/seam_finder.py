@@ -1,9 +1,9 @@
-"""Seams: which picture each pixels of the output comes from, decided on the reduced canvas.
+"""Seams: which picture each pixel of the output comes from, decided on the reduced canvas.
 
 "voronoi": where the borders of two pictures are equally far, so that each picture gives its middle. "graphcut": round
 that line, within a band, along the path on which the two pictures differ least (Kwatra et al. 2003, with OpenCV's
 cut), so that what moved or stands out of the plane is taken from one of them whole. Pictures are added one after the
-other, so that memory is that of one label per pixels of the reduced canvas.
+other, so that memory is that of one label per pixel of the reduced canvas.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from rdstitch.compositing.survey import Survey, SurveyTile
 from rdstitch.compositing.warp import locate
 from rdstitch.io.reduction import block_mean
 
-NOBODY = -1
+NO_OWNER = -1
 
 # Band in which a seam may wander: the new picture's share of both border weights.
 _LEAST_SHARE, _LARGEST_SHARE = 0.2, 0.8
@@ -32,14 +32,14 @@ _MOVED = 3
 
 @dataclass(frozen=True)
 class SeamMap:
-    """Owner of each pixels of the reduced canvas.
+    """Owner of each pixel of the reduced canvas.
 
     Attributes
     ----------
     labels : ndarray of shape (h, w), int32
         Index of the picture, or -1 where there is none.
     factor : int
-        Canvas pixels per reduced pixels, even or 1.
+        Canvas pixels per reduced pixel, even or 1.
     softness : int
         Shares pass from one owner to the next over so many reduced pixels on either side of a seam, for feathering.
     """
@@ -49,11 +49,11 @@ class SeamMap:
     softness: int = 0
 
     def owners(self, box: Box) -> list[int]:
-        """Pictures that own anything on a box (canvas pixels), ascending; -1 first where nobody owns a part of it."""
+        """Pictures that own anything on a box (canvas pixels), ascending; -1 first where a part has no owner."""
         return [int(owner) for owner in np.unique(self._window(box))]
 
     def share(self, owner: int, box: Box) -> Float32Array:
-        """How much of each pixels of a box (canvas pixels) a picture owns: labels interpolated linearly, (h, w).
+        """How much of each pixel of a box (canvas pixels) a picture owns: labels interpolated linearly, (h, w).
 
         Every value depends on the labels around it alone, bit for bit, whatever the box: sums of ones and of shares of
         an even number of pixels are exact.
@@ -80,7 +80,7 @@ class SeamMap:
         return replace(self, labels=np.take(self.labels, np.arange(-margin, turn + margin) % turn + margin, axis=1))
 
     def _window(self, box: Box) -> NDArray[np.int32]:
-        """The labels that have a say in a box, one and the softness more on each side; the border repeats itself."""
+        """The labels that affect a box, one and the softness more on each side; the border repeats itself."""
         around = 1 + self.softness
         columns, rows = (
             np.clip(np.arange(start // self.factor - around, -(-stop // self.factor) + around), 0, count - 1)
@@ -92,7 +92,7 @@ class SeamMap:
 def find_seams(
     survey: Survey, exposure: Exposure, graphcut: bool, progress: Callable[[float], None] | None = None
 ) -> SeamMap:
-    """Owner of every pixels.
+    """Owner of every pixel.
 
     Parameters
     ----------
@@ -102,10 +102,10 @@ def find_seams(
     graphcut : bool
         Whether seams avoid what differs; otherwise they run where borders are equally far.
     progress : callable, optional
-        Told the share of the work done.
+        Called with the share of the work done.
     """
     width, height = survey.canvas.size
-    labels = np.full((height, width), NOBODY, dtype=np.int32)
+    labels = np.full((height, width), NO_OWNER, dtype=np.int32)
     weights = np.zeros((height, width), dtype=np.float32)
     channels = next((t.pixels.shape[2] for t in survey.tiles if t is not None), 1)
     composite = np.zeros((height, width, channels), dtype=np.float32) if graphcut else None
@@ -119,7 +119,7 @@ def find_seams(
                 corrected = exposure.correct(index, locate(survey.warps[index], tile.box), tile.pixels)
                 pixels = corrected * np.float32(1.0 / full_scale(corrected.dtype))
                 apart = survey.canvas.period is not None
-                won = _cut(tile, pixels, composite[cut], labels[cut] != NOBODY, weights[cut], apart=apart)
+                won = _cut(tile, pixels, composite[cut], labels[cut] != NO_OWNER, weights[cut], apart=apart)
                 composite[cut][won] = pixels[won]
             labels[cut][won] = index
             weights[cut][won] = tile.weight[won]
@@ -190,7 +190,7 @@ def _graph_cut(images: list[Float32Array], masks: list[NDArray[np.uint8]]) -> ND
     if not free.any():
         return won
     part = _around(free)
-    # The stubs know neither the class nor a UMat made of an array.
+    # The type stubs lack the class, and a UMat made of an array.
     detail: Any = cv2
     finder = detail.detail_GraphCutSeamFinder("COST_COLOR_GRAD")
     cut_images, cut_masks = ([detail.UMat(np.ascontiguousarray(a[part])) for a in both] for both in (images, masks))

@@ -24,8 +24,8 @@ _NEGLIGIBLE_SHRINK = 1.05
 _MASK_FEATHER = 0.125
 # Room around a part of a picture for the kernel of the resampling, pixels.
 KERNEL_MARGIN = 8
-# Px that are read for one of the output, at least: a Gaussian needs two, or nearly so, to make it smooth.
-_PX_PER_OUTPUT_PX = 1.9
+# Pixels read for one of the output, at least: a Gaussian needs nearly two to smooth them.
+_PIXELS_PER_OUTPUT_PIXEL = 1.9
 # Largest reduction at which previews are read, a power of two.
 _LARGEST_PREVIEW = 8
 # Share of the pixels below which a part is cut out.
@@ -49,7 +49,7 @@ class LoadedPicture:
     part : (int, int, int, int) or None
         What can be resampled from it, pixels of the original; None for all of it. It holds more, for the kernel.
     origin : (int, int)
-        Where its first pixels lies in the whole reduced picture.
+        Where its first pixel lies in the whole reduced picture.
     """
 
     pixels: NDArray[Any]
@@ -94,7 +94,7 @@ def prepare_picture(picture: Picture, shrink: float, reduction: int = 1) -> Load
     ----------
     picture : Picture
     shrink : float
-        Original px per output px. From 4 on, the picture is averaged over whole blocks first; a Gaussian does the rest.
+        Original pixels per output pixel. From 4 on, whole blocks are averaged first; a Gaussian does the rest.
     reduction : int
         What the picture was read smaller by.
     """
@@ -102,7 +102,7 @@ def prepare_picture(picture: Picture, shrink: float, reduction: int = 1) -> Load
     if picture.alpha is not None:
         opaque = picture.alpha >= _OPAQUE_FROM
         pixels = _filled(pixels, opaque)
-    # Blocks alone alias; a Gaussian on at least two pixels per output pixels does not.
+    # Blocks alone alias; a Gaussian on at least two pixels per output pixel does not.
     further = max(1, int(shrink / reduction / 2))
     if further > 1:
         pixels = block_mean(pixels, further)
@@ -166,7 +166,7 @@ class PictureReader:
 
     def _reduction(self, index: int, shrink: float) -> int:
         """What a picture is read smaller by for an output that shrinks it so much; a Gaussian does the rest."""
-        return 1 if self._pictures[index].preview is None else fitting_reduction(shrink / _PX_PER_OUTPUT_PX)
+        return 1 if self._pictures[index].preview is None else fitting_reduction(shrink / _PIXELS_PER_OUTPUT_PIXEL)
 
     def __call__(self, index: int, reduction: int = 1) -> Picture:
         """Read picture ``index``; a grey picture among coloured ones becomes coloured.

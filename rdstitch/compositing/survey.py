@@ -1,4 +1,4 @@
-"""A first look at all pictures, small, on the canvas: what exposure and seams are decided on."""
+"""All pictures on a reduced canvas: what exposure and seams are decided on."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -48,7 +48,7 @@ class Survey:
     Attributes
     ----------
     factor : int
-        Canvas pixels per reduced pixels, a power of two.
+        Canvas pixels per reduced pixel, a power of two.
     canvas : Canvas
         The reduced canvas.
     warps : tuple of Warp

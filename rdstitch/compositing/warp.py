@@ -19,7 +19,7 @@ from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.radial_homography import to_plane
 
 # Coordinates are computed on a lattice of the canvas and interpolated linearly, to this many pixels of the picture.
-# OpenCV rounds them to 1/32 pixels afterwards.
+# OpenCV rounds them to 1/32 pixel afterwards.
 _LATTICE_ERROR = 0.01
 _PROBES = 16
 
@@ -62,7 +62,7 @@ class Warp:
     step : int
         Spacing of the coordinate lattice, canvas pixels.
     shrink : float
-        Picture pixels per canvas pixels (median over the picture); above 1 the picture gets smaller.
+        Picture pixels per canvas pixel (median over the picture); above 1 the picture gets smaller.
     surface : Surface or None
         What gives directions to canvas pixels; None where the canvas is a plane.
     displacement : callable, optional
@@ -129,7 +129,7 @@ class Geometry:
 
     @cached_property
     def filled(self) -> bool:
-        """Whether the picture is on all of the box, beyond doubt: it holds all nodes of the lattice, with half a px."""
+        """Whether the picture certainly covers the box: it holds all nodes of the lattice, with half a pixel around."""
         points = self.lattice.nodes(self.box, self.lattice.step)
         limit = np.array(self.warp.camera.image_size, dtype=np.float32) - 1
         return bool((points >= 0).all() and (points <= limit).all())
@@ -169,7 +169,7 @@ def plan_warp(
 
 
 def _measured(draft: Warp, probes: FloatArray, canvas: Canvas) -> Warp:
-    """The warp with its box, and with the spacing and the shrinkage that it has at canvas px all over the picture."""
+    """The warp with its box, and with the spacing and the shrinkage at canvas pixels all over the picture."""
     draft = replace(draft, shrink=_shrink(draft, probes))
     return replace(draft, box=_reached(draft, canvas), step=_lattice_step(draft, probes))
 
@@ -221,7 +221,7 @@ def _lattice_step(warp: Warp, probes: FloatArray) -> int:
 
 
 def _shrink(warp: Warp, probes: FloatArray) -> float:
-    """Median over the picture of picture pixels per canvas pixels."""
+    """Median over the picture of picture pixels per canvas pixel."""
     offsets = np.array([(-0.5, 0.0), (0.5, 0.0), (0.0, -0.5), (0.0, 0.5)])
     around = probes[:, None] + offsets
     left, right, top, bottom = np.moveaxis(warp.source_points(around[..., 0], around[..., 1]), 1, 0)

@@ -37,9 +37,9 @@ class Georeference:
     zone : int
         1 to 60; negative in the south.
     scale : complex
-        Metres per pixels times the turn: easting + i northing = ``scale`` (x - i y) + ``origin``.
+        Metres per pixel times the turn: easting + i northing = ``scale`` (x - i y) + ``origin``.
     origin : complex
-        Easting + i northing of the centre of the top-left pixels, m.
+        Easting + i northing of the centre of the top-left pixel, m.
     error : float
         Root mean square distance of the cameras' positions from where the picture puts them, m.
     """
@@ -63,7 +63,7 @@ class Georeference:
     def tiff_tags(self) -> list[ExtraTag]:
         """What makes a TIFF file a GeoTIFF."""
         a, b = self.scale.real, self.scale.imag
-        # GeoTIFF counts from the corner of the first pixels.
+        # GeoTIFF counts from the corner of the first pixel.
         corner = self.origin - self.scale * (0.5 - 0.5j)
         matrix = (a, b, 0.0, corner.real, b, -a, 0.0, corner.imag, *(0.0,) * 7, 1.0)
         # Version 1.1.0 and three keys: projected, pixels are areas, which system.

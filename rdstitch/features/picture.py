@@ -35,7 +35,7 @@ class View:
     mask : ndarray of shape (height, width), bool or uint8, or None
         True or not zero where the picture counts; None for everywhere.
     reduction : int
-        Blocks of so many pixels a side of the whole picture are one pixels.
+        Blocks of so many pixels a side of the whole picture are one pixel.
     image_size : (int, int), optional
         Width and height of the whole picture, pixels; where it is not given, this is the whole.
     """

@@ -191,5 +191,5 @@ class _Level:
 
 
 def _tile_span(number: int, length: int) -> tuple[int, int]:
-    """First and last but one pixels of a tile with its overlap, along one axis of a level."""
+    """First and last but one pixel of a tile with its overlap, along one axis of a level."""
     return max(0, number * TILE - OVERLAP), min(length, (number + 1) * TILE + OVERLAP)

@@ -28,7 +28,7 @@ def check_mask(path: str | Path, picture: str | Path, size: tuple[int, int]) -> 
         When the mask cannot be read, or has another shape than the picture; the text names it.
     """
     (width, height), (w, h) = size, read_metadata(path).size
-    # Sizes are whole pixels, so that the shape may differ by one pixels of the larger.
+    # Sizes are whole pixels, so that the shape may differ by one pixel of the larger.
     if abs(width * h - height * w) > max(width, height, w, h):
         raise InputError(
             f"{path}: a mask of {w} x {h} px does not fit on {picture}, which has {width} x {height} px; "

@@ -103,7 +103,7 @@ def read_image(path: str | Path, reduction: int = 1) -> Picture:
 
 
 def reduced(picture: Picture, factor: int) -> Picture:
-    """Blocks of ``factor`` pixels a side become one pixels, transparent where any of them is; the metadata stay."""
+    """Blocks of ``factor`` pixels a side become one pixel, transparent where any of them is; the metadata stay."""
     if factor == 1:
         return picture
     alpha = None if picture.alpha is None else block_minimum(picture.alpha, factor)
@@ -113,7 +113,7 @@ def reduced(picture: Picture, factor: int) -> Picture:
 def _decoders_share(image: Image.Image, metadata: Metadata, reduction: int) -> int:
     """By how much of a reduction the decoder can make the picture smaller; 1 for nothing."""
     factor = math.gcd(reduction, _LARGEST_DECODED_REDUCTION)
-    # Blocks begin at the stored picture's first pixels; in one that is to be mirrored they must end at its last.
+    # Blocks begin at the stored picture's first pixel; in one that is to be mirrored they must end at its last.
     crosswise = metadata.orientation != 1 and any(n % factor for n in image.size)
     return 1 if image.format not in _JPEG or min(image.size) < factor or crosswise else factor
 

@@ -65,7 +65,7 @@ class DisplacementField:
 
     @cached_property
     def steepest(self) -> float:
-        """Largest change of the displacement per pixels, between nodes; from 1 on a picture may fold."""
+        """Largest change of the displacement per pixel, between nodes; from 1 on a picture may fold."""
         spacing = (np.array(self.image_size) - 1.0) / (self.values.shape[1] - 1, self.values.shape[0] - 1)
         across = np.linalg.norm(np.diff(self.values, axis=1), axis=-1) / spacing[0]
         down = np.linalg.norm(np.diff(self.values, axis=0), axis=-1) / spacing[1]

@@ -24,7 +24,7 @@ _ROUNDS = 5
 _ROBUST, _LEAST_SCALE = 2.0, 0.3
 # A field vanishes over about this share of a picture where nothing supports it.
 _FADE = 0.2
-# Limit of the displacement's change per pixels: far from 1, where a picture would fold.
+# Limit of the displacement's change per pixel: far from 1, where a picture would fold.
 _STEEPEST = 0.25
 
 
@@ -37,7 +37,7 @@ class Stiffness:
     cells : int
         Of the grid, along the longer side of a picture.
     slope : float
-        Change of the displacement per pixels that is as likely as a residual of one robust scale.
+        Change of the displacement per pixel that is as likely as a residual of one robust scale.
     """
 
     cells: int

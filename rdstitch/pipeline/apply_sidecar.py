@@ -254,7 +254,7 @@ def _sources(
 def _resized(camera: Camera, source: Source) -> Camera:
     """The registered camera for a picture that shows the same at perhaps another size."""
     (w1, h1), (w2, h2) = camera.image_size, source.metadata.size
-    # Sizes are whole pixels, so that the shape may differ by one pixels of the picture.
+    # Sizes are whole pixels, so that the shape may differ by one pixel of the picture.
     if abs(w1 * h2 - h1 * w2) > max(w1, h1):
         raise InputError(
             f"{source.path}: has {w2} x {h2} px, which is not the shape of the {w1} x {h1} px that were registered"

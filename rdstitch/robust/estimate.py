@@ -147,7 +147,7 @@ def estimate_radial_homography(
     threshold : float
         Largest transfer error of an inlier, pixels of image 2.
     confidence : float
-        Wanted probability that no better model was missed.
+        Probability with which no better model was missed when sampling stops.
     max_iterations : int
         At most so many samples.
     seed : int
@@ -190,7 +190,7 @@ def estimate_radial_homographies(pairs: Sequence[PairMatches], options: Estimati
     Raises
     ------
     ArgumentError
-        When the two-point solver is wanted for a pair without known tilts.
+        When the two-point solver is requested for a pair without known tilts.
     """
     if options.solver == "two_point" and any(pair.tilts is None for pair in pairs):
         raise ArgumentError("the two_point solver needs the tilt")

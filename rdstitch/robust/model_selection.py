@@ -15,7 +15,7 @@ from rdstitch.robust.pair_models import HomographyPairModel, PairModel
 from rdstitch.robust.refinement import Fits, Inspection, PairProblems, refine_pairs
 
 _LEAST_NOISE = 0.02  # pixels; below, noise-free data would reject every model over rounding
-_NEAR = 3.0  # errors, in thresholds, beyond which a match has no say in the choice
+_NEAR = 3.0  # errors, in thresholds, beyond which a match is left out of the choice
 _FREE_STEPS, _STEPS = 8, 15
 
 
@@ -104,8 +104,8 @@ class PairSelection:
 def select_models(models: list[PairModel], pairs: PairSelection) -> list[PairFit]:
     """Fit every model to each pair and choose by the Bayesian information criterion.
 
-    The noise is that of the freest model, so that a lesser model is held against what the images allow and not against
-    its own misfit.
+    The noise is that of the freest model, so that a more restricted model is compared with what the images allow and
+    not with its own misfit.
 
     Parameters
     ----------

@@ -59,7 +59,7 @@ def own_lenses(relations: Sequence[RadialHomography], data: Measurements, thresh
     parameters = np.zeros((count, _LENS + 9))
     parameters[:, :2] = [[relation.distortion] * 2 for relation in relations]
     parameters[:, _LENS:] = _HOMOGRAPHY.initialize(np.stack([relation.homography for relation in relations]))
-    with np.errstate(all="ignore"):  # a wild step may leave the lens model
+    with np.errstate(all="ignore"):  # a step may leave the domain of the lens model
         problems = _Problems(data, np.full(count, threshold), np.ones(count))
         for _ in range(_ROUNDS):
             noise = noise_of(problems.errors(parameters), threshold)

@@ -4,8 +4,8 @@
 "similarity"  the same with a change of height
 "homography"  any homography
 
-Refinement knows a model only by its functions, which take the states of B pairs at once. The state of the planar models
-is ``(ψ1, θ1, ψ2, θ2, φ, tx, ty, log height, log focal correction)``; of these the free ones are estimated.
+The functions of a model take the states of B pairs at once. The state of the planar models is
+``(ψ1, θ1, ψ2, θ2, φ, tx, ty, log height, log focal correction)``; of these the free ones are estimated.
 """
 
 from dataclasses import dataclass, field
@@ -53,7 +53,7 @@ class PairModel(Protocol):
         ...
 
     def prior(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What is known beforehand: residuals in standard deviations (B, K), and their derivative (K, P)."""
+        """Priors: residuals in standard deviations (B, K), and their derivative (K, P)."""
         ...
 
 
@@ -85,7 +85,7 @@ class HomographyPairModel:
         return np.asarray(moved / np.linalg.norm(moved, axis=1, keepdims=True))
 
     def prior(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Nothing is known."""
+        """None."""
         return np.empty((len(state), 0)), np.empty((0, 8))
 
 
@@ -112,7 +112,7 @@ class PlanarPairModel:
     _directions: FloatArray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Note by what each step changes the state, (P, 9)."""
+        """Directions in which each free parameter moves the state, (P, 9)."""
         free: list[tuple[int, ...]] = [] if self.tilts_known else [_PSI, _THETA]
         free += [(_YAW,), (_TX,), (_TY,)]
         if self.height_free:
@@ -152,7 +152,7 @@ class PlanarPairModel:
         return np.concatenate([tilt, motion[:, 2:5], height, np.zeros((len(h), 1))], axis=1)
 
     def motion(self, state: FloatArray) -> PlanarMotion:
-        """The motion that one state (9,) stands for, with the tilt of image 1 where the two differ."""
+        """The motion that one state (9,) describes, with the tilt of image 1 where the two differ."""
         psi, theta, _, _, yaw, tx, ty, height, _ = state.tolist()
         return PlanarMotion((psi, theta), yaw, (tx, ty), float(np.exp(height)))
 

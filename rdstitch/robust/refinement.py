@@ -116,7 +116,7 @@ class PairProblems:
         return Inspection(errors, equations.cost, equations.information, shares)
 
 
-@np.errstate(all="ignore")  # a wild step may leave the lens model
+@np.errstate(all="ignore")  # a step may leave the domain of the lens model
 def refine_pairs(problems: PairProblems, start: Fits, iterations: int) -> Fits:
     """Fit the model and λ by at most so many steps.
 

@@ -57,7 +57,7 @@ class Drawing:
     pixels : ndarray of shape (h, w), float32
         NaN where the picture is not.
     origin : ndarray of shape (2,)
-        Where their first pixels lies, pixels of the plane.
+        Where their first pixel lies, pixels of the plane.
     """
 
     pixels: Grey

@@ -25,7 +25,7 @@ from rdstitch.compositing.boxes import Float32Array
 from rdstitch.compositing.photometric import full_scale
 from rdstitch.compositing.placed_picture import place_pictures
 from rdstitch.compositing.preparation import prepare_composite
-from rdstitch.compositing.seam_finder import NOBODY, SeamMap
+from rdstitch.compositing.seam_finder import NO_OWNER, SeamMap
 from rdstitch.compositing.source_images import PictureReader
 from rdstitch.compositing.survey import Survey, survey_pictures
 from rdstitch.compositing.warp import locate
@@ -41,7 +41,7 @@ def seam_steps(seams: SeamMap, survey: Survey, corrected: list[Float32Array]) ->
     steps = []
     for axis in (0, 1):
         a, b = (labels[:-1], labels[1:]) if axis == 0 else (labels[:, :-1], labels[:, 1:])
-        y, x = np.nonzero((a != b) & (a != NOBODY) & (b != NOBODY))
+        y, x = np.nonzero((a != b) & (a != NO_OWNER) & (b != NO_OWNER))
         for first, second in {*zip(a[y, x].tolist(), b[y, x].tolist(), strict=True)}:
             here = (a[y, x] == first) & (b[y, x] == second)
             values, seen = [], np.ones(int(here.sum()), dtype=np.bool_)

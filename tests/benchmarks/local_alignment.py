@@ -27,7 +27,7 @@ from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, plan_canvas
 from rdstitch.compositing.placed_picture import place_pictures
 from rdstitch.compositing.preparation import prepare_composite
-from rdstitch.compositing.seam_finder import NOBODY
+from rdstitch.compositing.seam_finder import NO_OWNER
 from rdstitch.errors import RdstitchError
 from rdstitch.inputs.source import read_sources, readers
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
@@ -85,7 +85,7 @@ def across_seams(truth: Sequence, registration: Registration, local: LocalAlignm
     distances = []
     for axis in (0, 1):
         a, b = np.delete(seams.labels, -1, axis), np.delete(seams.labels, 0, axis)
-        y, x = np.nonzero((a != b) & (a != NOBODY) & (b != NOBODY))
+        y, x = np.nonzero((a != b) & (a != NO_OWNER) & (b != NO_OWNER))
         place = [seams.factor * (v + 0.5) - 0.5 for v in (x, y)]
         for first, second in sorted({*zip(a[y, x].tolist(), b[y, x].tolist(), strict=True)}):
             here = (a[y, x] == first) & (b[y, x] == second)

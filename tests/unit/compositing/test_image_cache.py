@@ -13,7 +13,7 @@ import pytest
 from rdstitch.camera import Camera
 from rdstitch.compositing.image_cache import PictureCache
 from rdstitch.compositing.image_parts import shown_parts
-from rdstitch.compositing.placed_picture import PlacedPicture
+from rdstitch.compositing.placed_picture import PlacedPicture, place_pictures
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.compositing.source_images import NOTHING, PictureReader, prepare_picture
 from rdstitch.compositing.warp import plan_warp
@@ -41,7 +41,8 @@ class DecodedImageCache:
     def cache(self, limit: int, *, ahead: bool = False) -> PictureCache:
         """All pictures, as they are."""
         lens = Camera((200, 100))
-        reader = PictureReader([PlacedPicture(partial(self.read, k), lens, np.eye(3)) for k in range(4)])
+        read = [lambda k=k: self.read(k) for k in range(4)]  # type: ignore[misc]
+        reader = PictureReader(place_pictures(read, [lens] * 4, [np.eye(3)] * 4))
         assert reader.samples[0] == 1
         self.reads.clear()
         return PictureCache(reader, [1.0] * 4, limit, ahead=ahead)
