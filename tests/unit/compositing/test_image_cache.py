@@ -41,7 +41,7 @@ class DecodedImageCache:
     def cache(self, limit: int, *, ahead: bool = False) -> PictureCache:
         """All pictures, as they are."""
         lens = Camera((200, 100))
-        read = [lambda k=k: self.read(k) for k in range(4)]  # type: ignore[misc]
+        read = [lambda k=k: self.read(k) for k in range(4)]
         reader = PictureReader(place_pictures(read, [lens] * 4, [np.eye(3)] * 4))
         assert reader.samples[0] == 1
         self.reads.clear()
