@@ -16,16 +16,16 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 from rdstitch.errors import ArgumentError, InputError, OutputError
 from rdstitch.io.packing import digest, pack, unpack
 from rdstitch.regular_files import open_regular, read_limited
+from rdstitch.stored import LARGEST_ENTRY, Stored, TemporaryFolder, entry_name
 
 Value = TypeVar("Value")
 
 _FORMAT = 1
-_LARGEST_ENTRY = 2**31  # bytes
 _WRONG = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError)
 _OPENCV = tuple(f"opencv-{kind}" for kind in ("contrib-python-headless", "contrib-python", "python-headless", "python"))
 _PACKAGES = ("numpy", "scipy", *_OPENCV, "pillow", "simplejpeg", "tifffile")
@@ -39,6 +39,8 @@ class Cache:
     ----------
     folder : Path or None
         Without one nothing is kept, and everything is computed.
+    temporary : TemporaryFolder or None
+        Where the folder serves this run alone, what removes it.
 
     Raises
     ------
@@ -47,6 +49,13 @@ class Cache:
     """
 
     folder: Path | None = None
+    temporary: TemporaryFolder | None = None
+
+    @classmethod
+    def for_this_run(cls) -> Self:
+        """A cache that goes with this run: it takes what need not be in memory all the time."""
+        owner = TemporaryFolder()
+        return cls(owner.path, owner)
 
     def __post_init__(self) -> None:
         """Make the folder before long work begins."""
@@ -97,6 +106,23 @@ class Cache:
             _keep(file, value)
         return value
 
+    def stored(
+        self,
+        stage: str,
+        kinds: tuple[type, ...],
+        inputs: tuple[Any, ...],
+        compute: Callable[[], Value],
+        valid: Callable[[Value], bool] = lambda value: True,
+    ) -> Stored[Value]:
+        """As :meth:`recall`, but the result stays on disk until it is loaded."""
+        if self.folder is None:
+            return Stored(value=compute())
+        file = self._file(stage, inputs)
+        if _read(file, kinds, valid):
+            return Stored(file, kinds, folder=self.temporary)
+        value = compute()
+        return Stored(file, kinds, folder=self.temporary) if _keep(file, value) else Stored(value=value)
+
     def recall_many(
         self,
         stage: str,
@@ -141,6 +167,8 @@ class Cache:
         """
         if self.folder is None or path is None:
             return ""
+        if self.temporary is not None:
+            return str(path)
         try:
             with open_regular(path) as stream:
                 return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -178,24 +206,21 @@ def _sources(folder: Traversable, prefix: str) -> Iterator[tuple[str, bytes]]:
             yield prefix + entry.name, entry.read_bytes()
 
 
-def _name(file: Path) -> str:
-    """The name of a result, as it is also written into its file: what is mistaken for it is no better than damaged."""
-    return file.parent.name + file.name
-
-
 def _read(file: Path, kinds: tuple[type, ...], valid: Callable[[Value], bool]) -> list[Value]:
     """The result that a file holds; none where it is missing, damaged, or no result for these inputs."""
     with suppress(InputError, ArgumentError, OSError, *_WRONG):
-        kept: tuple[str, Value] = unpack(read_limited(file, _LARGEST_ENTRY), kinds)
-        if isinstance(kept, tuple) and kept[0] == _name(file) and valid(kept[1]):
+        kept: tuple[str, Value] = unpack(read_limited(file, LARGEST_ENTRY), kinds)
+        if isinstance(kept, tuple) and kept[0] == entry_name(file) and valid(kept[1]):
             return [kept[1]]
     return []
 
 
-def _keep(file: Path, value: Any) -> None:
-    """Write a result; a cache that has become full or read-only is no reason to stop."""
+def _keep(file: Path, value: Any) -> bool:
+    """Write a result, and whether that was possible: a cache that has become full or read-only is no reason to stop."""
     with suppress(OSError):
-        _write(file, pack((_name(file), value)))
+        _write(file, pack((entry_name(file), value)))
+        return True
+    return False
 
 
 NO_CACHE = Cache()

@@ -1,12 +1,13 @@
 """Features of pictures, and their matches."""
 
-from rdstitch.features.detect import detect, detect_all
+from rdstitch.features.detect import detect, detect_view
 from rdstitch.features.guided import match_near
 from rdstitch.features.keypoints import Features
 from rdstitch.features.learned import LightGlue
 from rdstitch.features.match import Correspondences, Matcher, match
 from rdstitch.features.options import KINDS, FeatureOptions
 from rdstitch.features.overlap import match_overlap
+from rdstitch.features.packed import PackedFeatures
 from rdstitch.features.picture import View
 
 __all__ = [
@@ -16,9 +17,10 @@ __all__ = [
     "Features",
     "LightGlue",
     "Matcher",
+    "PackedFeatures",
     "View",
     "detect",
-    "detect_all",
+    "detect_view",
     "match",
     "match_near",
     "match_overlap",

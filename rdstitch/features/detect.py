@@ -1,15 +1,11 @@
 """Feature detection: pictures in, keypoints with descriptors out."""
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
-from typing import Any, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.errors import ArgumentError
 from rdstitch.features.detection import Detection, find
 from rdstitch.features.keypoints import Features
 from rdstitch.features.options import CLOSER, KINDS, FeatureOptions
@@ -17,13 +13,7 @@ from rdstitch.features.picture import Mask, PixelArray, PreparedPicture, View, p
 from rdstitch.features.spread import spread, strongest
 from rdstitch.opencv_state import one_opencv_thread
 
-__all__ = ["KINDS", "DetectionCache", "FeatureOptions", "Features", "View", "ViewLoader", "detect", "detect_all"]
-
-Found = TypeVar("Found")
-
-DetectionCache = Callable[[int, Callable[[], Features]], Found]
-"""Called with a picture's index and what detects its features; gives these, perhaps from an earlier run, or what
-stands for them where the picture cannot be read."""
+__all__ = ["KINDS", "FeatureOptions", "Features", "View", "ViewLoader", "detect", "detect_view"]
 
 ViewLoader = Callable[[float | None], View]
 """Loads one picture when it is called with the 10⁶ pixels that are needed of it; None: all. More pixels may come."""
@@ -57,6 +47,26 @@ def detect(image: PixelArray, options: FeatureOptions | None = None, mask: Mask 
     return _detect(lambda _: View(image, mask), options or FeatureOptions())
 
 
+def detect_view(source: ViewLoader, options: FeatureOptions) -> Features:
+    """As :func:`detect`, in one thread, for a picture that is loaded as large as it is needed.
+
+    Parameters
+    ----------
+    source : callable
+        See :data:`ViewLoader`.
+    options : FeatureOptions
+
+    Raises
+    ------
+    ArgumentError
+        As :func:`detect`.
+    Exception
+        What the source raises.
+    """
+    with one_opencv_thread():
+        return _detect(source, options)
+
+
 def _detect(source: ViewLoader, options: FeatureOptions) -> Features:
     """The same for a picture that is loaded as large as it is needed."""
     most, megapixels = options.limits
@@ -84,73 +94,3 @@ def _look(
     detection = find(picture.grey, options)
     usable = np.flatnonzero(picture.covers(detection.points, detection.scale / 2))
     return picture, detection, usable
-
-
-@overload
-def detect_all(
-    sources: Sequence[ViewLoader],
-    options: FeatureOptions | None = None,
-    workers: int = 1,
-    progress: Callable[[int, int], None] | None = None,
-) -> list[Features]: ...
-
-
-@overload
-def detect_all(
-    sources: Sequence[ViewLoader],
-    options: FeatureOptions | None,
-    workers: int,
-    progress: Callable[[int, int], None] | None,
-    recall: DetectionCache[Found],
-) -> list[Found]: ...
-
-
-def detect_all(
-    sources: Sequence[ViewLoader],
-    options: FeatureOptions | None = None,
-    workers: int = 1,
-    progress: Callable[[int, int], None] | None = None,
-    recall: DetectionCache[Found] | None = None,
-) -> list[Features] | list[Found]:
-    """Detect the features of many pictures, several at a time; at most ``workers`` pictures are in memory.
-
-    Parameters
-    ----------
-    sources : sequence of callable
-        Each loads one picture; see :data:`ViewLoader`.
-    options : FeatureOptions, optional
-    workers : int
-        Pictures to work on at the same time, each in one thread.
-    progress : callable, optional
-        Called in this thread with the number of pictures done and their total.
-    recall : callable, optional
-        Stands between this function and the detection of each picture; see :data:`DetectionCache`. Called in other
-        threads.
-
-    Returns
-    -------
-    list of Features
-        In the order of ``sources``; or what ``recall`` gave for each.
-
-    Raises
-    ------
-    ArgumentError
-        As :func:`detect`.
-    Exception
-        What a source raises; of several, that of the first source.
-    """
-    options = (options or FeatureOptions()).for_pictures(len(sources))
-    if workers < 1:
-        raise ArgumentError(f"workers must be at least 1, not {workers}")
-
-    def work(index: int) -> Features | Found:
-        compute = partial(_detect, sources[index], options)
-        return compute() if recall is None else recall(index, compute)
-
-    results: list[Any] = []
-    with one_opencv_thread(), ThreadPoolExecutor(workers) as pool:
-        for features in pool.map(work, range(len(sources))):
-            results.append(features)
-            if progress is not None:
-                progress(len(results), len(sources))
-    return results

@@ -6,7 +6,9 @@ OpenCV's own tests use: ALIKED takes ``image`` and gives ``keypoints``, ``descri
 """
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -89,10 +91,14 @@ class LightGlue:
     """
 
     def __init__(self, model: str | Path, min_score: float = 0.1) -> None:
-        self._model = Path(model)
+        self._model, self._min_score = Path(model), min_score
         self._matcher = _load("LightGlueMatcher", self._model, min_score)
         # The pair to match is the matcher's state: one thread at a time.
         self._lock = threading.Lock()
+
+    def __reduce__(self) -> tuple[Callable[[Path, float], "LightGlue"], tuple[Path, float]]:
+        """Other processes load the network once."""
+        return _loaded_once, (self._model, self._min_score)
 
     def match(self, features1: Features, features2: Features) -> Correspondences:
         """Match the features of two pictures, the most certain first.
@@ -125,6 +131,11 @@ class LightGlue:
         doubt = np.clip(np.array([m.distance for m in found], dtype=np.float64), 0.0, 1.0)
         order = np.lexsort((rows[:, 1], rows[:, 0], doubt))
         return Correspondences.of(features1, features2, rows[order], doubt[order])
+
+
+@cache
+def _loaded_once(model: Path, min_score: float) -> LightGlue:
+    return LightGlue(model, min_score)
 
 
 def _load(name: str, model: str | Path, *arguments: Any) -> Any:

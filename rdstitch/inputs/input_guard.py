@@ -1,7 +1,7 @@
 """Files that change during a run, or whose pixels a decoder has doubts about: noticed once for all who read them."""
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,6 +13,9 @@ from rdstitch.regular_files import open_regular
 _PIECE = 2**20
 
 _Stamp = tuple[int, int, int, int]
+
+GuardNotes = tuple[dict[Path, _Stamp | None], dict[Path, int], dict[Path, str]]
+"""Stamps and checksums of files, and why they may be damaged."""
 
 
 class InputGuard:
@@ -70,6 +73,30 @@ class InputGuard:
         return [
             Message(f"{path}: {self._damaged[path]}", (str(path),), code="damaged") for path in sorted(self._damaged)
         ]
+
+    def notes_on(self, paths: Iterable[Path]) -> GuardNotes:
+        """What was noticed of some files, for the guard of another process."""
+        known = [path for path in paths if path in self._checksums]
+        return (
+            {path: self._stamps[path] for path in known},
+            {path: self._checksums[path] for path in known},
+            {path: self._damaged[path] for path in known if path in self._damaged},
+        )
+
+    def learn(self, notes: GuardNotes) -> None:
+        """Take over what a guard in another process has noticed.
+
+        Raises
+        ------
+        InputError
+            When a file had another content there.
+        """
+        stamps, checksums, damaged = notes
+        for path, checksum in checksums.items():
+            if self._checksums.setdefault(path, checksum) != checksum:
+                raise InputError(f"{path}: its content has changed during the run; run again")
+            self._stamps.setdefault(path, stamps[path])
+        self._damaged |= damaged
 
     def __reduce__(self) -> tuple[type["InputGuard"], tuple[bool]]:
         """Copies and other processes begin anew."""

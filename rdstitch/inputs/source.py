@@ -65,8 +65,8 @@ class Source:
         return position if self.frame is None or self.frame.number is None else self.frame.number
 
     def content(self, cache: Cache) -> str:
-        """Hash of what the image is made from, for keys of the cache."""
-        if self.frame is None or self.frame.picture is None:
+        """Hash of what the image is made from, for keys of the cache; for one of this run alone its name will do."""
+        if self.frame is None or self.frame.picture is None or cache.temporary is not None:
             return cache.file(self.path)
         return cache.digest((self.frame.picture.pixels, self.frame.picture.alpha))
 

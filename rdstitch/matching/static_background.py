@@ -6,15 +6,14 @@ plane moved.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.features import Correspondences, Features
+from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.matching.match_graph import connected_components
+from rdstitch.matching.static_places import StaticPlaces
 from rdstitch.matching.two_view import PairRegistration
 
 _LEAST_PICTURES = 3
@@ -47,51 +46,26 @@ def has_static_background(pairs: Sequence[PairRegistration], threshold: float) -
     return 2 * static > len(registered) or overlaid >= max(_MIN_OVERLAID_PAIRS, _MIN_OVERLAID_SHARE * moving)
 
 
-def moving_features(
-    features: Sequence[Features], pairs: Sequence[PairRegistration], threshold: float
-) -> list[Features]:
+def moving_features(features: FeatureStore, pairs: Sequence[PairRegistration], threshold: float) -> FeatureStore:
     """The features of each picture without those that have a static match."""
-    moving = [np.ones(len(found), dtype=np.bool_) for found in features]
+    moving = [np.ones(len(found), dtype=np.bool_) for found in features.items]
     for pair in pairs:
         static = pair.correspondences.indices[_static_matches(pair, threshold)]
         moving[pair.image1][static[:, 0]] = False
         moving[pair.image2][static[:, 1]] = False
-    return [found.take(np.flatnonzero(kept)) for found, kept in zip(features, moving, strict=True)]
+    return FeatureStore(
+        tuple(found.take(np.flatnonzero(kept)) for found, kept in zip(features.items, moving, strict=True))
+    )
 
 
-@dataclass(frozen=True)
-class StaticPlaces:
-    """Where several pairs have static matches.
-
-    A feature there that is matched otherwise at first is left by :func:`moving_features`, and then finds what is static
-    in other pictures.
-
-    Attributes
-    ----------
-    places : cKDTree
-        Of shape (P, 2), pixels.
-    radius : float
-        Around a place, and motion of a static match at most, pixels.
-    """
-
-    places: cKDTree
-    radius: float
-
-    @classmethod
-    def of(cls, pairs: Sequence[PairRegistration], threshold: float) -> Self:
-        """Places where at least three static matches of any pairs begin."""
-        found = np.concatenate(
-            [np.empty((0, 2)), *(pair.correspondences.points1[_static_matches(pair, threshold)] for pair in pairs)]
-        )
-        radius = threshold * _STATIC
-        matches = cKDTree(found).query_ball_point(found, radius, return_length=True)
-        return cls(cKDTree(found[matches >= _MIN_CONFIRMATIONS]), radius)
-
-    def without_static(self, matched: Correspondences) -> Correspondences:
-        """The matches that move, or begin elsewhere."""
-        moved = np.linalg.norm(matched.points2 - matched.points1, axis=1)
-        distance, _ = self.places.query(matched.points1, distance_upper_bound=self.radius)
-        return matched.take(np.flatnonzero((moved > self.radius) | ~np.isfinite(distance)))
+def static_places(pairs: Sequence[PairRegistration], threshold: float) -> StaticPlaces:
+    """Places where at least three static matches of any pairs begin."""
+    found = np.concatenate(
+        [np.empty((0, 2)), *(pair.correspondences.points1[_static_matches(pair, threshold)] for pair in pairs)]
+    )
+    radius = threshold * _STATIC
+    matches = cKDTree(found).query_ball_point(found, radius, return_length=True)
+    return StaticPlaces(cKDTree(found[matches >= _MIN_CONFIRMATIONS]), radius)
 
 
 def _static_matches(pair: PairRegistration, threshold: float) -> BoolArray:

@@ -1,38 +1,42 @@
-"""Registration of pairs: match the features of two pictures, estimate homography and λ together."""
+"""Registration of pairs: match the features of two pictures, estimate homography and λ together.
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+The tasks of both stages are batches of pairs, for any :class:`concurrent.futures.Executor`: they take names of features
+and matches, which lie in the cache of the run, and give names back.
+"""
+
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from threading import Lock
 from typing import TypeVar
 
 import numpy as np
 
+from rdstitch.cache import Cache
 from rdstitch.camera import Camera
-from rdstitch.features import Correspondences, Features, Matcher, match_overlap
+from rdstitch.features import Correspondences, Matcher, match_overlap
+from rdstitch.matching.feature_store import StoredFeatures, StoredMatches
 from rdstitch.matching.links import Link
 from rdstitch.matching.options import PairOptions
+from rdstitch.matching.static_places import StaticPlaces
+from rdstitch.planar_motion import PlanarMotion
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
 
-Value = TypeVar("Value")
+Item = TypeVar("Item")
 
 Pair = tuple[int, int]
 
-PairProgress = Callable[[int, int], None]
-
-PairCache = Callable[[int, Callable[[], Value]], Value]
-"""Called with the position of a pair and what computes something of it; gives that, perhaps from an earlier run."""
-
-
-Estimate = Callable[[list[int]], list[RadialHomography]]
-
-RecallMany = Callable[[Sequence[int], Estimate], list[RadialHomography]]
-"""Called with the positions of pairs and with what estimates those at some places among them; gives all of theirs."""
-
-_PAIRS_AT_ONCE = 256  # after so many there is progress to show, and to keep
 _SELECT_BELOW = 50
 """Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them."""
+
+_LEAST_BATCHES = 8
+"""Batches that pairs are at least divided into for matching, so that a few pairs keep several workers busy."""
+
+_PAIRS_MATCHED_AT_ONCE, _PAIRS_ESTIMATED_AT_ONCE = 32, 128
+"""Pairs of a task at the most: after so many there is progress to show and to keep."""
+
+_one_estimation = Lock()
+"""Small arrays keep the interpreter busy: two threads at it would take half as long again as one after the other."""
 
 
 @dataclass(frozen=True)
@@ -43,16 +47,21 @@ class PairRegistration:
     ----------
     image1, image2 : int
         Indices of the pictures.
-    correspondences : Correspondences
-        The putative matches, pixels.
+    matches : StoredMatches
+        The putative matches, on disk.
     relation : RadialHomography
         The estimate from ``image1`` to ``image2``; falsy with the reason where there is none.
     """
 
     image1: int
     image2: int
-    correspondences: Correspondences
+    matches: StoredMatches
     relation: RadialHomography
+
+    @property
+    def correspondences(self) -> Correspondences:
+        """The putative matches, pixels; read every time."""
+        return self.matches.load()
 
     def link(self) -> Link:
         """The inliers, as global adjustment takes them."""
@@ -61,113 +70,137 @@ class PairRegistration:
         return Link(self.image1, self.image2, matched.points1[inliers], matched.points2[inliers], self.relation)
 
 
-def match_pairs(
-    features: Sequence[Features],
-    pairs: Sequence[tuple[int, int]],
-    matcher: Matcher,
-    *,
-    known_matches: Sequence[Correspondences | None] | None = None,
-    progress: PairProgress | None = None,
-    recall: PairCache[Correspondences] | None = None,
-    workers: int = 1,
-) -> list[Correspondences]:
-    """Match the features of pairs of pictures, several pairs at a time.
+@dataclass(frozen=True)
+class MatchingTask:
+    """Pairs to be matched together.
 
-    Parameters
+    Attributes
     ----------
-    features : sequence of Features
-        One a picture.
-    pairs : sequence of (int, int)
-        Indices of the pictures of each pair.
-    matcher : callable
-        Matches the features of two pictures.
-    known_matches : sequence of Correspondences or None, optional
+    features : sequence of (StoredFeatures, StoredFeatures)
+        Of the two pictures of each pair.
+    known : sequence of StoredMatches or None
         Some matches of each pair, where they are known: they show where the pictures overlap, and only there the rest
         is looked for.
-    progress : callable, optional
-        Called with the number of pairs done and their total.
-    recall : callable, optional
-        Stands between this function and the matching of each pair; see :data:`PairCache`.
-    workers : int
-        Threads; more than one only for a matcher that may be called from several.
+    matcher : callable
+        Matches the features of two pictures.
+    how : tuple
+        What stands for the matcher in the inputs of results.
+    cache : Cache
     """
 
-    def work(index: int) -> Correspondences:
-        image1, image2 = pairs[index]
-        known = None if known_matches is None else known_matches[index]
+    features: Sequence[tuple[StoredFeatures, StoredFeatures]]
+    known: Sequence[StoredMatches | None]
+    matcher: Matcher
+    how: tuple[float | str | None, ...]
+    cache: Cache
+
+
+def match_pairs(task: MatchingTask) -> list[StoredMatches]:
+    """Match the features of every pair of a task."""
+    return [_match_pair(one, two, known, task) for (one, two), known in zip(task.features, task.known, strict=True)]
+
+
+def _match_pair(
+    one: StoredFeatures, two: StoredFeatures, known: StoredMatches | None, task: MatchingTask
+) -> StoredMatches:
+    def compute() -> Correspondences:
         if known is None:
-            compute = partial(matcher, features[image1], features[image2])
-        else:
-            compute = partial(match_overlap, matcher, features[image1], features[image2], known)
-        return compute() if recall is None else recall(index, compute)
+            return task.matcher(one.load(), two.load())
+        return match_overlap(task.matcher, one.load(), two.load(), known.load())
 
-    done = []
-    with ThreadPoolExecutor(workers) as pool:
-        for found in pool.map(work, range(len(pairs))):
-            done.append(found)
-            if progress is not None:
-                progress(len(done), len(pairs))
-    return done
+    def valid(found: Correspondences) -> bool:
+        features1, features2 = one.load(), two.load()
+        own = found.of(features1, features2, found.indices, found.ratio)
+        return np.array_equal(own.points1, found.points1) and np.array_equal(own.points2, found.points2)
+
+    cache = task.cache
+    inputs = (one.key(cache), two.key(cache), task.how, None if known is None else known.key(cache))
+    stored = cache.stored("matches", (Correspondences,), inputs, compute, valid)
+    return StoredMatches(stored, len(stored.load()))
 
 
-def estimate_pairs(
-    cameras: Sequence[Camera],
-    pairs: Sequence[Pair],
-    matched: Sequence[Correspondences],
-    options: PairOptions,
-    *,
-    tilts: Sequence[tuple[float, float] | None] | None = None,
-    progress: PairProgress | None = None,
-    recall: RecallMany = lambda pairs, compute: compute(list(range(len(pairs)))),
-) -> list[PairRegistration]:
-    """Estimate the two-view geometry of every pair, many at a time, but in one thread.
+@dataclass(frozen=True)
+class EstimationTask:
+    """Pairs to be estimated together.
 
-    Several threads would take half as long again: small arrays keep the interpreter busy, for which threads wait.
-
-    Parameters
+    Attributes
     ----------
-    cameras : sequence of Camera
-        One a picture; of its lens only the centre and the focal length are used, unless ``options.distortion``.
-    pairs : sequence of (int, int)
-    matched : sequence of Correspondences
-        One a pair.
+    cameras : sequence of (Camera, Camera)
+        Of the two pictures of each pair; of their lens only the centre and the focal length are used, unless
+        ``options.distortion``.
+    matches : sequence of StoredMatches
+        Of each pair.
+    tilts : sequence of ((float, float) or None, (float, float) or None)
+        Known tilts (ψ, θ), radians, of the two pictures of each pair; None where unknown.
     options : PairOptions
-    tilts : sequence of (float, float) or None, optional
-        Known tilt (ψ, θ), radians, of each picture, None where unknown.
-    progress : callable, optional
-        Called with the number of pairs done and their total.
-    recall : callable, optional
-        Stands between this function and the estimation of some pairs; see :data:`RecallMany`.
+    cache : Cache
+    static : StaticPlaces, optional
+        Where static matches are no evidence.
+    store : Cache, optional
+        Where matches that are left without those lie on disk; ``cache`` if not given.
     """
+
+    cameras: Sequence[tuple[Camera, Camera]]
+    matches: Sequence[StoredMatches]
+    tilts: Sequence[tuple[tuple[float, float] | None, tuple[float, float] | None]]
+    options: PairOptions
+    cache: Cache
+    store: Cache
+    static: StaticPlaces | None = None
+
+
+def estimate_pairs(task: EstimationTask) -> list[tuple[StoredMatches, RadialHomography]]:
+    """Estimate the two-view geometry of every pair of a task, in lockstep, with the matches that it was found from."""
+    matches = [found if task.static is None else _moving(found, task.static, task.store) for found in task.matches]
+    inputs = [
+        (*cameras, found.key(task.cache), task.options, *tilts)
+        for cameras, found, tilts in zip(task.cameras, matches, task.tilts, strict=True)
+    ]
+    options = task.options
     limits = RansacOptions(options.threshold, options.confidence, options.max_iterations, options.seed)
     how = EstimationOptions(options.solver, options.distortion, limits, _SELECT_BELOW)
 
-    def matches_of(index: int) -> PairMatches:
-        (image1, image2), found = pairs[index], matched[index]
-        camera = cameras[image1]
-        own = Camera(camera.image_size, focal=camera.focal, focal_source=camera.focal_source, center=camera.center)
-        own = own.with_focal()
-        known = [None, None] if tilts is None else [tilts[image1], tilts[image2]]
-        return PairMatches(
-            found.points1,
-            found.points2,
-            own,
-            own.resized(cameras[image2].image_size),
-            -found.ratio,
-            None if None in known else np.array(known, dtype=np.float64),
-        )
+    def estimate(places: list[int]) -> list[RadialHomography]:
+        pairs = [_pair_matches(task.cameras[k], matches[k].load(), task.tilts[k]) for k in places]
+        with _one_estimation:
+            return estimate_radial_homographies(pairs, how)
 
-    done: list[PairRegistration] = []
-    for start in range(0, len(pairs), _PAIRS_AT_ONCE):
-        block = range(start, min(start + _PAIRS_AT_ONCE, len(pairs)))
+    def valid(place: int, relation: RadialHomography) -> bool:
+        return relation.homography.shape == (3, 3) and relation.inliers.shape == (len(matches[place]),)
 
-        def estimate(places: list[int], block: range = block) -> list[RadialHomography]:
-            return estimate_radial_homographies([matches_of(block[place]) for place in places], how)
+    kinds = (RadialHomography, Camera, PlanarMotion)
+    relations = task.cache.recall_many("pairs", kinds, inputs, estimate, valid)
+    return list(zip(matches, relations, strict=True))
 
-        relations = recall(block, estimate)
-        done += [
-            PairRegistration(*pairs[k], matched[k], relation) for k, relation in zip(block, relations, strict=True)
-        ]
-        if progress is not None:
-            progress(len(done), len(pairs))
-    return done
+
+def _moving(found: StoredMatches, static: StaticPlaces, store: Cache) -> StoredMatches:
+    """The matches that are left without those that are static."""
+    inputs = (found.key(store), static.radius, static.places.data)
+    stored = store.stored("moving-matches", (Correspondences,), inputs, lambda: static.without_static(found.load()))
+    return StoredMatches(stored, len(stored.load()))
+
+
+def _pair_matches(
+    cameras: tuple[Camera, Camera],
+    found: Correspondences,
+    tilts: tuple[tuple[float, float] | None, tuple[float, float] | None],
+) -> PairMatches:
+    """Matches of a pair as estimation takes them."""
+    camera = cameras[0]
+    own = Camera(camera.image_size, focal=camera.focal, focal_source=camera.focal_source, center=camera.center)
+    own = own.with_focal()
+    known = None if None in tilts else np.array(tilts, dtype=np.float64)
+    other = own.resized(cameras[1].image_size)
+    return PairMatches(found.points1, found.points2, own, other, -found.ratio, known)
+
+
+def matching_batches(items: Sequence[Item]) -> Iterator[Sequence[Item]]:
+    """Pairs by the tasks of :func:`match_pairs`."""
+    size = min(_PAIRS_MATCHED_AT_ONCE, -(-len(items) // _LEAST_BATCHES))
+    return (items[start : start + size] for start in range(0, len(items), size or 1))
+
+
+def estimation_batches(items: Sequence[Item]) -> Iterator[Sequence[Item]]:
+    """Pairs by the tasks of :func:`estimate_pairs`."""
+    size = _PAIRS_ESTIMATED_AT_ONCE
+    return (items[start : start + size] for start in range(0, len(items), size))

@@ -1,31 +1,41 @@
 """Pairs of pictures through all rounds: matched once, estimated alone, then with what the others know."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.camera import Camera
-from rdstitch.features import Correspondences, Features, Matcher, match_near
+from rdstitch.executors import in_order
+from rdstitch.features import Correspondences, Matcher, match_near
 from rdstitch.matching.candidate_pairs import pairs_that_matter
 from rdstitch.matching.distortion_consensus import vote
+from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.options import MatchingOptions, PairOptions
 from rdstitch.matching.static_background import (
-    StaticPlaces,
     has_static_background,
     moving_features,
     moving_images,
     show_motion,
+    static_places,
 )
-from rdstitch.matching.two_view import PairRegistration, estimate_pairs, match_pairs
-from rdstitch.planar_motion import PlanarMotion
+from rdstitch.matching.static_places import StaticPlaces
+from rdstitch.matching.two_view import (
+    EstimationTask,
+    MatchingTask,
+    Pair,
+    PairRegistration,
+    estimate_pairs,
+    estimation_batches,
+    match_pairs,
+    matching_batches,
+)
 from rdstitch.progress import Progress
-from rdstitch.radial_homography import RadialHomography
 
-Pair = tuple[int, int]
 Transfer = Callable[[int, int, FloatArray], FloatArray]
 
 _PRESCREEN_FEATURES = 1000  # strongest features of a picture, by which pairs are prescreened
@@ -41,35 +51,40 @@ class Pairing:
 
     Attributes
     ----------
-    features : sequence of Features
+    features : FeatureStore
     cameras : sequence of Camera
     matcher : callable
     options : MatchingOptions
     progress : callable
+    executor : concurrent.futures.Executor
+        Where batches of pairs are matched and estimated.
     cache : Cache
+        Of results of earlier runs.
+    store : Cache
+        Of what need not be in memory all the time.
     tilts : sequence of (float, float), optional
         (ψ, θ), radians, of each picture, where they are known exactly.
     static : StaticPlaces, optional
         Where static matches are no evidence.
     """
 
-    features: Sequence[Features]
+    features: FeatureStore
     cameras: Sequence[Camera]
     matcher: Matcher
     options: MatchingOptions
     progress: Progress
+    executor: Executor
     cache: Cache = NO_CACHE
+    store: Cache = NO_CACHE
     tilts: Sequence[tuple[float, float]] | None = None
     static: StaticPlaces | None = None
 
-    def prescreen_pairs(self, pairs: Sequence[Pair]) -> dict[Pair, Correspondences]:
+    def prescreen_pairs(self, pairs: Sequence[Pair]) -> dict[Pair, StoredMatches]:
         """The pairs whose strongest features match and that matter for the place of an image, with those matches.
 
         A pair that is passed over may overlap nevertheless, by little: its place then follows from the others.
         """
-        strongest = replace(
-            self, features=[found.take(np.arange(min(len(found), _PRESCREEN_FEATURES))) for found in self.features]
-        )
+        strongest = replace(self, features=self.features.strongest(_PRESCREEN_FEATURES))
         shared = dict(zip(pairs, strongest._match(pairs, "comparing pictures"), strict=True))
         most = np.zeros(len(self.features), dtype=np.intp)
         for pair, matches in shared.items():
@@ -85,7 +100,7 @@ class Pairing:
         self,
         pairs: Iterable[Pair],
         distortion: float | None = None,
-        shared: Mapping[Pair, Correspondences] | None = None,
+        shared: Mapping[Pair, StoredMatches] | None = None,
     ) -> list[PairRegistration]:
         """Match and estimate pairs (i, j), with λ free, or as the user or the other pairs say.
 
@@ -119,7 +134,7 @@ class Pairing:
         everything = [*pairs, *self.estimate(others)]
         chosen = sorted([*compared, *others])
         moving = replace(self, features=moving_features(self.features, everything, threshold))
-        strict = replace(moving, static=StaticPlaces.of(everything, threshold))
+        strict = replace(moving, static=static_places(everything, threshold))
         again, fewer = moving.estimate(chosen), strict.estimate(chosen)
         count = len(self.features)
         if moving_images(fewer, count, threshold) >= moving_images(again, count, threshold):
@@ -139,7 +154,7 @@ class Pairing:
             return pairs
         again = self._relate(
             [(pairs[index].image1, pairs[index].image2) for index in failed],
-            [pairs[index].correspondences for index in failed],
+            [pairs[index].matches for index in failed],
             consensus.distortion,
             "retrying pairs",
         )
@@ -174,7 +189,7 @@ class Pairing:
         chosen = [index for index, pair in enumerate(pairs) if pair.relation and (pair.image1, pair.image2) in weak]
         again = self._relate(
             [(pairs[index].image1, pairs[index].image2) for index in chosen],
-            [self._near(pairs[index], transfer) for index in chosen],
+            [StoredMatches.of(self._near(pairs[index], transfer)) for index in chosen],
             self.options.pair.distortion,
         )
         return {
@@ -196,78 +211,57 @@ class Pairing:
         )
 
     def _match(
-        self, pairs: Sequence[Pair], stage: str, shared: Mapping[Pair, Correspondences] | None = None
-    ) -> list[Correspondences]:
+        self, pairs: Sequence[Pair], stage: str, shared: Mapping[Pair, StoredMatches] | None = None
+    ) -> list[StoredMatches]:
         """Matches of every pair, from an earlier run where the cache has them."""
         # What a network finds depends on all that it is shown.
-        network = self.options.lightglue_model is not None
-        known_matches = [None if shared is None or network else shared.get(pair) for pair in pairs]
-
-        def recall(index: int, compute: Callable[[], Correspondences]) -> Correspondences:
-            (i, j), known = pairs[index], known_matches[index]
-            digest = None if known is None else self.cache.digest(known)
-            inputs = (self._digests[i], self._digests[j], self._matching, digest)
-
-            def valid(found: Correspondences) -> bool:
-                own = found.of(self.features[i], self.features[j], found.indices, found.ratio)
-                return np.array_equal(own.points1, found.points1) and np.array_equal(own.points2, found.points2)
-
-            return self.cache.recall("matches", (Correspondences,), inputs, compute, valid=valid)
-
-        # A network is no function: only one thread may use it.
-        workers = 1 if network else self.options.workers
-        return match_pairs(
-            self.features,
-            pairs,
-            self.matcher,
-            known_matches=known_matches,
-            progress=partial(self.progress, stage),
-            recall=recall,
-            workers=workers,
+        known = {} if shared is None or self.options.lightglue_model is not None else shared
+        tasks = (
+            MatchingTask(
+                [(self.features.items[i], self.features.items[j]) for i, j in batch],
+                [known.get(pair) for pair in batch],
+                self.matcher,
+                self._matching,
+                self.store,
+            )
+            for batch in matching_batches(pairs)
         )
+        done: list[StoredMatches] = []
+        for found in in_order(self.executor, match_pairs, tasks):
+            done += found
+            self.progress(stage, len(done), len(pairs))
+        return done
 
     def _relate(
         self,
         pairs: Sequence[Pair],
-        matched: Sequence[Correspondences],
+        matched: Sequence[StoredMatches],
         distortion: float | None,
         stage: str | None = None,
     ) -> list[PairRegistration]:
         """The relation of every pair, from an earlier run where the cache has it."""
         options = self._pair_options(distortion)
-        if self.static is not None:
-            matched = [self.static.without_static(found) for found in matched]
-
-        def recall(
-            indices: Sequence[int], compute: Callable[[list[int]], list[RadialHomography]]
-        ) -> list[RadialHomography]:
-            inputs = []
-            for index in indices:
-                i, j = pairs[index]
-                digest = self.cache.digest(matched[index])
-                inputs.append((self.cameras[i], self.cameras[j], digest, options, *self._tilts(i, j)))
-
-            def valid(place: int, relation: RadialHomography) -> bool:
-                count = len(matched[indices[place]])
-                return relation.homography.shape == (3, 3) and relation.inliers.shape == (count,)
-
-            kinds = (RadialHomography, Camera, PlanarMotion)
-            return self.cache.recall_many("pairs", kinds, inputs, compute, valid)
-
-        return estimate_pairs(
-            self.cameras,
-            pairs,
-            matched,
-            options,
-            tilts=self.tilts,
-            progress=None if stage is None else partial(self.progress, stage),
-            recall=recall,
+        tasks = (
+            EstimationTask(
+                [(self.cameras[pairs[k][0]], self.cameras[pairs[k][1]]) for k in batch],
+                [matched[k] for k in batch],
+                [(self._tilt(pairs[k][0]), self._tilt(pairs[k][1])) for k in batch],
+                options,
+                self.cache,
+                self.store,
+                self.static,
+            )
+            for batch in estimation_batches(range(len(pairs)))
         )
-
-    @cached_property
-    def _digests(self) -> list[str]:
-        """What stands for the features of each picture."""
-        return [self.cache.digest(found) for found in self.features]
+        done: list[PairRegistration] = []
+        for found in in_order(self.executor, estimate_pairs, tasks):
+            done += [
+                PairRegistration(*pair, matches, relation)
+                for pair, (matches, relation) in zip(pairs[len(done) :], found, strict=False)
+            ]
+            if stage is not None:
+                self.progress(stage, len(done), len(pairs))
+        return done
 
     @cached_property
     def _matching(self) -> tuple[float | str | None, ...]:
@@ -275,8 +269,8 @@ class Pairing:
         model = self.options.lightglue_model
         return self.options.ratio, None if model is None else self.cache.file(model)
 
-    def _tilts(self, *pictures: int) -> list[tuple[float, float] | None]:
-        return [None if self.tilts is None else self.tilts[picture] for picture in pictures]
+    def _tilt(self, picture: int) -> tuple[float, float] | None:
+        return None if self.tilts is None else self.tilts[picture]
 
     def _pair_options(self, distortion: float | None) -> PairOptions:
         pair = self.options.pair

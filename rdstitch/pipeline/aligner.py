@@ -15,8 +15,8 @@ from rdstitch.errors import ArgumentError, RegistrationError
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import neighbours
 from rdstitch.matching.neighbours_around import neighbours_around
-from rdstitch.matching.two_view import PairRegistration
-from rdstitch.matching.two_view_rounds import Pair, Pairing
+from rdstitch.matching.two_view import Pair, PairRegistration
+from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.messages import Message, names_of
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.working_size import at_working_size
@@ -152,7 +152,7 @@ def _no_overlap(paths: Sequence[str], pairs: Sequence[PairRegistration]) -> str:
     """Why no pair was registered, by the example of the pair with the most matches."""
     if not pairs:
         return "no two pictures could be compared"
-    best = max(pairs, key=lambda pair: len(pair.correspondences))
+    best = max(pairs, key=lambda pair: len(pair.matches))
     first, second = names_of([paths[best.image1], paths[best.image2]])
     return (
         f"no two pictures overlap: of the likeliest pair, {first} and {second}, {best.relation.reason}; "

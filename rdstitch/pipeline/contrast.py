@@ -6,7 +6,7 @@ a stretch and with local contrast equalized.
 """
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -14,8 +14,10 @@ import numpy as np
 
 from rdstitch.cache import Cache
 from rdstitch.errors import InputError
+from rdstitch.executors import in_order
 from rdstitch.features import FeatureOptions, View
 from rdstitch.features.picture import Stretch, common_stretch, usual_stretch
+from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.pipeline.detect_features import DetectedFeatures, detect_features
 from rdstitch.progress import Progress
@@ -48,21 +50,21 @@ class DetectionByContrast:
 def detect_by_contrast(
     sources: Sequence[Source],
     options: FeatureOptions,
-    workers: int,
-    cache: Cache,
+    executor: Executor,
+    store: Cache,
     *,
     skip_bad: bool,
     progress: Progress,
 ) -> DetectionByContrast:
     """Detect the features of all pictures, if necessary once more; see :func:`detect_features`."""
-    detect = partial(detect_features, workers=workers, cache=cache, skip_bad=skip_bad, progress=progress)
+    detect = partial(detect_features, executor=executor, store=store, skip_bad=skip_bad, progress=progress)
     deep = any(source.metadata.bit_depth > 8 for source in sources)
-    stretch = options.stretch or (_stretch_of(sources, options, workers, cache) if deep else None)
+    stretch = options.stretch or (_stretch_of(sources, options, executor, store) if deep else None)
     options = replace(options, stretch=stretch)
     detected = detect(sources, options)
     if options.equalize is not None or not _shows_little(sources, detected, options):
         return DetectionByContrast(detected, stretch, bool(options.equalize))
-    stretch = stretch or _stretch_of(sources, options, workers, cache)
+    stretch = stretch or _stretch_of(sources, options, executor, store)
     again = detect(sources, replace(options, stretch=stretch, equalize=True))
     if _typical_count(again) <= _typical_count(detected):
         return DetectionByContrast(detected, options.stretch, False)
@@ -73,32 +75,49 @@ def _shows_little(sources: Sequence[Source], detected: DetectedFeatures, options
     """Whether half of the pictures show few features for their size."""
     most, megapixels = options.limits
     shares = []
-    for index, (source, found) in enumerate(zip(sources, detected.features, strict=True)):
+    for index, (source, count) in enumerate(zip(sources, detected.features.counts.tolist(), strict=True)):
         if index not in detected.damaged:
             size = np.prod(source.metadata.size) / source.reduction(megapixels) ** 2 / 1e6
-            shares.append(len(found) / min(most, _USUAL_DENSITY * size))
+            shares.append(count / min(most, _USUAL_DENSITY * size))
     return bool(shares) and float(np.median(shares)) < _FEW
 
 
 def _typical_count(detected: DetectedFeatures) -> float:
-    return float(np.median([len(found) for found in detected.features]))
+    return float(np.median(detected.features.counts))
 
 
-def _stretch_of(sources: Sequence[Source], options: FeatureOptions, workers: int, cache: Cache) -> Stretch | None:
+def _stretch_of(
+    sources: Sequence[Source], options: FeatureOptions, executor: Executor, store: Cache
+) -> Stretch | None:
     """The stretch that suits all pictures together."""
-    megapixels = options.limits[1]
+    tasks = (_StretchTask(source, options.limits[1], store) for source in sources)
+    found = []
+    for stretch, notes in in_order(executor, _stretch_of_one, tasks):
+        sources[0].guard.learn(notes)
+        found.append(stretch)
+    return common_stretch(found)
 
-    def compute(source: Source) -> Stretch | None:
-        reduction = source.reduction(megapixels)
+
+@dataclass(frozen=True)
+class _StretchTask:
+    """A picture whose own stretch is wanted, at so many 10⁶ pixels."""
+
+    source: Source
+    megapixels: float | None
+    store: Cache
+
+
+def _stretch_of_one(task: _StretchTask) -> tuple[Stretch | None, GuardNotes]:
+    """The stretch of a picture, None for one that cannot be read; and what was noticed of its file."""
+    source, store = task.source, task.store
+
+    def compute() -> Stretch | None:
+        reduction = source.reduction(task.megapixels)
         try:
             picture = source.read(reduction, keep=True)
         except InputError:  # left out, or reported, by the detection
             return None
         return usual_stretch(View(picture.pixels, picture.alpha, reduction, source.camera.image_size))
 
-    def recall(source: Source) -> Stretch | None:
-        inputs = (source.content(cache), cache.file(source.mask), megapixels)
-        return cache.recall("stretches", (), inputs, partial(compute, source))
-
-    with ThreadPoolExecutor(workers) as pool:
-        return common_stretch(pool.map(recall, sources))
+    inputs = (source.content(store), store.file(source.mask), task.megapixels)
+    return store.recall("stretches", (), inputs, compute), source.guard.notes_on([source.path])

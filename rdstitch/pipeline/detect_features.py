@@ -1,16 +1,25 @@
 """Stage: the features of every picture, and which pictures turned out to be damaged."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from rdstitch.cache import Cache
 from rdstitch.errors import InputError
-from rdstitch.features import FeatureOptions, Features, View, detect, detect_all
+from rdstitch.executors import in_order
+from rdstitch.features import FeatureOptions, Features, PackedFeatures, View, detect, detect_view
+from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
+from rdstitch.matching.feature_store import FeatureStore, StoredFeatures
 from rdstitch.progress import Progress
+
+_LEAST_BATCHES = 16
+"""Batches that pictures are at least divided into, so that a few keep several workers busy."""
+
+_PICTURES_AT_ONCE = 8
+"""Pictures of a task at the most."""
 
 
 @dataclass(frozen=True)
@@ -19,21 +28,37 @@ class DetectedFeatures:
 
     Attributes
     ----------
-    features : tuple of Features
-        One a picture; a damaged picture has none.
+    features : FeatureStore
+        In pixels of the pictures; a damaged picture has none.
     damaged : mapping of int to str
         Why the pixels of a picture could not be read, by its index.
     """
 
-    features: tuple[Features, ...]
+    features: FeatureStore
     damaged: Mapping[int, str]
+
+
+@dataclass(frozen=True)
+class DetectionTask:
+    """Pictures whose features are to be detected together.
+
+    Attributes
+    ----------
+    sources : sequence of Source
+    options : FeatureOptions
+    store : Cache
+    """
+
+    sources: Sequence[Source]
+    options: FeatureOptions
+    store: Cache
 
 
 def detect_features(
     sources: Sequence[Source],
     options: FeatureOptions,
-    workers: int,
-    cache: Cache,
+    executor: Executor,
+    store: Cache,
     *,
     skip_bad: bool,
     progress: Progress,
@@ -44,9 +69,9 @@ def detect_features(
     ----------
     sources : sequence of Source
     options : FeatureOptions
-    workers : int
-        Pictures at the same time.
-    cache : Cache
+    executor : concurrent.futures.Executor
+    store : Cache
+        Where the features lie.
     skip_bad : bool
         Go on without damaged pictures instead of raising.
     progress : callable
@@ -56,28 +81,63 @@ def detect_features(
     InputError
         When the pixels of a picture cannot be read, unless ``skip_bad``.
     """
-    network = cache.file(options.aliked_model)
-    wanted = replace(options, aliked_model=None) if network else options
-
-    def recall(index: int, compute: Callable[[], Features]) -> Features | InputError:
-        source = sources[index]
-        inputs = (source.content(cache), cache.file(source.mask), source.camera.image_size, wanted, network)
-        try:
-            return cache.recall("features", (Features,), inputs, compute, valid=lambda found: _are_of(source, found))
-        except InputError as error:
-            if not skip_bad:
-                raise
-            return error
-
-    loaders = [partial(_load, source) for source in sources]
-    found = detect_all(loaders, options, workers, partial(progress, "detecting features"), recall)
+    results: list[StoredFeatures | InputError] = []
+    for found, notes in in_order(executor, detect_batch, _tasks(sources, options, store)):
+        sources[0].guard.learn(notes)
+        errors = [result for result in found if isinstance(result, InputError)]
+        if errors and not skip_bad:
+            raise errors[0]
+        results += found
+        progress("detecting features", len(results), len(sources))
     return DetectedFeatures(
-        tuple(
-            _no_features(options, source) if isinstance(result, InputError) else result
-            for source, result in zip(sources, found, strict=True)
+        FeatureStore(
+            tuple(
+                StoredFeatures.of(_no_features(options, source)) if isinstance(result, InputError) else result
+                for source, result in zip(sources, results, strict=True)
+            )
         ),
-        {index: str(result) for index, result in enumerate(found) if isinstance(result, InputError)},
+        {index: str(result) for index, result in enumerate(results) if isinstance(result, InputError)},
     )
+
+
+def _tasks(sources: Sequence[Source], options: FeatureOptions, store: Cache) -> Iterator[DetectionTask]:
+    size = min(_PICTURES_AT_ONCE, -(-len(sources) // _LEAST_BATCHES))
+    return (
+        DetectionTask(sources[start : start + size], options, store) for start in range(0, len(sources), size)
+    )
+
+
+def detect_batch(task: DetectionTask) -> tuple[list[StoredFeatures | InputError], GuardNotes]:
+    """The features of each picture of a task, or why it cannot be read; and what was noticed of the files."""
+    found: list[StoredFeatures | InputError] = []
+    for source in task.sources:
+        try:
+            found.append(_detected(source, task))
+        except InputError as error:
+            found.append(error)
+    return found, task.sources[0].guard.notes_on([source.path for source in task.sources])
+
+
+def _detected(source: Source, task: DetectionTask) -> StoredFeatures:
+    """The features of a picture, from an earlier run where the store has them."""
+    store, options = task.store, task.options
+    network = store.file(options.aliked_model)
+    wanted = replace(options, aliked_model=None) if network else options
+    inputs = (source.content(store), store.file(source.mask), source.camera.image_size, wanted, network)
+
+    def load(megapixels: float | None) -> View:
+        # It is kept for the checks that read it again.
+        reduction = source.reduction(megapixels)
+        picture = source.read(reduction, keep=True)
+        return View(picture.pixels, picture.alpha, reduction, source.camera.image_size)
+
+    def compute() -> PackedFeatures:
+        return PackedFeatures.pack(detect_view(load, options))
+
+    stored = store.stored(
+        "features", (PackedFeatures, Features), inputs, compute, lambda found: _are_of(source, found.unpack())
+    )
+    return StoredFeatures(stored, len(stored.load().features))
 
 
 def _are_of(source: Source, features: Features) -> bool:
@@ -85,13 +145,6 @@ def _are_of(source: Source, features: Features) -> bool:
     size = source.camera.image_size
     within = (features.points >= -0.5) & (features.points <= np.array(size) - 0.5)
     return features.image_size == size and bool(within.all()) and bool(np.isfinite(features.descriptors).all())
-
-
-def _load(source: Source, megapixels: float | None) -> View:
-    """A picture as large as detection needs it; it is kept for the checks that read it again."""
-    reduction = source.reduction(megapixels)
-    picture = source.read(reduction, keep=True)
-    return View(picture.pixels, picture.alpha, reduction, source.camera.image_size)
 
 
 def _no_features(options: FeatureOptions, source: Source) -> Features:

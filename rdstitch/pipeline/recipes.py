@@ -8,6 +8,7 @@ from rdstitch.alignment import Alignment
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.camera_files import CAMERA_SUFFIXES, camera_file_text
 from rdstitch.errors import ArgumentError, InputError
+from rdstitch.executors import open_executor
 from rdstitch.export.path_plot import path_as_svg
 from rdstitch.export.trajectory_files import WRITERS, has_times
 from rdstitch.inputs.attitudes import with_attitudes
@@ -87,7 +88,8 @@ def pano(
     ) as found:
         _check_outputs(output, options, files_of(found.frames))
         sources, _ = _read(found.frames, options, skip_bad=False)
-        registration = register(sources, options, skip_bad=False, progress=progress)
+        with open_executor(options.threads, len(sources)) as executor:
+            registration = register(sources, options, executor, skip_bad=False, progress=progress)
         registration = registration.with_messages(found.messages)
         return _composite(registration, output, options, progress, frontal=True)
 
@@ -216,7 +218,8 @@ def trajectory(
         check_distinct(files)
         sources, unread = _read(found.frames, options, skip_bad=True)
         times = timestamps_of(sources, timestamps)
-        registration = register(sources, options, skip_bad=True, metric=True, progress=progress)
+        with open_executor(options.threads, len(sources)) as executor:
+            registration = register(sources, options, executor, skip_bad=True, metric=True, progress=progress)
         registration = registration.with_messages([*unread, *found.messages])
         registration = accept(registration, options)
     _release_decoded_images(registration)
@@ -236,7 +239,8 @@ def trajectory(
 def _register_all(found: FoundPictures, options: StitchOptions, progress: Progress) -> Registration:
     """Register a sequence, leaving out what cannot be read."""
     sources, unread = _read(found.frames, options, skip_bad=True)
-    registration = register(sources, options, skip_bad=True, progress=progress)
+    with open_executor(options.threads, len(sources)) as executor:
+        registration = register(sources, options, executor, skip_bad=True, progress=progress)
     return registration.with_messages([*unread, *found.messages])
 
 

@@ -1,6 +1,7 @@
 """The registration that pano, mosaic, calibrate and trajectory share: features, pairs, one alignment."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 
@@ -20,7 +21,7 @@ from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner, close_loops, rematch_weak_pairs
 from rdstitch.pipeline.contrast import detect_by_contrast
 from rdstitch.pipeline.estimates import impossible_estimates_fail
-from rdstitch.pipeline.working_size import at_working_size, features_at
+from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.progress import Progress, silent
 from rdstitch.registration import Registration
 
@@ -40,6 +41,7 @@ _LOW_CONTRAST = Message(
 def register(
     sources: Sequence[Source],
     options: StitchOptions,
+    executor: Executor,
     *,
     skip_bad: bool,
     metric: bool = False,
@@ -56,6 +58,8 @@ def register(
     ----------
     sources : sequence of Source
     options : StitchOptions
+    executor : concurrent.futures.Executor
+        Where features are detected and pairs are registered; see :func:`rdstitch.executors.open_executor`.
     skip_bad : bool
         Leave out damaged pictures instead of raising.
     metric : bool
@@ -70,15 +74,11 @@ def register(
     options = options.for_pictures(len(sources))
     cache = Cache(options.cache)
     aligner = Aligner.of(sources, options, cache)
-    rendered = detect_by_contrast(
-        sources, options.features, options.threads, cache, skip_bad=skip_bad, progress=progress
-    )
+    store = cache if options.cache is not None else Cache.for_this_run()
+    rendered = detect_by_contrast(sources, options.features, executor, store, skip_bad=skip_bad, progress=progress)
     detected = rendered.detected
     cameras = [at_working_size(source.camera, options.features.limits[1]) for source in sources]
-    features = [
-        features_at(found, source.camera, camera)
-        for found, source, camera in zip(detected.features, sources, cameras, strict=True)
-    ]
+    features = detected.features.at_sizes([camera.image_size for camera in cameras])
     candidates = first_pairs(features, options.seed)
     pairing = Pairing(
         features,
@@ -86,7 +86,9 @@ def register(
         _matcher(options),
         options.matching,
         progress,
+        executor,
         cache,
+        store,
         aligner.options.exact_tilts(len(sources)),
     )
     moving = pairing.remove_static_background(pairing.estimate_candidates(candidates), candidates)
@@ -99,7 +101,7 @@ def register(
         aligned = aligner.metric(aligned)
     return Registration(
         tuple(sources),
-        tuple(map(len, detected.features)),
+        tuple(features.counts.tolist()),
         aligned.pairs,
         aligned.alignment,
         (

@@ -8,9 +8,7 @@ homographies are in half diagonals, which are the same at every size; only pixel
 from collections.abc import Sequence
 from dataclasses import replace
 
-from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.features import Features
 from rdstitch.features.picture import halving
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.registration import Registration
@@ -21,18 +19,6 @@ def at_working_size(camera: Camera, megapixels: float | None) -> Camera:
     factor = 1 if megapixels is None else halving(camera.image_size, megapixels)
     width, height = camera.image_size
     return camera.resized((-(-width // factor), -(-height // factor)))
-
-
-def features_at(features: Features, full: Camera, working: Camera) -> Features:
-    """Features with points and scales in pixels of the ``working`` size instead of the full one."""
-    if full.image_size == working.image_size:
-        return features
-    return replace(
-        features,
-        points=_moved(features.points, full, working),
-        scale=features.scale * working.half_diagonal / full.half_diagonal,
-        image_size=working.image_size,
-    )
 
 
 def at_full_size(registration: Registration) -> Registration:
@@ -48,22 +34,13 @@ def at_full_size(registration: Registration) -> Registration:
 
 def _pair_at_full_size(pair: PairRegistration, working: Sequence[Camera], full: Sequence[Camera]) -> PairRegistration:
     i, j = pair.image1, pair.image2
-    found = pair.correspondences
+    after = (full[i].image_size, full[j].image_size)
     return replace(
         pair,
-        correspondences=replace(
-            found,
-            points1=_moved(found.points1, working[i], full[i]),
-            points2=_moved(found.points2, working[j], full[j]),
-        ),
+        matches=pair.matches.resized((working[i].image_size, working[j].image_size), after),
         relation=replace(
             pair.relation,
-            camera=pair.relation.camera.resized(full[i].image_size),
-            camera2=pair.relation.camera2.resized(full[j].image_size),
+            camera=pair.relation.camera.resized(after[0]),
+            camera2=pair.relation.camera2.resized(after[1]),
         ),
     )
-
-
-def _moved(points: FloatArray, before: Camera, after: Camera) -> FloatArray:
-    """Points (N, 2) of one size in pixels of another: the same in half diagonals from the centre of the picture."""
-    return Camera(after.image_size).denormalize(Camera(before.image_size).normalize(points))

@@ -172,7 +172,7 @@ def _pairs(result: StitchResult) -> list[dict[str, Any]]:
         entries.append(
             {
                 "images": [names[pair.image1], names[pair.image2]],
-                "matches": len(pair.correspondences),
+                "matches": len(pair.matches),
                 "inliers": int(relation.inliers.sum()),
                 "rms_px": relation.rms,
                 "lambda": relation.distortion,

@@ -15,6 +15,7 @@ import numpy as np
 from examples.judging import AlignmentError, alignment_error
 from rdstitch.alignment import Alignment
 from rdstitch.camera import Camera
+from rdstitch.executors import open_executor
 from rdstitch.inputs.source import read_sources
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.register import register
@@ -72,7 +73,10 @@ def main() -> None:
                 for chosen in ("auto", "division"):
                     start = time.process_time()
                     sources, _ = read_sources(files, camera=None, focal=None, distortion=None, skip_bad=False)
-                    registration = register(sources, StitchOptions(lens=chosen, workers=1), skip_bad=False)
+                    with open_executor(1, len(sources)) as executor:
+                        registration = register(
+                            sources, StitchOptions(lens=chosen, workers=1), executor, skip_bad=False
+                        )
                     error = _error(sequence, registration.alignment)
                     found = registration.alignment
                     print(

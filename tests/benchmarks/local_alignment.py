@@ -29,6 +29,7 @@ from rdstitch.compositing.placed_picture import place_pictures
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.seam_finder import NO_OWNER
 from rdstitch.errors import RdstitchError
+from rdstitch.executors import open_executor
 from rdstitch.inputs.source import read_sources, readers
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
 from rdstitch.options import StitchOptions
@@ -129,7 +130,8 @@ def measure(kind: str, height: float, seed: int, pictures: int) -> Figures:
         sources, _ = read_sources(paths, camera=None, focal=None, distortion=None, skip_bad=False)
         options = StitchOptions(workers=1, threshold=3.0)
         start = time.process_time()
-        registration = accept(register(sources, options, skip_bad=True), options)
+        with open_executor(1, len(sources)) as executor:
+            registration = accept(register(sources, options, executor, skip_bad=True), options)
         registered = time.process_time()
         local = align_registration_locally(registration, "auto")
         done = time.process_time()

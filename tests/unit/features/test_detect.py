@@ -1,6 +1,7 @@
 """Features lie where they should, keep clear of masks, and do not depend on threads."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import cv2
@@ -9,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.features import FeatureOptions, Features, View, detect, detect_all, match
+from rdstitch.features import FeatureOptions, Features, View, detect, detect_view, match
 from rdstitch.features.opencv import to_rootsift
 from rdstitch.features.picture import halving
 from rdstitch.features.spread import spread, strongest
@@ -148,10 +149,9 @@ def test_grey_layouts_agree(picture: NDArray[np.uint8]) -> None:
 def test_threads_change_nothing(kind: str, picture: NDArray[np.uint8]) -> None:
     options = FeatureOptions(kind=kind, max_features=700)
     sources = [lambda _, i=i: View(np.rot90(picture, i).copy()) for i in range(4)]
-    seen: list[tuple[int, int]] = []
-    one = detect_all(sources, options, 1, lambda done, total: seen.append((done, total)))
-    several = detect_all(sources, options, 3)
-    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    one = [detect_view(source, options) for source in sources]
+    with ThreadPoolExecutor(3) as pool:
+        several = list(pool.map(lambda source: detect_view(source, options), sources))
     before = cv2.getNumThreads()
     for threads in (1, 4):
         cv2.setNumThreads(threads)
@@ -161,13 +161,13 @@ def test_threads_change_nothing(kind: str, picture: NDArray[np.uint8]) -> None:
     assert one[1].image_size == (HEIGHT, WIDTH)
 
 
-def test_what_a_source_raises_is_raised(picture: NDArray[np.uint8]) -> None:
+def test_what_a_source_raises_is_raised() -> None:
     def broken(_: float | None) -> View:
         raise InputError("cannot read")
 
     before = cv2.getNumThreads()
     with pytest.raises(InputError, match="cannot read"):
-        detect_all([lambda _: View(picture), broken], workers=2)
+        detect_view(broken, FeatureOptions())
     assert cv2.getNumThreads() == before
 
 
@@ -201,8 +201,6 @@ def test_bad_arguments_are_refused(picture: NDArray[np.uint8]) -> None:
             detect(bad)
     with pytest.raises(ArgumentError, match="int32"):
         detect(np.zeros((50, 50), np.int32))
-    with pytest.raises(ArgumentError, match="workers"):
-        detect_all([], workers=0)
 
 
 def test_rootsift_compares_roots() -> None:

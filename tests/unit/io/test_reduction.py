@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from rdstitch.features import FeatureOptions, View, detect, detect_all
+from rdstitch.features import FeatureOptions, View, detect, detect_view
 from rdstitch.features.options import CLOSER
 from rdstitch.io import Metadata, read_image, write_image
 from rdstitch.io.reduction import block_mean, block_minimum, fitting_reduction, halved
@@ -101,7 +101,7 @@ def test_features_of_a_reduced_picture_lie_where_they_are_in_the_whole(pixels: N
         asked.append(megapixels)
         return View(block_mean(large, 2), reduction=2, image_size=(4 * WIDTH, 4 * HEIGHT))
 
-    (small,) = detect_all([load], options)
+    small = detect_view(load, options)
     assert small.image_size == whole.image_size == (4 * WIDTH, 4 * HEIGHT)
     assert asked == [options.work_megapixels, CLOSER * WIDTH * HEIGHT / 1e6]  # for a closer look
     distance = np.linalg.norm(whole.points[:50, None] - small.points[None], axis=2).min(axis=1)

@@ -5,6 +5,7 @@ import pytest
 
 from rdstitch.camera import Camera
 from rdstitch.features import Correspondences
+from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.lens_votes import Votes
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.robust import estimate_radial_homography
@@ -20,5 +21,7 @@ def test_few_inliers_have_no_vote(count: int, votes: int) -> None:
     relation = estimate_radial_homography(points1, points2, LENS.image_size, focal=520.0)
     assert relation.inliers.all()
     indices = np.repeat(np.arange(count)[:, None], 2, axis=1)
-    pair = PairRegistration(0, 1, Correspondences(indices, points1, points2, np.ones(count)), relation)
+    pair = PairRegistration(
+        0, 1, StoredMatches.of(Correspondences(indices, points1, points2, np.ones(count))), relation
+    )
     assert len(Votes.of([pair], 3.0)) == votes

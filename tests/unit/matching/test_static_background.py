@@ -6,12 +6,13 @@ import pytest
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features
+from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.static_background import (
-    StaticPlaces,
     has_static_background,
     is_static_pair,
     moving_features,
     show_motion,
+    static_places,
 )
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.radial_homography import RadialHomography
@@ -26,12 +27,13 @@ def _pair(moved: FloatArray, image1: int = 0, image2: int = 1) -> PairRegistrati
     points = np.random.default_rng(0).uniform((0.0, 0.0), (600.0, 479.0), (count, 2))
     indices = np.stack([np.arange(count), np.arange(count)[::-1]], axis=1)
     matched = Correspondences(indices, points, points + np.stack([moved, np.zeros(count)], axis=1), np.ones(count))
-    return PairRegistration(image1, image2, matched, RadialHomography(np.eye(3), LENS, LENS, np.ones(count, np.bool_)))
+    relation = RadialHomography(np.eye(3), LENS, LENS, np.ones(count, np.bool_))
+    return PairRegistration(image1, image2, StoredMatches.of(matched), relation)
 
 
 def _failed(image1: int, image2: int) -> PairRegistration:
     pair = _pair(np.zeros(10), image1, image2)
-    return PairRegistration(image1, image2, pair.correspondences, RadialHomography.failed("no", LENS, LENS, 10))
+    return PairRegistration(image1, image2, pair.matches, RadialHomography.failed("no", LENS, LENS, 10))
 
 
 @pytest.mark.parametrize(("moved", "static"), [(0.0, True), (0.9, True), (1.1, False), (2.0, False), (40.0, False)])
@@ -60,7 +62,7 @@ def test_what_moves_by_less_than_the_threshold_is_taken_out_of_static_pairs_only
     # Of the static pair, ten matches move by more than the threshold.
     moved = np.append(np.zeros(28), [2.9, 2.9, *[3.1] * 5, *[50.0] * 5])
     pairs = [_pair(moved), _pair(np.full(count, 30.0), 1, 2), _failed(0, 2)]
-    left = [found.scale.tolist() for found in moving_features(features, pairs, THRESHOLD)]
+    left = [found.scale.tolist() for found in moving_features(FeatureStore.of(features), pairs, THRESHOLD)]
     assert left == [list(range(30, 40)), list(range(10)), list(range(40))]
 
 
@@ -113,7 +115,7 @@ def _with_overlay(static: int, image1: int = 0, image2: int = 1, *, seed: int = 
 def test_of_a_pair_that_moves_only_static_outliers_are_taken_out() -> None:
     one, numbers = np.ones(48), np.arange(48.0)
     features = [Features(np.zeros((48, 2)), np.zeros((48, 8), np.float32), numbers, one, one, None, "made up")] * 2
-    first, second = moving_features(features, [_with_overlay(8)], THRESHOLD)
+    first, second = moving_features(FeatureStore.of(features), [_with_overlay(8)], THRESHOLD)
     assert first.scale.tolist() == list(range(40))
     assert second.scale.tolist() == list(range(8, 48))
 
@@ -121,7 +123,7 @@ def test_of_a_pair_that_moves_only_static_outliers_are_taken_out() -> None:
 @pytest.mark.parametrize(("pairs", "left"), [(3, 40), (2, 48)])
 def test_a_place_is_static_from_three_static_matches_on(pairs: int, left: int) -> None:
     seen = [_with_overlay(8, 0, 1 + k, seed=k) for k in range(pairs)]
-    places = StaticPlaces.of(seen, THRESHOLD)
+    places = static_places(seen, THRESHOLD)
     assert len(places.without_static(seen[0].correspondences)) == left
     # What moves from such a place is kept.
     moving = _pair(np.full(48, 30.0)).correspondences

@@ -1,5 +1,6 @@
 """Rounds of pairing: what rests does not hide what moves; pairs that hang on little find more where it must be."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 
@@ -10,6 +11,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features, match
 from rdstitch.matching.candidate_pairs import neighbours
+from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.matching.options import MatchingOptions
 from rdstitch.matching.static_background import is_static_pair
 from rdstitch.matching.two_view_rounds import MovingPairs, Pairing
@@ -53,7 +55,8 @@ def _pairing(resting: int, moving: int, repeated: int = 0, seed: int = 0) -> Pai
         inside = ((points > 0) & (points < (639, 479))).all(axis=1)
         found.append(_features(points[inside], seen_as[inside]))
     matcher = partial(match, ratio=None)
-    return Pairing(found, [LENS.with_focal()] * PICTURES, matcher, MatchingOptions(), silent)
+    cameras = [LENS.with_focal()] * PICTURES
+    return Pairing(FeatureStore.of(found), cameras, matcher, MatchingOptions(), silent, ThreadPoolExecutor(1))
 
 
 ALL = [(i, j) for i in range(PICTURES) for j in range(i + 1, PICTURES)]
@@ -130,7 +133,7 @@ def test_pictures_with_many_matches_are_left_as_they_are() -> None:
 
 def test_pictures_that_share_nothing_are_rejected_by_the_prescreen() -> None:
     one, other = _pairing(0, 400), _pairing(0, 400, seed=1)
-    together = replace(one, features=[*one.features[:2], *other.features[:2]])
+    together = replace(one, features=FeatureStore.of([*one.features[:2], *other.features[:2]]))
     assert list(together.prescreen_pairs(ALL)) == [(0, 1), (2, 3)]
 
 
@@ -145,7 +148,7 @@ def test_a_few_matches_beside_hundreds_do_not_pass_the_prescreen() -> None:
         points = np.zeros((count, 2))
         return Correspondences(points.astype(np.intp), points, points, points[:, 0])
 
-    known = replace(pairing, features=several, matcher=matcher)
+    known = replace(pairing, features=FeatureStore.of(several), matcher=matcher)
     # The most that they share with another: 300, 400, 400 and 200.
     assert list(known.prescreen_pairs(ALL)) == [(0, 1), (0, 2), (0, 3), (1, 2), (2, 3)]
     shared[0, 3], shared[0, 2] = 9, 14

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rdstitch.executors import open_executor
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import write_image
@@ -24,7 +25,8 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Registration:
     frames = flight(3, 3).write(tmp_path_factory.mktemp("good"))
     sources, _ = read_sources(frames, camera=None, focal=380.0, distortion=None, skip_bad=False)
     options = StitchOptions(workers=1, features=FeatureOptions(max_features=600))
-    return register(sources, options, skip_bad=False)
+    with open_executor(1, len(sources)) as executor:
+        return register(sources, options, executor, skip_bad=False)
 
 
 def _texts(registration: Registration, *, lens_only: bool = False) -> list[str]:

@@ -1,0 +1,188 @@
+"""Features and matches of a whole set, on disk: between stages, processes and machines travel their names."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Self, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.arrays import FloatArray
+from rdstitch.cache import Cache
+from rdstitch.camera import Camera
+from rdstitch.features import Correspondences, Features, PackedFeatures
+from rdstitch.stored import Stored
+
+Size = tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class StoredFeatures:
+    """Features of one picture, read when they are needed.
+
+    Attributes
+    ----------
+    stored : Stored of PackedFeatures
+        In pixels of the size of the picture.
+    count : int
+        Number of features that are stored.
+    image_size : (int, int), optional
+        Width and height of the picture in whose pixels they are wanted; None: as they are stored.
+    chosen : ndarray of shape (N,), intp, optional
+        Those that are wanted, in their order; None: all.
+    most : int, optional
+        Only so many of these, the first ones.
+    """
+
+    stored: Stored[PackedFeatures]
+    count: int
+    image_size: Size | None = None
+    chosen: NDArray[np.intp] | None = None
+    most: int | None = None
+
+    @classmethod
+    def of(cls, features: Features) -> Self:
+        """Features that stay in memory."""
+        return cls(Stored(value=PackedFeatures.pack(features)), len(features))
+
+    def __len__(self) -> int:
+        """Number of features."""
+        count = self.count if self.chosen is None else len(self.chosen)
+        return count if self.most is None else min(count, self.most)
+
+    def load(self) -> Features:
+        """Read the features; InputError when they have vanished."""
+        features = self.stored.load().unpack()
+        if self.image_size is not None and features.image_size not in (None, self.image_size):
+            features = _at_size(features, self.image_size)
+        if self.chosen is None and self.most is None:
+            return features
+        chosen = np.arange(len(features)) if self.chosen is None else self.chosen
+        return features.take(chosen[: self.most])
+
+    def take(self, index: NDArray[np.intp]) -> Self:
+        """Those of the given indices."""
+        return replace(self, chosen=index if self.chosen is None else self.chosen[index])
+
+    def strongest(self, most: int) -> Self:
+        """At most so many."""
+        return replace(self, most=most)
+
+    def key(self, cache: Cache) -> str:
+        """What stands for them in the inputs of later results; empty without a cache."""
+        return cache.digest((self.stored.name or self.stored.value, self.image_size, self.chosen, self.most))
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureStore(Sequence[Features]):
+    """Features of the pictures of a set; an item is read when it is asked for.
+
+    Attributes
+    ----------
+    items : tuple of StoredFeatures
+    """
+
+    items: tuple[StoredFeatures, ...]
+
+    @classmethod
+    def of(cls, features: Iterable[Features]) -> Self:
+        """Features that stay in memory."""
+        return cls(tuple(map(StoredFeatures.of, features)))
+
+    def __len__(self) -> int:
+        """Number of pictures."""
+        return len(self.items)
+
+    @overload
+    def __getitem__(self, index: int) -> Features: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> "FeatureStore": ...
+
+    def __getitem__(self, index: int | slice) -> "Features | FeatureStore":
+        """The features of a picture, or of some of them."""
+        return FeatureStore(self.items[index]) if isinstance(index, slice) else self.items[index].load()
+
+    @property
+    def counts(self) -> NDArray[np.intp]:
+        """Number of features of each picture, (N,); nothing is read for it."""
+        return np.array([len(item) for item in self.items], dtype=np.intp)
+
+    def at_sizes(self, sizes: Sequence[Size]) -> Self:
+        """The same in pixels of the pictures at other sizes, (width, height) of each."""
+        resized = (replace(item, image_size=size) for item, size in zip(self.items, sizes, strict=True))
+        return replace(self, items=tuple(resized))
+
+    def strongest(self, most: int) -> Self:
+        """At most so many of each picture."""
+        return replace(self, items=tuple(item.strongest(most) for item in self.items))
+
+
+@dataclass(frozen=True, eq=False)
+class StoredMatches:
+    """Putative matches of one pair, read when they are needed.
+
+    Attributes
+    ----------
+    stored : Stored of Correspondences
+    count : int
+        Number of matches.
+    sizes : ((int, int), (int, int), (int, int), (int, int)), optional
+        Width and height of the two pictures in whose pixels they are stored, and of those in whose they are wanted.
+    """
+
+    stored: Stored[Correspondences]
+    count: int
+    sizes: tuple[Size, Size, Size, Size] | None = None
+
+    @classmethod
+    def of(cls, matches: Correspondences) -> Self:
+        """Matches that stay in memory."""
+        return cls(Stored(value=matches), len(matches))
+
+    def __len__(self) -> int:
+        """Number of matches."""
+        return self.count
+
+    @property
+    def points1(self) -> FloatArray:
+        """Places of the matches in the first picture, pixels, (M, 2); read every time."""
+        return self.load().points1
+
+    @property
+    def points2(self) -> FloatArray:
+        """In the second."""
+        return self.load().points2
+
+    def load(self) -> Correspondences:
+        """Read the matches; InputError when they have vanished."""
+        found = self.stored.load()
+        if self.sizes is None:
+            return found
+        before1, before2, after1, after2 = self.sizes
+        return replace(
+            found, points1=_moved(found.points1, before1, after1), points2=_moved(found.points2, before2, after2)
+        )
+
+    def resized(self, before: tuple[Size, Size], after: tuple[Size, Size]) -> Self:
+        """The same in pixels of pictures of another size."""
+        return replace(self, sizes=(*before, *after))
+
+    def key(self, cache: Cache) -> str:
+        """What stands for them in the inputs of later results; empty without a cache."""
+        return cache.digest((self.stored.name or self.stored.value, self.sizes))
+
+
+def _at_size(features: Features, size: Size) -> Features:
+    """Features in pixels of the picture at another size."""
+    before = features.image_size
+    assert before is not None
+    factor = Camera(size).half_diagonal / Camera(before).half_diagonal
+    return replace(
+        features, points=_moved(features.points, before, size), scale=features.scale * factor, image_size=size
+    )
+
+
+def _moved(points: FloatArray, before: Size, after: Size) -> FloatArray:
+    """Points (N, 2) of one size in pixels of another: the same in half diagonals from the centre of the picture."""
+    return Camera(after).denormalize(Camera(before).normalize(points))

@@ -1,0 +1,130 @@
+"""Results that lie on disk until they are needed, so that thousands of them need not fit into memory."""
+
+import shutil
+import tempfile
+import weakref
+from collections import OrderedDict
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Lock
+from typing import Any, Generic, TypeVar, cast
+
+from rdstitch.errors import ArgumentError, InputError
+from rdstitch.io.packing import unpack
+from rdstitch.regular_files import read_limited
+
+Value = TypeVar("Value")
+
+LARGEST_ENTRY = 2**31  # bytes
+_ROOM = 32 * 2**20  # bytes of files whose content is kept in memory
+
+
+class TemporaryFolder:
+    """A folder that is removed when nobody refers to it any more, and at the end of the process at the latest.
+
+    Copies in other processes name it, but do not own it; back in the process that made it, they are the folder itself.
+
+    Parameters
+    ----------
+    path : Path, optional
+        That of another process; a new one if not given.
+    """
+
+    def __init__(self, path: Path | None = None) -> None:
+        self.path = path or Path(tempfile.mkdtemp(prefix="rdstitch-store-"))
+        if path is None:
+            _own[self.path] = self
+            weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
+
+    def __reduce__(self) -> tuple[Callable[[Path], "TemporaryFolder"], tuple[Path]]:
+        """See the class."""
+        return _folder, (self.path,)
+
+
+_own: weakref.WeakValueDictionary[Path, TemporaryFolder] = weakref.WeakValueDictionary()
+
+
+def _folder(path: Path) -> TemporaryFolder:
+    return _own.get(path) or TemporaryFolder(path)
+
+
+@dataclass(frozen=True)
+class Stored(Generic[Value]):
+    """A result that is read when it is needed; one that could not be kept on disk stays in memory.
+
+    Attributes
+    ----------
+    file : Path or None
+        Entry of a cache.
+    kinds : tuple of dataclass
+        What the result is made of.
+    value : Value or None
+        The result itself, without a file.
+    folder : TemporaryFolder or None
+        What must not be removed before.
+    """
+
+    file: Path | None = None
+    kinds: tuple[type, ...] = ()
+    value: Value | None = None
+    folder: TemporaryFolder | None = field(default=None, compare=False, repr=False)
+
+    def load(self) -> Value:
+        """The result; those used recently are still in memory.
+
+        Raises
+        ------
+        InputError
+            When the file has vanished or is damaged.
+        """
+        if self.file is None:
+            return cast(Value, self.value)
+        return cast(Value, _recent.recall(self.file, self._read))
+
+    @property
+    def name(self) -> str:
+        """What stands for the result in the inputs of later ones; empty without a file."""
+        return "" if self.file is None else entry_name(self.file)
+
+    def _read(self) -> tuple[Value, int]:
+        assert self.file is not None
+        try:
+            data = read_limited(self.file, LARGEST_ENTRY)
+            name, value = unpack(data, self.kinds)
+            if name == self.name:
+                return value, len(data)
+        except (InputError, ArgumentError, OSError, TypeError, ValueError) as error:
+            raise InputError(f"{self.file}: this entry of the cache vanished or was damaged; run again") from error
+        raise InputError(f"{self.file}: this entry of the cache was replaced by another; run again")
+
+
+def entry_name(file: Path) -> str:
+    """The name of a result, as it is also written into its file: what is mistaken for it is no better than damaged."""
+    return file.parent.name + file.name
+
+
+class _RecentlyUsed:
+    """Values of files, of which the least recently used are dropped when there are too many."""
+
+    def __init__(self, room: int) -> None:
+        self._room = room
+        self._held: OrderedDict[Path, tuple[Any, int]] = OrderedDict()
+        self._lock = Lock()
+
+    def recall(self, file: Path, read: Callable[[], tuple[Any, int]]) -> Any:
+        with self._lock, suppress(KeyError):
+            self._held.move_to_end(file)
+            return self._held[file][0]
+        value, size = read()
+        with self._lock:
+            if file not in self._held:
+                self._held[file] = value, size
+                self._room -= size
+            while self._room < 0 and self._held:
+                self._room += self._held.popitem(last=False)[1][1]
+        return value
+
+
+_recent = _RecentlyUsed(_ROOM)
