@@ -86,9 +86,7 @@ def _typical_count(detected: DetectedFeatures) -> float:
     return float(np.median(detected.features.counts))
 
 
-def _stretch_of(
-    sources: Sequence[Source], options: FeatureOptions, executor: Executor, store: Cache
-) -> Stretch | None:
+def _stretch_of(sources: Sequence[Source], options: FeatureOptions, executor: Executor, store: Cache) -> Stretch | None:
     """The stretch that suits all pictures together."""
     tasks = (_StretchTask(source, options.limits[1], store) for source in sources)
     found = []

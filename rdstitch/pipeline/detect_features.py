@@ -122,7 +122,8 @@ def _detected(source: Source, task: DetectionTask) -> StoredFeatures:
     """The features of a picture, from an earlier run where the store has them."""
     store, options = task.store, task.options
     network = store.file(options.aliked_model)
-    wanted = replace(options, aliked_model=None) if network else options
+    # What stands for its content, whatever the file is called.
+    wanted = replace(options, aliked_model="") if network else options
     inputs = (source.content(store), store.file(source.mask), source.camera.image_size, wanted, network)
 
     def load(megapixels: float | None) -> View:

@@ -1,0 +1,142 @@
+"""Worker processes: what they run comes back in order; they end with their parent, and one that dies is replaced."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from concurrent.futures import Executor, ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from rdstitch.errors import ArgumentError, InputError, LimitError
+from rdstitch.executors import ProcessExecutor, in_order, open_executor
+from tests.unit.executors import tasks
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    state = Path(f"/proc/{process}/stat")
+    return not state.exists() or state.read_text().rsplit(")", 1)[1].split()[0] != "Z"
+
+
+def _wait_until_gone(processes: list[int], seconds: float = 10.0) -> None:
+    until = time.monotonic() + seconds
+    while any(map(_alive, processes)):
+        assert time.monotonic() < until, processes
+        time.sleep(0.02)
+
+
+def test_results_come_in_the_order_of_the_tasks_from_other_processes() -> None:
+    with ProcessExecutor(2) as executor:
+        assert list(in_order(executor, tasks.square, range(200))) == [k * k for k in range(200)]
+        own = set(in_order(executor, tasks.process_number, [0.2] * 4))
+    assert len(own) == 2
+    assert os.getpid() not in own
+    _wait_until_gone(list(own))
+
+
+def test_workers_have_one_thread_and_may_print() -> None:
+    with ProcessExecutor(1) as executor:
+        assert executor.submit(tasks.thread_settings).result() == ("1", 1)
+        assert executor.submit(tasks.chatter).result() == 7
+
+
+def test_what_a_task_raises_is_raised_with_its_type() -> None:
+    with ProcessExecutor(1) as executor:
+        for kind in (InputError, ArgumentError, OSError, EOFError):
+            with pytest.raises(kind, match="in a task"):
+                executor.submit(tasks.fail, kind).result()
+        with pytest.raises(RuntimeError, match="cannot travel"):
+            executor.submit(tasks.fail_strangely).result()
+        assert executor.submit(tasks.square, 3).result() == 9
+
+
+def test_a_worker_that_dies_costs_its_task_only(tmp_path: Path) -> None:
+    with ProcessExecutor(2) as executor:
+        done = list(in_order(executor, tasks.die_once, [tmp_path / f"{k}" if k == 3 else None for k in range(8)]))
+    assert done == [0] * 3 + [1] + [0] * 4
+    with ProcessExecutor(1) as executor:
+        with pytest.raises(LimitError, match="worker process was ended"):
+            executor.submit(tasks.die, signal.SIGKILL).result()
+        assert executor.submit(tasks.square, 3).result() == 9
+
+
+def test_an_exception_ends_the_workers_in_the_middle_of_their_tasks() -> None:
+    def interrupted() -> None:
+        with ProcessExecutor(2) as executor:
+            workers.extend(in_order(executor, tasks.process_number, [0.2] * 4))
+            executor.submit(time.sleep, 60)
+            executor.submit(time.sleep, 60)
+            time.sleep(0.1)
+            raise KeyboardInterrupt
+
+    workers: list[int] = []
+    begun = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert time.monotonic() - begun < 20
+    _wait_until_gone(workers)
+
+
+def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
+    program = """
+        import time
+        from rdstitch.executors import ProcessExecutor
+        from tests.unit.executors import tasks
+        executor = ProcessExecutor(1)
+        print(executor.submit(tasks.process_number, 0).result(), flush=True)
+        executor.submit(time.sleep, 60)
+        time.sleep(60)
+    """
+    parent = subprocess.Popen([sys.executable, "-c", textwrap.dedent(program)], stdout=subprocess.PIPE)
+    assert parent.stdout is not None
+    worker = int(parent.stdout.readline())
+    assert _alive(worker)
+    parent.kill()
+    parent.communicate()
+    _wait_until_gone([worker])
+
+
+def test_a_script_is_not_run_again_by_its_workers(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from rdstitch.executors import ProcessExecutor\n"
+        "from tests.unit.executors import tasks\n"
+        "print('once')\n"
+        "with ProcessExecutor(2) as executor:\n"
+        "    print(executor.submit(tasks.square, 5).result())\n",
+        encoding="utf-8",
+    )
+    root = Path(__file__).resolve().parents[3]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(root), *sys.path])}
+    done = subprocess.run([sys.executable, script], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == "once\n25\n"
+    assert done.stderr == ""
+
+
+def test_few_tasks_are_under_way() -> None:
+    numbers = iter(range(1000))
+    with ThreadPoolExecutor(1) as executor:
+        assert next(in_order(executor, tasks.square, numbers)) == 0
+    assert next(numbers) < 100
+
+
+def test_after_a_failure_the_rest_is_cancelled(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as executor, pytest.raises(ZeroDivisionError):
+        list(in_order(executor, tasks.leave_trace, [tmp_path / "first", None, *(tmp_path / f"{k}" for k in range(40))]))
+    assert len(list(tmp_path.iterdir())) < 10
+
+
+@pytest.mark.parametrize(
+    ("workers", "pictures", "kind"),
+    [(1, 1000, ThreadPoolExecutor), (4, 12, ThreadPoolExecutor), (2, 1000, ProcessExecutor)],
+)
+def test_few_pictures_are_not_worth_starting_processes(workers: int, pictures: int, kind: type[Executor]) -> None:
+    with open_executor(workers, pictures) as executor:
+        assert isinstance(executor, kind)
