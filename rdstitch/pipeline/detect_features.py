@@ -10,6 +10,8 @@ from rdstitch.cache import Cache
 from rdstitch.errors import InputError
 from rdstitch.executors import in_order
 from rdstitch.features import FeatureOptions, Features, PackedFeatures, View, detect, detect_view
+from rdstitch.features.options import CLOSER
+from rdstitch.features.picture import halving
 from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.matching.feature_store import FeatureStore, StoredFeatures
@@ -102,9 +104,7 @@ def detect_features(
 
 def _tasks(sources: Sequence[Source], options: FeatureOptions, store: Cache) -> Iterator[DetectionTask]:
     size = min(_PICTURES_AT_ONCE, -(-len(sources) // _LEAST_BATCHES))
-    return (
-        DetectionTask(sources[start : start + size], options, store) for start in range(0, len(sources), size)
-    )
+    return (DetectionTask(sources[start : start + size], options, store) for start in range(0, len(sources), size))
 
 
 def detect_batch(task: DetectionTask) -> tuple[list[StoredFeatures | InputError], GuardNotes]:
@@ -124,7 +124,11 @@ def _detected(source: Source, task: DetectionTask) -> StoredFeatures:
     network = store.file(options.aliked_model)
     # What stands for its content, whatever the file is called.
     wanted = replace(options, aliked_model="") if network else options
-    inputs = (source.content(store), store.file(source.mask), source.camera.image_size, wanted, network)
+    # Megapixels matter by what a picture is halved to; they vary with the number of pictures.
+    size, megapixels = source.camera.image_size, options.limits[1]
+    halvings = None if megapixels is None else (halving(size, megapixels), halving(size, CLOSER * megapixels))
+    wanted = replace(wanted, work_megapixels=None)
+    inputs = (source.content(store), store.file(source.mask), size, wanted, halvings, network)
 
     def load(megapixels: float | None) -> View:
         # It is kept for the checks that read it again.
