@@ -1,5 +1,6 @@
 """Lenses to render with. :class:`rdstitch.camera.Camera` is one; the others are no division model."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -65,22 +66,48 @@ class _FixedFocalLens:
         return points * self.focal + self.center
 
 
+_FISHEYES: dict[str, tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], FloatArray]]] = {
+    "equidistant": (lambda angle: angle, lambda r: r),
+    "equisolid": (
+        lambda angle: 2.0 * np.sin(angle / 2.0),
+        lambda radius: 2.0 * np.arcsin(np.minimum(radius / 2.0, 1.0)),
+    ),
+    "stereographic": (lambda angle: 2.0 * np.tan(angle / 2.0), lambda r: 2.0 * np.arctan(r / 2.0)),
+}
+"""Measured radius of the angle to the axis, in focal lengths, and the inverse, of each kind of fisheye."""
+
+
 @dataclass(frozen=True)
 class FisheyeLens(_FixedFocalLens):
-    """Equidistant fisheye: a ray at angle θ from the axis is measured ``focal * θ`` from the centre."""
+    """A fisheye: the angle θ of a ray to the axis alone says how far from the centre it is measured.
+
+    Attributes
+    ----------
+    kind : str
+        "equidistant" (``focal * θ``), "equisolid" (``2 focal sin(θ/2)``) or "stereographic" (``2 focal tan(θ/2)``).
+    """
+
+    kind: str = field(default="equidistant", kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Check the kind."""
+        if self.kind not in _FISHEYES:
+            raise ArgumentError(f"a fisheye is {', '.join(_FISHEYES)}, not {self.kind}")
 
     def undistort(self, points: ArrayLike) -> FloatArray:
         """Measured pixels to pinhole pixels; NaN for rays at 90° and more."""
         x = self._normalize(points)
-        angle = np.linalg.norm(x, axis=-1, keepdims=True)
-        inside = np.where(angle < np.pi / 2, angle, np.nan)
-        return self._denormalize(x * np.tan(inside) / np.where(angle > 0.0, angle, 1.0) + x * (angle == 0.0))
+        radius = np.linalg.norm(x, axis=-1, keepdims=True)
+        angle = _FISHEYES[self.kind][1](radius)
+        tangent = np.tan(np.where(angle < np.pi / 2, angle, np.nan))
+        return self._denormalize(x * np.where(radius > 0.0, tangent / np.maximum(radius, 1e-300), 1.0))
 
     def distort(self, points: ArrayLike) -> FloatArray:
         """Pinhole pixels to measured pixels."""
         x = self._normalize(points)
-        radius = np.linalg.norm(x, axis=-1, keepdims=True)
-        return self._denormalize(x * np.where(radius > 0.0, np.arctan(radius) / np.maximum(radius, 1e-300), 1.0))
+        tangent = np.linalg.norm(x, axis=-1, keepdims=True)
+        radius = _FISHEYES[self.kind][0](np.arctan(tangent))
+        return self._denormalize(x * np.where(tangent > 0.0, radius / np.maximum(tangent, 1e-300), 1.0))
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,12 @@ LENSES: list[Lens] = [
     Camera(SIZE, -0.4, focal=260.0),
     Camera(SIZE, -0.2, -0.08, focal=260.0),
     FisheyeLens(SIZE, 220.0),
+    FisheyeLens(SIZE, 220.0, kind="equisolid"),
+    FisheyeLens(SIZE, 220.0, kind="stereographic"),
     BrownLens(SIZE, 260.0, k1=-0.25, k2=0.06, p1=2e-3, p2=-1e-3),
 ]
+
+IDS = ["division", "division2", "equidistant", "equisolid", "stereographic", "brown"]
 
 
 def blobs(size: tuple[int, int], places: FloatArray, sigma: float) -> PictureTexture:
@@ -49,7 +53,7 @@ def centroid(picture: FloatArray, around: FloatArray, radius: int = 9) -> FloatA
     return np.array([u + (window.sum(axis=0) @ grid) / window.sum(), v + (window.sum(axis=1) @ grid) / window.sum()])
 
 
-@pytest.mark.parametrize("lens", LENSES, ids=["division", "division2", "fisheye", "brown"])
+@pytest.mark.parametrize("lens", LENSES, ids=IDS)
 @pytest.mark.parametrize("texels_per_pixel", [0.8, 1.0, 2.6])
 def test_a_blob_is_seen_where_projection_puts_it(lens: Lens, texels_per_pixel: float) -> None:
     assert lens.focal is not None
@@ -68,7 +72,7 @@ def test_a_blob_is_seen_where_projection_puts_it(lens: Lens, texels_per_pixel: f
     np.testing.assert_allclose(sequence.to_picture(0, places), wanted, atol=1e-6)
 
 
-@pytest.mark.parametrize("lens", LENSES, ids=["division", "division2", "fisheye", "brown"])
+@pytest.mark.parametrize("lens", LENSES, ids=IDS)
 def test_lenses_go_both_ways(lens: Lens) -> None:
     points = np.random.default_rng(2).uniform((0, 0), SIZE, (500, 2))
     pinhole = lens.undistort(points)
