@@ -19,6 +19,7 @@ from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.messages import Message, names_of
 from rdstitch.options import StitchOptions
+from rdstitch.pipeline.reselect_inliers import reselect_inliers
 from rdstitch.pipeline.working_size import at_working_size
 
 _CLOSURE_ROUNDS = 2
@@ -118,9 +119,15 @@ def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candi
 
 
 def rematch_weak_pairs(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs) -> AlignedPairs:
-    """Match pairs of weakly supported pictures again, only near where the alignment expects the matches."""
+    """Match pairs of weakly supported pictures again, only near where the alignment expects the matches.
+
+    Where the lens has more than λ, the inliers of all other pairs are selected again with it: pairs on their own have
+    one λ, with which matches at the corners of such a lens are outliers, and relief is not.
+    """
     alignment = aligned.alignment
     stronger = pairing.guided_rematch(list(aligned.pairs), alignment.support, alignment.transfer)
+    if alignment.lens != "division" and not aligner.options.lens_known:
+        stronger = {**reselect_inliers(aligned.pairs, alignment, pairing.options.pair.threshold), **stronger}
     return aligner.align([stronger.get(k, pair) for k, pair in enumerate(aligned.pairs)]) if stronger else aligned
 
 

@@ -1,0 +1,89 @@
+"""With a lens that has more than λ, matches at the corners are inliers that pairs on their own took for outliers."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rdstitch.alignment import AlignmentOptions
+from rdstitch.arrays import FloatArray
+from rdstitch.cache import NO_CACHE
+from rdstitch.camera import Camera
+from rdstitch.features import Correspondences
+from rdstitch.matching.links import Link
+from rdstitch.matching.two_view import PairRegistration
+from rdstitch.pipeline.aligner import Aligner, rematch_weak_pairs
+from rdstitch.pipeline.reselect_inliers import reselect_inliers
+from tests.alignment_scenes import grid, scene
+
+FISHEYE = Camera((640, 480), -0.49, -0.055, (335.0, 226.0), distortion3=-0.008)
+FAR = 0.8  # half diagonals
+
+
+def _radius(link: Link) -> FloatArray:
+    """The larger of the distances of both points from the centre, half diagonals."""
+    points = np.stack([link.points1, link.points2])
+    radius: FloatArray = np.linalg.norm(FISHEYE.normalize(points), axis=2).max(axis=0)
+    return radius
+
+
+def _registered(link: Link) -> PairRegistration:
+    """As an estimate with one λ leaves it: nothing near the corners, and some outliers in the middle."""
+    count = len(link)
+    index = np.column_stack([np.arange(count)] * 2)
+    matches = Correspondences(index, link.points1, link.points2, np.linspace(0.1, 0.8, count))
+    relation = replace(link.relation, inliers=_radius(link) < FAR)
+    return PairRegistration(link.image1, link.image2, matches, relation)
+
+
+@pytest.fixture(scope="module")
+def registered() -> tuple[Aligner, list[PairRegistration], list[Link]]:
+    rng = np.random.default_rng(0)
+    given = scene(grid(4, 3, (0.4, 0.35), np.pi, rng), lens=FISHEYE, rng=rng, noise=0.25, focal=420.0)
+    aligner = Aligner(tuple(map(str, range(12))), tuple(given.cameras), AlignmentOptions(), NO_CACHE)
+    return aligner, [_registered(link) for link in given.links], given.links
+
+
+def test_corners_come_back_and_outliers_go(registered: tuple[Aligner, list[PairRegistration], list[Link]]) -> None:
+    aligner, pairs, links = registered
+    alignment = aligner.align(pairs).alignment
+    assert alignment.lens in ("division2", "division3")
+    selected = reselect_inliers(pairs, alignment, 3.0)
+    assert set(selected) == set(range(len(pairs)))
+    inliers = np.concatenate([selected[k].relation.inliers for k in selected])
+    radius = np.concatenate([_radius(link) for link in links])
+    # One in twenty of the matches is an outlier.
+    assert inliers[radius >= FAR].mean() > 0.8
+    assert 0.93 < inliers.mean() < 0.99
+    again = reselect_inliers(pairs, alignment, 0.3)
+    assert sum(pair.relation.inliers.sum() for pair in again.values()) < 0.8 * inliers.sum()
+
+
+def test_a_pair_that_does_not_fit_stays_as_it_is(
+    registered: tuple[Aligner, list[PairRegistration], list[Link]],
+) -> None:
+    aligner, pairs, _ = registered
+    alignment = aligner.align(pairs).alignment
+    moved = replace(pairs[0].correspondences, points2=pairs[0].correspondences.points2 + 9.0)
+    selected = reselect_inliers([replace(pairs[0], correspondences=moved), *pairs[1:]], alignment, 3.0)
+    assert 0 not in selected
+    assert 1 in selected
+
+
+@pytest.mark.parametrize("lens", ["auto", "division"])
+def test_only_a_rich_lens_calls_for_it(
+    registered: tuple[Aligner, list[PairRegistration], list[Link]], lens: str
+) -> None:
+    aligner, pairs, _ = registered
+    aligner = replace(aligner, options=AlignmentOptions(lens=lens))
+    aligned = aligner.align(pairs)
+    options = SimpleNamespace(pair=SimpleNamespace(threshold=3.0))
+    pairing: Any = SimpleNamespace(options=options, guided_rematch=lambda *_: {})
+    found = rematch_weak_pairs(aligner, pairing, aligned)
+    if lens == "division":
+        assert found is aligned
+    else:
+        gained = sum(found.alignment.support.values()) - sum(aligned.alignment.support.values())
+        assert gained > 100
