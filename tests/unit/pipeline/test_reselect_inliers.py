@@ -12,6 +12,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.cache import NO_CACHE
 from rdstitch.camera import Camera
 from rdstitch.features import Correspondences
+from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.links import Link
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.pipeline.aligner import Aligner, rematch_weak_pairs
@@ -35,7 +36,7 @@ def _registered(link: Link) -> PairRegistration:
     index = np.column_stack([np.arange(count)] * 2)
     matches = Correspondences(index, link.points1, link.points2, np.linspace(0.1, 0.8, count))
     relation = replace(link.relation, inliers=_radius(link) < FAR)
-    return PairRegistration(link.image1, link.image2, matches, relation)
+    return PairRegistration(link.image1, link.image2, StoredMatches.of(matches), relation)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +68,7 @@ def test_a_pair_that_does_not_fit_stays_as_it_is(
     aligner, pairs, _ = registered
     alignment = aligner.align(pairs).alignment
     moved = replace(pairs[0].correspondences, points2=pairs[0].correspondences.points2 + 9.0)
-    selected = reselect_inliers([replace(pairs[0], correspondences=moved), *pairs[1:]], alignment, 3.0)
+    selected = reselect_inliers([replace(pairs[0], matches=StoredMatches.of(moved)), *pairs[1:]], alignment, 3.0)
     assert 0 not in selected
     assert 1 in selected
 
