@@ -36,12 +36,15 @@ class NoiseModel:
         Correspondences of links that fit.
     effective : float
         Independent observations.
+    common : float
+        Root mean square of what the errors of neighbours have in common, in diagonals of a picture.
     """
 
     noise: float
     overdispersion: float
     counted: BoolArray
     effective: float
+    common: float
 
     @classmethod
     def of_independent_links(cls, observations: Observations, errors: FloatArray) -> "NoiseModel":
@@ -54,10 +57,11 @@ class NoiseModel:
         squared = squared_lengths(errors)
         sigma = sigma_of(squared[observations.scale_inliers_mask])
         inliers = squared <= (ALIGNMENT_WIDTH * sigma) ** 2
-        overdispersion = coherence(observations, errors, inliers).overdispersion
+        agreement = coherence(observations, errors, inliers)
         counted = ~misfitting_links(squared, observations)[observations.link]
-        effective = max(2.0 * float((counted & inliers).sum()) / overdispersion, 2.0)
-        return cls(math.hypot(sigma / math.sqrt(freedom), EXACTNESS), overdispersion, counted, effective)
+        effective = max(2.0 * float((counted & inliers).sum()) / agreement.overdispersion, 2.0)
+        noise = math.hypot(sigma / math.sqrt(freedom), EXACTNESS)
+        return cls(noise, agreement.overdispersion, counted, effective, agreement.relative_size)
 
     @property
     def price(self) -> float:

@@ -20,7 +20,7 @@ _CELLS = (2, 3, 4)
 _COHERENT = 0.5
 """Correlation of neighbours from which on a scene does not count as flat, if what they have in common is large."""
 
-_LARGE = 0.00075
+LARGE = 0.00075
 """Of a picture's diagonal: lenses that one λ describes roughly leave less, flights over trees and houses more."""
 
 _LEAST_DISTANCE = 0.005
@@ -104,7 +104,7 @@ def judge_relief(found: Coherence, model: str) -> ReliefTest:
         Name of the model that left the residuals.
     """
     agreement = f"errors of neighbours agree (correlation {found.correlation:.2f}, {found.size:.1f} px in common)"
-    relief = found.correlation > _COHERENT and found.relative_size > _LARGE
+    relief = found.correlation > _COHERENT and found.relative_size > LARGE
     if model == "rotation":
         moved = "the camera moved between the pictures (parallax): what is near does not fit; turn about the lens"
         text = f"{agreement}: {moved}" if relief else f"the camera hardly moved (correlation {found.correlation:.2f})"

@@ -9,7 +9,6 @@ from rdstitch.alignment.result import LinkFit
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.cache import Cache
 from rdstitch.errors import PartialResultError, RegistrationError
-from rdstitch.matching.match_graph import connected_components
 from rdstitch.messages import Message, left_out, names_of
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner
@@ -37,6 +36,14 @@ class _Offenders:
     reasons: Mapping[int, Message]
     links: Mapping[tuple[int, int], Message]
 
+    def __bool__(self) -> bool:
+        """Whether there are any."""
+        return bool(self.reasons or self.links)
+
+    def __or__(self, other: "_Offenders") -> "_Offenders":
+        """Those of both."""
+        return _Offenders({**self.reasons, **other.reasons}, {**self.links, **other.links})
+
 
 @impossible_estimates_fail()
 def accept(registration: Registration, options: StitchOptions, *, lens_only: bool = False) -> Registration:
@@ -62,16 +69,17 @@ def accept(registration: Registration, options: StitchOptions, *, lens_only: boo
     first = registration.with_messages(found)
     if not first.ok and not options.force:
         aligner = Aligner.of(registration.sources, options, cache)
-        offending = 0
+        left = _Offenders({}, {})
         for _ in range(_MOST_ROUNDS):
             if current.with_messages(found).ok:
                 break
             if _concerns_all(found):
                 raise RefusedError(at_full_size(first if current is registration else current.with_messages(found)))
             worst = _worst(current, found)
-            shrunk, offending = _without(current, worst, aligner), offending + len(worst.reasons)
+            left |= worst
+            shrunk = _without(registration, left, aligner) if worst else None
             # Where as many pictures fail as pass, nobody can say which of them are right.
-            if shrunk is None or shrunk.alignment.used.sum() <= offending:
+            if shrunk is None or shrunk.alignment.used.sum() <= len(left.reasons):
                 raise RefusedError(at_full_size(first))
             current, found = shrunk, _checked(shrunk, options, cache, lens_only)
     accepted = at_full_size(current).with_messages(found)
@@ -129,39 +137,33 @@ def _held_by(registration: Registration, offenders: _Offenders) -> dict[int, set
 
 
 def _without(registration: Registration, offenders: _Offenders, aligner: Aligner) -> Registration | None:
-    """The rest, aligned anew; None where nothing can be left out, or nothing that fits together would be left."""
-    if not offenders.reasons and not offenders.links:
-        return None
-    before = registration.alignment.used
-    kept = {
-        (fit.image1, fit.image2)
-        for fit in registration.alignment.links
-        if fit.used
-        and not {fit.image1, fit.image2} & offenders.reasons.keys()
-        and (fit.image1, fit.image2) not in offenders.links
-    }
-    largest = connected_components(len(before), [i for i, _ in kept], [j for _, j in kept])[0]
-    if len(largest) < 2:
-        return None
-    inside = set(largest)
-    pairs = [p for p in registration.pairs if (p.image1, p.image2) in kept and p.image1 in inside]
+    """The rest, aligned anew; None where nothing that fits together would be left.
+
+    Pairs that contradicted the offenders are judged again: it may have been the offenders that were wrong.
+    """
+    pairs = [
+        pair
+        for pair in registration.pairs
+        if not {pair.image1, pair.image2} & offenders.reasons.keys()
+        and (pair.image1, pair.image2) not in offenders.links
+    ]
     try:
         aligned = aligner.align(pairs)
     except RegistrationError:
         return None
-    named = {message.images for message in registration.left_out}
+    used = aligned.alignment.used
     reasons = dict(offenders.reasons)
-    for (i, j), message in offenders.links.items():
-        reasons.update({k: message for k in (i, j) if k not in inside})
+    for pair, message in offenders.links.items():
+        reasons.update({k: message for k in pair if not used[k]})
     for picture, others in _held_by(registration, offenders).items():
-        if picture not in inside:
-            named_others = ", ".join(names_of(aligner.paths[k] for k in sorted(others)))
-            reasons.setdefault(picture, Message(f"hangs on {named_others}, which was left out; add pictures around it"))
-    explained = explain_unaligned(aligned.alignment, aligner.paths)
-    news = [
-        left_out(aligner.paths[k], reasons[k].text) if k in reasons else message
-        for k, message in zip(np.flatnonzero(~aligned.alignment.used).tolist(), explained, strict=True)
-        if message.images not in named
+        named_others = ", ".join(names_of(aligner.paths[k] for k in sorted(others)))
+        reasons.setdefault(picture, Message(f"hangs on {named_others}, which was left out; add pictures around it"))
+    known = {message.images: message for message in registration.left_out}
+    explained = zip(np.flatnonzero(~used).tolist(), explain_unaligned(aligned.alignment, aligner.paths), strict=True)
+    unused = [
+        known.get(message.images, left_out(aligner.paths[k], reasons[k].text) if k in reasons else message)
+        for k, message in explained
     ]
-    whole = [m for m in registration.messages if m not in registration.alignment.messages]
-    return replace(registration, alignment=aligned.alignment, messages=(*aligned.alignment.messages, *whole, *news))
+    dropped = (*registration.alignment.messages, *registration.left_out)
+    whole = [message for message in registration.messages if message not in dropped]
+    return replace(registration, alignment=aligned.alignment, messages=(*aligned.alignment.messages, *whole, *unused))

@@ -1,0 +1,101 @@
+"""Strips over rough ground: ``python -m tests.benchmarks.relief [--sets N] [--pictures N]``.
+
+Every set is a strip of pictures by one camera over hills ("bumps"), buildings or ridges ("slopes") of 2, 5 or 10 % of
+its height, or over a plane, as matches with 0.3 pixels of noise and 10 % outliers, through two-view estimation and
+alignment. Printed a row:
+
+one camera
+    Sets in which a model of one camera was chosen, not free homographies.
+shape
+    Largest displacement of a picture's centre, after a similarity, per cent of the strip's length: median and largest.
+relief
+    Sets in which relief was noticed.
+λ
+    Of the strip and its windows of 2, 4 and 8 pictures: windows in which λ is called observable, the share of them with
+    ``|λ - truth| <= 3 σ``, and the median of ``|λ - truth| / σ`` and of σ.
+"""
+
+import argparse
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from rdstitch.alignment import AlignmentOptions, align
+from rdstitch.alignment.result import Alignment
+from rdstitch.errors import RdstitchError
+from rdstitch.synthetic import RELIEFS
+from tests.relief_strips import Strip, displacement, strip
+
+HEIGHTS = (0.02, 0.05, 0.1)
+
+
+def windows(item: Strip, pictures: int, seed: int) -> Iterator[tuple[int, Strip]]:
+    """The whole, and two windows of each length."""
+    rng = np.random.default_rng((seed, 3))
+    yield pictures, item
+    for count in (2, 4, 8):
+        for first in rng.integers(0, pictures - count + 1, 2).tolist():
+            yield count, item.window(first, count)
+
+
+def main() -> None:
+    """Print a row for every kind of ground."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sets", type=int, default=2, help="of each row")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first set")
+    parser.add_argument("--pictures", type=int, default=40)
+    parser.add_argument("--kind", choices=[*RELIEFS, "flat"], help="only this kind of ground")
+    arguments = parser.parse_args()
+    rows = [("flat", 0.0), *((kind, height) for height in HEIGHTS for kind in RELIEFS)]
+    ratios: dict[int, list[float]] = {}
+    for kind, height in (row for row in rows if arguments.kind in (None, row[0])):
+        start, shapes, cameras, noticed, own = time.process_time(), [], 0, 0, dict[int, list[tuple[float, float]]]()
+        for seed in range(arguments.first, arguments.first + arguments.sets):
+            item = strip(kind, height, seed, arguments.pictures)
+            for count, part in windows(item, arguments.pictures, seed):
+                found = _aligned(part)
+                if found is None:
+                    continue
+                if count == arguments.pictures:
+                    shapes.append(displacement(item, found))
+                    cameras += found.model != "homography"
+                    noticed += found.relief.found
+                error = abs(found.distortion - item.distortion)
+                own.setdefault(count, []).append((error, found.distortion_std))
+        print(
+            f"{kind} {height:.0%}: one camera {cameras} of {arguments.sets}, "
+            f"shape {100 * np.median(np.array(shapes)):.2f} ({100 * max(shapes):.2f}) %, relief {noticed}, "
+            + "; ".join(_of_distortion(count, pairs) for count, pairs in sorted(own.items()))
+            + f"; {time.process_time() - start:.0f} s",
+            flush=True,
+        )
+        for count, pairs in own.items():
+            ratios.setdefault(count, []).extend(error / std for error, std in pairs if np.isfinite(std))
+    for count, ratio in sorted(ratios.items()):
+        share, median = np.mean(np.array(ratio) <= 3.0), np.median(np.array(ratio))
+        print(f"all windows of {count}: {share:.0%} within 3 σ, median {median:.2f}")
+    every = np.concatenate([*map(np.array, ratios.values())])
+    print(f"all: {len(every)}, {np.mean(every <= 3.0):.1%} within 3 σ, median {np.median(every):.2f}")
+
+
+def _aligned(part: Strip) -> Alignment | None:
+    try:
+        return align(part.cameras, part.links, AlignmentOptions())
+    except RdstitchError:
+        return None
+
+
+def _of_distortion(count: int, pairs: list[tuple[float, float]]) -> str:
+    observable = np.array([pair for pair in pairs if np.isfinite(pair[1])]).reshape(-1, 2)
+    if not len(observable):
+        return f"{count}: none of {len(pairs)} observable"
+    ratio = observable[:, 0] / observable[:, 1]
+    return (
+        f"{count}: {len(observable)} of {len(pairs)}, {np.mean(ratio <= 3.0):.0%}, {np.median(ratio):.2f} "
+        f"(σ {np.median(observable[:, 1]):.4f})"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,107 @@
+"""The same folder at other sizes: ``python -m tests.benchmarks.scales FOLDER... [--calibrate]``.
+
+Every folder is registered as it is, at half its size and enlarged twice, as ``mosaic`` does, or ``calibrate``. Printed
+are the pictures used, λ and its standard deviation, and how far λ is from that of the folder as it is, in standard
+deviations of the less certain one. Pictures are handed on as arrays, so that their headers do not matter.
+"""
+
+import argparse
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+import rdstitch
+from rdstitch.errors import InputError, RdstitchError
+from rdstitch.features.picture import PixelArray
+from rdstitch.io.read import read_image
+
+SCALES = (1.0, 0.5, 2.0)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a folder.
+
+    Attributes
+    ----------
+    status : int
+        Exit status of the command line.
+    used : tuple of bool
+        Which pictures are in the result.
+    distortion, deviation : float
+        λ and its standard deviation; NaN without a result.
+    text : str
+        Why it was refused, or all messages.
+    """
+
+    status: int
+    used: tuple[bool, ...]
+    distortion: float
+    deviation: float
+    text: str
+
+
+def pictures_of(folder: Path) -> list[PixelArray]:
+    """The pictures of a folder, in the order of their names."""
+    found = []
+    for file in sorted(folder.iterdir()):
+        try:
+            found.append(read_image(file).pixels)
+        except InputError:
+            continue
+    return found
+
+
+def resized(picture: PixelArray, scale: float) -> PixelArray:
+    """A picture at another size."""
+    how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
+    return picture if scale == 1.0 else np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=how))
+
+
+def outcome_of(pictures: Sequence[PixelArray], *, calibrate: bool) -> Outcome:
+    """Register pictures as the command line does."""
+    options = rdstitch.StitchOptions(workers=1, channel_order="rgb", dry_run=not calibrate)
+    try:
+        if calibrate:
+            registration = rdstitch.calibrate(pictures, options)
+        else:
+            registration = rdstitch.mosaic(pictures, None, options).registration
+    except RdstitchError as error:
+        return Outcome(error.exit_status, (False,) * len(pictures), math.nan, math.nan, str(error))
+    found = registration.alignment
+    text = "; ".join(map(str, registration.messages))
+    return Outcome(0, tuple(found.used.tolist()), found.distortion, found.distortion_std, text)
+
+
+def main() -> None:
+    """Print a line for every folder and size."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folders", nargs="+", type=Path)
+    parser.add_argument("--calibrate", action="store_true")
+    parser.add_argument("--messages", action="store_true", help="print what the user would read, too")
+    arguments = parser.parse_args()
+    for folder in arguments.folders:
+        pictures, first = pictures_of(folder), None
+        for scale in SCALES:
+            start = time.process_time()
+            found = outcome_of([resized(picture, scale) for picture in pictures], calibrate=arguments.calibrate)
+            first = first or found
+            away = abs(found.distortion - first.distortion) / max(found.deviation, first.deviation)
+            print(
+                f"{folder.name} x{scale:g}: status {found.status}, {sum(found.used)} of {len(found.used)} pictures "
+                f"({sum(a != b for a, b in zip(found.used, first.used, strict=True))} others), "
+                f"λ = {found.distortion:.4f} ± {found.deviation:.4f} ({away:.1f} σ away), "
+                f"{time.process_time() - start:.0f} s",
+                flush=True,
+            )
+            if found.status or arguments.messages:
+                print(f"    {found.text}")
+
+
+if __name__ == "__main__":
+    main()
