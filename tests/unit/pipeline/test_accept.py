@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from rdstitch.cache import NO_CACHE
+from rdstitch.executors import open_executor
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.source import read_sources
 from rdstitch.messages import Message, Severity, left_out
@@ -37,7 +38,8 @@ def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Pat
     frames = flight(3, 3).write(tmp_path)
     sources, _ = read_sources(frames, camera=None, focal=380.0, distortion=None, skip_bad=False)
     options = StitchOptions(workers=1, features=FeatureOptions(max_features=600))
-    found = register(sources, options, skip_bad=False)
+    with open_executor(1, len(sources)) as executor:
+        found = register(sources, options, executor, skip_bad=False)
     links = tuple(replace(fit, used=2 in (fit.image1, fit.image2)) for fit in found.alignment.links)
     spoiled = replace(
         found,
