@@ -3,12 +3,15 @@
 from examples.judging.alignment import AlignmentError, alignment_error
 from examples.judging.comparison import PlaneComparison, compare_with_plane, coverage, plane_under, sharpness
 from examples.judging.fitting import fit_homography, fit_similarity
+from examples.judging.sphere import SphereComparison, compare_with_sphere
 
 __all__ = [
     "AlignmentError",
     "PlaneComparison",
+    "SphereComparison",
     "alignment_error",
     "compare_with_plane",
+    "compare_with_sphere",
     "coverage",
     "fit_homography",
     "fit_similarity",

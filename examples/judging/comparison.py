@@ -120,7 +120,7 @@ def compare_with_plane(
     ArgumentError
         When the mosaic has another shape or type.
     """
-    grey, filled = _grey_and_filled(mosaic)
+    grey, filled = grey_and_filled(mosaic)
     filled = filled if valid is None else valid
     width, height = plane.size
     truth = _grey(plane.region(0, 0, width, height))
@@ -234,7 +234,7 @@ def _place_by_features(grey: LinearPixels, filled: NDArray[np.bool_], truth: Lin
     Matches that agree only roughly take part on purpose: a mosaic that has drifted should be laid on the plane as a
     whole, not by the part of it that is right.
     """
-    found = [_features(grey, filled), _features(truth, None)]
+    found = [features(grey, filled), features(truth, None)]
     if any(len(descriptors) < _LEAST_MATCHES for _, descriptors in found):
         return None
     (points1, descriptors1), (points2, descriptors2) = found
@@ -251,7 +251,7 @@ def _place_by_features(grey: LinearPixels, filled: NDArray[np.bool_], truth: Lin
     return fit_similarity(a[agreed], b[agreed])
 
 
-def _features(grey: LinearPixels, mask: NDArray[np.bool_] | None) -> tuple[FloatArray, NDArray[np.float32]]:
+def features(grey: LinearPixels, mask: NDArray[np.bool_] | None) -> tuple[FloatArray, NDArray[np.float32]]:
     """SIFT points in px and descriptors, from a picture reduced to a moderate size."""
     factor = min(1.0, float(np.sqrt(_FEATURE_PIXELS / grey.size)))
     size = (max(1, round(grey.shape[1] * factor)), max(1, round(grey.shape[0] * factor)))
@@ -265,7 +265,7 @@ def _features(grey: LinearPixels, mask: NDArray[np.bool_] | None) -> tuple[Float
     return at_full_size, np.asarray(descriptors, dtype=np.float32)
 
 
-def _grey_and_filled(mosaic: NDArray[Any]) -> tuple[LinearPixels, NDArray[np.bool_]]:
+def grey_and_filled(mosaic: NDArray[Any]) -> tuple[LinearPixels, NDArray[np.bool_]]:
     """Grey levels in [0, 1] and which px are filled."""
     if mosaic.ndim not in (2, 3) or (mosaic.ndim == 3 and mosaic.shape[2] not in (3, 4)):
         raise ArgumentError(f"a mosaic has shape (h, w), (h, w, 3) or (h, w, 4), not {mosaic.shape}")

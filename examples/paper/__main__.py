@@ -21,6 +21,7 @@ FIGURES = {
     "figure10": "aerial surveys with and without λ",
     "homography_estimation": "robust estimators on pairs with distortion",
     "end_to_end": "rendered sets stitched by rdstitch and by the peers",
+    "panoramas": "rendered turns on the spot stitched by rdstitch and by the peers",
 }
 """Modules in the order in which they run, with what they measure."""
 

@@ -103,12 +103,12 @@ def _judge(
     """One row of the table, and the mosaic."""
     output = folder / "mosaic.tif"
     done = run_all(stitcher.commands(files, output, picture_set.field_of_view), folder, timeout)
-    mosaic = _mosaic(folder) if done.ok else None
+    mosaic = read_mosaic(folder) if done.ok else None
     found = None if mosaic is None else _compared(mosaic, sequence)
-    return (stitcher.name, *_row(done, found, _distortion_error(output, sequence))), mosaic
+    return (stitcher.name, *row_of(done, found, distortion_error_of(output, sequence))), mosaic
 
 
-def _row(done: Run, found: PlaneComparison | None, distortion_error: float | None) -> tuple[object, ...]:
+def row_of(done: Run, found: PlaneComparison | None, distortion_error: float | None) -> tuple[object, ...]:
     """Errors are given in px of the pictures, for mosaics of any scale."""
     status = "time is up" if done.status is None else str(done.status)
     cost = (done.seconds, done.processor_seconds, done.megabytes, "" if done.ok else done.said)
@@ -133,7 +133,7 @@ def _in_pictures(error: float, found: PlaneComparison) -> object:
     return error * found.texels_per_pixel if np.isfinite(error) else f"> {_SEARCH}"
 
 
-def _mosaic(folder: Path) -> Pixels | None:
+def read_mosaic(folder: Path) -> Pixels | None:
     """What the stitcher wrote; RGB or grey, with alpha where it has one."""
     written = sorted(folder.glob("mosaic*.tif")) + sorted(folder.glob("mosaic*.jpg"))
     if not written:
@@ -149,7 +149,7 @@ def _mosaic(folder: Path) -> Pixels | None:
     return np.concatenate([colours, alpha[:, :, None]], axis=2)
 
 
-def _distortion_error(output: Path, sequence: Sequence) -> float | None:
+def distortion_error_of(output: Path, sequence: Sequence) -> float | None:
     """|λ - λ_true| where the stitcher has told its λ."""
     told = Path(f"{output}.json")
     if not told.is_file() or not isinstance(sequence.lens, Camera):

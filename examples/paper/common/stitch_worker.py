@@ -21,6 +21,18 @@ def rdstitch(output: str, pictures: Sequence[str]) -> int:
     return 0
 
 
+def rdstitch_sphere(output: str, pictures: Sequence[str]) -> int:
+    """``rdstitch mosaic --projection sphere``."""
+    errors, package = import_module("rdstitch.errors"), import_module("rdstitch")
+    options = package.StitchOptions(composite=package.CompositeOptions(projection="sphere"))
+    try:
+        package.mosaic(pictures, output, options)
+    except errors.RdstitchError as error:
+        print(error, file=sys.stderr)
+        return int(error.exit_status)
+    return 0
+
+
 def opencv_panorama(output: str, pictures: Sequence[str]) -> int:
     """OpenCV's Stitcher for a camera that turns."""
     return _opencv(output, pictures, 0)
@@ -58,7 +70,7 @@ def _stitching(output: str, pictures: Sequence[str], kind: str) -> int:
 
 WORKERS: dict[str, Callable[[str, Sequence[str]], int]] = {
     worker.__name__: worker
-    for worker in (rdstitch, opencv_panorama, opencv_scans, stitching_rotation, stitching_affine)
+    for worker in (rdstitch, rdstitch_sphere, opencv_panorama, opencv_scans, stitching_rotation, stitching_affine)
 }
 
 

@@ -66,6 +66,16 @@ def installed_stitchers(peer_python: str | None) -> tuple[list[Stitcher], tuple[
     return found, tuple(notes)
 
 
+def installed_panorama_stitchers(peer_python: str | None) -> tuple[list[Stitcher], tuple[str, ...]]:
+    """The same for panoramas of a camera that turns, all on the sphere."""
+    own = Stitcher("rdstitch mosaic", _worker(sys.executable, "rdstitch_sphere"))
+    others, notes = installed_stitchers(peer_python)
+    chosen = [peer for peer in others if peer.name in ("OpenCV Stitcher, PANORAMA", "stitching, Stitcher")]
+    if any(peer.name.startswith("Hugin") for peer in others):
+        chosen.append(Stitcher("Hugin, automatic", _hugin_sphere))
+    return [own, *chosen], notes
+
+
 def _imports(python: str, module: str) -> bool:
     done = subprocess.run([python, "-c", f"import {module}"], capture_output=True, check=False)
     return done.returncode == 0
@@ -85,6 +95,13 @@ def _hugin_automatic(pictures: Sequence[Path], output: Path, _: float) -> list[l
         ["hugin_executor", "--assistant", "a.pto"],
         ["hugin_executor", "--stitching", f"--prefix={output.stem}", "a.pto"],
     ]
+
+
+def _hugin_sphere(pictures: Sequence[Path], output: Path, field_of_view: float) -> list[list[str]]:
+    """The assistant, and the whole of what it has made on the sphere."""
+    generate, assist, stitch = _hugin_automatic(pictures, output, field_of_view)
+    project = ["pano_modify", "--projection=2", "--fov=AUTO", "--canvas=AUTO", "--crop=AUTO", "-o", "a.pto", "a.pto"]
+    return [generate, assist, project, stitch]
 
 
 def _hugin_by_hand(pictures: Sequence[Path], output: Path, field_of_view: float) -> list[list[str]]:
