@@ -61,6 +61,9 @@ class AlignmentOptions:
         is mounted on that.
     attitudes_std : float
         Their standard deviation, radians; 0 for exact ones.
+    gravity : ndarray of shape (N, 3), optional
+        Direction down in the axes of each camera (right, down, ahead), where it is known; NaN elsewhere. It levels
+        panoramas.
     lens : str
         One of :data:`rdstitch.alignment.lens_selection.LENSES`, or "auto": the simplest that the data allow.
     most : int
@@ -73,6 +76,7 @@ class AlignmentOptions:
     tilt: tuple[float, float] | None = None
     attitudes: ArrayLike | None = None
     attitudes_std: float = 0.0
+    gravity: ArrayLike | None = None
     lens: str = "auto"
     most: int = 250
 
@@ -199,6 +203,7 @@ def align(
         votes,
         chosen.refined(fit.free_lens),
         observable,
+        None if options.gravity is None else np.asarray(options.gravity, dtype=np.float64),
     )
     return build_alignment(found)
 

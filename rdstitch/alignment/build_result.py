@@ -49,6 +49,8 @@ class AdjustedPictures:
         The lens, with the distortion centre if the motion model freed it.
     observable : bool
         Whether λ is observable, or known.
+    gravity : ndarray of shape (M, 3), optional
+        Direction down in the axes of every camera; NaN where it is unknown.
     """
 
     cameras: Sequence[Camera]
@@ -60,6 +62,7 @@ class AdjustedPictures:
     votes: Consensus
     lens: LensChoice
     observable: bool
+    gravity: FloatArray | None = None
 
 
 def build_alignment(found: AdjustedPictures) -> Alignment:
@@ -169,7 +172,8 @@ def _in_frame_of_reference(found: AdjustedPictures) -> tuple[FloatArray, PlanarP
     matrices = fit.adjusted.matrices.matrices
     homographies = np.full((count, 3, 3), np.nan)
     if fit.model is ROTATION:
-        homographies[found.pictures] = levelled(matrices, reference)
+        gravity = None if found.gravity is None else found.gravity[found.pictures]
+        homographies[found.pictures] = levelled(matrices, reference, gravity)
         return homographies, None
     if not fit.model.shared_names:
         homographies[found.pictures] = matrices[reference] @ np.linalg.inv(matrices)

@@ -7,8 +7,11 @@ from rdstitch.arrays import FloatArray
 _FULL_CIRCLE = np.pi / 2
 """Pictures whose centres leave no wider gap than this, radians, count as all the way round."""
 
+_MAX_GRAVITY_SPREAD = np.radians(5.0)
+"""Median angle between measured directions of gravity and their mean, up to which they are believed."""
 
-def levelled(matrices: FloatArray, reference: int) -> FloatArray:
+
+def levelled(matrices: FloatArray, reference: int, gravity: FloatArray | None = None) -> FloatArray:
     """Matrices from undistorted coordinates of each picture to directions in a level frame.
 
     The frame has x to the right, y down, and z towards the middle of what the pictures show, or towards the reference
@@ -19,6 +22,8 @@ def levelled(matrices: FloatArray, reference: int) -> FloatArray:
     matrices : ndarray of shape (N, 3, 3)
         ``diag(f, f, 1) R_i``, from directions in any frame to the pictures, all with the same f.
     reference : int
+    gravity : ndarray of shape (N, 3), optional
+        Direction down in the axes of each camera, as it has measured it; NaN where it has not.
 
     Returns
     -------
@@ -26,24 +31,40 @@ def levelled(matrices: FloatArray, reference: int) -> FloatArray:
     """
     focal = float(np.linalg.norm(matrices[0, 0]))
     rotations = matrices / np.array([[focal], [focal], [1.0]])
-    frame = level_frame(rotations, reference)
+    frame = level_frame(rotations, reference, measured_down(rotations, gravity))
     directions: FloatArray = frame @ np.swapaxes(rotations, 1, 2) @ np.diag([1.0, 1.0, focal])
     return directions
 
 
-def level_frame(rotations: FloatArray, reference: int) -> FloatArray:
+def measured_down(rotations: FloatArray, gravity: FloatArray | None) -> FloatArray | None:
+    """Direction down (3,), in the frame that rotations (N, 3, 3) lead from, by gravity (N, 3) in the cameras' axes.
+
+    None where no camera has measured it, or where the measurements contradict each other.
+    """
+    if gravity is None:
+        return None
+    down = np.einsum("nij,ni->nj", rotations, gravity)
+    down = down[np.isfinite(down).all(axis=1)]
+    if not len(down):
+        return None
+    mean = _unit(down.mean(axis=0))
+    spread = float(np.median(np.arccos(np.clip(down @ mean, -1.0, 1.0))))
+    return mean if spread < _MAX_GRAVITY_SPREAD else None
+
+
+def level_frame(rotations: FloatArray, reference: int, down_by_gravity: FloatArray | None = None) -> FloatArray:
     """Rotation (3, 3) to the level frame from the one that rotations (N, 3, 3) lead from to the cameras.
 
     People hold cameras so that the horizon is level, whichever way they turn: the x axes of all pictures lie in one
     plane, and the direction down is the one they have least in common with (Brown and Lowe 2007, section 5). The less
-    the pictures turn, the more counts what is down in them.
+    the pictures turn, the more counts what is down in them. Gravity, where cameras have measured it, decides alone.
     """
     right, down, ahead = np.moveaxis(rotations, 1, 0)
     mean_down = _unit(down.mean(axis=0))
     spread, axes = np.linalg.eigh(right.T @ right)
     axis = axes[:, 0] * (1.0 if axes[:, 0] @ mean_down > 0.0 else -1.0)
     certainty = (spread[1] - spread[0]) / max(spread[1] + spread[0], 1e-12)
-    y = _unit(certainty * axis + (1.0 - certainty) * mean_down)
+    y = _unit(certainty * axis + (1.0 - certainty) * mean_down) if down_by_gravity is None else down_by_gravity
     x = _unit(np.cross(y, ahead[reference]))
     z = np.cross(x, y)
     heading = _middle(np.arctan2(ahead @ x, ahead @ z))

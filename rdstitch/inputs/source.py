@@ -20,6 +20,7 @@ from rdstitch.io.metadata import Metadata, read_metadata
 from rdstitch.io.read import Picture, read_image, reduced
 from rdstitch.io.reduction import block_minimum, fitting_reduction, reduced_size
 from rdstitch.messages import Message, left_out
+from rdstitch.planar_motion import rotation_from_tilt
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,14 @@ class Source:
     def name(self) -> str:
         """File name, for messages and reports."""
         return self.path.name
+
+    @property
+    def down(self) -> tuple[float, float, float] | None:
+        """Unit vector straight down in the camera's axes (right, down, ahead), as measured or as its XMP says."""
+        if self.attitude is None:
+            return self.metadata.nadir
+        x, y, z = rotation_from_tilt(self.attitude)[:, 2].tolist()
+        return x, y, z
 
     def number(self, position: int) -> int:
         """Its number in the video or bag that it was taken from, else its position in the sequence."""

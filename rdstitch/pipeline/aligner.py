@@ -9,6 +9,7 @@ import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.result import LinkFit, PlanarPoses, ReliefTest
+from rdstitch.arrays import FloatArray
 from rdstitch.cache import Cache
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, RegistrationError
@@ -143,7 +144,16 @@ def _alignment_options(sources: Sequence[Source], options: StitchOptions) -> Ali
         tilt=options.tilt or ((0.0, 0.0) if exact else None),
         attitudes=np.array(attitudes) if attitudes else None,
         attitudes_std=options.attitude_std,
+        gravity=_gravity(sources),
     )
+
+
+def _gravity(sources: Sequence[Source]) -> FloatArray | None:
+    """Direction down in the axes of each camera, (N, 3), by its attitude or its XMP; None where all lack both."""
+    known = [source.down for source in sources]
+    if all(down is None for down in known):
+        return None
+    return np.array([(np.nan,) * 3 if down is None else down for down in known])
 
 
 def _reference(sources: Sequence[Source], name: str | None) -> int | None:

@@ -8,9 +8,11 @@ import pytest
 from PIL import Image
 
 from rdstitch.camera import Camera
-from rdstitch.synthetic.panorama import TurningSequence, panorama_rotations, turning_sequence
+from rdstitch.pipeline import pano
+from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, panorama_rotations, turning_sequence
 from rdstitch.synthetic.rendering import Photometry
 from tests.cli.running import Run
+from tests.drone_xmp import euler_angles, xmp_of
 
 LENS = Camera((320, 240), -0.2, focal=260.0, focal_source="option")
 
@@ -82,3 +84,47 @@ def test_a_turning_camera_has_no_path(rdstitch: Run, around: list[Path], tmp_pat
     done = rdstitch("trajectory", around[0].parent, "-o", tmp_path / "path.csv")
     assert done.status == 2
     assert "turned on the spot" in done.err
+
+
+# Three pictures through a camera that is held askew and points upwards: they alone do not tell what is level.
+_HEADINGS, _PITCH, _ROLL = np.radians([-30.0, 0.0, 30.0]), 0.3, 0.35
+
+
+def _down(sequence: TurningSequence, paths: list[Path]) -> float:
+    """Angle between down in the scene and down in the panorama, degrees."""
+    alignment = pano(paths).registration.alignment
+    assert alignment.model == "rotation"
+    down = alignment.homographies @ np.diag([1.0, 1.0, 1.0 / (alignment.focal or 1.0)]) @ sequence.rotations
+    return float(np.degrees(np.arccos(np.clip(down[:, 1, 1], -1.0, 1.0))).max())
+
+
+def test_gravity_in_the_pictures_levels_them(tmp_path: Path) -> None:
+    rotations = camera_rotations(_HEADINGS, _PITCH, _ROLL)
+    sequence = turning_sequence(LENS, rotations, seed=2, photometry=Photometry(noise=0.005))
+    plain, with_xmp = [], []
+    for index, rotation in enumerate(rotations):
+        plain.append(tmp_path / f"plain_{index}.jpg")
+        with_xmp.append(tmp_path / f"xmp_{index}.jpg")
+        picture = Image.fromarray(sequence.frame(index))
+        picture.save(plain[-1], quality=95)
+        # Of level ground: X to the right, Y towards the camera's back, down below.
+        xmp = xmp_of("dji-gimbal", *euler_angles("dji-gimbal", rotation @ [[1.0, 0.0], [0.0, 0.0], [0.0, -1.0]]))
+        picture.save(with_xmp[-1], quality=95, xmp=xmp.encode())
+    assert _down(sequence, plain) > 5.0
+    assert _down(sequence, with_xmp) < 0.5
+
+
+def test_orientation_in_exif_says_what_is_down(tmp_path: Path) -> None:
+    """A phone held upright stores its pictures lying on their side."""
+    rotations = camera_rotations(np.radians([-20.0, 0.0, 20.0]), 0.05, np.pi / 2)
+    sequence = turning_sequence(LENS, rotations, seed=2, photometry=Photometry(noise=0.005))
+    paths = []
+    exif = Image.Exif()
+    exif[0x0112] = 8  # the first column is the bottom: turn to the left to look at it
+    for index in range(len(rotations)):
+        paths.append(tmp_path / f"phone_{index}.jpg")
+        Image.fromarray(sequence.frame(index)).save(paths[-1], quality=95, exif=exif)
+    result = pano(paths)
+    assert result.registration.sources[0].camera.image_size == (240, 320)
+    axes = result.registration.alignment.homographies[:, :, 1]  # what is down in the pictures
+    assert (axes[:, 1] > 0.95).all()
