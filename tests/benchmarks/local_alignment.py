@@ -132,9 +132,8 @@ def _ideal_seams(truth: Sequence, used: NDArray[np.intp], placed: list[PlacedPic
     tiles = []
     for number, tile, warp in zip(used, survey.tiles, survey.warps, strict=True):
         assert tile is not None
-        x, y = np.meshgrid(
-            *(np.arange(start, stop, dtype=np.float64) for start, stop in zip(tile.box[:2], tile.box[2:]))
-        )
+        left, top, right, bottom = map(float, tile.box)
+        x, y = np.meshgrid(np.arange(left, right), np.arange(top, bottom))
         seen = truth.to_ground(int(number), warp.source_points(x.ravel(), y.ravel())).reshape(*x.shape, 2)
         shown = np.concatenate([np.nan_to_num(seen), np.zeros((*x.shape, 1))], axis=2) * _BRIGHTNESS_PER_PIXEL
         tiles.append(replace(tile, pixels=shown.astype(np.float32)))
