@@ -13,10 +13,11 @@ from rdstitch.alignment.model_selection import ModelChoice
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y, metric_poses
 from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.planarity import coherence, judge_relief
-from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPoses
+from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPoses, ShapeTest
 from rdstitch.alignment.rotation_frame import levelled
 from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.alignment.sandwich import sandwich_std
+from rdstitch.alignment.shape_test import judge_shape
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS, Camera
 from rdstitch.matching.distortion_consensus import Consensus
@@ -107,8 +108,19 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
         rms=float(np.sqrt(adjusted.squared[inliers].mean())) if inliers.any() else math.nan,
         links=_link_fits(found, inliers),
         relief=relief,
+        shape=_shape(found),
         messages=_warnings(found),
     )
+
+
+def _shape(found: AdjustedPictures) -> ShapeTest | None:
+    """Whether the whole may be bent, with the picture's index among all."""
+    fit = found.choice.fit
+    if fit.model is ROTATION or not found.observable:
+        return None
+    pictures = found.pictures
+    judged = judge_shape(found.problem, fit, [found.cameras[k] for k in pictures])
+    return replace(judged, image=int(pictures[judged.image]))
 
 
 def _inflation(found: AdjustedPictures) -> float:

@@ -204,9 +204,9 @@ class BundleAdjuster:
         squared: FloatArray = self._evaluate(parameters, 1.0, 1.0).equations.squared
         return squared
 
-    def normal_equations(self, adjusted: BundleAdjustmentResult) -> SparseNormalEquations:
-        """At a solution, priors included."""
-        state = self._evaluate(adjusted.parameters, adjusted.sigma, ALIGNMENT_WIDTH * adjusted.sigma)
+    def normal_equations(self, adjusted: BundleAdjustmentResult, width: float | None = None) -> SparseNormalEquations:
+        """At a solution, priors included; the ``width`` of the loss, pixels, follows the errors if not given."""
+        state = self._evaluate(adjusted.parameters, adjusted.sigma, width or ALIGNMENT_WIDTH * adjusted.sigma)
         return self._normal_equations(state, adjusted.sigma)
 
     def _descend(self, parameters: Parameters, sigma: float, width: float, most: int) -> tuple[_State, int, bool]:

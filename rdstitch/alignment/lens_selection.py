@@ -19,8 +19,10 @@ from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.noise_model import NoiseModel
 from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.planarity import coherence
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS
+from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 LENSES: dict[str, tuple[str, ...]] = {
     "division": ("distortion",),
@@ -33,8 +35,12 @@ LENSES: dict[str, tuple[str, ...]] = {
 CENTER = np.array([name.startswith("center") for name in LENS_PARAMETERS])
 """Which of :data:`rdstitch.camera.LENS_PARAMETERS` are the distortion centre, shape (5,)."""
 
-_FARTHEST_CENTER = 0.08
-"""Half diagonals: a distortion centre farther off is no lens, but something else that it takes the blame for."""
+_FARTHEST_CENTER, _FARTHEST_CENTER_OF_CROPS = 0.08, 0.25
+"""Half diagonals: a distortion centre farther off than the first is no lens, but something else that it takes the blame
+for, or the centre of pictures that were cropped; one farther off than the second is neither."""
+
+_NO_COHERENCE = 0.3
+"""Correlation of the errors of neighbours up to which nothing else can be to blame: relief leaves more."""
 
 _SHARED_GAIN, _SHARED_GAIN_OF_SERIES = 2.5, 1.0
 """Standard deviations of the mean gain of the parts that the observations fall into, by which it must exceed 0; and
@@ -43,9 +49,10 @@ where μ is needed already, so that it is certain that λ alone does not describ
 _CELLS = 4
 """Cells per side of a link's overlap, each of which is a part where there are few links."""
 
-_ENOUGH_PICTURES = 4
-"""Pictures from which on the distortion centre is freed. In fewer a tilt and a change of height stand for it, and pairs
-like those of ``examples.paper figure5`` are registered worse with it free."""
+_ENOUGH_PICTURES, _ENOUGH_PICTURES_OF_A_MOTION = 4, 3
+"""Pictures from which on the distortion centre is freed: where every link is on its own, and where one camera explains
+all of them. In fewer a tilt and a change of height stand for it, and pairs like those of ``examples.paper figure5`` are
+registered worse with it free."""
 
 _ENOUGH_LINKS = 8
 """Links from which on each is a part."""
@@ -105,7 +112,8 @@ def choose_lens(
     """
     if not names:
         return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), apart, "given")
-    few = len(names) > 1 and _pictures(observations) < _ENOUGH_PICTURES
+    pictures = _pictures(observations)
+    few = len(names) > 1 and pictures < _ENOUGH_PICTURES
     if few:
         names = [name for name in names if name != "division-center"]
     free = [free_parameters(name) & ~(CENTER & few) for name in names]
@@ -120,12 +128,13 @@ def choose_lens(
     best = 0
     for index in range(1, len(names)):
         added = int(free[index].sum() - free[best].sum())
-        if judge.prefers(fits[index], fits[best], added, names[best]) and is_plausible(fits[index]):
+        gains = judge.prefers(fits[index], fits[best], added, names[best])
+        if gains and has_plausible_center(fits[index], observations):
             best = index
     reason = _reason(names, fits, best)
     if few:
         reason += "; too few pictures to find the distortion centre, which is taken to be the middle"
-    refinements = (CENTER,) if best == 0 and not few else ()
+    refinements = (CENTER,) if best == 0 and pictures >= _ENOUGH_PICTURES_OF_A_MOTION else ()
     return LensChoice(names[best], free[best], fits[best], reason, refinements)
 
 
@@ -133,9 +142,15 @@ def _pictures(observations: Observations) -> int:
     return len(np.unique(np.concatenate([observations.image1, observations.image2])))
 
 
-def is_plausible(adjusted: BundleAdjustmentResult) -> bool:
-    """Whether the distortion centre is where lenses have it."""
-    return bool(np.abs(adjusted.parameters.lens[CENTER]).max() < _FARTHEST_CENTER)
+def has_plausible_center(adjusted: BundleAdjustmentResult, observations: Observations) -> bool:
+    """Whether the distortion centre is where lenses have it; or farther off, and explains the errors altogether."""
+    farthest = float(np.abs(adjusted.parameters.lens[CENTER]).max())
+    if farthest < _FARTHEST_CENTER:
+        return True
+    errors = whitened_errors(observations, adjusted.homographies, adjusted.parameters.lens)
+    inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
+    agree = coherence(observations, errors, inliers).correlation
+    return farthest < _FARTHEST_CENTER_OF_CROPS and agree < _NO_COHERENCE
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.lens_selection import is_plausible
+from rdstitch.alignment.lens_selection import has_plausible_center
 from rdstitch.alignment.motion_models import HOMOGRAPHY, LOG_HEIGHT, MODELS, POSE, PSI, THETA, MotionModel, metric_poses
 from rdstitch.alignment.noise_model import EXACTNESS, NoiseModel, squared_lengths
 from rdstitch.alignment.normal_equations import whitened_errors
@@ -54,7 +54,8 @@ class ModelChoice:
 def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolArray] = ()) -> ModelChoice:
     """Adjust models from the least to the most free, and take the best.
 
-    The best two are then tried with more of the lens free: an off-centre lens acts like less regular motion.
+    The best two and the least free one are then tried with more of the lens free: an off-centre lens acts like less
+    regular motion.
 
     A homography for every link on its own leaves errors that no model of the family can undercut. Once freer models
     could not pay for their freedom even with those, they are not tried.
@@ -73,10 +74,11 @@ def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolAr
     noise = bound if len(fits) < len(names) else _noise_of_fit(problem, fits[-1])
     costs = np.array([fit_cost(noise, problem, fit) for fit in fits])
     for lens in lenses:
-        for index in np.argsort(costs, kind="stable")[:2].tolist():
+        # The least free one besides: an off-centre lens may have ruled it out.
+        for index in sorted({0, *np.argsort(costs, kind="stable")[:2].tolist()}):
             wider = problem.extend(fits[index], lens | fits[index].free_lens)
             cost = fit_cost(noise, problem, wider)
-            if cost < costs[index] and is_plausible(wider.adjusted):
+            if cost < costs[index] and has_plausible_center(wider.adjusted, problem.observations):
                 fits[index], costs[index] = wider, cost
     best = int(np.argmin(costs[: max(len(cameras), 1)]))
     if cameras and len(fits) > len(cameras) and _beyond_one_camera(problem, fits[best], fits[-1]):

@@ -216,6 +216,11 @@ class SparseNormalEquations:
                 return information
         return np.zeros_like(self.shared)
 
+    def pose_response(self) -> FloatArray:
+        """How the poses follow a unit step of each shared parameter, shape (F, S): ``-A⁻¹ B``."""
+        response: FloatArray = -self._eliminate(1e-12)[1][:, : self.coupling.shape[1]]
+        return response
+
     def _eliminate(self, damping: float) -> tuple[FloatArray, FloatArray]:
         """The Schur complement (S, S) and ``A⁻¹ [B, gradient]``."""
         right = np.column_stack([self.coupling, self.gradient_poses])

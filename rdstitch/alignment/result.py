@@ -86,6 +86,36 @@ class ReliefTest:
     explanation: str
 
 
+@dataclass(frozen=True)
+class ShapeTest:
+    """Whether the overlaps hold the shape of the whole, or it may be off where they agree.
+
+    Attributes
+    ----------
+    doubtful : bool
+        A picture may be off by more than is tolerable.
+    shown : bool
+        The errors show that something is left out; otherwise the pictures only fail to exclude it.
+    gain : float
+        By how many squared standard deviations the errors would be smaller with what is left out.
+    image : int
+        The picture that may be off the most.
+    shift, shift_std : float
+        How far that picture would move with what is left out, and the standard deviation of that, pixels; up to one
+        homography of the whole.
+    cause : str
+        What is most likely to be left out.
+    """
+
+    doubtful: bool
+    shown: bool
+    gain: float
+    image: int
+    shift: float
+    shift_std: float
+    cause: str
+
+
 @dataclass(frozen=True, repr=False)
 class Alignment:
     """All pictures registered as one.
@@ -135,6 +165,8 @@ class Alignment:
     links : tuple of LinkFit
         In the order of the links given.
     relief : ReliefTest
+    shape : ShapeTest or None
+        None for a turn on the spot, and where λ is not observable.
     messages : tuple of Message
         What the user should know of the whole: λ not observable, two cameras, ….
     """
@@ -160,6 +192,7 @@ class Alignment:
     rms: float
     links: tuple[LinkFit, ...]
     relief: ReliefTest
+    shape: ShapeTest | None = None
     messages: tuple[Message, ...] = ()
 
     def __repr__(self) -> str:

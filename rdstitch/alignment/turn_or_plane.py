@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.lens_selection import is_plausible
+from rdstitch.alignment.lens_selection import has_plausible_center
 from rdstitch.alignment.model_selection import ModelChoice, choose_model, fit_cost, noise_of_links, price
 from rdstitch.alignment.motion_models import RIGID
 from rdstitch.alignment.noise_model import EXACTNESS, NoiseModel
@@ -78,7 +78,8 @@ def _choice(problem: Problem, noise: NoiseModel, turned: Fit, lenses: Sequence[B
     """The turn, with more of the lens free where that pays."""
     for lens in lenses:
         wider = problem.extend(turned, lens | turned.free_lens)
-        if fit_cost(noise, problem, wider) < fit_cost(noise, problem, turned) and is_plausible(wider.adjusted):
+        plausible = has_plausible_center(wider.adjusted, problem.observations)
+        if plausible and fit_cost(noise, problem, wider) < fit_cost(noise, problem, turned):
             turned = wider
     return ModelChoice(turned, f"{ROTATION.name}: {reason}", noise.overdispersion)
 

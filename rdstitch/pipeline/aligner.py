@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
-from rdstitch.alignment.result import LinkFit, PlanarPoses, ReliefTest
+from rdstitch.alignment.result import LinkFit, PlanarPoses, ReliefTest, ShapeTest
 from rdstitch.arrays import FloatArray
 from rdstitch.cache import Cache
 from rdstitch.camera import Camera
@@ -87,7 +87,7 @@ class Aligner:
             raise RegistrationError(_no_overlap(self.paths, pairs))
         inputs = (self.cameras, self.cache.digest(links), self.options)
         compute = partial(align, self.cameras, links, self.options)
-        kinds = (Alignment, Camera, LinkFit, PlanarPoses, ReliefTest, Message)
+        kinds = (Alignment, Camera, LinkFit, PlanarPoses, ReliefTest, ShapeTest, Message)
 
         def valid(alignment: Alignment) -> bool:
             count = len(self.cameras)

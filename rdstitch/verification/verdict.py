@@ -1,5 +1,6 @@
 """Every run judges itself: can the result be relied on?"""
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -98,6 +99,7 @@ def judge(
     return (
         *_error_of_the_whole(alignment, threshold, checked),
         *(parallax_messages(paths, parallax) or _relief(paths, alignment)),
+        *([] if lens_only else _shape(paths, alignment)),
         *([] if lens_only else _pattern(ambiguous, checked)),
         *(suspicions[pair] for pair in decisive),
         *_outvoted(paths, [pair for pair in suspicions if pair not in decisive]),
@@ -130,6 +132,22 @@ def _relief(paths: Sequence[str], alignment: Alignment) -> list[Message]:
     first, second = names_of(images)
     text = f"{alignment.relief.explanation}; most of all between {first} and {second} ({worst.rms:.1f} pixels)"
     return [Message(text, images, code="parallax" if alignment.on_sphere else "relief")]
+
+
+def _shape(paths: Sequence[str], alignment: Alignment) -> list[Message]:
+    """A shape of the whole that the overlaps do not hold, and the picture that may be off the most."""
+    shape = alignment.shape
+    if shape is None or not shape.doubtful:
+        return []
+    image = paths[shape.image]
+    size = f"about {math.hypot(shape.shift, shape.shift_std):.0f} pixels in the whole, though its overlaps agree"
+    if shape.shown:
+        text = f"may be off by {size}: the errors have a pattern that was not modelled, most likely {shape.cause}"
+    else:
+        text = (
+            f"may be off by {size}: the pictures cannot exclude {shape.cause}; give the lens, or more rows of pictures"
+        )
+    return [Message(text, (image,), code="shape")]
 
 
 def _agreement_of_all(used: Sequence[LinkFit]) -> list[Message]:

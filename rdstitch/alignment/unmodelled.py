@@ -1,0 +1,122 @@
+"""What no model of the family describes, as small changes of the measured points that undo it.
+
+A lens whose axis is off the middle, pictures that were cropped, rows that are read one after the other while the camera
+moves, a surface that is curved: where such a thing is small, pictures of it are those of the model with their points
+moved a little.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from rdstitch.alignment.adjustment_problem import Fit
+from rdstitch.alignment.lens_selection import CENTER
+from rdstitch.alignment.motion_models import LOG_HEIGHT, PlanarModel, X, Y, inverses, metric_poses
+from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.division_model import distort, undistort
+from rdstitch.radial_homography import project
+
+Correction = Callable[[FloatArray, IntArray, float], FloatArray]
+"""Takes measured points (M, 2), half diagonals, the picture of each (M,), and the size of the effect to the points that
+the model would have measured."""
+
+OFF_CENTER = "a lens whose axis is off the middle (were the pictures cropped?)"
+OTHER_LENS = "a lens of another kind"
+ROLLING_SHUTTER = "rows that were read while the camera moved (a rolling shutter)"
+CURVED = "a curved surface"
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One thing that is not modelled.
+
+    Attributes
+    ----------
+    cause : str
+        Which kind of thing it is.
+    correct : callable
+    std : float
+        How large it may be where nothing is known of it.
+    """
+
+    cause: str
+    correct: Correction
+    std: float
+
+
+def unmodelled_effects(fit: Fit) -> list[Effect]:
+    """What a fit leaves out: of its lens, of the shutter, and of the ground where poses are metric."""
+    lens, free = fit.adjusted.parameters.lens, fit.free_lens
+    effects = []
+    if not free[CENTER].any():
+        effects += [Effect(OFF_CENTER, _shifted(axis), 0.03) for axis in (0, 1)]
+    if not free[1]:
+        effects.append(Effect(OTHER_LENS, _bent(lens), 0.03))
+    # The camera's motion shears and stretches what its rows see, and so do pixels that are no squares.
+    effects += [Effect(ROLLING_SHUTTER, _sheared(np.array(matrix)), 0.01) for matrix in _SHEARS]
+    if isinstance(fit.model, PlanarModel):
+        effects += [Effect(CURVED, _curved(fit, axes), 0.05) for axes in ((0, 0), (0, 1), (1, 1))]
+    return effects
+
+
+_SHEARS = ([[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [0.0, 0.0]])
+
+
+def _shifted(axis: int) -> Correction:
+    """The distortion centre lies elsewhere."""
+    direction = np.eye(2)[axis]
+
+    def correct(points: FloatArray, pictures: IntArray, size: float) -> FloatArray:
+        moved: FloatArray = points - size * direction
+        return moved
+
+    return correct
+
+
+def _bent(lens: FloatArray) -> Correction:
+    """μ is another one."""
+    center, (first, second, third) = lens[CENTER], lens[~CENTER].tolist()
+
+    def correct(points: FloatArray, pictures: IntArray, size: float) -> FloatArray:
+        flat = undistort(points - center, first, (second + size, third))
+        moved: FloatArray = distort(flat, first, (second, third)) + center
+        return moved
+
+    return correct
+
+
+def _sheared(matrix: FloatArray) -> Correction:
+    """The picture is changed linearly."""
+
+    def correct(points: FloatArray, pictures: IntArray, size: float) -> FloatArray:
+        moved: FloatArray = points + size * points @ matrix.T
+        return moved
+
+    return correct
+
+
+def _curved(fit: Fit, axes: tuple[int, int]) -> Correction:
+    """The ground is a paraboloid, its height one half of ``size`` times two coordinates, in heights of the camera."""
+    adjusted = fit.adjusted
+    poses = metric_poses(adjusted.parameters.poses, adjusted.parameters.shared)
+    position, height = poses[:, [X, Y]], np.exp(poses[:, LOG_HEIGHT])
+    to_picture, middle = adjusted.matrices.matrices, position.mean(axis=0)
+    to_ground = inverses(to_picture)
+    lens = adjusted.parameters.lens
+    distortion, higher, center = float(lens[0]), tuple(lens[1:3].tolist()), lens[CENTER]
+
+    def correct(points: FloatArray, pictures: IntArray, size: float) -> FloatArray:
+        foot = mapped(to_ground[pictures], undistort(points - center, distortion, higher))
+        a, b = (foot - middle)[:, axes].T
+        below = position[pictures]
+        place = below + (foot - below) * (1.0 - 0.5 * size * a * b / height[pictures])[:, None]
+        moved: FloatArray = distort(mapped(to_picture[pictures], place), distortion, higher) + center
+        return moved
+
+    return correct
+
+
+def mapped(homographies: FloatArray, points: FloatArray) -> FloatArray:
+    """Points (M, 2), each by its own homography (M, 3, 3)."""
+    return project(np.einsum("mij,mj->mi", homographies[:, :, :2], points) + homographies[:, :, 2])

@@ -1,0 +1,74 @@
+"""Whether the shape of the whole is known: what bends every overlap alike is seen, and nothing where nothing is."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from rdstitch.alignment import Alignment, AlignmentOptions, align
+from rdstitch.alignment.motion_models import X
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
+from tests.alignment_scenes import Scene, grid, scene
+
+
+def _row(count: int = 6, **options: object) -> Scene:
+    rng = np.random.default_rng(3)
+    poses = grid(count, 1, (0.45, 0.0), 0.1, rng)
+    return scene(poses, rng=rng, reach=1, overlap=0.1, outliers=0.0, noise=0.2, **options)  # type: ignore[arg-type]
+
+
+def _aligned(row: Scene, **options: object) -> Alignment:
+    return align(row.cameras, row.links, AlignmentOptions(**options))  # type: ignore[arg-type]
+
+
+def _sheared(row: Scene, amount: float) -> Scene:
+    """The rows of the pictures read one after another, while the camera moves across them."""
+
+    def shear(points: FloatArray) -> FloatArray:
+        moved: FloatArray = points + amount * (points[:, 1:] - row.cameras[0].center[1]) * np.array([0.0, 1.0])
+        return moved
+
+    links = [replace(link, points1=shear(link.points1), points2=shear(link.points2)) for link in row.links]
+    return replace(row, links=links)
+
+
+def test_a_plain_row_is_not_doubted() -> None:
+    found = _aligned(_row()).shape
+    assert found is not None
+    assert not found.doubtful
+    assert not found.shown
+    assert np.hypot(found.shift, found.shift_std) < 2.0
+
+
+def test_a_rolling_shutter_is_shown_and_named() -> None:
+    found = _aligned(_sheared(_row(), 0.06), lens="division").shape
+    assert found is not None
+    assert found.doubtful
+    assert found.shown
+
+
+def test_an_off_center_lens_is_found_in_three_pictures_or_shown() -> None:
+    size = (640, 480)
+    lens = Camera(size, distortion=-0.25, center=(319.5 + 48.0, 239.5 + 30.0))
+    row = _row(4, lens=lens)
+    freed = _aligned(row)
+    assert np.abs(np.array(freed.cameras[0].center) - lens.center).max() < 8.0
+    assert freed.shape is not None
+    assert not freed.shape.doubtful
+    held = _aligned(row, lens="division").shape
+    assert held is not None
+    assert held.shown
+    assert "axis is off the middle" in held.cause
+
+
+def test_what_the_pictures_cannot_exclude_is_said() -> None:
+    """Of a long row with few matches nobody knows whether it is bent."""
+    rng = np.random.default_rng(3)
+    poses = grid(14, 1, (0.85, 0.0), 0.02, rng)
+    row = scene(poses, rng=rng, reach=1, overlap=0.05, outliers=0.0, noise=0.6, per_link=30)
+    assert poses[:, X].std() > 1.0
+    found = _aligned(row).shape
+    assert found is not None
+    assert found.doubtful
+    assert not found.shown
+    assert found.image in (0, 13)
