@@ -13,7 +13,7 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.lens_selection import has_plausible_center
 from rdstitch.alignment.model_selection import ModelChoice, choose_model, fit_cost, noise_of_links, price
-from rdstitch.alignment.motion_models import RIGID
+from rdstitch.alignment.motion_models import RIGID, SIMILARITY
 from rdstitch.alignment.noise_model import EXACTNESS, NoiseModel
 from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.arrays import BoolArray
@@ -54,7 +54,8 @@ def choose_motion(problem: Problem, names: Sequence[str], lenses: Sequence[BoolA
         f"place would look the same); it leaves an error of {turned.adjusted.sigma:.2f} px"
     )
     sigma = math.hypot(turned.adjusted.sigma, EXACTNESS)
-    if _turns_far(turned) and sigma < max(_AS_GOOD * bound.noise, parallax):
+    as_good = sigma < _AS_GOOD * bound.noise
+    if _turns_far(turned) and (as_good or (sigma < parallax and not _is_over_plane(problem, bound))):
         return _choice(problem, bound, turned, lenses, explained)
     if not possible:
         return choose_model(problem, planar, lenses)
@@ -66,6 +67,15 @@ def choose_motion(problem: Problem, names: Sequence[str], lenses: Sequence[BoolA
     other = over_plane.fit
     gains = f"{explained}, more freedom gains too little ({other.model.name} {other.adjusted.sigma:.2f} px)"
     return _choice(problem, bound, turned, lenses, gains)
+
+
+def _is_over_plane(problem: Problem, noise: NoiseModel) -> bool:
+    """Whether a camera that keeps its tilt over a plane explains the pictures as well as pairs on their own do.
+
+    A row of pictures over a plane can be bent into a turn with an odd lens; parallax does not make a plane of a turn.
+    """
+    fits = (problem.fit(model) for model in (RIGID, SIMILARITY))
+    return any(math.hypot(fit.adjusted.sigma, EXACTNESS) < _AS_GOOD * noise.noise for fit in fits)
 
 
 def _turns_far(turned: Fit) -> bool:
