@@ -92,6 +92,7 @@ def plan_panorama(
     rotate: float = 0.0,
     reference: int | None = None,
     names: Sequence[str] | None = None,
+    max_stretch: float = math.inf,
 ) -> Canvas:
     """Plan the canvas that holds every picture of a panorama.
 
@@ -104,6 +105,9 @@ def plan_panorama(
         "plane", "cylinder", "sphere", "mercator", or "auto": what suits the field of view.
     scale, rotate, reference, names
         As for :func:`rdstitch.compositing.plan_canvas`.
+    max_stretch : float
+        What the projection would stretch more than so many times has no place on the canvas: the ends of a plane, the
+        top and the bottom of a cylinder. Without a limit, pictures that look too far up or down are refused.
 
     Raises
     ------
@@ -115,14 +119,36 @@ def plan_panorama(
     seen = seen_directions(cameras, directions)
     chosen = choose_projection(seen) if projection == "auto" else Projection(projection)
     if chosen == PLANE:
-        return plan_canvas(cameras, directions, scale=scale, rotate=rotate, reference=reference, names=names)
+        return plan_canvas(
+            cameras,
+            directions,
+            scale=scale,
+            rotate=rotate,
+            reference=reference,
+            names=names,
+            max_stretch=max_stretch,
+        )
     called = [f"picture {k + 1}" for k in range(len(cameras))] if names is None else list(names)
     lengths = np.linalg.norm(directions, axis=1)
     focal = lengths[:, 2] / lengths[:, 0] * [camera.half_diagonal for camera in cameras]
     resolution = scale * float(np.median(focal) if reference is None else focal[reference])
+    if max_stretch < math.inf:
+        seen = _within(seen, chosen.latitude_limit(max_stretch), called)
     canvas = _lay_out(seen, chosen, resolution, rotate, called)
     refuse_scale(cameras, np.array(canvas.size, dtype=np.float64))
     return canvas
+
+
+def _within(seen: SeenDirections, limit: float, names: Sequence[str]) -> SeenDirections:
+    """The part of a field of view up to a latitude, radians, above and below the horizon."""
+    for outline, name in zip(seen.outlines, names, strict=True):
+        if not (outline[:, 1].min() < limit and outline[:, 1].max() > -limit):
+            raise LimitError(
+                f"{name}: looks so far up or down that all of it would be stretched beyond the limit; "
+                "use --projection sphere, or raise --max-stretch"
+            )
+    outlines = (np.column_stack([outline[:, 0], np.clip(outline[:, 1], -limit, limit)]) for outline in seen.outlines)
+    return SeenDirections(tuple(outlines), seen.around)
 
 
 def _lay_out(

@@ -12,6 +12,7 @@ mercator  (longitude, asinh tan latitude)   keeps shapes; between cylinder and s
 ========= ================================= ==================================================
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,6 +43,16 @@ class Projection:
     def largest_latitude(self) -> float:
         """What it can show without absurd stretching, radians."""
         return {"plane": 0.45, "cylinder": 0.42, "mercator": 0.47, "sphere": 0.5}[self.name] * np.pi
+
+    def latitude_limit(self, max_stretch: float) -> float:
+        """Latitude, radians, up to which it stretches pictures no more than so many times, in no direction.
+
+        The sphere has none: it stretches poles beyond all measure, and is there to show them.
+        """
+        if self.name == "sphere":
+            return 0.5 * np.pi
+        stretch = max_stretch if self.name == "mercator" else math.sqrt(max_stretch)
+        return min(math.acos(1.0 / stretch), self.largest_latitude)
 
     def project(self, directions: FloatArray) -> FloatArray:
         """Places (..., 2) of directions (..., 3) of any length; NaN where there are none."""

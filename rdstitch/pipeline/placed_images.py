@@ -103,6 +103,7 @@ def _plan(placed: PlacedImages, options: CompositeOptions, scale: float) -> Canv
             rotate=options.rotate,
             reference=placed.reference,
             names=names,
+            max_stretch=options.max_stretch,
         )
     if options.projection not in ("auto", "plane"):
         raise ArgumentError(

@@ -128,3 +128,24 @@ def test_orientation_in_exif_says_what_is_down(tmp_path: Path) -> None:
     assert result.registration.sources[0].camera.image_size == (240, 320)
     axes = result.registration.alignment.homographies[:, :, 1]  # what is down in the pictures
     assert (axes[:, 1] > 0.95).all()
+
+
+def test_deep_zoom_of_a_full_turn_is_joined_at_the_edge(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
+    plain, tiles = tmp_path / "around.png", tmp_path / "around.dzi"
+    assert rdstitch("pano", *around, "-o", plain).status == 0
+    arguments = ("--images", around[0].parent, "-o", tiles, "--max-memory", "200M")
+    assert rdstitch("apply", f"{plain}.json", *arguments).status == 0
+    with Image.open(plain) as picture:
+        whole = np.asarray(picture.convert("RGB")).astype(float)
+    height, width = whole.shape[:2]
+    levels = sorted((tmp_path / "around_files").iterdir(), key=lambda folder: int(folder.name))
+    last = max(int(tile.stem.split("_")[0]) for tile in levels[-1].iterdir())
+    ends = []
+    for column, side in ((0, 0), (last, -1)):
+        with Image.open(next(iter(levels[-1].glob(f"{column}_0.*")))) as tile:
+            ends.append(np.asarray(tile.convert("RGB")).astype(float)[:, side])
+    rows = slice(60, 200)
+    assert np.abs(ends[0] - ends[1])[rows].mean() < 1.5 * np.abs(np.diff(whole[60:200], axis=1)).mean()
+    # The same picture, but for the compression of the tiles.
+    assert np.abs(ends[0][rows] - whole[rows, 0]).mean() < 6.0
+    assert (width, height) == tuple(json.loads((tmp_path / "around.dzi.json").read_text("utf-8"))["output"]["size"])

@@ -114,6 +114,26 @@ def test_what_a_projection_cannot_show_is_refused_by_name() -> None:
         plan_panorama([LENS] * 9, around, projection="plane")
 
 
+@pytest.mark.parametrize("name", ["plane", "cylinder", "mercator"])
+def test_nothing_is_stretched_beyond_the_limit(name: str) -> None:
+    rotations = camera_rotations([-0.6, -0.2, 0.2, 0.6], [0.0, 0.6, 0.6, 0.0], 0.05)
+    directions = _directions(rotations)
+    free = plan_panorama([LENS] * 4, directions, projection=name, reference=0)
+    near = plan_panorama([LENS] * 4, directions, projection=name, reference=0, max_stretch=1.5)
+    assert near.size[1] < 0.8 * free.size[1]
+    if name != "plane":
+        x, y = np.zeros(1), np.array([(-0.5 - near.matrix[1, 2]) / near.matrix[0, 0]])
+        top = np.array([float(part[0]) for part in np.broadcast_arrays(*near.projection.directions(x, y))])
+        cosine = np.hypot(top[0], top[2]) / np.linalg.norm(top)
+        assert cosine ** -(1 if name == "mercator" else 2) == pytest.approx(1.5, rel=0.01)
+
+
+def test_a_picture_that_is_stretched_everywhere_is_refused_by_name() -> None:
+    up = _directions(camera_rotations([0.0, 0.5], [0.0, 1.2]))
+    with pytest.raises(LimitError, match=r"b.png.*--projection sphere, or raise --max-stretch"):
+        plan_panorama([LENS] * 2, up, projection="cylinder", names=["a.png", "b.png"], max_stretch=1.2)
+
+
 # "balanced" keeps regions near the brightness of their own pictures, and so depends on which of them the extension of
 # the canvas shows twice; what it may not do is to leave a step at the edge.
 OPTIONS = {
