@@ -1,35 +1,37 @@
 """Which pairs of pictures to match, so that the cost does not grow with the square of their number.
 
-Up to :data:`EXHAUSTIVE_UP_TO` pictures every pair is compared. Beyond, pictures that follow one another and pictures
-that look alike. Of these, each picture is registered with those that matter for its place; and once poses are known,
-with those that the poses put beside it and that close a loop.
+Up to :data:`EXHAUSTIVE_UP_TO` pictures every pair is compared. Beyond, pictures that follow one another, that were
+taken near each other, and that look alike. Of these, each picture is registered with those that matter for its place;
+and once poses are known, with those that the poses put beside it and that close a loop.
 """
 
-import warnings
 from collections.abc import Mapping, Sequence
-from itertools import combinations
+from itertools import combinations, islice
 from typing import Protocol, TypeVar
 
 import numpy as np
+from scipy import sparse
 from scipy.spatial import KDTree
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.features import Features
+from rdstitch.matching.retrieval import Similarity, similarity
 from rdstitch.radial_homography import to_plane
 
 EXHAUSTIVE_UP_TO = 30
 """Number of pictures up to which every pair is tried."""
 
+CANDIDATES = 15
+"""Other pictures that one is compared with, in the mean: the sides and corners of a survey's frame, twice over."""
+
 _FOLLOWING = 3  # pictures after each one that are tried
-_LOOKALIKES = 6  # pictures that look most alike that are tried for each one
+_LOOKALIKES = 4  # pictures most like each one that are tried, whatever the others are like
+_NEAREST = 8  # pictures taken nearest to each one that are tried
 _NEIGHBOURS = 10  # nearest pictures in the plane that are considered for each one
 _LEAST_OVERLAP = 0.15  # share of the smaller footprint
 _PARTNERS = 6  # pairs of a picture that its place is found by; those that others choose come on top
 _CELLS_ASIDE = 4  # cells of a picture, a side, that its partners are to cover
-_WORDS = 64
-_TRAINING = 20000  # descriptors that the words are learned from
-_DESCRIBING = 1000  # strongest features that describe a picture
 
 Pairs = list[tuple[int, int]]
 
@@ -50,51 +52,65 @@ class PointsOfTwo(Protocol):
         ...
 
 
-def first_pairs(features: Sequence[Features], seed: int) -> Pairs:
+def first_pairs(features: Sequence[Features], seed: int, positions: FloatArray | None = None) -> Pairs:
     """Pairs (i, j), i < j, to try before anything is known of the poses.
+
+    Beyond :data:`EXHAUSTIVE_UP_TO` pictures, they are at most :data:`CANDIDATES` a picture in the mean, unless
+    positions ask for more: pictures that follow one another where the order means something, those that were taken
+    nearest to each other, a few that each picture is most alike to, and those that are most alike of all.
 
     Parameters
     ----------
     features : sequence of Features
         One a picture, in the order in which the pictures were taken, if there is one.
     seed : int
+    positions : ndarray of shape (N, 2) or (N, 3), optional
+        Where each picture was taken, in any unit; NaN where that is not known.
     """
     count = len(features)
     if count <= EXHAUSTIVE_UP_TO:
         return list(combinations(range(count), 2))
-    pairs = {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + _FOLLOWING, count))}
-    return sorted(pairs | lookalikes(features, seed))
+    alike = similarity(features, seed)
+    chosen = set() if positions is None else _nearest_positions(positions)
+    if alike is None or alike.ordered:
+        chosen |= {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + _FOLLOWING, count))}
+    if alike is not None:
+        chosen |= _alike_to_each(alike, {i for i, found in enumerate(features) if len(found)})
+        chosen |= _most_alike(alike, chosen, CANDIDATES * count // 2)
+    return sorted(chosen)
 
 
-def lookalikes(features: Sequence[Features], seed: int) -> set[tuple[int, int]]:
-    """Pairs of pictures whose features are most alike, by vectors of locally aggregated descriptors (VLAD).
+def _alike_to_each(alike: Similarity, known: set[int]) -> set[tuple[int, int]]:
+    """Pairs of each picture with those most like it; in a sequence with those before and after which there are less.
 
-    Each picture's descriptors are assigned to the nearest of a few words, learned from the pictures themselves; the
-    residuals are added up per word, square-rooted, normalized per word and as a whole (Arandjelović and Zisserman
-    2013). One matrix product then compares all pictures.
+    Neighbours in the sequence would otherwise hide the places where it crosses itself.
     """
-    counts = np.array([min(len(found), _DESCRIBING) for found in features])
-    total = int(counts.sum())
-    if total < _WORDS * 10:
-        return set()
-    random = np.random.default_rng([seed, 2])
-    chosen = np.sort(random.choice(total, min(_TRAINING, total), replace=False))
-    starts = np.cumsum(counts) - counts
-    own = np.split(chosen, np.searchsorted(chosen, starts[1:]))
-    training = np.concatenate(
-        [_describing(found)[part - start] for found, part, start in zip(features, own, starts, strict=True)]
-    )
-    # Imported late: only large sets need it.
-    from scipy.cluster.vq import kmeans2
+    chosen = set()
+    for i, (row, peak) in enumerate(zip(alike.most_alike.tolist(), alike.peak.tolist(), strict=True)):
+        if alike.ordered:
+            row = [j for j, own in zip(row, peak, strict=True) if own and abs(i - j) > _FOLLOWING]
+        chosen |= {(min(i, j), max(i, j)) for j in row[:_LOOKALIKES] if i in known and j in known}
+    return chosen
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a word that no descriptor is nearest to does no harm
-        words, _ = kmeans2(training, _WORDS, iter=8, minit="points", rng=random)
-    vectors = np.stack([_aggregate(_describing(found), words) for found in features])
-    alike = vectors @ vectors.T
-    np.fill_diagonal(alike, -np.inf)
-    best = np.argsort(-alike, axis=1, kind="stable")[:, :_LOOKALIKES]
-    return {(min(i, j), max(i, j)) for i, row in enumerate(best.tolist()) for j in row if len(features[i])}
+
+def _most_alike(alike: Similarity, chosen: set[tuple[int, int]], total: int) -> set[tuple[int, int]]:
+    """The pairs most alike of all besides those chosen, so many that there are ``total`` of both."""
+    scores = sparse.triu(alike.scores, k=1).tocoo()
+    best = np.argsort(-scores.data, kind="stable")
+    best = best[scores.data[best] > 0.0]
+    others = (pair for pair in zip(scores.row[best].tolist(), scores.col[best].tolist(), strict=True))
+    return set(islice((pair for pair in others if pair not in chosen), max(total - len(chosen), 0)))
+
+
+def _nearest_positions(positions: FloatArray) -> set[tuple[int, int]]:
+    """Pairs of pictures that were taken nearest to each other."""
+    known = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    if len(known) < 2:
+        return set()
+    places = positions[known]
+    nearest = KDTree(places).query(places, k=min(_NEAREST + 1, len(known)))[1].reshape(len(known), -1)
+    pairs = np.sort(np.stack([np.repeat(known, nearest.shape[1]), known[nearest.ravel()]], axis=1), axis=1)
+    return {(i, j) for i, j in pairs.tolist() if i != j}
 
 
 def pairs_that_matter(
@@ -167,24 +183,6 @@ def neighbours(cameras: Sequence[Camera], homographies: FloatArray, tried: set[t
             if _overlap(boxes[a], boxes[b]) >= _LEAST_OVERLAP:
                 found.add(pair)
     return sorted(found)
-
-
-def _describing(features: Features) -> FloatArray:
-    """The descriptors that stand for a picture."""
-    descriptors = features.descriptors[:_DESCRIBING]
-    return (np.unpackbits(descriptors.astype(np.uint8), axis=1) if features.binary else descriptors).astype(np.float64)
-
-
-def _aggregate(descriptors: FloatArray, words: FloatArray) -> FloatArray:
-    """One unit vector of a picture's descriptors."""
-    distances = (words**2).sum(axis=1) - 2.0 * descriptors @ words.T
-    nearest = distances.argmin(axis=1)
-    sums = np.zeros_like(words)
-    np.add.at(sums, nearest, descriptors - words[nearest])
-    sums = np.sign(sums) * np.sqrt(np.abs(sums))
-    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
-    vector = sums.ravel()
-    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-12))
 
 
 def _footprint(camera: Camera, homography: FloatArray) -> FloatArray:

@@ -12,6 +12,7 @@ from rdstitch.alignment.reference_frame import frontal_reference, in_frame_of
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.cache import Cache
 from rdstitch.features import LightGlue, Matcher, match
+from rdstitch.inputs.positions import positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import first_pairs
 from rdstitch.matching.mixed_lenses import separate_lenses
@@ -79,7 +80,7 @@ def register(
     detected = rendered.detected
     cameras = [at_working_size(source.camera, options.features.limits[1]) for source in sources]
     features = detected.features.at_sizes([camera.image_size for camera in cameras])
-    candidates = first_pairs(features, options.seed)
+    candidates = first_pairs(features, options.seed, positions_of(sources))
     pairing = Pairing(
         features,
         cameras,

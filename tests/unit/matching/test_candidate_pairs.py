@@ -4,18 +4,20 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.features import Features
 from rdstitch.features.keypoints import Descriptors
 from rdstitch.matching.candidate_pairs import (
+    CANDIDATES,
     EXHAUSTIVE_UP_TO,
     first_pairs,
-    lookalikes,
     neighbours,
     pairs_that_matter,
 )
+from rdstitch.matching.retrieval import similarity
 
 
 def _features(descriptors: Descriptors) -> Features:
@@ -56,10 +58,66 @@ def test_the_number_of_pairs_grows_with_the_number_of_frames_not_with_its_square
     assert 3.0 < many / few < 5.0
 
 
+def _survey(side: int, order: NDArray[np.intp]) -> tuple[list[Features], set[tuple[int, int]]]:
+    """Pictures of a plane, side by side, half over one another, in some order; pairs that overlap by a quarter."""
+    rng = np.random.default_rng(8)
+    corners = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2) * 0.5
+    corners = corners[order] + rng.uniform(-0.02, 0.02, (side**2, 2))
+    places = rng.uniform(0.0, side / 2 + 1.0, ((10 * side) ** 2, 2))
+    words = rng.normal(size=(len(places), 64)).astype(np.float32)
+    pictures = []
+    for corner in corners:
+        seen = words[((places > corner) & (places < corner + 1.0)).all(axis=1)]
+        repeated = seen[rng.random(len(seen)) < 0.7]  # no detector finds all of them again
+        pictures.append(_features(repeated + 0.3 * rng.normal(size=repeated.shape).astype(np.float32)))
+    shared = np.maximum(1.0 - np.abs(corners[:, None] - corners), 0.0).prod(axis=2)
+    return pictures, {(i, j) for i, j in np.argwhere(shared > 0.22).tolist() if i < j}
+
+
+@pytest.mark.parametrize("ordered", [False, True])
+def test_pairs_that_overlap_are_among_fifteen_candidates_a_picture(ordered: bool) -> None:
+    side = 16
+    order = np.arange(side**2) if ordered else np.random.default_rng(3).permutation(side**2)
+    pictures, overlapping = _survey(side, order)
+    pairs = set(first_pairs(pictures, seed=0))
+    assert len(overlapping) > 3 * side**2
+    assert 2 * len(pairs) <= CANDIDATES * side**2
+    assert CANDIDATES <= 15
+    assert len(overlapping & pairs) >= 0.98 * len(overlapping)
+
+
+def test_the_order_of_pictures_counts_only_where_it_means_something() -> None:
+    side = 9
+    following = {(i, i + 3) for i in range(side**2 - 3)}
+    ordered, _ = _survey(side, np.arange(side**2))
+    assert following < set(first_pairs(ordered, seed=0))
+    shuffled, _ = _survey(side, np.random.default_rng(4).permutation(side**2))
+    assert not following < set(first_pairs(shuffled, seed=0))
+
+
+def test_the_same_features_and_seed_give_the_same_pairs() -> None:
+    pictures, _ = _survey(7, np.random.default_rng(5).permutation(49))
+    assert first_pairs(pictures, seed=3) == first_pairs(pictures, seed=3)
+
+
+def test_pictures_taken_near_each_other_are_paired_whatever_they_look_like() -> None:
+    rng = np.random.default_rng(0)
+    count = 60
+    pictures = [_features(rng.normal(size=(30, 64)).astype(np.float32)) for _ in range(count)]
+    turn = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    positions = np.column_stack([np.cos(turn), np.sin(turn)])[rng.permutation(count)]
+    positions[7] = np.nan
+    pairs = set(first_pairs(pictures, seed=0, positions=positions))
+    near = np.linalg.norm(positions[:, None] - positions, axis=2) < 0.35
+    assert {(i, j) for i, j in np.argwhere(near).tolist() if i < j} < pairs
+    assert len({pair for pair in pairs if 7 in pair}) < count - 1
+
+
 def test_pictures_without_features_look_like_none() -> None:
     nothing = _features(np.zeros((0, 64), dtype=np.float32))
-    assert lookalikes([nothing] * 40, seed=1) == set()
-    assert len(first_pairs([nothing, *_drive(34)], seed=1)) > 34
+    pairs = first_pairs([nothing, *_drive(34)], seed=1)
+    assert len(pairs) > 34
+    assert [pair for pair in pairs if 0 in pair] == [(0, 1), (0, 2), (0, 3)]
 
 
 @pytest.mark.parametrize(("overlap", "found"), [(0.1, []), (0.2, [(0, 1)]), (0.5, [(0, 1)]), (0.9, [(0, 1)])])
@@ -141,11 +199,11 @@ def test_neighbours_with_partners_in_common_are_not_tried_again_but_loops_are_cl
 
 
 def test_too_few_features_for_words_look_like_none() -> None:
-    """Sixty-four words are learned from ten times as many descriptors, or not at all."""
+    """Words are learned from 640 descriptors or more, or not at all."""
     rng = np.random.default_rng(0)
     pictures = [_features(rng.normal(size=(16, 64)).astype(np.float32)) for _ in range(39)]
-    assert lookalikes(pictures, seed=1) == set()
-    assert lookalikes([*pictures, pictures[0]], seed=1) != set()
+    assert similarity(pictures, seed=1) is None
+    assert similarity([*pictures, pictures[0]], seed=1) is not None
 
 
 def test_pictures_that_look_like_none_are_paired_with_the_three_that_follow() -> None:
