@@ -22,7 +22,7 @@ _GROUPS = {
         "view",
         "quiet",
     ),
-    "Input": ("every", "exclude", "include_only", "match", "topic", "timestamps"),
+    "Input": ("following", "idle", "refresh", "every", "exclude", "include_only", "match", "topic", "timestamps"),
     "Camera": ("distortion", "lens_model", "lens", "tilt", "attitude", "attitude_std", "save_camera"),
     "Features and registration": (
         "features",

@@ -19,7 +19,12 @@ class UserPath(click.Path):
         super().__init__(path_type=Path, readable=False, allow_dash=allow_dash)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Replace ``~`` and make a path; a file whose name begins with it is written ``./~name``."""
+        """Replace ``~`` and make a path; a file whose name begins with it is written ``./~name``.
+
+        An address stays text: as a path it would lose one of its slashes.
+        """
+        if "://" in str(value):
+            return value
         path = super().convert(value, param, ctx)
         try:
             return path.expanduser() if isinstance(path, Path) else path

@@ -146,7 +146,7 @@ def _command_line() -> str:
 def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = False) -> None:
     """λ and the plan of a dry run, or the sidecar, to standard output; what the user must know to standard error."""
     reporter.finish()
-    _warn_of(result.registration, reporter)
+    warn_of(result.registration, reporter)
     if as_json:
         from rdstitch.sidecar.write import sidecar
 
@@ -180,7 +180,7 @@ def _duration(seconds: float) -> str:
 def report_registration(registration: "Registration", reporter: Reporter, *, as_json: bool = False) -> None:
     """λ, or the camera, to standard output; pictures left out to standard error."""
     reporter.finish()
-    _warn_of(registration, reporter)
+    warn_of(registration, reporter)
     if as_json:
         from rdstitch.sidecar.write import plain
 
@@ -189,7 +189,7 @@ def report_registration(registration: "Registration", reporter: Reporter, *, as_
         _echo_lambda(registration)
 
 
-def _warn_of(registration: "Registration", reporter: Reporter) -> None:
+def warn_of(registration: "Registration", reporter: Reporter) -> None:
     """What the user must know of a registration."""
     alignment = registration.alignment
     for message in (*registration.failures, *registration.warnings, *registration.left_out):

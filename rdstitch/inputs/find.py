@@ -106,7 +106,7 @@ def find_pictures(
     frames: list[Frame] = []
     outputs: list[Path] = []
     for frame, named in _expand(arguments, frames_folder, every, topic):
-        is_output = frame.picture is None and _is_rdstitch_output(frame.path)
+        is_output = frame.picture is None and is_rdstitch_output(frame.path)
         if _entry(frame.path) in unwanted and (is_output or not named):
             continue
         if is_output and not named:
@@ -182,8 +182,14 @@ def names_in(text: str) -> list[str]:
     return [name for name in names if name]
 
 
-def _in_folder(folder: Path) -> list[Path]:
-    """The pictures of a folder, and those that nobody here can read: who reads them will say so."""
+def pictures_in(folder: Path) -> list[Path]:
+    """The pictures of a folder in natural order, and those that nobody here can read: who reads them will say so.
+
+    Raises
+    ------
+    InputError
+        When the folder cannot be read.
+    """
     try:
         entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
     except OSError as error:
@@ -194,9 +200,15 @@ def _in_folder(folder: Path) -> list[Path]:
     found += [
         path for path in entries if path.suffix.lower() in HEIF_SUFFIXES | RAW_SUFFIXES and path.stem not in stems
     ]
+    return sorted(found, key=natural_key)
+
+
+def _in_folder(folder: Path) -> list[Path]:
+    """The same; a folder without pictures is an error."""
+    found = pictures_in(folder)
     if not found:
         raise InputError(f"{folder}: there are no pictures in this folder")
-    return sorted(found, key=natural_key)
+    return found
 
 
 def _matching(pattern: str) -> list[Path]:
@@ -207,7 +219,7 @@ def _matching(pattern: str) -> list[Path]:
     return sorted(found, key=natural_key)
 
 
-def _is_rdstitch_output(path: Path) -> bool:
+def is_rdstitch_output(path: Path) -> bool:
     """Whether rdstitch wrote this picture: the sidecar beside it says so, and means this one."""
     try:
         record = json.loads(read_limited(path.with_name(path.name + ".json"), LARGEST_FILE))

@@ -43,7 +43,7 @@ class Frame:
 Image = str | os.PathLike[str] | NDArray[Any]
 """A file, whatever else stands for files (see :mod:`rdstitch.inputs.find`), or an array."""
 
-Images = Image | Iterable[Image]
+Images = Image | Iterable[Image | Frame]
 """One image or any number of them, an iterator for example."""
 
 Named = str | os.PathLike[str] | Frame
@@ -91,16 +91,16 @@ def files_of(frames: Iterable[Frame]) -> list[Path]:
 
 
 def _as_input(item: Any, index: int, channel_order: ChannelOrder) -> Named:
-    if isinstance(item, (str, os.PathLike)):
+    if isinstance(item, (str, os.PathLike, Frame)):
         return item
     if not isinstance(item, np.ndarray):
         kind = type(item).__name__
         raise ArgumentError(f"image {index}: expected a path or a NumPy array, not {kind}; convert it by numpy.asarray")
     name = f"image_{index:04d}"
-    return Frame(Path(name), index, picture=_as_picture(name, item, channel_order))
+    return Frame(Path(name), index, picture=array_as_picture(name, item, channel_order))
 
 
-def _as_picture(name: str, array: NDArray[Any], channel_order: ChannelOrder) -> Picture:
+def array_as_picture(name: str, array: NDArray[Any], channel_order: ChannelOrder) -> Picture:
     """An array as the readers of files give it: in RGB order, alpha apart, and a copy, since buffers are reused."""
     if array.ndim not in (2, 3) or array.size == 0:
         raise ArgumentError(f"{name}: expected an array of shape (H, W) or (H, W, C), not {array.shape}")

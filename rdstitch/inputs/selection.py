@@ -25,12 +25,13 @@ def selected(frames: Sequence[Frame], exclude: Sequence[str], include_only: Sequ
         for pattern in patterns:
             if not any(_fits(frame, pattern) for frame in frames):
                 raise ArgumentError(f"--{option} {pattern}: none of the {len(frames)} pictures is called so")
-    return [
-        frame
-        for frame in frames
-        if (not include_only or any(_fits(frame, pattern) for pattern in include_only))
-        and not any(_fits(frame, pattern) for pattern in exclude)
-    ]
+    return [frame for frame in frames if is_selected(frame, exclude, include_only)]
+
+
+def is_selected(frame: Frame, exclude: Sequence[str], include_only: Sequence[str]) -> bool:
+    """Whether a picture is used; see :func:`selected`."""
+    included = not include_only or any(_fits(frame, pattern) for pattern in include_only)
+    return included and not any(_fits(frame, pattern) for pattern in exclude)
 
 
 def _fits(frame: Frame, pattern: str) -> bool:

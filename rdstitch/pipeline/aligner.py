@@ -72,7 +72,7 @@ class Aligner:
         paths = tuple(str(source.path) for source in sources)
         megapixels = options.features.for_pictures(len(sources)).limits[1]
         cameras = tuple(at_working_size(source.camera.with_focal(), megapixels) for source in sources)
-        return cls(paths, cameras, _alignment_options(sources, options), cache)
+        return cls(paths, cameras, alignment_options(sources, options), cache)
 
     def align(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
         """Align the pictures by the pairs that were registered; from an earlier run where the cache has it.
@@ -132,7 +132,7 @@ def rematch_weak_pairs(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs
     return aligner.align([stronger.get(k, pair) for k, pair in enumerate(aligned.pairs)]) if stronger else aligned
 
 
-def _alignment_options(sources: Sequence[Source], options: StitchOptions) -> AlignmentOptions:
+def alignment_options(sources: Sequence[Source], options: StitchOptions) -> AlignmentOptions:
     """What is decided or known beforehand; measured attitudes that are not exact leave the mount's tilt open."""
     attitudes = [source.attitude for source in sources if source.attitude is not None]
     exact = bool(attitudes) and options.attitude_std == 0.0

@@ -192,7 +192,7 @@ def _by_name(file: Path, read: Callable[[], Any]) -> Any:
         raise type(error)(one_line(f"{file}: {error}")) from error
 
 
-def _is_rdstitch_output(file: Path) -> Any:
+def is_rdstitch_output(file: Path) -> Any:
     """A folder with one picture beside which this file lies as its sidecar."""
     (file.parent / "a.png").write_bytes(PICTURES["png"])
     return find_pictures([file.parent])
@@ -221,7 +221,7 @@ PARSERS = (
     Parser("cache entry", _entries(), _entry),
     Parser("attitude table", _TABLES, _attitudes),
     Parser("list", _LISTS, _list),
-    Parser("sidecar beside a picture", (json.dumps(SIDECAR).encode(),), _is_rdstitch_output, "a.png.json"),
+    Parser("sidecar beside a picture", (json.dumps(SIDECAR).encode(),), is_rdstitch_output, "a.png.json"),
     Parser("picture", _pictures(), _picture),
     Parser("xmp", _XMP_BLOCKS, _xmp),
     Parser("exif", _exif_blocks(), _exif),

@@ -1,14 +1,20 @@
 """``rdstitch mosaic``: a folder of frames becomes one rectified picture."""
 
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from rdstitch_cli import following as live
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import GroupedCommand
 from rdstitch_cli.progress import Reporter
 from rdstitch_cli.stitching import Report, stitch_options, summarize
+
+if TYPE_CHECKING:
+    from rdstitch.inputs.frame import Named
 
 
 @click.command(
@@ -19,6 +25,7 @@ Examples:
   rdstitch mosaic flight/*.jpg -o field.tif --camera camera.json
   find . -name '*.jpg' -print0 | rdstitch mosaic - -o all.tif
   rdstitch mosaic drive.mp4 --every 10 -o drive.png --report drive.html
+  rdstitch mosaic incoming/ -o field.jpg --follow --idle 30
 """,
 )
 @options.inputs
@@ -26,6 +33,8 @@ Examples:
 @options.overwrite
 @options.every
 @options.topic
+@live.follow
+@live.refresh
 @click.option("--reference", metavar="NAME", help="Picture that sets the frame; otherwise the best connected one.")
 @options.preview
 @options.known
@@ -46,6 +55,9 @@ def mosaic(
     inputs: tuple[Path, ...],
     output: Path,
     every: int,
+    following: bool,
+    idle: float | None,
+    refresh: float,
     report: Path | None,
     as_json: bool,
     quiet: bool,
@@ -56,17 +68,24 @@ def mosaic(
 
     INPUT is a folder, a picture, a quoted pattern, @FILE with one input a line (or separated by NUL), - for such a
     list on standard input, a video, or a ROS bag. Pictures that do not fit are left out and named on standard error.
+    With --follow, frames are registered as they arrive.
     """
     from rdstitch.pipeline import mosaic as recipe
 
-    with Reporter(-quiet + verbose) as reporter:
-        paths = options.resolve(inputs)
-        report_page = Report(report, reporter, paths, given["overwrite"], output)
+    with Reporter(-quiet + verbose) as reporter, ExitStack() as stack:
+        stitch = stitch_options(reporter, **given)
+        named: list[Path] = [] if following else options.resolve(inputs)
+        paths: Sequence[Named] = named
+        report_page = Report(report, reporter, named, given["overwrite"], output)
+        if following:
+            arrived = live.followed(inputs, stitch, reporter, output=output, every=every, idle=idle, refresh=refresh)
+            paths = stack.enter_context(arrived)
         with report_page.explaining():
-            result = recipe(
-                paths, output, stitch_options(reporter, **given), every=every, progress=report_page.progress
-            )
-        summarize(result, reporter, as_json=as_json)
+            result = recipe(paths, output, stitch, every=every, progress=report_page.progress)
+        if following and not as_json:
+            live.print_result(result.registration, reporter, output)
+        else:
+            summarize(result, reporter, as_json=as_json)
         report_page.write(result)
         if result.plan is None:
             reporter.made(result.summary)

@@ -1,14 +1,20 @@
 """``rdstitch trajectory``: the path of the camera over the plane."""
 
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from rdstitch_cli import following as live
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import GroupedCommand
 from rdstitch_cli.progress import Reporter
 from rdstitch_cli.stitching import report_registration, stitch_options
+
+if TYPE_CHECKING:
+    from rdstitch.inputs.frame import Named
 
 
 @click.command(
@@ -18,6 +24,7 @@ Examples:
   rdstitch trajectory floor/ -o poses.csv
   rdstitch trajectory floor/ -o poses.txt --format tum --height 0.42
   rdstitch trajectory drive.bag --topic /camera/image_raw -o poses.csv
+  rdstitch trajectory 0 -o poses.csv --follow | robot
 """,
 )
 @options.inputs
@@ -49,6 +56,7 @@ Examples:
 @options.overwrite
 @options.every
 @options.topic
+@live.follow
 @options.known
 @options.estimation
 @options.trust
@@ -61,6 +69,8 @@ def trajectory(
     timestamps: Path | None,
     plot: Path | None,
     every: int,
+    following: bool,
+    idle: float | None,
     quiet: bool,
     verbose: bool,
     **given: Any,
@@ -68,15 +78,22 @@ def trajectory(
     """Find where the camera was for each picture: x, y and yaw over the plane.
 
     INPUT is what 'rdstitch mosaic' takes. Positions are in units of the first picture's height above the plane, or in
-    metres when --height says how many those are; they are as good as the focal length (see --focal).
+    metres when --height says how many those are; they are as good as the focal length (see --focal). With --follow,
+    poses are printed as frames arrive.
     """
     from rdstitch.pipeline import trajectory as recipe
 
-    with Reporter(-quiet + verbose) as reporter:
+    with Reporter(-quiet + verbose) as reporter, ExitStack() as stack:
+        stitch = stitch_options(reporter, **given)
+        if following:
+            arrived = live.followed(inputs, stitch, reporter, output=output, every=every, idle=idle)
+            paths: Sequence[Named] = stack.enter_context(arrived)
+        else:
+            paths = options.resolve(inputs)
         _, registration = recipe(
-            options.resolve(inputs),
+            paths,
             output,
-            stitch_options(reporter, **given),
+            stitch,
             layout=layout,
             timestamps=timestamps,
             plot=plot,
@@ -84,5 +101,8 @@ def trajectory(
             every=every,
             progress=reporter,
         )
-        report_registration(registration, reporter)
+        if following:
+            live.print_result(registration, reporter, output)
+        else:
+            report_registration(registration, reporter)
         reporter.made(f"{output}: {registration.summary}")

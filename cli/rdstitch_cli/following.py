@@ -1,0 +1,112 @@
+"""``--follow``: frames are registered as they arrive, one line of JSON each, and together at the end."""
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from rdstitch_cli import options
+from rdstitch_cli.progress import Reporter
+from rdstitch_cli.stitching import warn_of
+
+if TYPE_CHECKING:
+    from rdstitch.inputs.frame import Named
+    from rdstitch.pipeline import Registration, StitchOptions
+
+follow = options.together(
+    click.option(
+        "--follow",
+        "following",
+        is_flag=True,
+        help="Register frames as they arrive, and print a line of JSON for each: INPUT is a folder that grows, - for "
+        "names on standard input, a video, the index of a camera, or a stream. All are registered together at the end: "
+        "of the video or the names, after --idle, or with Ctrl-C.",
+    ),
+    click.option(
+        "--idle",
+        type=click.FloatRange(0.0, min_open=True),
+        metavar="SECONDS",
+        help="With --follow: end when no frame has come for so long; otherwise a folder is followed until Ctrl-C.",
+    ),
+)
+
+refresh = click.option(
+    "--refresh",
+    type=click.FloatRange(0.0),
+    default=5.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="With --follow: refresh the picture of what has been seen, OUTPUT with .preview.jpg, so often; 0: none.",
+)
+
+
+@contextmanager
+def followed(
+    inputs: Sequence[Path],
+    stitch: "StitchOptions",
+    reporter: Reporter,
+    *,
+    output: Path,
+    every: int,
+    idle: float | None,
+    refresh: float | None = None,
+) -> Iterator[list["Named"]]:
+    """Print a line for each frame as it arrives; then, inside the block, what all of them are as inputs of a recipe.
+
+    ``refresh`` is None where no picture is made.
+    """
+    from rdstitch.inputs.arrivals import Arrivals
+    from rdstitch.io.atomic import check_output
+    from rdstitch.io.staging import temporary_folder
+    from rdstitch.pipeline.follow import follow as follow_frames
+
+    if len(inputs) != 1:
+        raise click.UsageError("--follow takes one input: a folder, a video, the index of a camera, a stream or -")
+    source = Path(inputs[0])
+    if source.is_dir() and output.resolve().parent == source.resolve():
+        raise click.UsageError(f"{output}: lies in the folder that is followed; choose a name in another folder")
+    # Before hours of frames, not after them.
+    if refresh is None:
+        check_output(output, stitch.overwrite, suffixes=())
+    else:
+        check_output(output, stitch.overwrite)
+        check_output(f"{output}.json", stitch.overwrite, suffixes=())
+    preview = output.with_suffix(".preview.jpg") if refresh else None
+    with temporary_folder() as folder:
+        arrivals = Arrivals(str(inputs[0]), frames_folder=lambda: folder, names=sys.stdin, every=every, idle=idle)
+        try:
+            for frame in follow_frames(arrivals, stitch, preview=preview, refresh=refresh or 0.0):
+                print_line(frame.as_dict())
+        except KeyboardInterrupt:
+            reporter.note("interrupted: registering what has arrived; interrupt once more to give up")
+        yield arrivals.inputs
+    if preview is not None:
+        # What it was a sketch of is there now.
+        preview.unlink(missing_ok=True)
+
+
+def print_line(record: dict[str, object]) -> None:
+    """One line of JSON, at once."""
+    click.echo(json.dumps(record, ensure_ascii=False))
+    sys.stdout.flush()
+
+
+def print_result(registration: "Registration", reporter: Reporter, output: Path) -> None:
+    """The last line: what came of all frames together; what the user must know, to standard error."""
+    reporter.finish()
+    warn_of(registration, reporter)
+    alignment = registration.alignment
+    observable = alignment.distortion_std < float("inf")
+    print_line(
+        {
+            "output": str(output),
+            "frames": len(alignment.used),
+            "used": int(alignment.used.sum()),
+            "lambda": alignment.distortion if observable else None,
+            "lambda_std": alignment.distortion_std if observable else None,
+        }
+    )

@@ -1,0 +1,172 @@
+"""Frames as they arrive: in a folder that grows, by names on standard input, from a video, a camera or a stream."""
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO
+
+import cv2
+
+from rdstitch.errors import ArgumentError, InputError
+from rdstitch.inputs.find import is_rdstitch_output, natural_key, pictures_in
+from rdstitch.inputs.frame import Frame, Named, array_as_picture
+from rdstitch.io.video import VIDEO_SUFFIXES, write_frame
+
+_POLL = 0.2  # seconds between two looks at a folder
+_SETTLED = 1.0  # seconds after its last change from which on a file counts as complete
+_WAITING = 256  # names that are read ahead
+
+
+class Arrivals:
+    """Iterates over the frames of one source as they arrive.
+
+    The iteration ends with a video, with the end of a list of names, and after ``idle`` seconds without a new frame;
+    that of a folder or camera goes on until it is interrupted otherwise.
+
+    Parameters
+    ----------
+    source : path or str
+        A folder, a video, the index of a camera, or what else OpenCV opens as a stream ("rtsp://…", "/dev/video0"); "-"
+        for names on ``names``.
+    names : text stream, optional
+        Names of pictures, one a line, for "-".
+    every : int
+        Of a video, camera or stream, every n-th frame.
+    idle : float or None
+        Seconds without a new frame after which the iteration ends; None: never.
+    frames_folder : callable
+        Gives the folder where frames of cameras and streams, which come only once, are written.
+    """
+
+    def __init__(
+        self,
+        source: str | Path,
+        *,
+        frames_folder: Callable[[], Path],
+        names: IO[str] | None = None,
+        every: int = 1,
+        idle: float | None = None,
+    ) -> None:
+        self._source, self._names, self._every, self._idle = str(source), names, every, idle
+        self._frames_folder = frames_folder
+        self._seen: list[Frame] = []
+        path = Path(self._source)
+        if self._source == "-":
+            if names is None:
+                raise ArgumentError("there is no list of names to follow")
+            self._kind = "names"
+        elif path.is_dir():
+            self._kind = "folder"
+        elif path.suffix.lower() in VIDEO_SUFFIXES and path.exists():
+            self._kind = "video"
+        elif self._source.isdecimal() or "://" in self._source or path.is_char_device():
+            self._kind = "stream"
+        else:
+            raise InputError(
+                f"{self._source}: cannot be followed; name a folder, a video, the index of a camera or a stream, or - "
+                "for names on standard input"
+            )
+
+    @property
+    def inputs(self) -> list[Named]:
+        """What an ordinary run over all that has arrived takes."""
+        if self._kind in ("folder", "video"):
+            return [self._source]
+        return list(self._seen)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Every frame, once it is complete."""
+        if self._kind == "folder":
+            return self._of_folder(Path(self._source))
+        return self._of_names() if self._kind == "names" else self._of_capture()
+
+    def _of_folder(self, folder: Path) -> Iterator[Frame]:
+        """New pictures of a folder, in natural order as far as they come at the same time."""
+        done: set[Path] = set()
+        sizes: dict[Path, int] = {}
+        last = time.monotonic()
+        while True:
+            complete = []
+            for path in pictures_in(folder):
+                if path in done:
+                    continue
+                try:
+                    status = path.stat()
+                except OSError:  # gone again
+                    continue
+                grown = sizes.get(path) != status.st_size
+                sizes[path] = status.st_size
+                if status.st_size and (not grown or time.time() - status.st_mtime > _SETTLED):
+                    complete.append(path)
+            for path in sorted(complete, key=natural_key):
+                done.add(path)
+                sizes.pop(path, None)
+                if not is_rdstitch_output(path):
+                    yield Frame(path)
+                    last = time.monotonic()
+            if not complete:
+                if self._is_over(last):
+                    return
+                time.sleep(_POLL)
+
+    def _of_names(self) -> Iterator[Frame]:
+        """The pictures whose names are read, by a thread that may wait for them."""
+        assert self._names is not None
+        read: queue.Queue[str | None] = queue.Queue(_WAITING)
+        threading.Thread(target=_read_lines, args=(self._names, read), daemon=True).start()
+        while True:
+            try:
+                # Not endlessly: an interrupt is noticed between two waits only on Windows.
+                name = read.get(timeout=_POLL if self._idle is None else self._idle)
+            except queue.Empty:
+                if self._idle is None:
+                    continue
+                return
+            if name is None:
+                return
+            if name:
+                frame = Frame(Path(name))
+                self._seen.append(frame)
+                yield frame
+
+    def _of_capture(self) -> Iterator[Frame]:
+        """Every n-th frame of a video, camera or stream; those of a camera and a stream are kept as files too."""
+        live = self._kind == "stream"
+        capture = cv2.VideoCapture(int(self._source) if self._source.isdecimal() else self._source)
+        stem = "frame" if live else Path(self._source).stem
+        try:
+            if not capture.isOpened():
+                raise InputError(f"{self._source}: OpenCV cannot open this camera, video or stream")
+            number, last = 0, time.monotonic()
+            while True:
+                if not capture.grab():
+                    if not live or self._idle is None or self._is_over(last):
+                        return
+                    time.sleep(_POLL)
+                    continue
+                last = time.monotonic()
+                stamp = time.time() if live else capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
+                decoded, pixels = capture.retrieve() if number % self._every == 0 else (False, None)
+                if decoded and pixels is not None:
+                    name = f"{stem}_{number:06d}.png"
+                    if live:
+                        self._seen.append(Frame(write_frame(self._frames_folder() / name, pixels), number, stamp))
+                    yield Frame(Path(name), number, stamp, array_as_picture(name, pixels, "bgr"))
+                number += 1
+        finally:
+            capture.release()
+
+    def _is_over(self, last: float) -> bool:
+        return self._idle is not None and time.monotonic() - last >= self._idle
+
+
+def _read_lines(stream: IO[str], read: "queue.Queue[str | None]") -> None:
+    """Hand on the lines of a stream, and None at its end."""
+    try:
+        for line in stream:
+            read.put(line.rstrip("\r\n"))
+    except (OSError, ValueError):  # closed while it was read
+        pass
+    read.put(None)

@@ -1,0 +1,197 @@
+"""Frames registered as they arrive: a pose for each, and a preview now and then."""
+
+import math
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rdstitch.cache import NO_CACHE
+from rdstitch.features import FeatureOptions, match
+from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.input_guard import InputGuard
+from rdstitch.inputs.masks import with_masks
+from rdstitch.inputs.selection import is_selected
+from rdstitch.inputs.source import Source, read_sources
+from rdstitch.inputs.timestamps import timestamps_of
+from rdstitch.io.write import write_image
+from rdstitch.options import StitchOptions
+from rdstitch.pipeline.aligner import alignment_options
+from rdstitch.pipeline.detect_features import detect_features
+from rdstitch.pipeline.working_size import at_working_size, features_at
+from rdstitch.progress import silent
+from rdstitch.tracking import Preview, Tracked, Tracker, TrackingOptions
+
+_FEATURES = 600  # of a frame, that suffice to follow it
+_MEGAPIXELS = 0.1  # 10⁶ pixels in which they are detected: a frame of 640 x 480 pixels is halved once
+_PREVIEW_MEGAPIXELS = 0.08
+
+
+@dataclass(frozen=True)
+class FollowedFrame:
+    """What is known of one frame when it has arrived.
+
+    Attributes
+    ----------
+    name : str
+    number : int
+        In the video, camera or stream that it comes from, else in the order of arrival.
+    timestamp : float
+        s; NaN where not known.
+    tracked : Tracked or None
+        Its place and λ; None where it could not be read.
+    reason : str
+        Why there is no place; empty where there is one.
+    """
+
+    name: str
+    number: int
+    timestamp: float
+    tracked: Tracked | None
+    reason: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """As a line of JSON takes it; null for what is not known."""
+        found = self.tracked
+        pose = None if found is None else found.pose
+        placement = None if found is None else found.placement
+        return {
+            "name": self.name,
+            "frame": self.number,
+            "timestamp": _known(self.timestamp),
+            "x": None if pose is None else pose.x,
+            "y": None if pose is None else pose.y,
+            "yaw_deg": None if pose is None else math.degrees(pose.yaw),
+            "height": None if pose is None else pose.height,
+            "homography": None if placement is None else placement.homography.tolist(),
+            "lambda": None if found is None else _known(found.distortion),
+            "lambda_std": None if found is None else _known(found.distortion_std),
+            "map": None if found is None else found.map_number,
+            "keyframe": found is not None and found.keyframe,
+            "inliers": 0 if found is None else found.inliers,
+            "revised": found is not None and found.revised,
+            "reason": self.reason,
+        }
+
+
+def follow(
+    frames: Iterable[Frame], options: StitchOptions, *, preview: Path | None = None, refresh: float = 5.0
+) -> Iterator[FollowedFrame]:
+    """Register frames as they arrive, against the last keyframes.
+
+    Poses are for watching: loops are closed, and every pair is used, only when all frames are registered together
+    afterwards, by :func:`rdstitch.mosaic` or :func:`rdstitch.trajectory`. Features are fewer and from smaller pictures
+    than there. Memory does not grow with the number of frames.
+
+    Parameters
+    ----------
+    frames : iterable of Frame
+        See :class:`rdstitch.inputs.arrivals.Arrivals`.
+    options : StitchOptions
+    preview : path, optional
+        Picture to write of what has been seen so far; JPEG or PNG.
+    refresh : float
+        Seconds between two versions of it at least.
+
+    Yields
+    ------
+    FollowedFrame
+        One a frame; and one more for keyframes that find their place only later.
+    """
+    features = _live_features(options.features)
+    pair = options.matching.pair
+    tracker = Tracker(TrackingOptions(pair, alignment_options([], options)), partial(match, ratio=options.ratio))
+    sketch = None if preview is None else _Sketch(preview, refresh)
+    labels: dict[int, FollowedFrame] = {}  # of the frames that may still find their place
+    order = 0
+    for arrived in frames:
+        if not is_selected(arrived, options.exclude, options.include_only):
+            continue
+        frame = arrived if arrived.number is not None else replace(arrived, number=order)
+        order += 1
+        source, reason = _source(frame, options)
+        if source is None:
+            yield FollowedFrame(frame.path.name, frame.number or 0, math.nan, None, reason)
+            continue
+        found = detect_features([source], features, 1, NO_CACHE, skip_bad=True, progress=silent)
+        label = FollowedFrame(source.name, source.number(0), float(timestamps_of([source])[0]), None)
+        if found.damaged:
+            yield replace(label, reason=found.damaged[0])
+            continue
+        camera = at_working_size(source.camera, features.work_megapixels)
+        results = tracker.add(features_at(found.features[0], source.camera, camera), camera)
+        labels[results[-1].number] = label
+        for result in results:
+            known = labels[result.number]
+            why = "" if result.placement is not None else _why(tracker, result)
+            yield replace(known, tracked=result, reason=why)
+        waiting = tracker.numbers_without_place
+        labels = {number: known for number, known in labels.items() if number in waiting}
+        if sketch is not None:
+            sketch.add(source, results[-1])
+        source.decoded_images.clear()
+    if sketch is not None:
+        sketch.write()
+
+
+class _Sketch:
+    """The preview and its file."""
+
+    def __init__(self, file: Path, refresh: float) -> None:
+        self._file, self._refresh, self._preview = file, refresh, Preview()
+        self._written, self._changed = -math.inf, False
+
+    def add(self, source: Source, result: Tracked) -> None:
+        """Paint a keyframe; write the file when that is due."""
+        if result.keyframe and result.placement is not None:
+            picture = source.read(source.reduction(_PREVIEW_MEGAPIXELS))
+            self._preview.paint(picture.pixels, result.placement)
+            self._changed = True
+        if time.monotonic() - self._written >= self._refresh:
+            self.write()
+
+    def write(self) -> None:
+        """Replace the file, if there is anything new."""
+        if self._changed:
+            write_image(self._file, self._preview.pixels, overwrite=True)
+            self._written, self._changed = time.monotonic(), False
+
+
+def _live_features(options: FeatureOptions) -> FeatureOptions:
+    """Fewer features, from smaller pictures."""
+    megapixels = options.work_megapixels
+    return replace(
+        options,
+        max_features=min(options.max_features, _FEATURES),
+        work_megapixels=_MEGAPIXELS if megapixels is None else min(megapixels, _MEGAPIXELS),
+    )
+
+
+def _source(frame: Frame, options: StitchOptions) -> tuple[Source | None, str]:
+    """The frame as a source, or why there is none."""
+    sources, unread = read_sources(
+        [frame],
+        camera=options.camera,
+        focal=options.focal,
+        distortion=options.distortion,
+        skip_bad=True,
+        guard=InputGuard(options.strict),
+        max_memory=options.composite.max_memory,
+    )
+    if not sources:
+        return None, unread[0].text
+    common = options.mask is not None and not Path(options.mask).is_dir()
+    return with_masks(sources, options.mask if common else None)[0], ""
+
+
+def _why(tracker: Tracker, result: Tracked) -> str:
+    """Why a frame has no place."""
+    if result.inliers or not result.number:
+        return "the first frames wait for others" if tracker.waits else "its motion fits no plane yet"
+    return "it begins a new map" if result.keyframe else "no keyframe shows what it shows"
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,11 @@
+"""Frames registered as they arrive: each against the last keyframes, the last keyframes now and then among themselves.
+
+Memory is bounded: descriptors and matches are kept of the last keyframes only. What comes of it is for watching and
+steering; loops are closed and every pair is used when the whole sequence is registered at the end.
+"""
+
+from rdstitch.tracking.placement import CameraPose, Placement, Similarity2
+from rdstitch.tracking.preview import Preview
+from rdstitch.tracking.tracker import Tracked, Tracker, TrackingOptions
+
+__all__ = ["CameraPose", "Placement", "Preview", "Similarity2", "Tracked", "Tracker", "TrackingOptions"]

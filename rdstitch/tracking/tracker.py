@@ -1,0 +1,312 @@
+"""The tracker: a frame comes in, its place on the plane comes out."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rdstitch.alignment import Alignment, AlignmentOptions, align
+from rdstitch.camera import Camera
+from rdstitch.errors import RegistrationError
+from rdstitch.features import Features, Matcher
+from rdstitch.matching.distortion_consensus import vote
+from rdstitch.matching.options import PairOptions
+from rdstitch.matching.two_view import PairRegistration, estimate_pairs
+from rdstitch.tracking.placement import CameraPose, Placement, Similarity2
+
+_WINDOW = 48  # keyframes that are kept
+_PARTNERS = 2  # last keyframes that a frame is matched with
+_SEARCHED = 12  # last keyframes among which a lost frame looks for its place
+_FIRST_ALIGNMENT = 5  # keyframes that the first alignment takes
+_GROWTH = 1.5  # from one alignment to the next, while λ is not known
+_EVERY = 24  # keyframes from one alignment to the next afterwards
+_KNOWN_STD = 0.002  # of λ: a tenth of a pixel in the corner of a picture of 640 x 480 pixels, over half of it
+_KNOWN_AFTER = 12  # keyframes that λ is not known before
+_STILL_SHARED = 0.75  # share of a frame that its last keyframe shows, below which it becomes a keyframe
+_GRID = 8  # points a side by which that is measured
+_LOST = 10  # frames in a row without a place, after which a new map begins
+_FEWEST_INLIERS = 15
+_MATCHES = 80  # of a link, that the alignment uses
+_SAME_TILT = ("rigid", "similarity")
+
+
+@dataclass(frozen=True)
+class TrackingOptions:
+    """What is decided or known beforehand.
+
+    Attributes
+    ----------
+    pair : PairOptions
+        With λ, where it is known.
+    alignment : AlignmentOptions
+        Of the windows of keyframes; λ is that of the cameras where ``pair`` has one.
+    """
+
+    pair: PairOptions = field(default_factory=PairOptions)
+    alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """What became of one frame.
+
+    Attributes
+    ----------
+    number : int
+        Of the frame, in the order of arrival.
+    placement : Placement or None
+        Where it lies on the plane of its map; None where that is not known.
+    distortion, distortion_std : float
+        λ by all frames up to this one, half-diagonal frame; NaN and inf where it cannot be seen.
+    map_number : int
+        Maps have no common plane: a new one begins where the track was lost.
+    keyframe : bool
+    inliers : int
+        Matches with the last keyframes that agree.
+    revised : bool
+        Whether the frame had come before and only now found its place.
+    """
+
+    number: int
+    placement: Placement | None
+    distortion: float
+    distortion_std: float
+    map_number: int
+    keyframe: bool
+    inliers: int
+    revised: bool = False
+
+    @property
+    def pose(self) -> CameraPose | None:
+        """Of the camera, where its place is known and the model has poses."""
+        return None if self.placement is None else self.placement.pose
+
+
+@dataclass
+class _Keyframe:
+    number: int
+    camera: Camera
+    features: Features
+    placement: Placement | None = None
+
+
+class Tracker:
+    """Registers frames of one camera one after the other.
+
+    Parameters
+    ----------
+    options : TrackingOptions
+    matcher : callable
+    """
+
+    def __init__(self, options: TrackingOptions, matcher: Matcher) -> None:
+        self._options, self._match = options, matcher
+        self._count, self._map, self._lost = 0, 0, 0
+        self._model = options.alignment.model
+        self._focal: float | None = None
+        self._distortion, self._std = options.pair.distortion, math.inf
+        if self._distortion is not None:
+            self._std = 0.0
+        self._start_map()
+
+    @property
+    def distortion_known(self) -> bool:
+        """Whether λ was given, or is known well enough to be kept."""
+        return self._options.pair.distortion is not None
+
+    @property
+    def waits(self) -> bool:
+        """Whether there are too few keyframes for a map."""
+        return self._planar_model is None
+
+    @property
+    def numbers_without_place(self) -> set[int]:
+        """Numbers of the keyframes that may still find their place."""
+        return {keyframe.number for keyframe in self._keyframes if keyframe.placement is None}
+
+    def add(self, features: Features, camera: Camera) -> list[Tracked]:
+        """Register the next frame; it comes last, after those before it that only now have found their place.
+
+        Parameters
+        ----------
+        features : Features
+        camera : Camera
+            Of the size that the features' points are measured at.
+        """
+        number, self._count = self._count, self._count + 1
+        frame = _Keyframe(number, camera, features)
+        if not self._keyframes:
+            self._keyframes.append(frame)
+            return [self._tracked(frame, keyframe=True, inliers=0)]
+        links = self._links(frame)
+        inliers = max((int(link.relation.inliers.sum()) for link in links), default=0)
+        if not links:
+            return [self._without_place(frame)]
+        self._lost = 0
+        frame.placement = self._placed(frame, links)
+        if self._shown_by_last(frame, links) >= _STILL_SHARED:
+            return [self._tracked(frame, keyframe=False, inliers=inliers)]
+        return [*self._add_keyframe(frame, links), self._tracked(frame, keyframe=True, inliers=inliers)]
+
+    def _start_map(self) -> None:
+        self._keyframes: list[_Keyframe] = []
+        self._pairs: list[PairRegistration] = []
+        self._keyframes_seen, self._next_alignment = 0, _FIRST_ALIGNMENT
+        self._planar_model: str | None = None
+
+    def _without_place(self, frame: _Keyframe) -> Tracked:
+        """A frame that no keyframe shows; after many of them, a new map begins with the last."""
+        self._lost += 1
+        waiting = self._planar_model is None and len(self._keyframes) == 1
+        if self._lost >= _LOST or waiting:
+            self._map += not waiting
+            self._lost = 0
+            self._start_map()
+            self._keyframes.append(frame)
+            return self._tracked(frame, keyframe=True, inliers=0)
+        return self._tracked(frame, keyframe=False, inliers=0)
+
+    def _links(self, frame: _Keyframe) -> list[PairRegistration]:
+        """The frame with the last keyframes, as far as they can be registered; of a lost one, with more of them."""
+        recent = self._keyframes[::-1]
+        found = self._registered(frame, recent[:_PARTNERS])
+        return found or self._registered(frame, recent[_PARTNERS:_SEARCHED])
+
+    def _registered(self, frame: _Keyframe, others: Sequence[_Keyframe]) -> list[PairRegistration]:
+        """Pairs whose second picture is the frame; their numbers are those of the frames."""
+        if not others:
+            return []
+        pictures = [*others, frame]
+        pairs = [(place, len(others)) for place in range(len(others))]
+        matched = [self._match(other.features, frame.features) for other in others]
+        found = estimate_pairs([picture.camera for picture in pictures], pairs, matched, self._options.pair)
+        return [
+            replace(pair, image1=others[pair.image1].number, image2=frame.number)
+            for pair in found
+            if pair.relation and pair.relation.inliers.sum() >= _FEWEST_INLIERS
+        ]
+
+    def _placed(self, frame: _Keyframe, links: Sequence[PairRegistration]) -> Placement | None:
+        """The place of a frame by its links with keyframes that have one."""
+        by_number = {keyframe.number: keyframe for keyframe in self._keyframes}
+        known = [(by_number[k.image1].placement, k) for k in links]
+        placed = [(placement, link) for placement, link in known if placement is not None]
+        if not placed:
+            return None
+        nearest, best = max(placed, key=lambda pair: int(pair[1].relation.inliers.sum()))
+        camera = frame.camera.with_coefficients(*nearest.camera.coefficients)
+        if self._planar_model not in _SAME_TILT:
+            inverse = np.linalg.inv(best.relation.homography)
+            return Placement(camera, nearest.homography @ inverse, nearest.focal)
+        # Where the camera of that keyframe would see the matches, and where they are: one motion of the plane.
+        stay = Placement(camera, nearest.homography, nearest.focal)
+        inliers = [link.link() for _, link in placed]
+        here = np.concatenate([stay.to_plane(link.points2) for link in inliers])
+        there = np.concatenate(
+            [placement.to_plane(link.points1) for (placement, _), link in zip(placed, inliers, strict=True)]
+        )
+        seen = np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
+        return Similarity2.fitted(here[seen], there[seen], keep_size=self._planar_model == "rigid").applied(stay)
+
+    def _shown_by_last(self, frame: _Keyframe, links: Sequence[PairRegistration]) -> float:
+        """Share of the frame that the newest of its partners shows."""
+        last = max(links, key=lambda link: link.image1)
+        size = np.array(frame.camera.image_size, dtype=np.float64)
+        axes = [np.linspace(0.0, side - 1.0, _GRID) for side in size]
+        points = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+        there = last.relation.transfer(points)  # the camera moved by about as much either way
+        inside = (there >= 0.0).all(axis=1) & (there <= size - 1.0).all(axis=1)
+        return float(inside.mean())
+
+    def _add_keyframe(self, frame: _Keyframe, links: Sequence[PairRegistration]) -> list[Tracked]:
+        """Keep the frame; align the window when it is due, which may place frames that had none."""
+        self._keyframes = [*self._keyframes, frame][-_WINDOW:]
+        self._keyframes_seen += 1
+        first = self._keyframes[0].number
+        self._pairs = [pair for pair in [*self._pairs, *links] if pair.image1 >= first]
+        if not self.distortion_known:
+            self._vote()
+        if self._keyframes_seen + 1 < self._next_alignment:
+            return []
+        steps = _EVERY if self.distortion_known else max(2, round(self._next_alignment * (_GROWTH - 1.0)))
+        self._next_alignment += min(steps, _EVERY)
+        without = [keyframe for keyframe in self._keyframes[:-1] if keyframe.placement is None]
+        self._align_window()
+        found = [keyframe for keyframe in without if keyframe.placement is not None]
+        return [replace(self._tracked(keyframe, keyframe=True, inliers=0), revised=True) for keyframe in found]
+
+    def _vote(self) -> None:
+        """λ by the pairs alone, until there is an alignment."""
+        if self._planar_model is None and self._pairs:
+            relations = [pair.relation for pair in self._pairs]
+            consensus = vote([r.distortion for r in relations], [r.distortion_std for r in relations])
+            self._distortion, self._std = consensus.distortion, consensus.std
+
+    def _align_window(self) -> None:
+        """Align the keyframes of the window among themselves, and bring them to the plane of the map."""
+        place = {keyframe.number: index for index, keyframe in enumerate(self._keyframes)}
+        links = [replace(pair.link(), image1=place[pair.image1], image2=place[pair.image2]) for pair in self._pairs]
+        known = self._options.pair.distortion
+        cameras = [keyframe.camera.with_focal() for keyframe in self._keyframes]
+        if known is not None:
+            cameras = [camera.with_coefficients(known) for camera in cameras]
+        if self._focal is not None:
+            # Another focal length would give other heights: those of one map must not depend on the window.
+            own = (camera.half_diagonal for camera in cameras)
+            cameras = [
+                replace(camera, focal=self._focal * size, focal_source="option")
+                for camera, size in zip(cameras, own, strict=True)
+            ]
+        options = replace(
+            self._options.alignment,
+            model=self._model,
+            lens="auto" if known is not None else "division",
+            lens_known=known is not None,
+            most=_MATCHES,
+            attitudes=None,
+            reference=None,
+        )
+        try:
+            alignment = align(cameras, links, options)
+        except RegistrationError:
+            return
+        if alignment.on_sphere:
+            return
+        self._take_over(alignment)
+
+    def _take_over(self, alignment: Alignment) -> None:
+        """λ, the model and the places of the keyframes from an alignment of the window."""
+        if alignment.distortion_std < self._std or not math.isfinite(self._std):
+            self._distortion, self._std = alignment.distortion, alignment.distortion_std
+        placements: list[Placement | None] = [
+            Placement(camera, homography, alignment.focal) if used else None
+            for camera, homography, used in zip(alignment.cameras, alignment.homographies, alignment.used, strict=True)
+        ]
+        self._planar_model = alignment.model
+        move = self._to_map(placements)
+        if move is None:
+            return
+        for keyframe, placement in zip(self._keyframes, placements, strict=True):
+            if placement is not None:
+                keyframe.placement = move.applied(placement)
+        if not self.distortion_known and self._std <= _KNOWN_STD and len(self._keyframes) >= _KNOWN_AFTER:
+            self._options = replace(
+                self._options, pair=replace(self._options.pair, distortion=self._distortion, solver="auto")
+            )
+            self._model, self._focal = alignment.model, alignment.focal
+
+    def _to_map(self, placements: Sequence[Placement | None]) -> Similarity2 | None:
+        """From the plane of an alignment to that of the map; the first alignment defines it."""
+        both = [(new, keyframe.placement) for new, keyframe in zip(placements, self._keyframes, strict=True)]
+        shared = [(new, old) for new, old in both if new is not None and old is not None]
+        if shared:
+            return Similarity2.between(*zip(*shared, strict=True))
+        first = next((placement for placement in placements if placement is not None), None)
+        if first is None:
+            return None
+        return Similarity2(1.0, 0.0) if first.pose is None else Similarity2.to_origin(first.pose)
+
+    def _tracked(self, frame: _Keyframe, *, keyframe: bool, inliers: int) -> Tracked:
+        distortion = math.nan if self._distortion is None else self._distortion
+        return Tracked(frame.number, frame.placement, distortion, self._std, self._map, keyframe, inliers)

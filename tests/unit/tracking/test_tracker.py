@@ -1,0 +1,152 @@
+"""Frames placed one after the other: near the truth, in bounded memory, and never silently on the wrong map."""
+
+import math
+from functools import partial
+
+import numpy as np
+import pytest
+
+from rdstitch.alignment.result import PlanarPoses
+from rdstitch.alignment.trajectory import Trajectory, compare
+from rdstitch.camera import Camera
+from rdstitch.features import Features, match
+from rdstitch.matching.options import PairOptions
+from rdstitch.synthetic import Sequence, blank, line_poses, sequence_over, turn_poses
+from rdstitch.tracking import Tracked, Tracker, TrackingOptions
+from rdstitch.tracking import tracker as module
+
+SIZE = (320, 240)
+DISTORTION = -0.25
+
+
+def _drive(count: int, overlap: float = 0.7, path: str = "turn") -> Sequence:
+    lens = Camera(SIZE, DISTORTION, focal=256.0)
+    make = {"turn": turn_poses, "line": line_poses}[path]
+    return sequence_over(blank, lens, make(lens, count, overlap=overlap, tilt=(0.05, -0.03)))
+
+
+def _features(sequence: Sequence, world: int = 0) -> list[Features]:
+    """What a detector would find: points of the plane, each with a descriptor of its own, off by 0.2 pixels."""
+    rng = np.random.default_rng(world)
+    width, height = sequence.texture.size
+    places = rng.uniform(0.0, (width, height), (width * height // 500, 2))
+    words = rng.normal(size=(len(places), 32)).astype(np.float32)
+    frames = []
+    for index in range(len(sequence)):
+        seen = sequence.to_picture(index, places)
+        inside = np.isfinite(seen).all(axis=1) & (seen > 0.0).all(axis=1) & (seen < np.array(SIZE) - 1.0).all(axis=1)
+        points = seen[inside] + rng.normal(0.0, 0.2, (int(inside.sum()), 2))
+        ones = np.ones(len(points))
+        frames.append(Features(points, words[inside], ones, 0.0 * ones, ones, None, "made up", SIZE))
+    return frames
+
+
+def _tracker(distortion: float | None = None) -> Tracker:
+    return Tracker(TrackingOptions(PairOptions(distortion=distortion)), partial(match, ratio=0.8))
+
+
+def _path(results: list[Tracked]) -> Trajectory:
+    """The last pose given of each frame."""
+    poses = {result.number: pose for result in results if (pose := result.pose) is not None}
+    numbers = sorted(poses)
+    places = np.array([(poses[k].x, poses[k].y) for k in numbers])
+    yaw, height = (np.array([getattr(poses[k], name) for k in numbers]) for name in ("yaw", "height"))
+    return Trajectory(np.array(numbers), places, yaw, height)
+
+
+def _truth(sequence: Sequence) -> Trajectory:
+    p, unit = sequence.poses, sequence.poses.height[0]
+    return Trajectory.from_poses(PlanarPoses(p.yaw, p.position / unit, p.height / unit, p.tilt))
+
+
+@pytest.mark.parametrize("distortion", [None, DISTORTION])
+def test_the_path_and_lambda_come_near_the_truth(distortion: float | None) -> None:
+    sequence, tracker = _drive(40), _tracker(distortion)
+    results = [result for frame in _features(sequence) for result in tracker.add(frame, Camera(SIZE))]
+    error = compare(_path(results), _truth(sequence))
+    assert error.drift < 0.004
+    assert error.rotation < math.radians(0.1)
+    assert abs(results[-1].distortion - DISTORTION) < 0.003
+    assert tracker.distortion_known
+    # Every frame but those before the first alignment has a place when it comes.
+    assert all(result.placement is not None for result in results if result.number >= 12)
+
+
+def test_lambda_becomes_surer_and_is_exact_where_it_is_given() -> None:
+    frames, tracker = _features(_drive(30)), _tracker()
+    results = [tracker.add(frame, Camera(SIZE))[-1] for frame in frames]
+    stds = [result.distortion_std for result in results]
+    assert stds[0] == math.inf
+    assert stds[-1] < 0.5 * stds[3]
+    known = _tracker(-0.2).add(frames[0], Camera(SIZE))[-1]
+    assert (known.distortion, known.distortion_std) == (-0.2, 0.0)
+
+
+def test_keyframes_that_came_before_the_map_are_given_their_place_later() -> None:
+    frames, tracker = _features(_drive(12)), _tracker()
+    results = [result for frame in frames for result in tracker.add(frame, Camera(SIZE))]
+    revised = [result for result in results if result.revised]
+    assert revised
+    assert revised[0].number == 0
+    pose = revised[0].pose
+    assert pose is not None
+    np.testing.assert_allclose([pose.x, pose.y, pose.yaw, pose.height], [0.0, 0.0, 0.0, 1.0], atol=1e-9)
+    assert all(result.placement is not None for result in revised)
+
+
+def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_WINDOW", 10)
+    tracker = _tracker(DISTORTION)
+    for frame in _features(_drive(40, overlap=0.6, path="line")):
+        tracker.add(frame, Camera(SIZE))
+    assert len(tracker._keyframes) == 10
+    first = tracker._keyframes[0].number
+    assert first >= 25
+    assert tracker._pairs
+    assert all(pair.image1 >= first for pair in tracker._pairs)
+
+
+def test_a_camera_that_stands_still_makes_no_keyframes() -> None:
+    frames, tracker = _features(_drive(12)), _tracker()
+    for frame in frames:
+        tracker.add(frame, Camera(SIZE))
+    results = [tracker.add(frames[-1], Camera(SIZE)) for _ in range(5)]
+    assert [len(result) for result in results] == [1] * 5
+    assert not any(result[-1].keyframe for result in results)
+    poses = [result[-1].pose for result in results]
+    assert all(pose is not None and pose == poses[0] for pose in poses)
+
+
+def test_a_frame_of_something_else_has_no_place_and_the_next_one_has() -> None:
+    frames, tracker = _features(_drive(16)), _tracker()
+    strangers = _features(_drive(16), world=7)
+    for frame in frames[:14]:
+        tracker.add(frame, Camera(SIZE))
+    lost = tracker.add(strangers[3], Camera(SIZE))[-1]
+    assert lost.placement is None
+    assert lost.inliers == 0
+    assert lost.map_number == 0
+    assert tracker.add(frames[14], Camera(SIZE))[-1].placement is not None
+
+
+def test_a_new_map_begins_where_the_track_is_lost_for_good(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_LOST", 3)
+    frames, tracker = _features(_drive(8)), _tracker()
+    elsewhere = _features(_drive(11, path="line"), world=7)
+    before = [tracker.add(frame, Camera(SIZE))[-1] for frame in frames]
+    after = [tracker.add(frame, Camera(SIZE))[-1] for frame in elsewhere]
+    assert {result.map_number for result in before} == {0}
+    assert [result.placement for result in after[: module._LOST]] == [None] * module._LOST
+    assert after[-1].map_number == 1
+    assert after[-1].placement is not None
+
+
+def test_frames_without_features_are_none_to_wait_for() -> None:
+    tracker = _tracker()
+    none = np.zeros(0)
+    empty = Features(np.zeros((0, 2)), np.zeros((0, 32), np.float32), none, none, none, None, "made up", SIZE)
+    frames = _features(_drive(14))
+    for frame in [empty, empty, *frames]:
+        result = tracker.add(frame, Camera(SIZE))[-1]
+    assert result.map_number == 0
+    assert result.placement is not None
