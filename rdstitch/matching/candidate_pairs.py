@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.features import Features
+from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.matching.retrieval import Similarity, similarity
 from rdstitch.radial_homography import to_plane
 
@@ -52,7 +52,7 @@ class PointsOfTwo(Protocol):
         ...
 
 
-def first_pairs(features: Sequence[Features], seed: int, positions: FloatArray | None = None) -> Pairs:
+def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None = None) -> Pairs:
     """Pairs (i, j), i < j, to try before anything is known of the poses.
 
     Beyond :data:`EXHAUSTIVE_UP_TO` pictures, they are at most :data:`CANDIDATES` a picture in the mean, unless
@@ -61,8 +61,8 @@ def first_pairs(features: Sequence[Features], seed: int, positions: FloatArray |
 
     Parameters
     ----------
-    features : sequence of Features
-        One a picture, in the order in which the pictures were taken, if there is one.
+    features : FeatureStore
+        Of the pictures, in the order in which the pictures were taken, if there is one.
     seed : int
     positions : ndarray of shape (N, 2) or (N, 3), optional
         Where each picture was taken, in any unit; NaN where that is not known.
@@ -75,7 +75,7 @@ def first_pairs(features: Sequence[Features], seed: int, positions: FloatArray |
     if alike is None or alike.ordered:
         chosen |= {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + _FOLLOWING, count))}
     if alike is not None:
-        chosen |= _alike_to_each(alike, {i for i, found in enumerate(features) if len(found)})
+        chosen |= _alike_to_each(alike, set(np.flatnonzero(features.counts).tolist()))
         chosen |= _most_alike(alike, chosen, CANDIDATES * count // 2)
     return sorted(chosen)
 

@@ -6,7 +6,6 @@ a tree of two levels (Nistér and Stewénius 2006). Two pictures are alike as fa
 their square, of which 10,000 pictures take seconds.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +14,7 @@ from scipy import sparse
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.features import Features
+from rdstitch.matching.feature_store import FeatureStore
 
 _DESCRIBING = 1000  # strongest features that describe a picture
 _DESCRIPTORS_PER_WORD = 16  # few enough that a word is rare, enough that one place on the ground is one word
@@ -104,22 +104,22 @@ class Vocabulary:
         return word
 
 
-def similarity(features: Sequence[Features], seed: int) -> Similarity | None:
+def similarity(features: FeatureStore, seed: int) -> Similarity | None:
     """How alike the pictures are whose features these are; None where they show too little to say.
 
     Parameters
     ----------
-    features : sequence of Features
-        One a picture, in the order in which the pictures were taken, if there is one; each is used once at a time.
+    features : FeatureStore
+        One a picture, in the order in which the pictures were taken, if there is one; read twice, one at a time.
     seed : int
     """
     weights = _weighted_words(features, seed)
     return None if weights is None else _compare(weights)
 
 
-def _weighted_words(features: Sequence[Features], seed: int) -> sparse.csr_array | None:
+def _weighted_words(features: FeatureStore, seed: int) -> sparse.csr_array | None:
     """The words of each picture, as unit vectors (N, words); zero for pictures without features."""
-    counts = np.array([min(len(found), _DESCRIBING) for found in features])
+    counts = np.minimum(features.counts, _DESCRIBING)
     total = int(counts.sum())
     if total < _LEAST_DESCRIPTORS:
         return None
@@ -131,7 +131,8 @@ def _weighted_words(features: Sequence[Features], seed: int) -> sparse.csr_array
     parts = np.split(chosen, np.searchsorted(chosen, starts[1:]))
     training = [_describing(found)[part - start] for found, part, start in zip(features, parts, starts, strict=True)]
     vocabulary = Vocabulary.learned(np.concatenate([part for part in training if len(part)]), branches, random)
-    words = [vocabulary.assign(_describing(found)) if len(found) else np.empty(0, np.intp) for found in features]
+    described = (_describing(found) for found in features)
+    words = [vocabulary.assign(found) if len(found) else np.empty(0, np.intp) for found in described]
     image, word = np.repeat(np.arange(len(counts)), counts), np.concatenate(words)
     ones = np.ones(total, dtype=np.float32)
     used = sparse.coo_array((ones, (image, word)), shape=(len(counts), vocabulary.size)).tocsr()

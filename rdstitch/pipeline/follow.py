@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rdstitch.cache import NO_CACHE
-from rdstitch.features import FeatureOptions, match
+from rdstitch.errors import InputError
+from rdstitch.features import FeatureOptions, View, detect_view, match
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.masks import with_masks
@@ -17,11 +17,10 @@ from rdstitch.inputs.selection import is_selected
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.inputs.timestamps import timestamps_of
 from rdstitch.io.write import write_image
+from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import alignment_options
-from rdstitch.pipeline.detect_features import detect_features
-from rdstitch.pipeline.working_size import at_working_size, features_at
-from rdstitch.progress import silent
+from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.tracking import Preview, Tracked, Tracker, TrackingOptions
 
 _FEATURES = 600  # of a frame, that suffice to follow it
@@ -115,13 +114,14 @@ def follow(
         if source is None:
             yield FollowedFrame(frame.path.name, frame.number or 0, math.nan, None, reason)
             continue
-        found = detect_features([source], features, 1, NO_CACHE, skip_bad=True, progress=silent)
         label = FollowedFrame(source.name, source.number(0), float(timestamps_of([source])[0]), None)
-        if found.damaged:
-            yield replace(label, reason=found.damaged[0])
+        try:
+            found = detect_view(partial(_view, source), features)
+        except InputError as error:
+            yield replace(label, reason=str(error))
             continue
-        camera = at_working_size(source.camera, features.work_megapixels)
-        results = tracker.add(features_at(found.features[0], source.camera, camera), camera)
+        camera = at_working_size(source.camera, features.limits[1])
+        results = tracker.add(FeatureStore.of([found]).at_sizes([camera.image_size])[0], camera)
         labels[results[-1].number] = label
         for result in results:
             known = labels[result.number]
@@ -161,12 +161,19 @@ class _Sketch:
 
 def _live_features(options: FeatureOptions) -> FeatureOptions:
     """Fewer features, from smaller pictures."""
-    megapixels = options.work_megapixels
+    most, megapixels = options.limits
     return replace(
         options,
-        max_features=min(options.max_features, _FEATURES),
+        max_features=min(most, _FEATURES),
         work_megapixels=_MEGAPIXELS if megapixels is None else min(megapixels, _MEGAPIXELS),
     )
+
+
+def _view(source: Source, megapixels: float | None) -> View:
+    """The frame as large as detection needs it; it is kept for the preview."""
+    reduction = source.reduction(megapixels)
+    picture = source.read(reduction, keep=True)
+    return View(picture.pixels, picture.alpha, reduction, source.camera.image_size)
 
 
 def _source(frame: Frame, options: StitchOptions) -> tuple[Source | None, str]:

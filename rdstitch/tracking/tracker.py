@@ -11,8 +11,9 @@ from rdstitch.camera import Camera
 from rdstitch.errors import RegistrationError
 from rdstitch.features import Features, Matcher
 from rdstitch.matching.distortion_consensus import vote
+from rdstitch.matching.links import Link
 from rdstitch.matching.options import PairOptions
-from rdstitch.matching.two_view import PairRegistration, estimate_pairs
+from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
 from rdstitch.tracking.placement import CameraPose, Placement, Similarity2
 
 _WINDOW = 48  # keyframes that are kept
@@ -27,6 +28,7 @@ _STILL_SHARED = 0.75  # share of a frame that its last keyframe shows, below whi
 _GRID = 8  # points a side by which that is measured
 _LOST = 10  # frames in a row without a place, after which a new map begins
 _FEWEST_INLIERS = 15
+_SELECT_BELOW = 50  # inliers below which motions of the plane compete with a free homography
 _MATCHES = 80  # of a link, that the alignment uses
 _SAME_TILT = ("rigid", "similarity")
 
@@ -140,7 +142,7 @@ class Tracker:
             self._keyframes.append(frame)
             return [self._tracked(frame, keyframe=True, inliers=0)]
         links = self._links(frame)
-        inliers = max((int(link.relation.inliers.sum()) for link in links), default=0)
+        inliers = max((len(link) for link in links), default=0)
         if not links:
             return [self._without_place(frame)]
         self._lost = 0
@@ -151,7 +153,7 @@ class Tracker:
 
     def _start_map(self) -> None:
         self._keyframes: list[_Keyframe] = []
-        self._pairs: list[PairRegistration] = []
+        self._window_links: list[Link] = []
         self._keyframes_seen, self._next_alignment = 0, _FIRST_ALIGNMENT
         self._planar_model: str | None = None
 
@@ -167,49 +169,53 @@ class Tracker:
             return self._tracked(frame, keyframe=True, inliers=0)
         return self._tracked(frame, keyframe=False, inliers=0)
 
-    def _links(self, frame: _Keyframe) -> list[PairRegistration]:
+    def _links(self, frame: _Keyframe) -> list[Link]:
         """The frame with the last keyframes, as far as they can be registered; of a lost one, with more of them."""
         recent = self._keyframes[::-1]
         found = self._registered(frame, recent[:_PARTNERS])
         return found or self._registered(frame, recent[_PARTNERS:_SEARCHED])
 
-    def _registered(self, frame: _Keyframe, others: Sequence[_Keyframe]) -> list[PairRegistration]:
-        """Pairs whose second picture is the frame; their numbers are those of the frames."""
+    def _registered(self, frame: _Keyframe, others: Sequence[_Keyframe]) -> list[Link]:
+        """Links of other frames with the frame, by the numbers of all."""
         if not others:
             return []
-        pictures = [*others, frame]
-        pairs = [(place, len(others)) for place in range(len(others))]
+        options = self._options.pair
+        limits = RansacOptions(options.threshold, options.confidence, options.max_iterations, options.seed)
+        how = EstimationOptions(options.solver, options.distortion, limits, _SELECT_BELOW)
         matched = [self._match(other.features, frame.features) for other in others]
-        found = estimate_pairs([picture.camera for picture in pictures], pairs, matched, self._options.pair)
+        pairs = [
+            PairMatches(
+                found.points1, found.points2, other.camera.with_focal(), frame.camera.with_focal(), -found.ratio
+            )
+            for other, found in zip(others, matched, strict=True)
+        ]
+        relations = estimate_radial_homographies(pairs, how)
         return [
-            replace(pair, image1=others[pair.image1].number, image2=frame.number)
-            for pair in found
-            if pair.relation and pair.relation.inliers.sum() >= _FEWEST_INLIERS
+            Link(other.number, frame.number, found.points1[fit.inliers], found.points2[fit.inliers], fit)
+            for other, found, fit in zip(others, matched, relations, strict=True)
+            if fit and fit.inliers.sum() >= _FEWEST_INLIERS
         ]
 
-    def _placed(self, frame: _Keyframe, links: Sequence[PairRegistration]) -> Placement | None:
+    def _placed(self, frame: _Keyframe, links: Sequence[Link]) -> Placement | None:
         """The place of a frame by its links with keyframes that have one."""
         by_number = {keyframe.number: keyframe for keyframe in self._keyframes}
         known = [(by_number[k.image1].placement, k) for k in links]
         placed = [(placement, link) for placement, link in known if placement is not None]
         if not placed:
             return None
-        nearest, best = max(placed, key=lambda pair: int(pair[1].relation.inliers.sum()))
+        nearest, best = max(placed, key=lambda pair: len(pair[1]))
         camera = frame.camera.with_coefficients(*nearest.camera.coefficients)
         if self._planar_model not in _SAME_TILT:
             inverse = np.linalg.inv(best.relation.homography)
             return Placement(camera, nearest.homography @ inverse, nearest.focal)
         # Where the camera of that keyframe would see the matches, and where they are: one motion of the plane.
         stay = Placement(camera, nearest.homography, nearest.focal)
-        inliers = [link.link() for _, link in placed]
-        here = np.concatenate([stay.to_plane(link.points2) for link in inliers])
-        there = np.concatenate(
-            [placement.to_plane(link.points1) for (placement, _), link in zip(placed, inliers, strict=True)]
-        )
+        here = np.concatenate([stay.to_plane(link.points2) for _, link in placed])
+        there = np.concatenate([placement.to_plane(link.points1) for placement, link in placed])
         seen = np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
         return Similarity2.fitted(here[seen], there[seen], keep_size=self._planar_model == "rigid").applied(stay)
 
-    def _shown_by_last(self, frame: _Keyframe, links: Sequence[PairRegistration]) -> float:
+    def _shown_by_last(self, frame: _Keyframe, links: Sequence[Link]) -> float:
         """Share of the frame that the newest of its partners shows."""
         last = max(links, key=lambda link: link.image1)
         size = np.array(frame.camera.image_size, dtype=np.float64)
@@ -219,12 +225,12 @@ class Tracker:
         inside = (there >= 0.0).all(axis=1) & (there <= size - 1.0).all(axis=1)
         return float(inside.mean())
 
-    def _add_keyframe(self, frame: _Keyframe, links: Sequence[PairRegistration]) -> list[Tracked]:
+    def _add_keyframe(self, frame: _Keyframe, links: Sequence[Link]) -> list[Tracked]:
         """Keep the frame; align the window when it is due, which may place frames that had none."""
         self._keyframes = [*self._keyframes, frame][-_WINDOW:]
         self._keyframes_seen += 1
         first = self._keyframes[0].number
-        self._pairs = [pair for pair in [*self._pairs, *links] if pair.image1 >= first]
+        self._window_links = [link for link in [*self._window_links, *links] if link.image1 >= first]
         if not self.distortion_known:
             self._vote()
         if self._keyframes_seen + 1 < self._next_alignment:
@@ -238,15 +244,15 @@ class Tracker:
 
     def _vote(self) -> None:
         """λ by the pairs alone, until there is an alignment."""
-        if self._planar_model is None and self._pairs:
-            relations = [pair.relation for pair in self._pairs]
+        if self._planar_model is None:
+            relations = [link.relation for link in self._window_links]
             consensus = vote([r.distortion for r in relations], [r.distortion_std for r in relations])
             self._distortion, self._std = consensus.distortion, consensus.std
 
     def _align_window(self) -> None:
         """Align the keyframes of the window among themselves, and bring them to the plane of the map."""
         place = {keyframe.number: index for index, keyframe in enumerate(self._keyframes)}
-        links = [replace(pair.link(), image1=place[pair.image1], image2=place[pair.image2]) for pair in self._pairs]
+        links = [replace(link, image1=place[link.image1], image2=place[link.image2]) for link in self._window_links]
         known = self._options.pair.distortion
         cameras = [keyframe.camera.with_focal() for keyframe in self._keyframes]
         if known is not None:

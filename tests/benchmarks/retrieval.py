@@ -14,8 +14,9 @@ from scipy.spatial import KDTree
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.features import FeatureOptions, Features, detect
+from rdstitch.features import FeatureOptions, detect
 from rdstitch.matching.candidate_pairs import first_pairs
+from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over, survey_poses
 from rdstitch.synthetic.poses import plane_outline
 
@@ -58,7 +59,7 @@ def main() -> None:
         sequence = survey(count, given.seed)
         order = np.arange(count) if given.ordered else np.random.default_rng(given.seed).permutation(count)
         options = FeatureOptions(max_features=given.features)
-        features: list[Features] = [detect(sequence.frame(index), options) for index in order.tolist()]
+        features = FeatureStore.of(detect(sequence.frame(index), options) for index in order.tolist())
         begun = time.process_time()
         pairs = set(first_pairs(features, seed=0))
         taken = time.process_time() - begun

@@ -13,11 +13,17 @@ from rdstitch.features.keypoints import Descriptors
 from rdstitch.matching.candidate_pairs import (
     CANDIDATES,
     EXHAUSTIVE_UP_TO,
-    first_pairs,
     neighbours,
     pairs_that_matter,
 )
+from rdstitch.matching.candidate_pairs import first_pairs as _first_pairs
+from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.matching.retrieval import similarity
+
+
+def first_pairs(features: list[Features], seed: int, positions: FloatArray | None = None) -> list[tuple[int, int]]:
+    """Of features in memory."""
+    return _first_pairs(FeatureStore.of(features), seed, positions)
 
 
 def _features(descriptors: Descriptors) -> Features:
@@ -202,8 +208,8 @@ def test_too_few_features_for_words_look_like_none() -> None:
     """Words are learned from 640 descriptors or more, or not at all."""
     rng = np.random.default_rng(0)
     pictures = [_features(rng.normal(size=(16, 64)).astype(np.float32)) for _ in range(39)]
-    assert similarity(pictures, seed=1) is None
-    assert similarity([*pictures, pictures[0]], seed=1) is not None
+    assert similarity(FeatureStore.of(pictures), seed=1) is None
+    assert similarity(FeatureStore.of([*pictures, pictures[0]]), seed=1) is not None
 
 
 def test_pictures_that_look_like_none_are_paired_with_the_three_that_follow() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rdstitch.alignment.result import PlanarPoses
-from rdstitch.alignment.trajectory import Trajectory, compare
+from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
 from rdstitch.camera import Camera
 from rdstitch.features import Features, match
 from rdstitch.matching.options import PairOptions
@@ -63,7 +63,7 @@ def _truth(sequence: Sequence) -> Trajectory:
 def test_the_path_and_lambda_come_near_the_truth(distortion: float | None) -> None:
     sequence, tracker = _drive(40), _tracker(distortion)
     results = [result for frame in _features(sequence) for result in tracker.add(frame, Camera(SIZE))]
-    error = compare(_path(results), _truth(sequence))
+    error = compare_trajectories(_path(results), _truth(sequence))
     assert error.drift < 0.004
     assert error.rotation < math.radians(0.1)
     assert abs(results[-1].distortion - DISTORTION) < 0.003
@@ -102,8 +102,8 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(tracker._keyframes) == 10
     first = tracker._keyframes[0].number
     assert first >= 25
-    assert tracker._pairs
-    assert all(pair.image1 >= first for pair in tracker._pairs)
+    assert tracker._window_links
+    assert all(link.image1 >= first for link in tracker._window_links)
 
 
 def test_a_camera_that_stands_still_makes_no_keyframes() -> None:
