@@ -1,18 +1,23 @@
 """Do the tests notice when a decision is changed? Small changes of the code, one at a time, each against its tests.
 
-    python -m tests.benchmarks.mutation                         # of every module of MAPPED, a sample of 10 mutants
+    python -m tests.benchmarks.mutation                             # a sample of 7 mutants of every module of MODULES
     python -m tests.benchmarks.mutation robust.verification --sample 0      # all mutants of one module
 
-A mutant is the module with one operator or constant changed; nothing on disk is touched. It is killed when one of the
-tests that the module is mapped to fails, or takes far longer than without the change. Those that survive are printed.
+A mutant is the module with one operator or constant changed; nothing on disk is touched. First the tests of TESTS run
+once, to see which of them executes which lines. A mutant then meets the tests that execute its line, the quickest
+first, as long as these take no more than ``--seconds``; it is killed when one fails, or takes far longer than without
+the change. Those that survive are printed.
 """
 
 import argparse
 import ast
+import json
 import os
 import random
 import signal
 import sys
+import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -20,32 +25,30 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
-from types import CodeType, ModuleType
+from types import CodeType, FrameType, ModuleType
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# Tests by module, or by package for those of its modules that are not named; the quickest to fail first.
-MAPPED = {
-    "robust": (
-        "unit/robust/test_sampling.py",
-        "unit/robust/test_pair_models.py",
-        "unit/robust/test_decisions.py",
-        "unit/robust/test_own_lenses.py",
-        "acceptance/test_robust_estimation.py",
-    ),
-    "verification": ("unit/verification", "property/test_trust.py"),
-    "matching.candidate_pairs": ("unit/matching/test_candidate_pairs.py", "unit/matching/test_two_view_rounds.py"),
-    "matching.distortion_consensus": ("unit/matching/test_distortion_consensus.py",),
-    "matching.lens_votes": ("unit/matching/test_mixed_lenses.py",),
-    "matching.match_graph": ("unit/matching/test_match_graph.py",),
-    "matching.mixed_lenses": ("unit/matching/test_mixed_lenses.py",),
-    "matching.static_background": ("unit/matching/test_static_background.py", "unit/matching/test_two_view_rounds.py"),
-    "matching.thinning": ("unit/matching/test_thinning.py",),
-    "alignment.cycle_consistency": ("unit/alignment/test_cycle_consistency.py", "unit/alignment/test_align.py"),
-    "alignment.model_selection": ("unit/alignment/test_align.py",),
-    "alignment.planarity": ("unit/alignment/test_planarity.py", "unit/alignment/test_align.py"),
-}
+# Packages and modules that decide; of a package all modules but those that only describe.
+MODULES = (
+    "robust",
+    "verification",
+    "matching.candidate_pairs",
+    "matching.distortion_consensus",
+    "matching.lens_votes",
+    "matching.match_graph",
+    "matching.mixed_lenses",
+    "matching.static_background",
+    "matching.thinning",
+    "alignment.cycle_consistency",
+    "alignment.lens_selection",
+    "alignment.model_selection",
+    "alignment.noise_model",
+    "alignment.planarity",
+    "alignment.turn_or_plane",
+)
+TESTS = ("unit/robust", "unit/verification", "unit/matching", "unit/alignment")
 
 # Numbers that decide nothing: changed, the same comes out, only sooner or later, or in other steps.
 SPEED_ONLY = frozenset(
@@ -76,12 +79,15 @@ class Mutant:
         Which change of the module, in the order of its text.
     line : int
     change : str
+    lines : frozenset of int
+        Of the statement; empty for one that is executed when the module is imported.
     """
 
     module: str
     number: int
     line: int
     change: str
+    lines: frozenset[int] = frozenset()
 
     def __str__(self) -> str:
         """Where, and what."""
@@ -155,7 +161,26 @@ def _changes_of(node: ast.expr) -> Iterator[_Change]:
 def mutants(module: str) -> list[Mutant]:
     """All mutants of a module."""
     tree = ast.parse(_path(module).read_text(encoding="utf-8"))
-    return [Mutant(module, k, change.node.lineno, change.text) for k, change in enumerate(_changes(tree))]
+    lines = _statement_lines(tree)
+    return [
+        Mutant(module, k, change.node.lineno, change.text, lines.get(change.node.lineno, frozenset()))
+        for k, change in enumerate(_changes(tree))
+    ]
+
+
+def _statement_lines(tree: ast.Module) -> dict[int, frozenset[int]]:
+    """For each line of a function's body the lines of its statement; of a compound one, those of its head."""
+    found: dict[int, frozenset[int]] = {}
+    for function in ast.walk(tree):
+        if not isinstance(function, ast.FunctionDef):
+            continue
+        for node in (inner for statement in function.body for inner in ast.walk(statement)):
+            if isinstance(node, ast.stmt):
+                body = getattr(node, "body", None)
+                last = body[0].lineno - 1 if body else node.end_lineno or node.lineno
+                lines = frozenset(range(node.lineno, max(last, node.lineno) + 1))
+                found.update(dict.fromkeys(lines, lines))
+    return found
 
 
 class _Importer(SourceFileLoader):
@@ -179,53 +204,153 @@ class _Importer(SourceFileLoader):
         return compile(ast.fix_missing_locations(tree), self.path, "exec")
 
 
-def survives(mutant: Mutant | None, tests: Sequence[str], seconds: float) -> bool:
-    """Whether all tests pass, in time, in a process of their own; without a mutant, as the code is."""
+@dataclass(frozen=True)
+class Coverage:
+    """Which test executes what.
+
+    Attributes
+    ----------
+    seconds : dict of str to float
+        Of each test, by its identifier.
+    lines : dict of str to set of (str, int)
+        Module and line, of each test.
+    """
+
+    seconds: dict[str, float]
+    lines: dict[str, set[tuple[str, int]]]
+
+    def tests(self, mutant: "Mutant", budget: float) -> list[str]:
+        """Those that execute the lines of a mutant, the quickest first, together in so many seconds."""
+        wanted = mutant.lines
+        found = [
+            test
+            for test, executed in self.lines.items()
+            if any(module == mutant.module and (not wanted or line in wanted) for module, line in executed)
+        ]
+        result: list[str] = []
+        for test in sorted(found, key=lambda test: self.seconds[test]):
+            budget -= self.seconds[test]
+            if result and budget < 0.0:
+                break
+            result.append(test)
+        return result
+
+
+class _Tracer:
+    """A plugin of pytest that notes what each test executes of the modules; what fixtures execute is every test's."""
+
+    def __init__(self, modules: Sequence[str]) -> None:
+        self._modules = {str(_path(module)): module for module in modules}
+        self._lines: set[tuple[str, int]] = set()
+        self._of_fixtures: dict[str, set[tuple[str, int]]] = {}
+        self.found = Coverage({}, {})
+
+    def _enter(self, frame: FrameType, event: str, argument: object) -> Any:
+        module = self._modules.get(frame.f_code.co_filename)
+        if module is None:
+            return None
+
+        def line(frame: FrameType, event: str, argument: object) -> Any:
+            self._lines.add((module, frame.f_lineno))
+            return line
+
+        return line
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        """After a phase of a test."""
+        test, file = report.nodeid, report.nodeid.split("::")[0]
+        if report.when == "setup":
+            self._of_fixtures.setdefault(file, set()).update(self._lines)
+        elif report.when == "call":
+            self.found.seconds[test] = report.duration
+            self.found.lines[test] = self._lines | self._of_fixtures[file]
+        self._lines = set()
+
+    def __enter__(self) -> "_Tracer":
+        """Begin to trace."""
+        threading.settrace(self._enter)
+        sys.settrace(self._enter)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End tracing."""
+        sys.settrace(None)
+        threading.settrace(None)
+
+
+def measure_coverage(modules: Sequence[str], tests: Sequence[str]) -> Coverage:
+    """Run all tests once, in a process of their own, as the code is."""
+    with tempfile.NamedTemporaryFile("r", suffix=".json") as file:
+        child = os.fork()
+        if not child:
+            _alone(partial(_trace, modules, tests, file.name))
+        _, status = os.waitpid(child, 0)
+        if os.waitstatus_to_exitcode(status) != 0:
+            raise SystemExit(f"the tests fail as the code is: {' '.join(tests)}")
+        seconds, lines = json.load(file)
+    return Coverage(seconds, {test: {(module, line) for module, line in found} for test, found in lines.items()})
+
+
+def _trace(modules: Sequence[str], tests: Sequence[str], file: str) -> int:
+    import pytest
+
+    with _Tracer(modules) as tracer:
+        status = int(pytest.main([*_QUIET, *(str(ROOT / "tests" / test) for test in tests)], [tracer]))
+    found = tracer.found
+    Path(file).write_text(json.dumps((found.seconds, {k: sorted(v) for k, v in found.lines.items()})), encoding="utf-8")
+    return status
+
+
+def survives(mutant: "Mutant", coverage: Coverage, budget: float) -> bool:
+    """Whether all tests of a mutant pass, in time, in a process of their own."""
+    tests = coverage.tests(mutant, budget)
+    if not tests:
+        return True
     child = os.fork()
     if not child:
-        _run(mutant, tests)
-    end = time.monotonic() + seconds
+        _alone(partial(_test, mutant, tests))
+    end = time.monotonic() + 20.0 + 8.0 * sum(coverage.seconds[test] for test in tests)
     while time.monotonic() < end:
         done, status = os.waitpid(child, os.WNOHANG)
         if done:
             return os.waitstatus_to_exitcode(status) == 0
-        time.sleep(0.05)
+        time.sleep(0.02)
     os.killpg(child, signal.SIGKILL)
     os.waitpid(child, 0)
     return False
 
 
-def _run(mutant: Mutant | None, tests: Sequence[str]) -> None:
-    """Run the tests and leave; everything that they print is lost."""
+def _test(mutant: "Mutant", tests: Sequence[str]) -> int:
+    import pytest
+
+    sys.meta_path.insert(0, _Importer(mutant))
+    return int(pytest.main([*_QUIET, *tests]))
+
+
+_QUIET = ("-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--rootdir", str(ROOT))
+
+
+def _alone(run: Callable[[], int]) -> None:
+    """Run, in a forked process, and leave; everything that is printed is lost."""
     os.setsid()
+    os.chdir(ROOT)
     nowhere = os.open(os.devnull, os.O_RDWR)
     for stream in (1, 2):
         os.dup2(nowhere, stream)
     status = 1
     try:
-        import pytest
-
-        if mutant is not None:
-            sys.meta_path.insert(0, _Importer(mutant))
-        status = int(
-            pytest.main(["-x", "-q", "-p", "no:cacheprovider", *(str(ROOT / "tests" / test) for test in tests)])
-        )
+        status = run()
     finally:
         os._exit(status)
 
 
-def _modules(wanted: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """The modules named, or all that are mapped, and the tests of each: those of its name first."""
-    found = {}
-    for name, tests in MAPPED.items():
+def _modules(wanted: Sequence[str]) -> list[str]:
+    """The modules named, or all of MODULES."""
+    found = []
+    for name in MODULES:
         package = ROOT / "rdstitch" / name.replace(".", "/")
-        parts = [f"{name}.{p.stem}" for p in sorted(package.glob("[!_]*.py"))] if package.is_dir() else [name]
-        for module in parts:
-            own = f"unit/{module.replace('.', '/test_').replace('/test_', '/', module.count('.') - 1)}.py"
-            first = (own,) if own not in tests and (ROOT / "tests" / own).exists() else ()
-            if not wanted or any(module == part or module.startswith(f"{part}.") for part in wanted):
-                found[module] = (*first, *tests)
-    return found
+        found += [f"{name}.{p.stem}" for p in sorted(package.glob("[!_]*.py"))] if package.is_dir() else [name]
+    return [m for m in found if not wanted or any(m == part or m.startswith(f"{part}.") for part in wanted)]
 
 
 def main() -> int:
@@ -233,29 +358,29 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         prog="python -m tests.benchmarks.mutation", description="Do tests notice changed decisions?"
     )
-    parser.add_argument("modules", nargs="*", help="below rdstitch, as robust or matching.thinning; all mapped ones")
-    parser.add_argument("--sample", type=int, default=10, help="mutants of each module; 0 is all of them")
+    parser.add_argument("modules", nargs="*", help="below rdstitch, as robust or matching.thinning; all of MODULES")
+    parser.add_argument("--sample", type=int, default=7, help="mutants of each module; 0 is all of them")
     parser.add_argument("--seed", type=int, default=0, help="of the sample")
+    parser.add_argument("--seconds", type=float, default=20.0, help="of tests that each mutant meets")
     parser.add_argument("--workers", type=int, default=1, help="mutants tested at a time")
+    parser.add_argument("--tests", nargs="+", default=TESTS, help="below tests")
     arguments = parser.parse_args()
     # Loaded once, before the processes of the mutants divide; nothing of rdstitch itself.
     import cv2  # noqa: F401
     import pytest  # noqa: F401
     import scipy.optimize
-    import scipy.sparse.csgraph  # noqa: F401
+    import scipy.sparse.csgraph
+    import scipy.spatial  # noqa: F401
 
+    modules = _modules(arguments.modules)
+    coverage = measure_coverage(modules, arguments.tests)
     total, lost = 0, 0
     with ThreadPoolExecutor(arguments.workers) as pool:
-        for module, tests in _modules(arguments.modules).items():
+        for module in modules:
             chosen = mutants(module)
             if 0 < arguments.sample < len(chosen):
                 chosen = random.Random(f"{arguments.seed} {module}").sample(chosen, arguments.sample)
-            start = time.monotonic()
-            if not survives(None, tests, 600.0):
-                print(f"{module}: its tests fail as the code is: {' '.join(tests)}")
-                return 1
-            seconds = 10.0 + 5.0 * (time.monotonic() - start)
-            alive = list(pool.map(partial(survives, tests=tests, seconds=seconds), chosen))
+            alive = list(pool.map(partial(survives, coverage=coverage, budget=arguments.seconds), chosen))
             survivors = [mutant for mutant, lives in zip(chosen, alive, strict=True) if lives]
             total, lost = total + len(chosen), lost + len(survivors)
             print(f"{module}: {len(survivors)} of {len(chosen)} survive", *survivors, sep="\n  ", flush=True)
