@@ -200,7 +200,6 @@ def align(
         ~wrong,
         problem,
         replace(choice, fit=fit),
-        votes,
         chosen.refined(fit.free_lens),
         observable,
         None if options.gravity is None else np.asarray(options.gravity, dtype=np.float64),

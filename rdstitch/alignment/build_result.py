@@ -20,7 +20,6 @@ from rdstitch.alignment.sandwich import sandwich_std
 from rdstitch.alignment.shape_test import judge_shape
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS, Camera
-from rdstitch.matching.distortion_consensus import Consensus
 from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.messages import Message
@@ -45,7 +44,6 @@ class AdjustedPictures:
     problem : Problem
         The final one.
     choice : ModelChoice
-    votes : Consensus
     lens : LensChoice
         The lens, with the distortion centre if the motion model freed it.
     observable : bool
@@ -60,7 +58,6 @@ class AdjustedPictures:
     right: BoolArray
     problem: Problem
     choice: ModelChoice
-    votes: Consensus
     lens: LensChoice
     observable: bool
     gravity: FloatArray | None = None
@@ -248,13 +245,6 @@ def _warnings(found: AdjustedPictures) -> tuple[Message, ...]:
             "give λ, a camera file, or pictures that overlap by less"
         )
         result.append(Message(text, code="lambda-not-observable"))
-    if found.votes.groups:
-        (low, few), (high, many) = found.votes.groups
-        text = (
-            f"{few} pairs see λ = {low:+.3f}, {many} pairs {high:+.3f}: two cameras, or a zoom; "
-            "stitch their pictures on their own"
-        )
-        result.append(Message(text, code="mixed-lenses"))
     if not found.choice.fit.adjusted.converged:
         result.append(Message("the adjustment did not converge; judge the result with care", code="not-converged"))
     return tuple(result)

@@ -13,8 +13,6 @@ from rdstitch.arrays import FloatArray
 
 _BINS = 50
 _ROUNDS = 20
-_LEAST_GROUP = 3
-"""Votes that make a second camera rather than a few bad pairs."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +35,6 @@ class Consensus:
         Bin edges of the histogram; empty without votes.
     histogram : ndarray of shape (B,)
         Weight of the votes in each bin, adding up to one.
-    groups : tuple of (float, int)
-        λ and number of votes of each of two separate groups: two cameras, or a zoom; empty where there is one group.
     reason : str
         One sentence.
     """
@@ -50,7 +46,6 @@ class Consensus:
     votes: int
     edges: FloatArray
     histogram: FloatArray
-    groups: tuple[tuple[float, int], ...]
     reason: str
 
 
@@ -71,7 +66,7 @@ def vote(distortion: ArrayLike, std: ArrayLike) -> Consensus:
     if not len(values):
         reason = f"none of {count} pairs can see the distortion: the camera hardly moves, or only turns about its axis"
         empty = np.empty(0)
-        return Consensus(np.nan, np.inf, 0.0, 0, 0, empty, empty, (), reason)
+        return Consensus(np.nan, np.inf, 0.0, 0, 0, empty, empty, reason)
     scatter = 0.0
     center = _weighted_median(values, errors**-2)
     for _ in range(_ROUNDS):
@@ -88,7 +83,6 @@ def vote(distortion: ArrayLike, std: ArrayLike) -> Consensus:
     uncertainty = float(1.0 / np.sqrt(max(weight.sum(), 1e-300)))
     low, high = min(values.min(), center - 1e-3), max(values.max(), center + 1e-3)
     histogram, edges = np.histogram(values, bins=_BINS, range=(low, high), weights=total**-2.0)
-    groups = _groups(values, errors)
     reason = f"{int(inside.sum())} of {len(values)} pairs agree on {center:+.4f}"
     return Consensus(
         center,
@@ -98,7 +92,6 @@ def vote(distortion: ArrayLike, std: ArrayLike) -> Consensus:
         len(values),
         edges,
         histogram / histogram.sum(),
-        groups,
         reason,
     )
 
@@ -121,26 +114,3 @@ def _scatter(residual: FloatArray, errors: FloatArray) -> float:
         else:
             high = middle
     return low
-
-
-def _groups(values: FloatArray, errors: FloatArray) -> tuple[tuple[float, int], ...]:
-    """Two groups of votes far apart, if the votes fall into two.
-
-    Uncertain votes do not count. The sorted votes are cut where that leaves the least scatter within the two
-    parts; they are two groups when each has a fifth of the votes, and their means are farther apart than six times
-    the scatter within either.
-    """
-    certain = np.sort(values[errors <= 2.0 * np.median(errors)])
-    count = len(certain)
-    least = max(_LEAST_GROUP, int(np.ceil(0.2 * count)))
-    if count < 2 * least:
-        return ()
-    cuts = range(least, count - least + 1)
-    cost = [np.var(certain[:cut]) * cut + np.var(certain[cut:]) * (count - cut) for cut in cuts]
-    cut = cuts[int(np.argmin(cost))]
-    parts = certain[:cut], certain[cut:]
-    gap = float(parts[1].mean() - parts[0].mean())
-    within = max(float(np.std(part)) for part in parts)
-    if gap <= 6.0 * max(within, float(np.median(errors))) or gap < 0.01:
-        return ()
-    return tuple((float(np.median(part)), len(part)) for part in parts)
