@@ -278,26 +278,28 @@ class _Tracer:
         threading.settrace(None)
 
 
-def measure_coverage(modules: Sequence[str], tests: Sequence[str]) -> Coverage:
-    """Run all tests once, in a process of their own, as the code is."""
-    with tempfile.NamedTemporaryFile("r", suffix=".json") as file:
+def measure_coverage(modules: Sequence[str], tests: Sequence[str], file: Path) -> Coverage:
+    """Run all tests once, in a process of their own, as the code is; a file that is there is read instead."""
+    if not file.exists():
         child = os.fork()
         if not child:
-            _alone(partial(_trace, modules, tests, file.name))
+            _alone(partial(_trace, modules, tests, file))
         _, status = os.waitpid(child, 0)
         if os.waitstatus_to_exitcode(status) != 0:
             raise SystemExit(f"the tests fail as the code is: {' '.join(tests)}")
-        seconds, lines = json.load(file)
+    seconds, lines = json.loads(file.read_text(encoding="utf-8"))
     return Coverage(seconds, {test: {(module, line) for module, line in found} for test, found in lines.items()})
 
 
-def _trace(modules: Sequence[str], tests: Sequence[str], file: str) -> int:
+def _trace(modules: Sequence[str], tests: Sequence[str], file: Path) -> int:
     import pytest
 
     with _Tracer(modules) as tracer:
         status = int(pytest.main([*_QUIET, *(str(ROOT / "tests" / test) for test in tests)], [tracer]))
-    found = tracer.found
-    Path(file).write_text(json.dumps((found.seconds, {k: sorted(v) for k, v in found.lines.items()})), encoding="utf-8")
+    if status == 0:
+        found = tracer.found
+        text = json.dumps((found.seconds, {test: sorted(lines) for test, lines in found.lines.items()}))
+        file.write_text(text, encoding="utf-8")
     return status
 
 
@@ -363,6 +365,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the sample")
     parser.add_argument("--seconds", type=float, default=20.0, help="of tests that each mutant meets")
     parser.add_argument("--workers", type=int, default=1, help="mutants tested at a time")
+    parser.add_argument("--coverage", type=Path, help="file that keeps what the tests execute, from run to run")
     parser.add_argument("--tests", nargs="+", default=TESTS, help="below tests")
     arguments = parser.parse_args()
     # Loaded once, before the processes of the mutants divide; nothing of rdstitch itself.
@@ -373,7 +376,8 @@ def main() -> int:
     import scipy.spatial  # noqa: F401
 
     modules = _modules(arguments.modules)
-    coverage = measure_coverage(modules, arguments.tests)
+    with tempfile.TemporaryDirectory() as folder:
+        coverage = measure_coverage(modules, arguments.tests, arguments.coverage or Path(folder) / "coverage.json")
     total, lost = 0, 0
     with ThreadPoolExecutor(arguments.workers) as pool:
         for module in modules:
