@@ -95,7 +95,7 @@ def padded_length(count: int) -> int:
     """
     if count <= _LEAST_WIDTH:
         return _LEAST_WIDTH
-    step = 1 << max((count - 1).bit_length() - 1 - _STEPS_PER_OCTAVE.bit_length() + 1, 0)
+    step = 1 << ((count - 1).bit_length() - _STEPS_PER_OCTAVE.bit_length())
     return -(-count // step) * step
 
 

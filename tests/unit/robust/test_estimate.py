@@ -1,0 +1,114 @@
+"""The public functions of two-view estimation: their arguments, and what known tilts and solvers change."""
+
+import inspect
+
+import numpy as np
+import pytest
+
+from rdstitch.errors import ArgumentError
+from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies, estimate_radial_homography
+from rdstitch.robust.estimate import SOLVERS
+from rdstitch.robust.ransac import RansacOptions
+from rdstitch.synthetic import correspondences
+
+MATCHES = correspondences(150, seed=4, outliers=0.3)
+LENS = MATCHES.truth.camera
+TRUE = MATCHES.truth.motion
+
+
+def test_defaults_are_those_of_the_options() -> None:
+    given = inspect.signature(estimate_radial_homography).parameters
+    options = RansacOptions()
+    for name in ("threshold", "confidence", "max_iterations", "seed"):
+        assert given[name].default == getattr(options, name)
+    assert (options.threshold, options.confidence, options.max_iterations, options.seed) == (3.0, 0.999, 10000, 0)
+    assert options.least_inliers == 8
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"solver": "six_point"}, "unknown solver"),
+        ({"solver": "three_point", "distortion": -0.1}, "nothing to choose"),
+        ({"distortion": -1.0}, "between -1 and 1"),
+        ({"distortion": 1.0}, "between -1 and 1"),
+        ({"threshold": 0.0}, "must be positive"),
+        ({"confidence": 0.0}, "between 0 and 1"),
+        ({"confidence": 1.0}, "between 0 and 1"),
+        ({"max_iterations": 0}, "must be positive"),
+        ({"tilt": (0.1, 0.2, 0.3)}, "tilt must be"),
+        ({"tilt": (np.nan, 0.2)}, "tilt must be"),
+        ({"tilt": np.zeros((3, 2))}, "tilt must be"),
+        ({"quality": np.ones(7)}, "quality must have shape"),
+        ({"solver": "two_point"}, "needs the tilt"),
+    ],
+)
+def test_wrong_arguments_are_refused(wrong: dict[str, object], says: str) -> None:
+    with pytest.raises(ArgumentError, match=says):
+        estimate_radial_homography(MATCHES.points1, MATCHES.points2, LENS.image_size, **wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("fits", [{"distortion": 0.99}, {"distortion": -0.99}, {"max_iterations": 1}, {"seed": 3}])
+def test_values_at_the_limits_are_taken(fits: dict[str, float]) -> None:
+    found = estimate_radial_homography(MATCHES.points1, MATCHES.points2, LENS.image_size, **fits)  # type: ignore[arg-type]
+    assert found.iterations >= 1
+
+
+@pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "two_point"])
+def test_each_solver_finds_the_motion(solver: str) -> None:
+    found = estimate_radial_homography(
+        MATCHES.points1, MATCHES.points2, LENS.image_size, focal=LENS.focal, solver=solver
+    )
+    assert found.ok
+    assert found.distortion == pytest.approx(LENS.distortion, abs=0.03)
+    assert solver in ("auto", found.solver)
+    assert found.solver != "four_point" or solver == "four_point"
+
+
+@pytest.mark.parametrize("solver", ["auto", "two_point", "three_point"])
+@pytest.mark.parametrize("both", [False, True])
+def test_a_known_tilt_is_used(solver: str, both: bool) -> None:
+    assert TRUE is not None
+    tilt = np.array([TRUE.tilt, TRUE.tilt]) if both else TRUE.tilt
+    found = estimate_radial_homography(
+        MATCHES.points1, MATCHES.points2, LENS.image_size, focal=LENS.focal, tilt=tilt, solver=solver
+    )
+    assert found.model == "rigid"
+    assert found.motion is not None
+    np.testing.assert_allclose(found.motion.tilt, TRUE.tilt, atol=1e-12)
+    assert found.motion.yaw == pytest.approx(TRUE.yaw, abs=0.01)
+    assert solver in ("auto", found.solver)
+
+
+def test_a_known_lens_is_kept() -> None:
+    found = estimate_radial_homography(MATCHES.points1, MATCHES.points2, LENS.image_size, distortion=LENS.distortion)
+    assert (found.distortion, found.distortion_std) == (LENS.distortion, 0.0)
+    assert found.solver in ("two_point_similarity", "four_point_dlt")
+
+
+def test_too_few_matches_are_no_result_but_a_reason() -> None:
+    found = estimate_radial_homography(MATCHES.points1[:5], MATCHES.points2[:5], LENS.image_size)
+    assert not found
+    assert "only 5 matches" in found.reason
+    wrong = np.random.default_rng(0).uniform((0, 0), (999, 799), (2, 100, 2))
+    assert not estimate_radial_homography(*wrong, LENS.image_size)
+
+
+def test_the_best_matches_are_sampled_first() -> None:
+    pair = PairMatches(MATCHES.points1, MATCHES.points2, LENS, LENS, np.linspace(0.0, 1.0, 150))
+    assert pair.order.tolist() == list(range(150))[::-1]
+    assert PairMatches(MATCHES.points1, MATCHES.points2, LENS, LENS).order.tolist() == list(range(150))
+    # Errors come back in the order of the matches, not of their quality.
+    found = estimate_radial_homographies([pair], EstimationOptions())[0]
+    agree = found.inliers == MATCHES.truth.inliers
+    assert agree.mean() > 0.95
+
+
+def test_pairs_with_many_inliers_need_no_other_model() -> None:
+    pair = PairMatches(MATCHES.points1, MATCHES.points2, LENS, LENS)
+    inliers = int(MATCHES.truth.inliers.sum())
+    models = [
+        estimate_radial_homographies([pair], EstimationOptions(select_below=limit))[0].model
+        for limit in (None, inliers + 20, inliers - 20)
+    ]
+    assert models == ["rigid", "rigid", "homography"]
