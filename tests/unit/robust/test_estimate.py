@@ -90,8 +90,8 @@ def test_too_few_matches_are_no_result_but_a_reason() -> None:
     found = estimate_radial_homography(MATCHES.points1[:5], MATCHES.points2[:5], LENS.image_size)
     assert not found
     assert "only 5 matches" in found.reason
-    wrong = np.random.default_rng(0).uniform((0, 0), (999, 799), (2, 100, 2))
-    assert not estimate_radial_homography(*wrong, LENS.image_size)
+    first, second = np.random.default_rng(0).uniform((0, 0), (999, 799), (2, 100, 2))
+    assert not estimate_radial_homography(first, second, LENS.image_size)
 
 
 def test_the_best_matches_are_sampled_first() -> None:

@@ -73,7 +73,7 @@ def test_it_comes_to_the_truth(model: PairModel, fixed: bool) -> None:
     shift[0, 2] = 0.01
     near = shift @ H
     start = Fits(model.initialize(near[None]), near[None], np.array([DISTORTION if fixed else -0.15]))
-    problems = _problems(model, fixed=fixed)
+    problems = _problems(model, noise=0.05, fixed=fixed)
     found = refine_pairs(problems, start, 30)
     assert found.distortion == pytest.approx(DISTORTION, abs=1e-4)
     seen = problems.inspect(found)
