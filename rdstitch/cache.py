@@ -52,6 +52,11 @@ class Cache:
     temporary: TemporaryFolder | None = None
 
     @classmethod
+    def at(cls, folder: Path | None) -> Self:
+        """A cache in a folder, if there is one, by its whole name, which holds in processes elsewhere too."""
+        return cls(None if folder is None else Path(folder).absolute())
+
+    @classmethod
     def for_this_run(cls) -> Self:
         """A cache that goes with this run: it takes what need not be in memory all the time."""
         owner = TemporaryFolder()
@@ -157,7 +162,7 @@ class Cache:
     def _file(self, stage: str, inputs: tuple[Any, ...]) -> Path:
         """Where the result of a stage is kept: its name is the digest of everything that it depends on."""
         assert self.folder is not None
-        name = digest((_FORMAT, _software(), stage, inputs))
+        name = digest((_FORMAT, software(), stage, inputs))
         return self.folder / stage / name[:2] / name[2:]
 
     def file(self, path: str | Path | None) -> str:
@@ -181,7 +186,7 @@ class Cache:
 
 
 @cache
-def _software() -> dict[str, str]:
+def software() -> dict[str, str]:
     """Everything but its inputs that a result may depend on: our sources, and versions of what they compute with."""
     found = {"rdstitch": sources_digest(files("rdstitch"))}
     for package in _PACKAGES:

@@ -10,6 +10,7 @@ from rdstitch.alignment import LENSES, MODELS
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError
+from rdstitch.executors import LOCAL
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.local_alignment import MOST_CELLS, LocalAlignmentMode
@@ -79,6 +80,10 @@ class StitchOptions:
         Seed of random sampling: the same gives the same result, bit for bit.
     workers : int
         Pictures and pairs worked on at the same time; 0: as many as there are cores.
+    scheduler : str, optional
+        Address of the scheduler of a Dask cluster that does the work, or "local" for one on this machine; needs the
+        extra ``distributed``. A cluster also needs ``cache``, a folder that all its machines see by the same name, as
+        they must see the pictures.
     overwrite : bool
         Replace existing outputs.
     strict : bool
@@ -122,6 +127,7 @@ class StitchOptions:
     cache: Path | None = None
     seed: int = 0
     workers: int = 0
+    scheduler: str | None = None
     overwrite: bool = False
     strict: bool = False
     force: bool = False
@@ -156,6 +162,8 @@ class StitchOptions:
             raise ArgumentError(f"local_alignment has from 2 to {MOST_CELLS} cells, not {self.local_alignment}")
         if isinstance(self.local_alignment, str) and self.local_alignment not in ("auto", "off"):
             raise ArgumentError(f"local_alignment is auto, off or a number of cells, not {self.local_alignment!r}")
+        if self.scheduler not in (None, LOCAL) and self.cache is None:
+            raise ArgumentError("a cluster needs a folder for features that all its machines see: give --cache too")
         if self.workers < 0 or self.seed < 0:
             raise ArgumentError("workers and seed must not be negative")
         if self.workers > _MAX_WORKERS:

@@ -188,6 +188,12 @@ estimation = together(
         metavar="DIR",
         help="Keep features, pairs and alignments in this folder, and continue from what is there; made if missing.",
     ),
+    click.option(
+        "--scheduler",
+        metavar="ADDRESS|local",
+        help="Let a Dask cluster do the work, whose machines see the pictures and the folder of --cache; local starts "
+        "one here.",
+    ),
     workers,
 )
 

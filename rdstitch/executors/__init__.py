@@ -5,7 +5,8 @@ package with small arguments and results; what is large lies in the cache of the
 """
 
 from rdstitch.executors.choice import open_executor
+from rdstitch.executors.dask_cluster import LOCAL, DaskExecutor
 from rdstitch.executors.in_order import in_order
 from rdstitch.executors.processes import ProcessExecutor
 
-__all__ = ["ProcessExecutor", "in_order", "open_executor"]
+__all__ = ["LOCAL", "DaskExecutor", "ProcessExecutor", "in_order", "open_executor"]

@@ -2,7 +2,9 @@
 
 import sys
 from concurrent.futures import Executor, ThreadPoolExecutor
+from pathlib import Path
 
+from rdstitch.executors.dask_cluster import DaskExecutor
 from rdstitch.executors.processes import ProcessExecutor
 
 _MANY = 60
@@ -10,15 +12,21 @@ _MANY = 60
 the interpreter, which matching and estimation keep busy."""
 
 
-def open_executor(workers: int, pictures: int) -> Executor:
+def open_executor(workers: int, pictures: int, *, scheduler: str | None = None, store: Path | None = None) -> Executor:
     """The executor for a set of so many pictures, to be used in a ``with`` block.
 
     Parameters
     ----------
     workers : int
-        Tasks at the same time.
+        Tasks at the same time on this machine.
     pictures : int
+    scheduler : str, optional
+        Address of a Dask scheduler, or "local"; see :class:`rdstitch.executors.dask_cluster.DaskExecutor`.
+    store : Path, optional
+        Folder of features and matches that the workers of that scheduler must see.
     """
+    if scheduler is not None:
+        return DaskExecutor(scheduler, workers, store)
     if workers > 1 and pictures >= _MANY and sys.executable:
         return ProcessExecutor(workers)
     return ThreadPoolExecutor(workers)

@@ -8,7 +8,7 @@ from typing import TypeVar
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-_AHEAD = 64  # tasks that have been submitted and whose results were not taken
+_AHEAD = 256  # tasks that have been submitted and whose results were not taken: enough for that many workers
 
 
 def in_order(executor: Executor, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -72,6 +73,12 @@ class Source:
     def number(self, position: int) -> int:
         """Its number in the video or bag that it was taken from, else its position in the sequence."""
         return position if self.frame is None or self.frame.number is None else self.frame.number
+
+    def with_absolute_paths(self) -> Self:
+        """The same by names that hold in whatever process, as far as it is a file."""
+        mask = None if self.mask is None else self.mask.absolute()
+        in_memory = self.frame is not None and self.frame.picture is not None
+        return replace(self, path=self.path if in_memory else self.path.absolute(), mask=mask)
 
     def content(self, cache: Cache) -> str:
         """Hash of what the image is made from, for keys of the cache; for one of this run alone its name will do."""

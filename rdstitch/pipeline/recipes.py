@@ -1,6 +1,7 @@
 """The recipes: each reads as the sequence of its stages."""
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Literal
 
@@ -88,7 +89,7 @@ def pano(
     ) as found:
         _check_outputs(output, options, files_of(found.frames))
         sources, _ = _read(found.frames, options, skip_bad=False)
-        with open_executor(options.threads, len(sources)) as executor:
+        with _executor(options, len(sources)) as executor:
             registration = register(sources, options, executor, skip_bad=False, progress=progress)
         registration = registration.with_messages(found.messages)
         return _composite(registration, output, options, progress, frontal=True)
@@ -218,7 +219,7 @@ def trajectory(
         check_distinct(files)
         sources, unread = _read(found.frames, options, skip_bad=True)
         times = timestamps_of(sources, timestamps)
-        with open_executor(options.threads, len(sources)) as executor:
+        with _executor(options, len(sources)) as executor:
             registration = register(sources, options, executor, skip_bad=True, metric=True, progress=progress)
         registration = registration.with_messages([*unread, *found.messages])
         registration = accept(registration, options)
@@ -239,9 +240,14 @@ def trajectory(
 def _register_all(found: FoundPictures, options: StitchOptions, progress: Progress) -> Registration:
     """Register a sequence, leaving out what cannot be read."""
     sources, unread = _read(found.frames, options, skip_bad=True)
-    with open_executor(options.threads, len(sources)) as executor:
+    with _executor(options, len(sources)) as executor:
         registration = register(sources, options, executor, skip_bad=True, progress=progress)
     return registration.with_messages([*unread, *found.messages])
+
+
+def _executor(options: StitchOptions, pictures: int) -> Executor:
+    """Where the tasks of a set of so many pictures are computed."""
+    return open_executor(options.threads, pictures, scheduler=options.scheduler, store=options.cache)
 
 
 def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Sequence[str | Path]) -> None:
@@ -268,7 +274,10 @@ def _read(frames: Sequence[Frame], options: StitchOptions, *, skip_bad: bool) ->
         if unread:
             raise InputError(f"fewer than two pictures can be read; {unread[0].text}")
         raise ArgumentError("stitching needs two different pictures or more; name at least one more")
-    return with_attitudes(with_masks(sources, options.mask), options.attitude), unread
+    sources = with_attitudes(with_masks(sources, options.mask), options.attitude)
+    if options.scheduler is not None:  # workers elsewhere have folders of their own that relative names begin at
+        sources = [source.with_absolute_paths() for source in sources]
+    return sources, unread
 
 
 def _composite(

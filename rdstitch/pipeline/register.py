@@ -73,7 +73,7 @@ def register(
         When no two pictures overlap.
     """
     options = options.for_pictures(len(sources))
-    cache = Cache(options.cache)
+    cache = Cache.at(options.cache)
     aligner = Aligner.of(sources, options, cache)
     store = cache if options.cache is not None else Cache.for_this_run()
     rendered = detect_by_contrast(sources, options.features, executor, store, skip_bad=skip_bad, progress=progress)

@@ -17,11 +17,11 @@ from tests.cli.running import flight
 
 
 @pytest.fixture(autouse=True)
-def _forget_software() -> Iterator[None]:
+def _forgetsoftware() -> Iterator[None]:
     """The digest of the sources is computed once a process."""
-    cache._software.cache_clear()
+    cache.software.cache_clear()
     yield
-    cache._software.cache_clear()
+    cache.software.cache_clear()
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def _recall(folder: Path, value: int) -> int:
-    cache._software.cache_clear()
+    cache.software.cache_clear()
     return Cache(folder).recall("stage", (), ("input",), lambda: value)
 
 

@@ -1,0 +1,113 @@
+"""``--scheduler``: a Dask cluster gives the same bytes, also when a worker dies; what cannot work is said in a line."""
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rdstitch
+from tests.cli.running import FAST, Run, flight
+
+pytest.importorskip("distributed")
+
+_PICTURES = 8  # each a task
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """A strip."""
+    return flight(4, _PICTURES).write(tmp_path_factory.mktemp("strip"))
+
+
+@contextmanager
+def _cluster(folder: Path, workers: int) -> Iterator[tuple[str, list["subprocess.Popen[bytes]"]]]:
+    """Address of a scheduler on loopback, and its worker processes, which nothing starts again."""
+    place, log = folder / "scheduler.json", (folder / "log").open("wb")
+    options = ("--scheduler-file", str(place), "--no-dashboard")
+
+    def start(*arguments: str) -> "subprocess.Popen[bytes]":
+        return subprocess.Popen([sys.executable, "-m", "dask", *arguments, *options], stdout=log, stderr=log)
+
+    started = [start("scheduler", "--host", "127.0.0.1", "--port", "0")]
+    try:
+        until = time.monotonic() + 60
+        while not place.exists():
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        once = ("--nthreads", "1", "--no-nanny", "--host", "127.0.0.1", "--local-directory", str(folder))
+        started += [start("worker", *once) for _ in range(workers)]
+        yield json.loads(place.read_text(encoding="utf-8"))["address"], started[1:]
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+        log.close()
+
+
+def _record(output: Path) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
+    for name in ("cache", "scheduler", "workers"):
+        del record["options"][name]
+    return record
+
+
+def test_a_cluster_gives_the_same_bytes_though_a_worker_dies(pictures: list[Path], tmp_path: Path) -> None:
+    features = rdstitch.FeatureOptions(max_features=600)
+    here, there = tmp_path / "here" / "out.png", tmp_path / "there" / "out.png"
+    here.parent.mkdir()
+    there.parent.mkdir()
+    rdstitch.mosaic(pictures, here, rdstitch.StitchOptions(features=features, workers=1))
+    with _cluster(tmp_path, 2) as (address, workers):
+        steps: list[tuple[str, int]] = []
+
+        def kill_one(stage: str, done: int, total: int) -> None:
+            steps.append((stage, done))
+            if stage == "detecting features" and 2 <= done < total:
+                workers[0].kill()
+
+        options = rdstitch.StitchOptions(features=features, cache=tmp_path / "store", scheduler=address)
+        rdstitch.mosaic(pictures, there, options, progress=kill_one)
+        assert workers[0].wait(10) != 0
+        assert workers[1].poll() is None
+    assert there.read_bytes() == here.read_bytes()
+    assert _record(there) == _record(here)
+    assert [done for stage, done in steps if stage == "detecting features"] == list(range(1, _PICTURES + 1))
+
+
+def test_a_cluster_is_started_here_and_ended(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    plain, done = (
+        rdstitch("mosaic", *frames, "-o", tmp_path / f"{name}.png", *FAST, *more)
+        for name, more in (("plain", ()), ("local", ("--scheduler", "local")))
+    )
+    assert (done.status, done.out, done.err) == (0, plain.out, "")
+    assert (tmp_path / "local.png").read_bytes() == (tmp_path / "plain.png").read_bytes()
+
+
+def test_what_a_cluster_lacks_is_said(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    arguments = ("mosaic", *frames, "-o", tmp_path / "out.png", *FAST, "--scheduler", "tcp://127.0.0.1:9")
+    without_cache = rdstitch(*arguments)
+    assert without_cache.status == 2
+    assert "--cache" in without_cache.line
+    nobody = rdstitch(*arguments, "--cache", tmp_path / "cache")
+    assert nobody.status == 2
+    assert "no Dask scheduler" in nobody.line
+    assert "tcp://127.0.0.1:9" in nobody.line
+    assert not (tmp_path / "out.png").exists()
+
+
+def test_arrays_travel_to_a_cluster() -> None:
+    sequence = flight(3, 3)
+    arrays = [sequence.frame(index) for index in range(3)]
+    features = rdstitch.FeatureOptions(max_features=600)
+    here, there = (
+        rdstitch.mosaic(arrays, options=rdstitch.StitchOptions(features=features, workers=1, scheduler=scheduler))
+        for scheduler in (None, "local")
+    )
+    assert np.array_equal(here.image, there.image)
