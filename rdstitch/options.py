@@ -2,6 +2,7 @@
 
 import math
 import os
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
@@ -10,7 +11,7 @@ from rdstitch.alignment import LENSES, MODELS
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError
-from rdstitch.executors import LOCAL
+from rdstitch.executors import LOCAL, open_executor
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.local_alignment import MOST_CELLS, LocalAlignmentMode
@@ -187,6 +188,10 @@ class StitchOptions:
             self.solver, self.known_distortion, self.threshold, self.confidence, self.max_iterations, self.seed
         )
         return MatchingOptions(pair, self.ratio, self.lightglue_model, self.threads)
+
+    def executor(self, pictures: int) -> Executor:
+        """Where the tasks of a set of so many pictures are computed; to be used in a ``with`` block."""
+        return open_executor(self.threads, pictures, scheduler=self.scheduler, store=self.cache)
 
     @property
     def threads(self) -> int:

@@ -1,7 +1,6 @@
 """The recipes: each reads as the sequence of its stages."""
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from pathlib import Path
 from typing import Literal
 
@@ -9,7 +8,6 @@ from rdstitch.alignment import Alignment
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.camera_files import CAMERA_SUFFIXES, camera_file_text
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.executors import open_executor
 from rdstitch.export.path_plot import path_as_svg
 from rdstitch.export.trajectory_files import WRITERS, has_times
 from rdstitch.inputs.attitudes import with_attitudes
@@ -89,7 +87,7 @@ def pano(
     ) as found:
         _check_outputs(output, options, files_of(found.frames))
         sources, _ = _read(found.frames, options, skip_bad=False)
-        with _executor(options, len(sources)) as executor:
+        with options.executor(len(sources)) as executor:
             registration = register(sources, options, executor, skip_bad=False, progress=progress)
         registration = registration.with_messages(found.messages)
         return _composite(registration, output, options, progress, frontal=True)
@@ -219,7 +217,7 @@ def trajectory(
         check_distinct(files)
         sources, unread = _read(found.frames, options, skip_bad=True)
         times = timestamps_of(sources, timestamps)
-        with _executor(options, len(sources)) as executor:
+        with options.executor(len(sources)) as executor:
             registration = register(sources, options, executor, skip_bad=True, metric=True, progress=progress)
         registration = registration.with_messages([*unread, *found.messages])
         registration = accept(registration, options)
@@ -240,14 +238,9 @@ def trajectory(
 def _register_all(found: FoundPictures, options: StitchOptions, progress: Progress) -> Registration:
     """Register a sequence, leaving out what cannot be read."""
     sources, unread = _read(found.frames, options, skip_bad=True)
-    with _executor(options, len(sources)) as executor:
+    with options.executor(len(sources)) as executor:
         registration = register(sources, options, executor, skip_bad=True, progress=progress)
     return registration.with_messages([*unread, *found.messages])
-
-
-def _executor(options: StitchOptions, pictures: int) -> Executor:
-    """Where the tasks of a set of so many pictures are computed."""
-    return open_executor(options.threads, pictures, scheduler=options.scheduler, store=options.cache)
 
 
 def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Sequence[str | Path]) -> None:
