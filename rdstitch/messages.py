@@ -46,6 +46,10 @@ class Message:
         return f"{Path(self.images[0]).name}: {self.text}" if len(self.images) == 1 else self.text
 
 
+def ignored(message: Message) -> None:
+    """Report nothing."""
+
+
 def left_out(path: str | Path, reason: str) -> Message:
     """A picture that is not in the result."""
     return Message(reason, (str(path),), "left out", "left-out")

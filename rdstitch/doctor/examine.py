@@ -62,7 +62,7 @@ def examine(
     """
     with found_pictures(as_inputs(inputs, channel_order), every=every) as pictures:
         sources, unread = read_sources(pictures.frames, camera=None, focal=None, distortion=None, skip_bad=True)
-        unreadable = [str(message) for message in unread]
+        unreadable = [f"{message.images[0]}: {message.text}" for message in unread]
         found: dict[int, _Examined] = {}
         workers = os.cpu_count() or 1
         with ThreadPoolExecutor(workers) as pool:

@@ -265,7 +265,7 @@ def _read(frames: Sequence[Frame], options: StitchOptions, *, skip_bad: bool) ->
     )
     if len(sources) < 2:
         if unread:
-            raise InputError(f"fewer than two pictures can be read; {unread[0].text}")
+            raise InputError(f"fewer than two pictures can be read; {unread[0].images[0]}: {unread[0].text}")
         raise ArgumentError("stitching needs two different pictures or more; name at least one more")
     sources = with_attitudes(with_masks(sources, options.mask), options.attitude)
     if options.scheduler is not None:  # workers elsewhere have folders of their own that relative names begin at

@@ -13,10 +13,12 @@ from rdstitch.compositing import Canvas, Composite, CompositeOptions, PlacedPict
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.inputs.find import found_pictures
 from rdstitch.inputs.frame import ChannelOrder, Images, as_inputs, files_of, in_order
+from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.atomic import check_output
 from rdstitch.io.read import Picture
 from rdstitch.io.write import write_image
+from rdstitch.messages import Message, ignored
 from rdstitch.progress import Progress, silent
 
 Framing = Literal["same", "all", "valid"]
@@ -34,6 +36,7 @@ def undistort(
     view: Framing = "same",
     overwrite: bool = False,
     channel_order: ChannelOrder = "bgr",
+    warn: Callable[[Message], None] = ignored,
     progress: Progress = silent,
 ) -> list[Path]: ...
 
@@ -48,6 +51,7 @@ def undistort(
     view: Framing = "same",
     overwrite: bool = False,
     channel_order: ChannelOrder = "bgr",
+    warn: Callable[[Message], None] = ignored,
     progress: Progress = silent,
 ) -> list[NDArray[Any]]: ...
 
@@ -61,6 +65,7 @@ def undistort(
     view: Framing = "same",
     overwrite: bool = False,
     channel_order: ChannelOrder = "bgr",
+    warn: Callable[[Message], None] = ignored,
     progress: Progress = silent,
 ) -> list[Path] | list[NDArray[Any]]:
     """Undistort pictures, each into a file of the same name in a folder, or into an array.
@@ -82,6 +87,8 @@ def undistort(
     overwrite : bool
     channel_order : str
         Of arrays that come in or go out: "bgr" or "rgb".
+    warn : callable
+        Called with each thing that the user should know: pictures not taken as input, and damaged ones.
     progress : callable
 
     Returns
@@ -95,14 +102,24 @@ def undistort(
         raise ArgumentError(f"unknown view {view!r}; choose same, all or valid")
     given = as_inputs(inputs, channel_order)
     with found_pictures(given) as found:
-        sources, _ = read_sources(found.frames, camera=camera, focal=None, distortion=distortion, skip_bad=False)
+        guard = InputGuard()
+        sources, _ = read_sources(
+            found.frames, camera=camera, focal=None, distortion=distortion, skip_bad=False, guard=guard
+        )
+        for message in found.messages:
+            warn(message)
         if folder is None:
-            return [in_order(_undistorted(source, view).pixels, channel_order) for source in sources]
+            pictures = [in_order(_undistorted(source, view).pixels, channel_order) for source in sources]
+            for message in guard.messages:
+                warn(message)
+            return pictures
         outputs = _outputs(sources, Path(folder), files_of(found.frames), overwrite)
         for done, (source, output) in enumerate(zip(sources, outputs, strict=True), start=1):
             picture = _undistorted(source, view)
             write_image(output, picture.pixels, picture.alpha, metadata=source.metadata, overwrite=overwrite)
             progress("undistorting", done, len(sources))
+        for message in guard.messages:
+            warn(message)
         return outputs
 
 

@@ -78,3 +78,9 @@ def test_arrays(frames: list[Path], single: bool) -> None:
     found = examine(pictures[0] if single else pictures, channel_order="rgb")
     assert found.pictures == (1 if single else 3)
     assert ("needs two pictures" in " ".join(found.advice)) == single
+
+
+def test_what_cannot_be_read_is_named_once(rdstitch: Run, tmp_path: Path) -> None:
+    missing = tmp_path / "nofolder"
+    done = rdstitch("doctor", missing)
+    assert (done.status, done.line.count(str(missing))) == (3, 1)

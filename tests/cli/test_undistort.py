@@ -3,11 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from rdstitch.camera import Camera
 from rdstitch.io import read_image
 from rdstitch.synthetic import Sequence
-from tests.cli.running import DISTORTION, Run
+from tests.cli.running import DISTORTION, FAST, Run
 
 
 def test_undistorted_pixels_are_where_the_model_says(
@@ -61,3 +62,20 @@ def test_refuses_to_write_over_its_input(rdstitch: Run, tmp_path: Path, frames: 
     assert done.status == 6
     assert str(own) in done.line
     assert own.read_bytes() == frames[0].read_bytes()
+
+
+def test_own_outputs_and_damaged_pictures_are_named(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    with Image.open(frames[0]) as image:
+        image.convert("RGB").save(pictures / "good.jpg", quality=95)
+        image.convert("RGB").save(pictures / "damaged.jpg", quality=95)
+    data = bytearray((pictures / "damaged.jpg").read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 40] = bytes(range(100, 140))
+    (pictures / "damaged.jpg").write_bytes(bytes(data))
+    assert rdstitch("pano", *frames[:2], "-o", pictures / "mosaic.png", *FAST).status == 0
+    done = rdstitch("undistort", pictures, "--lambda", "-0.1", "-o", tmp_path / "straight")
+    assert done.status == 0
+    assert "mosaic.png" in done.err
+    assert "damaged.jpg: is damaged" in done.err
+    assert sorted(path.name for path in (tmp_path / "straight").iterdir()) == ["damaged.jpg", "good.jpg"]

@@ -61,6 +61,7 @@ def undistort(
             distortion=distortion,
             view=view,
             overwrite=overwrite,
+            warn=lambda message: reporter.warn(str(message)),
             progress=reporter,
         )
         reporter.finish()
