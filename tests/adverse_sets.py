@@ -7,6 +7,7 @@ Each is a :class:`rdstitch.synthetic.Sequence`, so that the truth is known, and 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -18,7 +19,7 @@ from rdstitch.synthetic import Photometry, PictureTexture, Sequence, grid_poses,
 
 ADVERSE = (
     "body", "vehicle", "banner", "round border", "curved border", "blurred", "off centre", "crops", "rolling shutter",
-    "cylinder", "dirt",
+    "cylinder", "dirt", "bit rot",
 )  # fmt: skip
 """Kinds of sets. A right result, a warning that names the place, or a refusal: each is honest."""
 
@@ -90,6 +91,33 @@ class AlteredSequence(Sequence):
     def _of(values: FloatArray, index: int) -> FloatArray:
         own: FloatArray = values[index % len(values)]
         return own
+
+
+@dataclass(frozen=True)
+class RottenSequence(AlteredSequence):
+    """Pictures of which one has flipped bits in its JPEG file.
+
+    Attributes
+    ----------
+    rotten : int
+        Index of that picture.
+    flips : int
+        Bits that are flipped.
+    """
+
+    rotten: int = 0
+    flips: int = 1
+
+    def write(self, folder: str | Path, name: str = "frame_{:04d}.jpg") -> list[Path]:
+        """See :meth:`Sequence.write`."""
+        paths = super().write(folder, name)
+        data = bytearray(paths[self.rotten].read_bytes())
+        rng = np.random.default_rng((self.seed, self.rotten, self.flips))
+        begin = data.rfind(b"\xff\xda") + 14
+        for place in rng.integers(begin, len(data) - 2, self.flips).tolist():
+            data[place] ^= 1 << int(rng.integers(8))
+        paths[self.rotten].write_bytes(bytes(data))
+        return paths
 
 
 def adverse_set(kind: str, seed: int) -> Sequence:
@@ -249,6 +277,12 @@ def _dirt(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
     return replace(altered, texture=PictureTexture(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels))
 
 
+def _bit_rot(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
+    """A few flipped bits in one JPEG file."""
+    own = {name: getattr(altered, name) for name in ("texture", "lens", "poses", "photometry", "seed")}
+    return RottenSequence(**own, rotten=int(rng.integers(len(altered))), flips=int(2 ** rng.integers(0, 7)))
+
+
 _ALTERATIONS: dict[str, Callable[[AlteredSequence, np.random.Generator], Sequence]] = {
     "body": _body,
     "vehicle": _vehicle,
@@ -261,4 +295,5 @@ _ALTERATIONS: dict[str, Callable[[AlteredSequence, np.random.Generator], Sequenc
     "rolling shutter": _rolling_shutter,
     "cylinder": _cylinder,
     "dirt": _dirt,
+    "bit rot": _bit_rot,
 }

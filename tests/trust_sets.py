@@ -114,7 +114,9 @@ class Judged:
     error : float
         Median error, px.
     text : str
-        What the user would have been told.
+        What the user would have read.
+    warned : bool
+        Whether a warning names the place, or a decision that the user has to judge.
     """
 
     kind: str
@@ -123,6 +125,7 @@ class Judged:
     complete: bool
     error: float
     text: str
+    warned: bool = False
 
 
 def trust_set(seed: int, kind: str | None = None) -> TrustSet:
@@ -236,7 +239,8 @@ def judge_set(item: TrustSet, folder: Path, options: StitchOptions | None = None
     right = error < LARGEST_MEDIAN and worst < LARGEST_OF_A_PICTURE
     spoiled = item.sequence.taken if item.kind in SPOILED and isinstance(item.sequence, MixedSequence) else frozenset()
     complete = {_number(message.images[0]) for message in registration.left_out} == spoiled
-    return Judged(item.kind, 0, right, complete, error, text)
+    warned = any(message.images and message.severity == "warning" for message in registration.messages)
+    return Judged(item.kind, 0, right, complete, error, text, warned)
 
 
 def registration_error(sequence: Sequence, registration: Registration) -> tuple[float, float]:

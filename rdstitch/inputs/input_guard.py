@@ -70,9 +70,7 @@ class InputGuard:
     @property
     def messages(self) -> list[Message]:
         """What the user should know of the files."""
-        return [
-            Message(f"{path}: {self._damaged[path]}", (str(path),), code="damaged") for path in sorted(self._damaged)
-        ]
+        return [Message(self._damaged[path], (str(path),), code="damaged") for path in sorted(self._damaged)]
 
     def notes_on(self, paths: Iterable[Path]) -> GuardNotes:
         """What was noticed of some files, for the guard of another process."""

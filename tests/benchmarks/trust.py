@@ -24,7 +24,9 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=30, help="number of random sets")
     parser.add_argument("--first", type=int, default=0, help="seed of the first one")
     parser.add_argument(
-        "--kind", choices=(*_SOLVABLE, *_OTHERS), help="only sets of this kind; adverse ones only by name"
+        "--kind",
+        choices=(*_SOLVABLE, *_OTHERS, "adverse"),
+        help="only sets of this kind, or of all adverse ones in turn",
     )
     parser.add_argument(
         "--keep", type=Path, help="a line here for each set; those that are here already are not done again"
@@ -41,16 +43,15 @@ def main() -> None:
             if wanted.keep is not None:
                 with wanted.keep.open("a", encoding="utf-8") as stream:
                     stream.write(json.dumps({"seed": seed, **asdict(judged)}) + "\n")
-        silent = judged.status == 0 and not judged.right
-        solved = judged.status == 0 and judged.right and judged.complete
-        what = "silently wrong" if silent else "solved" if solved else "in part" if judged.status == 0 else "refused"
+        what = _outcome(judged)
+        silent, solved = what == "silently wrong", what == "solved"
         counts[judged.kind, what] += 1
         if silent or wanted.verbose or (judged.kind in _SOLVABLE and not solved):
             print(
                 f"{seed} {judged.kind}: {what}, status {judged.status}, {judged.error:.2f} px: {judged.text[:230]}",
                 flush=True,
             )
-    columns = ("solved", "in part", "refused", "silently wrong")
+    columns = ("solved", "in part", "refused", "warned of", "silently wrong")
     print(f"\n{'kind':16}" + "".join(f"{name:>16}" for name in columns))
     for kind in (*_SOLVABLE, *_OTHERS):
         print(f"{kind:16}" + "".join(f"{counts[kind, name]:16}" for name in columns))
@@ -61,9 +62,18 @@ def main() -> None:
     print(f"{(time.process_time() - start) / max(done, 1):.1f} s of processor time a set")
 
 
+def _outcome(judged: Judged) -> str:
+    """What became of a set, in two words at most; one that is wrong is not silent where a warning names the place."""
+    if judged.status:
+        return "refused"
+    if not judged.right:
+        return "warned of" if judged.warned else "silently wrong"
+    return "solved" if judged.complete else "in part"
+
+
 def _judge(seed: int, kind: str | None) -> Judged:
     with TemporaryDirectory() as folder:
-        return judge_set(trust_set(seed, kind), Path(folder))
+        return judge_set(trust_set(seed, ADVERSE[seed % len(ADVERSE)] if kind == "adverse" else kind), Path(folder))
 
 
 def _read(file: Path | None) -> dict[int, Judged]:
