@@ -1,8 +1,13 @@
 """What the agreement of neighbouring residuals says of the scene, whatever the size of the pictures."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
-from rdstitch.alignment.planarity import Coherence, judge_relief
+from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.planarity import Coherence, coherence, judge_relief
+from rdstitch.arrays import FloatArray
 
 
 @pytest.mark.parametrize(
@@ -14,3 +19,91 @@ def test_relief_needs_agreement_and_size(correlation: float, relative_size: floa
         relief = judge_relief(Coherence(correlation, relative_size * diagonal, relative_size, 3.0), "rigid")
         assert relief.found is found
         assert ("not one plane" in relief.explanation) is found
+
+
+def _residuals(common: float, own: float, *, links: int = 8, seed: int = 0) -> tuple[Observations, FloatArray]:
+    """Errors of ten by ten points a link: each has its own, and a smooth part in common with its neighbours."""
+    rng = np.random.default_rng(seed)
+    side = np.linspace(-0.5, 0.5, 10)
+    points = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    points = np.concatenate([points + rng.uniform(-0.01, 0.01, points.shape) for _ in range(links)])
+    wave = np.stack([np.sin(3.0 * points[:, 0] + 1.0), np.cos(3.0 * points[:, 1])], axis=1)
+    wave /= np.sqrt(np.mean(np.sum(wave**2, axis=1)))
+    errors = common * wave + own / np.sqrt(2.0) * rng.normal(size=points.shape)
+    first = np.arange(links)
+    start = np.arange(0, 100 * links + 1, 100)
+    size = np.full(links, 500.0)
+    return Observations(first, first + 1, start, points, points, size, size, np.full(links, 100)), errors
+
+
+ALL = np.ones(800, dtype=np.bool_)
+
+
+@pytest.mark.parametrize(("common", "own"), [(1.0, 0.5), (0.5, 1.0), (2.0, 0.01)])
+def test_what_neighbours_have_in_common_is_measured(common: float, own: float) -> None:
+    seen, errors = _residuals(common, own)
+    found = coherence(seen, errors, ALL)
+    assert found.size == pytest.approx(common, rel=0.15)
+    assert found.relative_size == pytest.approx(found.size / 1000.0)
+    assert found.correlation == pytest.approx(common**2 / (common**2 + own**2), abs=0.1)
+    assert found.overdispersion > 3.0
+
+
+def test_independent_errors_have_nothing_in_common() -> None:
+    seen, errors = _residuals(0.0, 1.0)
+    found = coherence(seen, errors, ALL)
+    assert abs(found.correlation) < 0.1
+    assert found.overdispersion < 1.5
+
+
+def test_the_overdispersion_is_that_of_sums_over_cells() -> None:
+    """Errors that are one number a link add up to K times as much variance as independent ones: K points a cell."""
+    seen, _ = _residuals(1.0, 1.0)
+    alike = np.repeat(np.random.default_rng(1).normal(size=(8, 2)), 100, axis=0)
+    assert coherence(seen, alike, ALL).overdispersion == pytest.approx(25.0, rel=0.02)
+    # Every link counts the points of its pictures again: 8 links of 5 pictures.
+    again = replace(seen, image1=np.array([0, 1, 2, 3, 0, 1, 2, 0]), image2=np.array([1, 2, 3, 4, 2, 3, 4, 3]))
+    assert coherence(again, alike, ALL).overdispersion == pytest.approx(25.0 * 8 / 4, rel=0.02)
+
+
+def test_only_inliers_count_and_few_say_nothing() -> None:
+    seen, errors = _residuals(1.0, 0.1)
+    errors[::10] = 1e6
+    inliers = np.arange(800) % 10 > 0
+    assert coherence(seen, errors, inliers).size == pytest.approx(1.0, rel=0.15)
+    for few in (np.zeros(800, dtype=np.bool_), np.arange(800) == 3):
+        assert coherence(seen, errors, few) == Coherence(0.0, 0.0, 0.0, 1.0)
+
+
+def test_a_feature_found_twice_is_no_neighbour() -> None:
+    """Pairs of points a few thousandths apart, with the same error; what is farther off is independent."""
+    seen, errors = _residuals(0.0, 1.0)
+    twice = replace(
+        seen, points1=np.repeat(seen.points1[::2], 2, axis=0) + np.tile([[0.0, 0.0], [0.003, 0.0]], (400, 1))
+    )
+    found = coherence(twice, np.repeat(errors[::2], 2, axis=0), ALL)
+    assert abs(found.correlation) < 0.2
+    apart = replace(
+        seen, points1=np.repeat(seen.points1[::2], 2, axis=0) + np.tile([[0.0, 0.0], [0.007, 0.0]], (400, 1))
+    )
+    assert coherence(apart, np.repeat(errors[::2], 2, axis=0), ALL).correlation > 0.8
+
+
+def test_what_is_far_away_is_no_neighbour() -> None:
+    seen, errors = _residuals(2.0, 0.01)
+    for factor, near in ((2.0, True), (3.0, False)):
+        wide = replace(seen, points1=factor * seen.points1)
+        assert (coherence(wide, errors, ALL).correlation > 0.5) is near
+
+
+@pytest.mark.parametrize(("correlation", "relative_size", "moved"), [(0.9, 0.001, True), (0.9, 0.0005, False)])
+def test_of_a_turn_what_neighbours_share_is_parallax(correlation: float, relative_size: float, moved: bool) -> None:
+    relief = judge_relief(Coherence(correlation, relative_size * 800.0, relative_size, 3.0), "rotation")
+    assert relief.found is moved
+    assert ("parallax" in relief.explanation) is moved
+    assert ("hardly moved" in relief.explanation) is not moved
+
+
+@pytest.mark.parametrize(("correlation", "says"), [(0.6, "nearly flat"), (0.4, "the scene is flat")])
+def test_flat_scenes_are_called_flat(correlation: float, says: str) -> None:
+    assert says in judge_relief(Coherence(correlation, 0.1, 0.0001, 3.0), "pose").explanation

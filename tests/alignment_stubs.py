@@ -1,0 +1,86 @@
+"""Observations and fits made up for tests of decisions: nothing is adjusted, errors are as given."""
+
+import math
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from rdstitch.alignment.adjustment_problem import Fit, Problem
+from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
+from rdstitch.alignment.motion_models import MotionModel
+from rdstitch.alignment.noise_model import NoiseModel
+from rdstitch.alignment.observations import Observations
+from rdstitch.arrays import FloatArray
+from rdstitch.robust.loss import ALIGNMENT_WIDTH
+
+SCALE = 500.0
+"""Half diagonals of all pictures, pixels."""
+
+SHIFT = np.array([[1.0, 0.0, 0.1], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+"""The homography of every link; without any motion links would count as static."""
+
+ONLY_DISTORTION = np.array([True, False, False, False, False])
+
+
+def observations(errors: FloatArray, pictures: int = 6) -> Observations:
+    """Links of neighbours and of next but one, whose errors under :data:`SHIFT` are (L, K, 2), pixels."""
+    links, each = errors.shape[:2]
+    pairs = [(i, i + step) for step in range(1, pictures) for i in range(pictures - step)][:links]
+    first, second = np.array(pairs, dtype=np.intp).T
+    points = np.random.default_rng(7).uniform(-0.6, 0.6, (links * each, 2))
+    start = np.arange(0, links * each + 1, each, dtype=np.intp)
+    size, moved = np.full(links, SCALE), points + SHIFT[:2, 2] - errors.reshape(-1, 2) / SCALE
+    return Observations(first, second, start, points, moved, size, size, np.full(links, each, dtype=np.intp))
+
+
+def independent_errors(links: int = 9, each: int = 60, sigma: float = 0.5) -> FloatArray:
+    """Normal errors (L, K, 2)."""
+    return np.random.default_rng(3).normal(0.0, sigma, (links, each, 2))
+
+
+def adjusted(
+    seen: Observations, squared: FloatArray, *, lens: Sequence[float] = (0.0,) * 5, poses: Any = None, shared: Any = ()
+) -> BundleAdjustmentResult:
+    """A result with these squared errors (M,)."""
+    sigma = float(np.sqrt(np.median(squared))) / 1.1774
+    parameters = SimpleNamespace(
+        lens=np.array(lens), poses=np.zeros((6, 6)) if poses is None else poses, shared=np.array(shared)
+    )
+    made: Any = SimpleNamespace(
+        squared=squared, sigma=sigma, parameters=parameters, homographies=np.tile(SHIFT, (len(seen), 1, 1))
+    )
+    found: BundleAdjustmentResult = made
+    return found
+
+
+def even_errors(noise: NoiseModel, misfit: float) -> FloatArray:
+    """Squared errors (M,), all alike, whose misfit adds up to a number."""
+    each = misfit * noise.overdispersion / int(noise.counted.sum())
+    squared = noise.noise**2 * ALIGNMENT_WIDTH**2 * math.expm1(each / ALIGNMENT_WIDTH**2)
+    return np.full(len(noise.counted), squared)
+
+
+def problem(seen: Observations, fits: Callable[[MotionModel], Fit], pictures: int = 6, **more: Any) -> Problem:
+    """A problem whose fits are given; ``problem.fitted`` lists the models that were fitted."""
+    fitted: list[str] = []
+
+    def fit(model: MotionModel, *_: object, **__: object) -> Fit:
+        fitted.append(model.name)
+        return fits(model)
+
+    made: Any = SimpleNamespace(
+        observations=seen,
+        homographies=np.tile(SHIFT, (len(seen), 1, 1)),
+        lens=np.zeros(5),
+        free_lens=ONLY_DISTORTION,
+        count=pictures,
+        fit=fit,
+        fitted=fitted,
+        extend=lambda fit, lens: fit,
+        knowledge=SimpleNamespace(log_focal=0.2, log_focal_std=0.3),
+        **more,
+    )
+    found: Problem = made
+    return found

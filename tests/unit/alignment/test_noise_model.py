@@ -1,0 +1,56 @@
+"""The noise that models are compared by."""
+
+import math
+
+import numpy as np
+import pytest
+
+from rdstitch.alignment.noise_model import EXACTNESS, NoiseModel, squared_lengths
+from tests.alignment_stubs import independent_errors, observations
+
+
+def test_the_noise_is_the_scatter_and_what_no_model_is_exact_to() -> None:
+    errors = independent_errors(sigma=0.5)
+    seen = observations(errors)
+    found = NoiseModel.of_errors(seen, errors.reshape(-1, 2))
+    assert found.noise == pytest.approx(math.hypot(0.5, EXACTNESS), rel=0.03)
+    assert found.counted.all()
+    # Nine links of six pictures measure each point about twice; the errors themselves are independent.
+    assert found.overdispersion == pytest.approx(9 / 5, rel=0.35)
+    assert found.effective == pytest.approx(2.0 * 540 / found.overdispersion, rel=0.02)
+    assert found.price == pytest.approx(math.log(found.effective))
+
+
+def test_what_parameters_absorbed_is_added_to_the_noise() -> None:
+    errors = independent_errors(each=12).reshape(-1, 2)
+    seen = observations(errors.reshape(9, 12, 2))
+    whole, apart = NoiseModel.of_errors(seen, errors), NoiseModel.of_independent_links(seen, errors)
+    absorbed = 1.0 - 4.0 * 9 / (9 * 12)
+    scatter = [math.sqrt(found.noise**2 - EXACTNESS**2) for found in (whole, apart)]
+    assert scatter[1] == pytest.approx(scatter[0] / math.sqrt(absorbed))
+    few = observations(errors.reshape(9, 12, 2)[:, :4])
+    least = NoiseModel.of_independent_links(few, errors.reshape(9, 12, 2)[:, :4].reshape(-1, 2))
+    whole = NoiseModel.of_errors(few, errors.reshape(9, 12, 2)[:, :4].reshape(-1, 2))
+    assert least.noise**2 - EXACTNESS**2 == pytest.approx((whole.noise**2 - EXACTNESS**2) / 0.1)
+
+
+def test_links_that_do_not_fit_do_not_count() -> None:
+    errors = independent_errors()
+    errors[4] += 40.0
+    found = NoiseModel.of_errors(observations(errors), errors.reshape(-1, 2))
+    assert np.flatnonzero(~found.counted).tolist() == list(range(240, 300))
+    assert found.noise == pytest.approx(math.hypot(0.5, EXACTNESS), rel=0.2)
+    assert len(found.misfit(np.zeros(540))) == 480
+
+
+def test_the_misfit_is_robust() -> None:
+    """``W² log(1 + r² / (σ W)²)`` over the overdispersion, W = 3.5: the square for small errors."""
+    found = NoiseModel(0.5, 2.0, np.ones(4, dtype=np.bool_), 100.0, 0.0)
+    misfit = found.misfit(np.array([0.0, 0.0025, 0.25 * 3.5**2, np.inf]))
+    np.testing.assert_allclose(misfit[:3], [0.0, 0.005, 0.5 * 3.5**2 * math.log(2.0)], rtol=1e-3)
+    assert np.isfinite(misfit[3])
+    assert misfit[3] > 100.0
+
+
+def test_what_cannot_be_transferred_is_infinitely_off() -> None:
+    assert squared_lengths(np.array([[3.0, 4.0], [np.nan, 1.0]])).tolist() == [25.0, np.inf]
