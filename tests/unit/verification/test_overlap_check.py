@@ -1,0 +1,78 @@
+"""Which overlaps are compared, and how many agree."""
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rdstitch.alignment.result import LinkFit
+from rdstitch.alignment.rotation_model import rotation_from_vector
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
+from rdstitch.verification import overlap_check
+from rdstitch.verification.overlap_check import CheckedLink, _least_confirmed, _scales, share_alike
+from rdstitch.verification.photometric_agreement import Agreement, PlacedPicture
+from rdstitch.verification.self_similarity import Ambiguity
+
+
+def _fit(i: int, j: int, inliers: int = 50) -> LinkFit:
+    return LinkFit(i, j, 100, inliers, 0.5, True)
+
+
+def test_of_few_links_all_are_compared() -> None:
+    links = [_fit(i, i + 1) for i in range(40)]
+    assert _least_confirmed(links) == links
+
+
+def test_of_many_those_with_the_fewest_triangles_and_matches_are_compared() -> None:
+    """A clique of nine has 36 links in seven triangles each; a chain of 20 hangs on it."""
+    clique = [_fit(i, j) for i in range(9) for j in range(i + 1, 9)]
+    chain = [_fit(k, k + 1, 30 + k) for k in range(8, 28)]
+    chosen = _least_confirmed([*clique, *chain])
+    assert len(chosen) == 40
+    assert set(chain) <= set(chosen)
+    weak = [_fit(fit.image1, fit.image2, 10 if fit.image1 == 3 else 50) for fit in clique]
+    chosen = _least_confirmed([*weak, *chain])
+    assert {fit for fit in weak if fit.inliers == 10} <= set(chosen)
+    assert chosen == [fit for fit in [*weak, *chain] if fit in chosen]
+
+
+def test_the_share_alike_is_that_of_all_cells() -> None:
+    def checked(cells: int, confirming: int) -> CheckedLink:
+        return CheckedLink(_fit(0, 1), Agreement(cells, confirming), Ambiguity(1.0, 0.0, 0.0))
+
+    assert share_alike([checked(100, 90), checked(20, 0)]) == pytest.approx(0.75)
+    assert math.isnan(share_alike([checked(0, 0)]))
+    assert math.isnan(share_alike([]))
+
+
+def test_pictures_are_drawn_at_powers_of_two_of_the_median_scale() -> None:
+    assert _scales([1.0, 1.2, 1.3, 2.6, 0.6]) == pytest.approx([1.2, 1.2, 1.2, 2.4, 0.6])
+
+
+def test_a_turn_is_compared_between_the_two_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Halfway between two directions, each picture is tilted by half the angle."""
+    seen: list[PlacedPicture] = []
+
+    def agreement(*both: PlacedPicture) -> Agreement:
+        seen.extend(both)
+        return Agreement(1, 1)
+
+    def of(picture: None, camera: Camera, matrix: FloatArray, stretch: None) -> PlacedPicture:
+        return PlacedPicture(np.zeros((2, 2), np.float32), camera, matrix)
+
+    monkeypatch.setattr(overlap_check, "placement_ambiguity", lambda first, second: Ambiguity(1.0, 0.0, 0.0))
+    monkeypatch.setattr(overlap_check, "draw", lambda picture, scale: picture)
+    monkeypatch.setattr(overlap_check, "drawing_scale", lambda picture: 1.0)
+    monkeypatch.setattr(overlap_check, "overlap_agreement", agreement)
+    monkeypatch.setattr(PlacedPicture, "of", of)
+    first, last, half = (rotation_from_vector(np.array([[0.0, angle, 0.0]]))[0] for angle in (0.1, 0.4, 0.15))
+    lens = Camera((64, 48))
+    alignment = SimpleNamespace(homographies=np.stack([first, last]), cameras=[lens] * 2, on_sphere=True)
+    source = SimpleNamespace(read=lambda *_, **__: None, camera=lens)
+    registration: Any = SimpleNamespace(alignment=alignment, sources=[source] * 2, stretch=None)
+    overlap_check._compare(registration, [_fit(0, 1)], [0, 1], 1)
+    np.testing.assert_allclose(seen[0].homography, half.T, atol=1e-9)
+    np.testing.assert_allclose(seen[1].homography, half, atol=1e-9)

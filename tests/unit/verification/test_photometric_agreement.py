@@ -1,0 +1,95 @@
+"""Whether two pictures look alike where they are put."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rdstitch.camera import Camera
+from rdstitch.io import Metadata, Picture
+from rdstitch.synthetic.textures import ground
+from rdstitch.verification.photometric_agreement import COMPARED_SIDE, Agreement, PlacedPicture, overlap_agreement
+
+PLANE = ground((900, 700), seed=3, channels=1).region(0, 0, 900, 700)[:, :, 0]
+SIZE = (400, 300)
+LENS = Camera(SIZE)
+
+
+def _placed(
+    left: int, top: int, *, put: tuple[float, float] = (0.0, 0.0), pixels: np.ndarray | None = None
+) -> PlacedPicture:
+    """A window of the plane; ``put`` so many pixels beside its place."""
+    seen = PLANE[top : top + SIZE[1], left : left + SIZE[0]] if pixels is None else pixels
+    matrix = np.eye(3)
+    matrix[:2, 2] = (np.array([left, top]) + put) / LENS.half_diagonal
+    return PlacedPicture(np.ascontiguousarray(seen, dtype=np.float32), LENS, matrix)
+
+
+def test_pictures_of_the_same_ground_agree() -> None:
+    found = overlap_agreement(_placed(100, 100), _placed(200, 150))
+    assert found.cells > 40
+    assert found.share > 0.95
+    assert found.share == found.confirming / found.cells
+
+
+@pytest.mark.parametrize(("off", "agree"), [(2.0, True), (3.4, False), (12.0, False)])
+def test_two_and_a_half_pixels_are_forgiven(off: float, agree: bool) -> None:
+    for put in ((off, 0.0), (0.0, -off), (-off * 0.6, off * 0.8)):
+        found = overlap_agreement(_placed(100, 100), _placed(200, 150, put=put))
+        assert (found.share > 0.8) if agree else (found.share < 0.2), put
+
+
+def test_other_ground_does_not_agree() -> None:
+    assert overlap_agreement(_placed(0, 0), _placed(0, 0, pixels=PLANE[390:690, 400:800])).share < 0.15
+
+
+def test_exposure_and_contrast_do_not_matter() -> None:
+    darker = 0.1 + 0.4 * PLANE[150:450, 200:600]
+    assert overlap_agreement(_placed(100, 100), _placed(200, 150, pixels=darker)).share > 0.95
+
+
+def test_what_has_no_texture_says_nothing() -> None:
+    flat = np.full((300, 400), 0.5, dtype=np.float32)
+    assert overlap_agreement(_placed(100, 100, pixels=flat), _placed(200, 150)).cells == 0
+    assert overlap_agreement(_placed(100, 100), _placed(200, 150, pixels=flat)).cells == 0
+    assert Agreement(0, 0).share == 1.0
+    # Noise of a hundredth of full range is none; of a fiftieth it is.
+    noise = np.random.default_rng(0).normal(0.5, 1.0, (300, 400))
+    for size, textured in ((0.009, False), (0.02, True)):
+        made = (0.5 + size * (noise - 0.5)).astype(np.float32)
+        assert (overlap_agreement(_placed(0, 0, pixels=made), _placed(0, 0, pixels=made)).cells > 0) is textured
+
+
+def test_cells_lie_inside_the_overlap_and_there_are_not_too_many() -> None:
+    whole = overlap_agreement(_placed(100, 100), _placed(100, 100))
+    # Cells of 24 pixels, with eight around them: 15 by 11.
+    assert 60 < whole.cells <= 120
+    none = overlap_agreement(_placed(0, 0), _placed(500, 400))
+    assert none.cells == 0
+    half = overlap_agreement(_placed(100, 100), _placed(300, 100))
+    assert 0.3 * 165 < half.cells < 0.55 * 165
+    masked = PLANE[100:400, 100:500].copy()
+    masked[:, 200:] = np.nan
+    seen = overlap_agreement(_placed(100, 100, pixels=masked), _placed(100, 100))
+    assert 0.3 * 165 < seen.cells < 0.55 * 165
+    assert seen.share > 0.95
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_pictures_are_compared_small_and_grey(dtype: type) -> None:
+    full = np.iinfo(dtype).max
+    pixels: NDArray[Any] = np.zeros((600, 2 * COMPARED_SIDE, 3), dtype=dtype)
+    pixels[..., 0] = full
+    alpha = np.full((600, 2 * COMPARED_SIDE), 255, np.uint8)
+    alpha[:, :512] = 0
+    made = PlacedPicture.of(Picture(pixels, alpha, Metadata((1024, 600))), Camera((1024, 600)), np.eye(3))
+    assert made.grey.shape == (300, COMPARED_SIDE)
+    assert made.camera.image_size == (COMPARED_SIDE, 300)
+    assert np.isnan(made.grey[:, :250]).all()
+    np.testing.assert_allclose(made.grey[:, 260:], 1.0 / 3.0, rtol=1e-5)
+    small = PlacedPicture.of(Picture(pixels[:100, :200], None, Metadata((200, 100))), Camera((200, 100)), np.eye(3))
+    assert small.grey.shape == (100, 200)
+    dark = Picture(pixels[:100, :200, 0] // 10, None, Metadata((200, 100)))
+    low = PlacedPicture.of(dark, LENS, np.eye(3), (0.0, full / 5))
+    np.testing.assert_allclose(low.grey, 0.5, rtol=0.02)
