@@ -52,7 +52,7 @@ def ignored(message: Message) -> None:
 
 def left_out(path: str | Path, reason: str) -> Message:
     """A picture that is not in the result."""
-    return Message(reason, (str(path),), "left out", "left-out")
+    return Message(reason.removeprefix(f"{path}: "), (str(path),), "left out", "left-out")
 
 
 def of_severity(messages: Iterable[Message], *severities: Severity) -> tuple[Message, ...]:

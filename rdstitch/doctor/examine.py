@@ -28,8 +28,9 @@ _BLURRED = 0.6  # of the median sharpness
 _DARK, _BURNT = 0.06, 0.05  # mean brightness; share of burnt-out pixels
 _LEAST_OVERLAP = 0.3
 _ZOOMED = 1.03  # ratio of focal lengths by EXIF
-_BASE_MEMORY = 200 * 2**20  # interpreter and libraries
-_FEATURES_MEMORY = 3 * 2**20  # keypoints, descriptors and matches of a picture
+# Bytes, fitted to the sets of python -m tests.benchmarks.doctor: interpreter and libraries, features and matches of a
+# picture, and bytes of the compositor for each of the mosaic.
+_BASE_MEMORY, _FEATURES_MEMORY, _COMPOSITE_SHARE = 150 * 2**20, 3 * 2**19, 1.5
 # Of processor time, s: per pair of 4000 features matched and estimated, and per megapixel composited.
 _SECONDS_PAIR, _SECONDS_MEGAPIXEL = 0.35, 0.2
 _PAIRS_PER_PICTURE = 4
@@ -121,7 +122,7 @@ def _conclude(
         len(groups),
         overlap,
         float(megapixels),
-        _memory(sources),
+        _memory(sources, overlap or 0.5),
         _seconds(sources, examined, overlap or 0.5, workers),
         tuple(_advice(count, unreadable, cameras, zoomed, blurred, dark, burnt, alone, groups, overlap)),
     )
@@ -141,7 +142,9 @@ def _common(items: Iterable[str]) -> tuple[tuple[str, int], ...]:
 
 def _camera(source: Source) -> str:
     m = source.metadata
-    return " ".join(filter(None, (m.make, m.model, m.serial))) or "unknown"
+    # Many makers begin the model with their name.
+    make = "" if m.make and m.model and m.model.lower().startswith(m.make.lower().split()[0]) else m.make
+    return " ".join(filter(None, (make, m.model, m.serial))) or "unknown"
 
 
 def _focal(sources: Sequence[Source]) -> tuple[str, bool]:
@@ -156,9 +159,16 @@ def _focal(sources: Sequence[Source]) -> tuple[str, bool]:
     return f"{text} by EXIF in {len(known)} of {len(sources)} pictures", zoomed
 
 
-def _memory(sources: Sequence[Source]) -> int:
-    largest = max(int(np.prod(source.metadata.size)) * source.metadata.bit_depth // 8 * 3 for source in sources)
-    return _BASE_MEMORY + max(DEFAULT_MEMORY, 6 * largest) + _FEATURES_MEMORY * len(sources)
+def _memory(sources: Sequence[Source], overlap: float) -> int:
+    """Libraries, features, and the part of the mosaic that the compositor holds at a time."""
+    shown = sum(np.prod(m.size) * m.channels * m.bit_depth / 8 for m in (source.metadata for source in sources))
+    composite = min(_COMPOSITE_SHARE * _mosaic_share(overlap) * float(shown), DEFAULT_MEMORY)
+    return int(_BASE_MEMORY + _FEATURES_MEMORY * len(sources) + composite)
+
+
+def _mosaic_share(overlap: float) -> float:
+    """Size of the mosaic in sizes of all pictures together, roughly."""
+    return 1.0 - overlap / 2.0
 
 
 def _seconds(sources: Sequence[Source], examined: Sequence[_Examined], overlap: float, workers: int) -> float:
@@ -169,7 +179,7 @@ def _seconds(sources: Sequence[Source], examined: Sequence[_Examined], overlap: 
         for source, item in zip(sources, examined, strict=True)
     )
     pairs = min(_PAIRS_PER_PICTURE * len(sources), len(sources) * (len(sources) - 1) / 2)
-    composite = sum(np.prod(source.metadata.size) for source in sources) / 1e6 * (1.0 - overlap / 2.0)
+    composite = sum(np.prod(source.metadata.size) for source in sources) / 1e6 * _mosaic_share(overlap)
     total = detecting + _SECONDS_PAIR * pairs + _SECONDS_MEGAPIXEL * composite
     return float(total / workers)
 
@@ -197,14 +207,16 @@ def _advice(
     if zoomed:
         advice.append("the lens was zoomed between the pictures: stitch those of one zoom on their own")
     if unreadable:
-        advice.append(f"{len(unreadable)} files cannot be read: {unreadable[0]}")
+        advice.append(f"{len(unreadable)} file{'s' * (len(unreadable) != 1)} cannot be read: {unreadable[0]}")
     if overlap is not None and overlap < _LEAST_OVERLAP:
         advice.append(f"pictures overlap by about {overlap:.0%} only: take more pictures, a third is the least")
     if overlap is not None and alone:
         named = ", ".join(alone[:3]) + ", …" * (len(alone) > 3)
         advice.append(f"no overlap with a neighbour was seen, and may lead to being left out: {named}")
     elif len(groups) > 1:
-        advice.append(f"the pictures fall into {len(groups)} groups: only the largest becomes the mosaic")
+        advice.append(
+            f"at a glance the pictures fall into {len(groups)} groups: if so, only the largest becomes the mosaic"
+        )
     if blurred:
         advice.append(f"leave blurred pictures out if their neighbours overlap without them: {', '.join(blurred[:3])}")
     if dark or burnt:
