@@ -1,10 +1,15 @@
-"""What is said of a motion other than the plane's, by the area that it covers."""
+"""A motion other than the plane's: how it is found, and what is said of it, by the area that it covers."""
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
-from rdstitch.verification.rival_motion import RivalMotion, rival_messages, rival_share
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
+from rdstitch.verification.rival_motion import RivalMotion, find_rival_motions, rival_messages, rival_share
 
 PATHS = ("folder/a.png", "folder/b.png")
 
@@ -45,3 +50,61 @@ def test_a_rival_does_not_spoil_the_lens() -> None:
 def test_the_share_is_of_all_pairs_together() -> None:
     assert rival_share([_rival(0, 60), _rival(30, 10)]) == 0.3
     assert rival_share([]) == 0.0
+
+
+LENS = Camera((800, 600))
+MOVED = np.array([60.0, 20.0])
+
+
+def _found(
+    points: FloatArray, other: FloatArray, *, rival: FloatArray | None = None, used: bool = True
+) -> list[RivalMotion]:
+    """Of two pictures whose plane moves by :data:`MOVED`; matches at ``other`` move by that and ``rival``."""
+
+    def transfer(i: int, j: int, points: FloatArray) -> FloatArray:
+        return np.asarray(points + MOVED)
+
+    off = np.array([40.0, -30.0]) if rival is None else rival
+    points1 = np.concatenate([points, other])
+    points2 = np.concatenate([points + MOVED, other + MOVED + off])
+    alignment: Any = SimpleNamespace(cameras=[LENS] * 2, used=np.array([True, used]), transfer=transfer)
+    matched = SimpleNamespace(points1=points1, points2=points2, ratio=np.full(len(points1), 0.5))
+    pair: Any = SimpleNamespace(image1=0, image2=1, correspondences=matched)
+    return find_rival_motions(alignment, [pair], 3.0)
+
+
+def _grid(left: float, top: float, columns: int, rows: int, step: float = 50.0) -> FloatArray:
+    """Points in the middle of as many cells of 50 pixels."""
+    x, y = np.meshgrid(np.arange(columns), np.arange(rows))
+    return np.asarray(np.stack([left + step * (x.ravel() + 0.5), top + step * (y.ravel() + 0.5)], axis=1))
+
+
+def test_a_second_motion_is_found_with_its_place_and_area() -> None:
+    (found,) = _found(_grid(0, 0, 16, 6), _grid(200, 350, 5, 4))
+    assert (found.area, found.plane_area) == (20, 96)
+    assert found.share == pytest.approx(20 / 116)
+    assert found.center == pytest.approx((325.0, 450.0))
+    assert found.disagreement == pytest.approx(50.0, abs=0.1)
+
+
+def test_area_that_the_plane_covers_too_does_not_count() -> None:
+    (found,) = _found(_grid(0, 0, 16, 10), _grid(200, 350, 5, 4) + 5.0)
+    assert (found.area, found.plane_area) == (5, 160)
+
+
+@pytest.mark.parametrize(("size", "area"), [(0.018, 0), (0.022, 20)])
+def test_what_relief_does_is_no_motion(size: float, area: int) -> None:
+    """Up to two hundredths of the diagonal."""
+    (found,) = _found(_grid(0, 0, 16, 6), _grid(200, 350, 5, 4), rival=size * 1000.0 * np.array([0.6, 0.8]))
+    assert found.area == area
+
+
+def test_a_few_wrong_matches_are_no_motion() -> None:
+    assert _found(_grid(0, 0, 16, 6), _grid(200, 350, 11, 1))[0].area == 0
+    wrong = np.random.default_rng(0).uniform(-300.0, 300.0, (40, 2))
+    assert _found(_grid(0, 0, 16, 6), _grid(0, 350, 10, 4), rival=wrong)[0].area == 0
+
+
+def test_pictures_that_are_not_used_or_do_not_agree_anywhere_are_left_alone() -> None:
+    assert _found(_grid(0, 0, 16, 6), _grid(200, 350, 5, 4), used=False) == []
+    assert _found(_grid(0, 0, 0, 0), _grid(200, 350, 5, 4)) == []

@@ -6,13 +6,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rdstitch.alignment.result import LinkFit
 from rdstitch.executors import open_executor
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import write_image
+from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.register import register
 from rdstitch.registration import Registration
+from rdstitch.verification import verdict
+from rdstitch.verification.overlap_check import CheckedLink
+from rdstitch.verification.photometric_agreement import Agreement
+from rdstitch.verification.self_similarity import Ambiguity
 from rdstitch.verification.verdict import judge
 from tests.cli.running import flight
 
@@ -120,3 +126,78 @@ def test_one_wrong_pair_does_not_condemn_its_pictures(good: Registration) -> Non
     closing = replace(links[0], image1=0, image2=2, count=100, inliers=10)
     messages = judge(replace(good, alignment=replace(good.alignment, links=(*links, closing))), THRESHOLD)
     assert not any(message.severity == "failure" for message in messages)
+
+
+def _checked(cells: int, confirming: int, *, pair: tuple[int, int] = (0, 1), elsewhere: float = 0.0) -> CheckedLink:
+    fit = LinkFit(*pair, 100, 90, 0.5, True)
+    return CheckedLink(fit, Agreement(cells, confirming), Ambiguity(0.9, elsewhere, 0.25))
+
+
+def _checked_by(monkeypatch: pytest.MonkeyPatch, good: Registration, *checked: CheckedLink) -> list[Message]:
+    monkeypatch.setattr(verdict, "check_overlaps", lambda *_: list(checked))
+    return list(judge(good, THRESHOLD))
+
+
+@pytest.mark.parametrize(
+    ("cells", "confirming", "severity"),
+    [
+        (100, 9, "failure"),
+        (100, 10, "warning"),
+        (100, 14, "warning"),
+        (100, 15, None),
+        (7, 0, None),
+        (8, 0, "failure"),
+    ],
+)
+def test_a_tenth_of_an_overlap_must_look_alike(
+    good: Registration, monkeypatch: pytest.MonkeyPatch, cells: int, confirming: int, severity: str | None
+) -> None:
+    """Chance lets seven per cent agree; below eight cells there is too little texture."""
+    found = _checked_by(monkeypatch, good, _checked(cells, confirming))
+    assert [message.severity for message in found] == ([] if severity is None else [severity])
+    assert all(f"({confirming} of {cells}" in m.text or f"only {confirming} of {cells}" in m.text for m in found)
+
+
+@pytest.mark.parametrize(("ambiguous", "of_all"), [(1, False), (2, True)])
+def test_a_pattern_all_over_is_one_failure(
+    good: Registration, monkeypatch: pytest.MonkeyPatch, ambiguous: int, of_all: bool
+) -> None:
+    """Of more than two fifths of the pairs."""
+    pairs = [(0, 1), (1, 2), (0, 2)]
+    checked = [_checked(100, 90, pair=pair, elsewhere=0.9 * (k < ambiguous)) for k, pair in enumerate(pairs)]
+    found = _checked_by(monkeypatch, good, *checked)
+    assert any(f"{ambiguous} of 3 pairs fit as well elsewhere" in message.text for message in found) is of_all
+    assert any(
+        "25% of a picture away" in message.text or "1 of the pairs fit badly" in message.text for message in found
+    )
+
+
+@pytest.mark.parametrize(
+    ("rms", "share", "severity"), [(8.9, 0.26, "warning"), (8.9, 0.24, "failure"), (9.1, 0.9, "failure")]
+)
+def test_errors_of_rough_ground_are_a_warning_where_pictures_look_alike(
+    good: Registration, monkeypatch: pytest.MonkeyPatch, rms: float, share: float, severity: str
+) -> None:
+    alignment = good.alignment
+    rough = replace(alignment, rms=rms, relief=replace(alignment.relief, found=True))
+    checked = [_checked(100, int(100 * share)), _checked(7, 7, pair=(1, 2))]
+    found = _checked_by(monkeypatch, replace(good, alignment=rough), *checked)
+    (message,) = [m for m in found if "the pictures disagree by" in m.text]
+    assert message.severity == severity
+
+
+def test_only_pairs_without_which_the_pictures_fall_apart_decide() -> None:
+    message = Message("doubtful", (), "failure")
+    used = [LinkFit(i, j, 100, 90, 0.5, True) for i, j in ((0, 1), (1, 2), (0, 2), (2, 3))]
+    assert verdict._decisive({(0, 1): message}, used, 4) == []
+    assert verdict._decisive({(0, 1): message, (2, 3): message}, used, 4) == [(2, 3)]
+    assert verdict._decisive({(0, 1): message, (0, 2): message}, used, 4) == [(0, 1), (0, 2)]
+    assert verdict._decisive({}, used, 4) == []
+
+
+def test_of_doubtful_pairs_on_which_nothing_depends_the_pictures_are_named() -> None:
+    paths = [f"folder/{name}.jpg" for name in "abcd"]
+    (message,) = verdict._outvoted(paths, [(2, 3), (0, 2)])
+    assert message.images == ("folder/a.jpg", "folder/c.jpg", "folder/d.jpg")
+    assert "2 of the pairs fit badly, and little depends on them: c.jpg and d.jpg, a.jpg and c.jpg" in message.text
+    assert verdict._outvoted(paths, []) == []
