@@ -109,16 +109,6 @@ class TransferJacobian:
     own_radius2: FloatArray
 
     @cached_property
-    def by_distortion(self) -> FloatArray:
-        """By λ, shape (N, 2, 1)."""
-        return self._by_coefficient(1)
-
-    @cached_property
-    def by_own_distortion(self) -> FloatArray:
-        """By the λ of picture 2 alone, a part of :attr:`by_distortion`, shape (N, 2, 1)."""
-        return (self.by_own_divisor.T * self.own_radius2).T[:, :, None]
-
-    @cached_property
     def by_lens(self) -> FloatArray:
         """By :data:`rdstitch.camera.LENS_PARAMETERS`, shape (N, 2, 5); the centre shifts in both pictures."""
         coefficients = [self._by_coefficient(power) for power in (1, 2, 3)]
@@ -135,8 +125,6 @@ def transfer_jacobian(
     distortion: float,
     points: FloatArray,
     higher: Sequence[float] = (),
-    *,
-    own_distortion: float | None = None,
 ) -> TransferJacobian:
     """:func:`transfer` with its analytic derivatives.
 
@@ -154,10 +142,7 @@ def transfer_jacobian(
         Points of picture 1, normalized. Points that cannot be transferred give NaN everywhere.
     higher : sequence of float
         μ and ν in the frame of the points.
-    own_distortion : float, optional
-        λ of picture 2, where it is another.
     """
-    own_distortion = distortion if own_distortion is None else own_distortion
     # Coordinates first, points last: so every operation runs along the points, which are many.
     lifted = np.ascontiguousarray(lift(points, distortion, higher).T)
     r2 = (lifted[:2] ** 2).sum(axis=0)
@@ -165,11 +150,11 @@ def transfer_jacobian(
     h = np.ascontiguousarray(homography.transpose(1, 2, 0)) if each else homography
     z = np.einsum(f"ij{each},jn->in", h, lifted)
     w = np.where(z[2] > 0.0, z[2], np.nan)
-    d = np.ascontiguousarray(distort((z[:2] / w).T, own_distortion, higher).T)
+    d = np.ascontiguousarray(distort((z[:2] / w).T, distortion, higher).T)
 
     rho2 = (d**2).sum(axis=0)
-    g = divisor(rho2, own_distortion, higher)
-    alpha = 2.0 * divisor_slope(rho2, own_distortion, higher) / g
+    g = divisor(rho2, distortion, higher)
+    alpha = 2.0 * divisor_slope(rho2, distortion, higher) / g
     stretch = 1.0 - alpha * rho2
     # d by z: that by u, over w, for the first two; and -u / w, of which "d by u" makes -d / (stretch w), for the third.
     scale = g / w

@@ -18,7 +18,16 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.lens_selection import has_plausible_center
-from rdstitch.alignment.motion_models import HOMOGRAPHY, LOG_HEIGHT, MODELS, POSE, PSI, THETA, MotionModel, metric_poses
+from rdstitch.alignment.motion_models import (
+    HOMOGRAPHY,
+    LOG_HEIGHT,
+    PLANAR_MODELS,
+    POSE,
+    PSI,
+    THETA,
+    MotionModel,
+    metric_poses,
+)
 from rdstitch.alignment.noise_model import EXACTNESS, NoiseModel, squared_lengths
 from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.planarity import LARGE
@@ -65,7 +74,7 @@ def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolAr
         names = [name for name in names if name != POSE.name]
     fits: list[Fit] = []
     for name in names:
-        model = MODELS[name]
+        model = PLANAR_MODELS[name]
         cost = min((fit_cost(bound, problem, fit) for fit in fits), default=math.inf)
         if cost <= least + price(bound, problem, model, problem.free_lens) or _cannot_gain(bound, problem, fits, model):
             break

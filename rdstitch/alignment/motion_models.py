@@ -283,5 +283,5 @@ SIMILARITY = PlanarModel("similarity", (YAW, X, Y, LOG_HEIGHT))
 TILTING = PlanarModel("tilting", (YAW, X, Y, LOG_HEIGHT, PSI, THETA))
 POSE = PlanarModel("pose", (YAW, X, Y, LOG_HEIGHT, PSI, THETA))
 HOMOGRAPHY = HomographyModel()
-MODELS: dict[str, MotionModel] = {model.name: model for model in (RIGID, SIMILARITY, TILTING, POSE, HOMOGRAPHY)}
+PLANAR_MODELS: dict[str, MotionModel] = {model.name: model for model in (RIGID, SIMILARITY, TILTING, POSE, HOMOGRAPHY)}
 """The family by name, from the least to the most free."""

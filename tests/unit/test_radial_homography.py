@@ -7,14 +7,11 @@ import pytest
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.division_model import distort
 from rdstitch.planar_motion import PlanarMotion
 from rdstitch.radial_homography import (
     RadialHomography,
     from_plane,
-    lift,
     measurement_whitening,
-    project,
     to_plane,
     transfer,
     transfer_jacobian,
@@ -53,19 +50,6 @@ def test_derivatives_match_finite_differences(lam: float, higher: tuple[float, .
         np.testing.assert_allclose(found.by_lens[:, :, 3 + axis], by_centre, atol=1e-8)
         by_point = difference(lambda e, s=shift: transfer(H, lam, POINTS + e * s, higher))  # type: ignore[misc]
         np.testing.assert_allclose(found.by_point[:, :, axis], by_point, atol=1e-8)
-
-
-def test_each_picture_may_have_a_lens_of_its_own() -> None:
-    found = transfer_jacobian(H, -0.3, POINTS, own_distortion=-0.1)
-
-    def moved(first: float, second: float) -> FloatArray:
-        return distort(project(lift(POINTS, first) @ H.T), second)
-
-    np.testing.assert_allclose(found.points, moved(-0.3, -0.1), atol=1e-14)
-    by_own = difference(lambda e: moved(-0.3, -0.1 + e))
-    np.testing.assert_allclose(found.by_own_distortion[:, :, 0], by_own, atol=1e-8)
-    by_both = difference(lambda e: moved(-0.3 + e, -0.1 + e))
-    np.testing.assert_allclose(found.by_lens[:, :, 0], by_both, atol=1e-8)
 
 
 def test_a_point_behind_the_camera_is_nan() -> None:

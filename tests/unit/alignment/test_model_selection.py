@@ -9,7 +9,7 @@ import pytest
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.model_selection import choose_model, fit_cost, noise_of_links, parameter_count, price
-from rdstitch.alignment.motion_models import HOMOGRAPHY, MODELS, POSE, RIGID, SIMILARITY, TILTING, MotionModel
+from rdstitch.alignment.motion_models import HOMOGRAPHY, PLANAR_MODELS, POSE, RIGID, SIMILARITY, TILTING, MotionModel
 from rdstitch.alignment.noise_model import EXACTNESS
 from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.arrays import FloatArray
@@ -22,7 +22,7 @@ from tests.alignment_stubs import (
     problem,
 )
 
-NAMES = list(MODELS)
+NAMES = list(PLANAR_MODELS)
 SEEN = observations(independent_errors())
 BARE = problem(SEEN, lambda model: Fit(model, adjusted(SEEN, np.ones(540)), ONLY_DISTORTION))
 NOISE, LEAST = noise_of_links(BARE)

@@ -6,7 +6,7 @@ import pytest
 from rdstitch.alignment.motion_models import (
     HOMOGRAPHY,
     LOG_HEIGHT,
-    MODELS,
+    PLANAR_MODELS,
     RIGID,
     SIMILARITY,
     TILTING,
@@ -30,7 +30,7 @@ def _some(model: MotionModel, count: int, rng: np.random.Generator) -> tuple[np.
     return model.retract(poses, 0.3 * rng.normal(size=(count, model.pose_size))), shared
 
 
-@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
+@pytest.mark.parametrize("model", PLANAR_MODELS.values(), ids=PLANAR_MODELS)
 def test_derivatives_are_those_of_the_matrices(model: MotionModel) -> None:
     rng = np.random.default_rng(0)
     poses, shared = _some(model, 4, rng)
