@@ -221,11 +221,12 @@ class Coverage:
 
     def tests(self, mutant: "Mutant", budget: float) -> list[str]:
         """Those that execute the lines of a mutant, the quickest first, together in so many seconds."""
-        wanted = mutant.lines
+        wanted, own = mutant.lines, f"/test_{mutant.module.rpartition('.')[2]}.py::"
         found = [
             test
             for test, executed in self.lines.items()
-            if any(module == mutant.module and (not wanted or line in wanted) for module, line in executed)
+            if (not wanted and own in test)
+            or any(module == mutant.module and (not wanted or line in wanted) for module, line in executed)
         ]
         result: list[str] = []
         for test in sorted(found, key=lambda test: self.seconds[test]):

@@ -41,7 +41,7 @@ THROUGH_COMMANDS = {"doctor", "report", "sidecar", "viewer"}
 
 @pytest.mark.parametrize("test", sorted(UNIT.rglob("test_*.py")), ids=lambda path: str(path.relative_to(UNIT)))
 def test_unit_tests_lie_where_the_code_lies(test: Path) -> None:
-    """A test of a room is in the folder of its name, with its module's name or using it; one of a module at the top too."""
+    """A test of a room is in the folder of its name, and is named after a module of it, or uses it."""
     parts = test.relative_to(UNIT).parts
     if len(parts) == 1:
         assert test.stem.removeprefix("test_") in ABOUT_THE_TREE | set(ROOMS)

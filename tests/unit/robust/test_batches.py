@@ -81,6 +81,13 @@ def test_normal_equations_are_those_of_the_jacobian(own: bool) -> None:
     jacobian = np.stack([(at(values + step).error - at(values - step).error)[0] / 2e-6 for step in steps], axis=-1)
     xx, xy, yy = found.precision[0]
     precision = np.stack([[xx, xy], [xy, yy]])
+    moves = [points1 + 1e-4 * axis for axis in np.eye(2)]
+    shifted = [Measurements.from_pixels(p, points2, Camera((640, 480)), Camera((640, 480))) for p in moves]
+    lenses = PairLenses(lens[:1], lens[1:2], lens[2:3], lens[None, 3:]) if own else PairLenses(lens[:1])
+    by_point = [(differentiate(h[None], lenses, other).error - found.error)[0, :, :40] / 1e-4 for other in shifted]
+    sampson = np.stack(by_point, axis=1).transpose(2, 0, 1)
+    noise = (np.eye(2) + sampson @ np.swapaxes(sampson, 1, 2)) / 2.0
+    np.testing.assert_allclose(precision[..., :40].transpose(2, 0, 1), np.linalg.inv(noise), rtol=1e-3, atol=1e-4)
     relative = data.present[0] / (1.0 + found.squared[0] / 9.0)
     expected = np.einsum("inp,ijn,jnq,n->pq", jacobian, precision, jacobian, relative**2)
     gradient = np.einsum("inp,ijn,jn,n->p", jacobian, precision, found.error[0], relative**2)

@@ -10,7 +10,6 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.robust.levenberg_marquardt import (
     FIRST_DAMPING,
     LARGEST_DAMPING,
-    LEAST_GAIN,
     BatchedNormalEquations,
     descend,
     next_damping,
@@ -79,8 +78,8 @@ def test_a_gain_of_a_hundredth_of_the_noise_ends_it() -> None:
     """Expected falls of the cost below 1e-5 of it are not worth a step."""
     near = MINIMA + np.array([1.0, 0.0]) * 1e-3 / np.sqrt(1.0 + 4.0 * VALLEYS.b[:, None] * VALLEYS.a[:, None] ** 2)
     falls = VALLEYS.normal_equations(near).cost - VALLEYS.offset
-    for share, moves in ((0.9, False), (1.2, True)):
-        found = descend(Valleys(VALLEYS.a, VALLEYS.b, falls / (share * LEAST_GAIN)), _add, near, 1)
+    for share, moves in ((0.9e-5, False), (1.2e-5, True)):
+        found = descend(Valleys(VALLEYS.a, VALLEYS.b, falls / share), _add, near, 1)
         assert ((found == near).all(axis=1) == (not moves)).all(), share
 
 

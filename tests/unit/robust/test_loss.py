@@ -11,6 +11,7 @@ SQUARED = np.array([0.0, 1.0, 4.0, 36.0, np.inf])
 def test_the_loss_grows_like_the_square_and_saturates_at_that_of_the_width() -> None:
     """Geman and McClure: ``e² w² / (w² + e²)``."""
     np.testing.assert_allclose(robust_cost(SQUARED, 2.0), [0.0, 0.8, 2.0, 3.6, 4.0])
+    np.testing.assert_allclose(robust_cost(SQUARED, 3.0), [0.0, 0.9, 36.0 / 13.0, 7.2, 9.0])
     np.testing.assert_allclose(loss_ratio(SQUARED, 2.0), [1.0, 0.8, 0.5, 0.1, 0.0])
 
 

@@ -70,9 +70,10 @@ def test_a_turn_is_compared_between_the_two_pictures(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(PlacedPicture, "of", of)
     first, last, half = (rotation_from_vector(np.array([[0.0, angle, 0.0]]))[0] for angle in (0.1, 0.4, 0.15))
     lens = Camera((64, 48))
-    alignment = SimpleNamespace(homographies=np.stack([first, last]), cameras=[lens] * 2, on_sphere=True)
+    focal = np.diag([0.7, 0.7, 1.0])  # half diagonals to directions
+    alignment = SimpleNamespace(homographies=np.stack([first, last]) @ focal, cameras=[lens] * 2, on_sphere=True)
     source = SimpleNamespace(read=lambda *_, **__: None, camera=lens)
     registration: Any = SimpleNamespace(alignment=alignment, sources=[source] * 2, stretch=None)
     overlap_check._compare(registration, [_fit(0, 1)], [0, 1], 1)
-    np.testing.assert_allclose(seen[0].homography, half.T, atol=1e-9)
-    np.testing.assert_allclose(seen[1].homography, half, atol=1e-9)
+    np.testing.assert_allclose(seen[0].homography, half.T @ focal, atol=1e-9)
+    np.testing.assert_allclose(seen[1].homography, half @ focal, atol=1e-9)
