@@ -16,7 +16,7 @@ from rdstitch.robust.sampling import Sampler
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
 from rdstitch.solvers.solutions import Solutions
 
-_FIRST_BATCH, _SECOND_BATCH = 64, 256  # most pairs need no more than the first
+_FIRST_BATCH, _SECOND_BATCH = 64, 160  # samples of five points; then of each solver: three of 60 % outliers need 140
 _LARGEST_BATCH = 512
 _SAMPLES_AT_ONCE = 4096
 _LEAST_EXPLORATION = 96  # samples that every solver draws unless its own confidence is reached before
@@ -240,10 +240,14 @@ class _Lane:
         return homography, distortion, least
 
     def _optimized(self, start: Hypotheses, data: Measurements, rows: IntArray) -> Hypotheses:
-        """The best of each hypothesis, its refinement in the model it assumes, and from there as a free homography."""
+        """The best of each hypothesis, its refinement in the model it assumes, and from there as a free homography.
+
+        Where the solver assumes none, one refinement is enough to count inliers by; the choice of the model refines the
+        last of them again.
+        """
         best = self._refined(start, data, rows, self._solver.model, 3.0 * self._options.threshold)
         if isinstance(self._solver.model, HomographyPairModel):
-            return self._refined(best, data, rows, self._solver.model, self._options.threshold)
+            return best
         enough = best.inliers.sum(axis=1) >= _FREE_REFINEMENT
         for chosen, model in ((enough, HomographyPairModel()), (~enough, self._solver.model)):
             part = np.flatnonzero(chosen)
