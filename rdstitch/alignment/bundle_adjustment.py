@@ -5,6 +5,7 @@ of the loss follows the scatter of the errors, from wide to narrow, so that good
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -18,6 +19,7 @@ from rdstitch.alignment.normal_equations import (
     squared_errors,
 )
 from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.pose_blocks import PoseBlocks
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import LENS_PARAMETERS
 from rdstitch.robust.levenberg_marquardt import FIRST_DAMPING, LARGEST_DAMPING, LEAST_GAIN, next_damping
@@ -258,6 +260,11 @@ class BundleAdjuster:
             product: FloatArray = matrices.matrices[j] @ inverses(matrices.matrices)[i]
         return product
 
+    @cached_property
+    def _blocks(self) -> PoseBlocks:
+        """The pattern of the normal matrix."""
+        return PoseBlocks.of(self.observations, self.freedom.poses)
+
     def _sigma(self, state: _State) -> float:
         return sigma_of(state.equations.squared[self.observations.scale_inliers_mask])
 
@@ -282,7 +289,7 @@ class BundleAdjuster:
             self.observations,
             state.matrices,
             state.homographies,
-            self.freedom.poses,
+            self._blocks,
             self.freedom.lens,
             self.weight(sigma),
         )

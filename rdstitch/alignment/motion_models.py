@@ -264,11 +264,14 @@ class HomographyModel:
 
 def inverses(matrices: FloatArray) -> FloatArray:
     """Inverses of (N, 3, 3) by cofactors; not finite where a step made a matrix singular."""
-    a, b, c = matrices[:, 0], matrices[:, 1], matrices[:, 2]
+    (a, b, c), (d, e, f), (g, h, i) = matrices.transpose(1, 2, 0)
+    cofactors = np.empty((3, 3, len(matrices)))
     with np.errstate(all="ignore"):
-        cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=2)
-        inverse: FloatArray = cofactors / np.einsum("ni,ni->n", a, cofactors[:, :, 0])[:, None, None]
-    return inverse
+        cofactors[:, 0] = e * i - f * h, f * g - d * i, d * h - e * g
+        cofactors[:, 1] = c * h - b * i, a * i - c * g, b * g - a * h
+        cofactors[:, 2] = b * f - c * e, c * d - a * f, a * e - b * d
+        cofactors /= a * cofactors[0, 0] + b * cofactors[1, 0] + c * cofactors[2, 0]
+    return np.ascontiguousarray(cofactors.transpose(2, 0, 1))
 
 
 def _unit_determinant(matrices: FloatArray) -> FloatArray:

@@ -16,6 +16,7 @@ from scipy.sparse.linalg import splu
 
 from rdstitch.alignment.motion_models import ModelMatrices, inverses
 from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.pose_blocks import PoseBlocks
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import LENS_PARAMETERS
 from rdstitch.division_model import distort, is_one_to_one
@@ -163,6 +164,8 @@ class SparseNormalEquations:
 
     Attributes
     ----------
+    blocks : PoseBlocks
+        The pattern of A.
     poses : sparse array of shape (F, F)
         A, of the F free pose parameters.
     coupling : ndarray of shape (F, S)
@@ -172,6 +175,7 @@ class SparseNormalEquations:
     gradient_poses, gradient_shared : ndarray of shape (F,) and (S,)
     """
 
+    blocks: PoseBlocks
     poses: sparse.csc_array
     coupling: FloatArray
     shared: FloatArray
@@ -196,7 +200,7 @@ class SparseNormalEquations:
         """With priors added: on the poses as inverse variances and distances from the means, both (F,)."""
         return replace(
             self,
-            poses=(self.poses + sparse.diags_array(precision_poses)).tocsc(),
+            poses=self.blocks.with_diagonal(self.poses, precision_poses),
             shared=self.shared + information_shared,
             gradient_poses=self.gradient_poses + precision_poses * error_poses,
             gradient_shared=self.gradient_shared + gradient_shared,
@@ -226,9 +230,9 @@ class SparseNormalEquations:
         right = np.column_stack([self.coupling, self.gradient_poses])
         if self.poses.shape[0] == 0:
             return self.shared, right
-        diagonal = self.poses.diagonal()
+        diagonal = self.poses.data[self.blocks.diagonal]
         floor = max(float(diagonal.max()), 1e-300) * 1e-14
-        damped = (self.poses + sparse.diags_array(damping * diagonal + floor)).tocsc()
+        damped = self.blocks.with_diagonal(self.poses, damping * diagonal + floor)
         factor = splu(damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         solved = factor.solve(right)
         return self.shared - self.coupling.T @ solved[:, :-1], solved
@@ -249,7 +253,7 @@ def chain(
     observations: Observations,
     model: ModelMatrices,
     homographies: FloatArray,
-    free: BoolArray,
+    blocks: PoseBlocks,
     free_lens: BoolArray,
     weight: float,
 ) -> SparseNormalEquations:
@@ -263,8 +267,8 @@ def chain(
         Of all N pictures.
     homographies : ndarray of shape (L, 3, 3)
         ``P_j P_i⁻¹`` of each link.
-    free : ndarray of shape (N, D), bool
-        Pose parameters that may move.
+    blocks : PoseBlocks
+        Of the pose parameters that may move.
     free_lens : ndarray of shape (5,), bool
         Lens parameters that may move; they follow the model's shared parameters.
     weight : float
@@ -274,12 +278,12 @@ def chain(
     size, count = model.by_pose.shape[1], len(observations)
     inverse = inverses(model.matrices)[i][:, None]
     along = homographies[:, None]
-    blocks = [
+    by_parts = [
         -along @ model.by_pose[i] @ inverse,
         model.by_pose[j] @ inverse,
         model.by_shared[j] @ inverse - along @ model.by_shared[i] @ inverse,
     ]
-    by_homography = np.concatenate(blocks, axis=1).reshape(count, -1, 9)
+    by_homography = np.concatenate(by_parts, axis=1).reshape(count, -1, 9)
     lens = np.flatnonzero(free_lens)
     width = by_homography.shape[1]
     derivative = np.zeros((count, _ENTRIES, width + len(lens)))
@@ -288,20 +292,12 @@ def chain(
     local = np.swapaxes(derivative, 1, 2) @ equations.gram @ derivative * weight
     gradient = np.einsum("lpk,lp->lk", derivative, equations.gradient) * weight
 
-    number = np.where(free, np.cumsum(free.reshape(-1)).reshape(free.shape) - 1, -1)
-    column = np.concatenate([number[i], number[j]], axis=1)
-    total = int(free.sum())
     pair = 2 * size
-    row_index = np.broadcast_to(column[:, :, None], (count, pair, pair)).reshape(-1)
-    column_index = np.broadcast_to(column[:, None, :], (count, pair, pair)).reshape(-1)
-    kept = (row_index >= 0) & (column_index >= 0)
-    values = local[:, :pair, :pair].reshape(-1)[kept]
-    poses = sparse.coo_array((values, (row_index[kept], column_index[kept])), shape=(total, total)).tocsc()
-
-    coupling = np.zeros((total + 1, width - pair + len(lens)))
-    np.add.at(coupling, column.reshape(-1), local[:, :pair, pair:].reshape(count * pair, -1))
-    gradient_poses = np.zeros(total + 1)
-    np.add.at(gradient_poses, column.reshape(-1), gradient[:, :pair].reshape(-1))
     return SparseNormalEquations(
-        poses, coupling[:-1], local[:, pair:, pair:].sum(axis=0), gradient_poses[:-1], gradient[:, pair:].sum(axis=0)
+        blocks,
+        blocks.matrix(local[:, :pair, :pair]),
+        blocks.sums(local[:, :pair, pair:]),
+        local[:, pair:, pair:].sum(axis=0),
+        blocks.sums(gradient[:, :pair]),
+        gradient[:, pair:].sum(axis=0),
     )

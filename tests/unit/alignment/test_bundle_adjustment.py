@@ -7,6 +7,7 @@ from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters,
 from rdstitch.alignment.motion_models import HOMOGRAPHY, PLANAR_MODELS, RIGID, TILTING, MotionModel
 from rdstitch.alignment.normal_equations import chain, link_equations, squared_errors
 from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.pose_blocks import PoseBlocks
 from rdstitch.robust.loss import robust_cost, robust_weight
 from tests.alignment_scenes import Scene, grid, jittered, scene
 
@@ -49,7 +50,9 @@ def test_gradient_and_curvature_of_the_whole_cost(model: MotionModel, width: flo
     free = np.ones((count, model.pose_size), dtype=np.bool_)
     free[0] = False
     matrices = model.matrices(start.poses, start.shared)
-    normal = chain(equations, observations, matrices, homographies(start), free, FREE_LENS, 2.0)
+    normal = chain(
+        equations, observations, matrices, homographies(start), PoseBlocks.of(observations, free), FREE_LENS, 2.0
+    )
 
     def cost(poses_step: np.ndarray, shared_step: np.ndarray) -> float:
         step = np.zeros((count, model.pose_size))
@@ -81,7 +84,15 @@ def test_information_on_shared_parameters_is_what_elimination_leaves() -> None:
     h = matrices.matrices[observations.image2] @ np.linalg.inv(matrices.matrices)[observations.image1]
     free = np.ones((len(truth.cameras), 6), dtype=np.bool_)
     free[0] = ~TILTING.gauge
-    normal = chain(link_equations(observations, h, start.lens, 5.0), observations, matrices, h, free, ONE_LENS, 1.0)
+    normal = chain(
+        link_equations(observations, h, start.lens, 5.0),
+        observations,
+        matrices,
+        h,
+        PoseBlocks.of(observations, free),
+        ONE_LENS,
+        1.0,
+    )
     normal = normal.with_priors(np.full(int(free.sum()), 1e4), np.zeros(int(free.sum())), np.eye(4), np.zeros(4))
     dense = np.block([[normal.poses.toarray(), normal.coupling], [normal.coupling.T, normal.shared]])
     expected = np.linalg.inv(np.linalg.inv(dense)[-4:, -4:])

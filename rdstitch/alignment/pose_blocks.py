@@ -1,0 +1,76 @@
+"""Which poses the links couple: the pattern of the sparse normal matrix, the same at every step of an adjustment."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from scipy import sparse
+
+from rdstitch.alignment.observations import Observations
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class PoseBlocks:
+    """The normal matrix of F free pose parameters, put together from blocks of L links.
+
+    Attributes
+    ----------
+    column : ndarray of shape (L, 2 D)
+        Which of the free parameters those of the link's two pictures are; F for those that are not free.
+    free : int
+        F.
+    kept : ndarray of shape (L, 2 D, 2 D), bool
+        Entries of the links' blocks between free parameters.
+    place : ndarray of shape (K,)
+        Where each of these is added in the data of the matrix.
+    indices, indptr : ndarray
+        Of the matrix by columns; all of its diagonal is stored.
+    diagonal : ndarray of shape (F,)
+        Where the diagonal lies in the data.
+    """
+
+    column: IntArray
+    free: int
+    kept: BoolArray
+    place: IntArray
+    indices: IntArray
+    indptr: IntArray
+    diagonal: IntArray
+
+    @classmethod
+    def of(cls, observations: Observations, free: BoolArray) -> Self:
+        """Of links between N pictures, whose parameters (N, D) may move where ``free``."""
+        total = int(free.sum())
+        number = np.where(free, np.cumsum(free.reshape(-1)).reshape(free.shape) - 1, total)
+        column = np.concatenate([number[observations.image1], number[observations.image2]], axis=1)
+        across, down = np.broadcast_arrays(column[:, None, :], column[:, :, None])
+        kept = (across < total) & (down < total)
+        of_diagonal = np.arange(total) * (total + 1)
+        entries, place = np.unique(
+            np.concatenate([across[kept] * total + down[kept], of_diagonal]), return_inverse=True
+        )
+        own, diagonal = np.split(place.reshape(-1), [int(kept.sum())])
+        indptr = np.searchsorted(entries, np.arange(total + 1) * total)
+        indices = entries % max(total, 1)
+        return cls(column, total, kept, own, indices.astype(np.int32), indptr.astype(np.int32), diagonal)
+
+    def matrix(self, local: FloatArray) -> sparse.csc_array:
+        """The sum of blocks (L, 2 D, 2 D)."""
+        data: FloatArray = np.bincount(self.place, local[self.kept], minlength=len(self.indices)).astype(np.float64)
+        return self._of(data)
+
+    def with_diagonal(self, matrix: sparse.csc_array, added: FloatArray) -> sparse.csc_array:
+        """A matrix of this pattern with something (F,) added to its diagonal."""
+        data = matrix.data.copy()
+        data[self.diagonal] += added
+        return self._of(data)
+
+    def sums(self, values: FloatArray) -> FloatArray:
+        """Of values (L, 2 D, ...) of each link the sum for each free parameter, (F, ...)."""
+        total = np.zeros((self.free + 1, *values.shape[2:]))
+        np.add.at(total, self.column.reshape(-1), values.reshape(-1, *values.shape[2:]))
+        return total[:-1]
+
+    def _of(self, data: FloatArray) -> sparse.csc_array:
+        return sparse.csc_array((data, self.indices, self.indptr), shape=(self.free, self.free))
