@@ -14,7 +14,7 @@ from rdstitch.alignment.bundle_adjustment import (
     Priors,
 )
 from rdstitch.alignment.cycle_consistency import link_medians
-from rdstitch.alignment.initialization import adjust_pairs_independently
+from rdstitch.alignment.initialization import MOST_ITERATIONS, adjust_pairs_independently
 from rdstitch.alignment.metric_upgrade import metric_upgrade
 from rdstitch.alignment.motion_models import HOMOGRAPHY, POSE, PSI, SIMILARITY, THETA, MotionModel
 from rdstitch.alignment.observations import Observations
@@ -30,8 +30,8 @@ _WIDEST_START = 0.05
 _LONG_CHAIN = 60
 """Pictures over which chained homographies drift so far that a planar model is the better start."""
 
-_TRIAL_LINKS, _TRIAL_MATCHES = 30, 40
-"""What the tilts to start from are tried on."""
+_TRIAL_LINKS, _TRIAL_MATCHES, _TRIAL_ITERATIONS = 30, 40, 8
+"""What the tilts to start from are tried on, and how long."""
 
 POSE_TILT_SPREAD = math.radians(35.0)
 """Of pictures of which nothing is known: half of the tilts lie below 40 degrees."""
@@ -266,15 +266,20 @@ class Problem:
         links = len(self.observations)
         few = np.linspace(0, links - 1, min(links, _TRIAL_LINKS)).astype(np.intp)
         sample, own = self.observations.subset(few).thinned(_TRIAL_MATCHES), self.homographies[few]
-        trials = [
-            adjust_pairs_independently(
-                model, sample, own, shared, self.lens, self.free_lens, priors, self.knowledge.attitudes
+
+        def adjusted(shared: FloatArray, lens: FloatArray, iterations: int) -> BundleAdjustmentResult:
+            return adjust_pairs_independently(
+                model, sample, own, shared, lens, self.free_lens, priors, self.knowledge.attitudes, iterations
             )
-            for shared in self._shared_to_try(model, priors.shared)
-        ]
+
+        starts = self._shared_to_try(model, priors.shared)
+        if len(starts) == 1:
+            return adjusted(starts[0], self.lens, MOST_ITERATIONS)
+        trials = [adjusted(shared, self.lens, _TRIAL_ITERATIONS) for shared in starts]
         width = ALIGNMENT_WIDTH * min(trial.sigma for trial in trials)
         cost = [float(robust_cost(trial.squared, width).sum()) for trial in trials]
-        return trials[int(np.argmin(cost))]
+        best = trials[int(np.argmin(cost))].parameters
+        return adjusted(best.shared, best.lens, MOST_ITERATIONS)
 
     def _shared_to_try(self, model: MotionModel, physical: FloatArray) -> list[FloatArray]:
         """Focal lengths; or shared parameters for the known or zero tilt, and for four around it, 0.2 radians away."""

@@ -15,8 +15,8 @@ from rdstitch.alignment.normal_equations import (
     LinkEquations,
     SparseNormalEquations,
     chain,
+    folds,
     link_equations,
-    squared_errors,
 )
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.pose_blocks import PoseBlocks
@@ -229,12 +229,12 @@ class BundleAdjuster:
             if not np.isfinite(predicted) or predicted <= LEAST_GAIN * max(state.cost, 1e-12):
                 return state, used, True
             moved = state.parameters.retract(self.model, step_poses, step_shared, self.freedom.lens)
-            cost = self._cost_at(moved, state.equations.whitening, sigma, width)
             used += 1
-            better = cost < state.cost
+            there = None if folds(moved.lens) else self._evaluate(moved, sigma, width)
+            better = there is not None and self._cost(there, state.equations.whitening, sigma, width) < state.cost
             damping = next_damping(damping, np.asarray(better))
-            if better:
-                state = self._evaluate(moved, sigma, width)
+            if better and there is not None:
+                state = there
             elif damping > LARGEST_DAMPING:
                 return state, used, True
         return state, used, False
@@ -247,11 +247,10 @@ class BundleAdjuster:
         cost = float(robust_cost(equations.squared, width).sum()) * self.weight(sigma)
         return _State(parameters, matrices, homographies, equations, cost + self._prior_cost(parameters))
 
-    def _cost_at(self, parameters: Parameters, whitening: FloatArray, sigma: float, width: float) -> float:
-        """The cost at other parameters, with the whitening held."""
-        homographies = self._of_links(self.model.matrices(parameters.poses, parameters.shared))
-        squared = squared_errors(self.observations, homographies, parameters.lens, whitening)
-        return float(robust_cost(squared, width).sum()) * self.weight(sigma) + self._prior_cost(parameters)
+    def _cost(self, state: _State, whitening: FloatArray, sigma: float, width: float) -> float:
+        """The cost of a state with a given whitening."""
+        squared = state.equations.squared_with(whitening)
+        return float(robust_cost(squared, width).sum()) * self.weight(sigma) + self._prior_cost(state.parameters)
 
     def _of_links(self, matrices: ModelMatrices) -> FloatArray:
         """``H_ij = P_j P_i⁻¹`` of each link, shape (L, 3, 3)."""

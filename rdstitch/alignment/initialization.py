@@ -22,7 +22,7 @@ from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.division_model import undistort
 from rdstitch.radial_homography import RadialHomography, transfer
 
-_MOST_ITERATIONS = 24
+MOST_ITERATIONS = 24
 """A start need not be the minimum."""
 
 
@@ -66,6 +66,7 @@ def adjust_pairs_independently(
     free_lens: BoolArray,
     priors: Priors,
     attitudes: FloatArray,
+    iterations: int = MOST_ITERATIONS,
 ) -> BundleAdjustmentResult:
     """Adjust every link on its own, with the shared parameters in common.
 
@@ -79,6 +80,8 @@ def adjust_pairs_independently(
         On the shared parameters and the lens; those on the poses are not used.
     attitudes : ndarray of shape (N, 2)
         How the tilt of each picture is known to differ from the shared one, radians.
+    iterations : int
+        Linearizations at most.
     """
     apart = observations.as_independent_pairs()
     count = 2 * len(apart)
@@ -97,4 +100,4 @@ def adjust_pairs_independently(
         none.poses_precision,
     )
     freedom = FreeParameters.fixing(model, count, list(range(0, count, 2)), free_lens)
-    return BundleAdjuster(model, apart, freedom, known, max_iterations=_MOST_ITERATIONS).run(start)
+    return BundleAdjuster(model, apart, freedom, known, max_iterations=iterations).run(start)

@@ -19,19 +19,17 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.pose_blocks import PoseBlocks
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import LENS_PARAMETERS
-from rdstitch.division_model import distort, is_one_to_one
+from rdstitch.division_model import is_one_to_one
 from rdstitch.radial_homography import (
-    lift,
     measurement_whitening,
     points_last,
-    project,
     side_by_side,
     transfer_jacobian,
     whiten,
 )
 from rdstitch.robust.loss import robust_weight
 
-_CHUNK = 8192
+_CHUNK = 4096
 """Correspondences linearized at a time: what stays in cache."""
 
 
@@ -53,12 +51,26 @@ class LinkEquations:
         ``|r|²`` of each correspondence, px², whitened; inf where it cannot be transferred.
     whitening : ndarray of shape (M, 2, 2)
         What makes r of an error in normalized coordinates.
+    error : ndarray of shape (M, 2)
+        That error; not finite where it cannot be transferred.
     """
 
     gram: FloatArray
     gradient: FloatArray
     squared: FloatArray
     whitening: FloatArray
+    error: FloatArray
+
+    @np.errstate(all="ignore")
+    def squared_with(self, whitening: FloatArray) -> FloatArray:
+        """``|r|²`` (M,) with a whitening that was computed elsewhere, px²; inf where there is no transfer.
+
+        Between one linearization and the next the whitening must stay what it is: otherwise the errors could be made
+        smaller by a larger derivative, against the gradient, which takes the whitening for constant.
+        """
+        r = whiten(whitening, self.error[:, :, None])[:, :, 0]
+        squared = np.einsum("mi,mi->m", r, r)
+        return np.where(np.isfinite(squared), squared, np.inf)
 
 
 def split_lens(lens: FloatArray) -> tuple[float, tuple[float, ...], FloatArray]:
@@ -67,6 +79,13 @@ def split_lens(lens: FloatArray) -> tuple[float, tuple[float, ...], FloatArray]:
     return distortion, tuple(higher) if any(higher) else (), lens[3:]
 
 
+def folds(lens: FloatArray) -> bool:
+    """Whether a lens with more than λ would show a place of the picture twice."""
+    distortion, higher, center = split_lens(lens)
+    return bool(higher) and not is_one_to_one(1.0 + float(np.linalg.norm(center)), (distortion, *higher))
+
+
+@np.errstate(all="ignore")  # a wild step may give homographies that are not finite
 def link_equations(
     observations: Observations, homographies: FloatArray, lens: FloatArray, width: float
 ) -> LinkEquations:
@@ -85,10 +104,10 @@ def link_equations(
     count = len(observations)
     gram, gradient = np.zeros((count, _ENTRIES, _ENTRIES)), np.zeros((count, _ENTRIES))
     squared = np.empty(len(observations.points1))
-    whitening = np.empty((len(observations.points1), 2, 2))
+    whitening, errors = np.empty((len(observations.points1), 2, 2)), np.empty((len(observations.points1), 2))
     for first, last in _chunks(observations.start):
         rows = slice(observations.start[first], observations.start[last])
-        jacobian, error, whitening[rows] = _whitened(observations, homographies, lens, first, last)
+        jacobian, error, whitening[rows], errors[rows] = _whitened(observations, homographies, lens, first, last)
         squared[rows] = np.einsum("mi,mi->m", error, error)
         lost = ~np.isfinite(squared[rows])
         squared[rows][lost] = np.inf
@@ -102,30 +121,7 @@ def link_equations(
             across, down = columns[:, :, a:b]
             gram[link] = across @ across.T + down @ down.T
             gradient[link] = across @ error[a:b, 0] + down @ error[a:b, 1]
-    return LinkEquations(gram, gradient, squared, whitening)
-
-
-@np.errstate(all="ignore")  # a wild step may give homographies that are not finite
-def squared_errors(
-    observations: Observations, homographies: FloatArray, lens: FloatArray, whitening: FloatArray
-) -> FloatArray:
-    """``|r|²`` (M,) with a whitening that was computed before, px²; inf where there is no transfer.
-
-    Between one linearization and the next the whitening must stay what it is: otherwise the errors could be made
-    smaller by a larger derivative, against the gradient, which takes the whitening for constant.
-    """
-    squared = np.empty(len(observations.points1))
-    distortion, higher, center = split_lens(lens)
-    if higher and not is_one_to_one(1.0 + float(np.linalg.norm(center)), (distortion, *higher)):
-        return np.full_like(squared, np.inf)  # the lens would fold the picture
-    for first, last in _chunks(observations.start):
-        rows = slice(observations.start[first], observations.start[last])
-        counts = np.diff(observations.start[first : last + 1])
-        lifted = lift(observations.points1[rows] - center, distortion, higher)
-        moved = np.einsum("mij,mj->mi", np.repeat(homographies[first:last], counts, axis=0), lifted)
-        error = distort(project(moved), distortion, higher) - (observations.points2[rows] - center)
-        squared[rows] = (np.einsum("mij,mj->mi", whitening[rows], error) ** 2).sum(axis=1)
-    return np.where(np.isfinite(squared), squared, np.inf)
+    return LinkEquations(gram, gradient, squared, whitening, errors)
 
 
 def whitened_errors(observations: Observations, homographies: FloatArray, lens: FloatArray) -> FloatArray:
@@ -143,8 +139,11 @@ def _chunks(start: NDArray[np.intp]) -> list[tuple[int, int]]:
 @np.errstate(all="ignore")
 def _whitened(
     observations: Observations, homographies: FloatArray, lens: FloatArray, first: int, last: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Jacobian (m, 2, 14) and error (m, 2) of the correspondences of some links, whitened, pixels; the whitening."""
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Jacobian (m, 2, 14) and error (m, 2) of the correspondences of some links, whitened, pixels.
+
+    Then the whitening, and the error as it is without.
+    """
     rows = slice(observations.start[first], observations.start[last])
     counts = np.diff(observations.start[first : last + 1])
     scale1 = np.repeat(observations.scale1[first:last], counts)[:, None, None]
@@ -155,7 +154,7 @@ def _whitened(
     whitening = measurement_whitening(result.by_point * (scale2 / scale1)) * scale2
     jacobian = side_by_side(result.by_homography, result.by_lens)
     error = result.points - (observations.points2[rows] - center)
-    return whiten(whitening, jacobian), whiten(whitening, error[:, :, None])[:, :, 0], whitening
+    return whiten(whitening, jacobian), whiten(whitening, error[:, :, None])[:, :, 0], whitening, error
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ class PoseBlocks:
     def sums(self, values: FloatArray) -> FloatArray:
         """Of values (L, 2 D, ...) of each link the sum for each free parameter, (F, ...)."""
         total = np.zeros((self.free + 1, *values.shape[2:]))
-        np.add.at(total, self.column.reshape(-1), values.reshape(-1, *values.shape[2:]))
+        np.add.at(total, self.column, values)
         return total[:-1]
 
     def _of(self, data: FloatArray) -> sparse.csc_array:

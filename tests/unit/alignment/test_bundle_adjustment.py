@@ -5,7 +5,7 @@ import pytest
 
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters, Priors, sigma_of
 from rdstitch.alignment.motion_models import HOMOGRAPHY, PLANAR_MODELS, RIGID, TILTING, MotionModel
-from rdstitch.alignment.normal_equations import chain, link_equations, squared_errors
+from rdstitch.alignment.normal_equations import chain, link_equations
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.pose_blocks import PoseBlocks
 from rdstitch.robust.loss import robust_cost, robust_weight
@@ -58,7 +58,8 @@ def test_gradient_and_curvature_of_the_whole_cost(model: MotionModel, width: flo
         step = np.zeros((count, model.pose_size))
         step[free] = poses_step
         moved = start.retract(model, step, shared_step, FREE_LENS)
-        squared = squared_errors(observations, homographies(moved), moved.lens, equations.whitening)
+        there = link_equations(observations, homographies(moved), moved.lens, width)
+        squared = there.squared_with(equations.whitening)
         return 2.0 * float(robust_cost(squared, width).sum())
 
     rng = np.random.default_rng(0)
