@@ -16,6 +16,7 @@ from rdstitch.matching.candidate_pairs import pairs_that_matter
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.options import MatchingOptions, PairOptions
+from rdstitch.matching.repeated_pattern import LEAST_REPETITION, match_pattern, repetition
 from rdstitch.matching.static_background import (
     has_static_background,
     moving_features,
@@ -42,6 +43,8 @@ _PRESCREEN_FEATURES = 1000  # strongest features of a picture, by which pairs ar
 _PROMISING = 8  # matches among these; pictures that share nothing have three to six by chance
 _WORTHWHILE = 0.05  # share of the matches that a picture has with the one most like it; less adds nothing
 _ENOUGH_MATCHES = 200  # of a picture with all others, from which on it needs no more
+_FEW_INLIERS = 50  # of a pair of a repeated pattern, which shows hundreds of keypoints
+_SURE_SHARE = 0.7  # of such matches that agree: right pairs have 0.8 to 1, lattices that hardly match half
 _SEARCH_RADIUS = 3.0  # thresholds around the place where a match is expected
 
 
@@ -142,6 +145,25 @@ class Pairing:
         if not show_motion(again, count, threshold):
             return MovingPairs(self, pairs, found=False)
         return MovingPairs(moving, again, found=True)
+
+    def match_repeated_patterns(self, pairs: list[PairRegistration]) -> list[PairRegistration]:
+        """Where the pictures show a repeated pattern, match again the pairs that failed or hold by little.
+
+        They may be off by whole periods of the pattern then; see :mod:`rdstitch.matching.repeated_pattern`.
+        """
+        network = self.options.lightglue_model is not None
+        if network or np.median([repetition(found) for found in self.features]) < LEAST_REPETITION:
+            return pairs
+        weak = [k for k, pair in enumerate(pairs) if not pair.relation or pair.relation.inliers.sum() < _FEW_INLIERS]
+        chosen = [(pairs[k].image1, pairs[k].image2) for k in weak]
+        matched = [StoredMatches.of(match_pattern(self.features[i], self.features[j])) for i, j in chosen]
+        again = self._relate(chosen, matched, self.options.pair.distortion, "matching a repeated pattern")
+        result = list(pairs)
+        for k, pair in zip(weak, again, strict=True):
+            inliers = pair.relation.inliers.sum()
+            if pair.relation and inliers > max(_SURE_SHARE * len(pair.matches), pairs[k].relation.inliers.sum()):
+                result[k] = pair
+        return result
 
     def retry_with_consensus_distortion(self, pairs: list[PairRegistration]) -> list[PairRegistration]:
         """Estimate the pairs that failed again, with the λ that the others agree on."""

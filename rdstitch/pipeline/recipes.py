@@ -166,7 +166,7 @@ def calibrate(
     options = options or StitchOptions()
     with found_pictures(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as found:
         _check_outputs(None, options, files_of(found.frames))
-        registration = _register_all(found, options, progress)
+        registration = _register_all(found, options, progress, lens_only=True)
         registration = accept(registration, options, lens_only=True)
     _release_decoded_images(registration)
     with Outputs(options.overwrite) as outputs:
@@ -235,11 +235,13 @@ def trajectory(
     return path, registration
 
 
-def _register_all(found: FoundPictures, options: StitchOptions, progress: Progress) -> Registration:
+def _register_all(
+    found: FoundPictures, options: StitchOptions, progress: Progress, *, lens_only: bool = False
+) -> Registration:
     """Register a sequence, leaving out what cannot be read."""
     sources, unread = _read(found.frames, options, skip_bad=True)
     with options.executor(len(sources)) as executor:
-        registration = register(sources, options, executor, skip_bad=True, progress=progress)
+        registration = register(sources, options, executor, skip_bad=True, lens_only=lens_only, progress=progress)
     return registration.with_messages([*unread, *found.messages])
 
 

@@ -46,6 +46,7 @@ def register(
     *,
     skip_bad: bool,
     metric: bool = False,
+    lens_only: bool = False,
     progress: Progress = silent,
 ) -> Registration:
     """Detect features, register pairs, and align all pictures as one.
@@ -65,6 +66,8 @@ def register(
         Leave out damaged pictures instead of raising.
     metric : bool
         Metric poses are needed, so that the freest model is that of planar motion with small tilts.
+    lens_only : bool
+        Only the lens is wanted, so that pictures of a repeated pattern may be off by whole periods of it.
     progress : callable
 
     Raises
@@ -93,7 +96,8 @@ def register(
         aligner.options.exact_tilts(len(sources)),
     )
     moving = pairing.remove_static_background(pairing.estimate_candidates(candidates), candidates)
-    lenses = separate_lenses(aligner.cameras, moving.pairs, options.threshold, options.known_distortion)
+    found = moving.pairing.match_repeated_patterns(moving.pairs) if lens_only else moving.pairs
+    lenses = separate_lenses(aligner.cameras, found, options.threshold, options.known_distortion)
     pairs = moving.pairing.retry_with_consensus_distortion(lenses.pairs)
     aligned = aligner.align(pairs)
     aligned = close_loops(aligner, moving.pairing, aligned, lenses.of_one_lens(candidates))

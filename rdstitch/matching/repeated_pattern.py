@@ -1,0 +1,131 @@
+"""Matches between pictures of a pattern that repeats itself: a chessboard, tiles, a board of tags.
+
+There each keypoint looks like many, so that no match is distinctive. But each of its likely partners says how the whole
+picture would be turned, scaled and moved, by the places, scales and orientations of the two keypoints alone; the motion
+that most keypoints have a partner for is right, or off by whole periods of the pattern. That is as good for the lens:
+a board that is shifted by a square is as flat as before. It is not for the places of the pictures.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.features import Correspondences, Features
+
+LEAST_REPETITION = 0.1
+"""Of :func:`repetition`: pictures with more show a repeated pattern. Boards have 0.15 to 0.8, flights up to 0.01."""
+
+_ALIKE = 0.45  # of the median distance between descriptors of a picture: nearer ones look the same
+_OTHERS = 4  # keypoints elsewhere that look the same, of one that repeats itself
+_STRONGEST = 1000  # keypoints that are looked at for that
+_PARTNERS = 6  # likely partners of each keypoint
+_HYPOTHESES = 400  # motions that are tried, each by one keypoint and one partner
+_REFINED = 4  # of them, the best, that are refined
+_LARGEST_SCALE = 2.5  # of one picture in the other
+_TURN, _LOG_SCALE = 0.5, 0.5  # radians, and logarithm, by which one keypoint's motion may differ from another's
+_NEAR, _FAR, _SPREAD = 0.01, 0.06, 0.12  # half diagonals: error beside the keypoint, at most, and its growth
+_TOLERANCES = (0.05, 0.035, 0.025, 0.02, 0.015, 0.015)  # half diagonals, of the rounds of refinement
+_AFFINE_ROUNDS = 2  # the first ones; then the quadratic one, which perspective and lens ask for
+_LEAST_MATCHES = 20
+
+
+def repetition(features: Features) -> float:
+    """Share of the keypoints that look like at least four others elsewhere in the picture, in [0, 1]."""
+    strongest = features.take(np.arange(min(len(features), _STRONGEST)))
+    if features.binary or len(strongest) <= _OTHERS:
+        return 0.0
+    distance = np.sqrt(_squared_distances(strongest, strongest))
+    apart = np.linalg.norm(strongest.points[:, None] - strongest.points, axis=2)
+    elsewhere = apart > 2.0 * np.maximum(strongest.scale[:, None], strongest.scale)
+    others = np.where(elsewhere, distance, np.inf)
+    nearest = np.partition(others, _OTHERS - 1, axis=1)[:, _OTHERS - 1]
+    return float(np.mean(nearest < _ALIKE * np.median(distance)))
+
+
+def match_pattern(features1: Features, features2: Features) -> Correspondences:
+    """Matches by the motion of the whole picture that most keypoints have a likely partner for.
+
+    Parameters
+    ----------
+    features1, features2 : Features
+        With orientations and descriptors of numbers; of others nothing is matched.
+
+    Returns
+    -------
+    Correspondences
+        In the order of their distance from where that motion puts them; none where it finds few.
+    """
+    nothing = Correspondences.of(features1, features2, np.empty((0, 2), dtype=np.intp), np.empty(0))
+    if features1.binary or features2.binary or min(len(features1), len(features2)) <= _PARTNERS:
+        return nothing
+    half = float(np.hypot(*(features1.image_size or np.ptp(features1.points, axis=0)))) / 2.0
+    own, partner, distance = _partners(features1, features2)
+    z1, z2 = (_complex(f.points)[index] / half for f, index in ((features1, own), (features2, partner)))
+    turn = features2.angle[partner] - features1.angle[own]
+    motion = features2.scale[partner] / features1.scale[own] * np.exp(1j * turn)
+    likely = np.argsort(distance, kind="stable")[: len(distance) // 2]
+    tried = likely[np.linspace(0, len(likely) - 1, min(_HYPOTHESES, len(likely))).astype(np.intp)]
+    support = np.array([len(np.unique(own[_agreeing(z1, z2, motion, index)])) for index in tried])
+    best, error = np.zeros(len(own), dtype=np.bool_), np.full(len(own), np.inf)
+    for index in tried[np.argsort(-support, kind="stable")[:_REFINED]]:
+        agreeing, errors = _refined(z1, z2, _agreeing(z1, z2, motion, int(index)))
+        if len(np.unique(own[agreeing])) > len(np.unique(own[best])):
+            best, error = agreeing, errors
+    chosen = np.flatnonzero(best)[np.argsort(error[best], kind="stable")]
+    for index in (own, partner):  # each keypoint once, with the partner that fits best
+        chosen = chosen[np.sort(np.unique(index[chosen], return_index=True)[1])]
+    if len(chosen) < _LEAST_MATCHES:
+        return nothing
+    indices = np.column_stack([own[chosen], partner[chosen]])
+    return Correspondences.of(features1, features2, indices, error[chosen] / _TOLERANCES[-1])
+
+
+def _squared_distances(features1: Features, features2: Features) -> FloatArray:
+    """Between all descriptors, (N, M)."""
+    a, b = (f.descriptors.astype(np.float32) for f in (features1, features2))
+    squared = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2.0 * a @ b.T
+    return np.asarray(np.maximum(squared, 0.0), dtype=np.float64)
+
+
+def _partners(features1: Features, features2: Features) -> tuple[IntArray, IntArray, FloatArray]:
+    """Keypoints of the first picture, each with its likely partners in the second, and how unlike they are."""
+    squared = _squared_distances(features1, features2)
+    nearest = np.argpartition(squared, _PARTNERS, axis=1)[:, :_PARTNERS]
+    distance = np.sqrt(np.take_along_axis(squared, nearest, axis=1)).ravel()
+    own, partner = np.repeat(np.arange(len(features1)), _PARTNERS), nearest.ravel()
+    scale = np.abs(np.log(features2.scale[partner] / features1.scale[own]))
+    kept = scale < np.log(_LARGEST_SCALE)
+    return own[kept], partner[kept], distance[kept]
+
+
+def _complex(points: FloatArray) -> NDArray[np.complex128]:
+    return np.asarray(points[:, 0] + 1j * points[:, 1], dtype=np.complex128)
+
+
+def _agreeing(
+    z1: NDArray[np.complex128], z2: NDArray[np.complex128], motion: NDArray[np.complex128], index: int
+) -> BoolArray:
+    """Which matches (M,) agree with the similarity that one of them says."""
+    expected = z2[index] + motion[index] * (z1 - z1[index])
+    tolerance = np.minimum(_NEAR + _SPREAD * np.abs(expected - z2[index]), _FAR)
+    relative = np.log(motion / motion[index])
+    near = np.abs(expected - z2) < tolerance
+    agreeing: BoolArray = near & (np.abs(relative.real) < _LOG_SCALE) & (np.abs(relative.imag) < _TURN)
+    return agreeing
+
+
+def _refined(
+    z1: NDArray[np.complex128], z2: NDArray[np.complex128], agreeing: BoolArray
+) -> tuple[BoolArray, FloatArray]:
+    """The matches that agree with a smooth map that is fitted to them, in rounds of falling tolerance; its errors."""
+    x, y = z1.real, z1.imag
+    terms = np.column_stack([np.ones(len(z1)), x, y, x * x, x * y, y * y])
+    errors = np.full(len(z1), np.inf)
+    for number, tolerance in enumerate(_TOLERANCES):
+        used = terms[:, :3] if number < _AFFINE_ROUNDS else terms
+        if agreeing.sum() < max(2 * used.shape[1], _LEAST_MATCHES // 2):
+            return np.zeros_like(agreeing), errors
+        fitted = np.linalg.lstsq(used[agreeing], z2[agreeing], rcond=None)[0]
+        errors = np.abs(used @ fitted - z2)
+        agreeing = errors < tolerance
+    return agreeing, errors
