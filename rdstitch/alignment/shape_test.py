@@ -44,8 +44,8 @@ _NO_ROBUSTNESS = 1e9
 _SMALL = 1e-3
 """Standard deviations of a parameter by which it is moved for a difference."""
 
-_LARGE, _LARGE_AND_SHOWN = 0.004, 0.002
-"""Of a picture's diagonal: a picture may be off by less; the second where errors show that something is left out."""
+_LARGE = 0.004
+"""Of a picture's diagonal: a picture may be off by less; sets wrong by three pixels of 500 have 0.005 and more."""
 
 _SHOWN_PER_EFFECT = 4.0
 """Gain of each effect, in squared standard deviations, from which on the pictures show that something is left out."""
@@ -173,7 +173,7 @@ def judge_shape(problem: Problem, fit: Fit, cameras: Sequence[Camera]) -> ShapeT
     worst = int(np.argmax(np.hypot(shifts, stds)))
     diagonal, shown = 2.0 * cameras[worst].half_diagonal, gain > _SHOWN_PER_EFFECT * len(effects)
     return ShapeTest(
-        doubtful=bool(np.hypot(shifts[worst], stds[worst]) > (_LARGE_AND_SHOWN if shown else _LARGE) * diagonal),
+        doubtful=bool(np.hypot(shifts[worst], stds[worst]) > _LARGE * diagonal),
         gain=gain,
         shown=shown,
         image=worst,

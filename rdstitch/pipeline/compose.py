@@ -115,7 +115,7 @@ def compose_pictures(
 
     if output is None:
         composite = compose(pictures, canvas, options, report)
-        return Composed(composite.canvas, composite, messages=composite.messages)
+        return Composed(composite.canvas, composite, messages=(*_masked(placed), *composite.messages))
     located: list[tuple[Georeference | None, str]] = []
 
     def tags(final: Canvas) -> list[ExtraTag]:
@@ -128,8 +128,21 @@ def compose_pictures(
     if place is not None and world_files:
         for path, text in zip(world_files, place.world_file_texts(), strict=True):
             outputs.write(path, text_bytes(text))
-    messages = (*written.messages, *([Message(note)] if note else []), *_profile_lost(placed.sources[0], Path(output)))
+    messages = (
+        *_masked(placed),
+        *written.messages,
+        *([Message(note)] if note else []),
+        *_profile_lost(placed.sources[0], Path(output)),
+    )
     return Composed(written.canvas, messages=messages, fingerprint=written.fingerprint, written=written)
+
+
+def _masked(placed: PlacedImages) -> list[Message]:
+    """What was left out of every picture."""
+    if placed.static is None:
+        return []
+    share = float(placed.static.mean())
+    return [Message(f"{share:.0%} of every picture is black, or stays where it is, in all of them, and was masked")]
 
 
 def _files_beside(output: str | Path | None, placed: PlacedImages, overwrite: bool) -> tuple[Path, ...]:

@@ -1,22 +1,29 @@
 """Registered pictures, ready to be composited, and the canvas that they need."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
 from rdstitch.compositing.near_part import NearPart
 from rdstitch.compositing.placed_picture import Displacement, PlacedPicture, place_pictures
+from rdstitch.compositing.static_pixels import LEAST_PICTURES, static_pixels
 from rdstitch.errors import ArgumentError
 from rdstitch.inputs.source import Source, readers
 from rdstitch.io.metadata import GpsPosition
 from rdstitch.io.read import Picture
+from rdstitch.io.reduction import fitting_reduction
 from rdstitch.registration import Registration
+
+_COMPARED, _COMPARED_SIDE = 8, 400
+"""Pictures, and pixels of their longer side, that are compared to find what is static in them."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +65,20 @@ class PlacedImages:
             alignment.on_sphere,
         )
 
+    @cached_property
+    def static(self) -> NDArray[np.bool_] | None:
+        """What shows no plane but the camera's own parts, or nothing, in all pictures; None where nothing does.
+
+        A few pictures of the commonest size are compared, reduced; those of other sizes count as a whole.
+        """
+        size, count = Counter(camera.image_size for camera in self.cameras).most_common(1)[0]
+        if count < LEAST_PICTURES:
+            return None
+        alike = [s for s, camera in zip(self.sources, self.cameras, strict=True) if camera.image_size == size]
+        chosen = np.linspace(0, count - 1, min(count, _COMPARED)).astype(np.intp).tolist()
+        reduction = fitting_reduction(max(size) / _COMPARED_SIDE)
+        return static_pixels([alike[k].read(reduction, keep=True).pixels for k in chosen])
+
     @property
     def positions(self) -> list[GpsPosition | None]:
         """Where each picture was taken; a camera that turned on the spot was at one place, and shows no plane."""
@@ -69,11 +90,26 @@ class PlacedImages:
             reader if part is None else partial(_read_near, reader, part)
             for reader, part in zip(readers(self.sources), near or [None] * len(self.sources), strict=True)
         ]
+        if self.static is not None:
+            common = Counter(camera.image_size for camera in self.cameras).most_common(1)[0][0]
+            read = [
+                partial(_read_moving, reader, self.static) if camera.image_size == common else reader
+                for reader, camera in zip(read, self.cameras, strict=True)
+            ]
         exposure = [source.metadata.exposure for source in self.sources]
         moved = self.displacements or None
         return place_pictures(
             read, self.cameras, self.homographies, preview=read, exposure=exposure, displacement=moved
         )
+
+
+def _read_moving(read: Callable[..., Picture], static: NDArray[np.bool_], reduction: int = 1) -> Picture:
+    """A picture, whole or reduced, without what is static."""
+    picture = read(reduction)
+    height, width = picture.pixels.shape[:2]
+    rows, columns = np.arange(height) * static.shape[0] // height, np.arange(width) * static.shape[1] // width
+    alpha = np.full((height, width), 255, dtype=np.uint8) if picture.alpha is None else picture.alpha
+    return replace(picture, alpha=np.where(static[np.ix_(rows, columns)], np.uint8(0), alpha))
 
 
 def _read_near(read: Callable[..., Picture], part: NearPart, reduction: int = 1) -> Picture:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rdstitch.io import read_image
+from tests.adverse_sets import adverse_set
 from tests.cli.running import DISTORTION, FAST, Run
 
 LEG = (255, 0, 255)
@@ -100,3 +101,19 @@ def test_a_mask_that_does_not_fit_is_named(rdstitch: Run, frames: list[Path], tm
     assert f"{mask}: a mask of 30 x 40 px does not fit" in done.line
     mask.write_bytes(b"no picture")
     assert rdstitch(*arguments).status == 3
+
+
+def test_a_black_border_in_all_pictures_is_masked(rdstitch: Run, tmp_path: Path) -> None:
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    adverse_set("round border", 2).write(pictures)
+    done = rdstitch("mosaic", pictures, "-o", tmp_path / "out.png", *FAST)
+    assert done.status == 0
+    assert "of every picture is black, or stays where it is" in done.err
+    found = read_image(tmp_path / "out.png")
+    assert found.alpha is not None
+    light = found.pixels.max(axis=2)
+    assert (light[found.alpha > 0] < 8).mean() < 0.02
+    again = ("apply", tmp_path / "out.png.json", "--images", pictures, "-o", tmp_path / "again.png")
+    assert rdstitch(*again).status == 0
+    assert (tmp_path / "again.png").read_bytes() == (tmp_path / "out.png").read_bytes()

@@ -41,7 +41,7 @@ def test_a_plain_row_is_not_doubted() -> None:
 
 
 def test_a_rolling_shutter_is_shown_and_named() -> None:
-    found = _aligned(_sheared(_row(), 0.06), lens="division").shape
+    found = _aligned(_sheared(_row(), 0.1), lens="division").shape
     assert found is not None
     assert found.doubtful
     assert found.shown

@@ -1,0 +1,102 @@
+"""What belongs to the camera and not to the plane: a black border, a robot's own body, a pasted banner.
+
+It is at the same place in every picture. Black is seen at once. Texture that stays has the same corners in all
+pictures, whereas those of the plane are at other places in each. Edges do not count: a rail along the motion stays too.
+"""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.arrays import BoolArray, FloatArray
+
+LEAST_PICTURES = 4
+"""Fewer may show the same by chance."""
+
+_BLACK = 0.02
+"""Of the brightest sample, up to which a pixel is black."""
+
+_LEAST_AREA = 0.005
+"""Of the picture, for a region to count."""
+
+_MOST_AREA = 0.6
+"""Of the picture: where more than this seems to stay, the pictures differ too little to say."""
+
+_STAYS = 0.5
+"""Agreement of the corners of the pictures: 1 for what stays, about 0 for what moves."""
+
+_LEAST_TEXTURE = 0.1
+"""Of what is usual in the pictures, for corners to count."""
+
+_WINDOW = 0.05
+"""Of the longer side, over which corners are compared."""
+
+
+def static_pixels(pictures: Sequence[NDArray[np.generic]]) -> BoolArray | None:
+    """Which pixels show what stays at its place in all pictures.
+
+    Parameters
+    ----------
+    pictures : sequence of ndarray of shape (h, w) or (h, w, C)
+        At least :data:`LEAST_PICTURES` of one camera that moved between them, some hundred pixels wide.
+
+    Returns
+    -------
+    ndarray of shape (h, w), bool, or None
+        None where nothing stays, or so much that the camera hardly moved.
+    """
+    grey = np.stack([_grey(picture) for picture in pictures])
+    window = max(3, round(_WINDOW * max(grey.shape[1:])))
+    dark = grey.max(axis=0) <= _BLACK * max(float(grey.max()), 1e-12)
+    black = _regions(dark, at_border=True)
+    # What is between the corners of a body belongs to it.
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (window | 1, window | 1))
+    closed = cv2.morphologyEx((_agreement(grey, window) > _STAYS).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
+    static = black | _regions(cv2.morphologyEx(closed, cv2.MORPH_OPEN, kernel) > 0, at_border=False)
+    share = float(static.mean())
+    return static if _LEAST_AREA < share < _MOST_AREA else None
+
+
+def _grey(picture: NDArray[np.generic]) -> NDArray[np.float32]:
+    samples = picture.astype(np.float32)
+    return samples if samples.ndim == 2 else samples.mean(axis=2)
+
+
+def _agreement(grey: NDArray[np.float32], window: int) -> FloatArray:
+    """How far the corners of different pictures agree, over a window, shape (h, w): 1 for what stays, else about 0."""
+    own, total = np.zeros((3, *grey.shape[1:])), np.zeros((2, *grey.shape[1:]))
+    for image in grey:
+        slope = np.stack([cv2.Sobel(image, cv2.CV_64F, 1, 0), cv2.Sobel(image, cv2.CV_64F, 0, 1)])
+        own += _tensor(slope)
+        total += slope
+    # Products of the slopes of one picture with those of all others, against those with its own.
+    others = (_tensor(total) - own) / (len(grey) - 1)
+    corners, common = (_smaller_eigenvalue(tensor, window) for tensor in (own, others))
+    agreement: FloatArray = common / np.maximum(corners, _LEAST_TEXTURE * float(np.median(corners)) + 1e-12)
+    return agreement
+
+
+def _tensor(slope: FloatArray) -> FloatArray:
+    return np.stack([slope[0] ** 2, slope[1] ** 2, slope[0] * slope[1]])
+
+
+def _smaller_eigenvalue(tensor: FloatArray, window: int) -> FloatArray:
+    """Of the structure tensor (3, h, w), over a window."""
+    xx, yy, xy = (cv2.boxFilter(part, -1, (window, window)) for part in tensor)
+    smaller: FloatArray = (xx + yy) / 2.0 - np.sqrt(((xx - yy) / 2.0) ** 2 + xy**2)
+    return smaller
+
+
+def _regions(found: NDArray[np.bool_], *, at_border: bool) -> NDArray[np.bool_]:
+    """The connected regions that are large enough, and reach the border if they must; grown by two pixels."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8))
+    border = set(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]).tolist())
+    large = [
+        k
+        for k in range(1, count)
+        if stats[k, cv2.CC_STAT_AREA] >= _LEAST_AREA * found.size and (not at_border or k in border)
+    ]
+    kept = np.isin(labels, large).astype(np.uint8)
+    return np.asarray(cv2.dilate(kept, np.ones((5, 5), dtype=np.uint8)), dtype=np.bool_)
