@@ -16,6 +16,9 @@ FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e4
 
 _LEAST_DAMPING = 1e-9
 
+_SETTLED, _OPTIMISM = 3, 20.0
+"""Steps after which a descent is given up that would have to gain so many times what its next step promises."""
+
 
 @dataclass
 class BatchedNormalEquations:
@@ -51,18 +54,23 @@ Retract = Callable[[FloatArray, FloatArray], tuple[FloatArray, BoolArray]]
 """Parameters (B, K) and steps (B, P) to the parameters after the step, and whether these are possible (B,)."""
 
 
-def descend(problems: Problems, retract: Retract, start: FloatArray, iterations: int) -> FloatArray:
+def descend(
+    problems: Problems, retract: Retract, start: FloatArray, iterations: int, useful: FloatArray | None = None
+) -> FloatArray:
     """Where at most so many steps lead to, parameters of shape (B, K).
 
-    A problem that has converged takes no further part, so that each is solved as if it were alone.
+    A problem that has converged takes no further part, so that each is solved as if it were alone; nor does one whose
+    loss will not fall to what is ``useful`` (B,), if given.
     """
     result = start.copy()
     current = problems.normal_equations(start)
     parameters, damping, rows = start, np.full(len(start), FIRST_DAMPING), np.arange(len(start))
-    for _ in range(iterations):
+    for taken in range(iterations):
         step = _damped_step(current, damping)
         gain = -np.einsum("bp,bp->b", step, current.gradient)
         going = (gain > LEAST_GAIN * current.cost) & (damping <= LARGEST_DAMPING)
+        if useful is not None and taken >= _SETTLED:
+            going &= current.cost - _OPTIMISM * gain < useful[rows]
         if not going.all():
             rows, step, parameters, damping = rows[going], step[going], parameters[going], damping[going]
             problems = problems.take(going)

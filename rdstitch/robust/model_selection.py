@@ -89,11 +89,13 @@ class PairSelection:
             noise=self.noise[rows],
         )
 
-    def fit(self, model: PairModel, width: FloatArray, steps: int) -> tuple[Fits, Inspection]:
+    def fit(
+        self, model: PairModel, width: FloatArray, steps: int, useful: FloatArray | None = None
+    ) -> tuple[Fits, Inspection]:
         """A model fitted to every pair from where it stands, with a loss of the given widths (B,), pixels."""
         start = Fits(model.initialize(self.homography, self.tilts), self.homography, self.distortion)
         problems = PairProblems(model, self.data, width, self.noise, self.fixed_distortion)
-        fits = refine_pairs(problems, start, steps)
+        fits = refine_pairs(problems, start, steps, useful)
         return fits, problems.inspect(fits)
 
     def at(self, fits: Fits) -> Self:
@@ -119,8 +121,12 @@ def select_models(models: list[PairModel], pairs: PairSelection) -> list[PairFit
     noise = noise_of(seen.errors, threshold)
     near = replace(pairs.at(free), noise=noise, data=pairs.data.only(seen.errors < _NEAR * threshold))
     inliers = np.maximum((seen.errors < threshold).sum(axis=1), 1)
-    fitted = [near.fit(model, loss_width(noise, threshold), _STEPS) for model in models]
-    criteria = [found.cost / noise**2 + found.information.shape[1] * np.log(2 * inliers) for _, found in fitted]
+    width, price = loss_width(noise, threshold), noise**2 * np.log(2 * inliers)
+    freest = near.fit(models[-1], width, _STEPS)
+    # Any model must fit that well to be chosen, even one without parameters.
+    useful = freest[1].cost + freest[1].information.shape[1] * price
+    fitted = [*(near.fit(model, width, _STEPS, useful) for model in models[:-1]), freest]
+    criteria = [found.cost + found.information.shape[1] * price for _, found in fitted]
     chosen = np.argmin(criteria, axis=0)
     rms = np.stack([rms_of(found.errors, threshold) for _, found in fitted], axis=1)
     result: dict[int, PairFit] = {}

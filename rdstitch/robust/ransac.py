@@ -245,14 +245,15 @@ class _Lane:
         Where the solver assumes none, one refinement is enough to count inliers by; the choice of the model refines the
         last of them again.
         """
-        best = self._refined(start, data, rows, self._solver.model, 3.0 * self._options.threshold)
+        wide = 3.0 * self._options.threshold
         if isinstance(self._solver.model, HomographyPairModel):
-            return best
-        enough = best.inliers.sum(axis=1) >= _FREE_REFINEMENT
+            return self._refined(start, data, rows, self._solver.model, wide)
+        best = start
+        enough = start.inliers.sum(axis=1) >= _FREE_REFINEMENT
         for chosen, model in ((enough, HomographyPairModel()), (~enough, self._solver.model)):
             part = np.flatnonzero(chosen)
             if len(part):
-                refined = self._refined(best.take(part), data.take(part), rows[part], model, self._options.threshold)
+                refined = self._refined(best.take(part), data.take(part), rows[part], model, wide)
                 best.put(part, refined, refined.cost < best.cost[part])
         return best
 

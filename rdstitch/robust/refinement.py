@@ -117,7 +117,7 @@ class PairProblems:
 
 
 @np.errstate(all="ignore")  # a step may leave the domain of the lens model
-def refine_pairs(problems: PairProblems, start: Fits, iterations: int) -> Fits:
+def refine_pairs(problems: PairProblems, start: Fits, iterations: int, useful: FloatArray | None = None) -> Fits:
     """Fit the model and λ by at most so many steps.
 
     Parameters
@@ -127,7 +127,9 @@ def refine_pairs(problems: PairProblems, start: Fits, iterations: int) -> Fits:
     start : Fits
         Their ``distortion`` is kept where it is fixed.
     iterations : int
+    useful : ndarray of shape (B,), optional
+        Value of the loss above which a fit is of no use, so that it need not be found.
     """
-    found = descend(problems, problems.retract, np.column_stack([start.distortion, start.state]), iterations)
+    found = descend(problems, problems.retract, np.column_stack([start.distortion, start.state]), iterations, useful)
     state = found[:, 1:]
     return Fits(state, problems.model.homography(state), found[:, 0])
