@@ -17,7 +17,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
-from rdstitch.division_model import distort, is_one_to_one, nearest_one_parameter, undistort
+from rdstitch.division_model import (
+    distort,
+    folds,
+    horizon_radius,
+    is_one_to_one,
+    nearest_one_parameter,
+    stretch_radius,
+    undistort,
+)
 from rdstitch.errors import ArgumentError, ImpossibleCameraError
 from rdstitch.records import Record
 
@@ -36,6 +44,11 @@ FOCAL_LOG_STD = {"option": 0.01, "file": 0.01, "estimate": 0.05, "exif": 0.05, "
 _GRID = 33  # points along each side of the picture at which lenses are compared
 
 _FOCAL_LIMITS = 0.05, 1e3  # half diagonals; the widest fisheyes have 0.3
+
+_NEAREST_HORIZON = 0.2  # half diagonals: a circle of 180 degrees that is smaller is a wrong camera file
+
+_LARGEST_STRETCH = 20.0
+"""How much the lens may stretch what is drawn where it sees beyond the horizon: to 77 degrees off the axis."""
 
 _GUESSED_FOCAL = 1.2  # half diagonals: a 26 mm lens on 36 x 24 mm, in the middle of what phones and drones carry
 
@@ -72,7 +85,13 @@ class Camera:
     Raises
     ------
     ArgumentError
-        When a value is not finite, or when the lens folds the picture: its model must be one-to-one out to the corners.
+        When a value is not finite; when the lens folds the picture: its model must be one-to-one out to the corners, or
+        to the horizon, the rays at 90 degrees to its axis; or when that is so near that next to nothing is seen.
+
+    Notes
+    -----
+    What a fisheye of 180 degrees and more shows beyond its horizon has no place on a plane: it is undistorted to NaN,
+    and masked in pictures.
     """
 
     image_size: tuple[int, int]
@@ -100,11 +119,15 @@ class Camera:
         if self.focal_source is not None and self.focal_source not in FOCAL_LOG_STD:
             raise ArgumentError(f"unknown source of a focal length: {self.focal_source!r}")
         with np.errstate(all="ignore"):  # absurd values, from a damaged file, overflow
-            corner = float(np.linalg.norm(self.normalize(self.outline(1)), axis=1).max())
-            if not is_one_to_one(corner, self.coefficients):
+            corner = self._corner_radius
+            if not (math.isfinite(corner) and not folds(corner, self.coefficients)):
                 raise ImpossibleCameraError(
-                    f"distortion {', '.join(f'{value:g}' for value in self.coefficients if value)} folds the picture "
-                    "at a corner; λ alone must be above -1"
+                    f"distortion {', '.join(f'{value:g}' for value in self.coefficients if value)} folds the picture"
+                )
+            if horizon_radius(self.distortion, self.higher) < _NEAREST_HORIZON:
+                raise ImpossibleCameraError(
+                    f"distortion {', '.join(f'{value:g}' for value in self.coefficients if value)} leaves next to "
+                    "nothing of the picture before the camera"
                 )
 
     @property
@@ -153,12 +176,30 @@ class Camera:
         other = distort(straight / scale, nearest)[..., 0]
         return np.asarray((radii - other) * self.half_diagonal)
 
+    @property
+    def sees_beyond_horizon(self) -> bool:
+        """Whether a part of the picture shows what is at 90 degrees to the axis and more."""
+        return not is_one_to_one(self._corner_radius, self.coefficients)
+
+    @property
+    def _corner_radius(self) -> float:
+        """Distance of the farthest corner from the centre, half diagonals."""
+        return float(np.linalg.norm(self.normalize(self._border(1)), axis=1).max())
+
     def _radii2(self) -> FloatArray:
-        """Squared radii, half diagonals, of points evenly over the picture."""
+        """Squared radii, half diagonals, of points evenly over the picture, as far as it can be undistorted."""
         u, v = (np.linspace(-0.5, side - 0.5, _GRID) for side in self.image_size)
         x, y = np.meshgrid((u - self.center[0]) / self.half_diagonal, (v - self.center[1]) / self.half_diagonal)
         squares: FloatArray = (x**2 + y**2).ravel()
-        return squares[squares > 0.0]
+        farthest = self.drawn_radius / self.half_diagonal
+        return squares[(squares > 0.0) & (squares <= farthest**2)]
+
+    @property
+    def drawn_radius(self) -> float:
+        """Measured radius, pixels, up to which pictures are drawn; inf where that is all of them."""
+        if not self.sees_beyond_horizon:
+            return math.inf
+        return stretch_radius(self.distortion, self.higher, _LARGEST_STRETCH) * self.half_diagonal
 
     @property
     def half_diagonal(self) -> float:
@@ -208,7 +249,20 @@ class Camera:
         return self.denormalize(distort(self.normalize(points), self.distortion, self.higher))
 
     def outline(self, points_per_side: int) -> FloatArray:
-        """Outer border of the picture, clockwise from the top-left corner, pixels, shape (4 points_per_side, 2)."""
+        """Outer border of what is drawn of the picture, pixels, shape (4 points_per_side, 2).
+
+        Clockwise from the top-left corner. Where the lens sees beyond the horizon, that lies within the circle up to
+        which it stretches what it shows by less than 20 times.
+        """
+        border, farthest = self._border(points_per_side), self.drawn_radius
+        if farthest == math.inf:
+            return border
+        offset = border - self.center
+        radius = np.linalg.norm(offset, axis=1, keepdims=True)
+        return np.asarray(self.center + offset * np.minimum(1.0, farthest / radius))
+
+    def _border(self, points_per_side: int) -> FloatArray:
+        """Outer border of the whole picture, clockwise from the top-left corner, pixels, (4 points_per_side, 2)."""
         width, height = self.image_size
         corners = np.array([(0, 0), (width, 0), (width, height), (0, height)], dtype=np.float64) - 0.5
         steps = np.arange(points_per_side)[:, None] / points_per_side

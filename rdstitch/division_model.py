@@ -36,6 +36,8 @@ _RATIO_STEPS = 12
 _FARTHEST = 4.0
 """Half diagonals: with more coefficients than λ the model is not used beyond, where only the highest power counts."""
 
+_STRETCH_SAMPLES = 4096
+
 _NEAREST_STEPS, _NEAREST_TOLERANCE = 20, 1e-13
 
 
@@ -146,10 +148,35 @@ def valid_radius(distortion: float, higher: tuple[float, ...] = ()) -> float:
     That is the first zero of ``g``, where points come from infinity, or of ``g - 2 q g'``, to which the derivative of
     the undistorted radius is proportional, whichever is nearer.
     """
-    coefficients = np.array([distortion, *higher])
-    growth = -(2.0 * np.arange(1, len(coefficients) + 1) - 1.0) * coefficients
-    zeros = [_first_zero(values) for values in (coefficients, growth)]
+    zeros = horizon_radius(distortion, higher), _fold_radius(distortion, higher)
     return min(*zeros, _FARTHEST) if any(higher) else min(zeros)
+
+
+@lru_cache(maxsize=256)
+def horizon_radius(distortion: float, higher: tuple[float, ...] = ()) -> float:
+    """Measured radius of the rays at 90 degrees to the axis, the first zero of ``g``; inf if there is none."""
+    return _first_zero(np.array([distortion, *higher]))
+
+
+@lru_cache(maxsize=256)
+def stretch_radius(distortion: float, higher: tuple[float, ...], stretch: float) -> float:
+    """Measured radius up to which the lens stretches what it shows by less than a factor; less than the valid one.
+
+    The stretch is the derivative of the undistorted radius, ``(g - 2 q g') / g²``.
+    """
+    limit = min(valid_radius(distortion, higher), _FARTHEST)
+    radii = np.linspace(0.0, limit, _STRETCH_SAMPLES, endpoint=False)
+    q = radii**2
+    g = divisor(q, distortion, higher)
+    beyond = g - 2.0 * q * divisor_slope(q, distortion, higher) > stretch * g**2
+    return float(radii[np.argmax(beyond) - 1]) if beyond.any() else limit
+
+
+@lru_cache(maxsize=256)
+def _fold_radius(distortion: float, higher: tuple[float, ...]) -> float:
+    """Measured radius at which the undistorted one stops growing, the first zero of ``g - 2 q g'``; inf for none."""
+    coefficients = np.array([distortion, *higher])
+    return _first_zero(-(2.0 * np.arange(1, len(coefficients) + 1) - 1.0) * coefficients)
 
 
 def nearest_one_parameter(radius2: FloatArray, distortion: float, higher: Sequence[float] = ()) -> tuple[float, float]:
@@ -224,3 +251,9 @@ def _distorted_radius(radius: FloatArray, distortion: float, higher: tuple[float
 def is_one_to_one(radius: float, coefficients: Sequence[float]) -> bool:
     """Whether the model of λ, μ, … holds out to a radius."""
     return valid_radius(float(coefficients[0]), tuple(float(value) for value in coefficients[1:])) > radius
+
+
+def folds(radius: float, coefficients: Sequence[float]) -> bool:
+    """Whether the undistorted radius stops growing within a radius, among rays that are before the camera."""
+    distortion, higher = float(coefficients[0]), tuple(float(value) for value in coefficients[1:])
+    return _fold_radius(distortion, higher) <= min(radius, horizon_radius(distortion, higher))

@@ -28,7 +28,7 @@ def read_lens(file: Path | None, reporter: Reporter) -> "Camera | None":
     found = read_camera_file(file)
     if found.fit is not None:
         reporter.warn(
-            f"{file}: λ = {found.camera.distortion:.6f} was fitted to the {found.kind} lens model, "
+            f"{file}: λ = {found.camera.nearest_distortion:.6f} was fitted to the {found.kind} lens model, "
             f"rms {found.fit.rms:.2f} px, at most {found.fit.largest:.2f} px"
         )
     return found.camera

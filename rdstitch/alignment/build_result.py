@@ -20,6 +20,7 @@ from rdstitch.alignment.sandwich import sandwich_std
 from rdstitch.alignment.shape_test import judge_shape
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS, Camera
+from rdstitch.errors import ImpossibleCameraError
 from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.messages import Message
@@ -154,6 +155,8 @@ def _adjusted_camera(
         center=(float(center[0]), float(center[1])),
         lens_covariance=tuple(map(tuple, covariance.tolist())) if estimated else None,
     )
+    if estimated and result.sees_beyond_horizon:
+        raise ImpossibleCameraError(f"with λ = {result.distortion:.3g} the corners would see behind the camera")
     std = _nearest_distortion_std(result, covariance) if found.observable else math.inf
     result = replace(result, distortion_std=std)
     return result if focal is None else replace(result, focal=focal * camera.half_diagonal, focal_source="estimate")

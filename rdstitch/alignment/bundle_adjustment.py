@@ -230,7 +230,7 @@ class BundleAdjuster:
                 return state, used, True
             moved = state.parameters.retract(self.model, step_poses, step_shared, self.freedom.lens)
             used += 1
-            there = None if folds(moved.lens) else self._evaluate(moved, sigma, width)
+            there = None if folds(moved.lens, self.observations.reach) else self._evaluate(moved, sigma, width)
             better = there is not None and self._cost(there, state.equations.whitening, sigma, width) < state.cost
             damping = next_damping(damping, np.asarray(better))
             if better and there is not None:

@@ -34,6 +34,8 @@ class Observations:
         Half the diagonal of each link's pictures, pixels.
     matches : ndarray of shape (L,), intp
         Correspondences that each link had before thinning.
+    reach : float
+        Radius in half diagonals out to which a lens must be one-to-one: the corners, unless a given one is not.
     """
 
     image1: IntArray
@@ -44,6 +46,7 @@ class Observations:
     scale1: FloatArray
     scale2: FloatArray
     matches: IntArray
+    reach: float = 1.0
 
     @classmethod
     def from_links(cls, links: Sequence[Link], cameras: Sequence[Camera], most: int | None = None) -> Self:
@@ -68,6 +71,7 @@ class Observations:
             np.array([sizes[i] for i in index1]),
             np.array([sizes[j] for j in index2]),
             np.array([len(link) for link in links], dtype=np.intp),
+            min([1.0, *(camera.drawn_radius / camera.half_diagonal for camera in cameras)]),
         )
 
     def __len__(self) -> int:
@@ -109,6 +113,7 @@ class Observations:
             self.scale1[chosen],
             self.scale2[chosen],
             self.matches[chosen],
+            self.reach,
         )
 
     def thinned(self, most: int) -> Self:

@@ -39,7 +39,7 @@ class LensFit:
 
 @dataclass(frozen=True)
 class LensSamples:
-    """Radii of points all over a picture, N of them.
+    """Radii of points all over what is drawn of a picture, N of them.
 
     Attributes
     ----------
@@ -59,6 +59,7 @@ class LensSamples:
         width, height = camera.image_size
         u, v = np.meshgrid(np.linspace(-0.5, width - 0.5, _GRID), np.linspace(-0.5, height - 0.5, _GRID))
         measured = np.column_stack([u.ravel(), v.ravel()])
+        measured = measured[np.linalg.norm(measured - camera.center, axis=1) <= camera.drawn_radius]
         straight = np.linalg.norm(camera.undistort(measured) - camera.center, axis=1) / unit
         return cls(straight, np.linalg.norm(measured - camera.center, axis=1) / unit, unit)
 
@@ -190,9 +191,10 @@ def _rays(forward: Forward, camera: Camera) -> tuple[FloatArray, FloatArray, Flo
         steps = np.diff(distance, axis=1, prepend=0.0)
     within = (measured > -0.5) & (measured < np.array(camera.image_size) - 0.5)
     inside = within[..., 0] & within[..., 1]
-    # Along each ray, what comes before it leaves the picture for the first time.
-    leaves = np.argmin(inside, axis=1)
+    # Along each ray, what comes before it leaves the picture for the first time; with a fisheye of 180 degrees and
+    # more it never does, and of what is near the horizon there is no need to know.
+    leaves = np.where(inside.all(axis=1), _STEPS, np.argmin(inside, axis=1))
     seen = np.arange(_STEPS) < leaves[:, None]
-    if inside.all(axis=1).any() or not inside[:, 0].all() or not (steps[seen] > 0.0).all():
+    if not inside[:, 0].all() or not (steps[seen] > 0.0).all():
         raise ArgumentError("the lens model folds the picture; it does not belong to pictures of this size")
     return rays[seen], measured[seen], (distance * steps)[seen]

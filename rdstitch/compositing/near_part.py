@@ -124,6 +124,7 @@ def _stretch(camera: Camera, matrix: FloatArray, resolution: float) -> tuple[Flo
     sides = np.linspace(-0.5, width - 0.5, _PROBES), np.linspace(-0.5, height - 0.5, _PROBES)
     points = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
     flat = camera.normalize(camera.undistort(points))
+    flat = flat[np.isfinite(flat).all(axis=1)]  # a fisheye may see beyond its horizon
     moved = flat @ matrix[:, :2].T + matrix[:, 2]
     depth: FloatArray = moved[:, 2]
     with np.errstate(all="ignore"):

@@ -97,7 +97,10 @@ class Warp:
     def contains(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
         """Which measured pixels lie in the picture; NaN does not."""
         width, height = self.camera.image_size
-        return (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
+        within: NDArray[np.bool_] = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
+        if (radius := self.camera.drawn_radius) < math.inf:
+            within &= (x - self.camera.center[0]) ** 2 + (y - self.camera.center[1]) ** 2 <= radius**2
+        return within
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +135,8 @@ class Geometry:
         """Whether the picture certainly covers the box: it holds all nodes of the lattice, with half a pixel around."""
         points = self.lattice.nodes(self.box, self.lattice.step)
         limit = np.array(self.warp.camera.image_size, dtype=np.float32) - 1
-        return bool((points >= 0).all() and (points <= limit).all())
+        drawn = self.warp.camera.drawn_radius == math.inf or bool(self.warp.contains(*points.T).all())
+        return drawn and bool((points >= 0).all() and (points <= limit).all())
 
     @cached_property
     def inside(self) -> NDArray[np.bool_]:

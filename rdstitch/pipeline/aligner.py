@@ -127,7 +127,7 @@ def rematch_weak_pairs(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs
     """
     alignment = aligned.alignment
     stronger = pairing.guided_rematch(list(aligned.pairs), alignment.support, alignment.transfer)
-    if alignment.lens != "division" and not aligner.options.lens_known:
+    if alignment.lens != "division" or alignment.cameras[alignment.reference].higher:
         stronger = {**reselect_inliers(aligned.pairs, alignment, pairing.options.pair.threshold), **stronger}
     return aligner.align([stronger.get(k, pair) for k, pair in enumerate(aligned.pairs)]) if stronger else aligned
 

@@ -1,5 +1,6 @@
 """Homography and distortion of pairs of images from their matches: the public functions."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -95,8 +96,8 @@ class EstimationOptions:
             raise ArgumentError(f"unknown solver {self.solver!r}; choose one of {', '.join(SOLVERS)}")
         if self.distortion is not None and self.solver != "auto":
             raise ArgumentError(f"with known distortion there is nothing to choose; leave out solver={self.solver!r}")
-        if self.distortion is not None and not -1.0 < self.distortion < 1.0:
-            raise ArgumentError(f"distortion must lie between -1 and 1, not {self.distortion}")
+        if self.distortion is not None and not -math.inf < self.distortion < 1.0:
+            raise ArgumentError(f"distortion must be a number below 1, not {self.distortion}")
         limits = self.ransac
         if not limits.threshold > 0.0 or not 0.0 < limits.confidence < 1.0 or limits.max_iterations < 1:
             raise ArgumentError("threshold and max_iterations must be positive, confidence between 0 and 1")

@@ -224,7 +224,8 @@ class _Lane:
         )
         tilts = None if self._tilts is None else np.repeat(self._tilts[rows], batch, axis=0)
         found = self._solver.solve(x1.reshape(-1, size, 2), x2.reshape(-1, size, 2), tilts)
-        keep = plausible(found, corner_radius=1.0)
+        # A lens that is known may see beyond the horizon at the corners: what is there is no inlier.
+        keep = plausible(found, corner_radius=0.0 if self._solver.fixed_distortion else 1.0)
         found = Solutions(found.sample[keep], found.homography[keep], found.distortion[keep])
         pair = found.sample // batch
         costs = truncated_costs(

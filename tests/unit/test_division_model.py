@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rdstitch.camera import Camera
-from rdstitch.division_model import distort, nearest_one_parameter, undistort, valid_radius
+from rdstitch.division_model import distort, horizon_radius, nearest_one_parameter, undistort, valid_radius
 from rdstitch.errors import ArgumentError
 from rdstitch.synthetic import FisheyeLens
 
@@ -35,11 +35,37 @@ def test_what_lies_beyond_the_domain_is_masked_and_never_folded(coefficients: tu
     assert not (distort([[x, 0.0] for x in np.geomspace(1e-3, 1e6, 300)], distortion, higher) > limit).any()
 
 
-def test_a_camera_that_folds_anywhere_in_the_picture_is_refused() -> None:
-    # At the corner itself the divisor is positive again: the fold is within.
-    assert 1.0 - 3.0 + 2.2 > 0.0
+@pytest.mark.parametrize("coefficients", [(1.2, 0.0, 0.0), (-0.4, 0.9, 0.0), (0.1, 0.1, 0.9)])
+def test_a_camera_that_folds_anywhere_in_the_picture_is_refused(coefficients: tuple[float, float, float]) -> None:
     with pytest.raises(ArgumentError, match="folds"):
-        Camera((640, 480), -3.0, 2.2)
+        Camera((640, 480), coefficients[0], coefficients[1], distortion3=coefficients[2])
+
+
+@pytest.mark.parametrize("coefficients", [(-1.6, 0.0, 0.0), (-3.0, 2.2, 0.0), (-1.2, -0.5, -0.4)])
+def test_what_a_fisheye_sees_beyond_the_horizon_is_masked(coefficients: tuple[float, float, float]) -> None:
+    camera = Camera((640, 480), coefficients[0], coefficients[1], (330.0, 235.0), distortion3=coefficients[2])
+    assert camera.sees_beyond_horizon
+    u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
+    points = np.column_stack([u.ravel(), v.ravel()])
+    straight, radius = camera.undistort(points), np.linalg.norm(camera.normalize(points), axis=1)
+    horizon = horizon_radius(camera.distortion, camera.higher)
+    seen = np.isfinite(straight).all(axis=1)
+    np.testing.assert_array_equal(seen, radius < horizon)
+    np.testing.assert_allclose(camera.distort(straight[seen]), points[seen], atol=1e-6)
+    # What is drawn ends before, where the lens stretches too much, and nowhere beyond the picture.
+    outline = camera.outline(16)
+    border = np.linalg.norm(camera.normalize(outline), axis=1)
+    assert (border < horizon).all()
+    assert np.isfinite(camera.undistort(outline)).all()
+    inner, outer = (np.linalg.norm(camera.undistort(camera.denormalize([[r, 0.0]])) - camera.center) for r in
+                    (border.max() - 1e-3, border.max()))  # fmt: skip
+    assert 15.0 < (outer - inner) / (1e-3 * camera.half_diagonal) < 21.0
+    assert not Camera((640, 480), -0.9).sees_beyond_horizon
+
+
+def test_too_small_a_circle_is_no_camera() -> None:
+    with pytest.raises(ArgumentError, match="next to nothing"):
+        Camera((640, 480), -30.0)
 
 
 def test_nearest_lambda_is_what_a_fit_of_measured_points_gives() -> None:
