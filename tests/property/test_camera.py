@@ -63,7 +63,15 @@ def test_a_resized_picture_shows_the_same_rays() -> None:
 
 
 @pytest.mark.parametrize(
-    "bad", [{"distortion": -1.0}, {"distortion": np.nan}, {"focal": 0.0}, {"focal": 1e9}, {"focal_source": "x"}]
+    "bad",
+    [
+        {"distortion": 1.0},
+        {"distortion": -30.0},
+        {"distortion": np.nan},
+        {"focal": 0.0},
+        {"focal": 1e9},
+        {"focal_source": "x"},
+    ],
 )
 def test_impossible_cameras_are_refused(bad: dict[str, float]) -> None:
     with pytest.raises(ArgumentError):
