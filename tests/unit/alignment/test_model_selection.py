@@ -133,3 +133,13 @@ def test_more_of_the_lens_is_freed_where_that_pays(gain: float, center: float, t
     wider = Fit(RIGID, better, lens | ONLY_DISTORTION)
     given.extend = lambda fit, lens: wider
     assert (choose_model(given, ["rigid"], [lens]).fit is wider) is taken
+
+
+def test_of_two_pictures_a_homography_is_always_tried() -> None:
+    """It needs no more parameters than one camera does."""
+    tailed = np.where(np.arange(540) % 5 < 3, _of_sigma(0.6), 16.0)  # a small scatter, and a large misfit
+    squared = {"rigid": tailed, "homography": even_errors(NOISE, LEAST + 1.0)}
+    for pictures, fitted in ((2, ["rigid", "homography"]), (3, ["rigid"])):
+        given: Any = _problem(squared, pictures)
+        choose_model(given, ["rigid", "homography"])
+        assert given.fitted == fitted, pictures

@@ -54,3 +54,20 @@ def test_the_misfit_is_robust() -> None:
 
 def test_what_cannot_be_transferred_is_infinitely_off() -> None:
     assert squared_lengths(np.array([[3.0, 4.0], [np.nan, 1.0]])).tolist() == [25.0, np.inf]
+
+
+def test_only_inliers_are_evidence() -> None:
+    """Errors beyond 3.5 standard deviations count in the misfit, but are no independent observations."""
+    errors = independent_errors(sigma=2.0)
+    errors[:, ::10] = [9.0, 6.0]
+    seen, flat = observations(errors), errors.reshape(-1, 2)
+    found = NoiseModel.of_errors(seen, flat)
+    inliers = np.linalg.norm(flat, axis=1) <= 3.5 * math.sqrt(found.noise**2 - EXACTNESS**2)
+    assert 0.88 < inliers.mean() <= 0.9
+    assert found.counted.all()
+    assert found.effective == pytest.approx(2.0 * inliers.sum() / found.overdispersion)
+
+
+def test_there_are_two_observations_at_least() -> None:
+    few = np.full((1, 1, 2), 0.3)
+    assert NoiseModel.of_errors(observations(few, 2), few.reshape(-1, 2)).effective == 2.0

@@ -107,3 +107,10 @@ def test_of_a_turn_what_neighbours_share_is_parallax(correlation: float, relativ
 @pytest.mark.parametrize(("correlation", "says"), [(0.6, "nearly flat"), (0.4, "the scene is flat")])
 def test_flat_scenes_are_called_flat(correlation: float, says: str) -> None:
     assert says in judge_relief(Coherence(correlation, 0.1, 0.0001, 3.0), "pose").explanation
+
+
+def test_with_one_point_a_cell_nothing_is_overdispersed() -> None:
+    seen, errors = _residuals(1.0, 0.1, links=1)
+    corners = np.array([0, 9, 90, 99])
+    inliers = np.isin(np.arange(100), corners)
+    assert coherence(seen, errors, inliers).overdispersion == 1.0

@@ -77,3 +77,24 @@ def test_a_turn_is_compared_between_the_two_pictures(monkeypatch: pytest.MonkeyP
     overlap_check._compare(registration, [_fit(0, 1)], [0, 1], 1)
     np.testing.assert_allclose(seen[0].homography, half.T @ focal, atol=1e-9)
     np.testing.assert_allclose(seen[1].homography, half @ focal, atol=1e-9)
+
+
+def test_cached_overlaps_are_those_of_the_same_links(monkeypatch: pytest.MonkeyPatch) -> None:
+    links = (_fit(0, 1), _fit(1, 2), LinkFit(0, 2, 9, 0, 0.5, False))
+    checked = [CheckedLink(fit, Agreement(1, 1), Ambiguity(1.0, 0.0, 0.0)) for fit in links[:2]]
+    verdicts: list[bool] = []
+
+    class Recorded:
+        def file(self, mask: object) -> str:
+            return ""
+
+        def recall(self, kind: str, types: object, key: object, compute: object, *, valid: Any) -> list[CheckedLink]:
+            verdicts.extend([valid(checked), valid(checked[::-1]), valid(checked[:1])])
+            return checked
+
+    alignment = SimpleNamespace(links=links, cameras=[None] * 3, homographies=[None] * 3)
+    source = SimpleNamespace(content=lambda cache: "", mask=None)
+    registration: Any = SimpleNamespace(alignment=alignment, sources=[source] * 3, stretch=None)
+    cache: Any = Recorded()
+    assert overlap_check.check_overlaps(registration, 1, cache) == checked
+    assert verdicts == [True, False, False]
