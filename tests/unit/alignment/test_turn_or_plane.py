@@ -91,7 +91,12 @@ def test_a_camera_that_turned_far_was_over_no_plane(degrees: float, sigma: float
 def test_a_hand_held_turn_may_have_some_parallax() -> None:
     """Up to 0.0015 of the diagonal, where no level camera over a plane explains the pictures."""
     size = 0.0015 * 2.0 * SCALE
-    for sigma, plane, name in ((0.9 * size, 3.0, "rotation"), (0.9 * size, 0.5, "rigid"), (1.1 * size, 1.0, "rigid")):
+    for sigma, plane, name in (
+        (0.9 * size, 3.0, "rotation"),
+        (0.9 * size, 0.7, "rotation"),  # better, but not as good as pairs on their own
+        (0.9 * size, 0.5, "rigid"),
+        (1.1 * size, 0.7, "rigid"),
+    ):
         given = _problem(_of_sigma(sigma), _of_sigma(plane), degrees=60, trial=1.0)
         assert _chosen(given) == name, (sigma, plane)
 

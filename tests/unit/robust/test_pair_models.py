@@ -54,3 +54,16 @@ def test_the_prior_pulls_the_focal_length_back() -> None:
     residual, derivative = model.prior(state)
     assert residual == pytest.approx(np.array([[0.5]]))
     np.testing.assert_allclose(derivative, [[0, 0, 0, 0, 0, 5.0]])
+
+
+@pytest.mark.parametrize("model", MODELS, ids=repr)
+def test_a_batch_is_as_each_alone(model: PairModel) -> None:
+    batch = np.stack([H, np.eye(3) + 0.1 * H, np.linalg.inv(H)])
+    tilts = np.concatenate([TILTS, 2.0 * TILTS, -TILTS])
+    states = model.initialize(batch, tilts)
+    for row in range(3):
+        only = slice(row, row + 1)
+        alone = model.initialize(batch[only], tilts[only])
+        np.testing.assert_allclose(states[only], alone, atol=1e-12)
+        np.testing.assert_allclose(model.homography(states)[only], model.homography(alone), atol=1e-12)
+        np.testing.assert_allclose(model.jacobian(states)[only], model.jacobian(alone), atol=1e-12)
