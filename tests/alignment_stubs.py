@@ -79,7 +79,7 @@ def problem(seen: Observations, fits: Callable[[MotionModel], Fit], pictures: in
         fit=fit,
         fitted=fitted,
         extend=lambda fit, lens: fit,
-        knowledge=SimpleNamespace(log_focal=0.2, log_focal_std=0.3),
+        camera_priors=SimpleNamespace(log_focal=0.2, log_focal_std=0.3),
         **more,
     )
     found: Problem = made

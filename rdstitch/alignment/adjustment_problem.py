@@ -146,7 +146,7 @@ class Problem:
     lens : ndarray of shape (4,)
         Where to start.
     free_lens : ndarray of shape (5,), bool
-    knowledge : CameraPriors
+    camera_priors : CameraPriors
     overdispersion : float
         See :class:`BundleAdjuster`.
     """
@@ -158,7 +158,7 @@ class Problem:
     reference: int
     lens: FloatArray
     free_lens: BoolArray
-    knowledge: CameraPriors
+    camera_priors: CameraPriors
     overdispersion: float = 1.0
 
     def fit(self, model: MotionModel, others: Sequence[Fit] = (), shared: FloatArray | None = None) -> Fit:
@@ -181,10 +181,10 @@ class Problem:
 
     def refine(self, model: MotionModel, start: Parameters, tilt_spread: float | None = None) -> Fit:
         """Adjust a model from a given start."""
-        if model is POSE and self.knowledge.attitudes_std is None:
+        if model is POSE and self.camera_priors.attitudes_std is None:
             return Fit(model, self._run(model, start, POSE_TILT_SPREAD), self.free_lens, POSE_TILT_SPREAD)
-        if not self._has_free_tilts(model) or self.knowledge.attitudes_std is not None:
-            spread = self.knowledge.attitudes_std or 0.0
+        if not self._has_free_tilts(model) or self.camera_priors.attitudes_std is not None:
+            spread = self.camera_priors.attitudes_std or 0.0
             own = spread if self._has_free_tilts(model) else 0.0
             return Fit(model, self._run(model, start, spread), self.free_lens, own)
         spread = tilt_spread or _TILT_SPREAD_START
@@ -216,12 +216,12 @@ class Problem:
     def adjuster(self, model: MotionModel, tilt_spread: float = _TILT_SPREAD_START) -> BundleAdjuster:
         """Of one model, with the priors on it."""
         freedom = FreeParameters.fixing(model, self.count, [self.reference], self.free_lens)
-        priors = self.knowledge.priors(model, self.count, tilt_spread)
+        priors = self.camera_priors.priors(model, self.count, tilt_spread)
         return BundleAdjuster(model, self.observations, freedom, priors, self.overdispersion)
 
     def _chained(self, model: MotionModel, others: Sequence[Fit], start: FloatArray | None) -> Parameters:
         """Every link on its own, chained along the tree of the links trusted most."""
-        o, attitudes = self.observations, self.knowledge.attitudes
+        o, attitudes = self.observations, self.camera_priors.attitudes
         shared, lens, homographies = np.zeros(0), self.lens, self.homographies
         if model.shared_names:
             apart = self._links_apart(SIMILARITY if self._has_free_tilts(model) else model, others, start)
@@ -233,7 +233,7 @@ class Problem:
 
     def _upgraded(self) -> Parameters:
         """Chained homographies with the metric of the plane that makes them pictures of one camera."""
-        o, prior = self.observations, self.knowledge
+        o, prior = self.observations, self.camera_priors
         tree = spanning_tree(self.count, o.image1, o.image2, self.trust, self.reference)
         chained = tree.chained(self.homographies, o.image1, np.eye(3))
         upgraded = metric_upgrade(chained, tree.root, prior.log_focal, prior.log_focal_std)
@@ -244,7 +244,7 @@ class Problem:
         self, model: MotionModel, others: Sequence[Fit], start: FloatArray | None
     ) -> BundleAdjustmentResult:
         """Every link on its own, from given shared parameters, those of another planar model or the best of several."""
-        priors = self.knowledge.priors(model, self.count, _TILT_SPREAD_START)
+        priors = self.camera_priors.priors(model, self.count, _TILT_SPREAD_START)
         planar = [other for other in others if other.model.shared_names]
         best = start
         if best is None:
@@ -257,19 +257,19 @@ class Problem:
             self.lens,
             self.free_lens,
             priors,
-            self.knowledge.attitudes,
+            self.camera_priors.attitudes,
         )
 
     def trial(self, model: MotionModel) -> BundleAdjustmentResult:
         """A few links on their own, from the best of several shared parameters."""
-        priors = self.knowledge.priors(model, self.count, _TILT_SPREAD_START)
+        priors = self.camera_priors.priors(model, self.count, _TILT_SPREAD_START)
         links = len(self.observations)
         few = np.linspace(0, links - 1, min(links, _TRIAL_LINKS)).astype(np.intp)
         sample, own = self.observations.subset(few).thinned(_TRIAL_MATCHES), self.homographies[few]
 
         def adjusted(shared: FloatArray, lens: FloatArray, iterations: int) -> BundleAdjustmentResult:
             return adjust_pairs_independently(
-                model, sample, own, shared, lens, self.free_lens, priors, self.knowledge.attitudes, iterations
+                model, sample, own, shared, lens, self.free_lens, priors, self.camera_priors.attitudes, iterations
             )
 
         starts = self._shared_to_try(model, priors.shared)
@@ -286,7 +286,7 @@ class Problem:
         if model is ROTATION:
             return [np.array([log_focal]) for log_focal in (*physical, *FOCAL_STARTS)]
         steps = np.array([(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2)])
-        if self.knowledge.tilt_known:
+        if self.camera_priors.tilt_known:
             steps = steps[:1]
         return [model.shared_from_physical(physical + np.array([*step, 0.0])) for step in steps]
 
@@ -296,7 +296,7 @@ class Problem:
         if model.shared_names and other.model.shared_names:
             return parameters
         shared = parameters.shared if model.shared_names else np.empty(0)
-        poses = model.nearest_poses(other.adjusted.matrices.matrices, shared, self.knowledge.attitudes)
+        poses = model.nearest_poses(other.adjusted.matrices.matrices, shared, self.camera_priors.attitudes)
         return Parameters(poses, shared, parameters.lens)
 
     def _nearest(self, model: MotionModel, starts: Sequence[Parameters]) -> Parameters:

@@ -96,7 +96,7 @@ class AlignmentOptions:
         attitudes = np.zeros((count, 2)) if self.attitudes is None else np.asarray(self.attitudes, dtype=np.float64)
         return [(psi, theta) for psi, theta in (attitudes + self.tilt).tolist()]
 
-    def knowledge(self, cameras: Sequence[Camera]) -> CameraPriors:
+    def camera_priors(self, cameras: Sequence[Camera]) -> CameraPriors:
         """As the adjustment needs it."""
         count = len(cameras)
         attitudes = np.zeros((count, 2)) if self.attitudes is None else np.asarray(self.attitudes, dtype=np.float64)
@@ -158,7 +158,7 @@ def align(
     """
     report = progress or (lambda stage: None)
     _check(cameras, links, options)
-    known = options.knowledge(cameras)
+    known = options.camera_priors(cameras)
     everything = Observations.from_links(links, cameras, options.most)
 
     report("consensus of the pairs")

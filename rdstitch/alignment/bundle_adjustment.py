@@ -162,7 +162,7 @@ class BundleAdjuster:
     ----------
     model : MotionModel
     observations : Observations
-    freedom : FreeParameters
+    free : FreeParameters
     priors : Priors
     overdispersion : float
         Variance of sums of errors over that of independent ones; weighs the correspondences against the priors.
@@ -172,7 +172,7 @@ class BundleAdjuster:
 
     model: MotionModel
     observations: Observations
-    freedom: FreeParameters
+    free: FreeParameters
     priors: Priors
     overdispersion: float = 1.0
     max_iterations: int = 60
@@ -221,14 +221,14 @@ class BundleAdjuster:
                 flat, step_shared = normal.solve(float(damping))
             except RuntimeError:  # singular: no correspondence of some pictures can be transferred
                 return state, used, False
-            step_poses = np.zeros(self.freedom.poses.shape)
-            step_poses[self.freedom.poses] = flat
+            step_poses = np.zeros(self.free.poses.shape)
+            step_poses[self.free.poses] = flat
             predicted = -(
                 normal.gradient_poses @ flat + normal.gradient_shared @ step_shared
             )  # of the quadratic model, to first order twice the decrease
             if not np.isfinite(predicted) or predicted <= LEAST_GAIN * max(state.cost, 1e-12):
                 return state, used, True
-            moved = state.parameters.retract(self.model, step_poses, step_shared, self.freedom.lens)
+            moved = state.parameters.retract(self.model, step_poses, step_shared, self.free.lens)
             used += 1
             there = None if folds(moved.lens, self.observations.reach) else self._evaluate(moved, sigma, width)
             better = there is not None and self._cost(there, state.equations.whitening, sigma, width) < state.cost
@@ -262,7 +262,7 @@ class BundleAdjuster:
     @cached_property
     def _blocks(self) -> PoseBlocks:
         """The pattern of the normal matrix."""
-        return PoseBlocks.of(self.observations, self.freedom.poses)
+        return PoseBlocks.of(self.observations, self.free.poses)
 
     def _sigma(self, state: _State) -> float:
         return sigma_of(state.equations.squared[self.observations.scale_inliers_mask])
@@ -289,10 +289,10 @@ class BundleAdjuster:
             state.matrices,
             state.homographies,
             self._blocks,
-            self.freedom.lens,
+            self.free.lens,
             self.weight(sigma),
         )
-        p, free, lens = self.priors, self.freedom.poses, self.freedom.lens
+        p, free, lens = self.priors, self.free.poses, self.free.lens
         precision = np.concatenate([p.shared_precision, p.lens_precision[lens]])
         physical, derivative = self._physical_parameters(state.parameters.shared)
         error = np.concatenate([physical - p.shared, (state.parameters.lens - p.lens)[lens]])
@@ -307,7 +307,7 @@ class BundleAdjuster:
     def _physical_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The named parameters (S,), and their derivatives by the shared ones and by the lens (S', S')."""
         physical, derivative = self.model.physical_parameters(shared)
-        size, lens = len(physical), int(self.freedom.lens.sum())
+        size, lens = len(physical), int(self.free.lens.sum())
         whole = np.eye(size + lens)
         whole[:size, :size] = derivative
         return physical, whole

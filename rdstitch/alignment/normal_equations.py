@@ -85,7 +85,7 @@ def folds(lens: FloatArray, reach: float = 1.0) -> bool:
     return bool(higher) and not is_one_to_one(reach + float(np.linalg.norm(center)), (distortion, *higher))
 
 
-@np.errstate(all="ignore")  # a wild step may give homographies that are not finite
+@np.errstate(all="ignore")  # a long step may give homographies that are not finite
 def link_equations(
     observations: Observations, homographies: FloatArray, lens: FloatArray, width: float
 ) -> LinkEquations:

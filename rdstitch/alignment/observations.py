@@ -85,15 +85,16 @@ class Observations:
 
     @cached_property
     def scale_inliers_mask(self) -> NDArray[np.bool_]:
-        """Which correspondences, shape (M,), tell how large errors are: all but those of links that rest, if others do.
+        """Which correspondences, shape (M,), the scale of the errors is estimated from: all but those of static links.
 
-        What stays where it is in the picture is found again in the same px, without the errors that a change of view
-        brings: a camera that stands still for a while would make all other links look wrong.
+        What stays where it is in the picture is localised in the same pixel again, without the errors that a change of
+        view brings: by the scale of a camera that stands still for a while, all other links would be outliers. All
+        correspondences where every link is static.
         """
-        px = np.linalg.norm(self.points2 - self.points1, axis=1) * self.scale1[self.link]
-        moves = [b > a and float(np.median(px[a:b])) > _STATIC for a, b in itertools.pairwise(self.start)]
-        telling = np.repeat(np.array(moves, dtype=np.bool_), np.diff(self.start))
-        return telling if telling.any() else np.ones_like(telling)
+        distance = np.linalg.norm(self.points2 - self.points1, axis=1) * self.scale1[self.link]
+        moves = [b > a and float(np.median(distance[a:b])) > _STATIC for a, b in itertools.pairwise(self.start)]
+        moving = np.repeat(np.array(moves, dtype=np.bool_), np.diff(self.start))
+        return moving if moving.any() else np.ones_like(moving)
 
     def subset(self, links: IntArray | NDArray[np.bool_], image_index: IntArray | None = None) -> Self:
         """Only some links; with ``image_index`` (N,) pictures get new numbers."""

@@ -49,7 +49,7 @@ def sandwich_std(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> 
     ground = _ground_blocks(adjuster.observations, adjusted)
     by_ground = float((np.bincount(ground, influence) ** 2).sum())
     blocks = len(np.unique(ground[influence != 0.0]))
-    free = int(adjuster.freedom.poses.sum()) + len(adjusted.parameters.shared) + int(adjuster.freedom.lens.sum())
+    free = int(adjuster.free.poses.sum()) + len(adjusted.parameters.shared) + int(adjuster.free.lens.sum())
     few = 2.0 * blocks / max(2.0 * blocks - free, 0.25 * blocks)  # what the parameters have absorbed
     blockwise = max(by_ground * few, _by_pictures(adjuster.observations, influence))
     return float(np.sqrt(blockwise + _absorbed(adjuster, adjusted, influence)))
@@ -63,8 +63,8 @@ def _influence(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> Fl
     poses, shared = replace(normal, gradient_poses=np.zeros_like(normal.gradient_poses), gradient_shared=unit).solve(
         1e-12
     )
-    step = np.zeros(adjuster.freedom.poses.shape)
-    step[adjuster.freedom.poses] = poses
+    step = np.zeros(adjuster.free.poses.shape)
+    step[adjuster.free.poses] = poses
     size = _STEP / max(float(np.sqrt(abs(shared[len(adjusted.parameters.shared)]))), 1e-12)
     ahead, behind = (_errors(adjuster, adjusted, sign * size * step, sign * size * shared) for sign in (1.0, -1.0))
     errors = whitened_errors(observations, adjusted.homographies, adjusted.parameters.lens)
@@ -78,7 +78,7 @@ def _errors(
     adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult, poses: FloatArray, shared: FloatArray
 ) -> FloatArray:
     """Whitened errors (M, 2) after a step."""
-    moved = adjusted.parameters.retract(adjuster.model, poses, shared, adjuster.freedom.lens)
+    moved = adjusted.parameters.retract(adjuster.model, poses, shared, adjuster.free.lens)
     matrices = adjuster.model.matrices(moved.poses, moved.shared).matrices
     i, j = adjuster.observations.image1, adjuster.observations.image2
     return whitened_errors(adjuster.observations, matrices[j] @ inverses(matrices)[i], moved.lens)

@@ -100,10 +100,10 @@ class _Directions:
     def moved(self, index: int, size: float) -> tuple[Parameters, Effect | None]:
         """The parameters after a step in one direction, and the effect that comes with it."""
         kept = self.response.shape[1] - len(self.effects)
-        poses, shared = np.zeros(self.adjuster.freedom.poses.shape), np.zeros(kept)
-        poses[self.adjuster.freedom.poses] = self.response[:, index] * size
+        poses, shared = np.zeros(self.adjuster.free.poses.shape), np.zeros(kept)
+        poses[self.adjuster.free.poses] = self.response[:, index] * size
         shared[index : index + 1] = size  # an effect is none of the model's parameters
-        parameters = self.fit.adjusted.parameters.retract(self.fit.model, poses, shared, self.adjuster.freedom.lens)
+        parameters = self.fit.adjusted.parameters.retract(self.fit.model, poses, shared, self.adjuster.free.lens)
         return parameters, None if index < kept else self.effects[index - kept]
 
     def errors(self, index: int, size: float) -> FloatArray:
@@ -126,7 +126,7 @@ class _Directions:
         ]
         by_step = np.stack(columns, axis=1)
         errors = self.errors(0, 0.0).ravel()
-        free = self.adjuster.freedom.poses
+        free = self.adjuster.free.poses
         precision = priors.poses_precision[free]
         offset = (self.fit.model.prior_coordinates(self.fit.adjusted.parameters.poses) - priors.poses)[free]
         gradient = weight * by_step.T @ errors + self.response.T @ (precision * offset)
@@ -135,7 +135,7 @@ class _Directions:
 
     def _priors(self) -> FloatArray:
         """Information (S, S) before anything is measured."""
-        priors, lens = self.adjuster.priors, self.adjuster.freedom.lens
+        priors, lens = self.adjuster.priors, self.adjuster.free.lens
         derivative = self.fit.model.physical_parameters(self.fit.adjusted.parameters.shared)[1]
         shared = derivative.T @ (priors.shared_precision[:, None] * derivative)
         others = [*priors.lens_precision[lens].tolist(), *(effect.std**-2.0 for effect in self.effects)]

@@ -100,5 +100,5 @@ def _cost(noise: NoiseModel, problem: Problem, turned: Fit) -> float:
     With a focal length that grows without limit a turn becomes a shift over a plane: what is known of the focal length
     counts.
     """
-    log_focal, known = float(turned.adjusted.parameters.shared[0]), problem.knowledge
+    log_focal, known = float(turned.adjusted.parameters.shared[0]), problem.camera_priors
     return fit_cost(noise, problem, turned) + ((log_focal - known.log_focal) / known.log_focal_std) ** 2

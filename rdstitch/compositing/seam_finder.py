@@ -170,7 +170,7 @@ def _parts(free: NDArray[np.bool_]) -> list[tuple[slice, slice]]:
 
 
 def _around(free: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """Where a cut is free to run, with room for what surely belongs to either side; the rest would only take time."""
+    """The box in which a cut can run, with a margin that certainly belongs to either side."""
     rows, columns = (np.flatnonzero(free.any(axis=axis)) for axis in (1, 0))
     return (
         slice(max(0, int(rows[0]) - _AROUND_FREE), int(rows[-1]) + 1 + _AROUND_FREE),
