@@ -37,6 +37,8 @@ _GROUPS = {
     "Output": (
         "rotate",
         "crop",
+        "projection",
+        "max_stretch",
         "max_size",
         "local_alignment",
         "exposure",
@@ -48,7 +50,19 @@ _GROUPS = {
         "plot",
         "as_json",
     ),
-    "Control": ("strict", "force", "dry_run", "cache", "max_memory", "workers", "seed", "verbose", "config", "help"),
+    "Control": (
+        "strict",
+        "force",
+        "dry_run",
+        "cache",
+        "max_memory",
+        "workers",
+        "scheduler",
+        "seed",
+        "verbose",
+        "config",
+        "help",
+    ),
 }
 _OTHERS = "Other options"
 
@@ -61,8 +75,8 @@ class GroupedCommand(click.Command):
         rows: dict[str, list[tuple[int, tuple[str, str]]]] = {group: [] for group in (*_GROUPS, _OTHERS)}
         for parameter in self.get_params(context):
             record = parameter.get_help_record(context)
-            if record is not None:
-                group, rank = place_of(parameter.name or "")
+            if record is not None and isinstance(parameter, click.Option):
+                group, rank = place_of("help" if "--help" in parameter.opts else parameter.name or "")
                 rows[group].append((rank, record))
         for group, found in rows.items():
             if found:

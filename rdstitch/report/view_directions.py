@@ -21,14 +21,17 @@ def view_directions(registration: Registration) -> str:
     view = seen_directions([alignment.cameras[k] for k in used], alignment.homographies[used])
     scale = (_WIDTH - 2 * _MARGIN) / 360.0
     height = 180.0 * scale + 2 * _MARGIN
-    parts = _grid(scale)
+    parts, outlines = _grid(scale), []
     for outline in view.outlines:
         degrees = np.degrees(outline)
         # What lies across the edge is drawn at both ends.
         turns = {360.0 * round(float(v) / 360.0) for v in (degrees[:, 0].min(), degrees[:, 0].max())}
         for turn in turns:
             line = _placed(degrees - (turn, 0.0), scale)
-            parts.append(path(line, closed=True, stroke=BLUE, fill=BLUE, fill_opacity=0.08, stroke_opacity=0.6))
+            outlines.append(path(line, closed=True, stroke=BLUE, fill=BLUE, fill_opacity=0.08, stroke_opacity=0.6))
+    frame = element("rect", x=_MARGIN, y=_MARGIN, width=360.0 * scale, height=180.0 * scale)
+    parts.append(element("clipPath", frame, id="all-around"))
+    parts.append(element("g", "".join(outlines), clip_path="url(#all-around)"))
     for index in used:
         x, y = _placed(np.degrees(middle(registration, index))[None], scale)[0]
         fill = RED if index == alignment.reference else GREY
