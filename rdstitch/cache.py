@@ -20,6 +20,7 @@ from typing import Any, Self, TypeVar
 
 from rdstitch.errors import ArgumentError, InputError, OutputError
 from rdstitch.io.packing import digest, pack, unpack
+from rdstitch.io.staging import lock, remove_dead_files
 from rdstitch.regular_files import open_regular, read_limited
 from rdstitch.stored import LARGEST_ENTRY, Stored, TemporaryFolder, entry_name
 
@@ -242,10 +243,12 @@ def _write(file: Path, data: bytes) -> None:
         with suppress(FileExistsError):
             folder.mkdir()
             folder.chmod(mode)
+    remove_dead_files(file.parent)
     handle, name = tempfile.mkstemp(prefix=".", suffix=".part", dir=file.parent)
     temporary = Path(name)
     try:
         with os.fdopen(handle, "wb") as stream:
+            lock(handle)
             stream.write(data)
         temporary.chmod(mode & 0o666)
         temporary.replace(file)

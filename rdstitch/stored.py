@@ -1,6 +1,5 @@
 """Results that lie on disk until they are needed, so that thousands of them need not fit into memory."""
 
-import shutil
 import tempfile
 import weakref
 from collections import OrderedDict
@@ -13,6 +12,7 @@ from typing import Any, Generic, TypeVar, cast
 
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.io.packing import unpack
+from rdstitch.io.staging import StagingFolder
 from rdstitch.regular_files import read_limited
 
 Value = TypeVar("Value")
@@ -33,10 +33,14 @@ class TemporaryFolder:
     """
 
     def __init__(self, path: Path | None = None) -> None:
-        self.path = path or Path(tempfile.mkdtemp(prefix="rdstitch-store-"))
-        if path is None:
-            _own[self.path] = self
-            weakref.finalize(self, shutil.rmtree, self.path, ignore_errors=True)
+        if path is not None:
+            self.path = path
+            return
+        # Locked by this process: the next run removes it where this one is killed.
+        folder = StagingFolder(Path(tempfile.gettempdir()), prefix="rdstitch-")
+        self.path = folder.path
+        _own[self.path] = self
+        weakref.finalize(self, folder.close)
 
     def __reduce__(self) -> tuple[Callable[[Path], "TemporaryFolder"], tuple[Path]]:
         """See the class."""

@@ -4,6 +4,7 @@ import os
 import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,6 +15,8 @@ if sys.platform != "win32":
 
 _LOCK = "lock"
 _TRIES = 10
+_UNLOCKED_SECONDS = 60.0
+"""After which a file that nobody has locked is not one that somebody has just made."""
 
 
 class StagingFolder:
@@ -63,6 +66,24 @@ def temporary_folder() -> Iterator[Path]:
         yield staging.path
     finally:
         staging.close()
+
+
+def lock(descriptor: int) -> None:
+    """Lock an open file for this process, where the system has locks; it goes with the descriptor."""
+    if sys.platform != "win32":
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def remove_dead_files(folder: Path) -> None:
+    """Remove the hidden, unfinished files of processes that were killed while they wrote them and held :func:`lock`."""
+    for file in folder.glob(".*.part") if sys.platform != "win32" else ():
+        with suppress(OSError):
+            if time.time() - file.stat().st_mtime > _UNLOCKED_SECONDS:
+                descriptor = _locked(file, create=False)
+                if descriptor is not None:
+                    file.unlink()
+                    os.close(descriptor)
 
 
 def _locked(file: Path, *, create: bool) -> int | None:

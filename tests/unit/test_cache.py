@@ -1,6 +1,9 @@
 """The cache: an entry is used only by the code that made it."""
 
 import os
+import subprocess
+import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +15,7 @@ from rdstitch import cache
 from rdstitch.cache import Cache
 from rdstitch.features import FeatureOptions
 from rdstitch.io.packing import pack
+from rdstitch.io.staging import lock, remove_dead_files
 from rdstitch.pipeline import StitchOptions, mosaic
 from tests.cli.running import flight
 
@@ -127,3 +131,32 @@ def test_an_emptied_check_is_made_again(tmp_path: Path) -> None:
     assert again.distortion == first.distortion
     for path in (tmp_path / "cache" / "overlaps").rglob("*"):
         assert path.is_dir() or path.stat().st_size > 300
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="nothing proves a process dead there")
+def test_unfinished_files_of_dead_processes_are_removed(tmp_path: Path) -> None:
+    cache = Cache(tmp_path)
+    cache.recall("stage", (), (1,), lambda: 1)
+    (folder,) = {file.parent for file in tmp_path.rglob("*") if file.is_file()}
+    dead, fresh, alive = (folder / f".{name}.part" for name in ("dead", "fresh", "alive"))
+    for file in (dead, fresh, alive):
+        file.write_bytes(b"half")
+    for file in (dead, alive):
+        os.utime(file, (0, 0))
+    with alive.open("rb+") as stream:
+        lock(stream.fileno())
+        remove_dead_files(folder)
+    assert (dead.exists(), fresh.exists(), alive.exists()) == (False, True, True)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="nothing proves a process dead there")
+def test_the_store_of_a_killed_run_is_removed_by_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    script = "import os; from rdstitch.cache import Cache; c = Cache.for_this_run(); os.kill(os.getpid(), 9)"
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", script], env=environment, check=False)
+    (left,) = tmp_path.iterdir()
+    kept = Cache.for_this_run()
+    assert not left.exists()
+    assert kept.folder is not None
+    assert kept.folder.exists()
