@@ -18,7 +18,7 @@ from rdstitch.regular_files import read_limited
 Value = TypeVar("Value")
 
 LARGEST_ENTRY = 2**31  # bytes
-_ROOM = 32 * 2**20  # bytes of files whose content is kept in memory
+_ROOM = 16 * 2**20  # bytes of files whose content is kept in memory
 
 
 class TemporaryFolder:

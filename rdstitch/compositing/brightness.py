@@ -27,7 +27,7 @@ from rdstitch.compositing.survey import Survey, SurveyTile
 
 _NODES = 7  # along each side of a picture
 # Pictures are compared by the means of cells: so many along a picture that is not cut off.
-_CELLS = 16
+_CELLS, _MOST_CELLS = 16, 150_000  # along a side of an overlap, and of all overlaps together
 _DARKEST = 0.02
 # How well the means of a cell agree, log units, where nothing but light differs; what differs by more counts less.
 _CELL_SIGMA, _HUBER = 0.03, 1.345
@@ -107,7 +107,9 @@ def _compare(survey: Survey, exposure: Exposure) -> _Cells | None:
     if not found:
         return None
     cells = [np.concatenate([entry[k] for entry in found]) for k in range(5)]
-    good = np.isfinite(cells[2]).all(axis=1) & np.isfinite(cells[3]).all(axis=1)
+    good = np.flatnonzero(np.isfinite(cells[2]).all(axis=1) & np.isfinite(cells[3]).all(axis=1))
+    # Of thousands of overlaps, each needs fewer.
+    good = good[:: max(1, -(-len(good) // _MOST_CELLS))]
     first, second, point1, point2, difference = (values[good] for values in cells)
     return _Cells(first, second, point1, point2, difference, overlap)
 

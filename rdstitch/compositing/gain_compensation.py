@@ -24,7 +24,7 @@ from rdstitch.compositing.survey import Survey, SurveyTile
 _SRGB_OFFSET = 0.055
 # Samples outside this part of the range are clipped or mostly noise.
 _DARKEST, _BRIGHTEST = 0.02, 0.97
-_SAMPLES_PER_PAIR, _LARGEST_SAMPLES = 800, 600_000
+_SAMPLES_PER_PAIR, _LARGEST_SAMPLES = 800, 200_000
 _FEWEST_SAMPLES = 30
 # How well two pictures' brightness can agree, and how far gains stray (log units): keeps long chains from drifting.
 _PAIR_SIGMA, _GAIN_SIGMA = 0.02, 0.5

@@ -50,7 +50,7 @@ class CompositeOptions:
     rotate : float
         Degrees that the output is turned clockwise.
     max_memory : int, optional
-        Bytes that the compositor may hold in pictures and tiles; None: 352 MB, or more where the canvas needs
+        Bytes that the compositor may hold in pictures and tiles; None: 256 MB, or more where the canvas needs
         it.
     interpolation : str
         Kernel of the one resampling: "linear", "cubic" or "lanczos".

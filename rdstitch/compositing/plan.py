@@ -13,7 +13,7 @@ from rdstitch.compositing.options import CompositeOptions
 from rdstitch.errors import LimitError
 
 # What the compositor takes by default; more memory means that fewer pictures are read twice.
-DEFAULT_MEMORY = 352 * 2**20
+DEFAULT_MEMORY = 256 * 2**20
 _TILE_SIZES = (512, 256)
 _MOST_WORKERS = 4
 _MOST_BANDS = 4

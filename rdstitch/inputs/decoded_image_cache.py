@@ -5,7 +5,7 @@ from threading import Lock
 
 from rdstitch.io.read import Picture
 
-_ROOM = 64 * 2**20
+_ROOM = 32 * 2**20
 
 
 class DecodedImageCache:
