@@ -68,6 +68,7 @@ def repeated(frames: int, kills: int, seed: int = 0) -> tuple[dict[str, float], 
     """Share of each kind of work that was begun again, and of all by its time; and whether the result is the same."""
     with TemporaryDirectory() as name:
         folder = Path(name)
+        (folder / "frames").mkdir()
         floor_drive("parking", frames, seed=7, size=(480, 360)).write(folder / "frames")
         outputs = [folder / "plain" / "out.tif", folder / "killed" / "out.tif"]
         logs = [folder / "plain.log", folder / "killed.log"]
