@@ -20,10 +20,8 @@ def _nothing_recent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stored, "_recent", stored._RecentlyUsed(0))
 
 
-def _kept(folder: Path, name: str, value: float) -> Stored[tuple[float, ...]]:
-    found = Cache(folder).stored("stage", (), (name,), lambda: (value,))
-    assert found.file is not None
-    return found
+def _kept(folder: Path, name: str, value: float) -> Stored[tuple[float]]:
+    return Cache(folder).stored("stage", (), (name,), lambda: (value,))
 
 
 def test_what_was_kept_is_read_again(tmp_path: Path) -> None:

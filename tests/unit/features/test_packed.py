@@ -20,7 +20,7 @@ def test_packed_features_match_as_before(kind: str, bytes_each: tuple[int, ...])
     again = [found.unpack() for found in packed]
     assert packed[0].descriptors.itemsize in bytes_each
     assert again[0].binary is features[0].binary
-    before, after = match(*features), match(*again)
+    before, after = (match(first, second) for first, second in (features, again))
     if kind in ("rootsift", "sift", "orb"):
         np.testing.assert_array_equal(again[0].descriptors, features[0].descriptors)
     common = set(map(tuple, before.indices.tolist())) & set(map(tuple, after.indices.tolist()))

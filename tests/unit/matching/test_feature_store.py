@@ -13,9 +13,8 @@ def _features(count: int, size: tuple[int, int]) -> Features:
     rng = np.random.default_rng(0)
     points = rng.uniform((-0.5, -0.5), np.array(size) - 0.5, (count, 2))
     numbers = np.arange(float(count))
-    return Features(
-        points, rng.integers(0, 9, (count, 8)).astype(np.float32), numbers, numbers, -numbers, None, "x", size
-    )
+    descriptors = rng.integers(0, 9, (count, 8)).astype(np.float32)
+    return Features(points, descriptors, numbers, numbers, -numbers, None, "x", size)
 
 
 def test_features_are_read_in_the_pixels_that_are_wanted() -> None:
