@@ -28,11 +28,11 @@ _BLURRED = 0.6  # of the median sharpness
 _DARK, _BURNT = 0.06, 0.05  # mean brightness; share of burnt-out pixels
 _LEAST_OVERLAP = 0.3
 _ZOOMED = 1.03  # ratio of focal lengths by EXIF
-# Bytes, fitted to the sets of python -m tests.benchmarks.doctor: interpreter and libraries, features and matches of a
-# picture, and bytes of the compositor for each of the mosaic.
-_BASE_MEMORY, _FEATURES_MEMORY, _COMPOSITE_SHARE = 150 * 2**20, 3 * 2**19, 1.5
-# Of processor time, s: per pair of 4000 features matched and estimated, and per megapixel composited.
-_SECONDS_PAIR, _SECONDS_MEGAPIXEL = 0.35, 0.2
+# Bytes, fitted to the sets of python -m tests.benchmarks.doctor: interpreter and libraries, detection in each thread,
+# features and matches of a picture, and of the compositor for each byte of the mosaic.
+_BASE_MEMORY, _DETECTION_MEMORY, _FEATURES_MEMORY, _COMPOSITE_SHARE = 130 * 2**20, 75 * 2**20, 3 * 2**19, 1.5
+# Of processor time, s: per pair matched and estimated, and per megapixel composited.
+_SECONDS_PAIR, _SECONDS_MEGAPIXEL = 0.1, 0.2
 _PAIRS_PER_PICTURE = 4
 
 
@@ -122,7 +122,7 @@ def _conclude(
         len(groups),
         overlap,
         float(megapixels),
-        _memory(sources, overlap or 0.5),
+        _memory(sources, overlap or 0.5, workers),
         _seconds(sources, examined, overlap or 0.5, workers),
         tuple(_advice(count, unreadable, cameras, zoomed, blurred, dark, burnt, alone, groups, overlap)),
     )
@@ -159,11 +159,11 @@ def _focal(sources: Sequence[Source]) -> tuple[str, bool]:
     return f"{text} by EXIF in {len(known)} of {len(sources)} pictures", zoomed
 
 
-def _memory(sources: Sequence[Source], overlap: float) -> int:
+def _memory(sources: Sequence[Source], overlap: float, workers: int) -> int:
     """Libraries, features, and the part of the mosaic that the compositor holds at a time."""
     shown = sum(np.prod(m.size) * m.channels * m.bit_depth / 8 for m in (source.metadata for source in sources))
     composite = min(_COMPOSITE_SHARE * _mosaic_share(overlap) * float(shown), DEFAULT_MEMORY)
-    return int(_BASE_MEMORY + _FEATURES_MEMORY * len(sources) + composite)
+    return int(_BASE_MEMORY + _DETECTION_MEMORY * workers + _FEATURES_MEMORY * len(sources) + composite)
 
 
 def _mosaic_share(overlap: float) -> float:
