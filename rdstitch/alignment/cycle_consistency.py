@@ -4,8 +4,6 @@ Before the adjustment, links are judged in triangles: the composition of three t
 be the identity, within what the links' covariances allow. After it, by the errors that the adjustment leaves them.
 """
 
-import itertools
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
@@ -168,6 +166,4 @@ def misfitting_links(squared: FloatArray, observations: Observations) -> BoolArr
 
 def link_medians(squared: FloatArray, observations: Observations) -> FloatArray:
     """Median length of the errors of each link, pixels, shape (L,)."""
-    edges = observations.start
-    lengths = np.sqrt(squared)
-    return np.array([np.median(lengths[a:b]) if b > a else np.inf for a, b in itertools.pairwise(edges)])
+    return observations.medians(np.sqrt(squared))

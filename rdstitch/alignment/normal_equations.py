@@ -5,7 +5,6 @@ contributes is summed up in a 14x14 matrix per link, whatever the motion model; 
 that matrix into the blocks of its two pictures and of the shared parameters.
 """
 
-import itertools
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -117,11 +116,22 @@ def link_equations(
         error *= root[:, None]
         edges = observations.start[first : last + 1] - observations.start[first]
         columns = points_last(jacobian)
-        for link, (a, b) in enumerate(itertools.pairwise(edges), start=first):
-            across, down = columns[:, :, a:b]
-            gram[link] = across @ across.T + down @ down.T
-            gradient[link] = across @ error[a:b, 0] + down @ error[a:b, 1]
+        gram[first:last], gradient[first:last] = _link_sums(columns, error, edges)
     return LinkEquations(gram, gradient, squared, whitening, errors)
+
+
+def _link_sums(columns: FloatArray, error: FloatArray, edges: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+    """``J'J`` (l, 14, 14) and ``J'r`` (l, 14) of links, whose correspondences lie between the edges (l + 1,)."""
+    counts = np.diff(edges)
+    gram, gradient = np.zeros((len(counts), len(columns[0]), len(columns[0]))), np.zeros((len(counts), len(columns[0])))
+    for count in np.unique(counts).tolist():
+        links = np.flatnonzero(counts == count)
+        rows = edges[links][:, None] + np.arange(count)
+        for axis in range(2):
+            own = columns[axis][:, rows].swapaxes(0, 1)
+            gram[links] += own @ own.swapaxes(1, 2)
+            gradient[links] += np.einsum("lpm,lm->lp", own, error[:, axis][rows])
+    return gram, gradient
 
 
 def whitened_errors(observations: Observations, homographies: FloatArray, lens: FloatArray) -> FloatArray:

@@ -92,9 +92,21 @@ class Observations:
         correspondences where every link is static.
         """
         distance = np.linalg.norm(self.points2 - self.points1, axis=1) * self.scale1[self.link]
-        moves = [b > a and float(np.median(distance[a:b])) > _STATIC for a, b in itertools.pairwise(self.start)]
-        moving = np.repeat(np.array(moves, dtype=np.bool_), np.diff(self.start))
+        moving = np.repeat(self.medians(distance) > _STATIC, np.diff(self.start))
         return moving if moving.any() else np.ones_like(moving)
+
+    def medians(self, values: FloatArray) -> FloatArray:
+        """Median of one value (M,) per correspondence over each link, shape (L,); inf where a link has none."""
+        counts = np.diff(self.start)
+        if not counts.any():
+            return np.full(len(counts), np.inf)
+        # Links have about as many correspondences each, and rows of a rectangle are sorted much faster than parts.
+        rows = np.full((len(counts), int(counts.max())), np.inf)
+        rows[self.link, np.arange(len(values)) - np.repeat(self.start[:-1], counts)] = values
+        rows.sort(axis=1)
+        ends = [rows[np.arange(len(rows)), np.maximum(place, 0)] for place in ((counts - 1) // 2, counts // 2)]
+        with np.errstate(invalid="ignore"):
+            return np.where(counts > 0, (ends[0] + ends[1]) / 2.0, np.inf)
 
     def subset(self, links: IntArray | NDArray[np.bool_], image_index: IntArray | None = None) -> Self:
         """Only some links; with ``image_index`` (N,) pictures get new numbers."""

@@ -100,8 +100,9 @@ def _ground_blocks(observations: Observations, adjusted: BundleAdjustmentResult)
     back = inverses(adjusted.matrices.matrices)[observations.image1][link]
     plane = project(np.einsum("mij,mj->mi", back, np.column_stack([flat, np.ones(len(flat))])))
     first = np.nan_to_num(plane)
-    sizes = [np.ptp(first[link == k], axis=0).max() for k in np.unique(link)]
-    side = max(float(np.median(sizes)), 1e-12) / _CELLS_PER_PICTURE
+    starts = observations.start[:-1][np.diff(observations.start) > 0]
+    sizes = np.maximum.reduceat(first, starts) - np.minimum.reduceat(first, starts)
+    side = max(float(np.median(sizes.max(axis=1))), 1e-12) / _CELLS_PER_PICTURE
     cells = np.floor((first - np.median(first, axis=0)) / side).astype(np.int64)
     number: IntArray = np.unique(np.clip(cells, -10_000, 10_000), axis=0, return_inverse=True)[1].reshape(-1)
     return number
