@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, TILTING, YAW, X, Y
 from rdstitch.arrays import FloatArray
@@ -56,6 +57,16 @@ def robot_path(count: int, step: float) -> FloatArray:
     return poses
 
 
+def ring(count: int, step: float) -> FloatArray:
+    """Poses (N, 6) around a circle, ``step`` heights apart, so that the last frame comes before the first."""
+    turn = 2.0 * np.pi * np.arange(count) / count
+    radius = step * count / (2.0 * np.pi)
+    poses = np.zeros((count, 6))
+    poses[:, YAW] = -turn
+    poses[:, X], poses[:, Y] = radius * np.sin(turn), radius * (1.0 - np.cos(turn))
+    return poses
+
+
 def scene(
     poses: FloatArray,
     *,
@@ -72,9 +83,11 @@ def scene(
     focal_source: str | None = "option",
     rng: np.random.Generator,
     reach: int | None = None,
+    closed: bool = False,
     relief: float = 0.0,
 ) -> Scene:
-    """Links between all pictures whose overlap is at least ``overlap``, at most ``reach`` frames apart.
+    """Links between all pictures whose overlap is at least ``overlap``, at most ``reach`` frames apart, also across
+    the end of the sequence where it is ``closed``.
 
     Outliers are what a pairwise estimation lets pass: off by up to 4 px. ``relief`` is the amplitude of smooth hills,
     in heights above the plane. ``lens`` is taken instead of ``size`` and ``distortion``.
@@ -87,27 +100,26 @@ def scene(
     cameras = [Camera(size, focal=guess or focal, focal_source=focal_source) for _ in poses]
     inverse = np.linalg.inv(truth)
     links = []
-    for i in range(len(poses)):
-        for j in range(i + 1, len(poses)):
-            if reach is not None and j - i > reach:
-                break
-            if np.linalg.norm(poses[i, [X, Y]] - poses[j, [X, Y]]) > 3.0 * np.hypot(*size) / focal:
-                continue
-            h = truth[j] @ inverse[i]
-            pixels = rng.uniform((0, 0), (size[0] - 1, size[1] - 1), (3 * per_link, 2))
-            plane = _seen(inverse[i], lens, pixels)
-            height = 1.0 + relief * np.sin(6 * plane[:, 0]) * np.cos(5 * plane[:, 1])
-            p1, p2 = (_measured(truth[k], poses[k], lens, plane, height) for k in (i, j))
-            inside = np.isfinite(p1).all(axis=1) & np.isfinite(p2).all(axis=1)
-            inside &= (p1 >= 0).all(axis=1) & (p1 <= np.array(size) - 1).all(axis=1)
-            inside &= (p2 >= 0).all(axis=1) & (p2 <= np.array(size) - 1).all(axis=1)
-            if inside.mean() < overlap:
-                continue
-            p1, p2 = p1[inside][:per_link], p2[inside][:per_link]
-            p1, p2 = p1 + rng.normal(0, noise, p1.shape), p2 + rng.normal(0, noise, p2.shape)
-            wrong = rng.random(len(p1)) < outliers
-            p2[wrong] += rng.uniform(-4, 4, (int(wrong.sum()), 2))
-            links.append(Link(i, j, p1, p2, _relation(h, lens, distortion, len(p1), rng)))
+    near = KDTree(poses[:, [X, Y]]).query_pairs(3.0 * float(np.hypot(*size)) / focal)
+    for i, j in sorted(near):
+        # Around a ring, the last frames are next to the first.
+        if reach is not None and reach < j - i < len(poses) - (reach if closed else 0):
+            continue
+        h = truth[j] @ inverse[i]
+        pixels = rng.uniform((0, 0), (size[0] - 1, size[1] - 1), (3 * per_link, 2))
+        plane = _seen(inverse[i], lens, pixels)
+        height = 1.0 + relief * np.sin(6 * plane[:, 0]) * np.cos(5 * plane[:, 1])
+        p1, p2 = (_measured(truth[k], poses[k], lens, plane, height) for k in (i, j))
+        inside = np.isfinite(p1).all(axis=1) & np.isfinite(p2).all(axis=1)
+        inside &= (p1 >= 0).all(axis=1) & (p1 <= np.array(size) - 1).all(axis=1)
+        inside &= (p2 >= 0).all(axis=1) & (p2 <= np.array(size) - 1).all(axis=1)
+        if inside.mean() < overlap:
+            continue
+        p1, p2 = p1[inside][:per_link], p2[inside][:per_link]
+        p1, p2 = p1 + rng.normal(0, noise, p1.shape), p2 + rng.normal(0, noise, p2.shape)
+        wrong = rng.random(len(p1)) < outliers
+        p2[wrong] += rng.uniform(-4, 4, (int(wrong.sum()), 2))
+        links.append(Link(i, j, p1, p2, _relation(h, lens, distortion, len(p1), rng)))
     return Scene(cameras, links, truth, poses, distortion)
 
 

@@ -1,47 +1,82 @@
 """How the global adjustment grows with the number of frames, and how near it comes to the truth.
 
-Run as ``python -m tests.benchmarks.adjustment``. Links are synthesised along a robot's path (a line, a turn, a
-parallel-parking path). Times are given per frame, and relative to the shortest sequence of the same run.
+Run as ``python -m tests.benchmarks.adjustment [COUNT …] [--path robot|ring|survey] [--links N] [--model MODEL …]``.
+Links are synthesised along a robot's path (a line, a turn, a parallel-parking path), around a ring that closes, or over
+a survey of parallel lanes. Printed are processor times per frame, and relative to the shortest sequence of the same
+run; the largest memory so far; and the drift, as the root mean square and as the largest error of a position in per
+cent of the path.
 """
 
+import argparse
 import math
+import resource
 import time
-from collections.abc import Sequence
 
 import numpy as np
 
 from rdstitch.alignment.align import AlignmentOptions, align
-from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
+from rdstitch.alignment.motion_models import LOG_HEIGHT, MODELS, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
-from tests.alignment_scenes import robot_path, scene
+from rdstitch.arrays import FloatArray
+from tests.alignment_scenes import Scene, grid, ring, robot_path, scene
+
+_STEP = 0.15  # heights between frames of a path
 
 
-def main(counts: Sequence[int] = (40, 80, 160, 320), models: Sequence[str] = ("auto", "homography")) -> None:
+def synthesised(path: str, count: int, links: int) -> Scene:
+    """Links of ``count`` frames, each with the ``links`` next ones; in a survey with those that overlap."""
+    rng = np.random.default_rng(count)
+    if path == "survey":
+        side = math.isqrt(count)
+        poses = grid(side, count // side, (0.6, 0.45), 0.05, rng)
+        return scene(poses, tilt=(-0.1, 0.087), noise=0.4, overlap=0.3, per_link=150, rng=rng)
+    poses = ring(count, _STEP) if path == "ring" else robot_path(count, _STEP)
+    closed = path == "ring"
+    return scene(poses, tilt=(-0.1, 0.087), noise=0.4, overlap=0.3, reach=links, closed=closed, per_link=150, rng=rng)
+
+
+def true_path(poses: FloatArray) -> Trajectory:
+    """The path through true poses (N, 6)."""
+    heights = np.exp(poses[:, LOG_HEIGHT])
+    return Trajectory.from_poses(PlanarPoses(poses[:, YAW], poses[:, [X, Y]], heights, poses[:, [PSI, THETA]]))
+
+
+def largest_error(found: Trajectory, truth: Trajectory) -> float:
+    """Largest distance of a position from the true one after the best similarity, as a share of the path."""
+    one, two = (t.position @ np.array([1.0, 1.0j]) for t in (found, truth))
+    one, two = one - one.mean(), two - two.mean()
+    return float(np.abs(np.vdot(one, two) / np.vdot(one, one) * one - two).max()) / truth.length
+
+
+def main() -> None:
     """Print one line per model and number of frames."""
-    columns = ("model", "frames", "links", "ms/frame", "ratio", "chosen", "Δλ", "transl. %", "rot. °", "drift %")
-    print("".join(f"{column:>11}" for column in columns))
-    for model in models:
+    parser = argparse.ArgumentParser(description="Cost and accuracy of the global adjustment")
+    parser.add_argument("counts", type=int, nargs="*", default=[40, 80, 160, 320], help="numbers of frames")
+    parser.add_argument("--path", choices=("robot", "ring", "survey"), default="robot")
+    parser.add_argument("--links", type=int, default=6, help="next frames that each is linked with")
+    parser.add_argument("--model", nargs="*", choices=("auto", *MODELS), default=["auto", "homography"])
+    given = parser.parse_args()
+    columns = ("model", "frames", "links", "s", "ms/frame", "ratio", "MB", "chosen", "Δλ", "transl. %", "rot. °")
+    print("".join(f"{column:>11}" for column in (*columns, "drift %", "largest %")))
+    for model in given.model:
         first = math.nan
-        for count in counts:
-            rng = np.random.default_rng(count)
-            given = scene(
-                robot_path(count, 0.15), tilt=(-0.1, 0.087), noise=0.4, overlap=0.3, reach=6, per_link=150, rng=rng
-            )
-            begin = time.perf_counter()
-            found = align(given.cameras, given.links, AlignmentOptions(model=model))
-            each = (time.perf_counter() - begin) / count * 1e3
+        for count in given.counts:
+            made = synthesised(given.path, count, given.links)
+            begin = time.process_time()
+            found = align(made.cameras, made.links, AlignmentOptions(model=model))
+            seconds = time.process_time() - begin
+            each = seconds / count * 1e3
             first = each if math.isnan(first) else first
-            row = f"{model:>11}{count:11d}{len(given.links):11d}{each:11.1f}{each / first:11.2f}{found.model:>11}"
-            row += f"{found.distortion - given.distortion:11.5f}"
+            memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+            row = f"{model:>11}{count:11d}{len(made.links):11d}{seconds:11.1f}{each:11.1f}{each / first:11.2f}"
+            row += f"{memory:11.0f}{found.model:>11}{found.distortion - made.distortion:11.5f}"
             if found.poses is not None:
-                p = given.poses
-                heights = np.exp(p[:, LOG_HEIGHT])
-                truth = Trajectory.from_poses(PlanarPoses(p[:, YAW], p[:, [X, Y]], heights, p[:, [PSI, THETA]]))
-                error = compare_trajectories(Trajectory.from_alignment(found), truth)
+                path, truth = Trajectory.from_alignment(found), true_path(made.poses)
+                error = compare_trajectories(path, truth)
                 row += f"{100 * error.translation_in_own_unit:11.4f}{math.degrees(error.rotation):11.4f}"
-                row += f"{100 * error.drift:11.4f}"
-            print(row)
+                row += f"{100 * error.drift:11.4f}{100 * largest_error(path, truth):11.4f}"
+            print(row, flush=True)
 
 
 if __name__ == "__main__":

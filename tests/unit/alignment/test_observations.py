@@ -1,0 +1,56 @@
+"""Correspondences of all links as flat arrays."""
+
+import numpy as np
+
+from rdstitch.alignment.normal_equations import link_equations
+from rdstitch.alignment.observations import Observations
+from tests.alignment_scenes import ring, robot_path, scene
+
+
+def _observations(counts: list[int]) -> Observations:
+    rng = np.random.default_rng(0)
+    total, links = sum(counts), len(counts)
+    points = rng.uniform(-0.8, 0.8, (total, 2))
+    return Observations(
+        np.arange(links),
+        np.arange(links) + 1,
+        np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
+        points,
+        points + rng.normal(0.0, 0.05, points.shape),
+        np.full(links, 400.0),
+        np.full(links, 400.0),
+        np.array(counts),
+    )
+
+
+def test_medians_of_links_of_any_length() -> None:
+    counts = [5, 0, 1, 8, 2, 0]
+    observations = _observations(counts)
+    values = np.random.default_rng(1).normal(size=sum(counts))
+    values[3] = np.inf
+    found = observations.medians(values)
+    parts = np.split(values, np.cumsum(counts)[:-1])
+    assert found.tolist() == [float(np.median(part)) if len(part) else np.inf for part in parts]
+    assert _observations([0, 0]).medians(np.empty(0)).tolist() == [np.inf, np.inf]
+
+
+def test_sums_of_a_link_do_not_depend_on_the_other_links() -> None:
+    """Whether these have as many correspondences or not."""
+    observations = _observations([30, 12, 30, 0, 7])
+    homographies = np.eye(3) + np.random.default_rng(2).normal(0.0, 0.01, (5, 3, 3))
+    lens = np.array([-0.2, 0.0, 0.0, 0.0, 0.0])
+    together = link_equations(observations, homographies, lens, 20.0)
+    for link in range(5):
+        alone = link_equations(observations.subset(np.array([link])), homographies[[link]], lens, 20.0)
+        np.testing.assert_allclose(together.gram[link], alone.gram[0], rtol=1e-12, atol=1e-9)
+        np.testing.assert_allclose(together.gradient[link], alone.gradient[0], rtol=1e-12, atol=1e-9)
+    assert (together.gram[3] == 0.0).all()
+    assert (together.gram[0] != 0.0).any()
+
+
+def test_scenes_link_frames_in_reach_and_around_the_end() -> None:
+    """What the benchmark of the adjustment is given."""
+    made = scene(robot_path(8, 0.15), reach=2, per_link=20, rng=np.random.default_rng(0))
+    assert {(k.image1, k.image2) for k in made.links} == {(i, j) for i in range(8) for j in (i + 1, i + 2) if j < 8}
+    closed = scene(ring(12, 0.3), reach=1, closed=True, per_link=20, rng=np.random.default_rng(0))
+    assert {(k.image1, k.image2) for k in closed.links} == {*((i, i + 1) for i in range(11)), (0, 11)}
