@@ -38,6 +38,9 @@ _UNCONFIRMED = 0.1
 _MATCHES_OF_A_TURN = 5000
 """Correspondences of all links together that the final adjustment of a turn on the spot uses at least, if there are."""
 
+_MATCHES_OF_ALL, _MATCHES_OF_A_LINK = 1_000_000, 60
+"""Correspondences of all links together that are enough, and of a link that are used nevertheless."""
+
 _ROUNDS = 3
 """Rounds of rejecting wrong pairs and adjusting again."""
 
@@ -67,7 +70,7 @@ class AlignmentOptions:
     lens : str
         One of :data:`rdstitch.alignment.lens_selection.LENSES`, or "auto": the simplest that the data allow.
     most : int
-        Correspondences used of each link.
+        Correspondences used of each link at most; fewer where there are thousands of links.
     """
 
     reference: int | None = None
@@ -159,7 +162,9 @@ def align(
     report = progress or (lambda stage: None)
     _check(cameras, links, options)
     known = options.camera_priors(cameras)
-    everything = Observations.from_links(links, cameras, options.most)
+    # Thousands of links determine the lens and the poses many times over: memory and time grow with the links alone.
+    most = min(options.most, max(_MATCHES_OF_ALL // len(links), _MATCHES_OF_A_LINK))
+    everything = Observations.from_links(links, cameras, most)
 
     report("consensus of the pairs")
     votes = vote([k.relation.distortion for k in links], [k.relation.distortion_std for k in links])

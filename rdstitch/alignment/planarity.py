@@ -23,6 +23,9 @@ _COHERENT = 0.5
 LARGE = 0.00075
 """Of a picture's diagonal: lenses that one λ describes roughly leave less, flights over trees and houses more."""
 
+_ENOUGH = 200_000
+"""Correspondences of which the agreement is measured."""
+
 _LEAST_DISTANCE = 0.005
 """Half diagonals; nearer points are the same feature found twice."""
 
@@ -52,7 +55,9 @@ class Coherence:
 
 
 def coherence(observations: Observations, errors: FloatArray, inliers: BoolArray) -> Coherence:
-    """Agreement of the residuals (M, 2) of neighbouring inliers of the same link."""
+    """Agreement of the residuals (M, 2) of neighbouring inliers of the same link; of very many links, every n-th."""
+    every = max(1, -(-len(inliers) // _ENOUGH))
+    inliers = inliers & (observations.link % every == 0)
     link, points, residual = observations.link[inliers], observations.points1[inliers], errors[inliers]
     pictures = len(np.unique(np.concatenate([observations.image1, observations.image2])))
     if len(points) < 2:

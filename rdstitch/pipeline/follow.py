@@ -67,6 +67,7 @@ class FollowedFrame:
             "homography": None if placement is None else placement.homography.tolist(),
             "lambda": None if found is None else _known(found.distortion),
             "lambda_std": None if found is None else _known(found.distortion_std),
+            "lambda_known": found is not None and found.distortion_known,
             "map": None if found is None else found.map_number,
             "keyframe": found is not None and found.keyframe,
             "inliers": 0 if found is None else found.inliers,

@@ -61,6 +61,8 @@ class Tracked:
         Where it lies on the plane of its map; None where that is not known.
     distortion, distortion_std : float
         λ by all frames up to this one, half-diagonal frame; NaN and inf where it cannot be seen.
+    distortion_known : bool
+        Whether λ was given, or is so certain that it is kept from now on.
     map_number : int
         Maps have no common plane: a new one begins where the track was lost.
     keyframe : bool
@@ -74,6 +76,7 @@ class Tracked:
     placement: Placement | None
     distortion: float
     distortion_std: float
+    distortion_known: bool
     map_number: int
     keyframe: bool
     inliers: int
@@ -283,7 +286,7 @@ class Tracker:
 
     def _take_over(self, alignment: Alignment) -> None:
         """λ, the model and the places of the keyframes from an alignment of the window."""
-        if alignment.distortion_std < self._std or not math.isfinite(self._std):
+        if not self.distortion_known and alignment.distortion_std < self._std:
             self._distortion, self._std = alignment.distortion, alignment.distortion_std
         placements: list[Placement | None] = [
             Placement(camera, homography, alignment.focal) if used else None
@@ -315,4 +318,5 @@ class Tracker:
 
     def _tracked(self, frame: _Keyframe, *, keyframe: bool, inliers: int) -> Tracked:
         distortion = math.nan if self._distortion is None else self._distortion
-        return Tracked(frame.number, frame.placement, distortion, self._std, self._map, keyframe, inliers)
+        known = self.distortion_known
+        return Tracked(frame.number, frame.placement, distortion, self._std, known, self._map, keyframe, inliers)

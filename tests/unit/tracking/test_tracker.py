@@ -77,7 +77,10 @@ def test_lambda_becomes_surer_and_is_exact_where_it_is_given() -> None:
     results = [tracker.add(frame, Camera(SIZE))[-1] for frame in frames]
     stds = [result.distortion_std for result in results]
     assert stds[0] == math.inf
-    assert stds[-1] < 0.5 * stds[3]
+    assert 0.0 < stds[-1] < 0.5 * stds[3]
+    first = [result.distortion_known for result in results].index(True)
+    # From then on it is kept.
+    assert {result.distortion for result in results[first:]} == {results[first].distortion}
     known = _tracker(-0.2).add(frames[0], Camera(SIZE))[-1]
     assert (known.distortion, known.distortion_std) == (-0.2, 0.0)
 
