@@ -15,7 +15,8 @@ import time
 import numpy as np
 
 from rdstitch.alignment.align import AlignmentOptions, align
-from rdstitch.alignment.motion_models import LOG_HEIGHT, MODELS, PSI, THETA, YAW, X, Y
+from rdstitch.alignment.model_family import MODELS
+from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
 from rdstitch.arrays import FloatArray

@@ -61,10 +61,8 @@ def main() -> None:
     aligned = [k for k, frame in enumerate(found) if frame.tracked and frame.tracked.placement is not None]
     known = next((k for k, frame in enumerate(found) if frame.tracked and frame.tracked.distortion_known), 0)
     before, after = np.array(spent[:known]), np.array(spent[known:])
-    print(
-        f"ms a frame: {1e3 * before.mean():.1f} in the {known} frames before λ is known, {1e3 * after.mean():.1f} afterwards",
-        end=" ",
-    )
+    print(f"ms a frame: {1e3 * before.mean():.1f} in the {known} frames before λ is known,", end=" ")
+    print(f"{1e3 * after.mean():.1f} afterwards", end=" ")
     print(f"({1.0 / after.mean():.1f} frames a second; the slowest frame {1e3 * after.max():.0f} ms)")
     for share in (0.05, 0.1, 0.25, 0.5, 1.0):
         tracked = found[max(int(share * len(found)) - 1, 0)].tracked
