@@ -33,6 +33,9 @@ from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.planarity import LARGE
 from rdstitch.arrays import BoolArray
 
+NOT_ONE_CAMERA = "the pictures do not come from one camera with one focal length"
+"""Why free homographies were taken."""
+
 _LEAST_RATIO = 1.5
 """Times by which the errors of one camera must exceed those of free homographies."""
 
@@ -162,7 +165,7 @@ def _reason(fits: Sequence[Fit], best: int, names: Sequence[str]) -> str:
         "tilting": f"heights differ by {_height_spread(fits[best]):.0%}, "
         f"tilts by {math.degrees(fits[best].tilt_spread):.1f} degrees",
         "pose": f"one camera in any pose, tilted by up to {_largest_tilt(fits[best]):.0f} degrees",
-        "homography": "the pictures do not come from one camera with one focal length"
+        "homography": NOT_ONE_CAMERA
         if len(fits) > 1 and fits[best].adjusted.parameters.poses.shape[0] > 2
         else "two pictures need no more",
     }[name]

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from rdstitch.alignment.model_selection import NOT_ONE_CAMERA
 from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.errors import RegistrationError
@@ -137,9 +138,18 @@ def _relief(paths: Sequence[str], alignment: Alignment) -> list[Message]:
 def _shape(paths: Sequence[str], alignment: Alignment) -> list[Message]:
     """A shape of the whole that the overlaps do not hold, and the picture that may be off the most."""
     shape = alignment.shape
-    if shape is None or not shape.doubtful:
+    if shape is None:
         return []
     image = paths[shape.image]
+    if NOT_ONE_CAMERA in alignment.model_reason:
+        # Chains of free homographies bend with whatever is not modelled, a curved wall for one.
+        text = (
+            f"nobody knows how far it is off in the whole: {NOT_ONE_CAMERA}, or what they show is no plane; every "
+            "picture has a homography of its own, and their errors add up from picture to picture"
+        )
+        return [Message(text, (image,), code="shape")]
+    if not shape.doubtful:
+        return []
     size = f"about {math.hypot(shape.shift, shape.shift_std):.0f} pixels in the whole, though its overlaps agree"
     if shape.shown:
         text = f"may be off by {size}: the errors have a pattern that was not modelled, most likely {shape.cause}"

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rdstitch.alignment.model_selection import NOT_ONE_CAMERA
 from rdstitch.alignment.result import LinkFit
 from rdstitch.executors import open_executor
 from rdstitch.features import FeatureOptions
@@ -201,3 +202,17 @@ def test_of_doubtful_pairs_on_which_nothing_depends_the_pictures_are_named() -> 
     assert message.images == ("folder/a.jpg", "folder/c.jpg", "folder/d.jpg")
     assert "2 of the pairs fit badly, and little depends on them: c.jpg and d.jpg, a.jpg and c.jpg" in message.text
     assert verdict._outvoted(paths, []) == []
+
+
+def test_a_doubtful_shape_names_the_picture_and_the_size(good: Registration) -> None:
+    alignment = good.alignment
+    assert alignment.shape is not None
+    doubtful = replace(alignment.shape, doubtful=True, shown=True, image=2, shift=6.0, shift_std=8.0)
+    bent = replace(good, alignment=replace(alignment, shape=doubtful))
+    (message,) = judge(bent, THRESHOLD)
+    assert message.images == (str(good.sources[2].path),)
+    assert "about 10 pixels" in message.text
+    assert judge(bent, THRESHOLD, lens_only=True) == ()
+    free = replace(good, alignment=replace(alignment, model_reason=f"homography: {NOT_ONE_CAMERA}; it leaves 0.2 px"))
+    (message,) = judge(free, THRESHOLD)
+    assert "homography of its own" in message.text
