@@ -88,8 +88,8 @@ def find_pictures(
         Each a picture file, a folder, a pattern (``*``, ``?``, ``[...]``), ``@FILE`` with one argument a line or
         separated by NUL, a video file, a ROS bag, or a frame, which stays as it is.
     exclude : iterable of path
-        Files that are no input, such as the output, where they come from a folder or pattern or rdstitch wrote them.
-        Any other picture that is named stays: its user must hear that it would be written over.
+        Files that are no input, such as the output, where rdstitch wrote them. Any other picture stays: its user must
+        hear that it would be written over.
     frames_folder : callable, optional
         Gives the folder where frames of videos are written, losslessly; without it a video is refused.
     every : int
@@ -107,7 +107,7 @@ def find_pictures(
     outputs: list[Path] = []
     for frame, named in _expand(arguments, frames_folder, every, topic):
         is_output = frame.picture is None and is_rdstitch_output(frame.path)
-        if _entry(frame.path) in unwanted and (is_output or not named):
+        if _entry(frame.path) in unwanted and is_output:
             continue
         if is_output and not named:
             outputs.append(frame.path)

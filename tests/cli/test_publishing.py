@@ -157,3 +157,18 @@ def test_a_link_as_output(rdstitch: Run, located: Path, tmp_path: Path) -> None:
     assert rdstitch(*arguments, "-o", tmp_path / "out.jpg", "--overwrite").status == 0
     assert (tmp_path / "out.jpg").is_symlink()
     assert read_image(tmp_path / "disk" / "picture.jpg").pixels.size > 0
+
+
+@pytest.mark.parametrize("name", ["frame_0001.jpg", "../flight/frame_0001.jpg"])
+def test_a_picture_of_the_folder_is_never_replaced(rdstitch: Run, located: Path, tmp_path: Path, name: str) -> None:
+    """An output in the folder of the input is an earlier one only if rdstitch wrote it."""
+    flight = tmp_path / "flight"
+    shutil.copytree(located / "flight", flight)
+    first = sorted(flight.iterdir())[1]
+    before, output = first.read_bytes(), flight / name.replace("frame_0001.jpg", first.name)
+    done = rdstitch("mosaic", flight, "-o", output, "--overwrite", *FAST)
+    assert (done.status, "is one of the input pictures" in done.line) == (6, True)
+    assert first.read_bytes() == before
+    # What rdstitch wrote there is replaced.
+    assert rdstitch("mosaic", flight, "-o", flight / "out.jpg", *FAST).status == 0
+    assert rdstitch("mosaic", flight, "-o", flight / "out.jpg", "--overwrite", *FAST).status == 0
