@@ -19,7 +19,7 @@ MOST_CELLS = 100
 _CELLS = 12
 # The stiffest fields first: they are taken unless freer ones are better by a share that matters.
 _SLOPES = (0.02, 0.06, 0.2)
-_HELD_OUT = 5  # every so many-th match
+_HELD_OUT = 5  # every fifth match
 # Share by which held-out residuals must get smaller for local alignment to be worth while, and for freer fields.
 _WORTHWHILE, _BETTER = 0.15, 0.03
 _FEWEST_MATCHES = 100

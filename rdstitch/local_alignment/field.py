@@ -26,7 +26,7 @@ class DisplacementField:
     image_size : (int, int)
         Width and height of the picture, pixels.
     values : ndarray of shape (m, n, 2)
-        Displacement, px, at nodes that are spread evenly from the first to the last px of each row and column, m rows
+        Displacement, pixels, at nodes spread evenly from the first to the last pixel of each row and column, m rows
         of n.
     """
 

@@ -53,7 +53,7 @@ class PlaneFields:
     shapes : tuple of (int, int)
         Rows and columns of nodes of each picture.
     values : tuple of ndarray of shape (m n, 2)
-        Px of the median picture.
+        Pixels of the median picture.
     """
 
     shapes: tuple[tuple[int, int], ...]

@@ -55,7 +55,7 @@ class PlaneMatches:
 
 
 def plane_scale(cameras: Sequence[Camera], homographies: FloatArray) -> float:
-    """Px of the median picture per unit of the plane, at the pictures' centres."""
+    """Pixels of the median picture per unit of the plane, at the pictures' centres."""
     areas = []
     for camera, matrix in zip(cameras, homographies, strict=True):
         middle = (np.array(camera.image_size, dtype=np.float64) - 1.0) / 2.0

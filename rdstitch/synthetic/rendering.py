@@ -110,7 +110,7 @@ class Sequence:
         return texels_of_pixels(self.lens, self.from_plane(index), points)
 
     def to_ground(self, index: int, points: ArrayLike) -> FloatArray:
-        """Measured px (N, 2) of one picture to the texels that they show; on a plane the same as :meth:`to_plane`."""
+        """Measured pixels (N, 2) of one picture to the texels that they show; :meth:`to_plane` on a plane."""
         return self._on_ground(index, self.to_plane(index, points))
 
     def ground_to_picture(self, index: int, points: ArrayLike) -> FloatArray:

@@ -84,7 +84,7 @@ def misfit(model: Curve, size: int, truth: FloatArray) -> tuple[float, float]:
     starts = [np.zeros(size + 1) for _ in range(3)]
     for start, first in zip(starts, (-0.3, 0.3, -0.5), strict=True):
         start[1] = first
-    fits = [least_squares(residual, start, method="lm", max_nfev=2000) for start in starts]
+    fits = [least_squares(residual, start, method="lm", max_nfev=300) for start in starts]
     error = min(fits, key=lambda fit: float(fit.cost)).fun / weight
     return float(np.sqrt(np.average(error**2, weights=_MEASURED))), float(np.abs(error).max())
 
