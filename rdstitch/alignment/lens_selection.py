@@ -22,6 +22,7 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.planarity import coherence
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS
+from rdstitch.division_model import distort, undistort
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 LENSES: dict[str, tuple[str, ...]] = {
@@ -53,6 +54,11 @@ _ENOUGH_PICTURES, _ENOUGH_PICTURES_OF_A_MOTION = 4, 3
 """Pictures from which on the distortion centre is freed: where every link is on its own, and where one camera explains
 all of them. In fewer a tilt and a change of height stand for it, and pairs like those of ``examples.paper figure5`` are
 registered worse with it free."""
+
+_WORTH_SAYING = 0.5
+"""Pixels that a richer lens moves the corners of too few pictures by, from which on that is said."""
+
+_RADII, _SCALE_STEPS, _SCALE_STEP = 64, 6, 1e-6
 
 _ENOUGH_LINKS = 8
 """Links from which on each is a part."""
@@ -134,8 +140,25 @@ def choose_lens(
     reason = _reason(names, fits, best)
     if few:
         reason += "; too few pictures to find the distortion centre, which is taken to be the middle"
+        if best == 0 and (off := _distance(fits[0], fits[1], float(np.median(observations.scale1)))) > _WORTH_SAYING:
+            reason += f"; they do not show whether μ is needed, with which corners would lie {off:.1f} pixels elsewhere"
     refinements = (CENTER,) if best == 0 and pictures >= _ENOUGH_PICTURES_OF_A_MOTION else ()
     return LensChoice(names[best], free[best], fits[best], reason, refinements)
+
+
+def _distance(simple: BundleAdjustmentResult, rich: BundleAdjustmentResult, half_diagonal: float) -> float:
+    """Largest distance of the places at which two lenses measure the same rays, pixels, at the best common scale."""
+    radii = np.linspace(0.0, 1.0, _RADII + 1)[1:]
+    (distortion, *higher), other = rich.parameters.lens[:3].tolist(), float(simple.parameters.lens[0])
+    straight = undistort(np.column_stack([radii, np.zeros(_RADII)]), distortion, higher)
+    difference, scale = np.zeros(_RADII), 1.0
+    for _ in range(_SCALE_STEPS):
+        seen, more = (distort(factor * straight, other)[:, 0] for factor in (scale, scale * (1.0 + _SCALE_STEP)))
+        difference, slope = seen - radii, (more - seen) / _SCALE_STEP
+        known = np.isfinite(difference) & np.isfinite(slope)
+        # Radii count by the area that they stand for.
+        scale *= 1.0 - float((radii * slope * difference)[known].sum() / (radii * slope**2)[known].sum())
+    return float(np.nanmax(np.abs(difference))) * half_diagonal
 
 
 def _pictures(observations: Observations) -> int:

@@ -72,6 +72,20 @@ def test_a_centre_off_the_middle_is_found_alone() -> None:
     assert found.cameras[0].higher == ()
 
 
+def test_a_pair_says_whether_it_shows_the_lens() -> None:
+    reasons = []
+    for noise, per_link in ((0.05, 2000), (1.0, 60)):
+        rng = np.random.default_rng(0)
+        poses = grid(2, 1, (0.5, 0.35), 0.5, rng)
+        lens = Camera(SIZE, -0.25)
+        given = scene(poses, lens=lens, rng=rng, noise=noise, focal=420.0, per_link=per_link, outliers=0.0)
+        found = _align(given)
+        assert found.lens == "division"
+        reasons.append(found.lens_reason)
+    assert "whether μ is needed" not in reasons[0]
+    assert "whether μ is needed, with which corners would lie" in reasons[1]
+
+
 @pytest.mark.parametrize("relief", [0.01, 0.04])
 def test_relief_is_not_taken_for_lens(relief: float) -> None:
     found = _align(_scene(Camera(SIZE, -0.05), 2, relief=relief))
