@@ -166,8 +166,7 @@ def calibrate(
     options = options or StitchOptions()
     with found_pictures(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as found:
         _check_outputs(None, options, files_of(found.frames))
-        registration = _register_all(found, options, progress, lens_only=True)
-        registration = accept(registration, options, lens_only=True)
+        registration = accept(_register_all(found, options, progress, lens_only=True), options, lens_only=True)
     _release_decoded_images(registration)
     with Outputs(options.overwrite) as outputs:
         _save_camera(registration, options, outputs)
@@ -219,8 +218,7 @@ def trajectory(
         times = timestamps_of(sources, timestamps)
         with options.executor(len(sources)) as executor:
             registration = register(sources, options, executor, skip_bad=True, metric=True, progress=progress)
-        registration = registration.with_messages([*unread, *found.messages])
-        registration = accept(registration, options)
+        registration = accept(registration.with_messages([*unread, *found.messages]), options)
     _release_decoded_images(registration)
     registration = _with_damage(registration).with_messages(_scale_uncertainty(registration.alignment))
     path = Trajectory.from_alignment(registration.alignment, height)
