@@ -80,7 +80,7 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
     observations = problem.observations
     errors = whitened_errors(observations, adjusted.homographies, lens)
     inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
-    relief = judge_relief(coherence(observations, errors, inliers), fit.model.name)
+    relief = judge_relief(coherence(observations, errors, inliers), fit.model.name, len(observations))
     used = np.zeros(len(found.cameras), dtype=np.bool_)
     used[found.pictures] = True
     homographies, poses = _in_frame_of_reference(found)

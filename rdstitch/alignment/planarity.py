@@ -99,7 +99,7 @@ def _overdispersion(link: IntArray, points: FloatArray, residual: FloatArray, co
     return max(1.0, float((sums[several] ** 2).sum() / power[several].sum()))
 
 
-def judge_relief(found: Coherence, model: str) -> ReliefTest:
+def judge_relief(found: Coherence, model: str, links: int) -> ReliefTest:
     """What the agreement of neighbours means for the scene.
 
     Parameters
@@ -107,6 +107,8 @@ def judge_relief(found: Coherence, model: str) -> ReliefTest:
     found : Coherence
     model : str
         Name of the model that left the residuals.
+    links : int
+        Pairs of pictures; what is as wide as the overlap of one pair alone, its homography and λ absorb.
     """
     agreement = f"errors of neighbours agree (correlation {found.correlation:.2f}, {found.size:.1f} px in common)"
     relief = found.correlation > _COHERENT and found.relative_size > LARGE
@@ -120,5 +122,6 @@ def judge_relief(found: Coherence, model: str) -> ReliefTest:
     elif found.correlation > _COHERENT:
         text = f"{agreement}, as over a scene that is nearly flat"
     else:
-        text = f"errors of neighbours hardly agree (correlation {found.correlation:.2f}): the scene is flat"
+        seen = "the scene is flat" if links > 1 else "no relief shows, but hills as wide as one overlap would not"
+        text = f"errors of neighbours hardly agree (correlation {found.correlation:.2f}): {seen}"
     return ReliefTest(relief, found.correlation, found.size, text)

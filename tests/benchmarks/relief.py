@@ -46,10 +46,13 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="seed of the first set")
     parser.add_argument("--pictures", type=int, default=40)
     parser.add_argument("--kind", choices=[*RELIEFS, "flat"], help="only this kind of ground")
+    parser.add_argument("--height", type=float, choices=HEIGHTS, help="only this one")
     arguments = parser.parse_args()
     rows = [("flat", 0.0), *((kind, height) for height in HEIGHTS for kind in RELIEFS)]
     ratios: dict[int, list[float]] = {}
-    for kind, height in (row for row in rows if arguments.kind in (None, row[0])):
+    for kind, height in rows:
+        if arguments.kind not in (None, kind) or arguments.height not in (None, height):
+            continue
         start, shapes, cameras, noticed, own = time.process_time(), [], 0, 0, dict[int, list[tuple[float, float]]]()
         for seed in range(arguments.first, arguments.first + arguments.sets):
             item = strip(kind, height, seed, arguments.pictures)

@@ -16,7 +16,7 @@ from rdstitch.arrays import FloatArray
 )
 def test_relief_needs_agreement_and_size(correlation: float, relative_size: float, found: bool) -> None:
     for diagonal in (500.0, 2000.0):
-        relief = judge_relief(Coherence(correlation, relative_size * diagonal, relative_size, 3.0), "rigid")
+        relief = judge_relief(Coherence(correlation, relative_size * diagonal, relative_size, 3.0), "rigid", 9)
         assert relief.found is found
         assert ("not one plane" in relief.explanation) is found
 
@@ -98,15 +98,20 @@ def test_what_is_far_away_is_no_neighbour() -> None:
 
 @pytest.mark.parametrize(("correlation", "relative_size", "moved"), [(0.9, 0.001, True), (0.9, 0.0005, False)])
 def test_of_a_turn_what_neighbours_share_is_parallax(correlation: float, relative_size: float, moved: bool) -> None:
-    relief = judge_relief(Coherence(correlation, relative_size * 800.0, relative_size, 3.0), "rotation")
+    relief = judge_relief(Coherence(correlation, relative_size * 800.0, relative_size, 3.0), "rotation", 9)
     assert relief.found is moved
     assert ("parallax" in relief.explanation) is moved
     assert ("hardly moved" in relief.explanation) is not moved
 
 
-@pytest.mark.parametrize(("correlation", "says"), [(0.6, "nearly flat"), (0.4, "the scene is flat")])
-def test_flat_scenes_are_called_flat(correlation: float, says: str) -> None:
-    assert says in judge_relief(Coherence(correlation, 0.1, 0.0001, 3.0), "pose").explanation
+@pytest.mark.parametrize(
+    ("correlation", "links", "says"),
+    [(0.6, 9, "nearly flat"), (0.4, 9, "the scene is flat"), (0.4, 1, "no relief shows, but hills")],
+)
+def test_flat_scenes_are_called_flat_where_there_is_more_than_one_pair(
+    correlation: float, links: int, says: str
+) -> None:
+    assert says in judge_relief(Coherence(correlation, 0.1, 0.0001, 3.0), "pose", links).explanation
 
 
 def test_with_one_point_a_cell_nothing_is_overdispersed() -> None:

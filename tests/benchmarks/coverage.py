@@ -1,0 +1,58 @@
+"""Is λ's standard deviation honest? ``python -m tests.benchmarks.coverage FOLDER=λ... [--windows N] [--sizes 2 4 8]``.
+
+Windows of pictures that follow one another, at random places of folders whose λ is known, are calibrated each on its
+own. Printed are λ of each, its standard deviation and error in standard deviations, and in the end the share within
+three and the median. ``python -m tests.benchmarks.relief`` prints the same for rendered ground, flat and rough.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+
+import rdstitch
+from rdstitch.errors import RdstitchError
+
+_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+
+
+def main() -> None:
+    """Print a line for every window."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folders", nargs="+", metavar="FOLDER=LAMBDA")
+    parser.add_argument("--windows", type=int, default=2, help="of each size")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[2, 4, 8])
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    ratios: list[float] = []
+    refused = 0
+    for named in arguments.folders:
+        folder, truth = Path(named.rpartition("=")[0]), float(named.rpartition("=")[2])
+        files = sorted(file for file in folder.iterdir() if file.suffix.lower() in _SUFFIXES)
+        rng = np.random.default_rng(arguments.seed)
+        for size in arguments.sizes:
+            for first in rng.integers(0, len(files) - size + 1, arguments.windows).tolist():
+                start = time.process_time()
+                try:
+                    registration = rdstitch.calibrate(files[first : first + size], rdstitch.StitchOptions(workers=1))
+                except RdstitchError as error:
+                    refused += 1
+                    print(f"{folder.name} {first}+{size}: refused: {str(error)[:100]}", flush=True)
+                    continue
+                found = registration.alignment
+                ratio = abs(found.distortion - truth) / found.distortion_std
+                ratios.append(ratio)
+                print(
+                    f"{folder.name} {first}+{size}: λ = {found.distortion:.4f} ± {found.distortion_std:.4f} "
+                    f"({found.lens}), {ratio:.2f} σ from the truth, {time.process_time() - start:.1f} s",
+                    flush=True,
+                )
+    known = np.array([ratio for ratio in ratios if np.isfinite(ratio)])
+    print(
+        f"{len(known)} windows, {refused} refused: {np.mean(known <= 3):.0%} within 3 σ, median {np.median(known):.2f}"
+    )
+
+
+if __name__ == "__main__":
+    main()
