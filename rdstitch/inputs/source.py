@@ -75,7 +75,7 @@ class Source:
         return position if self.frame is None or self.frame.number is None else self.frame.number
 
     def with_absolute_paths(self) -> Self:
-        """The same by names that hold in whatever process, as far as it is a file."""
+        """The same by names that hold in workers elsewhere too, where relative ones begin at other folders."""
         mask = None if self.mask is None else self.mask.absolute()
         in_memory = self.frame is not None and self.frame.picture is not None
         return replace(self, path=self.path if in_memory else self.path.absolute(), mask=mask)

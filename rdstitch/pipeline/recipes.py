@@ -268,9 +268,7 @@ def _read(frames: Sequence[Frame], options: StitchOptions, *, skip_bad: bool) ->
             raise InputError(f"fewer than two pictures can be read; {unread[0].images[0]}: {unread[0].text}")
         raise ArgumentError("stitching needs two different pictures or more; name at least one more")
     sources = with_attitudes(with_masks(sources, options.mask), options.attitude)
-    if options.scheduler is not None:  # workers elsewhere have folders of their own that relative names begin at
-        sources = [source.with_absolute_paths() for source in sources]
-    return sources, unread
+    return (sources if options.scheduler is None else [s.with_absolute_paths() for s in sources]), unread
 
 
 def _composite(
