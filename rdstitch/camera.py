@@ -9,7 +9,7 @@ The lens is the division model of :mod:`rdstitch.division_model`, with λ alone 
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -102,7 +102,7 @@ class Camera:
     focal_source: str | None = None
     distortion_std: float | None = None
     distortion3: float = 0.0
-    lens_covariance: tuple[tuple[float, ...], ...] | None = None
+    lens_covariance: tuple[tuple[float, ...], ...] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         """Fill in the image centre and check every value."""

@@ -42,11 +42,20 @@ CAMERA_SUFFIXES = (".json", ".yml", ".yaml", ".pto", ".txt")
 
 
 def load_camera(path: str | Path) -> Camera:
-    """Read a camera file of any known format; see :func:`read_camera_file`, which also tells how well λ fits.
+    """Read a camera file of any known format; see :func:`read_camera_file`, which also gives how well λ fits.
 
     Parameters
     ----------
     path : path
+
+    Returns
+    -------
+    Camera
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, or holds no camera.
     """
     return read_camera_file(path).camera
 

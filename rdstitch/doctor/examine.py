@@ -56,6 +56,10 @@ def examine(
     inputs, every, channel_order, progress
         As for :func:`rdstitch.mosaic`.
 
+    Returns
+    -------
+    Examination
+
     Raises
     ------
     InputError

@@ -39,7 +39,7 @@ _one_estimation = Lock()
 """Small arrays keep the interpreter busy: two threads at it would take half as long again as one after the other."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PairRegistration:
     """What became of one pair.
 
@@ -57,6 +57,10 @@ class PairRegistration:
     image2: int
     matches: StoredMatches
     relation: RadialHomography
+
+    def __repr__(self) -> str:
+        """One line: its pictures and their relation."""
+        return f"<PairRegistration {self.image1}, {self.image2}: {self.relation!r}>"
 
     @property
     def correspondences(self) -> Correspondences:

@@ -62,7 +62,7 @@ def apply(
     output : path, optional
         Picture to write, with a sidecar of its own beside it; without it the picture is in the result.
     composite : CompositeOptions, optional
-        Without it, those that the sidecar tells.
+        Those of the sidecar if not given.
     match : str
         Which picture takes whose place. "name": the one of the same file name, or of the same name before the suffix.
         "order": the one at the same position of equally many. "auto": by name, or by order where no name is the same.
@@ -80,6 +80,11 @@ def apply(
         Only plan; nothing is written.
     channel_order : str
         Of arrays: "bgr" or "rgb".
+
+    Returns
+    -------
+    Recomposition
+        The picture, or what was written, with the pictures left out and what else the user should know.
     progress : callable
 
     Raises
