@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.features import Correspondences
 from rdstitch.matching.feature_store import StoredMatches
@@ -25,3 +26,50 @@ def test_few_inliers_have_no_vote(count: int, votes: int) -> None:
         0, 1, StoredMatches.of(Correspondences(indices, points1, points2, np.ones(count))), relation
     )
     assert len(Votes.of([pair], 3.0)) == votes
+
+
+def _votes(distortion: list[list[float]], covariance: FloatArray) -> Votes:
+    count = len(distortion)
+    chain = np.arange(count)
+    return Votes(chain, chain + 1, np.array(distortion), np.tile(covariance, (count, 1, 1)))
+
+
+OWN = np.array([[4e-4, 1e-4], [1e-4, 9e-4]])
+FULL = OWN + 2e-4**2 * np.eye(2) + 0.05**2  # what no pair knows better, and what relief does to both pictures alike
+
+
+def test_votes_are_off_by_their_mahalanobis_distance() -> None:
+    votes = _votes([[-0.20, -0.20], [-0.25, -0.18]], OWN)
+    off = votes.distortion + 0.2
+    expected = np.sqrt(np.einsum("li,ij,lj->l", off, np.linalg.inv(FULL), off))
+    np.testing.assert_allclose(votes.mahalanobis_residuals(-0.2), expected, rtol=1e-9)
+
+
+def test_what_both_pictures_have_in_common_counts_little() -> None:
+    alike, unlike = _votes([[-0.15, -0.15]], OWN), _votes([[-0.15, -0.25]], OWN)
+    assert 2.0 * alike.mahalanobis_residuals(-0.2)[0] < unlike.mahalanobis_residuals(-0.2)[0]
+
+
+def test_differences_have_the_deviation_of_a_difference() -> None:
+    difference, std = _votes([[-0.20, -0.16], [-0.1, -0.3]], OWN).differences
+    np.testing.assert_allclose(difference, [0.04, -0.2])
+    np.testing.assert_allclose(std, np.sqrt(4e-4 + 9e-4 - 2e-4 + 2 * 2e-4**2))
+
+
+def test_pictures_come_from_their_lenses() -> None:
+    votes = _votes([[0.0, 0.0]] * 3, OWN)
+    assert votes.which(np.array([False, True, True, False])).tolist() == [[0, 1], [1, 1], [1, 0]]
+    assert len(votes) == 3
+
+
+def test_lenses_are_fitted_to_their_votes_by_least_sums_of_distances() -> None:
+    rng = np.random.default_rng(0)
+    first, second = -0.2 + 0.004 * rng.normal(size=(2, 60))
+    votes = _votes(np.stack([first, second + 0.1], axis=1).tolist(), 1e-5 * np.eye(2))
+    which = np.tile([0, 1], (60, 1))
+    found = votes.fitted(which, np.array([0.0, 0.0, 0.7]))
+    assert found[1] - found[0] == pytest.approx(0.1, abs=0.003)
+    assert found[2] == 0.7  # no vote: it stays
+    # One vote far off hardly moves the lenses: distances count, not their squares.
+    spoiled = _votes([*votes.distortion[:59].tolist(), [0.9, -0.9]], 1e-5 * np.eye(2))
+    assert np.abs(spoiled.fitted(which, np.array([0.0, 0.0])) - found[:2]).max() < 0.01
