@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 
-_BINS = 50
-_ROUNDS = 20
+_BINS = 50  # of the histogram, for the report alone
+_ROUNDS = 20  # of reweighting; three or four are needed
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from rdstitch.matching.match_graph import connected_components
 from rdstitch.matching.static_places import StaticPlaces
 from rdstitch.matching.two_view import PairRegistration
 
-_LEAST_PICTURES = 3
-_LEAST_SHARE = 0.5
+_LEAST_PICTURES, _LEAST_SHARE = 3, 0.5
+"""Pictures, in number and as a share, that pairs which move must connect: two could agree by chance."""
 
 _STATIC = 1.0 / 3.0
 """Motion of a static match at most, in thresholds: its two keypoints are localised to better than that."""

@@ -8,7 +8,7 @@ from rdstitch.solvers.solutions import Solutions
 
 _BLOCK = 1 << 15  # hypotheses x matches at once: the temporaries stay in cache
 
-_LEAST_DETERMINANT = 1e-6
+_LEAST_DETERMINANT = 1e-6  # of H at unit norm; an image is then squeezed to a millionth of its area
 
 
 def plausible(solutions: Solutions, corner_radius: float) -> BoolArray:
