@@ -31,6 +31,7 @@ from rdstitch.camera_files.opencv import is_opencv, opencv_fisheye_yaml, opencv_
 from rdstitch.camera_files.opencv_yaml import parse_yaml
 from rdstitch.camera_files.opendronemap import is_opendronemap, opendronemap_json, read_opendronemap
 from rdstitch.camera_files.ros import camera_info_yaml
+from rdstitch.camera_record import camera_from_record
 from rdstitch.errors import OutputError
 from rdstitch.io.atomic import write_text_atomic
 from rdstitch.records import parse_json, read_text
@@ -77,7 +78,7 @@ def read_camera_file(path: str | Path) -> CameraFile:
             return read_opencv(record)
         if is_opendronemap(record):
             return read_opendronemap(record)
-        return CameraFile(Camera.from_record(record), "rdstitch")
+        return CameraFile(camera_from_record(record), "rdstitch")
     if is_hugin(text):
         return read_hugin(text, file)
     if (own := read_comments(text, file, "rdstitch")) is not None:

@@ -5,6 +5,7 @@ import json
 from rdstitch.camera import Camera
 from rdstitch.camera_files.division import CameraFile, own_node
 from rdstitch.camera_files.lens_fit import LensFit
+from rdstitch.camera_record import camera_from_record
 from rdstitch.records import parse_json
 
 _OWN = "#rdstitch "
@@ -20,4 +21,4 @@ def read_comments(text: str, file: str, kind: str) -> CameraFile | None:
     own = next((line for line in text.splitlines() if line.startswith(_OWN)), None)
     if own is None:
         return None
-    return CameraFile(Camera.from_record(parse_json(own.removeprefix(_OWN), file)), kind)
+    return CameraFile(camera_from_record(parse_json(own.removeprefix(_OWN), file)), kind)

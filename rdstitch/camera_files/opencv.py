@@ -14,6 +14,7 @@ from rdstitch.camera_files.division import CameraFile, fitted_camera, own_node
 from rdstitch.camera_files.fisheye import Fisheye, fisheye_of
 from rdstitch.camera_files.lens_fit import LensFit
 from rdstitch.camera_files.opencv_yaml import to_yaml
+from rdstitch.camera_record import camera_from_record
 from rdstitch.errors import ArgumentError
 from rdstitch.records import Record
 
@@ -40,7 +41,7 @@ def read_opencv(record: Record) -> CameraFile:
         When a field is missing or wrong, or the model is one that λ cannot describe.
     """
     if (own := record.get(_OWN)) is not None:
-        return CameraFile(Camera.from_record(own), _KIND)
+        return CameraFile(camera_from_record(own), _KIND)
     (fx, skew, cx), (_, fy, cy) = _rows(_first(record, _MATRIX), 3, 3)[:2]
     if not (fx > 0.0 and fy > 0.0 and abs(skew) < 1e-6 * fx):
         _first(record, _MATRIX).fail("expected positive focal lengths and no skew")

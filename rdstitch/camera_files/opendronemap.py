@@ -6,6 +6,7 @@ from rdstitch.camera import Camera
 from rdstitch.camera_files.brown import CLOSE, Brown, brown_of
 from rdstitch.camera_files.division import CameraFile, fitted_camera, own_node
 from rdstitch.camera_files.fisheye import Fisheye, fisheye_of
+from rdstitch.camera_record import camera_from_record
 from rdstitch.errors import ArgumentError
 from rdstitch.records import Record
 
@@ -34,7 +35,7 @@ def read_opendronemap(record: Record) -> CameraFile:
         record.fail(f"has {len(cameras)} cameras; keep the one that took the pictures")
     ((_, entry),) = cameras.items()
     if (own := entry.get(_OWN)) is not None:
-        return CameraFile(Camera.from_record(own), _KIND)
+        return CameraFile(camera_from_record(own), _KIND)
     kind = entry["projection_type"].choice(_MODELS)
     size = (entry["width"].side(), entry["height"].side())
     longer = max(size)

@@ -335,12 +335,8 @@ def _scale_uncertainty(alignment: Alignment) -> list[Message]:
     unsure = 0.0 if alignment.focal is None or alignment.focal_std is None else alignment.focal_std / alignment.focal
     if unsure <= _MAX_SCALE_UNCERTAINTY:
         return []
-    return [
-        Message(
-            f"all lengths may be off together by {unsure:.0%}: the pictures hardly show the focal length; give --focal",
-            code="focal-unknown",
-        )
-    ]
+    text = f"all lengths may be off together by {unsure:.0%}: the pictures hardly show the focal length; give --focal"
+    return [Message(text, code="focal-unknown")]
 
 
 def _save_camera(registration: Registration, options: StitchOptions, outputs: Outputs) -> None:

@@ -8,7 +8,8 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import FOCAL_LOG_STD, Camera, read_coefficients
+from rdstitch.camera import FOCAL_LOG_STD, Camera
+from rdstitch.camera_record import read_coefficients
 from rdstitch.compositing import CompositeOptions
 from rdstitch.compositing.options import PROJECTIONS
 from rdstitch.errors import ArgumentError

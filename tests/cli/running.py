@@ -17,6 +17,7 @@ from jsonschema import Draft202012Validator
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.camera_record import camera_from_record
 from rdstitch.radial_homography import project
 from rdstitch.records import Record
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
@@ -110,7 +111,7 @@ def transfers(record: dict[str, Any]) -> Mapping[int, Callable[[FloatArray], Flo
     for index, image in enumerate(record["images"]):
         if image["used"]:
             width, height = image["size"]
-            lens = Camera.from_record(Record("sidecar", "camera", {**camera, "image_size": [width, height]}))
+            lens = camera_from_record(Record("sidecar", "camera", {**camera, "image_size": [width, height]}))
             found[index] = partial(_to_output, lens, np.array(image["to_output"]))
     return found
 
