@@ -22,6 +22,7 @@ from examples.paper import (
     figure9,
     figure10,
     homography_estimation,
+    panoramas,
     runtime,
 )
 from examples.paper.__main__ import main
@@ -255,3 +256,12 @@ def test_end_to_end_rdstitch_lies_on_the_true_plane() -> None:
     assert row["λ error"] < 0.1
     assert row["memory, MB"] > 50.0
     assert row["processor time, s"] > 0.5
+
+
+def test_panoramas_lie_on_the_true_sphere() -> None:
+    (own, peer) = panoramas.run(TINY).tables[0].rows
+    assert own[0] == "rdstitch mosaic"
+    assert own[1] == peer[1] == "0"
+    assert float(own[2]) < 0.2  # type: ignore[arg-type]
+    assert float(own[4]) > 99.0  # type: ignore[arg-type]
+    assert float(own[2]) < float(str(peer[2]).removeprefix("> "))  # type: ignore[arg-type]
