@@ -59,8 +59,14 @@ class Cache:
 
     @classmethod
     def for_this_run(cls) -> Self:
-        """A cache that goes with this run: it takes what need not be in memory all the time."""
-        owner = TemporaryFolder()
+        """A cache that goes with this run: it takes what need not be in memory all the time.
+
+        Where nothing can be written, everything stays in memory.
+        """
+        try:
+            owner = TemporaryFolder()
+        except OSError:
+            return cls()
         return cls(owner.path, owner)
 
     def __post_init__(self) -> None:

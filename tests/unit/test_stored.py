@@ -79,3 +79,13 @@ def test_other_processes_do_not_remove_the_folder() -> None:
     done = subprocess.run([sys.executable, "-c", program], input=pickle.dumps(own), capture_output=True, check=True)
     assert done.stdout.decode().strip() == str(own.path)
     assert own.path.is_dir()
+
+
+def test_without_a_place_for_temporary_files_everything_stays_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nowhere() -> str:
+        raise FileNotFoundError("No usable temporary directory found")
+
+    monkeypatch.setattr("tempfile.gettempdir", nowhere)
+    found = Cache.for_this_run().stored("stage", (), ("a",), lambda: 5)
+    assert found.file is None
+    assert found.load() == 5
