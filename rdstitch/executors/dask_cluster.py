@@ -18,7 +18,7 @@ Result = TypeVar("Result")
 LOCAL = "local"
 """Address that stands for a cluster on this machine, started for one run."""
 
-_PATIENCE = 10  # s, for the scheduler to answer; six times as long for a first worker
+_PATIENCE, _START = 5, 60  # s, for the scheduler to answer, and for a first worker
 
 
 class DaskExecutor(Executor):
@@ -58,7 +58,7 @@ class DaskExecutor(Executor):
             self._client = self._open.enter_context(
                 distributed.Client(address, timeout=_PATIENCE, set_as_default=False)
             )
-            self._client.wait_for_workers(1, timeout=6 * _PATIENCE)
+            self._client.wait_for_workers(1, timeout=_START)
             # Made before the workers look for it.
             self._check_workers(Cache.at(store).folder)
         except (OSError, ValueError) as error:

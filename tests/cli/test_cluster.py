@@ -102,6 +102,7 @@ def test_what_a_cluster_lacks_is_said(rdstitch: Run, frames: list[Path], tmp_pat
     assert not (tmp_path / "out.png").exists()
 
 
+@pytest.mark.slow
 def test_arrays_travel_to_a_cluster() -> None:
     sequence = flight(3, 3)
     arrays = [sequence.frame(index) for index in range(3)]
