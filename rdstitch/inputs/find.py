@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 
 from rdstitch.errors import InputError
-from rdstitch.inputs.frame import Frame, Named
+from rdstitch.inputs.frame import Frame, Named, files_of
 from rdstitch.inputs.rosbag import extract_images, is_bag
 from rdstitch.io.optional_readers import HEIF_SUFFIXES, RAW_SUFFIXES
 from rdstitch.io.staging import temporary_folder
@@ -36,10 +36,18 @@ class FoundPictures:
         In natural order within a folder or pattern.
     outputs : list of Path
         Pictures in folders and patterns that rdstitch wrote, by the sidecars beside them, and that are no input.
+    lists : tuple of Path
+        The ``@list`` files that were named.
     """
 
     frames: list[Frame]
     outputs: list[Path]
+    lists: tuple[Path, ...] = ()
+
+    @property
+    def files(self) -> list[Path]:
+        """What no output may be written over."""
+        return [*files_of(self.frames), *self.lists]
 
     @property
     def messages(self) -> list[Message]:
@@ -105,6 +113,7 @@ def find_pictures(
     unwanted = {_entry(Path(path)) for path in exclude}
     frames: list[Frame] = []
     outputs: list[Path] = []
+    arguments = list(arguments)
     for frame, named in _expand(arguments, frames_folder, every, topic):
         is_output = frame.picture is None and is_rdstitch_output(frame.path)
         if _entry(frame.path) in unwanted and is_output:
@@ -115,7 +124,9 @@ def find_pictures(
             frames.append(frame)
     if outputs and not frames:
         raise InputError(f"{outputs[0].parent}: there are no pictures but those that rdstitch wrote")
-    return FoundPictures(frames, outputs)
+    texts = [str(argument) for argument in arguments if not isinstance(argument, Frame)]
+    lists = tuple(Path(text[1:]) for text in texts if text.startswith("@") and not _exists(Path(text)))
+    return FoundPictures(frames, outputs, lists)
 
 
 def _entry(path: Path) -> Path:

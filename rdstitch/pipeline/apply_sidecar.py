@@ -104,7 +104,7 @@ def apply(
     given = as_inputs(images, channel_order)
     with found_pictures(given, output=output, every=every) as found, Outputs(overwrite) as outputs:
         if output is not None:
-            _check_outputs(Path(output), overwrite, files_of(found.frames), saved.path)
+            _check_outputs(Path(output), overwrite, found.files, saved.path)
         chosen, matched = _match(saved, found.frames, match)
         guard = InputGuard(strict)
         sources, left_out = _sources(saved, chosen, guard, options.max_memory)

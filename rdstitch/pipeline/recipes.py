@@ -12,7 +12,7 @@ from rdstitch.export.path_plot import path_as_svg
 from rdstitch.export.trajectory_files import WRITERS, has_times
 from rdstitch.inputs.attitudes import with_attitudes
 from rdstitch.inputs.find import FoundPictures, found_pictures
-from rdstitch.inputs.frame import Frame, Images, as_inputs, files_of
+from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.masks import with_masks
 from rdstitch.inputs.selection import selected
@@ -85,7 +85,7 @@ def pano(
     with found_pictures(
         as_inputs(inputs, options.channel_order), output=output, every=every, topic=options.topic
     ) as found:
-        _check_outputs(output, options, files_of(found.frames))
+        _check_outputs(output, options, found.files)
         sources, _ = _read(found.frames, options, skip_bad=False)
         with options.executor(len(sources)) as executor:
             registration = register(sources, options, executor, skip_bad=False, progress=progress)
@@ -138,7 +138,7 @@ def mosaic(
     with found_pictures(
         as_inputs(inputs, options.channel_order), output=output, every=every, topic=options.topic
     ) as found:
-        _check_outputs(output, options, files_of(found.frames))
+        _check_outputs(output, options, found.files)
         registration = _register_all(found, options, progress)
         return _composite(registration, output, options, progress)
 
@@ -165,7 +165,7 @@ def calibrate(
     """
     options = options or StitchOptions()
     with found_pictures(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as found:
-        _check_outputs(None, options, files_of(found.frames))
+        _check_outputs(None, options, found.files)
         registration = accept(_register_all(found, options, progress, lens_only=True), options, lens_only=True)
     _release_decoded_images(registration)
     with Outputs(options.overwrite) as outputs:
@@ -212,7 +212,8 @@ def trajectory(
     with found_pictures(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as found:
         files = [file for file in (output, plot) if file is not None]
         for file in files:
-            check_output(file, options.overwrite, files_of(found.frames), suffixes=())
+            read = found.files if timestamps is None else [*found.files, timestamps]
+            check_output(file, options.overwrite, read, suffixes=())
         check_distinct(files)
         sources, unread = _read(found.frames, options, skip_bad=True)
         times = timestamps_of(sources, timestamps)

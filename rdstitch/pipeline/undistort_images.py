@@ -12,7 +12,7 @@ from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, PlacedPicture, compose
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.inputs.find import found_pictures
-from rdstitch.inputs.frame import ChannelOrder, Images, as_inputs, files_of, in_order
+from rdstitch.inputs.frame import ChannelOrder, Images, as_inputs, in_order
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.atomic import check_output
@@ -113,7 +113,7 @@ def undistort(
             for message in guard.messages:
                 warn(message)
             return pictures
-        outputs = _outputs(sources, Path(folder), files_of(found.frames), overwrite)
+        outputs = _outputs(sources, Path(folder), found.files, overwrite)
         for done, (source, output) in enumerate(zip(sources, outputs, strict=True), start=1):
             picture = _undistorted(source, view)
             write_image(output, picture.pixels, picture.alpha, metadata=source.metadata, overwrite=overwrite)

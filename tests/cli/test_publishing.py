@@ -172,3 +172,15 @@ def test_a_picture_of_the_folder_is_never_replaced(rdstitch: Run, located: Path,
     # What rdstitch wrote there is replaced.
     assert rdstitch("mosaic", flight, "-o", flight / "out.jpg", *FAST).status == 0
     assert rdstitch("mosaic", flight, "-o", flight / "out.jpg", "--overwrite", *FAST).status == 0
+
+
+def test_a_list_of_pictures_and_of_times_is_never_replaced(rdstitch: Run, located: Path, tmp_path: Path) -> None:
+    pictures = sorted((located / "flight").iterdir())
+    names, times = tmp_path / "names.txt", tmp_path / "times.csv"
+    names.write_text("\n".join(map(str, pictures)))
+    times.write_text("".join(f"{picture.name},{k}\n" for k, picture in enumerate(pictures)))
+    for output in (names, times):
+        before = output.read_bytes()
+        arguments = ("trajectory", f"@{names}", "--timestamps", times, "-o", output, "--overwrite", *FAST)
+        assert rdstitch(*arguments).status == 6
+        assert output.read_bytes() == before
