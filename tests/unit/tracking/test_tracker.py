@@ -59,36 +59,52 @@ def _truth(sequence: Sequence) -> Trajectory:
     return Trajectory.from_poses(PlanarPoses(p.yaw, p.position / unit, p.height / unit, p.tilt))
 
 
-@pytest.mark.parametrize("distortion", [None, DISTORTION])
-def test_the_path_and_lambda_come_near_the_truth(distortion: float | None) -> None:
-    sequence, tracker = _drive(40), _tracker(distortion)
-    results = [result for frame in _features(sequence) for result in tracker.add(frame, Camera(SIZE))]
+@pytest.fixture(scope="module")
+def drive() -> Sequence:
+    """A turn of thirty frames."""
+    return _drive(30)
+
+
+@pytest.fixture(scope="module")
+def tracked(drive: Sequence) -> list[Tracked]:
+    """What becomes of its frames where nothing is known."""
+    tracker = _tracker()
+    return [result for frame in _features(drive) for result in tracker.add(frame, Camera(SIZE))]
+
+
+def _check(results: list[Tracked], sequence: Sequence) -> None:
+    """Near the truth; every frame but those before the first alignment has a place when it comes."""
     error = compare_trajectories(_path(results), _truth(sequence))
     assert error.drift < 0.004
     assert error.rotation < math.radians(0.1)
-    assert abs(results[-1].distortion - DISTORTION) < 0.003
-    assert tracker.distortion_known
-    # Every frame but those before the first alignment has a place when it comes.
     assert all(result.placement is not None for result in results if result.number >= 12)
 
 
-def test_lambda_becomes_surer_and_is_exact_where_it_is_given() -> None:
-    frames, tracker = _features(_drive(30)), _tracker()
-    results = [tracker.add(frame, Camera(SIZE))[-1] for frame in frames]
+def test_the_path_and_lambda_come_near_the_truth(tracked: list[Tracked], drive: Sequence) -> None:
+    _check(tracked, drive)
+    assert abs(tracked[-1].distortion - DISTORTION) < 0.003
+
+
+def test_a_lambda_that_is_given_is_kept(drive: Sequence) -> None:
+    tracker = _tracker(DISTORTION)
+    results = [result for frame in _features(drive)[:14] for result in tracker.add(frame, Camera(SIZE))]
+    _check(results, drive)
+    assert {(result.distortion, result.distortion_std) for result in results} == {(DISTORTION, 0.0)}
+    assert all(result.distortion_known for result in results)
+
+
+def test_lambda_becomes_surer_until_it_is_known(tracked: list[Tracked]) -> None:
+    results = [result for result in tracked if not result.revised]
     stds = [result.distortion_std for result in results]
     assert stds[0] == math.inf
     assert 0.0 < stds[-1] < 0.5 * stds[3]
     first = [result.distortion_known for result in results].index(True)
     # From then on it is kept.
     assert {result.distortion for result in results[first:]} == {results[first].distortion}
-    known = _tracker(-0.2).add(frames[0], Camera(SIZE))[-1]
-    assert (known.distortion, known.distortion_std) == (-0.2, 0.0)
 
 
-def test_keyframes_that_came_before_the_map_are_given_their_place_later() -> None:
-    frames, tracker = _features(_drive(12)), _tracker()
-    results = [result for frame in frames for result in tracker.add(frame, Camera(SIZE))]
-    revised = [result for result in results if result.revised]
+def test_keyframes_that_came_before_the_map_are_given_their_place_later(tracked: list[Tracked]) -> None:
+    revised = [result for result in tracked if result.revised]
     assert revised
     assert revised[0].number == 0
     pose = revised[0].pose
