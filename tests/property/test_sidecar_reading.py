@@ -83,7 +83,7 @@ def test_a_good_one_is_read_whole(tmp_path: Path) -> None:
         (("images", 0, "size"), [400], "images[0].size"),
         (("images", 0, "size"), [400, 0], "images[0].size[1]"),
         (("images", 0, "size"), None, "images[0].size"),
-        (("images", 0, "coefficients"), [-5, 0, 0], "images[0]"),
+        (("images", 0, "coefficients"), [5, 0, 0], "images[0]"),
         (("images", 0, "coefficients"), [True, 0, 0], "images[0].coefficients[0]"),
         (("images", 0, "used"), 1, "images[0].used"),
         (("images", 0, "focal_source"), "guesswork", "images[0].focal_source"),
