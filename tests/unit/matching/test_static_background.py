@@ -128,3 +128,9 @@ def test_a_place_is_static_from_three_static_matches_on(pairs: int, left: int) -
     # What moves from such a place is kept.
     moving = _pair(np.full(48, 30.0)).correspondences
     assert len(places.without_static(moving)) == 48
+
+
+def test_a_static_place_reaches_as_far_as_a_static_match_moves() -> None:
+    places = static_places([_with_overlay(8, 0, 1 + k, seed=k) for k in range(3)], THRESHOLD)
+    assert places.radius == pytest.approx(THRESHOLD / 3.0)
+    assert places.places.n >= 8
