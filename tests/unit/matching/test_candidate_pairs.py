@@ -1,10 +1,13 @@
 """Which pairs are looked at: all of a few pictures; of many, those that follow one another or look alike."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import sparse
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
@@ -13,6 +16,8 @@ from rdstitch.features.keypoints import Descriptors
 from rdstitch.matching.candidate_pairs import (
     CANDIDATES,
     EXHAUSTIVE_UP_TO,
+    _alike_to_each,
+    _most_alike,
     neighbours,
     pairs_that_matter,
 )
@@ -231,3 +236,21 @@ def test_ten_neighbours_of_each_picture_are_candidates() -> None:
     far = np.concatenate([places, places])
     far[11:, 0, 2] += 50.0
     assert len(neighbours([lens] * 22, far, everything)) == 55
+
+
+def _alike(ordered: bool = False) -> Any:
+    rows = [[0.0, 0.9, 0.5, 0.0], [0.9, 0.0, 0.7, 0.2], [0.5, 0.7, 0.0, 0.0], [0.0, 0.2, 0.0, 0.0]]
+    scores = sparse.csr_array(np.array(rows))
+    most = np.array([[1, 2], [0, 2], [1, 0], [1, 2]])
+    return SimpleNamespace(most_alike=most, peak=np.ones((4, 2), dtype=np.bool_), ordered=ordered, scores=scores)
+
+
+def test_pictures_without_features_are_like_none() -> None:
+    assert _alike_to_each(_alike(), {0, 1, 2, 3}) == {(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)}
+    assert _alike_to_each(_alike(), {0, 1, 2}) == {(0, 1), (0, 2), (1, 2)}
+    assert _alike_to_each(_alike(ordered=True), {0, 1, 2, 3}) == set()
+
+
+def test_the_pairs_most_alike_fill_up_what_is_wanted() -> None:
+    for total, pairs in ((0, set()), (1, set()), (2, {(0, 1)}), (3, {(0, 1), (1, 2)}), (9, {(0, 1), (1, 2), (1, 3)})):
+        assert _most_alike(_alike(), {(0, 2)}, total) == pairs, total
