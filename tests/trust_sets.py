@@ -38,7 +38,8 @@ ODD = ("odd lens",)
 """Solvable too, but only where asked for: the pictures of one lens that is no division model about their centre."""
 
 SPOILED = ("spoiled",)
-"""Ten pictures of which one to three show other ground or were zoomed: solved from the rest, and those named."""
+"""Ten pictures of which one to three show other ground, were zoomed, are blurred, noisy or taken aslant: solved from the
+rest. Those of the first two kinds are named; the others are used rightly, or named."""
 
 HOPELESS = (
     "apart", "textureless", "repeated", "turning", "mixed lenses", "mixed by one", "little overlap", "mixed ground"
@@ -61,10 +62,13 @@ class MixedSequence(Sequence):
         The same poses with what else there is.
     taken : frozenset of int
         Pictures that come from ``other``.
+    usable : bool
+        Whether these may be registered rightly with the rest.
     """
 
     other: Sequence | None = None
     taken: frozenset[int] = frozenset()
+    usable: bool = False
 
     def _of(self, index: int) -> Sequence:
         own = Sequence(self.texture, self.lens, self.poses, self.photometry, seed=self.seed)
@@ -192,7 +196,7 @@ def _poses(kind: str, lens: Lens, tilt: tuple[float, float], rng: np.random.Gene
 
 def _mixed(kind: str, sequence: Sequence, rng: np.random.Generator, seed: int) -> MixedSequence:
     """Some pictures through another lens (a zoom), or over other ground."""
-    lens = sequence.lens
+    lens, usable = sequence.lens, False
     if kind == "mixed lenses":
         assert isinstance(lens, Camera)
         assert lens.focal is not None
@@ -211,15 +215,31 @@ def _mixed(kind: str, sequence: Sequence, rng: np.random.Generator, seed: int) -
     elif kind in SPOILED:
         assert isinstance(lens, Camera)
         assert lens.focal is not None
-        if rng.random() < 0.5:
+        how = str(rng.choice(["zoomed", "other ground", "blurred", "noisy", "aslant"]))
+        usable = how in ("blurred", "noisy", "aslant")
+        if how == "zoomed":
             other = replace(sequence, lens=replace(lens, distortion=lens.distortion / 2, focal=1.4 * lens.focal))
-        else:
+        elif how == "other ground":
             other = replace(sequence, texture=ground(sequence.texture.size, seed + 1))
+        elif how == "aslant":
+            aside = rng.uniform(0.4, 0.6) * np.array([np.cos(seed), np.sin(seed)])
+            other = replace(sequence, poses=replace(sequence.poses, tilt=sequence.poses.tilt + aside))
+        else:
+            light = sequence.photometry
+            blurred = replace(light, blur=float(rng.uniform(3.0, 8.0)))
+            other = replace(sequence, photometry=blurred if how == "blurred" else replace(light, noise=0.4))
         taken = frozenset(rng.choice(len(sequence), int(rng.integers(1, 4)), replace=False).tolist())
     else:
         other, taken = replace(sequence, texture=ground(sequence.texture.size, seed + 1)), frozenset({2})
     return MixedSequence(
-        sequence.texture, lens, sequence.poses, sequence.photometry, seed=sequence.seed, other=other, taken=taken
+        sequence.texture,
+        lens,
+        sequence.poses,
+        sequence.photometry,
+        seed=sequence.seed,
+        other=other,
+        taken=taken,
+        usable=usable,
     )
 
 
@@ -237,8 +257,9 @@ def judge_set(item: TrustSet, folder: Path, options: StitchOptions | None = None
     error, worst = measure(item.sequence, registration)
     text = "; ".join(map(str, registration.messages))
     right = error < LARGEST_MEDIAN and worst < LARGEST_OF_A_PICTURE
-    spoiled = item.sequence.taken if item.kind in SPOILED and isinstance(item.sequence, MixedSequence) else frozenset()
-    complete = {_number(message.images[0]) for message in registration.left_out} == spoiled
+    mixed = item.sequence if item.kind in SPOILED and isinstance(item.sequence, MixedSequence) else None
+    missing = {_number(message.images[0]) for message in registration.left_out}
+    complete = not missing if mixed is None else missing == mixed.taken or (mixed.usable and missing < mixed.taken)
     warned = any(message.images and message.severity == "warning" for message in registration.messages)
     return Judged(item.kind, 0, right, complete, error, text, warned)
 
