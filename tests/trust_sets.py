@@ -38,8 +38,8 @@ ODD = ("odd lens",)
 """Solvable too, but only where asked for: the pictures of one lens that is no division model about their centre."""
 
 SPOILED = ("spoiled",)
-"""Ten pictures of which one to three show other ground, were zoomed, are blurred, noisy or taken aslant: solved from the
-rest. Those of the first two kinds are named; the others are used rightly, or named."""
+"""Ten pictures of which one to three show other ground, were zoomed, are blurred, noisy or taken aslant: solved from
+the rest. Those of the first two kinds are named; the others are used rightly, or named."""
 
 HOPELESS = (
     "apart", "textureless", "repeated", "turning", "mixed lenses", "mixed by one", "little overlap", "mixed ground"
