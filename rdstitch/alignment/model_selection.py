@@ -42,6 +42,9 @@ _LEAST_RATIO = 1.5
 _LEAST_RATIO_OVER_RELIEF = 3.0
 """The same where neighbours agree in the errors of free homographies, too."""
 
+_FOCAL_LIMITS = 0.2, 50.0
+"""Half diagonals: focal lengths that a model may ask for; the widest fisheyes have 0.3."""
+
 _TYPICAL_TILT_SPREAD = math.radians(3.0)
 """Spread of tilts from which on a wider one costs: Occam's factor of the hierarchical prior on the tilts."""
 
@@ -84,18 +87,27 @@ def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolAr
         fits.append(problem.fit(model, fits[-1:]))
     cameras = [fit for fit in fits if fit.model is not HOMOGRAPHY]
     noise = bound if len(fits) < len(names) else _noise_of_fit(problem, fits[-1])
-    costs = np.array([fit_cost(noise, problem, fit) for fit in fits])
+    costs = np.array([fit_cost(noise, problem, fit) if has_plausible_focal(fit) else math.inf for fit in fits])
     for lens in lenses:
         # The least free one besides: an off-centre lens may have ruled it out.
         for index in sorted({0, *np.argsort(costs, kind="stable")[:2].tolist()}):
             wider = problem.extend(fits[index], lens | fits[index].free_lens)
             cost = fit_cost(noise, problem, wider)
-            if cost < costs[index] and has_plausible_center(wider.adjusted, problem.observations):
+            plausible = has_plausible_focal(wider) and has_plausible_center(wider.adjusted, problem.observations)
+            if cost < costs[index] and plausible:
                 fits[index], costs[index] = wider, cost
     best = int(np.argmin(costs[: max(len(cameras), 1)]))
     if cameras and len(fits) > len(cameras) and _beyond_one_camera(problem, fits[best], fits[-1]):
         best = len(fits) - 1
     return ModelChoice(fits[best], _reason(fits, best, list(names)), noise.overdispersion)
+
+
+def has_plausible_focal(fit: Fit) -> bool:
+    """Whether a lens can have the focal length of a fit: over relief, small tilts may ask for any."""
+    if not fit.model.shared_names:
+        return True
+    focal = math.exp(float(fit.model.physical_parameters(fit.adjusted.parameters.shared)[0][-1]))
+    return _FOCAL_LIMITS[0] < focal < _FOCAL_LIMITS[1]
 
 
 def _cannot_gain(bound: NoiseModel, problem: Problem, fits: Sequence[Fit], model: MotionModel) -> bool:

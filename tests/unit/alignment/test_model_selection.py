@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.model_selection import choose_model, fit_cost, noise_of_links, parameter_count, price
+from rdstitch.alignment.model_selection import (
+    choose_model,
+    fit_cost,
+    has_plausible_focal,
+    noise_of_links,
+    parameter_count,
+    price,
+)
 from rdstitch.alignment.motion_models import HOMOGRAPHY, PLANAR_MODELS, POSE, RIGID, SIMILARITY, TILTING, MotionModel
 from rdstitch.alignment.noise_model import EXACTNESS
 from rdstitch.alignment.rotation_model import ROTATION
@@ -143,3 +150,17 @@ def test_of_two_pictures_a_homography_is_always_tried() -> None:
         given: Any = _problem(squared, pictures)
         choose_model(given, ["rigid", "homography"])
         assert given.fitted == fitted, pictures
+
+
+@pytest.mark.parametrize(("focal", "plausible"), [(0.1, False), (0.3, True), (2.0, True), (80.0, False)])
+def test_no_model_asks_for_a_focal_length_that_no_lens_has(focal: float, plausible: bool) -> None:
+    """Over relief, free tilts may: of 640 x 480 pixels 15."""
+
+    class Adjusted:
+        class parameters:  # noqa: N801
+            shared = TILTING.shared_from_physical(np.array([0.01, 0.02, math.log(focal)]))
+
+    fit: Any = Fit(TILTING, Adjusted, np.zeros(5, dtype=np.bool_))  # type: ignore[arg-type]
+    assert has_plausible_focal(fit) is plausible
+    free: Any = Fit(HOMOGRAPHY, Adjusted, np.zeros(5, dtype=np.bool_))  # type: ignore[arg-type]
+    assert has_plausible_focal(free)
