@@ -45,7 +45,8 @@ def true_path(poses: FloatArray) -> Trajectory:
 
 def largest_error(found: Trajectory, truth: Trajectory) -> float:
     """Largest distance of a position from the true one after the best similarity, as a share of the path."""
-    one, two = (t.position @ np.array([1.0, 1.0j]) for t in (found, truth))
+    shared = np.isin(truth.frame, found.frame)
+    one, two = (places @ np.array([1.0, 1.0j]) for places in (found.position, truth.position[shared]))
     one, two = one - one.mean(), two - two.mean()
     return float(np.abs(np.vdot(one, two) / np.vdot(one, one) * one - two).max()) / truth.length
 
@@ -58,7 +59,20 @@ def main() -> None:
     parser.add_argument("--links", type=int, default=6, help="next frames that each is linked with")
     parser.add_argument("--model", nargs="*", choices=("auto", *MODELS), default=["auto", "homography"])
     given = parser.parse_args()
-    columns = ("model", "frames", "links", "s", "ms/frame", "ratio", "MB", "chosen", "Δλ", "transl. %", "rot. °")
+    columns = (
+        "model",
+        "frames",
+        "aligned",
+        "links",
+        "s",
+        "ms/frame",
+        "ratio",
+        "MB",
+        "chosen",
+        "Δλ",
+        "transl. %",
+        "rot. °",
+    )
     print("".join(f"{column:>11}" for column in (*columns, "drift %", "largest %")))
     for model in given.model:
         first = math.nan
@@ -70,7 +84,8 @@ def main() -> None:
             each = seconds / count * 1e3
             first = each if math.isnan(first) else first
             memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-            row = f"{model:>11}{count:11d}{len(made.links):11d}{seconds:11.1f}{each:11.1f}{each / first:11.2f}"
+            row = f"{model:>11}{count:11d}{int(found.used.sum()):11d}{len(made.links):11d}"
+            row += f"{seconds:11.1f}{each:11.1f}{each / first:11.2f}"
             row += f"{memory:11.0f}{found.model:>11}{found.distortion - made.distortion:11.5f}"
             if found.poses is not None:
                 path, truth = Trajectory.from_alignment(found), true_path(made.poses)
