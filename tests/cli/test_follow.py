@@ -113,7 +113,8 @@ def test_a_frame_that_cannot_be_read_has_a_line_with_the_reason(
     (folder / "frame_0001.png").write_bytes(b"no picture")
     outcome = rdstitch("trajectory", folder, "-o", tmp_path / "path.csv", "--follow", "--idle", "0.1", *FAST)
     lines = [json.loads(line) for line in outcome.out.splitlines()]
-    assert "frame_0001.png" in lines[1]["reason"]
+    assert lines[1]["name"] == "frame_0001.png"
+    assert "no picture" in lines[1]["reason"]
     assert lines[1]["x"] is None
 
 
