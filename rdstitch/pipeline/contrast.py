@@ -58,11 +58,12 @@ def detect_by_contrast(
 ) -> DetectionByContrast:
     """Detect the features of all pictures, if necessary once more; see :func:`detect_features`."""
     detect = partial(detect_features, executor=executor, store=store, skip_bad=skip_bad, progress=progress)
-    deep = any(source.metadata.bit_depth > 8 for source in sources)
-    stretch = options.stretch or (_stretch_of(sources, options, executor, store) if deep else None)
+    depths = {source.metadata.bit_depth > 8 for source in sources}
+    stretch = options.stretch or (_stretch_of(sources, options, executor, store) if depths == {True} else None)
     options = replace(options, stretch=stretch)
     detected = detect(sources, options)
-    if options.equalize is not None or not _shows_little(sources, detected, options):
+    # Samples of two kinds have no grey levels in common: each picture is stretched on its own.
+    if options.equalize is not None or len(depths) > 1 or not _shows_little(sources, detected, options):
         return DetectionByContrast(detected, stretch, bool(options.equalize))
     stretch = stretch or _stretch_of(sources, options, executor, store)
     again = detect(sources, replace(options, stretch=stretch, equalize=True))

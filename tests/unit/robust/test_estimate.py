@@ -30,8 +30,8 @@ def test_defaults_are_those_of_the_options() -> None:
     [
         ({"solver": "six_point"}, "unknown solver"),
         ({"solver": "three_point", "distortion": -0.1}, "nothing to choose"),
-        ({"distortion": -1.0}, "between -1 and 1"),
-        ({"distortion": 1.0}, "between -1 and 1"),
+        ({"distortion": np.nan}, "below 1"),
+        ({"distortion": 1.0}, "below 1"),
         ({"threshold": 0.0}, "must be positive"),
         ({"confidence": 0.0}, "between 0 and 1"),
         ({"confidence": 1.0}, "between 0 and 1"),
