@@ -16,9 +16,10 @@ from rdstitch.alignment.bundle_adjustment import (
 from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.initialization import MOST_ITERATIONS, adjust_pairs_independently
 from rdstitch.alignment.metric_upgrade import metric_upgrade
-from rdstitch.alignment.motion_models import HOMOGRAPHY, POSE, PSI, SIMILARITY, THETA, MotionModel
+from rdstitch.alignment.motion_models import HOMOGRAPHY, POSE, PSI, SIMILARITY, THETA, MotionModel, PlanarModel
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.rotation_model import FOCAL_STARTS, ROTATION
+from rdstitch.alignment.warm_start import WarmStart
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import Camera
 from rdstitch.matching.match_graph import spanning_tree
@@ -149,6 +150,8 @@ class Problem:
     camera_priors : CameraPriors
     overdispersion : float
         See :class:`BundleAdjuster`.
+    warm : WarmStart, optional
+        Where models over a plane start, instead of at chained links.
     """
 
     observations: Observations
@@ -160,6 +163,7 @@ class Problem:
     free_lens: BoolArray
     camera_priors: CameraPriors
     overdispersion: float = 1.0
+    warm: WarmStart | None = None
 
     def fit(self, model: MotionModel, others: Sequence[Fit] = (), shared: FloatArray | None = None) -> Fit:
         """Adjust a model from the chained links or from the solution of a less free model, whichever is nearer.
@@ -169,6 +173,9 @@ class Problem:
         if not others and not model.shared_names and self.count > _LONG_CHAIN:
             others = [self.fit(SIMILARITY)]
         starts = [self._taken_over(model, other) for other in others]
+        if self.warm is not None and isinstance(model, PlanarModel):
+            spread = self.warm.tilt_spread if model is self.warm.model else None
+            return self.refine(model, self._nearest(model, [self.warm.start_of(model), *starts]), spread)
         if model is POSE:
             starts.append(self._upgraded())
         elif not (others and self._has_free_tilts(model)):

@@ -1,5 +1,6 @@
 """The recipe of the global adjustment: consensus, match graph, choice of the model, adjustment."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -14,16 +15,18 @@ from rdstitch.alignment.adjustment_problem import (
     thin_for_selection,
 )
 from rdstitch.alignment.build_result import AdjustedPictures, build_alignment
-from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
+from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult, sigma_of
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.initialization import relations_at
 from rdstitch.alignment.lens_selection import LENSES, choose_lens
 from rdstitch.alignment.model_family import MODELS
-from rdstitch.alignment.model_selection import ModelChoice
+from rdstitch.alignment.model_selection import ModelChoice, noise_of_links
+from rdstitch.alignment.noise_model import EXACTNESS
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.alignment.turn_or_plane import choose_motion
+from rdstitch.alignment.warm_start import WarmStart
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_STD, Camera
 from rdstitch.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTION
@@ -31,6 +34,7 @@ from rdstitch.errors import ArgumentError, RegistrationError
 from rdstitch.matching.distortion_consensus import Consensus, vote
 from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import connected_components, spanning_tree
+from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
 
 _UNCONFIRMED = 0.1
 """Weight in the spanning tree of a link without a consistent triangle, relative to one with."""
@@ -43,6 +47,9 @@ _MATCHES_OF_ALL, _MATCHES_OF_A_LINK = 1_000_000, 60
 
 _ROUNDS = 3
 """Rounds of rejecting wrong pairs and adjusting again."""
+
+_AS_GOOD = 1.5
+"""Errors of an earlier alignment, in units of those of pairs on their own, up to which a later one starts there."""
 
 
 @dataclass(frozen=True)
@@ -138,6 +145,7 @@ def align(
     links: Sequence[Link],
     options: AlignmentOptions = AlignmentOptions(),
     *,
+    former: Alignment | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Alignment:
     """Align all pictures over one plane.
@@ -149,6 +157,9 @@ def align(
     links : sequence of Link
         The pairs that overlap, each once.
     options : AlignmentOptions
+    former : Alignment, optional
+        Of the same cameras with the same options and other links. Where these agree with it, the adjustment starts
+        there, not at chained links.
     progress : callable, optional
         Called with the name of each stage as it begins.
 
@@ -187,7 +198,10 @@ def align(
     trust = few.matches.astype(np.float64) * np.where(confirmed > 0, 1.0, _UNCONFIRMED)
     graph = _Graph(len(cameras), few, relations, trust, lens, free_lens, known, options)
     problem, pictures = graph.problem(~wrong)
-    choice = choose_motion(problem, options.models, chosen.refinements)
+    choice = None
+    if former is not None and former.lens == chosen.name:
+        choice = _choose_from(former, cameras, problem, pictures, options, chosen.refinements)
+    choice = choice or choose_motion(problem, options.models, chosen.refinements)
     graph = replace(graph, free_lens=choice.fit.free_lens)
     choice, pictures, wrong = _drop_wrong_pairs(graph, problem, pictures, choice, wrong)
 
@@ -239,6 +253,27 @@ def _lens_start(cameras: Sequence[Camera], options: AlignmentOptions, votes: Con
 def _lens_of(camera: Camera) -> FloatArray:
     """The lens of a camera; the pictures' points are already relative to its centre."""
     return np.array([*camera.coefficients, 0.0, 0.0])
+
+
+def _choose_from(
+    former: Alignment,
+    cameras: Sequence[Camera],
+    problem: Problem,
+    pictures: IntArray,
+    options: AlignmentOptions,
+    refinements: Sequence[BoolArray],
+) -> ModelChoice | None:
+    """The choice from the solution of an earlier alignment; None where that does not explain every link any more."""
+    warm = WarmStart.of(former, cameras, pictures, problem.lens, problem.free_lens)
+    if warm is None or options.attitudes is not None:
+        return None
+    squared, noise = problem.squared(warm.model, warm.parameters), noise_of_links(problem)[0].noise
+    sigma = sigma_of(squared)
+    if misfitting_links(squared, problem.observations).any() or sigma > _AS_GOOD * math.hypot(noise, EXACTNESS):
+        return None
+    choice = choose_motion(replace(problem, warm=warm), options.models, refinements)
+    costs = [robust_cost(errors, ALIGNMENT_WIDTH * sigma).sum() for errors in (choice.fit.adjusted.squared, squared)]
+    return choice if choice.fit.model is warm.model and costs[0] <= costs[1] else None
 
 
 def _observable(apart: BundleAdjustmentResult) -> bool:

@@ -74,8 +74,10 @@ class Aligner:
         cameras = tuple(at_working_size(source.camera.with_focal(), megapixels) for source in sources)
         return cls(paths, cameras, alignment_options(sources, options), cache)
 
-    def align(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
+    def align(self, pairs: Sequence[PairRegistration], former: Alignment | None = None) -> AlignedPairs:
         """Align the pictures by the pairs that were registered; from an earlier run where the cache has it.
+
+        A ``former`` alignment of other pairs of the pictures is where the new one starts, if these agree with it.
 
         Raises
         ------
@@ -85,8 +87,8 @@ class Aligner:
         links = tuple(pair.link() for pair in pairs if pair.relation)
         if not links:
             raise RegistrationError(_no_overlap(self.paths, pairs))
-        inputs = (self.cameras, self.cache.digest(links), self.options)
-        compute = partial(align, self.cameras, links, self.options)
+        inputs = (self.cameras, self.cache.digest(links), self.options, self.cache.digest(former))
+        compute = partial(align, self.cameras, links, self.options, former=former)
         kinds = (Alignment, Camera, LinkFit, PlanarPoses, ReliefTest, ShapeTest, Message)
 
         def valid(alignment: Alignment) -> bool:
@@ -115,7 +117,7 @@ def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candi
         pairs = tuple(sorted([*pairs, *found], key=lambda pair: (pair.image1, pair.image2)))
         if not any(pair.relation for pair in found):
             return AlignedPairs(pairs, alignment)
-        aligned = aligner.align(pairs)
+        aligned = aligner.align(pairs, alignment)
     return aligned
 
 
@@ -129,7 +131,9 @@ def rematch_weak_pairs(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs
     stronger = pairing.guided_rematch(list(aligned.pairs), alignment.support, alignment.transfer)
     if alignment.lens != "division" or alignment.cameras[alignment.reference].higher:
         stronger = {**reselect_inliers(aligned.pairs, alignment, pairing.options.pair.threshold), **stronger}
-    return aligner.align([stronger.get(k, pair) for k, pair in enumerate(aligned.pairs)]) if stronger else aligned
+    if not stronger:
+        return aligned
+    return aligner.align([stronger.get(k, pair) for k, pair in enumerate(aligned.pairs)], alignment)
 
 
 def alignment_options(sources: Sequence[Source], options: StitchOptions) -> AlignmentOptions:
