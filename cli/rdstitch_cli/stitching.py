@@ -16,6 +16,7 @@ from rdstitch_cli.progress import Reporter
 if TYPE_CHECKING:
     from rdstitch.camera import Camera
     from rdstitch.compositing import CompositePlan
+    from rdstitch.io.outputs import Outputs
     from rdstitch.pipeline import Registration, StitchOptions, StitchResult
 
 
@@ -83,7 +84,7 @@ def _preview(
 
 
 class Report:
-    """The report of a run: the progress that measures its stages, and the file that is written at the end.
+    """The report of a run: the progress that measures its stages, and the file that is written with the picture.
 
     Parameters
     ----------
@@ -130,12 +131,12 @@ class Report:
                 write_report(self._file, refused.registration, self.progress.stages, _command_line())
             raise
 
-    def write(self, result: "StitchResult | Registration") -> None:
-        """Write the file, if one is wanted; a dry run writes nothing."""
-        if self._file is not None and getattr(result, "plan", None) is None:
+    def stage(self, outputs: "Outputs", result: "StitchResult | Registration") -> None:
+        """Stage the file, if one is wanted, to be published with what else the recipe writes."""
+        if self._file is not None:
             from rdstitch.report import write_report
 
-            write_report(self._file, result, self.progress.stages, _command_line())
+            write_report(self._file, result, self.progress.stages, _command_line(), outputs=outputs)
 
 
 def _command_line() -> str:

@@ -13,6 +13,7 @@ from pathlib import Path
 from rdstitch.errors import InputError
 from rdstitch.inputs.frame import Frame, Named, files_of
 from rdstitch.inputs.rosbag import extract_images, is_bag
+from rdstitch.io.interrupted import interrupted_outputs
 from rdstitch.io.optional_readers import HEIF_SUFFIXES, RAW_SUFFIXES
 from rdstitch.io.staging import temporary_folder
 from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames
@@ -113,9 +114,12 @@ def find_pictures(
     unwanted = {_entry(Path(path)) for path in exclude}
     frames: list[Frame] = []
     outputs: list[Path] = []
+    interrupted = cache(interrupted_outputs)
     arguments = list(arguments)
     for frame, named in _expand(arguments, frames_folder, every, topic):
-        is_output = frame.picture is None and is_rdstitch_output(frame.path)
+        is_output = frame.picture is None and (
+            is_rdstitch_output(frame.path) or frame.path.name in interrupted(frame.path.parent)
+        )
         if _entry(frame.path) in unwanted and is_output:
             continue
         if is_output and not named:

@@ -1,9 +1,9 @@
 """The files of one result: written aside, then published together, so that all are new, or all are as they were.
 
-A picture, its tiles, its world file and its sidecar belong together. Each is written into a hidden folder beside its
-place; when all are complete, they take their places one after the other, in the order in which they were staged. When
-one of them cannot, those before it go back. A process that is killed within these milliseconds leaves some old and
-some new: the sidecar, which is staged last, names size and digest of its picture, so that a reader sees it.
+A picture, its tiles, its world file, its pages and its sidecar belong together. Each is written into a hidden folder
+beside its place; when all are complete, they take their places one after the other, in the order in which they were
+staged. When one of them cannot, those before it go back. A process that is killed within these milliseconds leaves some
+old and some new: the sidecar, which is staged last, names size and digest of its picture, so that a reader sees it.
 """
 
 import errno
@@ -98,9 +98,9 @@ class Outputs:
         with self.writing(path) as staged:
             staged.write_bytes(data)
 
-    def staged(self, path: str | Path) -> Path:
-        """Where an output lies until it is published."""
-        return next(item.staged for item in self._items if item.name == Path(path))
+    def staged(self, path: str | Path) -> Path | None:
+        """Where an output lies until it is published; None where none of this name is staged."""
+        return next((item.staged for item in self._items if item.name == Path(path)), None)
 
     def _staged(self, name: Path, *, is_folder: bool) -> _Item:
         place = Path(os.path.realpath(name.parent)) / name.name
@@ -108,7 +108,9 @@ class Outputs:
             place = Path(os.path.realpath(place))
         if place.parent not in self._folders:
             self._folders[place.parent] = StagingFolder(place.parent)
-        staged = self._folders[place.parent].path / f"new{len(self._items)}{name.suffix}"
+        # Tiles are staged just before their description, and are found beside it by its name.
+        number = sum(not item.is_folder for item in self._items)
+        staged = self._folders[place.parent].path / f"new{number}{'_files' if is_folder else name.suffix}"
         self._items.append(_Item(name, place, staged, is_folder))
         return self._items[-1]
 

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from rdstitch.io.interrupted import publish_sidecars
+
 # On Windows nothing proves a process dead, and its leftovers stay.
 if sys.platform != "win32":
     import fcntl
@@ -113,5 +115,6 @@ def _remove_dead(parent: Path, prefix: str) -> None:
         with suppress(OSError):
             descriptor = _locked(folder / _LOCK, create=False)
             if descriptor is not None:
+                publish_sidecars(folder)
                 shutil.rmtree(folder, ignore_errors=True)
                 os.close(descriptor)

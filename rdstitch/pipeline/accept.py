@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rdstitch.alignment.result import LinkFit
+from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.cache import Cache
 from rdstitch.errors import PartialResultError, RegistrationError
@@ -17,6 +17,7 @@ from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.registration import Registration
 from rdstitch.verification.verdict import RefusedError, judge
 
+_MAX_SCALE_UNCERTAINTY = 0.05  # share that lengths may be off by, as far as the focal length is, without a word
 _MOST_ROUNDS = 20
 """Times that something is left out; each takes one adjustment."""
 
@@ -167,3 +168,12 @@ def _without(registration: Registration, offenders: _Offenders, aligner: Aligner
     dropped = (*registration.alignment.messages, *registration.left_out)
     whole = [message for message in registration.messages if message not in dropped]
     return replace(registration, alignment=aligned.alignment, messages=(*aligned.alignment.messages, *whole, *unused))
+
+
+def scale_uncertainty(alignment: Alignment) -> list[Message]:
+    """A warning where the focal length, and with it the length of every step, is hardly known."""
+    unsure = 0.0 if alignment.focal is None or alignment.focal_std is None else alignment.focal_std / alignment.focal
+    if unsure <= _MAX_SCALE_UNCERTAINTY:
+        return []
+    text = f"all lengths may be off together by {unsure:.0%}: the pictures hardly show the focal length; give --focal"
+    return [Message(text, code="focal-unknown")]

@@ -1,10 +1,9 @@
 """The recipes: each reads as the sequence of its stages."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
-from rdstitch.alignment import Alignment
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.camera_files import CAMERA_SUFFIXES, camera_file_text
 from rdstitch.errors import ArgumentError, InputError
@@ -22,7 +21,7 @@ from rdstitch.io.atomic import check_distinct, check_output, json_bytes, text_by
 from rdstitch.io.outputs import Outputs
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.accept import accept
+from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.align_locally import align_registration_locally
 from rdstitch.pipeline.compose import compose_pictures
 from rdstitch.pipeline.page import viewed_pictures, write_page
@@ -35,7 +34,6 @@ from rdstitch.stitch_result import StitchResult
 
 TrajectoryFormat = Literal["csv", "tum", "kitti"]
 
-_MAX_SCALE_UNCERTAINTY = 0.05  # share that lengths may be off by, as far as the focal length is, without a word
 _NO_TIMES = Message(
     "not every picture has a time stamp: numbers of frames stand for them; give --timestamps", code="no-time-stamps"
 )
@@ -48,6 +46,7 @@ def pano(
     *,
     every: int = 1,
     progress: Progress = silent,
+    beside: Callable[[Outputs, StitchResult], None] | None = None,
 ) -> StitchResult:
     """Stitch a few pictures that overlap, in any order, in the frame of one of them.
 
@@ -63,6 +62,8 @@ def pano(
         Use every n-th video frame.
     progress : callable
         Called with the name of a stage, the number of steps done, and their total.
+    beside : callable, optional
+        Called with the outputs and the result, to stage further files that are published together with the picture.
 
     Returns
     -------
@@ -90,7 +91,7 @@ def pano(
         with options.executor(len(sources)) as executor:
             registration = register(sources, options, executor, skip_bad=False, progress=progress)
         registration = registration.with_messages(found.messages)
-        return _composite(registration, output, options, progress, frontal=True)
+        return _composite(registration, output, options, progress, beside, frontal=True)
 
 
 def mosaic(
@@ -100,6 +101,7 @@ def mosaic(
     *,
     every: int = 1,
     progress: Progress = silent,
+    beside: Callable[[Outputs, StitchResult], None] | None = None,
 ) -> StitchResult:
     """Stitch a whole sequence on the rectified plane: seen straight from above, metric up to scale.
 
@@ -111,10 +113,8 @@ def mosaic(
         be read are left out by name.
     output : path, optional
         As for :func:`pano`.
-    options : StitchOptions, optional
-    every : int
-        Use every n-th video frame.
-    progress : callable
+    options, every, progress, beside
+        As for :func:`pano`.
 
     Returns
     -------
@@ -140,11 +140,16 @@ def mosaic(
     ) as found:
         _check_outputs(output, options, found.files)
         registration = _register_all(found, options, progress)
-        return _composite(registration, output, options, progress)
+        return _composite(registration, output, options, progress, beside)
 
 
 def calibrate(
-    inputs: Images, options: StitchOptions | None = None, *, every: int = 1, progress: Progress = silent
+    inputs: Images,
+    options: StitchOptions | None = None,
+    *,
+    every: int = 1,
+    progress: Progress = silent,
+    beside: Callable[[Outputs, Registration], None] | None = None,
 ) -> Registration:
     """Find the lens from pictures of a plane; the camera is ``result.camera``.
 
@@ -152,6 +157,8 @@ def calibrate(
     ----------
     inputs, options, every, progress
         As for :func:`mosaic`; nothing is composited. ``options.save_camera`` names the file to write.
+    beside : callable, optional
+        Called with the outputs and the result, to stage further files that are published together with the camera.
 
     Returns
     -------
@@ -168,9 +175,12 @@ def calibrate(
         _check_outputs(None, options, found.files)
         registration = accept(_register_all(found, options, progress, lens_only=True), options, lens_only=True)
     _release_decoded_images(registration)
+    result = _with_damage(registration)
     with Outputs(options.overwrite) as outputs:
         _save_camera(registration, options, outputs)
-    return _with_damage(registration)
+        if beside is not None:
+            beside(outputs, result)
+    return result
 
 
 def trajectory(
@@ -221,7 +231,7 @@ def trajectory(
             registration = register(sources, options, executor, skip_bad=True, metric=True, progress=progress)
         registration = accept(registration.with_messages([*unread, *found.messages]), options)
     _release_decoded_images(registration)
-    registration = _with_damage(registration).with_messages(_scale_uncertainty(registration.alignment))
+    registration = _with_damage(registration).with_messages(scale_uncertainty(registration.alignment))
     path = Trajectory.from_alignment(registration.alignment, height)
     path = path.labelled([s.name for s in sources], [s.number(k) for k, s in enumerate(sources)], times)
     if layout == "tum" and not has_times(path):
@@ -277,6 +287,7 @@ def _composite(
     output: str | Path | None,
     options: StitchOptions,
     progress: Progress,
+    beside: Callable[[Outputs, StitchResult], None] | None,
     *,
     frontal: bool = False,
 ) -> StitchResult:
@@ -311,10 +322,11 @@ def _composite(
         )
         if not options.dry_run:
             _save_camera(registration, options, outputs)
+            if beside is not None:
+                beside(outputs, result)
             if output is not None:
                 write_page(outputs, output, composed, viewed_pictures(result))
-            # Last: whoever finds it finds what it belongs to.
-            if output is not None:
+                # Last: whoever finds it finds what it belongs to.
                 outputs.write(f"{output}.json", json_bytes(sidecar(result)))
     return result
 
@@ -329,15 +341,6 @@ def _release_decoded_images(registration: Registration) -> None:
     """Let go of pictures that were kept for stages that will not come."""
     for source in registration.sources:
         source.decoded_images.clear()
-
-
-def _scale_uncertainty(alignment: Alignment) -> list[Message]:
-    """A warning where the focal length, and with it the length of every step, is hardly known."""
-    unsure = 0.0 if alignment.focal is None or alignment.focal_std is None else alignment.focal_std / alignment.focal
-    if unsure <= _MAX_SCALE_UNCERTAINTY:
-        return []
-    text = f"all lengths may be off together by {unsure:.0%}: the pictures hardly show the focal length; give --focal"
-    return [Message(text, code="focal-unknown")]
 
 
 def _save_camera(registration: Registration, options: StitchOptions, outputs: Outputs) -> None:

@@ -1,6 +1,7 @@
 """The picture that came out, with the outlines of the pictures in it."""
 
 from html import escape
+from pathlib import Path
 
 import numpy as np
 
@@ -13,9 +14,9 @@ _SIDE = 1200
 _MOST_NAMES = 12
 
 
-def mosaic(result: StitchResult) -> str:
+def mosaic(result: StitchResult, staged: Path | None = None) -> str:
     """The output, small; every outline has its picture's name as title, and a few pictures have it written."""
-    picture = of_mosaic(result, _SIDE)
+    picture = of_mosaic(result, _SIDE, staged)
     if picture is None:
         return section("Mosaic", "No picture was written.")
     name = "" if result.output is None else f"{result.output.name}, "

@@ -5,7 +5,7 @@ from html import escape
 from importlib.metadata import version
 from pathlib import Path
 
-from rdstitch.io.atomic import write_bytes_atomic
+from rdstitch.io.outputs import Outputs
 from rdstitch.registration import Registration
 from rdstitch.report.camera_path import path_over_plane
 from rdstitch.report.grid import grid
@@ -46,6 +46,8 @@ def write_report(
     result: StitchResult | Registration,
     stages: Sequence[tuple[str, float]] = (),
     command: str = "",
+    *,
+    outputs: Outputs | None = None,
 ) -> None:
     """Write the report of a result: one HTML file without anything outside of it.
 
@@ -57,27 +59,38 @@ def write_report(
         Name and seconds of each stage; see :class:`rdstitch.pipeline.timing.StageTimer`.
     command : str
         The command line that made the result, if any.
+    outputs : Outputs, optional
+        Where the report is staged, to be published with the picture; without, it replaces what is there.
 
     Raises
     ------
     OutputError
         When the file cannot be written.
     """
+    if outputs is None:
+        with Outputs(overwrite=True) as alone:
+            write_report(path, result, stages, command, outputs=alone)
+        return
+    output = result.output if isinstance(result, StitchResult) else None
+    page = report_page(result, stages, command, None if output is None else outputs.staged(output))
     # Names of files need not be UTF-8.
-    write_bytes_atomic(path, report_page(result, stages, command).encode("utf-8", "backslashreplace"))
+    outputs.write(path, page.encode("utf-8", "backslashreplace"))
 
 
 def report_page(
-    result: StitchResult | Registration, stages: Sequence[tuple[str, float]] = (), command: str = ""
+    result: StitchResult | Registration,
+    stages: Sequence[tuple[str, float]] = (),
+    command: str = "",
+    staged: Path | None = None,
 ) -> str:
-    """The report as HTML; see :func:`write_report`."""
+    """The report as HTML; see :func:`write_report`. ``staged`` is the picture's file until it is published."""
     stitched = result if isinstance(result, StitchResult) else None
     registration = result.registration if isinstance(result, StitchResult) else result
     title = "rdstitch report" if stitched is None or stitched.output is None else stitched.output.name
     body = [
         summary(registration, stitched),
         notices(registration),
-        "" if stitched is None else mosaic(stitched),
+        "" if stitched is None else mosaic(stitched, staged),
         match_graph(registration),
         votes(registration),
         grid(registration),

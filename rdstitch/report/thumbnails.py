@@ -1,6 +1,7 @@
 """Small pictures inside the page, as data addresses."""
 
 import base64
+from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
@@ -21,13 +22,14 @@ def of_source(source: Source, side: int) -> str | None:
         return None
 
 
-def of_mosaic(result: StitchResult, side: int) -> str | None:
-    """A thumbnail of the output; None where there is none, as after a dry run."""
+def of_mosaic(result: StitchResult, side: int, staged: Path | None = None) -> str | None:
+    """A thumbnail of the output, or of its staged file; None where there is none, as after a dry run."""
     if result.composite is not None:
         return data_address(result.composite.pixels, side)
-    if result.output is None or not result.output.exists():
+    file = staged or result.output
+    if file is None or not file.exists():
         return None
-    return data_address(read_preview(result.output, result.canvas.size, side)[0], side)
+    return data_address(read_preview(file, result.canvas.size, side)[0], side)
 
 
 def data_address(pixels: NDArray[Any], side: int) -> str:

@@ -87,6 +87,100 @@ def test_whatever_fails_every_single_time(
     _check_all_failures(rdstitch, located, tmp_path, operation, name, overwrite, 1)
 
 
+@pytest.mark.parametrize("name", ["out.jpg", "out.dzi"])
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_the_report_is_published_with_the_picture(
+    rdstitch: Run, located: Path, tmp_path: Path, overwrite: bool, name: str
+) -> None:
+    out, cache = tmp_path / "out", tmp_path / "cache"
+    arguments: tuple[str | Path, ...] = ("mosaic", located / "flight", "-o", out / name, "--report", out / "why.html")
+    arguments = (*arguments, "--scale", "0.3", "--blend", "none", "--seam", "none", "--cache", cache, *FAST)
+    out.mkdir()
+    # Also so that the cache has everything, whose own renames do not count.
+    assert rdstitch(*arguments, "--rotate", "90").status == 0
+    before = _outputs(out)
+    assert {name, f"{name}.json", "why.html"} <= set(before)
+    if overwrite:
+        arguments = (*arguments, "--overwrite")
+    else:
+        before = {}
+        shutil.rmtree(out)
+        out.mkdir()
+    with failing_disk("rename") as disk:
+        assert rdstitch(*arguments).status == 0
+    assert disk.count >= 3
+    assert "<h2>Mosaic</h2>" in (out / "why.html").read_text(encoding="utf-8")
+    assert "No picture was written" not in (out / "why.html").read_text(encoding="utf-8")
+    for failing in range(disk.count):
+        shutil.rmtree(out)
+        out.mkdir()
+        for path, content in before.items():
+            (out / path).parent.mkdir(parents=True, exist_ok=True)
+            (out / path).write_bytes(content)
+        with failing_disk("rename", failing):
+            done = rdstitch(*arguments)
+        assert done.status == 6, (failing, done.err)
+        assert _outputs(out) == before
+    assert rdstitch(*arguments).status == 0
+
+
+_KILLED_WHILE_PUBLISHING = """
+import os, signal
+from rdstitch.io.outputs import Outputs
+from rdstitch_cli.main import main
+place, left = Outputs._place, [{published}]
+def publish(outputs, item):
+    if not left[0]:
+        os.kill(os.getpid(), signal.SIGKILL)
+    left[0] -= 1
+    place(outputs, item)
+Outputs._place = publish
+main()
+"""
+
+
+@pytest.mark.parametrize("published", [0, 1, 2])
+def test_a_run_that_was_killed_while_it_published_can_be_run_again(
+    rdstitch: Run, frames: list[Path], tmp_path: Path, published: int
+) -> None:
+    for frame in frames:
+        shutil.copy(frame, tmp_path)
+    output, report = tmp_path / "out.png", tmp_path / "why.html"
+    arguments = ("mosaic", tmp_path, "-o", output, "--report", report, "--overwrite", *FAST)
+    killed = finished(start(*arguments, program=_KILLED_WHILE_PUBLISHING.format(published=published)))
+    assert killed.status == -9
+    assert (output.exists(), report.exists()) == (published > 0, published > 1)
+    assert not (tmp_path / "out.png.json").exists()
+    assert rdstitch(*arguments).status == 0
+    record = json.loads((tmp_path / "out.png.json").read_text(encoding="utf-8"))
+    assert [image["name"] for image in record["images"]] == [frame.name for frame in frames]
+    names = {*(frame.name for frame in frames), "out.png", "out.png.json", "why.html"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+
+
+def test_the_next_run_gives_the_picture_of_a_killed_one_its_sidecar(
+    rdstitch: Run, frames: list[Path], tmp_path: Path
+) -> None:
+    for frame in frames:
+        shutil.copy(frame, tmp_path)
+    output = tmp_path / "out.png"
+    program = _KILLED_WHILE_PUBLISHING.format(published=1)
+    assert finished(start("mosaic", tmp_path, "-o", output, *FAST, program=program)).status == -9
+    made = output.read_bytes()
+    done = rdstitch("mosaic", tmp_path, "-o", tmp_path / "other.png", *FAST)
+    assert (done.status, "rdstitch wrote them: out.png" in done.line) == (0, True)
+    record = json.loads((tmp_path / "out.png.json").read_text(encoding="utf-8"))["output"]
+    assert (record["sha256"], output.read_bytes()) == (sha256(made).hexdigest(), made)
+    # A picture of the user's that has taken the name since is no output.
+    (tmp_path / "out.png.json").unlink()
+    output.unlink()
+    assert finished(start("mosaic", tmp_path, "-o", output, *FAST, program=program)).status == -9
+    shutil.copy(frames[0], output)
+    done = rdstitch("mosaic", tmp_path, "-o", output, "--overwrite", *FAST)
+    assert (done.status, "is one of the input pictures" in done.line) == (6, True)
+    assert output.read_bytes() == frames[0].read_bytes()
+
+
 def test_of_two_processes_one_succeeds(located: Path, tmp_path: Path) -> None:
     output = tmp_path / "out.dzi"
     options = (("--rotate", "0"), ("--rotate", "90"))

@@ -64,9 +64,8 @@ def calibrate(
         paths = options.resolve(inputs)
         report_page = Report(report, reporter, paths, given["overwrite"])
         with report_page.explaining():
-            registration = recipe(paths, wanted, every=every, progress=report_page.progress)
+            registration = recipe(paths, wanted, every=every, progress=report_page.progress, beside=report_page.stage)
         report_registration(registration, reporter, as_json=as_json)
         for line in (*describe_lens(registration.alignment), *export_note(registration.camera, output)):
             reporter.note(line)
-        report_page.write(registration)
         reporter.made(f"{output}: {registration.summary}")

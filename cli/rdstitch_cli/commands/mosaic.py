@@ -81,11 +81,10 @@ def mosaic(
             arrived = live.followed(inputs, stitch, reporter, output=output, every=every, idle=idle, refresh=refresh)
             paths = stack.enter_context(arrived)
         with report_page.explaining():
-            result = recipe(paths, output, stitch, every=every, progress=report_page.progress)
+            result = recipe(paths, output, stitch, every=every, progress=report_page.progress, beside=report_page.stage)
         if following and not as_json:
             live.print_result(result.registration, reporter, output)
         else:
             summarize(result, reporter, as_json=as_json)
-        report_page.write(result)
         if result.plan is None:
             reporter.made(result.summary)

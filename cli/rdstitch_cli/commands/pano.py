@@ -63,9 +63,13 @@ def pano(
         report_page = Report(report, reporter, paths, given["overwrite"], output)
         with report_page.explaining():
             result = recipe(
-                paths, output, stitch_options(reporter, **given), every=every, progress=report_page.progress
+                paths,
+                output,
+                stitch_options(reporter, **given),
+                every=every,
+                progress=report_page.progress,
+                beside=report_page.stage,
             )
         summarize(result, reporter, as_json=as_json)
-        report_page.write(result)
         if result.plan is None:
             reporter.made(result.summary)
