@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box, cut, intersection
+from rdstitch.compositing.field_solver import solve_fields
 from rdstitch.compositing.gain_compensation import estimate_gains
 from rdstitch.compositing.options import ExposureMethod
+from rdstitch.compositing.overlaps import overlapping_pairs
 from rdstitch.compositing.photometric import Exposure, bilinear_weights, full_scale
 from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.survey import Survey, SurveyTile
@@ -72,8 +73,8 @@ def estimate_exposure(
 class _Cells:
     """Cells that two pictures show: pictures (M,), measured pixels of the middle in either (M, 2), difference (M, C).
 
-    The difference is what the first picture is brighter by, log units; the overlap (N, N) of two pictures the share of
-    the smaller one.
+    The difference is what the first picture is brighter by, log units; the overlap (N, N), sparse, of two pictures the
+    share of the smaller one.
     """
 
     first: NDArray[np.intp]
@@ -81,37 +82,51 @@ class _Cells:
     point1: FloatArray
     point2: FloatArray
     difference: FloatArray
-    overlap: FloatArray
+    overlap: sparse.csr_array
 
 
 def _compare(survey: Survey, exposure: Exposure) -> _Cells | None:
     """Means of the cells of every overlap, clipped samples included: a burnt-out sky must not end in a step either."""
-    tiles = survey.tiles
-    found: list[tuple[Any, ...]] = []
-    overlap = np.zeros((len(tiles), len(tiles)))
-    for i, a in enumerate(tiles):
-        for j, b in enumerate(tiles[:i]):
-            if a is None or b is None or (box := intersection(a.box, b.box)) is None:
-                continue
-            seen = cut(a.inside, a.box, box) & cut(b.inside, b.box, box)
-            overlap[i, j] = overlap[j, i] = seen.sum() / min(a.inside.sum(), b.inside.sum())
-            side = max(2, round(max(*seen.shape, *a.inside.shape, *b.inside.shape) / _CELLS))
-            count, x, y = _cell_means(seen, box, side)
-            means = [_cell_values(tile, box, seen, side) for tile in (a, b)]
-            good = (count > side**2 / 2) & (np.minimum(*means).min(axis=-1) > _DARKEST)
-            if good.any():
-                values = [np.log(mean[good] + exposure.offset) for mean in means]
-                points = [survey.warps[k].source_points(x[good], y[good]) for k in (i, j)]
-                pair = (np.full(len(points[0]), k, dtype=np.intp) for k in (i, j))
-                found.append((*pair, *points, values[0] - values[1]))
-    if not found:
-        return None
-    cells = [np.concatenate([entry[k] for entry in found]) for k in range(5)]
-    good = np.flatnonzero(np.isfinite(cells[2]).all(axis=1) & np.isfinite(cells[3]).all(axis=1))
+    tiles, count = survey.tiles, len(survey.tiles)
+    pairs = overlapping_pairs([None if tile is None else tile.box for tile in tiles])
+    found: list[tuple[FloatArray, ...]] = []
+    shares = np.zeros(len(pairs))
+    for index, (a, b) in enumerate((tiles[i], tiles[j]) for i, j in pairs.tolist()):
+        assert a is not None
+        assert b is not None
+        box = intersection(a.box, b.box)
+        assert box is not None
+        seen = cut(a.inside, a.box, box) & cut(b.inside, b.box, box)
+        shares[index] = seen.sum() / min(a.inside.sum(), b.inside.sum())
+        side = max(2, round(max(*seen.shape, *a.inside.shape, *b.inside.shape) / _CELLS))
+        pixels, x, y = _cell_means(seen, box, side)
+        means = [_cell_values(tile, box, seen, side) for tile in (a, b)]
+        good = (pixels > side**2 / 2) & (np.minimum(*means).min(axis=-1) > _DARKEST)
+        values = [np.log(mean[good] + exposure.offset) for mean in means]
+        found.append((x[good], y[good], values[0] - values[1]))
+    which = np.repeat(np.arange(len(pairs)), [len(entry[0]) for entry in found])
     # Of thousands of overlaps, each needs fewer.
-    good = good[:: max(1, -(-len(good) // _MOST_CELLS))]
-    first, second, point1, point2, difference = (values[good] for values in cells)
-    return _Cells(first, second, point1, point2, difference, overlap)
+    few = np.s_[:: max(1, -(-len(which) // _MOST_CELLS))]
+    if not len(which):
+        return None
+    x, y, difference = (np.concatenate([entry[k] for entry in found])[few] for k in range(3))
+    ends = pairs[which[few]].T
+    points = [np.empty((len(x), 2)) for _ in ends]
+    for picture, shown in zip(ends, points, strict=True):
+        for k, chosen in _by_picture(picture):
+            shown[chosen] = survey.warps[k].source_points(x[chosen], y[chosen])
+    good = np.isfinite(points[0]).all(axis=1) & np.isfinite(points[1]).all(axis=1)
+    overlap = sparse.csr_array((shares, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    first, second = (end[good] for end in ends)
+    point1, point2 = (shown[good] for shown in points)
+    return _Cells(first, second, point1, point2, difference[good], sparse.csr_array(overlap + overlap.T))
+
+
+def _by_picture(pictures: NDArray[np.intp]) -> list[tuple[int, NDArray[np.intp]]]:
+    """Each picture of a list, and where it is there."""
+    order = np.argsort(pictures, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(pictures[order])) + 1)
+    return [(int(pictures[group[0]]), group) for group in groups if len(group)]
 
 
 def _cell_means(seen: NDArray[np.bool_], box: Box, side: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -142,7 +157,7 @@ def _brightness_around(cells: _Cells, log_gain: FloatArray) -> FloatArray:
     Neighbours count by the share that they have in common with the picture: what one picture alone is brighter by is to
     vanish.
     """
-    weight = cells.overlap + np.eye(len(log_gain))
+    weight = cells.overlap + sparse.eye_array(len(log_gain))
     return np.asarray(weight @ log_gain / weight.sum(axis=1)[:, None])
 
 
@@ -156,27 +171,26 @@ def _fit_fields(
     count, channels = exposure.log_gain.shape
     signed = ((1.0, cells.first, cells.point1), (-1.0, cells.second, cells.point2))
     left = cells.difference - exposure.log_gain[cells.first] + exposure.log_gain[cells.second]
-    columns, entries = np.empty((len(left), 8), dtype=np.intp), np.empty((len(left), 8))
-    for part, (sign, picture, points) in enumerate(signed):
-        place = np.s_[4 * part : 4 * part + 4]
-        for k in np.unique(picture):
-            chosen = picture == k
+    begin, parts = 4 * np.arange(len(left) + 1), []
+    for sign, picture, points in signed:
+        columns, entries = np.empty((len(left), 4), dtype=np.intp), np.empty((len(left), 4))
+        for k, chosen in _by_picture(picture):
             nodes, shares = bilinear_weights(cameras[k], points[chosen], _NODES)
-            columns[chosen, place], entries[chosen, place] = k * _NODES**2 + nodes, sign * shares
+            columns[chosen], entries[chosen] = k * _NODES**2 + nodes, sign * shares
             # Only the vignetting: there are no fields yet.
-            left[chosen] -= sign * exposure.smooth_part(int(k), cameras[k], points[chosen])
-    rows = np.repeat(np.arange(len(left)), 8)
-    design = sparse.csr_array((entries.ravel(), (rows, columns.ravel())), shape=(len(left), count * _NODES**2))
+            left[chosen] -= sign * exposure.smooth_part(k, cameras[k], points[chosen])
+        shape = (len(left), count * _NODES**2)
+        parts.append(sparse.csr_array((entries.ravel(), columns.ravel(), begin), shape=shape))
     even, near = _field_prior(sigma)
-    prior = sparse.csr_array(sparse.kron(sparse.eye_array(count), even + near))
     expected = sparse.kron(sparse.eye_array(count), near) @ np.repeat(wanted, _NODES**2, axis=0)
-    weight = np.ones(len(left))
+    prior = sparse.csr_array(sparse.kron(sparse.eye_array(count), even + near)), expected
+    weight, fields = np.ones(len(left)), np.zeros((count, _NODES, _NODES, channels))
     for _ in range(_ROUNDS):
-        weighted = (sparse.diags_array(weight / _CELL_SIGMA**2) @ design).T
-        solution = splu(sparse.csc_array(weighted @ design + prior)).solve(weighted @ left + expected)
-        residual = np.abs(left - design @ solution).mean(axis=1)
+        fields = solve_fields((parts[0], parts[1]), weight / _CELL_SIGMA**2, left, prior, fields)
+        values = fields.reshape(-1, channels)
+        residual = np.abs(left - parts[0] @ values - parts[1] @ values).mean(axis=1)
         weight = 1.0 / np.maximum(1.0, residual / (_HUBER * _CELL_SIGMA))
-    return np.asarray(solution.reshape(count, _NODES, _NODES, channels), dtype=np.float64)
+    return fields
 
 
 def _field_prior(sigma: float) -> tuple[sparse.csr_array, sparse.csr_array]:

@@ -17,6 +17,7 @@ from scipy.sparse.linalg import spsolve
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box, cut, intersection
+from rdstitch.compositing.overlaps import overlapping_pairs
 from rdstitch.compositing.photometric import Exposure, full_scale, no_exposure, squared_radius
 from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.survey import Survey, SurveyTile
@@ -99,19 +100,15 @@ class _Samples:
 
 def _collect(survey: Survey, cameras: Sequence[Camera]) -> _Samples | None:
     """Samples from every pair of overlapping pictures, evenly spread."""
-    pairs = [
-        (i, j, box)
-        for i, a in enumerate(survey.tiles)
-        if a is not None
-        for j, b in enumerate(survey.tiles[:i])
-        if b is not None and (box := intersection(a.box, b.box)) is not None
-    ]
+    pairs = overlapping_pairs([None if tile is None else tile.box for tile in survey.tiles]).tolist()
     limit = max(_FEWEST_SAMPLES, min(_SAMPLES_PER_PAIR, _LARGEST_SAMPLES // max(1, len(pairs))))
     found: list[tuple[Any, ...]] = []
-    for i, j, box in pairs:
+    for i, j in pairs:
         a, b = survey.tiles[i], survey.tiles[j]
         assert a is not None
         assert b is not None
+        box = intersection(a.box, b.box)
+        assert box is not None
         inside = cut(a.inside, a.box, box) & cut(b.inside, b.box, box)
         where = np.flatnonzero(inside)
         if len(where) < _FEWEST_SAMPLES:
