@@ -40,7 +40,8 @@ _OWN_SIGMA, _GAIN_SIGMA = 0.02, 0.3
 _RISE_SIGMA, _BEND_SIGMA = 0.1, 0.5
 # From here on, as a share of the full range, brightened samples are compressed instead of clipped.
 _KNEE = 0.75
-_MEDIAN_SAMPLES, _MEDIAN_ROUNDS = 2000, 4
+# Of a picture, and of all together.
+_MEDIAN_SAMPLES, _MOST_MEDIAN_SAMPLES, _MEDIAN_ROUNDS = 2000, 400_000, 4
 
 
 def estimate_exposure(
@@ -208,11 +209,12 @@ def _field_prior(sigma: float) -> tuple[sparse.csr_array, sparse.csr_array]:
 def _with_median_kept(exposure: Exposure, survey: Survey, cameras: Sequence[Camera]) -> Exposure:
     """Gains with a common factor that leaves the median of all samples where it was."""
     values, logs = [], []
+    limit = min(_MEDIAN_SAMPLES, max(1, _MOST_MEDIAN_SAMPLES // len(cameras)))
     for index, tile in enumerate(survey.tiles):
         if tile is None:
             continue
         where = np.flatnonzero(tile.inside)
-        where = where[:: max(1, len(where) // _MEDIAN_SAMPLES)]
+        where = where[:: max(1, len(where) // limit)]
         y, x = (axis.astype(np.float64) for axis in np.unravel_index(where, tile.inside.shape))
         points = survey.warps[index].source_points(x + tile.box[0], y + tile.box[1])
         pixels = tile.pixels.reshape(-1, tile.pixels.shape[2])[where].astype(np.float64)
