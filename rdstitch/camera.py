@@ -114,7 +114,9 @@ class Camera:
         if not all(math.isfinite(value) for value in numbers):
             raise ImpossibleCameraError(f"camera has a value that is not finite: {numbers}")
         if self.focal is not None and not is_focal_length(self.focal, self.image_size):
-            raise ImpossibleCameraError(f"no lens has a focal length of {self.focal:g} px for {width} x {height} px")
+            raise ImpossibleCameraError(
+                f"no lens of {width} x {height} pixels has a focal length of {self.focal:g} pixels"
+            )
         if self.focal_source is not None and self.focal_source not in FOCAL_LOG_STD:
             raise ArgumentError(f"unknown source of a focal length: {self.focal_source!r}")
         with np.errstate(all="ignore"):  # absurd values, from a damaged file, overflow

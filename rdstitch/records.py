@@ -190,14 +190,14 @@ class Record:
         """Width and height of a picture, pixels."""
         values = [item.side() for item in self.items()]
         if len(values) != 2:
-            self.expected("width and height in px")
+            self.expected("width and height in pixels")
         return values[0], values[1]
 
     def side(self) -> int:
         """Width or height of a picture, pixels."""
         value = self.integer(1)
         if value > _LARGEST_SIDE:
-            self.expected("a width or height in px")
+            self.expected("a width or height in pixels")
         return value
 
     def matrix(self) -> NDArray[np.float64]:

@@ -30,7 +30,7 @@ def read_lens(file: Path | None, reporter: Reporter) -> "Camera | None":
     if found.fit is not None:
         reporter.warn(
             f"{file}: λ = {found.camera.nearest_distortion:.6f} was fitted to the {found.kind} lens model, "
-            f"rms {found.fit.rms:.2f} px, at most {found.fit.largest:.2f} px"
+            f"rms {found.fit.rms:.2f} pixels, at most {found.fit.largest:.2f} pixels"
         )
     return found.camera
 
@@ -162,9 +162,11 @@ def show_plan(plan: "CompositePlan") -> None:
     """What compositing would take, to standard output."""
     (width, height), megapixels = plan.canvas_size, plan.canvas_size[0] * plan.canvas_size[1] / 1e6
     click.echo(f"pictures: {plan.pictures}")
-    click.echo(f"canvas: {width} x {height} px, {megapixels:.4g} megapixels")
+    click.echo(f"canvas: {width} x {height} pixels, {megapixels:.4g} megapixels")
     click.echo(f"output: {_amount(plan.output_bytes)} of samples, before compression")
-    click.echo(f"memory: about {_amount(plan.memory_bytes)} for {plan.workers} tiles of {plan.tile_size} px at a time")
+    click.echo(
+        f"memory: about {_amount(plan.memory_bytes)} for {plan.workers} tiles of side {plan.tile_size} at a time"
+    )
     click.echo(f"time: about {_duration(plan.seconds)} for compositing")
 
 
@@ -196,7 +198,7 @@ def warn_of(registration: "Registration", reporter: Reporter) -> None:
     for message in (*registration.failures, *registration.warnings, *registration.left_out):
         reporter.warn(str(message))
     used = int(alignment.used.sum())
-    reporter.log(f"{used} of {len(alignment.used)} pictures, rms {alignment.rms:.2f} px; {alignment.model_reason}")
+    reporter.log(f"{used} of {len(alignment.used)} pictures, rms {alignment.rms:.2f} pixels; {alignment.model_reason}")
 
 
 def _echo_json(content: Any) -> None:

@@ -182,11 +182,11 @@ def _reason(fits: Sequence[Fit], best: int, names: Sequence[str]) -> str:
         else "two pictures need no more",
     }[name]
     if len(names) == 1:
-        return f"{name}: as requested; it leaves an error of {own:.2f} px"
-    less = ", ".join(f"{fit.model.name} {fit.adjusted.sigma:.2f} px" for fit in fits[:best])
-    more = ", ".join(f"{fit.model.name} {fit.adjusted.sigma:.2f} px" for fit in fits[best + 1 :])
+        return f"{name}: as requested; it leaves an error of {own:.2f} pixels"
+    less = ", ".join(f"{fit.model.name} {fit.adjusted.sigma:.2f} pixels" for fit in fits[:best])
+    more = ", ".join(f"{fit.model.name} {fit.adjusted.sigma:.2f} pixels" for fit in fits[best + 1 :])
     return (
-        f"{name}: {what}; it leaves an error of {own:.2f} px"
+        f"{name}: {what}; it leaves an error of {own:.2f} pixels"
         + (f", less free models more ({less})" if less else "")
         + (f", more freedom gains too little ({more})" if more else "")
         + (", and free homographies could gain too little" if len(fits) < len(names) else "")

@@ -110,7 +110,7 @@ def judge_relief(found: Coherence, model: str, links: int) -> ReliefTest:
     links : int
         Pairs of pictures; what is as wide as the overlap of one pair alone, its homography and λ absorb.
     """
-    agreement = f"errors of neighbours agree (correlation {found.correlation:.2f}, {found.size:.1f} px in common)"
+    agreement = f"errors of neighbours agree (correlation {found.correlation:.2f}, {found.size:.1f} pixels in common)"
     relief = found.correlation > _COHERENT and found.relative_size > LARGE
     if model == "rotation":
         moved = "the camera moved between the pictures (parallax): what is near does not fit; turn about the lens"

@@ -47,11 +47,11 @@ def choose_motion(problem: Problem, names: Sequence[str], lenses: Sequence[BoolA
         return choose_model(problem, planar, lenses)
     turned = problem.fit(ROTATION, shared=trial.parameters.shared)
     if not planar:
-        reason = f"as requested; it leaves an error of {turned.adjusted.sigma:.2f} px"
+        reason = f"as requested; it leaves an error of {turned.adjusted.sigma:.2f} pixels"
         return _choice(problem, bound, turned, lenses, reason)
     explained = (
         "the camera turned on the spot, so that the pictures say nothing of the scene's shape (a plane seen from one "
-        f"place would look the same); it leaves an error of {turned.adjusted.sigma:.2f} px"
+        f"place would look the same); it leaves an error of {turned.adjusted.sigma:.2f} pixels"
     )
     sigma = math.hypot(turned.adjusted.sigma, EXACTNESS)
     as_good = sigma < _AS_GOOD * bound.noise
@@ -65,7 +65,7 @@ def choose_motion(problem: Problem, names: Sequence[str], lenses: Sequence[BoolA
     if fit_cost(bound, problem, over_plane.fit) < _cost(bound, problem, turned):
         return over_plane
     other = over_plane.fit
-    gains = f"{explained}, more freedom gains too little ({other.model.name} {other.adjusted.sigma:.2f} px)"
+    gains = f"{explained}, more freedom gains too little ({other.model.name} {other.adjusted.sigma:.2f} pixels)"
     return _choice(problem, bound, turned, lenses, gains)
 
 

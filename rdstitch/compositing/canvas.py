@@ -37,8 +37,8 @@ class Canvas:
     matrix : ndarray of shape (3, 3)
         Affine, from plane coordinates to canvas pixels (centre of the top-left pixel at (0, 0)).
     footprints : tuple of ndarray of shape (K, 2)
-        Outline of what is drawn of each picture, canvas px, clockwise. Of a canvas that goes all the way round, one of
-        its places; it may reach beyond the canvas.
+        Outline of what is drawn of each picture, canvas pixels, clockwise. Of a canvas that goes all the way round,
+        one of its places; it may reach beyond the canvas.
     projection : Projection
         What ``matrix`` is applied to: the places that it gives to directions.
     period : float or None
@@ -242,7 +242,7 @@ def _refuse_absurd(
         middle = np.median([outline.mean(axis=0) for outline in outlines], axis=0)
         farthest = int(np.argmax([np.linalg.norm(outline.mean(axis=0) - middle) for outline in outlines]))
         raise LimitError(
-            f"the canvas would have {extent[0]:.0f} x {extent[1]:.0f} px, over {_LARGEST_GROWTH:.0f} times all "
+            f"the canvas would have {extent[0]:.0f} x {extent[1]:.0f} pixels, over {_LARGEST_GROWTH:.0f} times all "
             f"pictures; {names[farthest]} lies farthest off: leave it out"
         )
 
@@ -251,4 +251,4 @@ def refuse_scale(cameras: Sequence[Camera], extent: FloatArray) -> None:
     """Refuse a scale that leaves nothing of the pictures, or blows them up beyond all sense."""
     pixels = sum(c.image_size[0] * c.image_size[1] for c in cameras)
     if float(extent.min()) < 1.0 or float(np.prod(extent)) > _LARGEST_ENLARGEMENT * pixels:
-        raise LimitError(f"the canvas would have {extent[0]:.3g} x {extent[1]:.3g} px; use a --scale nearer to 1")
+        raise LimitError(f"the canvas would have {extent[0]:.3g} x {extent[1]:.3g} pixels; use a --scale nearer to 1")

@@ -16,8 +16,8 @@ _POINTS_PER_SIDE = 64
 # Radians: the view up to which a plane shows it without much stretching, and the height up to which a cylinder does.
 _PLANE_VIEW = math.radians(90.0)
 _CYLINDER_HEIGHT = math.radians(70.0)
-# A full turn is a multiple of this many px, or of less than 1/256 of it, so that both ends of a canvas have the same
-# lattices, reduced pixels and bands.
+# A full turn is a multiple of this many pixels, or of less than 1/256 of it, so that both ends of a canvas have the
+# same lattices, reduced pixels and bands.
 _UNIT, _UNITS_PER_TURN = 32, 256
 
 

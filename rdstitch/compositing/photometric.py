@@ -70,7 +70,7 @@ class Exposure:
     def correct(self, index: int, geometry: Geometry, pixels: NDArray[Any]) -> NDArray[Any]:
         """Resampled pixels (h, w, C) of picture ``index``, as if all were exposed alike.
 
-        In the type of the pixels. Depends, px by px, on nothing but the px: every box gives the same, bit for bit.
+        In the type of the pixels. Each depends on nothing but itself: every box gives the same, bit for bit.
         """
         gain = np.exp(-self.log_gain[index]).astype(np.float32)
         if not (self.vignetting.any() or self.fields.size):

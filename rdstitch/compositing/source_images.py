@@ -182,7 +182,7 @@ class PictureReader:
         wanted = reduced_size(placed.camera.image_size, reduction)
         if (width, height) != wanted:
             expected = "{} x {}".format(*wanted)
-            raise InputError(f"picture {index + 1} has {width} x {height} px, but its camera has {expected}")
+            raise InputError(f"picture {index + 1} has {width} x {height} pixels, but its camera has {expected}")
         if self._samples is None:
             self._samples = picture.pixels.shape[2:], picture.pixels.dtype
         channels, dtype = self._samples

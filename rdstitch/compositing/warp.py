@@ -55,8 +55,8 @@ class Warp:
     ----------
     camera : Camera
     from_canvas : ndarray of shape (3, 3)
-        Canvas px, or the directions of a projection, to normalized undistorted coordinates; third coordinate positive
-        in front of the camera.
+        Canvas pixels, or the directions of a projection, to normalized undistorted coordinates; third coordinate
+        positive in front of the camera.
     box : (int, int, int, int)
         Where the picture can lie on the canvas: x0, y0, x1, y1, pixels, end exclusive.
     step : int

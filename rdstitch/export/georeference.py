@@ -1,7 +1,7 @@
 """Where the output lies on the Earth, by the positions in the pictures' EXIF: GeoTIFF tags, or a world file.
 
-The output is a plane seen straight from above, so that a similarity takes its px to UTM coordinates. It is fitted to
-the positions of the cameras, which are taken to be above the centres of their pictures.
+The output is a plane seen straight from above, so that a similarity takes its pixels to UTM coordinates. It is fitted
+to the positions of the cameras, which are taken to be above the centres of their pictures.
 """
 
 import math

@@ -87,7 +87,7 @@ class Source:
         return cache.digest((self.frame.picture.pixels, self.frame.picture.alpha))
 
     def reduction(self, megapixels: float | None) -> int:
-        """By how much it can be read smaller and has no fewer px than a picture that is halved to so many 10⁶ px."""
+        """By how much it can be read smaller and has no fewer pixels than a picture halved to so many 10⁶ pixels."""
         return 1 if megapixels is None else fitting_reduction(halving(self.camera.image_size, megapixels))
 
     def read(self, reduction: int = 1, *, keep: bool = False) -> Picture:
@@ -126,7 +126,7 @@ class Source:
         expected = self.camera.image_size
         if picture.pixels.shape[1::-1] != reduced_size(expected, reduction):
             now, before = ("{} x {}".format(*size) for size in (picture.metadata.size, expected))
-            raise InputError(f"{self.path}: has {now} px now, but had {before} before; run again")
+            raise InputError(f"{self.path}: has {now} pixels now, but had {before} before; run again")
         if self.mask is None:
             return picture
         alpha = block_minimum(read_mask(self.mask, expected), reduction)
@@ -250,7 +250,7 @@ def _fitted(camera: Camera, size: tuple[int, int]) -> Camera:
     ratio, own = size[0] / size[1], camera.image_size[0] / camera.image_size[1]
     if not any(abs(ratio / shape - 1.0) < 0.02 for shape in (own, 1.0 / own)):
         raise ArgumentError(
-            f"the camera file is for {camera.image_size[0]} x {camera.image_size[1]} px; "
-            f"a picture of {size[0]} x {size[1]} px was cropped or comes from another camera"
+            f"the camera file is for {camera.image_size[0]} x {camera.image_size[1]} pixels; "
+            f"a picture of {size[0]} x {size[1]} pixels was cropped or comes from another camera"
         )
     return camera.resized(size)

@@ -48,7 +48,7 @@ def _encoded(layout: Layout, samples: NDArray[np.generic], alpha: NDArray[np.uin
     ]
     done, data = cv2.imencode(".jpg", picture, options)
     if not done:
-        raise LimitError(f"{layout.size[0]} x {layout.size[1]} px cannot be encoded as JPEG; write a .tif")
+        raise LimitError(f"{layout.size[0]} x {layout.size[1]} pixels cannot be encoded as JPEG; write a .tif")
     return np.asarray(data, dtype=np.uint8).tobytes()
 
 

@@ -57,7 +57,7 @@ class Layout:
         """Check the values."""
         if min(self.size) < 1 or self.channels < 1:
             raise ArgumentError(
-                f"a picture of {self.size[0]} x {self.size[1]} px and {self.channels} channels is empty"
+                f"a picture of {self.size[0]} x {self.size[1]} pixels and {self.channels} channels is empty"
             )
         if self.dtype not in (np.uint8, np.uint16, np.float32):
             raise ArgumentError(f"pixels must be uint8, uint16 or float32, not {self.dtype}")

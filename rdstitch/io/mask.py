@@ -31,7 +31,7 @@ def check_mask(path: str | Path, picture: str | Path, size: tuple[int, int]) -> 
     # Sizes are whole pixels, so that the shape may differ by one pixel of the larger.
     if abs(width * h - height * w) > max(width, height, w, h):
         raise InputError(
-            f"{path}: a mask of {w} x {h} px does not fit on {picture}, which has {width} x {height} px; "
+            f"{path}: a mask of {w} x {h} pixels does not fit on {picture}, which has {width} x {height} pixels; "
             "a mask has its picture's size, or another size of the same shape"
         )
 

@@ -72,8 +72,8 @@ def read_image(path: str | Path, reduction: int = 1) -> Picture:
     ----------
     path
     reduction : int
-        Blocks of so many px a side become one px, the last ones of what is there of them. The metadata stay those of
-        the whole picture. JPEG files are decoded at 1/2, 1/4 or 1/8 of the size, in a fraction of time and memory.
+        Blocks of so many pixels a side become one pixel, the last ones of what is there of them. The metadata stay
+        those of the whole picture. JPEG files are decoded at 1/2, 1/4 or 1/8 of the size, in a fraction of the time.
 
     Raises
     ------

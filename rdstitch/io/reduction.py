@@ -1,4 +1,4 @@
-"""Pictures made smaller by a whole factor, such that px of the small one stand for whole blocks of the large one."""
+"""Pictures made smaller by a whole factor: a pixel of the small one stands for a whole block of the large one."""
 
 from typing import Any
 
@@ -40,7 +40,7 @@ def block_minimum(alpha: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
 
 
 def halved(strip: NDArray[Any], transparent: bool) -> NDArray[Any]:
-    """Mean of 2 x 2 px of samples (h, w, C), weighted by the alpha that the last channel is where it is transparent.
+    """Mean of 2 x 2 pixels (h, w, C), weighted by the alpha that the last channel is where it is transparent.
 
     An odd border repeats itself. Halves are rounded up, in every strip alike.
     """

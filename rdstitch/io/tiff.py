@@ -118,7 +118,7 @@ def _short_strips(strips: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
 
 
 def _has_predictor(dtype: np.dtype[Any]) -> bool:
-    """Whether differences of neighbouring px are stored; what is usual for floating point, few programs can read."""
+    """Whether differences of neighbours are stored; what is usual for floating point, few programs can read."""
     return dtype.kind == "u"
 
 

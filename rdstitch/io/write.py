@@ -184,7 +184,7 @@ def check_size(path: str | Path, size: tuple[int, int]) -> None:
     limit = SIDE_LIMITS.get(suffix)
     if limit is not None and max(size) > limit:
         raise LimitError(
-            f"{path}: {size[0]} x {size[1]} px is more than {suffix[1:]} can hold ({limit} px a side); "
+            f"{path}: {size[0]} x {size[1]} pixels is more than {suffix[1:]} can hold ({limit} pixels a side); "
             "write a .tif, or use a smaller --scale"
         )
 

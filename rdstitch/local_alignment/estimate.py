@@ -102,7 +102,7 @@ def align_locally(
     cells = _CELLS if choice == "auto" else choice
     held_out = np.arange(len(placed)) % _HELD_OUT == 0
     stiffness, before, after = _choose(placed.take(~held_out), placed.take(held_out), cameras, cells)
-    text = f"matches held out of the fit: {before.median:.2f} px apart without, {after.median:.2f} px with it"
+    text = f"matches held out of the fit: {before.median:.2f} pixels apart without, {after.median:.2f} pixels with it"
     if choice == "auto" and after.median > (1.0 - _WORTHWHILE) * before.median:
         return LocalAlignment((), f"not worth while; {text}", 0, before, after)
     fields = picture_fields(fit_fields(placed, cameras, stiffness), cameras, homographies, scale)

@@ -262,6 +262,6 @@ def _resized(camera: Camera, source: Source) -> Camera:
     # Sizes are whole pixels, so that the shape may differ by one pixel of the picture.
     if abs(w1 * h2 - h1 * w2) > max(w1, h1):
         raise InputError(
-            f"{source.path}: has {w2} x {h2} px, which is not the shape of the {w1} x {h1} px that were registered"
+            f"{source.path}: has {w2} x {h2} pixels, which is not the shape of the {w1} x {h1} that were registered"
         )
     return camera.resized((w2, h2))

@@ -39,7 +39,7 @@ def viewed_pictures(result: StitchResult) -> list[ViewedPicture]:
             ("features", str(registration.keypoints[index])),
             ("matches", str(sum(fit.inliers for fit in links))),
         ]
-        partners = [f"{names[fit.image1 + fit.image2 - index]} ({fit.inliers}, {fit.rms:.2f} px)" for fit in links]
+        partners = [f"{names[fit.image1 + fit.image2 - index]} ({fit.inliers}, {fit.rms:.2f} pixels)" for fit in links]
         facts.append(("pairs", ", ".join(partners)))
         if alignment.poses is not None:
             poses = alignment.poses

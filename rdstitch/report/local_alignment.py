@@ -32,11 +32,11 @@ def local_alignment(result: StitchResult) -> str:
     hidden = f" {len(names) - len(order)} pictures with smaller ones are not drawn." if len(order) < len(names) else ""
     spread = ""
     if local.before is not None and local.after is not None:
-        spread = f" (95 %: {local.before.percentile95:.2f} and {local.after.percentile95:.2f} px)"
+        spread = f" (95 %: {local.before.percentile95:.2f} and {local.after.percentile95:.2f} pixels)"
     return section(
         title,
         f"The ground is not quite a plane, so that each picture's content is moved a little; {local.reason}{spread}. "
-        f"The longest arrow of all stands for {largest:.1f} px.{hidden}",
+        f"The longest arrow of all stands for {largest:.1f} pixels.{hidden}",
         drawing(_WIDTH, -(-len(order) // _COLUMNS) * row, parts, "displacement of each picture"),
     )
 
@@ -54,7 +54,7 @@ def _picture(field: DisplacementField, name: str, x: float, y: float, side: floa
     arrows = [
         element(
             "line",
-            element("title", f"{np.linalg.norm(by):.2f} px"),
+            element("title", f"{np.linalg.norm(by):.2f} pixels"),
             x1=float(x + p[0] * scale),
             y1=float(y + p[1] * scale),
             x2=float(x + (p[0] + tip[0]) * scale),
@@ -65,4 +65,4 @@ def _picture(field: DisplacementField, name: str, x: float, y: float, side: floa
         + element("circle", cx=float(x + p[0] * scale), cy=float(y + p[1] * scale), r=1.2, fill=BLUE)
         for p, tip, by in zip(places, tips, moved, strict=True)
     ]
-    return frame + "".join(arrows) + label(x, y + height * scale + 13.0, f"{name}: up to {field.largest:.1f} px")
+    return frame + "".join(arrows) + label(x, y + height * scale + 13.0, f"{name}: up to {field.largest:.1f} pixels")

@@ -31,7 +31,7 @@ def match_graph(registration: Registration) -> str:
         parts.append(
             element(
                 "line",
-                element("title", f"{escape(names)}: {fit.inliers} of {fit.count} matches, {fit.rms:.2f} px"),
+                element("title", f"{escape(names)}: {fit.inliers} of {fit.count} matches, {fit.rms:.2f} pixels"),
                 x1=float(x1),
                 y1=float(y1),
                 x2=float(x2),

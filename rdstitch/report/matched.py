@@ -60,7 +60,8 @@ def _pair(registration: Registration, title: str, fit: LinkFit) -> str:
     parts += _lines(ends[0][inliers], ends[1][inliers], GREEN, 0.6)
     tall = max(height * scale for (_, height), scale in zip(sizes, scales, strict=True))
     names = " and ".join(source.name for source in sources)
-    text = f"{title}: {names}; {fit.inliers} of {int(inliers.sum())} inliers agree with the whole, rms {fit.rms:.2f} px"
+    agree = f"{fit.inliers} of {int(inliers.sum())} inliers agree with the whole, rms {fit.rms:.2f} pixels"
+    text = f"{title}: {names}; {agree}"
     return element("h3", escape(text)) + drawing(2 * _WIDTH + _GAP, tall, parts, text)
 
 

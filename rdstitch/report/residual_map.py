@@ -41,7 +41,7 @@ def residual_map(registration: Registration) -> str:
         y, x = divmod(int(index), _COLUMNS)
         shade = 255 - round(150 * rms[index] / max(darkest, 1e-9))
         tip = mean[index] / longest * _ARROW * side
-        title = f"{count[index]} matches, rms {rms[index]:.2f} px, mean {np.linalg.norm(mean[index]):.2f} px"
+        title = f"{count[index]} matches, rms {rms[index]:.2f} pixels, mean {np.linalg.norm(mean[index]):.2f} pixels"
         box = {"x": x * side, "y": y * side, "width": side, "height": side}
         parts.append(element("rect", element("title", title), fill=f"rgb({shade},{shade},{shade})", **box))
         start = np.array([(x + 0.5) * side, (y + 0.5) * side])
@@ -62,7 +62,7 @@ def residual_map(registration: Registration) -> str:
         label(
             0.0,
             tall + 16,
-            f"darkest cell: rms {darkest:.2f} px; longest arrow: mean of {longest:.2f} px in that direction",
+            f"darkest cell: rms {darkest:.2f} pixels; longest arrow: mean of {longest:.2f} pixels in that direction",
         )
     )
     return section(

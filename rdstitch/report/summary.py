@@ -22,7 +22,7 @@ def summary(registration: Registration, result: StitchResult | None) -> str:
         ("λ per px²", f"{camera.distortion_px:.4e}"),
         ("pictures", f"{int(alignment.used.sum())} of {len(alignment.used) + _unread(registration)}"),
         ("pairs", f"{sum(fit.used for fit in alignment.links)} used of {len(registration.pairs)} compared"),
-        ("error", f"{alignment.rms:.3f} px rms of all inliers"),
+        ("error", f"{alignment.rms:.3f} pixels rms of all inliers"),
         ("motion", _motion(alignment.model, alignment.model_reason)),
         ("scene", alignment.relief.explanation),
         ("reference", registration.sources[alignment.reference].name),
@@ -30,9 +30,9 @@ def summary(registration: Registration, result: StitchResult | None) -> str:
     if alignment.tilt is not None:
         rows.append(("tilt ψ, θ", "{:.2f}°, {:.2f}°".format(*np.degrees(alignment.tilt))))
     if camera.focal is not None:
-        rows.append(("focal length", f"{camera.focal:.1f} px ({camera.focal_source})"))
+        rows.append(("focal length", f"{camera.focal:.1f} pixels ({camera.focal_source})"))
     if result is not None:
-        rows.append(("output", "{} x {} px".format(*result.canvas.size)))
+        rows.append(("output", "{} x {} pixels".format(*result.canvas.size)))
     return section("Summary", "", _verdict(registration), table((), rows))
 
 

@@ -37,7 +37,7 @@ def view_directions(registration: Registration) -> str:
         fill = RED if index == alignment.reference else GREY
         parts.append(element("circle", element("title", registration.sources[index].name), cx=x, cy=y, r=3, fill=fill))
     across, down = (math.degrees(angle) for angle in view.extent)
-    focal = "" if registration.camera.focal is None else f" The focal length is {registration.camera.focal:.1f} px."
+    focal = "" if registration.camera.focal is None else f" The focal length is {registration.camera.focal:.1f} pixels."
     return section(
         "Directions",
         f"The camera turned on the spot. Its {len(used)} pictures show {across:.0f} x {down:.0f} degrees around it; "

@@ -239,6 +239,6 @@ def rms_of(errors: FloatArray, threshold: float) -> FloatArray:
 
 def _explained(models: list[PairModel], chosen: int, rms: FloatArray) -> str:
     """One clause on why this model and not another."""
-    listed = ", ".join(f"{model.name} {value:.2f} px" for model, value in zip(models, rms, strict=True))
+    listed = ", ".join(f"{model.name} {value:.2f} pixels" for model, value in zip(models, rms, strict=True))
     why = "no model with less freedom" if chosen == len(models) - 1 else "the least free model that"
     return f"{models[chosen].name}: {why} explains the data (rms {listed})"

@@ -27,9 +27,9 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
 
     ``lambda`` is for half the image diagonal. ``images[].to_plane`` maps undistorted, half-diagonal-normalized
     coordinates of a picture to the plane, or to directions where the camera turned on the spot,
-    ``output.plane_to_output`` places of the plane, or of the projection, to px of the output; ``images[].to_output`` is
-    the product, on a plane; ``pairs[].homography`` maps coordinates of the first picture to those of the second. All
-    fields are described in docs/sidecar.md.
+    ``output.plane_to_output`` places of the plane, or of the projection, to pixels of the output;
+    ``images[].to_output`` is the product, on a plane; ``pairs[].homography`` maps coordinates of the first picture
+    to those of the second. All fields are described in docs/sidecar.md.
     """
     registration, alignment = result.registration, result.registration.alignment
     camera = registration.camera

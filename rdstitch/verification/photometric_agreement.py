@@ -82,7 +82,7 @@ class PlacedPicture:
         return cls(grey, camera.resized((grey.shape[1], grey.shape[0])), homography)
 
     def sampled(self, plane: Callable[[FloatArray], FloatArray], box: Box) -> Grey:
-        """The picture where ``plane`` (M, 2) to (M, 2) puts the px x, y of a box on the plane; NaN where it is not."""
+        """The picture where ``plane``, (M, 2) to (M, 2), puts pixels of the plane; NaN outside the picture."""
 
         def places(x: FloatArray, y: FloatArray) -> FloatArray:
             grid = np.stack(np.broadcast_arrays(x, y), axis=-1)

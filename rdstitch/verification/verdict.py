@@ -119,7 +119,7 @@ def _error_of_the_whole(alignment: Alignment, threshold: float, checked: Sequenc
     rms = alignment.rms
     if rms <= _LARGEST_RMS * threshold:
         return []
-    text = f"the pictures disagree by {rms:.1f} px, more than the threshold of {threshold:g} px"
+    text = f"the pictures disagree by {rms:.1f} pixels, more than the threshold of {threshold:g} pixels"
     rough = alignment.relief.found and rms <= _LARGEST_RMS_OF_RELIEF * threshold and _look_alike(checked)
     return [Message(f"{text}: the ground is rough", code="relief") if rough else _failure(text)]
 

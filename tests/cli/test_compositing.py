@@ -114,7 +114,7 @@ def test_dry_run_reports_and_writes_nothing(rdstitch: Run, frames: list[Path], t
     assert told["pictures"] == "3"
     assert rdstitch("mosaic", *frames, "-o", tmp_path / "a.png", *FAST).status == 0
     height, width = read_image(tmp_path / "a.png").pixels.shape[:2]
-    assert told["canvas"].startswith(f"{width} x {height} px")
+    assert told["canvas"].startswith(f"{width} x {height} pixels")
 
 
 def test_file_and_memory_hold_the_same_picture(frames: list[Path], tmp_path: Path) -> None:

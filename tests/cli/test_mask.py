@@ -98,7 +98,7 @@ def test_a_mask_that_does_not_fit_is_named(rdstitch: Run, frames: list[Path], tm
     assert cv2.imwrite(str(mask), np.full((40, 30), 255, np.uint8))
     done = rdstitch(*arguments)
     assert done.status == 3
-    assert f"{mask}: a mask of 30 x 40 px does not fit" in done.line
+    assert f"{mask}: a mask of 30 x 40 pixels does not fit" in done.line
     mask.write_bytes(b"no picture")
     assert rdstitch(*arguments).status == 3
 

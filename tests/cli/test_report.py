@@ -108,7 +108,7 @@ def test_displacements_are_drawn_for_each_picture(frames: list[Path]) -> None:
     options = StitchOptions(workers=1, local_alignment=6)
     result = pano(frames[:2], options=options)
     drawn = report_page(result).split("<h2>Local alignment</h2>")[1].split("</section>")[0]
-    assert all(f"{frame.name}: up to {field.largest:.1f} px" in drawn
+    assert all(f"{frame.name}: up to {field.largest:.1f} pixels" in drawn
                for frame, field in zip(frames, result.local_alignment.fields, strict=False))  # fmt: skip
     assert drawn.count("<rect") == 2
     assert "matches held out of the fit" in drawn
@@ -122,7 +122,7 @@ def test_the_numbers_are_those_of_the_result(frames: list[Path]) -> None:
     (fit,) = result.registration.alignment.links
     assert f"{fit.inliers} of {result.registration.pairs[0].relation.inliers.sum()} inliers" in page.text
     assert f"{result.distortion:.6f} ± {result.registration.alignment.distortion_std:.6f}" in page.text
-    assert "{} x {} px".format(*result.canvas.size) in page.text
+    assert "{} x {} pixels".format(*result.canvas.size) in page.text
     assert "They were not measured." in page.text
     # One pair is best and worst.
     assert "The pair: " in page.text

@@ -154,7 +154,7 @@ def test_a_failed_prefetch_raises_where_the_picture_is_read() -> None:
     decoded_images.frames[1] = decoded_images.frames[1][:50]
     cache.prefetch([1, 2])
     _until(lambda: decoded_images.reads[2] == 1)
-    with pytest.raises(InputError, match="picture 2 has 200 x 50 px"):
+    with pytest.raises(InputError, match="picture 2 has 200 x 50 pixels"):
         cache.get(1, WHOLE)
 
 

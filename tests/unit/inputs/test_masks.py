@@ -64,7 +64,7 @@ def test_a_black_mask_leaves_nothing_and_a_white_one_all(tmp_path: Path) -> None
 @pytest.mark.parametrize("shape", [(40, 30), (30, 42), (15, 22), (300, 420)])
 def test_a_mask_of_another_shape_is_named(tmp_path: Path, shape: tuple[int, int]) -> None:
     path = save(tmp_path / "a.png", np.zeros(shape, np.uint8))
-    with pytest.raises(InputError, match=rf"a\.png: a mask of {shape[1]} x {shape[0]} px does not fit on .*b\.png"):
+    with pytest.raises(InputError, match=rf"a\.png: a mask of {shape[1]} x {shape[0]} pixels does not fit on .*b\.png"):
         check_mask(path, tmp_path / "b.png", SIZE)
 
 
