@@ -58,7 +58,7 @@ def test_the_residual_of_a_foreign_lens_is_reported(rdstitch: Run, frames: list[
     arguments = ("undistort", frames[0], "--camera", file, "-o", tmp_path / "straight", "--overwrite")
     told = rdstitch(*arguments)
     assert told.status == 0
-    assert re.search(r"OpenDroneMap.* rms \d+\.\d\d px", told.line)
+    assert re.search(r"OpenDroneMap.* rms \d+\.\d\d pixels", told.line)
     assert rdstitch(*arguments, "-q").err == ""
 
 

@@ -65,4 +65,5 @@ def undistort(
             progress=reporter,
         )
         reporter.finish()
-        reporter.made(f"{output}: {len(written)} pictures undistorted")
+        noun = "picture" if len(written) == 1 else "pictures"
+        reporter.made(f"{output}: {len(written)} {noun} undistorted")
