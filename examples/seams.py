@@ -1,7 +1,7 @@
 """Before and after: python -m examples.seams [PICTURE …] -o FILE [--at LEFT TOP].
 
 Stitches pictures (by default the bundled pair), once plain, without exposure, seams and blending, and once with the
-defaults, and writes one place of both, by default that where they differ most, plain on the left, px for px.
+defaults, and writes one place of both, by default that where they differ most, plain on the left, pixel for pixel.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from rdstitch.pipeline import StitchOptions, mosaic
 
 BUNDLED = sorted((Path(__file__).parent / "data" / "garfield_red").glob("*.jpg"))
 PLAIN = CompositeOptions(exposure="none", seam="none", blend="none")
-SIDE, GAP = 320, 8  # px
+SIDE, GAP = 320, 8  # pixels
 
 
 def stitched(pictures: list[Path], composite: CompositeOptions) -> NDArray[Any]:
@@ -41,19 +41,36 @@ def largest_difference(first: NDArray[Any], second: NDArray[Any]) -> tuple[int, 
     return int(top), int(left)
 
 
-def main() -> None:
-    """Read the command line, stitch twice, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def arguments(description: str | None) -> argparse.Namespace:
+    """Read pictures, output and place from the command line."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pictures", nargs="*", type=Path, default=BUNDLED)
     parser.add_argument("-o", "--output", type=Path, required=True)
-    parser.add_argument("--at", nargs=2, type=int, metavar=("LEFT", "TOP"), help="place, px of the output")
-    given = parser.parse_args()
-    plain, default = (stitched(given.pictures, options) for options in (PLAIN, CompositeOptions()))
-    top, left = given.at[::-1] if given.at else largest_difference(plain, default)
-    crops = [picture[top : top + SIDE, left : left + SIDE, :-1] for picture in (plain, default)]
-    gap = np.full((SIDE, GAP, crops[0].shape[2]), np.iinfo(plain.dtype).max, plain.dtype)
+    parser.add_argument("--at", nargs=2, type=int, metavar=("LEFT", "TOP"), help="place, pixels of the output")
+    return parser.parse_args()
+
+
+def write_beside(given: argparse.Namespace, first: NDArray[Any], second: NDArray[Any]) -> tuple[int, int]:
+    """Write the same place of two mosaics side by side: the one given, or where they differ most.
+
+    Returns
+    -------
+    (int, int)
+        Left and top of the place, pixels.
+    """
+    top, left = given.at[::-1] if given.at else largest_difference(first, second)
+    crops = [picture[top : top + SIDE, left : left + SIDE, :-1] for picture in (first, second)]
+    gap = np.full((SIDE, GAP, crops[0].shape[2]), np.iinfo(first.dtype).max, first.dtype)
     write_image(given.output, np.concatenate([crops[0], gap, crops[1]], axis=1), quality=85)
-    print(f"px {left}, {top} of {plain.shape[1]} x {plain.shape[0]}")
+    return left, top
+
+
+def main() -> None:
+    """Read the command line, stitch twice, write."""
+    given = arguments(__doc__)
+    plain, default = (stitched(given.pictures, options) for options in (PLAIN, CompositeOptions()))
+    left, top = write_beside(given, plain, default)
+    print(f"pixel {left}, {top} of {plain.shape[1]} x {plain.shape[0]}")
 
 
 if __name__ == "__main__":
