@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rdstitch.camera_files import load_camera, save_camera
     from rdstitch.compositing import CompositeOptions
     from rdstitch.doctor import Examination, examine
+    from rdstitch.errors import RdstitchError
     from rdstitch.features import FeatureOptions
     from rdstitch.messages import Message
     from rdstitch.pipeline import (
@@ -43,6 +44,7 @@ _HOMES = {
     "FeatureOptions": "rdstitch.features",
     "Message": "rdstitch.messages",
     "RadialHomography": "rdstitch.radial_homography",
+    "RdstitchError": "rdstitch.errors",
     "Recomposition": "rdstitch.pipeline",
     "Registration": "rdstitch.pipeline",
     "StitchOptions": "rdstitch.pipeline",
@@ -72,6 +74,7 @@ __all__ = [
     "FeatureOptions",
     "Message",
     "RadialHomography",
+    "RdstitchError",
     "Recomposition",
     "Registration",
     "StitchOptions",

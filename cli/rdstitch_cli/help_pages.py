@@ -1,6 +1,9 @@
 """Help pages: options in groups, those that matter first on top; ``rdstitch help``."""
 
+import re
 from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
 
 import click
 
@@ -92,18 +95,32 @@ def place_of(name: str) -> tuple[str, int]:
     return _OTHERS, 0
 
 
-@click.command("help", epilog="\b\nExamples:\n  rdstitch help\n  rdstitch help pano\n")
-@click.argument("commands", nargs=-1, metavar="[COMMAND]")
+@click.command("help", epilog="\b\nExamples:\n  rdstitch help\n  rdstitch help pano\n  rdstitch help no-overlap\n")
+@click.argument("topics", nargs=-1, metavar="[COMMAND|CODE]")
 @click.pass_context
-def help_command(context: click.Context, commands: Sequence[str]) -> None:
-    """Show the help of a command, or this page."""
+def help_command(context: click.Context, topics: Sequence[str]) -> None:
+    """Show the help of a command, what the code of a message means, or this page."""
     root = context.find_root()
     group = root.command
     assert isinstance(group, click.Group)
-    if not commands:
+    if not topics:
         click.echo(group.get_help(root))
         return
-    command = group.get_command(root, commands[0])
-    if command is None or len(commands) > 1:
-        raise click.UsageError(f"there is no command {' '.join(commands)!r}", root)
-    click.echo(command.get_help(click.Context(command, info_name=commands[0], parent=root)))
+    name = " ".join(topics)
+    if command := group.get_command(root, name):
+        click.echo(command.get_help(click.Context(command, info_name=name, parent=root)))
+    elif paragraph := troubleshooting().get(name.strip("[]")):
+        click.echo(paragraph)
+    else:
+        raise click.UsageError(f"there is no command and no message code {name!r}", root)
+
+
+def troubleshooting() -> dict[str, str]:
+    """What to do about each message, by its code: the paragraphs of docs/troubleshooting.md."""
+    page = resources.files("rdstitch_cli") / "troubleshooting.md"
+    if not page.is_file():  # a checkout
+        page = Path(__file__).parents[2] / "docs" / "troubleshooting.md"
+    text = re.sub(r"\[([a-z-]+)\]\(#\1\)", r"`rdstitch help \1`", page.read_text(encoding="utf-8"))
+    sections = re.split(r"^##+ ", text, flags=re.MULTILINE)[1:]
+    titles = [section.partition("\n") for section in sections]
+    return {title: body.strip() for title, _, body in titles if body.strip() and " " not in title}

@@ -48,6 +48,7 @@ Examples:
   rdstitch pano left.jpg right.jpg -o pano.jpg
   rdstitch mosaic flight/ -o field.tif --config survey.toml
   rdstitch calibrate wall/ -o camera.yml
+  rdstitch help left-out        what a message that ends with [left-out] means
 """
 
 _UNEXPECTED, _USAGE, _INTERRUPTED, _BROKEN_PIPE = 1, 2, 130, 141
@@ -131,8 +132,8 @@ def run(arguments: list[str]) -> int:
     except click.ClickException as error:
         return _complain(_usage(error), error.exit_code, debug)
     except RdstitchError as error:
-        code = f" [{error.code}]" if error.code else ""
-        return _complain(f"{error}{code}", error.exit_status, debug)
+        hint = f"; see 'rdstitch help {error.code}'" if error.code else ""
+        return _complain(f"{error}{hint}", error.exit_status, debug)
     except MemoryError:
         return _complain(_OUT_OF_MEMORY, 7, debug)
     except Exception as error:  # noqa: BLE001 - the last line of defence: no traceback for users

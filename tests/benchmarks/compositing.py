@@ -105,7 +105,7 @@ def composite_files(paths: list[Path], homographies: FloatArray, output: Path, *
 
 def whole_run(paths: list[Path], output: Path) -> str:
     """The command, from files to file."""
-    command = [sys.executable, "-m", "rdstitch_cli.main", "mosaic", *map(str, paths), "-o", str(output), "--overwrite"]
+    command = [sys.executable, "-m", "rdstitch_cli", "mosaic", *map(str, paths), "-o", str(output), "--overwrite"]
     program = "import sys; from rdstitch_cli.main import main; sys.argv[0] = 'rdstitch'; main()"
     done = subprocess.run([sys.executable, "-c", program, *command[3:]], capture_output=True, text=True, check=False)
     return f"λ {done.stdout.strip()}" if done.returncode == 0 else f"status {done.returncode}: {done.stderr.strip()}"

@@ -92,6 +92,8 @@ def test_help_is_a_command_too(rdstitch: Run) -> None:
     assert rdstitch("help").out == rdstitch("--help").out
     assert rdstitch("help", "pano").out == rdstitch("pano", "--help").out
     assert rdstitch("help", "stitch").status == 2
+    assert rdstitch("help", "no-overlap").out == rdstitch("help", "[no-overlap]").out
+    assert "`rdstitch help left-out`" in rdstitch("help", "not-reliable").out
     assert rdstitch("-V").out == rdstitch("--version").out
 
 

@@ -3,6 +3,8 @@
 import re
 from pathlib import Path
 
+from rdstitch_cli.help_pages import troubleshooting
+
 from rdstitch import errors
 from rdstitch.messages import Message, left_out
 from rdstitch.verification.verdict import RefusedError
@@ -17,6 +19,7 @@ def test_every_code_has_a_paragraph_and_every_paragraph_a_code() -> None:
     of_messages = {code for text in sources for code in re.findall(r'code ?= ?"([a-z-]+)"', text)}
     assert {RefusedError.code, "relief", "lambda-not-observable"} <= of_messages
     assert sorted(headings) == sorted((of_errors | of_messages) - {""})
+    assert sorted(troubleshooting()) == sorted(headings)
 
 
 def test_codes_end_the_line() -> None:
