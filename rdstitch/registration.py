@@ -63,6 +63,11 @@ class Registration:
         return of_severity(self.messages, "failure")
 
     @property
+    def notes(self) -> tuple[Message, ...]:
+        """How the result was made, where the user would not expect it."""
+        return of_severity(self.messages, "note")
+
+    @property
     def warnings(self) -> tuple[Message, ...]:
         """What the user should look at although there is a result."""
         return of_severity(self.messages, "warning")

@@ -51,7 +51,7 @@ def followed(
     reporter: Reporter,
     *,
     output: Path,
-    every: int,
+    every: int | None,
     idle: float | None,
     refresh: float | None = None,
 ) -> Iterator[list["Named"]]:
@@ -77,7 +77,7 @@ def followed(
         check_output(f"{output}.json", stitch.overwrite, suffixes=())
     preview = output.with_suffix(".preview.jpg") if refresh else None
     with temporary_folder() as folder:
-        arrivals = Arrivals(str(inputs[0]), frames_folder=lambda: folder, names=sys.stdin, every=every, idle=idle)
+        arrivals = Arrivals(str(inputs[0]), frames_folder=lambda: folder, names=sys.stdin, every=every or 1, idle=idle)
         try:
             for frame in follow_frames(arrivals, stitch, preview=preview, refresh=refresh or 0.0):
                 print_line(frame.as_dict())

@@ -57,14 +57,20 @@ inputs = click.argument(
     metavar="INPUT...",
 )
 
-every = click.option(
-    "--every",
-    type=click.IntRange(1),
-    default=1,
-    show_default=True,
-    metavar="N",
-    help="Of a video or ROS bag, every N-th frame.",
-)
+
+def _every(otherwise: int | None) -> Decorator[Any]:
+    """The option, and what a command takes without it: None for "auto"."""
+    return click.option(
+        "--every",
+        type=WordOrNumber(("auto",), 1, 1_000_000),
+        callback=lambda _context, _option, value: {None: otherwise, "auto": None}.get(value, value),
+        metavar="auto|N",
+        help="Of a video or ROS bag, every N-th frame; auto: those that show new ground.  [default: auto; of "
+        "trajectory and apply 1]",
+    )
+
+
+every, every_frame = _every(None), _every(1)
 
 topic = click.option("--topic", metavar="NAME", help="Of a ROS bag, the topic of its images.")
 

@@ -44,7 +44,7 @@ class _Examined:
 
 
 def examine(
-    inputs: Images, *, every: int = 1, channel_order: ChannelOrder = "bgr", progress: Progress = silent
+    inputs: Images, *, every: int | None = None, channel_order: ChannelOrder = "bgr", progress: Progress = silent
 ) -> Examination:
     """Find out at a glance what a run will meet.
 

@@ -7,16 +7,17 @@ import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 from rdstitch.errors import InputError
 from rdstitch.inputs.frame import Frame, Named, files_of
+from rdstitch.inputs.keyframes import wanted_frames
 from rdstitch.inputs.rosbag import extract_images, is_bag
 from rdstitch.io.interrupted import interrupted_outputs
 from rdstitch.io.optional_readers import HEIF_SUFFIXES, RAW_SUFFIXES
 from rdstitch.io.staging import temporary_folder
-from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames
+from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames, grey_frames
 from rdstitch.messages import Message, names_of, shortened
 from rdstitch.records import LARGEST_FILE, read_text
 from rdstitch.regular_files import read_limited
@@ -39,11 +40,14 @@ class FoundPictures:
         Pictures in folders and patterns that rdstitch wrote, by the sidecars beside them, and that are no input.
     lists : tuple of Path
         The ``@list`` files that were named.
+    notes : tuple of Message
+        On videos of which not every frame was taken.
     """
 
     frames: list[Frame]
     outputs: list[Path]
     lists: tuple[Path, ...] = ()
+    notes: tuple[Message, ...] = ()
 
     @property
     def files(self) -> list[Path]:
@@ -54,21 +58,22 @@ class FoundPictures:
     def messages(self) -> list[Message]:
         """What the user should know of what was not taken."""
         if not self.outputs:
-            return []
+            return [*self.notes]
         paths = [str(path) for path in self.outputs]
         names = shortened(names_of(paths))
         return [
+            *self.notes,
             Message(
                 f"not taken as input, since sidecars say that rdstitch wrote them: {names}",
                 tuple(paths),
                 code="own-output",
-            )
+            ),
         ]
 
 
 @contextmanager
 def found_pictures(
-    arguments: Iterable[Named], *, output: str | Path | None = None, every: int = 1, topic: str | None = None
+    arguments: Iterable[Named], *, output: str | Path | None = None, every: int | None = None, topic: str | None = None
 ) -> Iterator[FoundPictures]:
     """The pictures of :func:`find_pictures`, of videos too, whose frames exist only inside the block."""
     with ExitStack() as stack:
@@ -86,7 +91,7 @@ def find_pictures(
     *,
     exclude: Iterable[str | Path] = (),
     frames_folder: Callable[[], Path] | None = None,
-    every: int = 1,
+    every: int | None = None,
     topic: str | None = None,
 ) -> FoundPictures:
     """The frames that the arguments stand for.
@@ -101,8 +106,9 @@ def find_pictures(
         hear that it would be written over.
     frames_folder : callable, optional
         Gives the folder where frames of videos are written, losslessly; without it a video is refused.
-    every : int
-        Use every n-th frame of videos and ROS bags.
+    every : int, optional
+        Use every n-th frame of videos and ROS bags; without it those that show new ground, see
+        :mod:`rdstitch.inputs.keyframes`.
     topic : str, optional
         Topic of the images in ROS bags; without one, the only topic of images.
 
@@ -114,9 +120,10 @@ def find_pictures(
     unwanted = {_entry(Path(path)) for path in exclude}
     frames: list[Frame] = []
     outputs: list[Path] = []
+    notes: list[Message] = []
     interrupted = cache(interrupted_outputs)
     arguments = list(arguments)
-    for frame, named in _expand(arguments, frames_folder, every, topic):
+    for frame, named in _expand(arguments, frames_folder, every, notes, topic):
         is_output = frame.picture is None and (
             is_rdstitch_output(frame.path) or frame.path.name in interrupted(frame.path.parent)
         )
@@ -130,7 +137,7 @@ def find_pictures(
         raise InputError(f"{outputs[0].parent}: there are no pictures but those that rdstitch wrote")
     texts = [str(argument) for argument in arguments if not isinstance(argument, Frame)]
     lists = tuple(Path(text[1:]) for text in texts if text.startswith("@") and not _exists(Path(text)))
-    return FoundPictures(frames, outputs, lists)
+    return FoundPictures(frames, outputs, lists, tuple(notes))
 
 
 def _entry(path: Path) -> Path:
@@ -147,11 +154,15 @@ def natural_key(path: Path) -> list[tuple[int, str | int]]:
 def _expand(
     arguments: Iterable[Named],
     frames_folder: Callable[[], Path] | None,
-    every: int,
+    every: int | None,
+    notes: list[Message],
     topic: str | None,
     lists: tuple[Path, ...] = (),
 ) -> Iterator[tuple[Frame, bool]]:
-    """Every frame, and whether it was named one by one; ``lists`` are those that the arguments come from."""
+    """Every frame, and whether it was named one by one; ``notes`` on videos are added.
+
+    ``lists`` are those that the arguments come from.
+    """
     for argument in arguments:
         if isinstance(argument, Frame):
             yield argument, True
@@ -164,7 +175,7 @@ def _expand(
                     raise InputError(f"{file}: the list of pictures names itself")
                 # Another program may write the list while we read it: @<(find ...) in a shell.
                 names = names_in(read_text(file, regular=False))
-                yield from _expand(names, frames_folder, every, topic, (*lists, file))
+                yield from _expand(names, frames_folder, every, notes, topic, (*lists, file))
             elif glob.has_magic(text):
                 yield from ((Frame(found), False) for found in _matching(text))
             else:
@@ -172,13 +183,17 @@ def _expand(
         elif is_bag(path):
             if frames_folder is None:
                 raise InputError(f"{path}: a ROS bag is no picture here; use 'rdstitch mosaic'")
-            yield from ((frame, True) for frame in extract_images(path, frames_folder(), every, topic))
+            images, wanted = extract_images(path, frames_folder(), every, topic)
+            notes += wanted.messages(path)
+            yield from ((frame, True) for frame in images)
         elif path.is_dir():
             yield from ((Frame(found), False) for found in _in_folder(path))
         elif path.suffix.lower() in VIDEO_SUFFIXES:
             if frames_folder is None:
                 raise InputError(f"{path}: a video is no picture here; use 'rdstitch mosaic' or extract its frames")
-            yield from ((Frame(*frame), True) for frame in extract_frames(path, frames_folder(), every))
+            wanted = wanted_frames(every, partial(grey_frames, path))
+            notes += wanted.messages(path)
+            yield from ((Frame(*frame), True) for frame in extract_frames(path, frames_folder(), wanted.__contains__))
         else:
             yield Frame(path), True
 

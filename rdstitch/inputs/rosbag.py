@@ -1,6 +1,7 @@
 """Images of a ROS bag, of version 1 or 2, as picture files with time stamps; no ROS is needed, only ``rosbags``."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from rdstitch.errors import InputError, OutputError
 from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.keyframes import Wanted, wanted_frames
 from rdstitch.io.video import write_frame
 
 _SUFFIXES = (".bag", ".db3", ".mcap")
@@ -41,17 +43,25 @@ def is_bag(path: Path) -> bool:
     return path.suffix.lower() in _SUFFIXES or (path.is_dir() and (path / _DESCRIPTION).is_file())
 
 
-def extract_images(path: Path, folder: Path, every: int = 1, topic: str | None = None) -> list[Frame]:
-    """Write every n-th image of a topic to a folder, losslessly, with number and time stamp (s) of its header.
+def extract_images(
+    path: Path, folder: Path, every: int | None = 1, topic: str | None = None
+) -> tuple[list[Frame], Wanted]:
+    """Write images of a topic to a folder, losslessly, with number and time stamp (s) of the header.
 
     Parameters
     ----------
     path : Path
         File of ROS 1, folder of ROS 2 or a file in it.
     folder : Path
-    every : int
+    every : int or None
+        Every n-th image; None: those that show new ground.
     topic : str, optional
         Without one, the only topic of images.
+
+    Returns
+    -------
+    list of Frame, Wanted
+        The images, and which they are.
 
     Raises
     ------
@@ -69,7 +79,9 @@ def extract_images(path: Path, folder: Path, every: int = 1, topic: str | None =
         with AnyReader([bag], default_typestore=get_typestore(Stores.LATEST)) as reader:
             connections = [c for c in reader.connections if c.msgtype in (_IMAGE, _COMPRESSED)]
             chosen = _chosen_topic(path, sorted({c.topic for c in connections}), topic)
-            return list(_frames(reader, [c for c in connections if c.topic == chosen], path, folder, every))
+            messages = _Messages(reader, [c for c in connections if c.topic == chosen], path)
+            wanted = wanted_frames(every, messages.grey)
+            return list(messages.frames(folder, wanted)), wanted
     except (InputError, OutputError):
         raise
     except Exception as error:  # rosbags raises many kinds on damaged files
@@ -88,20 +100,41 @@ def _chosen_topic(path: Path, topics: list[str], wanted: str | None) -> str:
     return wanted or topics[0]
 
 
-def _frames(reader: Any, connections: list[Any], path: Path, folder: Path, every: int) -> Iterator[Frame]:
-    for number, (connection, time_ns, data) in enumerate(reader.messages(connections=connections)):
-        if number % every:
-            continue
-        message = reader.deserialize(data, connection.msgtype)
-        stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
-        name = f"{path.stem}_{number:06d}"
-        if connection.msgtype == _COMPRESSED:
-            file = folder / f"{name}{_suffix(message.data)}"
-            file.write_bytes(message.data.tobytes())
-        else:
-            file = write_frame(folder / f"{name}.png", _pixels(path, message))
-        # Drivers that do not set the stamp leave it 0; the recorder's time is then the best that is known.
-        yield Frame(file, number, stamp or time_ns * 1e-9)
+@dataclass(frozen=True)
+class _Messages:
+    """The images of one topic."""
+
+    reader: Any
+    connections: list[Any]
+    path: Path
+
+    def grey(self) -> Iterator[NDArray[np.uint8]]:
+        """All of them, (H, W), 8 bits; black where one cannot be decoded."""
+        for connection, _, data in self.reader.messages(connections=self.connections):
+            message = self.reader.deserialize(data, connection.msgtype)
+            if connection.msgtype == _COMPRESSED:
+                decoded = cv2.imdecode(message.data, cv2.IMREAD_GRAYSCALE)
+                yield np.zeros((1, 1), np.uint8) if decoded is None else np.asarray(decoded, dtype=np.uint8)
+                continue
+            pixels = _pixels(self.path, message)
+            pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
+            yield pixels if pixels.ndim == 2 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+
+    def frames(self, folder: Path, wanted: Wanted) -> Iterator[Frame]:
+        """Those that are wanted, written to a folder."""
+        for number, (connection, time_ns, data) in enumerate(self.reader.messages(connections=self.connections)):
+            if number not in wanted:
+                continue
+            message = self.reader.deserialize(data, connection.msgtype)
+            stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+            name = f"{self.path.stem}_{number:06d}"
+            if connection.msgtype == _COMPRESSED:
+                file = folder / f"{name}{_suffix(message.data)}"
+                file.write_bytes(message.data.tobytes())
+            else:
+                file = write_frame(folder / f"{name}.png", _pixels(self.path, message))
+            # Drivers that do not set the stamp leave it 0; the recorder's time is then the best that is known.
+            yield Frame(file, number, stamp or time_ns * 1e-9)
 
 
 def _suffix(data: NDArray[np.uint8]) -> str:

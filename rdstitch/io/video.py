@@ -1,9 +1,12 @@
 """Frames of a video, as picture files."""
 
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from rdstitch.errors import InputError, OutputError
 from rdstitch.io.decoding import check_readable
@@ -19,8 +22,22 @@ class VideoFrame(NamedTuple):
     timestamp: float
 
 
-def extract_frames(path: Path, folder: Path, every: int = 1) -> list[VideoFrame]:
-    """Write every ``every``-th frame of a video to a folder as PNG, named by video and frame number.
+def grey_frames(path: Path) -> Iterator[NDArray[np.uint8]]:
+    """All frames of a video, (H, W); black where one cannot be decoded.
+
+    Raises
+    ------
+    InputError
+        When the video cannot be read.
+    """
+    black = np.zeros((1, 1), dtype=np.uint8)
+    for _, _, capture in _grabbed(path):
+        decoded, frame = capture.retrieve()
+        yield np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), dtype=np.uint8) if decoded else black
+
+
+def extract_frames(path: Path, folder: Path, wanted: Callable[[int], bool]) -> list[VideoFrame]:
+    """Write frames of a video, those whose numbers are wanted, to a folder as PNG, named by video and frame number.
 
     Raises
     ------
@@ -29,26 +46,30 @@ def extract_frames(path: Path, folder: Path, every: int = 1) -> list[VideoFrame]
     OutputError
         When a frame cannot be written.
     """
+    written: list[VideoFrame] = []
+    for number, timestamp, capture in _grabbed(path):
+        decoded, frame = capture.retrieve() if wanted(number) else (False, None)
+        if decoded and frame is not None:
+            file = write_frame(folder / f"{path.stem}_{number:06d}.png", frame)
+            written.append(VideoFrame(file, number, timestamp))
+    if not written:
+        raise InputError(f"{path}: the video has no frame that can be read")
+    return written
+
+
+def _grabbed(path: Path) -> Iterator[tuple[int, float, cv2.VideoCapture]]:
+    """Number and time, s, of each frame of a video, and what decodes it."""
     check_readable(path)
     capture = cv2.VideoCapture(str(path))
     try:
         if not capture.isOpened():
             raise InputError(f"{path}: cannot be read as a video; convert it, or extract its frames with another tool")
-        written: list[VideoFrame] = []
         number = 0
         while capture.grab():
-            if number % every == 0:
-                timestamp = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
-                decoded, frame = capture.retrieve()
-                if decoded:
-                    file = write_frame(folder / f"{path.stem}_{number:06d}.png", frame)
-                    written.append(VideoFrame(file, number, timestamp))
+            yield number, capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0, capture
             number += 1
     finally:
         capture.release()
-    if not written:
-        raise InputError(f"{path}: the video has no frame that can be read")
-    return written
 
 
 def write_frame(file: Path, frame: cv2.typing.MatLike) -> Path:

@@ -42,7 +42,7 @@ def apply(
     *,
     match: MatchBy = "auto",
     mask: str | Path | None = None,
-    every: int = 1,
+    every: int | None = 1,
     workers: int = 0,
     overwrite: bool = False,
     strict: bool = False,
@@ -68,8 +68,8 @@ def apply(
         "order": the one at the same position of equally many. "auto": by name, or by order where no name is the same.
     mask : path, optional
         Picture, or folder of them, that is dark where the pictures do not count.
-    every : int
-        Use every n-th video frame.
+    every : int, optional
+        Look among every n-th frame of videos and ROS bags; None: among those that show new ground.
     workers : int
         Pictures worked on at the same time; 0: as many as there are cores.
     overwrite : bool

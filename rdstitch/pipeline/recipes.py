@@ -44,7 +44,7 @@ def pano(
     output: str | Path | None = None,
     options: StitchOptions | None = None,
     *,
-    every: int = 1,
+    every: int | None = None,
     progress: Progress = silent,
     beside: Callable[[Outputs, StitchResult], None] | None = None,
 ) -> StitchResult:
@@ -58,8 +58,8 @@ def pano(
         Picture to write, with the sidecar beside it; without it nothing is written, and the picture is
         ``result.image``.
     options : StitchOptions, optional
-    every : int
-        Use every n-th video frame.
+    every : int, optional
+        Use every n-th frame of videos and ROS bags; without it those that show new ground.
     progress : callable
         Called with the name of a stage, the number of steps done, and their total.
     beside : callable, optional
@@ -99,7 +99,7 @@ def mosaic(
     output: str | Path | None = None,
     options: StitchOptions | None = None,
     *,
-    every: int = 1,
+    every: int | None = None,
     progress: Progress = silent,
     beside: Callable[[Outputs, StitchResult], None] | None = None,
 ) -> StitchResult:
@@ -147,7 +147,7 @@ def calibrate(
     inputs: Images,
     options: StitchOptions | None = None,
     *,
-    every: int = 1,
+    every: int | None = None,
     progress: Progress = silent,
     beside: Callable[[Outputs, Registration], None] | None = None,
 ) -> Registration:
@@ -192,7 +192,7 @@ def trajectory(
     timestamps: str | Path | None = None,
     plot: str | Path | None = None,
     height: float = 1.0,
-    every: int = 1,
+    every: int | None = 1,
     progress: Progress = silent,
 ) -> tuple[Trajectory, Registration]:
     """Find the path of the camera over the plane.
@@ -200,7 +200,7 @@ def trajectory(
     Parameters
     ----------
     inputs, options, every, progress
-        As for :func:`mosaic`.
+        As for :func:`mosaic`, but that every frame of a video is used unless ``every`` says otherwise.
     output : path, optional
         File to write.
     layout : str

@@ -101,7 +101,7 @@ def undistort(
     if view not in ("same", "all", "valid"):
         raise ArgumentError(f"unknown view {view!r}; choose same, all or valid")
     given = as_inputs(inputs, channel_order)
-    with found_pictures(given) as found:
+    with found_pictures(given, every=1) as found:
         guard = InputGuard()
         sources, _ = read_sources(
             found.frames, camera=camera, focal=None, distortion=distortion, skip_bad=False, guard=guard

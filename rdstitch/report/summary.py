@@ -38,7 +38,7 @@ def summary(registration: Registration, result: StitchResult | None) -> str:
 
 def notices(registration: Registration) -> str:
     """Warnings, and pictures that were left out, each with the reason."""
-    warnings = [message.clause for message in registration.warnings]
+    warnings = [message.clause for message in (*registration.warnings, *registration.notes)]
     return section(
         "Warnings and left-out pictures",
         "",

@@ -111,7 +111,7 @@ def _plausible(option: click.Option) -> Any:
         return str(option.type.choices[0])
     if isinstance(option.type, (click.types.IntParamType, click.types.FloatParamType)):
         return 2
-    return {"tilt": "1,2", "attitude_std": "0.5", "max_memory": "1G", "local_alignment": "auto"}.get(
+    return {"tilt": "1,2", "attitude_std": "0.5", "max_memory": "1G", "local_alignment": "auto", "every": "auto"}.get(
         option.name or "", "name"
     )
 

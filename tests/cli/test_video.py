@@ -12,9 +12,12 @@ from tests.cli.running import DISTORTION, FAST, Run
 @pytest.fixture
 def video(frames: list[Path], tmp_path: Path) -> Path:
     """The frames one after the other."""
+    return _write(frames, tmp_path / "drive.avi")
+
+
+def _write(frames: list[Path], file: Path) -> Path:
     pictures = [cv2.cvtColor(read_image(frame).pixels, cv2.COLOR_RGB2BGR) for frame in frames]
     height, width = pictures[0].shape[:2]
-    file = tmp_path / "drive.avi"
     writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, (width, height))
     if not writer.isOpened():
         pytest.skip("this OpenCV writes no videos")
@@ -35,3 +38,15 @@ def test_a_video_is_as_good_as_its_frames(
     assert "warning" not in done.err
     assert abs(float(done.out) - DISTORTION) < 0.01
     assert (tmp_path / output).stat().st_size > 0
+
+
+def test_frames_that_show_nothing_new_are_passed_over_and_counted(
+    rdstitch: Run, frames: list[Path], tmp_path: Path
+) -> None:
+    slow = _write([frame for frame in frames for _ in range(4)], tmp_path / "slow.avi")
+    done = rdstitch("mosaic", slow, "-o", tmp_path / "out.png", "--focal", "380", *FAST)
+    assert done.status == 0
+    assert f"of {4 * len(frames)} frames are used" in done.err
+    assert "--every 1 takes all" in done.err
+    assert "warning" not in done.err
+    assert abs(float(done.out) - DISTORTION) < 0.01

@@ -32,7 +32,7 @@ Examples:
 )
 @options.output
 @options.overwrite
-@options.every
+@options.every_frame
 @click.option(
     "--match",
     type=click.Choice(["auto", "name", "order"]),
@@ -50,7 +50,7 @@ def apply(
     images: tuple[Path, ...],
     output: Path,
     overwrite: bool,
-    every: int,
+    every: int | None,
     match: Literal["auto", "name", "order"],
     mask: Path | None,
     workers: int,

@@ -42,7 +42,7 @@ Examples:
 def calibrate(
     inputs: tuple[Path, ...],
     output: Path,
-    every: int,
+    every: int | None,
     report: Path | None,
     as_json: bool,
     quiet: bool,

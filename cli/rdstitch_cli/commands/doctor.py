@@ -14,14 +14,14 @@ from rdstitch_cli.progress import Reporter
     epilog="""\b
 Examples:
   rdstitch doctor flight/
-  rdstitch doctor drive.mp4 --every 10 --json
+  rdstitch doctor drive.mp4 --json
 """,
 )
 @options.inputs
 @options.every
 @options.as_json
 @options.verbosity
-def doctor(inputs: tuple[Path, ...], every: int, as_json: bool, quiet: bool, verbose: bool) -> None:
+def doctor(inputs: tuple[Path, ...], every: int | None, as_json: bool, quiet: bool, verbose: bool) -> None:
     """Find out at a glance what a run will meet, and what to change before it.
 
     INPUT is what 'rdstitch mosaic' takes. Shown are sizes, cameras and zooms by EXIF, blur, exposure, overlap, and the

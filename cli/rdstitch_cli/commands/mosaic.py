@@ -24,7 +24,7 @@ Examples:
   rdstitch mosaic floor/ -o floor.tif
   rdstitch mosaic flight/*.jpg -o field.tif --camera camera.json
   find . -name '*.jpg' -print0 | rdstitch mosaic - -o all.tif
-  rdstitch mosaic drive.mp4 --every 10 -o drive.png --report drive.html
+  rdstitch mosaic drive.mp4 -o drive.png --report drive.html
   rdstitch mosaic incoming/ -o field.jpg --follow --idle 30
 """,
 )
@@ -54,7 +54,7 @@ Examples:
 def mosaic(
     inputs: tuple[Path, ...],
     output: Path,
-    every: int,
+    every: int | None,
     following: bool,
     idle: float | None,
     refresh: float,

@@ -44,7 +44,7 @@ Examples:
 def pano(
     inputs: tuple[Path, ...],
     output: Path,
-    every: int,
+    every: int | None,
     report: Path | None,
     as_json: bool,
     quiet: bool,

@@ -54,7 +54,7 @@ Examples:
 )
 @click.option("--plot", type=options.PICTURE, metavar="FILE", help="Draw the path to FILE (SVG).")
 @options.overwrite
-@options.every
+@options.every_frame
 @options.topic
 @live.follow
 @options.known
@@ -68,7 +68,7 @@ def trajectory(
     height: float,
     timestamps: Path | None,
     plot: Path | None,
-    every: int,
+    every: int | None,
     following: bool,
     idle: float | None,
     quiet: bool,
