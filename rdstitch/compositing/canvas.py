@@ -63,8 +63,8 @@ class Canvas:
         boxes = []
         for outline in self.footprints:
             low, high = np.floor(outline.min(axis=0)), np.ceil(outline.max(axis=0)) + 1
-            if self.period is not None:
-                low[0], high[0] = self._all_places(float(low[0]), float(high[0]))
+            shifts = self._shifts(float(low[0]), float(high[0]))
+            low[0], high[0] = low[0] + min(shifts), high[0] + max(shifts)
             x0, y0 = (max(0, int(v)) for v in low)
             boxes.append((x0, y0, min(width, int(high[0])), min(height, int(high[1]))))
         return boxes
@@ -76,11 +76,20 @@ class Canvas:
         sizes = [np.minimum(np.ptp(outline, axis=0) + 1, self.size) for outline in self.footprints]
         return [int(width * height) for width, height in sizes]
 
-    def _all_places(self, low: float, high: float) -> tuple[float, float]:
-        """From the leftmost to the rightmost of the places that repeat themselves with each turn."""
-        width, period = self.size[0], self.period or 1.0
-        turns = [k * period for k in range(-2, 3) if low + k * period < width and high + k * period > 0]
-        return low + min(turns), high + max(turns)
+    @property
+    def outlines(self) -> list[tuple[FloatArray, ...]]:
+        """The footprint of every picture at each of its places: two, where it lies across the edge of a full turn."""
+        return [
+            tuple(outline + np.array([shift, 0.0]) for shift in self._shifts(outline[:, 0].min(), outline[:, 0].max()))
+            for outline in self.footprints
+        ]
+
+    def _shifts(self, low: float, high: float) -> list[float]:
+        """From where a picture is, pixels, to all its places on the canvas, which repeat themselves with each turn."""
+        if self.period is None:
+            return [0.0]
+        turns = [k * self.period for k in range(-2, 3)]
+        return [turn for turn in turns if low + turn < self.size[0] and high + turn > 0]
 
     def place(self, camera: Camera, homography: FloatArray, points: ArrayLike) -> FloatArray:
         """Canvas pixels (N, 2) of measured pixels (N, 2) of a picture; NaN where it has no place."""

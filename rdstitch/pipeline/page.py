@@ -23,7 +23,7 @@ def write_page(outputs: Outputs, output: str | Path, composed: Composed, picture
 
 def plainly_viewed(canvas: Canvas, names: Sequence[str]) -> list[ViewedPicture]:
     """The pictures on a canvas, of which nothing was estimated."""
-    return [ViewedPicture(name, outline, ()) for name, outline in zip(names, canvas.footprints, strict=True)]
+    return [ViewedPicture(name, outlines, ()) for name, outlines in zip(names, canvas.outlines, strict=True)]
 
 
 def viewed_pictures(result: StitchResult) -> list[ViewedPicture]:
@@ -31,7 +31,7 @@ def viewed_pictures(result: StitchResult) -> list[ViewedPicture]:
     alignment, registration = result.registration.alignment, result.registration
     names = [source.name for source in registration.sources]
     viewed = []
-    for outline, index in zip(result.canvas.footprints, np.flatnonzero(alignment.used).tolist(), strict=True):
+    for outlines, index in zip(result.canvas.outlines, np.flatnonzero(alignment.used).tolist(), strict=True):
         source = registration.sources[index]
         links = [fit for fit in alignment.links if fit.used and index in (fit.image1, fit.image2)]
         facts = [
@@ -51,5 +51,5 @@ def viewed_pictures(result: StitchResult) -> list[ViewedPicture]:
             ]
         if index == alignment.reference:
             facts.append(("reference", "yes"))
-        viewed.append(ViewedPicture(names[index], outline, tuple(facts)))
+        viewed.append(ViewedPicture(names[index], outlines, tuple(facts)))
     return viewed

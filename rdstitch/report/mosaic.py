@@ -25,13 +25,12 @@ def mosaic(result: StitchResult, staged: Path | None = None) -> str:
     used = np.flatnonzero(result.registration.alignment.used)
     names = [result.registration.sources[index].name for index in used]
     parts = [element("image", href=picture, width=width * scale, height=height * scale)]
-    for text, outline in zip(names, result.canvas.footprints, strict=True):
-        points = (outline + 0.5) * scale
-        title = element("title", escape(text))
-        shape = path(points, closed=True, stroke=YELLOW, stroke_opacity=0.7, pointer_events="all")
-        parts.append(shape.replace("></path>", f">{title}</path>"))
+    for text, outlines in zip(names, result.canvas.outlines, strict=True):
+        places = [(outline + 0.5) * scale for outline in outlines]
+        shapes = (path(place, closed=True, stroke=YELLOW, stroke_opacity=0.7, pointer_events="all") for place in places)
+        parts.append(element("g", element("title", escape(text)) + "".join(shapes)))
         if len(names) <= _MOST_NAMES:
-            x, y = points.mean(axis=0)
+            x, y = min((place.mean(axis=0) for place in places), key=lambda middle: abs(middle[0] - width * scale / 2))
             style = {"fill": "white", "stroke": "black", "stroke_width": 3.0, "paint_order": "stroke"}
             parts.append(label(float(x), float(y), text, text_anchor="middle", font_size=14, **style))
     shown = drawing(width * scale, height * scale, parts, "the mosaic")

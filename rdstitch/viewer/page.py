@@ -27,14 +27,14 @@ class ViewedPicture:
     Attributes
     ----------
     name : str
-    outline : ndarray of shape (K, 2)
-        Pixels of the mosaic, centre of the top-left one at (0, 0).
+    outlines : sequence of ndarray of shape (K, 2)
+        At each of its places; pixels of the mosaic, centre of the top-left one at (0, 0).
     facts : tuple of (str, str)
         What is shown when the picture is clicked.
     """
 
     name: str
-    outline: FloatArray
+    outlines: Sequence[FloatArray]
     facts: tuple[tuple[str, str], ...]
 
 
@@ -108,12 +108,11 @@ def viewer_page(
 
 def _described(picture: ViewedPicture) -> dict[str, Any]:
     """For the script, which counts pixels from the corner of the first one."""
-    step = max(1, len(picture.outline) // _CORNERS)
-    outline = picture.outline[::step] + 0.5
+    outlines = [outline[:: max(1, len(outline) // _CORNERS)] + 0.5 for outline in picture.outlines]
     return {
         "name": picture.name.encode("utf-8", "backslashreplace").decode("utf-8"),
-        "outline": np.round(outline, 1).tolist(),
-        "center": np.round(outline.mean(axis=0), 1).tolist(),
+        "outlines": [np.round(outline, 1).tolist() for outline in outlines],
+        "centers": [np.round(outline.mean(axis=0), 1).tolist() for outline in outlines],
         "facts": [list(fact) for fact in picture.facts],
     }
 

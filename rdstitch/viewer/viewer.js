@@ -16,11 +16,14 @@ const drawing = make("g", svg, {});
 const seams = make("g", drawing, {});
 if (data.seams) make("image", seams, { href: data.seams, x: data.seamsBox[0], y: data.seamsBox[1],
   width: data.seamsBox[2], height: data.seamsBox[3], preserveAspectRatio: "none" });
-const outlines = make("g", drawing, {});
+make("rect", make("clipPath", drawing, { id: "mosaic" }), { width, height });
+const outlines = make("g", drawing, { "clip-path": "url(#mosaic)" });
 const names = document.getElementById("names");
 const pictures = data.pictures.map((picture) => ({
   ...picture,
-  path: make("path", outlines, { d: "M" + picture.outline.map((point) => point.join(",")).join("L") + "Z" }),
+  // A picture across the edge of a full turn has two places; its name is at the one that shows more of it.
+  path: make("path", outlines, { d: picture.outlines.map((line) => "M" + line.join("L") + "Z").join("") }),
+  center: picture.centers.reduce((a, b) => (Math.abs(a[0] - width / 2) < Math.abs(b[0] - width / 2) ? a : b)),
   label: names.appendChild(Object.assign(document.createElement("span"), { textContent: picture.name })),
 }));
 
@@ -64,9 +67,9 @@ viewer.addHandler("canvas-click", (event) => {
   if (!event.quick) return;
   const point = viewer.viewport.pointFromPixel(event.position);
   const at = [point.x * width, point.y * width];
-  const distance = ({ center }) => Math.hypot(center[0] - at[0], center[1] - at[1]);
+  const distance = ({ centers }) => Math.min(...centers.map(([x, y]) => Math.hypot(x - at[0], y - at[1])));
   // Of several pictures that show a place, the one whose centre is nearest.
-  show(pictures.filter((p) => inside(at, p.outline)).sort((a, b) => distance(a) - distance(b))[0]);
+  show(pictures.filter((p) => p.outlines.some((line) => inside(at, line))).sort((a, b) => distance(a) - distance(b))[0]);
 });
 const toggle = (id, node) => {
   const box = document.getElementById(id);

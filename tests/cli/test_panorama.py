@@ -1,19 +1,26 @@
 """Pictures taken by turning on the spot, from files to a panorama, through the command line."""
 
 import json
+import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
+from rdstitch.alignment.model_family import MODELS
 from rdstitch.camera import Camera
-from rdstitch.pipeline import pano
+from rdstitch.features import FeatureOptions
+from rdstitch.pipeline import StitchOptions, pano
+from rdstitch.pipeline.page import viewed_pictures
 from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, panorama_rotations, turning_sequence
 from rdstitch.synthetic.rendering import Photometry
+from rdstitch.viewer import viewer_page
 from tests.cli.running import Run
 from tests.drone_xmp import euler_angles, xmp_of
 
+_BUNDLED = Path(__file__).parents[2] / "examples" / "data" / "garfield_red"
 LENS = Camera((320, 240), -0.2, focal=260.0, focal_source="option")
 
 
@@ -54,6 +61,38 @@ def test_a_full_turn_becomes_a_sphere_that_viewers_turn(rdstitch: Run, around: l
     page = report.read_text(encoding="utf-8")
     assert "<h2>Directions</h2>" in page
     assert "9 pictures show 360 x" in page
+
+
+def test_outlines_are_where_the_pictures_are_at_both_ends_of_a_full_turn(around: list[Path], tmp_path: Path) -> None:
+    result = pano(around, tmp_path / "x.png", StitchOptions(features=FeatureOptions(max_features=600)))
+    canvas, alignment = result.canvas, result.registration.alignment
+    assert canvas.period is not None
+    page = viewer_page("x.dzi", canvas.size, viewed_pictures(result))
+    data = re.search(r'<script type="application/json" id="data">(.*?)</script>', page)
+    assert data is not None
+    shown = cv2.imread(str(tmp_path / "x.png"), cv2.IMREAD_GRAYSCALE)
+    assert shown is not None
+    patch = np.stack(np.meshgrid(np.arange(140, 180), np.arange(100, 140)), axis=-1).reshape(-1, 2)
+    across = 0
+    for k, picture in enumerate(json.loads(data[1])["pictures"]):
+        camera, homography = alignment.cameras[k], alignment.homographies[k]
+        border = canvas.place(camera, homography, camera.outline(64)) + 0.5
+        seen = np.zeros(canvas.size[0], dtype=bool)
+        for outline in picture["outlines"]:
+            away = np.array(outline)[:, None] - border
+            away[..., 0] -= np.rint(away[..., 0] / canvas.period) * canvas.period
+            assert np.linalg.norm(away, axis=-1).min(axis=1).max() < 0.1
+            left, right = np.array(outline)[:, 0].min(), np.array(outline)[:, 0].max()
+            seen[max(0, int(left)) : max(0, int(right))] = True
+        assert seen.sum() == pytest.approx(np.ptp(np.array(picture["outlines"][0])[:, 0]), abs=3)
+        across += len(picture["outlines"]) == 2
+        # The mosaic shows the middle of the picture where the middle is said to be.
+        x, y = canvas.place(camera, homography, patch).astype(np.float32).T
+        there = cv2.remap(shown, x[None] % np.float32(canvas.period), y[None], cv2.INTER_LINEAR)
+        own = cv2.imread(str(around[k]), cv2.IMREAD_GRAYSCALE)
+        assert own is not None
+        assert np.corrcoef(there[0], own[patch[:, 1], patch[:, 0]])[0, 1] > 0.97
+    assert across > 0
 
 
 def test_the_projection_is_the_users(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
@@ -149,3 +188,17 @@ def test_deep_zoom_of_a_full_turn_is_joined_at_the_edge(rdstitch: Run, around: l
     # The same picture, but for the compression of the tiles.
     assert np.abs(ends[0][rows] - whole[rows, 0]).mean() < 6.0
     assert (width, height) == tuple(json.loads((tmp_path / "around.dzi.json").read_text("utf-8"))["output"]["size"])
+
+
+def test_pictures_of_a_plane_are_what_they_are_without_a_turn_to_compete(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair, options = sorted(_BUNDLED.glob("*.jpg")), StitchOptions(features=FeatureOptions(max_features=1000))
+    for name in ("with", "without"):
+        (tmp_path / name).mkdir()
+        if name == "without":
+            monkeypatch.delitem(MODELS, "rotation")
+        pano(pair, tmp_path / name / "x.png", options)
+    assert (tmp_path / "with" / "x.png").read_bytes() == (tmp_path / "without" / "x.png").read_bytes()
+    one, other = (json.loads((tmp_path / k / "x.png.json").read_text(encoding="utf-8")) for k in ("with", "without"))
+    assert all(one[key] == other[key] for key in ("lambda", "model", "model_reason", "images", "pairs"))

@@ -42,7 +42,7 @@ def test_the_page_knows_the_pictures_and_needs_no_network(
     record = json.loads((tmp_path / "x.dzi.json").read_text(encoding="utf-8"))
     assert data["size"] == record["output"]["size"]
     assert [picture["name"] for picture in data["pictures"]] == [frame.name for frame in frames]
-    corners = np.concatenate([picture["outline"] for picture in data["pictures"]])
+    corners = np.concatenate([outline for picture in data["pictures"] for outline in picture["outlines"]])
     assert corners.min() >= -1
     assert (corners.max(axis=0) <= np.array(data["size"]) + 1).all()
     assert dict(data["pictures"][1]["facts"])["size"] == "400 x 300 pixels"
