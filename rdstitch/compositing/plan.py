@@ -10,9 +10,10 @@ from rdstitch.camera import Camera
 from rdstitch.compositing.blender import margin
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.options import CompositeOptions
+from rdstitch.compositing.process_memory import memory_left
 from rdstitch.errors import LimitError
 
-# What the compositor takes by default; more memory means that fewer pictures are read twice.
+# What the compositor takes at most by default; more memory means that fewer pictures are read twice.
 DEFAULT_MEMORY = 256 * 2**20
 _TILE_SIZES = (512, 256)
 _MOST_WORKERS = 4
@@ -82,7 +83,7 @@ def plan_composite(
         When the limit is too low for the smallest tiles.
     """
     bands = options.bands or usual_bands(cameras)
-    limit = options.max_memory or DEFAULT_MEMORY
+    limit = options.max_memory or min(DEFAULT_MEMORY, memory_left(len(cameras)))
     picture = max(c.image_size[0] * c.image_size[1] for c in cameras) * channels * itemsize
     # While a picture is decoded it is there twice, beside those in the cache.
     workers = options.workers or min(_MOST_WORKERS, os.cpu_count() or 1)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.compositing.photometric import Exposure, full_scale
-from rdstitch.compositing.survey import Survey, SurveyTile
+from rdstitch.compositing.survey import Survey
 from rdstitch.compositing.warp import locate
 from rdstitch.io.reduction import block_mean
 
@@ -113,34 +113,39 @@ def find_seams(
         if tile is not None:
             x0, y0, x1, y1 = tile.box
             cut = np.s_[y0:y1, x0:x1]
+            geometry = locate(survey.warps[index], tile.box)
+            weight = tile.weight(geometry)
             if composite is None:
-                won = tile.inside & (tile.weight > weights[cut])
+                won = tile.inside & (weight > weights[cut])
             else:
-                corrected = exposure.correct(index, locate(survey.warps[index], tile.box), tile.pixels)
+                corrected = exposure.correct(index, geometry, tile.pixels)
                 pixels = corrected * np.float32(1.0 / full_scale(corrected.dtype))
                 apart = survey.canvas.period is not None
-                won = _cut(tile, pixels, composite[cut], labels[cut] != NO_OWNER, weights[cut], apart=apart)
+                shares = weight / np.maximum(weight + weights[cut], np.float32(1e-12))
+                won = _cut(tile.inside, pixels, composite[cut], labels[cut] != NO_OWNER, shares, apart=apart)
                 composite[cut][won] = pixels[won]
             labels[cut][won] = index
-            weights[cut][won] = tile.weight[won]
+            weights[cut][won] = weight[won]
         if progress is not None:
             progress((index + 1) / len(survey.tiles))
     return SeamMap(labels, survey.factor)
 
 
 def _cut(
-    tile: SurveyTile,
+    inside: NDArray[np.bool_],
     pixels: Float32Array,
     below: Float32Array,
     covered: NDArray[np.bool_],
-    weights: Float32Array,
+    share: Float32Array,
     *,
     apart: bool,
 ) -> NDArray[np.bool_]:
-    """Where a new picture replaces what lies below it; ``apart``: in several places, one by one."""
-    both = tile.inside & covered
-    share = tile.weight / np.maximum(tile.weight + weights, np.float32(1e-12))
-    alone: NDArray[np.bool_] = tile.inside & ~covered
+    """Where a new picture, with its share of both border weights, replaces what lies below it.
+
+    ``apart``: in several places, one by one.
+    """
+    both = inside & covered
+    alone: NDArray[np.bool_] = inside & ~covered
     free = both & (share > _LEAST_SHARE) & (share < _LARGEST_SHARE)
     surely_new: NDArray[np.bool_] = alone | (both & (share >= _LARGEST_SHARE))
     surely_old = covered & ~(surely_new | free)

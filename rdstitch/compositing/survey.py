@@ -14,7 +14,7 @@ from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.sampling import border_weight, sample, sample_opacity
 from rdstitch.compositing.source_images import PictureReader
-from rdstitch.compositing.warp import Warp, locate, plan_warps
+from rdstitch.compositing.warp import Geometry, Warp, locate, plan_warps
 
 _LARGEST_PICTURE = 150_000
 _LARGEST_TOTAL = 16_000_000
@@ -31,14 +31,22 @@ class SurveyTile:
     pixels : ndarray of shape (h, w, C)
         In the picture's sample type.
     inside : ndarray of shape (h, w), bool
-    weight : ndarray of shape (h, w), float32
-        Falls from 1 at the picture's centre to 0 at its border.
+    opacity : ndarray of shape (h, w), float32, or None
+        Of a picture with a mask.
     """
 
     box: Box
     pixels: NDArray[Any]
     inside: NDArray[np.bool_]
-    weight: Float32Array
+    opacity: Float32Array | None = None
+
+    def weight(self, geometry: Geometry) -> Float32Array:
+        """Falls from 1 at the picture's centre to 0 at its border, (h, w); not kept, since all would be half a survey.
+
+        ``geometry`` is where the box comes from.
+        """
+        weight = border_weight(geometry)
+        return weight if self.opacity is None else weight * self.opacity
 
 
 @dataclass(frozen=True)
@@ -96,11 +104,10 @@ def _survey_tile(reader: PictureReader, index: int, warp: Warp) -> SurveyTile | 
     """One picture, small."""
     geometry = locate(warp, warp.box)
     picture = reader.prepared(index, warp.shrink)
-    inside, weight = geometry.inside, border_weight(geometry)
-    opacity = sample_opacity(picture, geometry)
+    inside, opacity = geometry.inside, sample_opacity(picture, geometry)
     if opacity is not None:
-        inside, weight = inside & (opacity > 0), weight * opacity
+        inside = inside & (opacity > 0)
     if not inside.any():
         return None
     pixels = sample(picture, geometry, "linear")
-    return SurveyTile(warp.box, pixels.reshape(*inside.shape, -1), inside, weight)
+    return SurveyTile(warp.box, pixels.reshape(*inside.shape, -1), inside, opacity)

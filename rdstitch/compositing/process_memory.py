@@ -1,0 +1,31 @@
+"""Memory of this process: what it holds, and how what earlier stages have freed goes back to the system."""
+
+import ctypes
+import os
+from contextlib import suppress
+from pathlib import Path
+
+_USUAL = 180 * 2**20  # bytes; where the system does not say it: the libraries, and a few hundred registered pictures
+_BOUND, _BOUND_OF_A_PICTURE = 400 * 10**6, 150 * 10**3  # bytes; of the whole process, see docs/scale.md
+
+
+def release_free_heap() -> None:
+    """Give memory that earlier stages have freed back to the system, where the C library would keep it (glibc).
+
+    What the threads of one stage have freed is of little use to those of the next, and would count twice.
+    """
+    with suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def memory_left(pictures: int) -> int:
+    """Bytes that a process may still take for so many pictures within its usual bound; negative beyond it."""
+    return _BOUND + _BOUND_OF_A_PICTURE * pictures - _resident()
+
+
+def _resident() -> int:
+    """Bytes that this process holds now."""
+    with suppress(OSError, ValueError, LookupError, AttributeError):
+        pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
+        return int(pages) * os.sysconf("SC_PAGE_SIZE")
+    return _USUAL
