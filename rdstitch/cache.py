@@ -22,6 +22,7 @@ from rdstitch.errors import ArgumentError, InputError, OutputError
 from rdstitch.io.packing import digest, pack, unpack
 from rdstitch.io.staging import lock, remove_dead_files
 from rdstitch.regular_files import open_regular, read_limited
+from rdstitch.remote_files import is_url, remote_status
 from rdstitch.stored import LARGEST_ENTRY, Stored, TemporaryFolder, entry_name
 
 Value = TypeVar("Value")
@@ -182,6 +183,8 @@ class Cache:
         if self.temporary is not None:
             return str(path)
         try:
+            if is_url(path):
+                return remote_status(path)[2]
             with open_regular(path) as stream:
                 return hashlib.file_digest(stream, "sha256").hexdigest()
         except OSError:

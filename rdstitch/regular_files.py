@@ -6,15 +6,19 @@ import stat
 from io import BufferedReader
 from pathlib import Path
 
+from rdstitch.remote_files import is_url, open_remote
+
 
 def open_regular(path: str | Path) -> BufferedReader:
-    """Open a regular file for reading bytes, at once whatever lies there.
+    """Open a regular file for reading bytes, at once whatever lies there; or one that a URL names.
 
     Raises
     ------
     OSError
         When it cannot be opened, or is no regular file.
     """
+    if is_url(path):
+        return open_remote(path)
     # Opening a pipe would wait for a writer.
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     mode = os.fstat(descriptor).st_mode

@@ -10,8 +10,8 @@ from rdstitch.camera import Camera
 from rdstitch.compositing.blender import margin
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.options import CompositeOptions
-from rdstitch.compositing.process_memory import memory_left
 from rdstitch.errors import LimitError
+from rdstitch.process_memory import memory_left
 
 # What the compositor takes at most by default; more memory means that fewer pictures are read twice.
 DEFAULT_MEMORY = 256 * 2**20

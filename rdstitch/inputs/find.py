@@ -21,6 +21,7 @@ from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames, grey_frames
 from rdstitch.messages import Message, names_of, shortened
 from rdstitch.records import LARGEST_FILE, read_text
 from rdstitch.regular_files import read_limited
+from rdstitch.remote_files import is_url, remote_names
 
 PICTURE_SUFFIXES = frozenset(
     [".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".bmp", ".tga", ".jp2", ".ppm", ".pgm", ".pnm", ".gif"]
@@ -124,8 +125,10 @@ def find_pictures(
     interrupted = cache(interrupted_outputs)
     arguments = list(arguments)
     for frame, named in _expand(arguments, frames_folder, every, notes, topic):
-        is_output = frame.picture is None and (
-            is_rdstitch_output(frame.path) or frame.path.name in interrupted(frame.path.parent)
+        is_output = (
+            frame.picture is None
+            and not is_url(frame.path)
+            and (is_rdstitch_output(frame.path) or frame.path.name in interrupted(frame.path.parent))
         )
         if _entry(frame.path) in unwanted and is_output:
             continue
@@ -168,7 +171,9 @@ def _expand(
             yield argument, True
             continue
         path, text = Path(argument), str(argument)
-        if not _exists(path):
+        if is_url(path):
+            yield from _at_url(text)
+        elif not _exists(path):
             if text.startswith("@"):
                 file = Path(text[1:])
                 if file in lists:
@@ -196,6 +201,25 @@ def _expand(
             yield from ((Frame(*frame), True) for frame in extract_frames(path, frames_folder(), wanted.__contains__))
         else:
             yield Frame(path), True
+
+
+def _at_url(url: str) -> Iterator[tuple[Frame, bool]]:
+    """The picture, or the pictures of the folder or pattern, that a URL names."""
+    path = Path(url)
+    pattern = glob.has_magic(path.name)
+    if not pattern and path.suffix.lower() in PICTURE_SUFFIXES:
+        yield Frame(path), True
+        return
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        raise InputError(f"{path}: only pictures are read from other machines; download the video first")
+    try:
+        found = sorted(map(Path, remote_names(url)), key=natural_key)
+    except OSError as error:
+        raise InputError(f"{path}: {error}") from error
+    found = [name for name in found if name.suffix.lower() in PICTURE_SUFFIXES | HEIF_SUFFIXES]
+    if not found:
+        raise InputError(f"{path}: there are no pictures at this address")
+    yield from ((Frame(name), False) for name in found)
 
 
 def _exists(path: Path) -> bool:

@@ -9,8 +9,10 @@ from rdstitch.errors import InputError
 from rdstitch.io.read import Picture
 from rdstitch.messages import Message
 from rdstitch.regular_files import open_regular
+from rdstitch.remote_files import is_url, remote_status
 
 _PIECE = 2**20
+_DIGITS = 16
 
 _Stamp = tuple[int, int, int, int]
 
@@ -104,6 +106,8 @@ class InputGuard:
 def _stamp(path: Path) -> _Stamp | None:
     """What changes with every change of a file, and is cheap to see; None where there is none."""
     try:
+        if is_url(path):
+            return int(remote_status(path)[2][:_DIGITS], 16), 0, 0, 0
         status = path.stat()
     except OSError:
         return None

@@ -22,6 +22,7 @@ from rdstitch.io.read import Picture, read_image, reduced
 from rdstitch.io.reduction import block_minimum, fitting_reduction, reduced_size
 from rdstitch.messages import Message, left_out
 from rdstitch.planar_motion import rotation_from_tilt
+from rdstitch.remote_files import held_in_memory, is_url
 
 
 @dataclass(frozen=True)
@@ -77,8 +78,8 @@ class Source:
     def with_absolute_paths(self) -> Self:
         """The same by names that hold in workers elsewhere too, where relative ones begin at other folders."""
         mask = None if self.mask is None else self.mask.absolute()
-        in_memory = self.frame is not None and self.frame.picture is not None
-        return replace(self, path=self.path if in_memory else self.path.absolute(), mask=mask)
+        named = is_url(self.path) or (self.frame is not None and self.frame.picture is not None)
+        return replace(self, path=self.path if named else self.path.absolute(), mask=mask)
 
     def content(self, cache: Cache) -> str:
         """Hash of what the image is made from, for keys of the cache; for one of this run alone its name will do."""
@@ -118,7 +119,7 @@ class Source:
         """The pixels from the file, masked."""
         array = None if self.frame is None else self.frame.picture
         if array is None:
-            with self.guard.reading(self.path):
+            with held_in_memory(self.path), self.guard.reading(self.path):
                 picture = read_image(self.path, reduction)
         else:
             picture = reduced(array, reduction)

@@ -17,7 +17,8 @@ import tifffile
 from PIL import Image
 
 from rdstitch.errors import InputError
-from rdstitch.io.optional_readers import check_reader
+from rdstitch.io.optional_readers import check_reader, is_raw
+from rdstitch.remote_files import is_url, remote_status
 
 # What Pillow, tifffile and OpenCV have been seen to raise on damaged files; warnings, where filters make them errors.
 _DAMAGE = (
@@ -48,11 +49,12 @@ def check_readable(path: Path) -> None:
     InputError
         When the path is missing, no regular file, empty, or not readable.
     """
+    if is_url(path):
+        _check_remote(path)
+        return
     try:
         status = path.stat()
     except FileNotFoundError:
-        if str(path).startswith(("http:/", "https:/")):
-            raise InputError(f"{path}: is an address, not a file; download it first") from None
         hint = "a link to nothing" if path.is_symlink() else "no such file"
         raise InputError(f"{path}: {hint}; check the name") from None
     except (OSError, ValueError) as error:
@@ -66,6 +68,23 @@ def check_readable(path: Path) -> None:
     check_reader(path)
     if not os.access(path, os.R_OK):
         raise InputError(f"{path}: permission denied; make it readable")
+
+
+def _check_remote(path: Path) -> None:
+    """The same of what a URL names."""
+    if is_raw(path):
+        raise InputError(f"{path}: raw files are read from this machine's disks only; download it first")
+    check_reader(path)
+    try:
+        is_folder, size, _ = remote_status(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; check the address") from None
+    except OSError as error:
+        raise InputError(f"{path}: {error}") from error
+    if is_folder:
+        raise InputError(f"{path}: is a folder, not a picture; name the pictures in it")
+    if size == 0:
+        raise InputError(f"{path}: is empty (0 bytes); copy it again from its source")
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from rdstitch.io.opening import check_megapixels, opened_picture
 from rdstitch.io.optional_readers import is_raw, raw_exif, raw_size
 from rdstitch.io.orientation import SIDEWAYS, turned_direction
 from rdstitch.io.xmp import finite, xmp_number, xmp_text
+from rdstitch.regular_files import open_regular
 
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
@@ -125,7 +126,7 @@ def read_metadata(path: str | Path) -> Metadata:
                 return metadata_of(image)
         except SyntaxError:
             # Pillow knows few sample layouts of TIFF (no 16-bit colour with alpha, no five bands).
-            with tifffile.TiffFile(file) as tiff:
+            with open_regular(file) as stream, tifffile.TiffFile(stream, name=str(file)) as tiff:
                 page = tiff.pages.first
                 size = page.imagewidth, page.imagelength
                 if min(size) < 1:

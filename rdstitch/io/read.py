@@ -206,7 +206,7 @@ def _split(samples: Pixels) -> tuple[Pixels, Pixels | None]:
 
 def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
     """Samples and alpha of the first page, with any number of bands."""
-    with tifffile.TiffFile(file) as tiff:
+    with open_regular(file) as stream, tifffile.TiffFile(stream, name=str(file)) as tiff:
         page = tiff.pages.first
         plain = page.photometric in (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB)
         has_alpha = any(extra in (1, 2) for extra in page.extrasamples)
@@ -218,7 +218,8 @@ def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
             samples = None
         axes = page.axes
     if samples is None:
-        return _split(_decode_with_opencv(file.read_bytes()))
+        with open_regular(file) as stream:
+            return _split(_decode_with_opencv(stream.read()))
     if axes.startswith("S"):
         samples, axes = np.moveaxis(samples, 0, -1), axes[1:] + "S"
     if axes not in ("YX", "YXS"):

@@ -7,6 +7,7 @@ their square, of which 10,000 pictures take seconds.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,10 @@ _ORDERED = 0.5  # share of the pictures of which that is true of the next one; a
 _BLOCK = 8192  # descriptors assigned at a time
 _ROWS = 256  # pictures compared with all others at a time
 
+_LARGEST = 65504.0  # in half precision
+
 Array32 = NDArray[np.float32]
+Descriptors = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True)
@@ -74,14 +78,14 @@ class Vocabulary:
     words: Array32
 
     @classmethod
-    def learned(cls, descriptors: Array32, branches: int, random: np.random.Generator) -> "Vocabulary":
-        """Words that the descriptors (M, D), more than ``branches``, fall into."""
+    def learned(cls, descriptors: Descriptors, branches: int, random: np.random.Generator) -> "Vocabulary":
+        """Words that the descriptors (M, D), more than ``branches``, fall into; of any type, made float32 in parts."""
         few = np.sort(random.choice(len(descriptors), min(_TRAINING_PER_BRANCH * branches, len(descriptors)), False))
-        top = _lloyd(descriptors[few], branches, random)
+        top = _lloyd(descriptors[few].astype(np.float32), branches, random)
         words = np.repeat(top[:, None], branches, axis=1)
         nearest = _nearest(descriptors, top)
         for branch in range(branches):
-            own = descriptors[nearest == branch]
+            own = descriptors[nearest == branch].astype(np.float32)
             if len(own):
                 found = _lloyd(own, min(branches, len(own)), random)
                 words[branch, : len(found)] = found
@@ -129,8 +133,7 @@ def _weighted_words(features: FeatureStore, seed: int) -> sparse.csr_array | Non
     chosen = np.sort(random.choice(total, wanted, replace=False))
     starts = np.cumsum(counts) - counts
     parts = np.split(chosen, np.searchsorted(chosen, starts[1:]))
-    training = [_describing(found)[part - start] for found, part, start in zip(features, parts, starts, strict=True)]
-    vocabulary = Vocabulary.learned(np.concatenate([part for part in training if len(part)]), branches, random)
+    vocabulary = Vocabulary.learned(_training(features, parts, starts), branches, random)
     described = (_describing(found) for found in features)
     words = [vocabulary.assign(found) if len(found) else np.empty(0, np.intp) for found in described]
     image, word = np.repeat(np.arange(len(counts)), counts), np.concatenate(words)
@@ -139,6 +142,22 @@ def _weighted_words(features: FeatureStore, seed: int) -> sparse.csr_array | Non
     rarity = np.log(len(counts) / np.maximum(np.bincount(used.indices, minlength=vocabulary.size), 1))
     weighted = (used @ sparse.diags_array(rarity.astype(np.float32))).tocsr()
     return _unit_rows(weighted)
+
+
+def _training(features: FeatureStore, parts: list[IntArray], starts: IntArray) -> NDArray[np.float16]:
+    """The descriptors that words are learned from, by their places among those of all pictures.
+
+    Half precision loses nothing of descriptors as they are stored, and single precision would be the largest array of a
+    run.
+    """
+    sample, filled = np.empty((0, 0), dtype=np.float16), 0
+    for found, part, start in zip(features, parts, starts, strict=True):
+        own = _describing(found)[part - start]
+        if not sample.size:
+            sample = np.empty((sum(map(len, parts)), own.shape[1]), dtype=np.float16)
+        sample[filled : filled + len(own)] = np.clip(own, -_LARGEST, _LARGEST)
+        filled += len(own)
+    return sample
 
 
 def _describing(features: Features) -> Array32:
@@ -208,11 +227,11 @@ def _lloyd(points: Array32, count: int, random: np.random.Generator) -> Array32:
     return centres
 
 
-def _nearest(points: Array32, centres: Array32) -> IntArray:
+def _nearest(points: Descriptors, centres: Array32) -> IntArray:
     """The nearest centre of each point, shape (M,)."""
     half = np.einsum("kd,kd->k", centres, centres) / 2.0
     nearest = np.empty(len(points), dtype=np.intp)
     for first in range(0, len(points), _BLOCK):
         part = slice(first, first + _BLOCK)
-        nearest[part] = (points[part] @ centres.T - half).argmax(axis=1)
+        nearest[part] = (points[part].astype(np.float32, copy=False) @ centres.T - half).argmax(axis=1)
     return nearest

@@ -14,7 +14,6 @@ from rdstitch.compositing import (
     compose_to_file,
     plan_composite,
 )
-from rdstitch.compositing.process_memory import release_free_heap
 from rdstitch.export.georeference import Georeference, georeference, has_place, world_file_paths
 from rdstitch.inputs.source import Source
 from rdstitch.io.atomic import check_output, text_bytes
@@ -25,6 +24,7 @@ from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
 from rdstitch.messages import Message
 from rdstitch.pipeline.placed_images import PlacedImages, plan
+from rdstitch.process_memory import release_free_heap
 from rdstitch.progress import Progress
 from rdstitch.viewer import viewer_path
 

@@ -23,6 +23,7 @@ from rdstitch.pipeline.aligner import Aligner, close_loops, rematch_weak_pairs
 from rdstitch.pipeline.contrast import detect_by_contrast
 from rdstitch.pipeline.estimates import impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_working_size
+from rdstitch.process_memory import release_free_heap
 from rdstitch.progress import Progress, silent
 from rdstitch.registration import Registration
 
@@ -84,6 +85,7 @@ def register(
     cameras = [at_working_size(source.camera, options.features.limits[1]) for source in sources]
     features = detected.features.at_sizes([camera.image_size for camera in cameras])
     candidates = first_pairs(features, options.seed, positions_of(sources))
+    release_free_heap()
     pairing = Pairing(
         features,
         cameras,

@@ -31,7 +31,7 @@ def place(tmp_path: Path, frames: list[Path], monkeypatch: pytest.MonkeyPatch) -
         ("pano a.png b.png", 2, "'-o'"),
         ("pano a.png b.png -o out.png --blen none", 2, "--blend"),
         ("pano a.png b.png -o -", 6, "-: "),
-        ("pano a.png https://example.org/b.png -o out.png", 3, "download it first"),
+        ("pano a.png nowhere://example.org/b.png -o out.png", 3, "nowhere:/example.org/b.png: "),
         ("mosaic @more -o out.png", 3, "more: "),
         ("mosaic a.png -o out.png", 2, "two different pictures"),
         ("pano a.png b.png -o out.png --tilt 200,0", 2, "'--tilt'"),

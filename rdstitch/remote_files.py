@@ -1,0 +1,124 @@
+"""Files that lie elsewhere, by a URL of any kind that fsspec knows: ``s3://``, ``gs://``, ``https://``, ``memory://`` …
+
+A URL travels as a path, like the name of any input. :class:`pathlib.Path` writes ``s3://bucket/name`` with one slash,
+which is undone here before anything is opened.
+"""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from importlib import import_module
+from io import BufferedReader, BytesIO
+from pathlib import Path
+from typing import Any
+
+_BLOCK = 2**18  # bytes of a file that are fetched at a time where only its header is wanted
+# Two letters or more: one is a drive.
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
+_SEVERAL = "::"  # between the parts of a chain, as in simplecache::s3://bucket/name
+_held: ContextVar[tuple[str, bytes] | None] = ContextVar("held", default=None)
+
+
+def is_url(path: str | Path) -> bool:
+    """Whether a name is a URL; also once it was made a path."""
+    return _SCHEME.match(str(path).rpartition(_SEVERAL)[2]) is not None
+
+
+def url_of(path: str | Path) -> str:
+    """The URL that a path was made of."""
+    chain = []
+    for part in str(path).split(_SEVERAL):
+        scheme, slash, rest = part.partition(":/")
+        absolute = "/" if scheme in ("file", "local") else ""
+        chain.append(f"{scheme}://{absolute}{rest.lstrip('/')}" if slash else part)
+    return _SEVERAL.join(chain)
+
+
+def open_remote(path: str | Path) -> BufferedReader:
+    """Open a file for reading bytes at any place; a header is had without the rest, where the server allows that.
+
+    Raises
+    ------
+    OSError
+        When it cannot be opened. The text says what to install, where something is missing.
+    """
+    held = _held.get()
+    if held is not None and held[0] == str(path):
+        return BufferedReader(BytesIO(held[1]))
+    with _as_os_error():
+        system, name = _filesystem(path)
+        stream: BufferedReader = system.open(name, "rb", block_size=_BLOCK)
+        if stream.seekable():
+            return stream
+        with stream:
+            return BufferedReader(BytesIO(stream.read()))
+
+
+@contextmanager
+def held_in_memory(path: Path) -> Iterator[None]:
+    """Fetch a file whole, once for all that open it inside the block; files of this machine stay where they are."""
+    if not is_url(path):
+        yield
+        return
+    with open_remote(path) as stream, _as_os_error():
+        token = _held.set((str(path), stream.read()))
+    try:
+        yield
+    finally:
+        _held.reset(token)
+
+
+def remote_status(path: str | Path) -> tuple[bool, int | None, str]:
+    """Whether it is a folder, its size in bytes where the server says that, and what changes with its content.
+
+    Raises
+    ------
+    OSError
+        As :func:`open_remote`.
+    """
+    with _as_os_error():
+        system, name = _filesystem(path)
+        found = system.info(name)
+        return found["type"] == "directory", found.get("size"), system.ukey(name)
+
+
+def remote_names(url: str) -> list[str]:
+    """URLs of the files in a folder, or of those that match a pattern; empty where the URL is neither.
+
+    Raises
+    ------
+    OSError
+        As :func:`open_remote`.
+    """
+    with _as_os_error():
+        system, name = _filesystem(url)
+        if any(letter in url for letter in "*["):
+            found = system.glob(name)
+        else:
+            found = system.ls(name, detail=False) if system.isdir(name) else []
+        before = url.rpartition(_SEVERAL)[0]
+        chain = f"{before}{_SEVERAL}" if before else ""
+        return [chain + system.unstrip_protocol(entry).rpartition(_SEVERAL)[2] for entry in found]
+
+
+def _filesystem(path: str | Path) -> tuple[Any, str]:
+    """The file system of a URL, and the name in it."""
+    try:
+        core = import_module("fsspec.core")
+    except ImportError:
+        raise OSError("URLs need the extra remote: pip install 'rdstitch[remote]'") from None
+    system, name = core.url_to_fs(url_of(path))
+    return system, name
+
+
+@contextmanager
+def _as_os_error() -> Iterator[None]:
+    """Whatever a file system raises; each has its own kinds of errors."""
+    try:
+        yield
+    except OSError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise OSError(f"cannot be fetched: {reason}") from error
