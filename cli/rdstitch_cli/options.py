@@ -290,7 +290,7 @@ compositing = together(
     click.option(
         "--max-memory",
         type=Bytes(),
-        help="Memory that compositing may take, as 800M; otherwise 256M, or more for a large canvas.",
+        help="Memory that compositing may take, as 800M; otherwise up to 256M, or more for a large canvas.",
     ),
     click.option(
         "--scale",

@@ -1,7 +1,9 @@
 """Stage: check a registration; what fails a check is left out by name, and the rest is aligned anew."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -47,7 +49,9 @@ class _Offenders:
 
 
 @impossible_estimates_fail()
-def accept(registration: Registration, options: StitchOptions, *, lens_only: bool = False) -> Registration:
+def accept(
+    registration: Registration, options: StitchOptions, executor: Executor, *, lens_only: bool = False
+) -> Registration:
     """The registration of what passes all checks, with everything that the user should know of it.
 
     Parameters
@@ -55,6 +59,8 @@ def accept(registration: Registration, options: StitchOptions, *, lens_only: boo
     registration : Registration
         In pixels of the working size; the result is in those of the pictures.
     options : StitchOptions
+    executor : concurrent.futures.Executor
+        Where pictures are compared.
     lens_only : bool
         Only the lens is wanted, so that doubts about the places of pictures do not matter.
 
@@ -66,7 +72,8 @@ def accept(registration: Registration, options: StitchOptions, *, lens_only: boo
         When a picture is left out, under ``options.strict``.
     """
     cache = Cache(options.cache)
-    current, found = registration, _checked(registration, options, cache, lens_only)
+    checked = partial(judge, threshold=options.threshold, executor=executor, cache=cache, lens_only=lens_only)
+    current, found = registration, checked(registration)
     first = registration.with_messages(found)
     if not first.ok and not options.force:
         aligner = Aligner.of(registration.sources, options, cache)
@@ -82,17 +89,13 @@ def accept(registration: Registration, options: StitchOptions, *, lens_only: boo
             # Where as many pictures fail as pass, nobody can say which of them are right.
             if shrunk is None or shrunk.alignment.used.sum() <= len(left.reasons):
                 raise RefusedError(at_full_size(first))
-            current, found = shrunk, _checked(shrunk, options, cache, lens_only)
+            current, found = shrunk, checked(shrunk)
     accepted = at_full_size(current).with_messages(found)
     if not accepted.ok and not options.force:
         raise RefusedError(at_full_size(first))
     if options.strict and accepted.left_out:
         raise PartialResultError("; ".join(map(str, accepted.left_out)))
     return accepted
-
-
-def _checked(registration: Registration, options: StitchOptions, cache: Cache, lens_only: bool) -> tuple[Message, ...]:
-    return judge(registration, options.threshold, options.threads, cache, lens_only=lens_only)
 
 
 def _concerns_all(found: Iterable[Message]) -> bool:

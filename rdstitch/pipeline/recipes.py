@@ -90,8 +90,8 @@ def pano(
         sources, _ = _read(found.frames, options, skip_bad=False)
         with options.executor(len(sources)) as executor:
             registration = register(sources, options, executor, skip_bad=False, progress=progress)
-        registration = registration.with_messages(found.messages)
-        return _composite(registration, output, options, progress, beside, frontal=True)
+            accepted = accept(registration.with_messages(found.messages), options, executor)
+        return _composite(accepted, output, options, progress, beside, frontal=True)
 
 
 def mosaic(
@@ -173,7 +173,7 @@ def calibrate(
     options = options or StitchOptions()
     with found_pictures(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as found:
         _check_outputs(None, options, found.files)
-        registration = accept(_register_all(found, options, progress, lens_only=True), options, lens_only=True)
+        registration = _register_all(found, options, progress, lens_only=True)
     _release_decoded_images(registration)
     result = _with_damage(registration)
     with Outputs(options.overwrite) as outputs:
@@ -229,7 +229,7 @@ def trajectory(
         times = timestamps_of(sources, timestamps)
         with options.executor(len(sources)) as executor:
             registration = register(sources, options, executor, skip_bad=True, metric=True, progress=progress)
-        registration = accept(registration.with_messages([*unread, *found.messages]), options)
+            registration = accept(registration.with_messages([*unread, *found.messages]), options, executor)
     _release_decoded_images(registration)
     registration = _with_damage(registration).with_messages(scale_uncertainty(registration.alignment))
     path = Trajectory.from_alignment(registration.alignment, height)
@@ -247,11 +247,11 @@ def trajectory(
 def _register_all(
     found: FoundPictures, options: StitchOptions, progress: Progress, *, lens_only: bool = False
 ) -> Registration:
-    """Register a sequence, leaving out what cannot be read."""
+    """Register and check a sequence, leaving out what cannot be read."""
     sources, unread = _read(found.frames, options, skip_bad=True)
     with options.executor(len(sources)) as executor:
         registration = register(sources, options, executor, skip_bad=True, lens_only=lens_only, progress=progress)
-    return registration.with_messages([*unread, *found.messages])
+        return accept(registration.with_messages([*unread, *found.messages]), options, executor, lens_only=lens_only)
 
 
 def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Sequence[str | Path]) -> None:
@@ -291,11 +291,11 @@ def _composite(
     *,
     frontal: bool = False,
 ) -> StitchResult:
-    """Check, then compose into memory, or into a file that is published with all that belongs to it.
+    """Compose into memory, or into a file that is published with all that belongs to it.
 
     ``frontal`` takes the undistorted reference picture for the plane.
     """
-    registration = with_frontal_reference(accept(registration, options), options, always=frontal)
+    registration = with_frontal_reference(registration, options, always=frontal)
     local = align_registration_locally(registration, options.local_alignment)
     placed = PlacedImages.of(registration, local.fields or None)
     with Outputs(options.overwrite) as outputs:

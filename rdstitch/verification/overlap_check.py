@@ -1,23 +1,37 @@
 """A second opinion on a registration: do the pictures look alike where it puts them together?"""
 
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+import functools
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import chain
 
 import numpy as np
 
 from rdstitch.alignment.result import LinkFit
 from rdstitch.alignment.rotation_model import nearest_rotation
+from rdstitch.arrays import FloatArray
 from rdstitch.cache import NO_CACHE, Cache
+from rdstitch.camera import Camera
+from rdstitch.executors import in_order
+from rdstitch.inputs.input_guard import GuardNotes
+from rdstitch.inputs.source import Source
 from rdstitch.io.reduction import fitting_reduction
 from rdstitch.registration import Registration
-from rdstitch.verification.photometric_agreement import COMPARED_SIDE, Agreement, PlacedPicture, overlap_agreement
-from rdstitch.verification.self_similarity import Ambiguity, draw, drawing_scale, placement_ambiguity
+from rdstitch.verification.photometric_agreement import (
+    COMPARED_SIDE,
+    Agreement,
+    PlacedPicture,
+    as_compared,
+    overlap_agreement,
+)
+from rdstitch.verification.self_similarity import Ambiguity, Drawing, draw, drawing_scale, placement_ambiguity
 
 _MOST_LINKS = 40
 """Links that are looked at in a large set; the least confirmed ones."""
+
+_LINKS_AT_ONCE = 5
+"""Links of a task at the most, so that a few keep several workers busy."""
 
 
 @dataclass(frozen=True)
@@ -43,14 +57,40 @@ class CheckedLink:
         return self.fit.image1, self.fit.image2
 
 
-def check_overlaps(registration: Registration, workers: int = 1, cache: Cache = NO_CACHE) -> list[CheckedLink]:
+@dataclass(frozen=True)
+class OverlapTask:
+    """Links to be looked at together.
+
+    Attributes
+    ----------
+    links : sequence of (LinkFit, float)
+        With the scale that the two pictures are drawn at, pixels a unit of the plane.
+    sources : mapping of int to Source
+        The pictures of these links.
+    cameras : mapping of int to Camera
+    homographies : mapping of int to ndarray of shape (3, 3)
+    stretch : (float, float) or None
+        Grey levels of black and white.
+    on_sphere : bool
+        Whether the homographies lead to directions.
+    """
+
+    links: Sequence[tuple[LinkFit, float]]
+    sources: Mapping[int, Source]
+    cameras: Mapping[int, Camera]
+    homographies: Mapping[int, FloatArray]
+    stretch: tuple[float, float] | None
+    on_sphere: bool
+
+
+def check_overlaps(registration: Registration, executor: Executor, cache: Cache = NO_CACHE) -> list[CheckedLink]:
     """Compare the pictures of every used link, or of those that the fewest others confirm.
 
     Parameters
     ----------
     registration : Registration
-    workers : int
-        Pictures read at the same time.
+    executor : concurrent.futures.Executor
+        Where batches of links are looked at.
     cache : Cache
 
     Raises
@@ -65,7 +105,13 @@ def check_overlaps(registration: Registration, workers: int = 1, cache: Cache = 
         (k, source.content(cache), cache.file(source.mask), alignment.cameras[k], alignment.homographies[k])
         for k, source in ((k, registration.sources[k]) for k in pictures)
     ]
-    compute = partial(_compare, registration, chosen, pictures, workers)
+
+    def compute() -> list[CheckedLink]:
+        checked: list[CheckedLink] = []
+        for found, notes in in_order(executor, compare_overlaps, _tasks(registration, chosen)):
+            registration.sources[0].guard.learn(notes)
+            checked += found
+        return checked
 
     def valid(checked: list[CheckedLink]) -> bool:
         return [link.pair for link in checked] == [(fit.image1, fit.image2) for fit in chosen]
@@ -80,43 +126,63 @@ def share_alike(checked: Sequence[CheckedLink]) -> float:
     return sum(link.agreement.confirming for link in checked) / cells if cells else float("nan")
 
 
-def _compare(
-    registration: Registration, chosen: Sequence[LinkFit], pictures: Sequence[int], workers: int
-) -> list[CheckedLink]:
-    """Read the pictures, and compare those of the chosen links."""
+def _tasks(registration: Registration, chosen: Sequence[LinkFit]) -> list[OverlapTask]:
+    """Batches of links that follow one another, which have pictures in common."""
     alignment = registration.alignment
+    scales = [1.0] * len(chosen)
+    if not alignment.on_sphere:
+        compared = (as_compared(alignment.cameras[fit.image2]) for fit in chosen)
+        fitting = [
+            drawing_scale(camera, alignment.homographies[fit.image2])
+            for camera, fit in zip(compared, chosen, strict=True)
+        ]
+        scales = _scales(fitting)
+    tasks = []
+    for start in range(0, len(chosen), _LINKS_AT_ONCE):
+        links = list(zip(chosen, scales, strict=True))[start : start + _LINKS_AT_ONCE]
+        own = sorted({k for fit, _ in links for k in (fit.image1, fit.image2)})
+        sources = {k: registration.sources[k] for k in own}
+        cameras, places = {k: alignment.cameras[k] for k in own}, {k: alignment.homographies[k] for k in own}
+        tasks.append(OverlapTask(links, sources, cameras, places, registration.stretch, alignment.on_sphere))
+    return tasks
 
-    def place(index: int) -> PlacedPicture:
-        source = registration.sources[index]
-        picture = source.read(fitting_reduction(max(source.camera.image_size) / COMPARED_SIDE), keep=True)
-        return PlacedPicture.of(picture, alignment.cameras[index], alignment.homographies[index], registration.stretch)
+
+def compare_overlaps(task: OverlapTask) -> tuple[list[CheckedLink], GuardNotes]:
+    """Read the pictures of a task, and compare those of each link; and what was noticed of the files."""
+    placed = {k: _placed(task, k) for k in task.sources}
+
+    @functools.cache
+    def drawing(index: int, scale: float) -> Drawing:
+        return draw(placed[index], scale)
 
     def compare(fit: LinkFit, scale: float) -> CheckedLink:
+        if task.on_sphere:
+            return _compare_around(fit, placed[fit.image1], placed[fit.image2])
         i, j = fit.image1, fit.image2
-        ambiguity = placement_ambiguity(drawings[i, scale], drawings[j, scale])
+        ambiguity = placement_ambiguity(drawing(i, scale), drawing(j, scale))
         return CheckedLink(fit, overlap_agreement(placed[i], placed[j]), ambiguity)
 
-    def compare_around(fit: LinkFit) -> CheckedLink:
-        # No plane shows all pictures of a turn; one between the two shows both, and stretches neither much.
-        both = alignment.homographies[[fit.image1, fit.image2]]
-        rotations = both / np.linalg.norm(both, axis=1, keepdims=True)
-        to_plane = nearest_rotation(rotations.sum(axis=0)).T @ both
-        first = replace(placed[fit.image1], homography=to_plane[0])
-        second = replace(placed[fit.image2], homography=to_plane[1])
-        scale = drawing_scale(second)
-        ambiguity = placement_ambiguity(draw(first, scale), draw(second, scale))
-        return CheckedLink(fit, overlap_agreement(first, second), ambiguity)
+    checked = [compare(*link) for link in task.links]
+    sources = list(task.sources.values())
+    return checked, sources[0].guard.notes_on([source.path for source in sources])
 
-    with ThreadPoolExecutor(workers) as pool:
-        placed = dict(zip(pictures, pool.map(place, pictures), strict=True))
-        if alignment.on_sphere:
-            return list(pool.map(compare_around, chosen))
-        scales = _scales([drawing_scale(placed[fit.image2]) for fit in chosen])
-        wanted = sorted(
-            {(k, scale) for fit, scale in zip(chosen, scales, strict=True) for k in (fit.image1, fit.image2)}
-        )
-        drawings = dict(zip(wanted, pool.map(lambda key: draw(placed[key[0]], key[1]), wanted), strict=True))
-        return list(pool.map(compare, chosen, scales))
+
+def _placed(task: OverlapTask, index: int) -> PlacedPicture:
+    """A picture, read and made small."""
+    source = task.sources[index]
+    picture = source.read(fitting_reduction(max(source.camera.image_size) / COMPARED_SIDE), keep=True)
+    return PlacedPicture.of(picture, task.cameras[index], task.homographies[index], task.stretch)
+
+
+def _compare_around(fit: LinkFit, first: PlacedPicture, second: PlacedPicture) -> CheckedLink:
+    """No plane shows all pictures of a turn; one between the two shows both, and stretches neither much."""
+    both = np.stack([first.homography, second.homography])
+    rotations = both / np.linalg.norm(both, axis=1, keepdims=True)
+    to_plane = nearest_rotation(rotations.sum(axis=0)).T @ both
+    first, second = replace(first, homography=to_plane[0]), replace(second, homography=to_plane[1])
+    scale = drawing_scale(second.camera, second.homography)
+    ambiguity = placement_ambiguity(draw(first, scale), draw(second, scale))
+    return CheckedLink(fit, overlap_agreement(first, second), ambiguity)
 
 
 def _scales(fitting: Sequence[float]) -> list[float]:

@@ -19,6 +19,7 @@ from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.lattice import Lattice
 from rdstitch.io.read import Picture
+from rdstitch.io.reduction import fitting_reduction, reduced_size
 from rdstitch.radial_homography import from_plane, to_plane
 
 Grey = NDArray[np.float32]
@@ -95,14 +96,25 @@ class PlacedPicture:
         return np.asarray(found, dtype=np.float32)
 
 
+def as_compared(camera: Camera) -> Camera:
+    """The camera of a picture as it is compared, for one that is read no larger than that asks for."""
+    read = reduced_size(camera.image_size, fitting_reduction(max(camera.image_size) / COMPARED_SIDE))
+    return camera.resized(_compared_size(read))
+
+
+def _compared_size(size: tuple[int, int]) -> tuple[int, int]:
+    """Width and height that a picture is made smaller to."""
+    factor = min(1.0, COMPARED_SIDE / max(size))
+    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
+
+
 def _reduced_grey(picture: Picture, stretch: tuple[float, float] | None) -> Grey:
     pixels = picture.pixels
     full = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else max(float(pixels.max()), 1e-12)
     if stretch is not None:  # black may be anywhere: only differences of grey levels are compared
         full = max(stretch[1] - stretch[0], 1e-12)
     height, width = pixels.shape[:2]
-    factor = min(1.0, COMPARED_SIDE / max(height, width))
-    size = max(1, round(width * factor)), max(1, round(height * factor))
+    size = _compared_size((width, height))
     small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.float32) / np.float32(full)
     grey: Grey = small if small.ndim == 2 else small.mean(axis=2, dtype=np.float32)
     if picture.alpha is not None:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.radial_homography import to_plane
 from rdstitch.verification.photometric_agreement import Grey, PlacedPicture
 
@@ -64,11 +65,11 @@ class Drawing:
     origin: FloatArray
 
 
-def drawing_scale(picture: PlacedPicture) -> float:
-    """Px per unit of the plane at which the middle of a picture keeps its size, made small."""
-    height, width = picture.grey.shape
+def drawing_scale(camera: Camera, homography: FloatArray) -> float:
+    """Pixels per unit of the plane at which the middle of a picture keeps its size, made small."""
+    width, height = camera.image_size
     around = np.array([[width / 2 + dx, height / 2 + dy] for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1))])
-    left, right, top, bottom = to_plane(picture.camera, picture.homography, around)
+    left, right, top, bottom = to_plane(camera, homography, around)
     (ax, ay), (bx, by) = right - left, bottom - top
     area = abs(ax * by - ay * bx) / 4.0
     return float(min(1.0, _LONGEST_SIDE / max(height, width)) / np.sqrt(area))

@@ -2,6 +2,8 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import nullcontext
 
 import numpy as np
 
@@ -51,7 +53,7 @@ class RefusedError(RegistrationError):
 def judge(
     registration: Registration,
     threshold: float,
-    workers: int = 1,
+    executor: Executor | None = None,
     cache: Cache = NO_CACHE,
     *,
     lens_only: bool = False,
@@ -67,8 +69,8 @@ def judge(
     registration : Registration
     threshold : float
         Largest transfer error of an inlier of a pair, pixels.
-    workers : int
-        Pictures read at the same time.
+    executor : concurrent.futures.Executor, optional
+        Where pictures are compared; None: in one thread.
     cache : Cache
     lens_only : bool
         Only the lens is wanted, so that doubts about the places of pictures do not make the result fail.
@@ -91,7 +93,8 @@ def judge(
     ]
     if geometric:  # what the pixels say of pictures that may be left out need not be known
         return tuple(geometric)
-    checked = [] if resting else check_overlaps(registration, workers, cache)
+    with nullcontext(executor) if executor is not None else ThreadPoolExecutor(1) as where:
+        checked = [] if resting else check_overlaps(registration, where, cache)
     ambiguous = _ambiguous(paths, checked)
     rivals = find_rival_motions(alignment, registration.pairs, threshold)
     parallax = find_parallax(alignment, registration.pairs) if alignment.on_sphere else []

@@ -171,7 +171,7 @@ def measure(kind: str, height: float, seed: int, pictures: int) -> Figures:
         options = StitchOptions(workers=1, threshold=3.0)
         start = time.process_time()
         with open_executor(1, len(sources)) as executor:
-            registration = accept(register(sources, options, executor, skip_bad=True), options)
+            registration = accept(register(sources, options, executor, skip_bad=True), options, executor)
         registered = time.process_time()
         local = align_registration_locally(registration, "auto")
         done = time.process_time()

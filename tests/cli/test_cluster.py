@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import rdstitch
+from rdstitch.executors import ProcessExecutor
 from tests.cli.running import FAST, Run, flight
 
 pytest.importorskip("distributed")
@@ -79,6 +80,29 @@ def test_a_cluster_gives_the_same_bytes_though_a_worker_dies(pictures: list[Path
     assert there.read_bytes() == here.read_bytes()
     assert _record(there) == _record(here)
     assert [done for stage, done in steps if stage == "detecting features"] == list(range(1, _PICTURES + 1))
+
+
+def test_one_and_four_worker_processes_give_the_same_bytes(
+    pictures: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All work on pictures and pairs is in tasks: each kind of them was handed over."""
+    handed: set[str] = set()
+
+    class Recording(ProcessExecutor):
+        def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Any:
+            handed.add(fn.__name__)
+            return super().submit(fn, *args, **kwargs)
+
+    monkeypatch.setattr("rdstitch.options.open_executor", lambda workers, *_, **__: Recording(workers))
+    outputs = []
+    for workers in (1, 4):
+        outputs.append(tmp_path / str(workers) / "out.png")
+        outputs[-1].parent.mkdir()
+        features = rdstitch.FeatureOptions(max_features=600)
+        rdstitch.mosaic(pictures, outputs[-1], rdstitch.StitchOptions(features=features, workers=workers))
+    assert outputs[0].read_bytes() == outputs[1].read_bytes()
+    assert _record(outputs[0]) == _record(outputs[1])
+    assert handed == {"detect_batch", "match_pairs", "estimate_pairs", "compare_overlaps"}
 
 
 def test_a_cluster_is_started_here_and_ended(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:

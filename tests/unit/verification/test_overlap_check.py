@@ -1,6 +1,8 @@
 """Which overlaps are compared, and how many agree."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +13,7 @@ from rdstitch.alignment.result import LinkFit
 from rdstitch.alignment.rotation_model import rotation_from_vector
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.verification import overlap_check
 from rdstitch.verification.overlap_check import CheckedLink, _least_confirmed, _scales, share_alike
 from rdstitch.verification.photometric_agreement import Agreement, PlacedPicture
@@ -65,16 +68,17 @@ def test_a_turn_is_compared_between_the_two_pictures(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(overlap_check, "placement_ambiguity", lambda first, second: Ambiguity(1.0, 0.0, 0.0))
     monkeypatch.setattr(overlap_check, "draw", lambda picture, scale: picture)
-    monkeypatch.setattr(overlap_check, "drawing_scale", lambda picture: 1.0)
+    monkeypatch.setattr(overlap_check, "drawing_scale", lambda camera, homography: 1.0)
     monkeypatch.setattr(overlap_check, "overlap_agreement", agreement)
     monkeypatch.setattr(PlacedPicture, "of", of)
     first, last, half = (rotation_from_vector(np.array([[0.0, angle, 0.0]]))[0] for angle in (0.1, 0.4, 0.15))
     lens = Camera((64, 48))
     focal = np.diag([0.7, 0.7, 1.0])  # half diagonals to directions
     alignment = SimpleNamespace(homographies=np.stack([first, last]) @ focal, cameras=[lens] * 2, on_sphere=True)
-    source = SimpleNamespace(read=lambda *_, **__: None, camera=lens)
+    source = SimpleNamespace(read=lambda *_, **__: None, camera=lens, guard=InputGuard(), path=Path("a.png"))
     registration: Any = SimpleNamespace(alignment=alignment, sources=[source] * 2, stretch=None)
-    overlap_check._compare(registration, [_fit(0, 1)], [0, 1], 1)
+    (task,) = overlap_check._tasks(registration, [_fit(0, 1)])
+    overlap_check.compare_overlaps(task)
     np.testing.assert_allclose(seen[0].homography, half.T @ focal, atol=1e-9)
     np.testing.assert_allclose(seen[1].homography, half @ focal, atol=1e-9)
 
@@ -96,5 +100,5 @@ def test_cached_overlaps_are_those_of_the_same_links(monkeypatch: pytest.MonkeyP
     source = SimpleNamespace(content=lambda cache: "", mask=None)
     registration: Any = SimpleNamespace(alignment=alignment, sources=[source] * 3, stretch=None)
     cache: Any = Recorded()
-    assert overlap_check.check_overlaps(registration, 1, cache) == checked
+    assert overlap_check.check_overlaps(registration, ThreadPoolExecutor(1), cache) == checked
     assert verdicts == [True, False, False]

@@ -24,7 +24,7 @@ def _placed(
 
 
 def _ambiguity(first: PlacedPicture, second: PlacedPicture) -> Ambiguity:
-    scale = drawing_scale(second)
+    scale = drawing_scale(second.camera, second.homography)
     return placement_ambiguity(draw(first, scale), draw(second, scale))
 
 
@@ -86,7 +86,7 @@ def test_a_large_picture_is_drawn_small_and_at_the_scale_of_its_middle() -> None
     large = Camera((1024, 768))
     made = PlacedPicture(np.zeros((768, 1024), np.float32), large, np.eye(3))
     # 640 pixels of half a diagonal a unit, and a quarter of its size.
-    assert drawing_scale(made) == pytest.approx(160.0)
+    assert drawing_scale(made.camera, made.homography) == pytest.approx(160.0)
     assert draw(made, 160.0).pixels.shape in ((192, 256), (193, 257))
-    assert drawing_scale(_placed(PLANE, 0, 0)) == pytest.approx(160.0)
+    assert drawing_scale(LENS, _placed(PLANE, 0, 0).homography) == pytest.approx(160.0)
     assert draw(made, 160.0).origin == pytest.approx([-128.0, -96.0], abs=1.0)

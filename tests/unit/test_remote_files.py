@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -70,9 +71,12 @@ def test_a_picture_is_fetched_once_each_time_it_is_read(flight: str, monkeypatch
     opened: list[str] = []
     system = type(fsspec.filesystem("memory"))
     original = system.open
-    monkeypatch.setattr(
-        system, "open", lambda self, name, *a, **k: (opened.append(name), original(self, name, *a, **k))[1]
-    )
+
+    def counted(self: Any, name: str, *arguments: Any, **options: Any) -> Any:
+        opened.append(name)
+        return original(self, name, *arguments, **options)
+
+    monkeypatch.setattr(system, "open", counted)
     source.read()
     assert len(opened) == 1
 

@@ -1,0 +1,24 @@
+"""What a composite may take when nobody says it."""
+
+import pytest
+
+from rdstitch.compositing import plan as planning
+from rdstitch.compositing.options import CompositeOptions
+from rdstitch.compositing.plan import DEFAULT_MEMORY, CompositePlan, plan_composite
+from tests.compositing_scenes import render
+
+
+def _planned(monkeypatch: pytest.MonkeyPatch, left: int) -> CompositePlan:
+    """The plan of a process that has so much left."""
+    scene = render(3, 1)
+    monkeypatch.setattr(planning, "memory_left", lambda pictures: left)
+    return plan_composite(scene.cameras, scene.canvas, CompositeOptions(workers=2))
+
+
+def test_it_takes_what_the_process_has_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    plenty, tight, none = (_planned(monkeypatch, 2**20 * left) for left in (1000, 80, -50))
+    assert (plenty.tile_size, plenty.workers) == (512, 2)
+    assert plenty.memory_bytes <= DEFAULT_MEMORY
+    assert tight.memory_bytes <= 80 * 2**20 < plenty.memory_bytes + plenty.cache_bytes
+    assert (none.tile_size, none.workers) == (256, 1)
+    assert none.memory_bytes < tight.memory_bytes

@@ -1,0 +1,25 @@
+"""What memory is left of the usual bound."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rdstitch import process_memory
+from rdstitch.process_memory import memory_left, release_free_heap
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system does not say what a process holds")
+def test_what_the_process_holds_counts() -> None:
+    before = memory_left(0)
+    held = np.ones(50_000_000, dtype=np.uint8)
+    assert before - memory_left(0) == pytest.approx(held.nbytes, rel=0.1)
+    del held
+    release_free_heap()
+    assert memory_left(0) == pytest.approx(before, abs=10e6)
+
+
+def test_the_bound_is_400_mb_and_150_kb_a_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process_memory, "_resident", lambda: 100_000_000)
+    assert memory_left(0) == 300_000_000
+    assert memory_left(1000) == 450_000_000
