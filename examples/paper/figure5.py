@@ -33,7 +33,7 @@ def run(settings: Settings) -> Report:
         "model",
         "median error, px",
         "95 %, px",
-        "lens told apart",
+        "warned",
     )
     title = f"Fig. 5: rendered pairs through an equidistant fisheye, {size[0]}x{size[1]} px, errors on the true plane"
     tables, notes = [Table(title, header, tuple(rows))], []
@@ -71,5 +71,5 @@ def _rendered(lens: Lens, seed: int) -> tuple[tuple[object, ...], Pixels]:
         registration.alignment.model,
         error.median,
         error.percentile95,
-        "no" if "whether μ is needed" in registration.alignment.lens_reason else "yes",
+        "yes" if any(message.code == "few-pictures" for message in registration.alignment.messages) else "no",
     ), picture

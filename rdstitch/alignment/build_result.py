@@ -8,7 +8,8 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.cycle_consistency import link_medians
-from rdstitch.alignment.lens_selection import CENTER, LensChoice
+from rdstitch.alignment.lens_description import radius_std
+from rdstitch.alignment.lens_selection import CENTER, ENOUGH_PICTURES, WORTH_SAYING, LensChoice
 from rdstitch.alignment.model_selection import ModelChoice
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y, metric_poses
 from rdstitch.alignment.normal_equations import whitened_errors
@@ -28,6 +29,12 @@ from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 _STEP = 1e-5
 """Of differences of λ, μ and ν."""
+
+_RADII = np.linspace(0.05, 1.0, 20)
+"""Half diagonals: where the lens is looked at, out to the corner."""
+
+_CONFIDENT = 2.0
+"""Standard deviations within which the lens is taken to be known: 95 %."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +114,7 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
         links=_link_fits(found, inliers),
         relief=relief,
         shape=_shape(found),
-        messages=_warnings(found),
+        messages=_warnings(found, own),
     )
 
 
@@ -239,7 +246,7 @@ def _link_fits(found: AdjustedPictures, inliers: BoolArray) -> tuple[LinkFit, ..
     return tuple(result)
 
 
-def _warnings(found: AdjustedPictures) -> tuple[Message, ...]:
+def _warnings(found: AdjustedPictures, camera: Camera) -> tuple[Message, ...]:
     """What the user should know of the whole."""
     result: list[Message] = []
     if not found.observable:
@@ -248,6 +255,14 @@ def _warnings(found: AdjustedPictures) -> tuple[Message, ...]:
             "give λ, a camera file, or pictures that overlap by less"
         )
         result.append(Message(text, code="lambda-not-observable"))
+    elif len(found.pictures) < ENOUGH_PICTURES and found.problem.free_lens.any():
+        off = max(found.lens.corner_shift, _CONFIDENT * float(radius_std(camera, _RADII)[-1]))
+        if off > WORTH_SAYING:
+            text = (
+                f"{len(found.pictures)} pictures show the lens to {off:.1f} pixels at the corners only; "
+                f"take {ENOUGH_PICTURES} or more, or give the lens"
+            )
+            result.append(Message(text, code="few-pictures"))
     if not found.choice.fit.adjusted.converged:
         result.append(Message("the adjustment did not converge; judge the result with care", code="not-converged"))
     return tuple(result)

@@ -50,13 +50,13 @@ where μ is needed already, so that it is certain that λ alone does not describ
 _CELLS = 4
 """Cells per side of a link's overlap, each of which is a part where there are few links."""
 
-_ENOUGH_PICTURES, _ENOUGH_PICTURES_OF_A_MOTION = 4, 3
+ENOUGH_PICTURES, _ENOUGH_PICTURES_OF_A_MOTION = 4, 3
 """Pictures from which on the distortion centre is freed: where every link is on its own, and where one camera explains
 all of them. In fewer a tilt and a change of height stand for it, and pairs like those of ``examples.paper figure5`` are
 registered worse with it free."""
 
-_WORTH_SAYING = 0.5
-"""Pixels that a richer lens moves the corners of too few pictures by, from which on that is said."""
+WORTH_SAYING = 0.5
+"""Pixels that the corners of too few pictures may lie elsewhere, from which on that is said."""
 
 _RADII, _SCALE_STEPS, _SCALE_STEP = 64, 6, 1e-6
 
@@ -81,6 +81,8 @@ class LensChoice:
     refinements : tuple of ndarray of shape (5,), bool
         What may still be freed, where the motion model shows it: a distortion centre that is off the middle looks like
         motion that is less regular. That μ is needed only pairs can say: it could stand for relief.
+    corner_shift : float
+        Pixels by which μ would move the corners, where too few pictures do not show whether it is needed.
     """
 
     name: str
@@ -88,6 +90,7 @@ class LensChoice:
     apart: BundleAdjustmentResult
     reason: str
     refinements: tuple[BoolArray, ...] = ()
+    corner_shift: float = 0.0
 
     def refined(self, free: BoolArray) -> Self:
         """With the parameters that were freed in the end."""
@@ -119,7 +122,7 @@ def choose_lens(
     if not names:
         return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), apart, "given")
     pictures = _pictures(observations)
-    few = len(names) > 1 and pictures < _ENOUGH_PICTURES
+    few = len(names) > 1 and pictures < ENOUGH_PICTURES
     if few:
         names = [name for name in names if name != "division-center"]
     free = [free_parameters(name) & ~(CENTER & few) for name in names]
@@ -137,13 +140,16 @@ def choose_lens(
         gains = judge.prefers(fits[index], fits[best], added, names[best])
         if gains and has_plausible_center(fits[index], observations):
             best = index
-    reason = _reason(names, fits, best)
+    reason, shift = _reason(names, fits, best), 0.0
     if few:
         reason += "; too few pictures to find the distortion centre, which is taken to be the middle"
-        if best == 0 and (off := _distance(fits[0], fits[1], float(np.median(observations.scale1)))) > _WORTH_SAYING:
-            reason += f"; they do not show whether μ is needed, with which corners would lie {off:.1f} pixels elsewhere"
+        shift = _distance(fits[0], fits[1], float(np.median(observations.scale1))) if best == 0 else 0.0
+        if shift > WORTH_SAYING:
+            reason += (
+                f"; they do not show whether μ is needed, with which corners would lie {shift:.1f} pixels elsewhere"
+            )
     refinements = (CENTER,) if best == 0 and pictures >= _ENOUGH_PICTURES_OF_A_MOTION else ()
-    return LensChoice(names[best], free[best], fits[best], reason, refinements)
+    return LensChoice(names[best], free[best], fits[best], reason, refinements, shift)
 
 
 def _distance(simple: BundleAdjustmentResult, rich: BundleAdjustmentResult, half_diagonal: float) -> float:

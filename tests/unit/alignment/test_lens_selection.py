@@ -1,5 +1,6 @@
 """The ladder of lenses: as simple as the pictures allow, and never taken in by relief."""
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -73,7 +74,7 @@ def test_a_centre_off_the_middle_is_found_alone() -> None:
 
 
 def test_a_pair_says_whether_it_shows_the_lens() -> None:
-    reasons = []
+    reasons, messages = [], []
     for noise, per_link in ((0.05, 2000), (1.0, 60)):
         rng = np.random.default_rng(0)
         poses = grid(2, 1, (0.5, 0.35), 0.5, rng)
@@ -82,8 +83,31 @@ def test_a_pair_says_whether_it_shows_the_lens() -> None:
         found = _align(given)
         assert found.lens == "division"
         reasons.append(found.lens_reason)
+        messages.append([message for message in found.messages if message.code == "few-pictures"])
     assert "whether μ is needed" not in reasons[0]
     assert "whether μ is needed, with which corners would lie" in reasons[1]
+    assert not messages[0]
+    (message,) = messages[1]
+    off = re.search("2 pictures show the lens to ([0-9.]+) pixels at the corners only", message.text)
+    assert off is not None
+    assert float(off[1]) > 0.5
+
+
+def test_four_pictures_are_not_few() -> None:
+    rng = np.random.default_rng(0)
+    poses = grid(2, 2, (0.5, 0.35), 0.5, rng)
+    given = scene(poses, lens=Camera(SIZE, -0.25), rng=rng, noise=1.0, focal=420.0, per_link=40)
+    found = _align(given, lens="division3")
+    assert radius_std(found.cameras[0], np.linspace(0.05, 1.0, 20))[-1] > 0.5
+    assert "few-pictures" not in [message.code for message in found.messages]
+
+
+def test_a_given_lens_is_not_doubted() -> None:
+    rng = np.random.default_rng(0)
+    lens = Camera(SIZE, -0.25)
+    given = scene(grid(2, 1, (0.5, 0.35), 0.5, rng), lens=lens, rng=rng, noise=1.0, focal=420.0, per_link=60)
+    cameras = [camera.with_coefficients(*lens.coefficients) for camera in given.cameras]
+    assert not _align(replace(given, cameras=cameras), lens_known=True).messages
 
 
 @pytest.mark.parametrize("relief", [0.01, 0.04])
