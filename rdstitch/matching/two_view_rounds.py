@@ -45,6 +45,7 @@ _WORTHWHILE = 0.05  # share of the matches that a picture has with the one most 
 _ENOUGH_MATCHES = 200  # of a picture with all others, from which on it needs no more
 _FEW_INLIERS = 50  # of a pair of a repeated pattern, which shows hundreds of keypoints
 _SURE_SHARE = 0.7  # of such matches that agree: right pairs have 0.8 to 1, lattices that hardly match half
+_SAMPLED = 5  # pictures that are looked at for a repeated pattern
 _SEARCH_RADIUS = 3.0  # thresholds around the place where a match is expected
 
 
@@ -151,8 +152,7 @@ class Pairing:
 
         They may be off by whole periods of the pattern then; see :mod:`rdstitch.matching.repeated_pattern`.
         """
-        network = self.options.lightglue_model is not None
-        if network or np.median([repetition(found) for found in self.features]) < LEAST_REPETITION:
+        if not self.shows_repeated_pattern:
             return pairs
         weak = [k for k, pair in enumerate(pairs) if not pair.relation or pair.relation.inliers.sum() < _FEW_INLIERS]
         chosen = [(pairs[k].image1, pairs[k].image2) for k in weak]
@@ -164,6 +164,19 @@ class Pairing:
             if pair.relation and inliers > max(_SURE_SHARE * len(pair.matches), pairs[k].relation.inliers.sum()):
                 result[k] = pair
         return result
+
+    @cached_property
+    def shows_repeated_pattern(self) -> bool:
+        """Whether keypoints of most of the pictures look like others elsewhere in the same picture."""
+        if self.options.lightglue_model is not None:
+            return False
+        sampled = np.unique(np.linspace(0, len(self.features) - 1, _SAMPLED).astype(np.intp)).tolist()
+        return bool(np.median([repetition(self.features[k]) for k in sampled]) >= LEAST_REPETITION)
+
+    def rematch_elsewhere(self, pairs: Sequence[PairRegistration], transfer: Transfer) -> list[PairRegistration]:
+        """Match registered pairs again, only near where ``transfer`` puts them; see :meth:`guided_rematch`."""
+        matched = [StoredMatches.of(self._near(pair, transfer)) for pair in pairs]
+        return self._relate([(pair.image1, pair.image2) for pair in pairs], matched, self.options.pair.distortion)
 
     def retry_with_consensus_distortion(self, pairs: list[PairRegistration]) -> list[PairRegistration]:
         """Estimate the pairs that failed again, with the λ that the others agree on."""

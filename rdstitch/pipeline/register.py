@@ -22,6 +22,7 @@ from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner, close_loops, rematch_weak_pairs
 from rdstitch.pipeline.contrast import detect_by_contrast
 from rdstitch.pipeline.estimates import impossible_estimates_fail
+from rdstitch.pipeline.pattern_shifts import settle_repeated_pattern
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.process_memory import release_free_heap
 from rdstitch.progress import Progress, silent
@@ -104,6 +105,11 @@ def register(
     aligned = aligner.align(pairs)
     aligned = close_loops(aligner, moving.pairing, aligned, lenses.of_one_lens(candidates))
     aligned = rematch_weak_pairs(aligner, moving.pairing, aligned)
+    undecided: dict[int, str] = {}
+    if not lens_only:
+        aligned, undecided = settle_repeated_pattern(
+            aligner, moving.pairing, aligned, sources, rendered.stretch, options.threads
+        )
     if metric:
         aligned = aligner.metric(aligned)
     return Registration(
@@ -115,7 +121,7 @@ def register(
             *aligned.alignment.messages,
             *([_STATIC_BACKGROUND] if moving.found else []),
             *([_LOW_CONTRAST] if rendered.equalized else []),
-            *_left_out(aligned.alignment, aligner.paths, {**lenses.left_out, **detected.damaged}),
+            *_left_out(aligned.alignment, aligner.paths, {**lenses.left_out, **detected.damaged, **undecided}),
         ),
         static_background=moving.found,
         stretch=rendered.stretch,

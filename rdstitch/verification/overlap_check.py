@@ -25,7 +25,8 @@ from rdstitch.verification.photometric_agreement import (
     as_compared,
     overlap_agreement,
 )
-from rdstitch.verification.self_similarity import Ambiguity, Drawing, draw, drawing_scale, placement_ambiguity
+from rdstitch.verification.self_similarity import SLACK, Ambiguity, Drawing, draw, drawing_scale, placement_ambiguity
+from rdstitch.verification.unique_places import unique_shifts
 
 _MOST_LINKS = 40
 """Links that are looked at in a large set; the least confirmed ones."""
@@ -45,11 +46,14 @@ class CheckedLink:
         Whether the two look alike where they are put together.
     ambiguity : Ambiguity
         Whether they would look as much alike elsewhere.
+    unique : bool
+        Whether they would, but for something unique that both show, which shows that they lie here.
     """
 
     fit: LinkFit
     agreement: Agreement
     ambiguity: Ambiguity
+    unique: bool = False
 
     @property
     def pair(self) -> tuple[int, int]:
@@ -73,6 +77,8 @@ class OverlapTask:
         Grey levels of black and white.
     on_sphere : bool
         Whether the homographies lead to directions.
+    metric : bool
+        Whether they lead to a plane on which a period of a pattern is the same everywhere.
     """
 
     links: Sequence[tuple[LinkFit, float]]
@@ -81,6 +87,7 @@ class OverlapTask:
     homographies: Mapping[int, FloatArray]
     stretch: tuple[float, float] | None
     on_sphere: bool
+    metric: bool
 
 
 def check_overlaps(registration: Registration, executor: Executor, cache: Cache = NO_CACHE) -> list[CheckedLink]:
@@ -143,13 +150,20 @@ def _tasks(registration: Registration, chosen: Sequence[LinkFit]) -> list[Overla
         own = sorted({k for fit, _ in links for k in (fit.image1, fit.image2)})
         sources = {k: registration.sources[k] for k in own}
         cameras, places = {k: alignment.cameras[k] for k in own}, {k: alignment.homographies[k] for k in own}
-        tasks.append(OverlapTask(links, sources, cameras, places, registration.stretch, alignment.on_sphere))
+        tasks.append(
+            OverlapTask(
+                links, sources, cameras, places, registration.stretch, alignment.on_sphere, alignment.poses is not None
+            )
+        )
     return tasks
 
 
 def compare_overlaps(task: OverlapTask) -> tuple[list[CheckedLink], GuardNotes]:
     """Read the pictures of a task, and compare those of each link; and what was noticed of the files."""
-    placed = {k: _placed(task, k) for k in task.sources}
+    placed = {
+        k: placed_picture(source, task.cameras[k], task.homographies[k], task.stretch)
+        for k, source in task.sources.items()
+    }
 
     @functools.cache
     def drawing(index: int, scale: float) -> Drawing:
@@ -163,15 +177,36 @@ def compare_overlaps(task: OverlapTask) -> tuple[list[CheckedLink], GuardNotes]:
         return CheckedLink(fit, overlap_agreement(placed[i], placed[j]), ambiguity)
 
     checked = [compare(*link) for link in task.links]
+    if task.metric:
+        checked = _by_what_is_unique(placed, checked)
     sources = list(task.sources.values())
     return checked, sources[0].guard.notes_on([source.path for source in sources])
 
 
-def _placed(task: OverlapTask, index: int) -> PlacedPicture:
-    """A picture, read and made small."""
-    source = task.sources[index]
+def placed_picture(
+    source: Source, camera: Camera, homography: FloatArray, stretch: tuple[float, float] | None
+) -> PlacedPicture:
+    """Read a picture small, and put it where an alignment has it.
+
+    Raises
+    ------
+    InputError
+        When it can no longer be read.
+    """
     picture = source.read(fitting_reduction(max(source.camera.image_size) / COMPARED_SIDE), keep=True)
-    return PlacedPicture.of(picture, task.cameras[index], task.homographies[index], task.stretch)
+    return PlacedPicture.of(picture, camera, homography, stretch)
+
+
+def _by_what_is_unique(placed: Mapping[int, PlacedPicture], checked: Sequence[CheckedLink]) -> list[CheckedLink]:
+    """The same links; those that are ambiguous but for something unique are known to be."""
+    shifts = unique_shifts(placed, [link.pair for link in checked if link.ambiguity.ambiguous])
+
+    def lies_here(link: CheckedLink) -> bool:
+        there = placed[link.fit.image2]
+        off = np.hypot(*shifts[link.pair].shift) * drawing_scale(there.camera, there.homography)
+        return bool(off <= SLACK)
+
+    return [replace(link, unique=link.pair in shifts and lies_here(link)) for link in checked]
 
 
 def _compare_around(fit: LinkFit, first: PlacedPicture, second: PlacedPicture) -> CheckedLink:

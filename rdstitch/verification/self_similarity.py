@@ -15,11 +15,11 @@ from rdstitch.camera import Camera
 from rdstitch.radial_homography import to_plane
 from rdstitch.verification.photometric_agreement import Grey, PlacedPicture
 
-_LONGEST_SIDE = 256  # pixels of the pictures that are compared
+LONGEST_SIDE = 256  # pixels of the pictures that are compared
 _MOST_PX = 4  # times the sides of a picture that its outline on the plane may have
 _COARSEST = 8.0  # pixels, standard deviation of the blur that brightness is measured by
 _NEAR = 14  # pixels: shifts that are none
-_SLACK = 3  # pixels by which the registration may be off
+SLACK = 3  # pixels by which the registration may be off
 _LEAST_NORM = 1e-4  # of the largest: where fewer pixels overlap, rounding decides
 _LEAST_SHARE = 0.5  # of the overlap that a shift must keep
 _ALIKE = 0.5  # correlation from which on two pictures look alike
@@ -65,30 +65,30 @@ class Drawing:
     origin: FloatArray
 
 
-def drawing_scale(camera: Camera, homography: FloatArray) -> float:
+def drawing_scale(camera: Camera, homography: FloatArray, longest_side: int = LONGEST_SIDE) -> float:
     """Pixels per unit of the plane at which the middle of a picture keeps its size, made small."""
     width, height = camera.image_size
     around = np.array([[width / 2 + dx, height / 2 + dy] for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1))])
     left, right, top, bottom = to_plane(camera, homography, around)
     (ax, ay), (bx, by) = right - left, bottom - top
     area = abs(ax * by - ay * bx) / 4.0
-    return float(min(1.0, _LONGEST_SIDE / max(height, width)) / np.sqrt(area))
+    return float(min(1.0, longest_side / max(height, width)) / np.sqrt(area))
 
 
-def draw(picture: PlacedPicture, scale: float) -> Drawing:
-    """Draw a picture on the plane with so many pixels a unit."""
+def draw(picture: PlacedPicture, scale: float, longest_side: int = LONGEST_SIDE) -> Drawing:
+    """Draw a picture on the plane with so many pixels a unit; ``longest_side`` is that of :func:`drawing_scale`."""
     outline = to_plane(picture.camera, picture.homography, picture.camera.outline(16)) * scale
     if not np.isfinite(outline).any():  # all of it behind the horizon
         return Drawing(np.full((1, 1), np.nan, dtype=np.float32), np.zeros(2))
     middle = np.nanmedian(outline, axis=0)
-    reach = _MOST_PX / 2.0 * _LONGEST_SIDE
+    reach = _MOST_PX / 2.0 * longest_side
     low, high = (
         np.clip(edge, middle - reach, middle + reach) for edge in (np.nanmin(outline, 0), np.nanmax(outline, 0))
     )
     origin = np.floor(low)
     width, height = np.maximum(np.ceil(high - origin).astype(int), 1).tolist()
     # The picture is smaller on the plane than it is: without a blur it would alias.
-    factor = max(1.0, max(picture.grey.shape) / _LONGEST_SIDE)
+    factor = max(1.0, max(picture.grey.shape) / longest_side)
     if factor > 1.05:
         blurred = np.asarray(cv2.GaussianBlur(picture.grey, (0, 0), 0.5 * factor), dtype=np.float32)
         picture = replace(picture, grey=blurred)
@@ -98,26 +98,26 @@ def draw(picture: PlacedPicture, scale: float) -> Drawing:
 
 def placement_ambiguity(first: Drawing, second: Drawing) -> Ambiguity:
     """Compare two pictures, drawn at the same scale, at all shifts on the plane."""
-    overlaps = _Overlaps.of(first.pixels, second.pixels)
+    overlaps = Overlaps.of(first.pixels, second.pixels)
     # Position of the first picture within the second: rows and columns count from -(size - 1) of the first.
     rows, columns = (np.arange(n) - (m - 1) for n, m in zip(overlaps.area.shape, first.pixels.shape, strict=True))
     offset = np.rint(first.origin - second.origin).astype(int)
     down, right = (rows - offset[1]).astype(np.float32), (columns - offset[0]).astype(np.float32)
-    close = np.ix_(np.abs(down) <= _SLACK, np.abs(right) <= _SLACK)
-    within = np.hypot(down[close[0]], right[close[1][0]]) <= _SLACK
+    close = np.ix_(np.abs(down) <= SLACK, np.abs(right) <= SLACK)
+    within = np.hypot(down[close[0]], right[close[1][0]]) <= SLACK
     most = float(overlaps.area[close][within].max(initial=0.0))
     if not most > 0:
         return Ambiguity(0.0, 0.0, 0.0)
     enough = overlaps.area >= _LEAST_SHARE * most
-    box = _box_around(enough, _SLACK)
+    box = _box_around(enough, SLACK)
     score, distance = overlaps.correlation(box), np.hypot(down[box[0], None], right[None, box[1]])
-    near = distance <= _SLACK
+    near = distance <= SLACK
     # A peak of its own, not the flank of the one here.
-    peak = score >= cv2.dilate(score, np.ones((2 * _SLACK + 1, 2 * _SLACK + 1), dtype=np.uint8))
+    peak = score >= cv2.dilate(score, np.ones((2 * SLACK + 1, 2 * SLACK + 1), dtype=np.uint8))
     other = np.where(peak & (distance > _NEAR) & enough[box], score, np.float32(0.0))
     best = int(other.argmax())
     here = float(score[near].max(initial=0.0))
-    return Ambiguity(here, float(other.flat[best]), float(distance.flat[best]) / _LONGEST_SIDE)
+    return Ambiguity(here, float(other.flat[best]), float(distance.flat[best]) / LONGEST_SIDE)
 
 
 def _box_around(chosen: NDArray[np.bool_], margin: int) -> tuple[slice, slice]:
@@ -138,7 +138,7 @@ def _without_brightness(picture: Grey) -> Grey:
 
 
 @dataclass(frozen=True)
-class _Overlaps:
+class Overlaps:
     """Sums over the overlap of two pictures, the first at every position in the second, shape (h, w) each.
 
     Attributes
@@ -155,7 +155,7 @@ class _Overlaps:
     area: Grey
 
     @classmethod
-    def of(cls, first: Grey, second: Grey) -> "_Overlaps":
+    def of(cls, first: Grey, second: Grey) -> "Overlaps":
         """By the convolution theorem."""
         height, width = (a + b - 1 for a, b in zip(first.shape, second.shape, strict=True))
         a, aa, am = _spectra(first[::-1, ::-1], height, width)
@@ -168,8 +168,8 @@ class _Overlaps:
         products, squares1, squares2, area = sums
         return cls(products, squares1, squares2, np.rint(area))
 
-    def correlation(self, box: tuple[slice, slice]) -> Grey:
-        """Normalized correlation at the positions in a box."""
+    def correlation(self, box: tuple[slice, slice] = (slice(None), slice(None))) -> Grey:
+        """Normalized correlation at the positions in a box; at all of them if not given."""
         norm = np.sqrt(np.maximum(self.squares1[box], 0.0) * np.maximum(self.squares2[box], 0.0))
         floor = _LEAST_NORM * max(float(norm.max()), 1e-12)
         correlation: Grey = np.where(norm > floor, self.products[box] / np.maximum(norm, floor), np.float32(0.0))

@@ -109,6 +109,7 @@ def judge(
         *_outvoted(paths, [pair for pair in suspicions if pair not in decisive]),
         *([] if parallax else rival_messages(paths, rivals, share_alike(checked), lens_only=lens_only)),
         *_little_alike(paths, checked),
+        *([] if lens_only else _settled(paths, checked)),
         *doubtful_inputs(registration.sources),
     )
 
@@ -276,8 +277,23 @@ def _ambiguous(paths: Sequence[str], checked: Sequence[CheckedLink]) -> dict[Pai
             "take pictures that share something unique",
         )
         for link in checked
-        if link.ambiguity.ambiguous
+        if link.ambiguity.ambiguous and not link.unique
     }
+
+
+def _settled(paths: Sequence[str], checked: Sequence[CheckedLink]) -> list[Message]:
+    """A repeated pattern in which what is unique decided, and the pair that has the least support besides."""
+    settled = [link for link in checked if link.unique]
+    if not settled:
+        return []
+    least = min(settled, key=lambda link: link.agreement.share)
+    images = (paths[least.fit.image1], paths[least.fit.image2])
+    first, second = names_of(images)
+    text = (
+        "the pictures show a repeated pattern; what is unique in them (dirt, a mark, an object) decided where they "
+        f"lie; look at the seams, that between {first} and {second} first"
+    )
+    return [Message(text, images, code="repeated-pattern")]
 
 
 def _little_alike(paths: Sequence[str], checked: Sequence[CheckedLink]) -> list[Message]:

@@ -74,7 +74,9 @@ def test_a_turn_is_compared_between_the_two_pictures(monkeypatch: pytest.MonkeyP
     first, last, half = (rotation_from_vector(np.array([[0.0, angle, 0.0]]))[0] for angle in (0.1, 0.4, 0.15))
     lens = Camera((64, 48))
     focal = np.diag([0.7, 0.7, 1.0])  # half diagonals to directions
-    alignment = SimpleNamespace(homographies=np.stack([first, last]) @ focal, cameras=[lens] * 2, on_sphere=True)
+    alignment = SimpleNamespace(
+        homographies=np.stack([first, last]) @ focal, cameras=[lens] * 2, on_sphere=True, poses=None
+    )
     source = SimpleNamespace(read=lambda *_, **__: None, camera=lens, guard=InputGuard(), path=Path("a.png"))
     registration: Any = SimpleNamespace(alignment=alignment, sources=[source] * 2, stretch=None)
     (task,) = overlap_check._tasks(registration, [_fit(0, 1)])

@@ -1,0 +1,96 @@
+"""Stage: pictures of a repeated pattern that were put together some periods away go where what is unique agrees."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from rdstitch.arrays import FloatArray
+from rdstitch.errors import RegistrationError
+from rdstitch.inputs.source import Source
+from rdstitch.matching.two_view import PairRegistration
+from rdstitch.matching.two_view_rounds import Pairing
+from rdstitch.pipeline.aligner import AlignedPairs, Aligner
+from rdstitch.radial_homography import RadialHomography, from_plane, to_plane
+from rdstitch.verification.overlap_check import placed_picture
+from rdstitch.verification.unique_places import unique_shifts
+
+_MOST_PICTURES = 60
+"""Pictures whose departures are in memory at once; of more, a repeated pattern is refused as before."""
+
+_PAIRS_OF_A_PICTURE = 6
+"""Pairs that are compared, by picture on average: those taken one soon after the other first."""
+
+_LEAST_PLACED = 0.5
+"""Of the pictures, that must find their place; of fewer nobody is helped."""
+
+_UNDECIDED = "shows a repeated pattern, and nothing unique in it decides where it lies"
+
+
+def settle_repeated_pattern(
+    aligner: Aligner,
+    pairing: Pairing,
+    aligned: AlignedPairs,
+    sources: Sequence[Source],
+    stretch: tuple[float, float] | None,
+    workers: int,
+) -> tuple[AlignedPairs, dict[int, str]]:
+    """Move pictures of a repeated pattern by whole periods, to where dirt, marks and objects in them agree.
+
+    Matches of such pictures agree as well some periods away, above all where the pictures share the most. Pairs of
+    which nothing unique decides where they lie are taken for unregistered then, so that no place rests on them. Where
+    too few are left, or the plane is not metric, everything stays as it was: the checks judge that.
+
+    Parameters
+    ----------
+    aligner : Aligner
+    pairing : Pairing
+    aligned : AlignedPairs
+    sources : sequence of Source
+    stretch : (float, float) or None
+        Grey levels of black and white, see :class:`rdstitch.registration.Registration`.
+    workers : int
+        Pictures that are read and compared at the same time.
+
+    Returns
+    -------
+    AlignedPairs
+    dict of int to str
+        Why pictures have no place any more, by their index.
+
+    Raises
+    ------
+    InputError
+        When a picture can no longer be read.
+    """
+    alignment = aligned.alignment
+    if alignment.poses is None or len(sources) > _MOST_PICTURES or not pairing.shows_repeated_pattern:
+        return aligned, {}
+    used = [pair for pair in aligned.pairs if pair.relation and alignment.used[[pair.image1, pair.image2]].all()]
+    compared = sorted(used, key=lambda pair: pair.image2 - pair.image1)[: _PAIRS_OF_A_PICTURE * len(sources)]
+    shown = {
+        k: placed_picture(sources[k], alignment.cameras[k], alignment.homographies[k], stretch)
+        for k in np.flatnonzero(alignment.used).tolist()
+    }
+    shifts = unique_shifts(shown, [(pair.image1, pair.image2) for pair in compared], workers)
+
+    def transfer(i: int, j: int, points: FloatArray) -> FloatArray:
+        there = to_plane(alignment.cameras[i], alignment.homographies[i], points) + shifts[i, j].shift
+        return from_plane(alignment.cameras[j], alignment.homographies[j], there)
+
+    decided = [pair for pair in compared if (pair.image1, pair.image2) in shifts]
+    again = {(pair.image1, pair.image2): pair for pair in pairing.rematch_elsewhere(decided, transfer)}
+    try:
+        settled = aligner.align([again.get((pair.image1, pair.image2), _undecided(pair)) for pair in aligned.pairs])
+    except RegistrationError:
+        return aligned, {}
+    placed = settled.alignment.used
+    if placed.sum() < max(2, _LEAST_PLACED * len(sources)):
+        return aligned, {}
+    return settled, dict.fromkeys(np.flatnonzero(alignment.used & ~placed).tolist(), _UNDECIDED)
+
+
+def _undecided(pair: PairRegistration) -> PairRegistration:
+    relation = pair.relation
+    failed = RadialHomography.failed(_UNDECIDED, relation.camera, relation.camera2, len(pair.matches))
+    return replace(pair, relation=failed)

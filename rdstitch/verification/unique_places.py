@@ -1,0 +1,209 @@
+"""What is unique in a repeated pattern (dirt on tiles, a mark, one object) decides where its pictures lie.
+
+Each picture is compared with itself, shifted by the periods of its own pattern: where it departs from their median,
+something is there once. Two pictures are then compared by these departures alone, at every shift by which the pattern
+fits. At the right one, those in the overlap are at the same places in both; at a wrong one, stains lie on clean tiles.
+"""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.radial_homography import from_plane, to_plane
+from rdstitch.verification.photometric_agreement import COMPARED_SIDE, Grey, PlacedPicture
+from rdstitch.verification.self_similarity import Drawing, Overlaps, draw, drawing_scale
+
+_NEAR = 10  # pixels: a shorter shift is no period that could be told from the peak itself
+_PERIODIC = 0.4  # correlation from which on a shift is a period
+_OWN_OVERLAP, _OVERLAP = 0.15, 0.05  # of a picture, that a shift must keep; of two, of the most that one keeps
+_FEWEST_PERIODS, _MOST_PERIODS = 4, 16  # shifts that a picture is compared with itself at
+_FEWEST_COPIES = 3  # other copies of a place, of which the median is clean though one of them has dirt
+_MARGIN = 6  # pixels at the border of a picture, where brightness cannot be removed well
+_DEPARTS, _MOST = 5.0, 25.0  # spreads of the copies: less is no departure, more counts as this
+_LEAST_MATCHED = 400.0  # squared spreads times pixels: a stain of sixteen pixels, five spreads beyond what is none
+_LEAST_SHARE = 0.8  # of the departures in the overlap that must be the same; right ones have 0.87 to 0.99
+_LEAST_LEAD = 3.0  # of what is matched here, over what is matched at any other shift
+
+
+@dataclass(frozen=True)
+class UniqueShift:
+    """The shift of one picture's drawing within another's at which what is unique in both agrees best.
+
+    Attributes
+    ----------
+    shift : ndarray of shape (2,)
+        (x, y) by which the first picture must be moved on the plane, pixels of the drawings or units of the plane.
+    matched : float
+        What is unique in both and the same, in squared spreads of the pattern times pixels, times ``share``.
+    share : float
+        Of what is unique in either, in the overlap: their correlation, in [-1, 1].
+    rival : float
+        The most that is matched so at any other shift.
+    """
+
+    shift: FloatArray
+    matched: float
+    share: float
+    rival: float
+
+    @property
+    def decides(self) -> bool:
+        """Whether the pictures lie here and nowhere else."""
+        clear = self.matched >= max(_LEAST_MATCHED, _LEAST_LEAD * self.rival)
+        return clear and self.share >= _LEAST_SHARE
+
+
+def unique_shifts(
+    placed: Mapping[int, PlacedPicture], pairs: Sequence[tuple[int, int]], workers: int = 1
+) -> dict[tuple[int, int], UniqueShift]:
+    """By how much the first picture of each pair must be moved for what is unique in both to agree.
+
+    Parameters
+    ----------
+    placed : mapping of int to PlacedPicture
+        The pictures, on a plane where a period of the pattern is the same shift everywhere (a metric or an affine one).
+    pairs : sequence of (int, int)
+    workers : int
+        Pictures that are compared at the same time.
+
+    Returns
+    -------
+    dict of (int, int) to UniqueShift
+        Of the pairs of which that decides, in units of the plane.
+    """
+    pictures = sorted({k for pair in pairs for k in pair})
+    if not pictures:
+        return {}
+    scale = float(np.median([drawing_scale(placed[k].camera, placed[k].homography, COMPARED_SIDE) for k in pictures]))
+
+    def prepare(k: int) -> tuple[Drawing, Grey | None]:
+        drawing = draw(placed[k], scale, COMPARED_SIDE)
+        return drawing, departures(drawing.pixels)
+
+    def compare(pair: tuple[int, int]) -> UniqueShift | None:
+        (first, unique1), (second, unique2) = prepared[pair[0]], prepared[pair[1]]
+        if unique1 is None or unique2 is None:
+            return None
+        found = unique_shift(first, second, unique1, unique2)
+        if found is None or not found.decides:
+            return None
+        shift = found.shift / scale
+        return replace(found, shift=shift) if _moves(placed[pair[0]], placed[pair[1]], shift) else None
+
+    with ThreadPoolExecutor(workers) as pool:
+        prepared = dict(zip(pictures, pool.map(prepare, pictures), strict=True))
+        compared = zip(pairs, pool.map(compare, pairs), strict=True)
+        return {pair: found for pair, found in compared if found is not None}
+
+
+def departures(pixels: Grey) -> Grey | None:
+    """How far each pixel (h, w) of a drawing departs from the picture's own pattern, in spreads of its copies.
+
+    Returns
+    -------
+    ndarray of shape (h, w), float32, or None
+        0 where it does not; NaN where nothing is known. None for a picture that shows too few periods.
+    """
+    found = _peaks(Overlaps.of(pixels, pixels), pixels, np.zeros(2), _OWN_OVERLAP)
+    periods = found.shift[np.hypot(*found.shift.T) > _NEAR]
+    periods = periods[np.argsort(np.hypot(*periods.T), kind="stable")][:_MOST_PERIODS]
+    if len(periods) < _FEWEST_PERIODS:
+        return None
+    copies = np.stack([_shifted(pixels, shift) for shift in periods])
+    count = np.isfinite(copies).sum(axis=0)
+    middle = _median(copies, count)
+    spread = 1.4826 * _median(np.abs(copies - middle), count)
+    known = (count >= _FEWEST_COPIES) & np.isfinite(pixels)
+    inside = cv2.erode(np.isfinite(pixels).astype(np.uint8), np.ones((2 * _MARGIN + 1,) * 2, np.uint8), borderValue=0)
+    if not known.any():
+        return None
+    departure, usual = (
+        np.asarray(cv2.GaussianBlur(np.where(known, values, np.float32(0.0)), (0, 0), 1.0), dtype=np.float32)
+        for values in (pixels - middle, spread)
+    )
+    relative = departure / np.maximum(usual, max(float(np.median(usual[known])), 1e-6))
+    size = np.clip(np.abs(relative) - _DEPARTS, 0.0, _MOST)
+    return np.where(known & (inside > 0), np.copysign(size, relative), np.float32(np.nan)).astype(np.float32)
+
+
+def unique_shift(first: Drawing, second: Drawing, unique1: Grey, unique2: Grey) -> UniqueShift | None:
+    """Compare two drawings at one scale by their departures, at every shift by which their pattern fits.
+
+    None where the pattern of both fits nowhere.
+    """
+    offset = np.rint(first.origin - second.origin)
+    found = _peaks(Overlaps.of(first.pixels, second.pixels), first.pixels, offset, _OVERLAP)
+    if not len(found.shift):
+        return None
+    overlaps = Overlaps.of(unique1, unique2)
+    matched, share = np.zeros(len(found.shift)), np.zeros(len(found.shift))
+    for k, (row, column) in enumerate(found.place.tolist()):
+        box = slice(row - 1, row + 2), slice(column - 1, column + 2)
+        share[k] = overlaps.correlation(box).max(initial=0.0)
+        matched[k] = share[k] * overlaps.products[box].max(initial=0.0)
+    best = int(matched.argmax())
+    elsewhere = np.hypot(*(found.shift - found.shift[best]).T) > _NEAR
+    rival = float(matched[elsewhere].max(initial=0.0))
+    return UniqueShift(found.shift[best], float(matched[best]), float(share[best]), rival)
+
+
+@dataclass(frozen=True)
+class _Peaks:
+    """Shifts by which two drawings fit, (N, 2) as (x, y), pixels, and their rows and columns (N, 2) among all."""
+
+    shift: FloatArray
+    place: IntArray
+
+
+def _peaks(overlaps: Overlaps, first: Grey, offset: FloatArray, least_overlap: float) -> _Peaks:
+    """The peaks of the correlation, to a part of a pixel, from the shift ``offset`` (x, y) on."""
+    score = overlaps.correlation()
+    kernel = np.ones((2 * _NEAR + 1, 2 * _NEAR + 1), dtype=np.uint8)
+    enough = overlaps.area >= least_overlap * overlaps.area.max()
+    peak = (score >= cv2.dilate(score, kernel)) & enough & (score > _PERIODIC)
+    peak[[0, -1]] = peak[:, [0, -1]] = False
+    row, column = np.nonzero(peak)
+    x, y = (
+        _vertex(score[row - dy, column - dx], score[row, column], score[row + dy, column + dx])
+        for dx, dy in ((1, 0), (0, 1))
+    )
+    height, width = first.shape
+    shift = np.column_stack([column - (width - 1) - offset[0] + x, row - (height - 1) - offset[1] + y])
+    return _Peaks(shift, np.column_stack([row, column]))
+
+
+def _vertex(before: Grey, here: Grey, after: Grey) -> FloatArray:
+    """Where a parabola through three neighbouring values (N,) of a peak is highest, from the middle one on."""
+    curvature = np.minimum(before + after - 2.0 * here, -1e-6).astype(np.float64)
+    return np.clip((before - after) / (2.0 * curvature), -0.5, 0.5)
+
+
+def _shifted(pixels: Grey, shift: FloatArray) -> Grey:
+    """A picture moved by (x, y); NaN where it is not."""
+    matrix = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]]])
+    size = pixels.shape[1], pixels.shape[0]
+    return np.asarray(
+        cv2.warpAffine(
+            pixels, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(float("nan"),)
+        ),
+        dtype=np.float32,
+    )
+
+
+def _median(copies: Grey, count: IntArray) -> Grey:
+    """Of those of the values (N, h, w) that are known, ``count`` (h, w) of them; NaN where there is none."""
+    ordered = np.sort(copies, axis=0)  # NaN come last
+    low, high = (np.take_along_axis(ordered, (np.maximum(count - above, 0) // 2)[None], axis=0)[0] for above in (1, 0))
+    return np.asarray(0.5 * (low + np.where(np.isfinite(high), high, low)), dtype=np.float32)
+
+
+def _moves(first: PlacedPicture, second: PlacedPicture, shift: FloatArray) -> bool:
+    """Whether a shift on the plane moves the second picture over the first: dust on the lens is where it was."""
+    height, width = first.grey.shape
+    middle = np.array([[width / 2.0, height / 2.0]])
+    seen = from_plane(second.camera, second.homography, to_plane(first.camera, first.homography, middle) + shift)
+    return not bool(np.linalg.norm(seen - middle) <= _NEAR)

@@ -1,0 +1,37 @@
+"""Tiles with stains are stitched where the stains agree."""
+
+from functools import partial
+
+import numpy as np
+
+import rdstitch
+from examples.judging import alignment_error
+from rdstitch.camera import Camera
+from rdstitch.radial_homography import to_plane
+from rdstitch.synthetic import Photometry, PictureTexture, Sequence, grid_poses, repeated, sequence_over
+
+LENS = Camera((320, 240), distortion=-0.15, focal=350.0)
+OPTIONS = rdstitch.StitchOptions(workers=1, features=rdstitch.FeatureOptions(max_features=500))
+
+
+def _stained_tiles() -> Sequence:
+    poses = grid_poses(LENS, 2, 1, overlap=0.5, yaw=0.1, tilt=(0.03, -0.05), seed=3)
+    taken = sequence_over(
+        partial(repeated, seed=3, period=60), LENS, poses, photometry=Photometry(noise=0.01), seed=3, margin=60
+    )
+    width, height = taken.texture.size
+    pixels = taken.texture.region(0, 0, width, height).copy()
+    rng = np.random.default_rng(8)
+    for x, y in zip(rng.integers(8, width - 8, 25), rng.integers(8, height - 8, 25), strict=True):
+        pixels[y - 4 : y + 5, x - 4 : x + 5] = rng.choice([0.02, 0.9])
+    return Sequence(PictureTexture(pixels), taken.lens, taken.poses, taken.photometry, seed=3)
+
+
+def test_stained_tiles_are_stitched_where_the_stains_agree() -> None:
+    sequence = _stained_tiles()
+    result = rdstitch.mosaic([sequence.frame(k) for k in range(len(sequence))], None, OPTIONS)
+    alignment = result.registration.alignment
+    assert alignment.used.all()
+    transfers = {k: partial(to_plane, alignment.cameras[k], alignment.homographies[k]) for k in range(len(sequence))}
+    assert alignment_error(sequence, transfers, model="homography").median < 0.3
+    assert "repeated-pattern" in [message.code for message in result.registration.warnings]
