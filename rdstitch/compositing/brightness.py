@@ -101,7 +101,7 @@ def _compare(survey: Survey, exposure: Exposure) -> _Cells | None:
         shares[index] = seen.sum() / min(a.inside.sum(), b.inside.sum())
         side = max(2, round(max(*seen.shape, *a.inside.shape, *b.inside.shape) / _CELLS))
         pixels, x, y = _cell_means(seen, box, side)
-        means = [_cell_values(tile, box, seen, side) for tile in (a, b)]
+        means = [_cell_values(tile, box, seen, side, pixels) for tile in (a, b)]
         good = (pixels > side**2 / 2) & (np.minimum(*means).min(axis=-1) > _DARKEST)
         values = [np.log(mean[good] + exposure.offset) for mean in means]
         found.append((x[good], y[good], values[0] - values[1]))
@@ -132,24 +132,30 @@ def _by_picture(pictures: NDArray[np.intp]) -> list[tuple[int, NDArray[np.intp]]
 
 def _cell_means(seen: NDArray[np.bool_], box: Box, side: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Number of pixels that count in each cell of a box, and their mean place on the reduced canvas."""
-    count = _cell_sums(seen.astype(np.float64), side)
     x, y = np.arange(box[0], box[2], dtype=np.float64), np.arange(box[1], box[3], dtype=np.float64)[:, None]
+    count, across, down = np.moveaxis(_cell_sums(np.stack([seen, seen * x, seen * y], axis=-1), side), -1, 0)
     with np.errstate(invalid="ignore"):
-        return count, _cell_sums(seen * x, side) / count, _cell_sums(seen * y, side) / count
+        return count, across / count, down / count
 
 
-def _cell_values(tile: SurveyTile, box: Box, seen: NDArray[np.bool_], side: int) -> FloatArray:
+def _cell_values(tile: SurveyTile, box: Box, seen: NDArray[np.bool_], side: int, count: FloatArray) -> FloatArray:
     """Mean share of the full range in each cell, shape (m, n, C); NaN where nothing counts."""
-    pixels = cut(tile.pixels, tile.box, box).astype(np.float64) / full_scale(tile.pixels.dtype)
+    pixels = cut(tile.pixels, tile.box, box)
     with np.errstate(invalid="ignore"):
-        mean = _cell_sums(pixels * seen[..., None], side) / _cell_sums(seen.astype(np.float64), side)[..., None]
+        mean = _cell_sums(pixels * seen[..., None], side) / (count[..., None] * full_scale(pixels.dtype))
     return np.nan_to_num(mean)
 
 
-def _cell_sums(values: FloatArray, side: int) -> FloatArray:
-    """Sums over cells of ``side`` x ``side`` pixels; the last ones may be cut off."""
-    rows, columns = (np.arange(0, n, side) for n in values.shape[:2])
-    return np.asarray(np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1), dtype=np.float64)
+def _cell_sums(values: NDArray[Any], side: int) -> FloatArray:
+    """Sums of values (h, w, C) over cells of ``side`` x ``side`` pixels; the last ones may be cut off.
+
+    As products with matrices of ones and zeros, which are many times faster than sums along short axes, and exact for
+    whole numbers.
+    """
+    height, width, channels = values.shape
+    rows, columns = (np.arange(n) // side == np.arange(-(-n // side))[:, None] for n in (height, width))
+    summed = rows.astype(np.float64) @ values.reshape(height, -1).astype(np.float64)
+    return np.asarray(columns.astype(np.float64) @ summed.reshape(-1, width, channels), dtype=np.float64)
 
 
 def _brightness_around(cells: _Cells, log_gain: FloatArray) -> FloatArray:
