@@ -14,7 +14,7 @@ from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.model_selection import PairFit, PairSelection, rms_of, select_models
-from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
+from rdstitch.robust.pair_models import PlanarPairModel
 from rdstitch.robust.ransac import RansacOptions, ransac
 from rdstitch.robust.verification import LEAST_PLACES, places, rejection_reason
 
@@ -230,8 +230,8 @@ def _estimate_batch(pairs: list[PairMatches], options: EstimationOptions) -> lis
     limit = np.inf if options.select_below is None else options.select_below
     few = search.best.inliers[found].sum(axis=1) < limit
     fits: dict[int, PairFit] = {}
-    family: list[PairModel] = _models(focal, std, tilts is not None)
-    for models, rows in ((family, few), (family[-1:], ~few)):
+    planar = [PlanarPairModel(focal, std, tilts is not None, height_free=free) for free in (False, True)]
+    for models, rows in ((planar, few), ([], ~few)):
         own = found[rows]
         if not len(own):
             continue
@@ -277,11 +277,6 @@ def _solvers(options: EstimationOptions, focal: float, focal_std: float, tilts_k
     if options.solver == "three_point":
         solvers = minimal_solvers(focal, focal_std, False, options.distortion)
     return [solver for solver in solvers if solver.name == options.solver]
-
-
-def _models(focal: float, focal_std: float, tilts_known: bool) -> list[PairModel]:
-    planar = [PlanarPairModel(focal, focal_std, tilts_known, height_free=free) for free in (False, True)]
-    return [*planar, HomographyPairModel()]
 
 
 def _result(

@@ -9,7 +9,10 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 
 LEAST_GAIN = 1e-5
-"""Expected relative fall of the loss that is worth another step: a hundredth of the noise."""
+"""Expected relative fall of the loss of all pictures that is worth another step: a hundredth of the noise."""
+
+PAIR_GAIN, ROUGH_GAIN = 1e-4, 1e-3
+"""The same of a pair, which has fewer matches; and where another descent goes on from there."""
 
 FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e4
 """Of the diagonal of the normal matrix: where a descent begins, and beyond which it has got stuck."""
@@ -31,11 +34,36 @@ class BatchedNormalEquations:
         Weighted ``J'J``.
     gradient : ndarray of shape (B, P)
         Half the gradient of the cost.
+    squared : ndarray of shape (B, N)
+        Squared errors of the measurements; inf where there is none.
     """
 
     cost: FloatArray
     information: FloatArray
     gradient: FloatArray
+    squared: FloatArray
+
+    @property
+    def errors(self) -> FloatArray:
+        """Errors of the measurements, (B, N); inf where there is none."""
+        return np.sqrt(self.squared)
+
+    def take(self, rows: BoolArray | IntArray) -> "BatchedNormalEquations":
+        """Those of some problems."""
+        return BatchedNormalEquations(self.cost[rows], self.information[rows], self.gradient[rows], self.squared[rows])
+
+    def put(self, rows: IntArray, others: "BatchedNormalEquations") -> None:
+        """Replace those of some problems."""
+        self.cost[rows], self.information[rows] = others.cost, others.information
+        self.gradient[rows], self.squared[rows] = others.gradient, others.squared
+
+    def where(self, better: BoolArray, others: "BatchedNormalEquations") -> "BatchedNormalEquations":
+        """The others where they are better."""
+        if better.all():
+            return others
+        result = self.take(np.arange(len(better)))
+        result.put(np.flatnonzero(better), others.take(better))
+        return result
 
 
 class Problems(Protocol):
@@ -55,40 +83,43 @@ Retract = Callable[[FloatArray, FloatArray], tuple[FloatArray, BoolArray]]
 
 
 def descend(
-    problems: Problems, retract: Retract, start: FloatArray, iterations: int, useful: FloatArray | None = None
-) -> FloatArray:
-    """Where at most so many steps lead to, parameters of shape (B, K).
+    problems: Problems,
+    retract: Retract,
+    start: FloatArray,
+    iterations: int,
+    useful: FloatArray | None = None,
+    *,
+    rough: bool = False,
+) -> tuple[FloatArray, BatchedNormalEquations]:
+    """Where at most so many steps lead to, parameters of shape (B, K), and the equations there.
 
     A problem that has converged takes no further part, so that each is solved as if it were alone; nor does one whose
-    loss will not fall to what is ``useful`` (B,), if given.
+    loss will not fall to what is ``useful`` (B,), if given. ``rough``: another descent goes on from there.
     """
-    result = start.copy()
-    current = problems.normal_equations(start)
-    parameters, damping, rows = start, np.full(len(start), FIRST_DAMPING), np.arange(len(start))
+    least_gain = ROUGH_GAIN if rough else PAIR_GAIN
+    result, parameters = start.copy(), start
+    current = found = problems.normal_equations(start)
+    damping, rows = np.full(len(start), FIRST_DAMPING), np.arange(len(start))
     for taken in range(iterations):
         step = _damped_step(current, damping)
         gain = -np.einsum("bp,bp->b", step, current.gradient)
-        going = (gain > LEAST_GAIN * current.cost) & (damping <= LARGEST_DAMPING)
+        going = (gain > least_gain * current.cost) & (damping <= LARGEST_DAMPING)
         if useful is not None and taken >= _SETTLED:
             going &= current.cost - _OPTIMISM * gain < useful[rows]
+        if not going.any():
+            break
         if not going.all():
             rows, step, parameters, damping = rows[going], step[going], parameters[going], damping[going]
-            problems = problems.take(going)
-            current = BatchedNormalEquations(current.cost[going], current.information[going], current.gradient[going])
-        if not len(rows):
-            break
+            problems, current = problems.take(going), current.take(going)
         moved, possible = retract(parameters, step)
         there = problems.normal_equations(moved)
         better = possible & (there.cost < current.cost)
-        parameters = np.where(better[:, None], moved, parameters)
-        current = BatchedNormalEquations(
-            np.where(better, there.cost, current.cost),
-            np.where(better[:, None, None], there.information, current.information),
-            np.where(better[:, None], there.gradient, current.gradient),
-        )
         damping = next_damping(damping, better)
-        result[rows] = parameters
-    return result
+        if better.any():
+            parameters, current = np.where(better[:, None], moved, parameters), current.where(better, there)
+            result[rows] = parameters
+            found.put(rows, current)
+    return result, found
 
 
 def next_damping(damping: FloatArray, better: BoolArray) -> FloatArray:

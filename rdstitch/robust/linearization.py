@@ -154,11 +154,14 @@ class EntryEquations:
     cost : ndarray of shape (B,)
     information : ndarray of shape (B, 9 + E, 9 + E)
     gradient : ndarray of shape (B, 9 + E)
+    squared : ndarray of shape (B, N)
+        Squared whitened errors, px²; inf where there is no transfer, or no match.
     """
 
     cost: FloatArray
     information: FloatArray
     gradient: FloatArray
+    squared: FloatArray
 
 
 def entry_equations(
@@ -167,14 +170,16 @@ def entry_equations(
     """The loss with its scale ``c`` (B,), pixels, and its normal equations by the entries of H and the lens."""
     squared = found.squared
     relative = loss_ratio(squared, scale[:, None])
-    lost = found.lost & present
-    relative[~present | lost] = 0.0
+    lost, useless = found.lost & present, found.lost | ~present
+    relative[useless] = 0.0
     cost = (squared * relative).sum(axis=1) + scale**2 * lost.sum(axis=1)
+    squared[useless] = np.inf
 
     lens = found.by_lens if free_lens else found.by_lens[:, :, :0]
     extra = lens.shape[2]
     columns = np.concatenate([found.by_image, lens, found.error[:, :, None]], axis=2)
-    xx, xy, yy = np.moveaxis(found.precision * (relative * relative)[:, None], 1, 0)[:, :, None]
+    weight = found.precision * (relative * relative)[:, None]
+    xx, xy, yy = weight[:, :1], weight[:, 1:2], weight[:, 2:]
     across, down = columns[:, 0], columns[:, 1]
     left_across, left_down = xx * across + xy * down, xy * across + yy * down
     by_h = across[:, :3, None] * left_across[:, None] + down[:, :3, None] * left_down[:, None]
@@ -197,14 +202,15 @@ def entry_equations(
         own = across[:, 3:-1] @ left_across[:, 3:].swapaxes(1, 2) + down[:, 3:-1] @ left_down[:, 3:].swapaxes(1, 2)
         information[:, 9:, 9:] = own[:, :, :extra]
         gradient[:, 9:] = own[:, :, extra]
-    return EntryEquations(cost, information, gradient)
+    return EntryEquations(cost, information, gradient, squared)
 
 
 def influence(found: TransferDerivatives, present: BoolArray, scale: FloatArray, free_lens: bool) -> FloatArray:
     """Each match's share of the gradient by the entries of H and the lens, (B, N, 9 + E)."""
     relative = loss_ratio(found.squared, scale[:, None])
     relative[~present | found.lost] = 0.0
-    xx, xy, yy = np.moveaxis(found.precision * (relative * relative)[:, None], 1, 0)
+    weight = found.precision * (relative * relative)[:, None]
+    xx, xy, yy = weight[:, 0], weight[:, 1], weight[:, 2]
     dx, dy = found.error[:, 0], found.error[:, 1]
     left = np.stack([xx * dx + xy * dy, xy * dx + yy * dy], axis=1)[:, :, None]
     by_image, by_lens = ((part * left).sum(axis=1) for part in (found.by_image, found.by_lens))

@@ -1,6 +1,6 @@
 """Which model of the family describes each of many pairs: the least free one that explains the data."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -11,8 +11,8 @@ from rdstitch.division_model import OBSERVABLE_STD
 from rdstitch.robust.covariance import covariances
 from rdstitch.robust.loss import PAIR_WIDTH, RAYLEIGH_MEDIAN
 from rdstitch.robust.measurements import Measurements
-from rdstitch.robust.pair_models import HomographyPairModel, PairModel
-from rdstitch.robust.refinement import Fits, Inspection, PairProblems, refine_pairs
+from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
+from rdstitch.robust.refinement import Fits, PairProblems, refine_pairs
 
 # Halved or doubled, these change the median error of λ by a sixth at most (``python -m tests.benchmarks.constants``).
 _LEAST_NOISE = 0.02  # pixels; below, noise-free data would reject every model over rounding
@@ -47,6 +47,17 @@ class PairFit:
     covariance: FloatArray
     distortion_std: float
     reason: str
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """One model fitted to B pairs: the whitened errors (B, N), the loss, px², and the normal matrix at the fits."""
+
+    model: PairModel
+    fits: Fits
+    errors: FloatArray
+    cost: FloatArray
+    information: FloatArray
 
 
 @dataclass(frozen=True)
@@ -90,21 +101,53 @@ class PairSelection:
             noise=self.noise[rows],
         )
 
-    def fit(
-        self, model: PairModel, width: FloatArray, steps: int, useful: FloatArray | None = None
-    ) -> tuple[Fits, Inspection]:
+    def fit(self, model: PairModel, width: FloatArray, steps: int, *, rough: bool = False) -> _Fitted:
         """A model fitted to every pair from where it stands, with a loss of the given widths (B,), pixels."""
         start = Fits(model.initialize(self.homography, self.tilts), self.homography, self.distortion)
         problems = PairProblems(model, self.data, width, self.noise, self.fixed_distortion)
-        fits = refine_pairs(problems, start, steps, useful)
-        return fits, problems.inspect(fits)
+        fits, found = refine_pairs(problems, start, steps, rough=rough)
+        return _Fitted(model, fits, found.errors, found.cost, found.information)
+
+    def fit_nested(
+        self, models: Sequence[PlanarPairModel], width: FloatArray, steps: int, useful: FloatArray
+    ) -> list[_Fitted]:
+        """The same of several models in lockstep: each is the last one with some of its parameters held at 0.
+
+        A fit is given up whose loss will not fall to what is ``useful`` (B,).
+        """
+        if not models:
+            return []
+        most, count = models[-1], len(self.data)
+        held = np.array([most.held_by(model) for model in models])
+        states = most.initialize(self.homography, self.tilts)
+        start = Fits(
+            np.concatenate([model.restricted(states) for model in models]),
+            *(np.concatenate([known] * len(models)) for known in (self.homography, self.distortion)),
+        )
+        every = self.take(np.tile(np.arange(count), len(models)))
+        problems = PairProblems(
+            most,
+            every.data,
+            np.tile(width, len(models)),
+            every.noise,
+            self.fixed_distortion,
+            np.repeat(held, count, axis=0),
+        )
+        fits, found = refine_pairs(problems, start, steps, np.tile(useful, len(models)))
+        errors, result = found.errors, []
+        for index, (model, own) in enumerate(zip(models, held, strict=True)):
+            rows = np.arange(index * count, (index + 1) * count)
+            free = np.flatnonzero(~np.concatenate([np.zeros(found.information.shape[1] - len(own), np.bool_), own]))
+            information = found.information[rows[:, None, None], free[:, None], free]
+            result.append(_Fitted(model, fits.take(rows), errors[rows], found.cost[rows], information))
+        return result
 
     def at(self, fits: Fits) -> Self:
         """Standing at fits."""
         return replace(self, homography=fits.homography, distortion=fits.distortion)
 
 
-def select_models(models: list[PairModel], pairs: PairSelection) -> list[PairFit]:
+def select_models(planar: Sequence[PlanarPairModel], pairs: PairSelection) -> list[PairFit]:
     """Fit every model to each pair and choose by the Bayesian information criterion.
 
     The noise is that of the freest model, so that a more restricted model is compared with what the images allow and
@@ -112,51 +155,54 @@ def select_models(models: list[PairModel], pairs: PairSelection) -> list[PairFit
 
     Parameters
     ----------
-    models : list of PairModel
-        From least to most free; the last one is a :class:`HomographyPairModel`.
+    planar : sequence of PlanarPairModel
+        From least to most free; they compete with the free homography.
     pairs : PairSelection
         ``noise`` is estimated anew.
     """
-    threshold = pairs.threshold
-    free, seen = pairs.fit(HomographyPairModel(), np.full(len(pairs.data), threshold), _FREE_STEPS)
-    noise = noise_of(seen.errors, threshold)
-    near = replace(pairs.at(free), noise=noise, data=pairs.data.only(seen.errors < _NEAR * threshold))
-    inliers = np.maximum((seen.errors < threshold).sum(axis=1), 1)
+    threshold, homography = pairs.threshold, HomographyPairModel()
+    free = pairs.fit(homography, np.full(len(pairs.data), threshold), _FREE_STEPS, rough=True)
+    noise = noise_of(free.errors, threshold)
+    near = replace(pairs.at(free.fits), noise=noise, data=pairs.data.only(free.errors < _NEAR * threshold))
+    inliers = np.maximum((free.errors < threshold).sum(axis=1), 1)
     width, price = loss_width(noise, threshold), noise**2 * np.log(2 * inliers)
-    freest = near.fit(models[-1], width, _STEPS)
+    freest = near.fit(homography, width, _STEPS)
     # Any model must fit that well to be chosen, even one without parameters.
-    useful = freest[1].cost + freest[1].information.shape[1] * price
-    fitted = [*(near.fit(model, width, _STEPS, useful) for model in models[:-1]), freest]
-    criteria = [found.cost + found.information.shape[1] * price for _, found in fitted]
-    chosen = np.argmin(criteria, axis=0)
-    rms = np.stack([rms_of(found.errors, threshold) for _, found in fitted], axis=1)
+    useful = freest.cost + freest.information.shape[1] * price
+    fitted = [*near.fit_nested(planar, width, _STEPS, useful), freest]
+    chosen = np.argmin([found.cost + found.information.shape[1] * price for found in fitted], axis=0)
+    rms = np.stack([rms_of(found.errors, threshold) for found in fitted], axis=1)
     result: dict[int, PairFit] = {}
 
     def finished(index: int, rows: IntArray) -> dict[int, PairFit]:
-        fits, found = fitted[index]
-        own = replace(near.at(fits), noise=noise_of(found.errors, threshold)).take(rows)
-        reasons = [_explained(models, index, rms[row]) for row in rows]
-        return dict(zip(rows.tolist(), _finished(models[index], own, pairs.data.take(rows), reasons), strict=True))
+        found = fitted[index]
+        own = replace(near.at(found.fits), noise=noise_of(found.errors, threshold)).take(rows)
+        reasons = [_explained(fitted, index, rms[row]) for row in rows]
+        fits = _finished(found.model, found.fits.take(rows), own, pairs.data.take(rows), reasons)
+        return dict(zip(rows.tolist(), fits, strict=True))
 
-    for index in range(len(models)):
+    for index in range(len(fitted)):
         rows = np.flatnonzero(chosen == index)
         if len(rows):
             result.update(finished(index, rows))
     # A camera that turns on the spot moves like one beside a plane seen edge on, where tilt, focal length and λ cannot
     # be distinguished; as a free homography the same images may show λ well.
-    unseen = [row for row, fit in result.items() if chosen[row] < len(models) - 1 and np.isinf(fit.distortion_std)]
+    unseen = [row for row, fit in result.items() if chosen[row] < len(planar) and np.isinf(fit.distortion_std)]
     if unseen:
-        free_fits = finished(len(models) - 1, np.array(sorted(unseen), dtype=np.intp))
+        free_fits = finished(len(planar), np.array(sorted(unseen), dtype=np.intp))
         result.update({row: fit for row, fit in free_fits.items() if np.isfinite(fit.distortion_std)})
     return [result[row] for row in range(len(pairs.data))]
 
 
-def _finished(model: PairModel, near: PairSelection, data: Measurements, reasons: list[str]) -> Iterator[PairFit]:
+def _finished(
+    model: PairModel, fits: Fits, near: PairSelection, data: Measurements, reasons: list[str]
+) -> Iterator[PairFit]:
     """The chosen model with its covariance, and without λ where that is not observable.
 
     Parameters
     ----------
     model : PairModel
+    fits : Fits
     near : PairSelection
         Standing at the fits; with the matches that the choice was made by.
     data : Measurements
@@ -164,14 +210,14 @@ def _finished(model: PairModel, near: PairSelection, data: Measurements, reasons
     reasons : list of str
         Why this model was chosen, for each pair.
     """
-    found = _inspected(model, near, data)
+    found = _inspected(model, fits, near, data)
     std = np.zeros(len(data)) if near.fixed_distortion else np.sqrt(found.covariance[:, 0, 0])
     unseen = np.flatnonzero(~(std < OBSERVABLE_STD))
     straight = None
     if len(unseen):
         level = replace(near.take(unseen), distortion=np.zeros(len(unseen)), fixed_distortion=True)
-        fits, _ = level.fit(model, loss_width(level.noise, near.threshold), _STEPS)
-        straight = _inspected(model, level.at(fits), data.take(unseen))
+        straightened = level.fit(model, loss_width(level.noise, near.threshold), _STEPS).fits
+        straight = _inspected(model, straightened, level, data.take(unseen))
     place = {row: index for index, row in enumerate(unseen.tolist())}
     for row, reason in enumerate(reasons):
         if row not in place or straight is None:
@@ -205,10 +251,10 @@ class _Inspected:
         )
 
 
-def _inspected(model: PairModel, pairs: PairSelection, data: Measurements) -> _Inspected:
+def _inspected(model: PairModel, fits: Fits, pairs: PairSelection, data: Measurements) -> _Inspected:
     """The fits as they stand, on all matches."""
     width = loss_width(pairs.noise, pairs.threshold)
-    fits, found = replace(pairs, data=data).fit(model, width, 0)
+    found = PairProblems(model, data, width, pairs.noise, pairs.fixed_distortion).inspect(fits)
     covariance = covariances(found.information, found.influence, pairs.noise, data)
     return _Inspected(fits, found.errors, covariance)
 
@@ -237,8 +283,8 @@ def rms_of(errors: FloatArray, threshold: float) -> FloatArray:
     return np.asarray(np.sqrt(np.where(count > 0, total, np.nan) / np.maximum(count, 1)))
 
 
-def _explained(models: list[PairModel], chosen: int, rms: FloatArray) -> str:
+def _explained(fitted: list[_Fitted], chosen: int, rms: FloatArray) -> str:
     """One clause on why this model and not another."""
-    listed = ", ".join(f"{model.name} {value:.2f} pixels" for model, value in zip(models, rms, strict=True))
-    why = "no model with less freedom" if chosen == len(models) - 1 else "the least free model that"
-    return f"{models[chosen].name}: {why} explains the data (rms {listed})"
+    listed = ", ".join(f"{one.model.name} {value:.2f} pixels" for one, value in zip(fitted, rms, strict=True))
+    why = "no model with less freedom" if chosen == len(fitted) - 1 else "the least free model that"
+    return f"{fitted[chosen].model.name}: {why} explains the data (rms {listed})"

@@ -61,13 +61,13 @@ def own_lenses(relations: Sequence[RadialHomography], data: Measurements, thresh
     parameters[:, _LENS:] = _HOMOGRAPHY.initialize(np.stack([relation.homography for relation in relations]))
     with np.errstate(all="ignore"):  # a step may leave the domain of the lens model
         problems = _Problems(data, np.full(count, threshold), np.ones(count))
+        found = problems.normal_equations(parameters)
         for _ in range(_ROUNDS):
-            noise = noise_of(problems.errors(parameters), threshold)
+            noise = noise_of(found.errors, threshold)
             problems = _Problems(data, loss_width(noise, threshold), noise)
-            parameters = descend(problems, _retract, parameters, _ITERATIONS)
-        noise = noise_of(problems.errors(parameters), threshold)
-        information = problems.normal_equations(parameters).information
-        covariance = covariances(information, problems.influence(parameters), noise, data)
+            parameters, found = descend(problems, _retract, parameters, _ITERATIONS)
+        noise = noise_of(found.errors, threshold)
+        covariance = covariances(found.information, problems.influence(parameters), noise, data)
     return [OwnLenses(own[:2], known[:2, :2]) for own, known in zip(parameters, covariance, strict=True)]
 
 
@@ -101,14 +101,8 @@ class _Problems:
         lens, weight = parameters[:, :_LENS] / _OWN_STD, self.noise**2
         information[:, :_LENS, :_LENS] += weight[:, None, None] * np.diag(_OWN_STD**-2.0)
         gradient[:, :_LENS] += weight[:, None] * lens / _OWN_STD
-        return BatchedNormalEquations(entries.cost + weight * (lens**2).sum(axis=1), information, gradient)
-
-    def errors(self, parameters: FloatArray) -> FloatArray:
-        """Whitened transfer errors, pixels, (B, N); inf where there is no transfer, or no match."""
-        found = differentiate(*_parts(parameters), self.data)
-        errors: FloatArray = np.sqrt(found.squared)
-        errors[found.lost | ~self.data.present] = np.inf
-        return errors
+        cost = entries.cost + weight * (lens**2).sum(axis=1)
+        return BatchedNormalEquations(cost, information, gradient, entries.squared)
 
     def influence(self, parameters: FloatArray) -> FloatArray:
         """Each match's share of the gradient, (B, N, P)."""

@@ -142,7 +142,8 @@ def ransac(
         Known tilts (ψ, θ) of both images, radians.
     options : RansacOptions
     """
-    lanes = [_Lane(solver, data, ordered, tilts, options, index) for index, solver in enumerate(solvers)]
+    quick = _subset(data, options.seed)
+    lanes = [_Lane(solver, data, quick, ordered, tilts, options, index) for index, solver in enumerate(solvers)]
     best = Hypotheses.none(data)
     confident = np.zeros(len(data), dtype=np.bool_)
     active = np.arange(len(data))
@@ -169,6 +170,7 @@ class _Lane:
         self,
         solver: MinimalSolver,
         data: Measurements,
+        quick: Measurements,
         ordered: BoolArray,
         tilts: FloatArray | None,
         options: RansacOptions,
@@ -176,11 +178,10 @@ class _Lane:
     ) -> None:
         self.drawn = np.zeros(len(data), dtype=np.intp)
         self._solver, self._index = solver, index
-        self._data, self._ordered, self._tilts = data, ordered, tilts
+        self._data, self._quick, self._ordered, self._tilts = data, quick, ordered, tilts
         self._options = options
         self._least_raw_cost = np.ones(len(data))
         self._sampler = Sampler(solver.sample_size, options.max_iterations, [options.seed, index])
-        self._quick = _subset(data, options.seed)
 
     def needed(self, best: Hypotheses, rows: IntArray, *, explore: bool = False) -> FloatArray:
         """Samples after which a better model than the best of each of some pairs is unlikely to have been missed.
@@ -267,7 +268,8 @@ class _Lane:
             model, data, np.full(len(data), scale), np.ones(len(data)), self._solver.fixed_distortion
         )
         state = model.initialize(start.homography, None if self._tilts is None else self._tilts[rows])
-        fits = refine_pairs(problems, Fits(state, start.homography, start.distortion), _LOCAL_STEPS)
+        begin = Fits(state, start.homography, start.distortion)
+        fits, _ = refine_pairs(problems, begin, _LOCAL_STEPS, rough=True)
         judged = Hypotheses.judged(fits.homography, fits.distortion, data, self._options.threshold, self._index)
         result = start.take(np.arange(len(data)))
         result.put(np.arange(len(data)), judged, judged.cost < start.cost)

@@ -30,6 +30,10 @@ class Fits:
     homography: FloatArray
     distortion: FloatArray
 
+    def take(self, rows: BoolArray | IntArray | slice) -> "Fits":
+        """Those of some pairs."""
+        return Fits(self.state[rows], self.homography[rows], self.distortion[rows])
+
 
 @dataclass(frozen=True)
 class Inspection:
@@ -55,17 +59,35 @@ class Inspection:
 
 @dataclass(frozen=True)
 class PairProblems:
-    """Refinement of B pairs as problems of least squares; parameters are ``(λ, state)``."""
+    """Refinement of B pairs as problems of least squares; parameters are ``(λ, state)``.
+
+    Attributes
+    ----------
+    model : PairModel
+    data : Measurements
+    scale : ndarray of shape (B,)
+        Of the loss, pixels.
+    noise : ndarray of shape (B,)
+        Standard deviation of the errors per axis, pixels.
+    fixed_distortion : bool
+        Whether λ is known.
+    held : ndarray of shape (B, P), bool, optional
+        Which parameters of the model keep their values.
+    """
 
     model: PairModel
     data: Measurements
     scale: FloatArray
     noise: FloatArray
     fixed_distortion: bool
+    held: BoolArray | None = None
 
     def take(self, rows: BoolArray | IntArray) -> Self:
         """Some of them."""
-        return type(self)(self.model, self.data.take(rows), self.scale[rows], self.noise[rows], self.fixed_distortion)
+        held = None if self.held is None else self.held[rows]
+        return type(self)(
+            self.model, self.data.take(rows), self.scale[rows], self.noise[rows], self.fixed_distortion, held
+        )
 
     def normal_equations(self, parameters: FloatArray) -> BatchedNormalEquations:
         """Loss, normal matrix and gradient."""
@@ -85,7 +107,12 @@ class PairProblems:
             information[:, free:, free:] += weight[:, None, None] * (by_state.T @ by_state)
             gradient[:, free:] += weight[:, None] * (residual @ by_state)
             cost = cost + weight * (residual**2).sum(axis=1)
-        return BatchedNormalEquations(cost, information, gradient)
+        if self.held is not None:
+            row, column = np.nonzero(self.held)
+            column += 0 if self.fixed_distortion else 1
+            information[row, column], information[row, :, column] = 0.0, 0.0
+            information[row, column, column], gradient[row, column] = 1.0, 0.0
+        return BatchedNormalEquations(cost, information, gradient, entries.squared)
 
     def chain(self, state: FloatArray) -> FloatArray:
         """Derivative of the entries of H and λ by λ and the model's parameters, (B, 9 + E, E + P)."""
@@ -110,15 +137,20 @@ class PairProblems:
         found = differentiate(fits.homography, PairLenses(fits.distortion), self.data)
         chain = self.chain(fits.state)
         equations = self._equations(found, fits.state, chain)
-        errors = np.sqrt(found.squared)
-        errors[found.lost | ~self.data.present] = np.inf
         shares = influence(found, self.data.present, self.scale, not self.fixed_distortion) @ chain
-        return Inspection(errors, equations.cost, equations.information, shares)
+        return Inspection(equations.errors, equations.cost, equations.information, shares)
 
 
 @np.errstate(all="ignore")  # a step may leave the domain of the lens model
-def refine_pairs(problems: PairProblems, start: Fits, iterations: int, useful: FloatArray | None = None) -> Fits:
-    """Fit the model and λ by at most so many steps.
+def refine_pairs(
+    problems: PairProblems,
+    start: Fits,
+    iterations: int,
+    useful: FloatArray | None = None,
+    *,
+    rough: bool = False,
+) -> tuple[Fits, BatchedNormalEquations]:
+    """Fit the model and λ by at most so many steps; the fits, and the equations there.
 
     Parameters
     ----------
@@ -129,7 +161,10 @@ def refine_pairs(problems: PairProblems, start: Fits, iterations: int, useful: F
     iterations : int
     useful : ndarray of shape (B,), optional
         Value of the loss above which a fit is of no use, so that it need not be found.
+    rough : bool
+        Another refinement goes on from there.
     """
-    found = descend(problems, problems.retract, np.column_stack([start.distortion, start.state]), iterations, useful)
+    parameters = np.column_stack([start.distortion, start.state])
+    found, equations = descend(problems, problems.retract, parameters, iterations, useful, rough=rough)
     state = found[:, 1:]
-    return Fits(state, problems.model.homography(state), found[:, 0])
+    return Fits(state, problems.model.homography(state), found[:, 0]), equations

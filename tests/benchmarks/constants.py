@@ -29,7 +29,7 @@ CONSTANTS: dict[str, tuple[str, ...]] = {
     "robust.ransac": ("_SOLVER_SUCCESS", "_LEAST_EXPLORATION", "_NOVELTY", "_FREE_REFINEMENT", "_LOCAL_STEPS"),
     "robust.verification": ("_CELLS_PER_DIAGONAL", "LEAST_PLACES", "_LARGEST_CHANCE"),
     "robust.covariance": ("_CELLS_PER_HALF_DIAGONAL",),
-    "robust.levenberg_marquardt": ("LEAST_GAIN", "FIRST_DAMPING"),
+    "robust.levenberg_marquardt": ("PAIR_GAIN", "ROUGH_GAIN", "FIRST_DAMPING"),
 }
 
 

@@ -23,7 +23,8 @@ class _Valleys:
         self.evaluations[self.number] += 1
         x = parameters[:, 0]
         residual, slope = x**2 - 1.0, 2.0 * x
-        return BatchedNormalEquations(self.floor + residual**2, (slope**2)[:, None, None], (slope * residual)[:, None])
+        cost, information, gradient = self.floor + residual**2, (slope**2)[:, None, None], (slope * residual)[:, None]
+        return BatchedNormalEquations(cost, information, gradient, (residual**2)[:, None])
 
 
 def _retract(parameters: FloatArray, step: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -33,9 +34,18 @@ def _retract(parameters: FloatArray, step: FloatArray) -> tuple[FloatArray, Bool
 def test_descents_that_cannot_become_useful_are_given_up() -> None:
     floor, start = np.array([0.0, 50.0]), np.full((2, 1), 30.0)
     counted = np.zeros((2, 2), dtype=np.intp)
-    everything = descend(_Valleys(floor, np.arange(2), counted[0]), _retract, start, 30)
-    useful = descend(_Valleys(floor, np.arange(2), counted[1]), _retract, start, 30, np.full(2, 10.0))
-    np.testing.assert_allclose(everything, 1.0, atol=1e-3)
+    everything, _ = descend(_Valleys(floor, np.arange(2), counted[0]), _retract, start, 30)
+    useful, found = descend(_Valleys(floor, np.arange(2), counted[1]), _retract, start, 30, np.full(2, 10.0))
+    np.testing.assert_allclose(everything[0], 1.0, atol=1e-2)
     assert useful[0, 0] == everything[0, 0]
+    np.testing.assert_array_equal(found.squared, (useful**2 - 1.0) ** 2)
+    np.testing.assert_array_equal(found.cost, floor + found.squared[:, 0])
     assert counted[1, 0] == counted[0, 0]
     assert counted[1, 1] < counted[0, 1]
+
+
+def test_what_is_only_a_start_takes_fewer_steps() -> None:
+    valley = _Valleys(np.ones(1), np.arange(1), np.zeros(1, dtype=np.intp))
+    start = np.full((1, 1), 1.01)
+    assert descend(valley, _retract, start, 30, rough=True)[0] == start
+    assert abs(descend(valley, _retract, start, 30)[0] - 1.0) < 1e-3

@@ -74,10 +74,29 @@ def test_it_comes_to_the_truth(model: PairModel, fixed: bool) -> None:
     near = shift @ H
     start = Fits(model.initialize(near[None]), near[None], np.array([DISTORTION if fixed else -0.15]))
     problems = _problems(model, noise=0.05, fixed=fixed)
-    found = refine_pairs(problems, start, 30)
+    found, equations = refine_pairs(problems, start, 30)
     assert found.distortion == pytest.approx(DISTORTION, abs=1e-4)
     seen = problems.inspect(found)
+    np.testing.assert_array_equal(seen.errors, equations.errors)
+    np.testing.assert_array_equal(seen.information, equations.information)
     assert seen.errors[0, :80].max() < 0.02
     assert np.isinf(seen.errors[0, 80:]).all()
     assert seen.influence.shape == (1, problems.data.present.shape[1], seen.information.shape[1])
     assert seen.cost == pytest.approx(problems.normal_equations(np.column_stack([found.distortion, found.state])).cost)
+
+
+def test_parameters_that_are_held_stay_and_the_rest_is_fitted_as_without_them() -> None:
+    """In lockstep with the freer model, a change of height that is held is no change of height."""
+    similar, rigid = (PlanarPairModel(FOCAL, 0.2, height_free=free) for free in (True, False))
+    state, near = similar.initialize(H[None]), np.array([-0.15])
+    own = refine_pairs(_problems(rigid), Fits(rigid.initialize(H[None]), H[None], near), 30)[0]
+    held = np.stack([similar.held_by(rigid), similar.held_by(similar)])
+    assert held.sum(axis=1).tolist() == [1, 0]
+    data = _data().take(np.array([0, 0]))
+    both = PairProblems(similar, data, np.full(2, 3.0), np.full(2, 0.5), False, held)
+    start = Fits(np.concatenate([rigid.restricted(state), state]), np.stack([H, H]), np.tile(near, 2))
+    found, equations = refine_pairs(both, start, 30)
+    np.testing.assert_allclose(found.state[0], own.state[0], atol=1e-6)
+    assert found.state[0, 7] == 0.0
+    assert found.distortion[0] == pytest.approx(own.distortion[0], abs=1e-7)
+    assert equations.gradient[0, 1 + np.flatnonzero(held[0])[0]] == 0.0
