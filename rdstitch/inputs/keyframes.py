@@ -21,7 +21,8 @@ _SHARED = (0.65, 0.8, 0.9)  # of two frames in a row, in the smaller direction; 
 _ENOUGH = 12  # frames, from which on fewer shared matches do no harm to λ
 _UNSEEN = 0.03  # share of a frame that none of the chosen ones around it need show
 _SIDE = 320  # pixels of the longer side that frames are tracked at
-_CORNERS, _QUALITY, _APART = 200, 0.01, 8.0
+_CORNERS, _QUALITY, _APART = 120, 0.01, 8.0
+_WINDOW = (15, 15)  # pixels, in which a corner is found again
 _FEWEST = 12  # corners that a motion is believed by
 _AGREEING = 0.4  # share of the corners that must agree
 _ERROR = 0.02  # of a motion, in sides: lenses and tilts are not affine
@@ -176,7 +177,9 @@ class _Corners:
         """The motion (3, 3) from the frame of the corners to the next one; None where it is not known."""
         if picture.shape != self._last.shape or len(self._at) < _FEWEST:
             return None
-        at, status, _ = cv2.calcOpticalFlowPyrLK(self._last, picture, self._at, np.empty_like(self._at))
+        at, status, _ = cv2.calcOpticalFlowPyrLK(
+            self._last, picture, self._at, np.empty_like(self._at), winSize=_WINDOW
+        )
         self._last = picture
         inside = (at >= 0.0).all(axis=(1, 2)) & (at[:, 0] < picture.shape[::-1]).all(axis=1)
         kept = (status[:, 0] > 0) & inside
