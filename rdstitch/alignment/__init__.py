@@ -1,8 +1,9 @@
 """From pairs of pictures to all of them registered as one."""
 
-from rdstitch.alignment.align import AlignmentOptions, align
+from rdstitch.alignment.align import align
 from rdstitch.alignment.lens_selection import LENSES
 from rdstitch.alignment.model_family import MODELS
+from rdstitch.alignment.options import AlignmentOptions
 from rdstitch.alignment.result import Alignment
 from rdstitch.matching.links import Link
 

@@ -11,17 +11,24 @@ from rdstitch.alignment.bundle_adjustment import (
     BundleAdjustmentResult,
     FreeParameters,
     Parameters,
-    Priors,
 )
+from rdstitch.alignment.camera_priors import CameraPriors
 from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.initialization import MOST_ITERATIONS, adjust_pairs_independently
 from rdstitch.alignment.metric_upgrade import metric_upgrade
-from rdstitch.alignment.motion_models import HOMOGRAPHY, POSE, PSI, SIMILARITY, THETA, MotionModel, PlanarModel
+from rdstitch.alignment.motion_models import (
+    HOMOGRAPHY,
+    POSE,
+    PSI,
+    SIMILARITY,
+    THETA,
+    MotionModel,
+    PlanarModel,
+)
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.rotation_model import FOCAL_STARTS, ROTATION
 from rdstitch.alignment.warm_start import WarmStart
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.camera import Camera
+from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.matching.match_graph import spanning_tree
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
 
@@ -40,72 +47,6 @@ POSE_TILT_SPREAD = math.radians(35.0)
 _TILT_SPREAD_START = math.radians(3.0)
 _TILT_SPREAD_LEAST = math.radians(0.05)
 _TILT_SPREAD_ROUNDS = 3
-_EXACT = 1e12  # precision of what is known: a standard deviation of 1e-6 radians
-
-
-@dataclass(frozen=True)
-class CameraPriors:
-    """Priors of the camera.
-
-    Attributes
-    ----------
-    log_focal, log_focal_std : float
-        Of the logarithm of the focal length in half diagonals.
-    tilt : (float, float)
-        (ψ, θ), radians.
-    tilt_known : bool
-    attitudes : ndarray of shape (N, 2)
-        How the tilt of each picture differs from the shared one, radians; zeros where that is not known.
-    attitudes_std : float or None
-        Standard deviation of these, 0 for exact ones; None where they are not known.
-    lens, lens_std : ndarray of shape (5,)
-        λ, μ, ν and the shift of the distortion centre.
-    """
-
-    log_focal: float
-    log_focal_std: float
-    tilt: tuple[float, float]
-    tilt_known: bool
-    attitudes: FloatArray
-    attitudes_std: float | None
-    lens: FloatArray
-    lens_std: FloatArray
-
-    def priors(self, model: MotionModel, count: int, tilt_spread: float) -> Priors:
-        """For ``count`` pictures whose tilts scatter by ``tilt_spread`` where nothing else is known of them."""
-        none = Priors.none(model, count)
-        known = replace(none, lens=self.lens, lens_precision=self.lens_std**-2.0)
-        if not model.shared_names:
-            return known
-        if model is ROTATION:
-            return replace(
-                known, shared=np.array([self.log_focal]), shared_precision=np.array([self.log_focal_std**-2.0])
-            )
-        tilt_precision = _EXACT if self.tilt_known else 0.0
-        poses, precision = np.zeros_like(none.poses), np.zeros_like(none.poses)
-        free = list(getattr(model, "free", ()))
-        for axis, column in enumerate((PSI, THETA)):
-            if column in free:
-                poses[:, free.index(column)] = self.attitudes[:, axis]
-                precision[:, free.index(column)] = max(tilt_spread, 1e-6) ** -2.0
-        return replace(
-            known,
-            shared=np.array([*self.tilt, self.log_focal]),
-            shared_precision=np.array([tilt_precision, tilt_precision, self.log_focal_std**-2.0]),
-            poses=poses,
-            poses_precision=precision,
-        )
-
-    def of(self, pictures: IntArray) -> "CameraPriors":
-        """Of some of the pictures only."""
-        return replace(self, attitudes=self.attitudes[pictures])
-
-
-def focal_prior(cameras: Sequence[Camera]) -> tuple[float, float]:
-    """Mean and standard deviation of the logarithm of the focal length in half diagonals."""
-    known = [camera for camera in cameras if camera.focal is not None] or [cameras[0].with_focal()]
-    ratios = [camera.focal / camera.half_diagonal for camera in known if camera.focal is not None]
-    return float(np.log(np.median(ratios))), max(camera.focal_log_std for camera in known)
 
 
 @dataclass(frozen=True)

@@ -5,24 +5,23 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rdstitch.alignment.adjustment_problem import (
-    CameraPriors,
     Problem,
-    focal_prior,
     homography_apart,
     thin_for_selection,
 )
 from rdstitch.alignment.build_result import AdjustedPictures, build_alignment
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult, sigma_of
+from rdstitch.alignment.camera_priors import CameraPriors
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.initialization import relations_at
-from rdstitch.alignment.lens_selection import LENSES, choose_lens
-from rdstitch.alignment.model_family import MODELS
+from rdstitch.alignment.lens_selection import choose_lens
 from rdstitch.alignment.model_selection import ModelChoice, noise_of_links
 from rdstitch.alignment.noise_model import EXACTNESS
 from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.options import AlignmentOptions
+from rdstitch.alignment.position_priors import hold_positions
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.alignment.turn_or_plane import choose_motion
@@ -52,98 +51,10 @@ _AS_GOOD = 1.5
 """Errors of an earlier alignment, in units of those of pairs on their own, up to which a later one starts there."""
 
 
-@dataclass(frozen=True)
-class AlignmentOptions:
-    """What the caller decides, and what is given of the camera.
-
-    Attributes
-    ----------
-    reference : int, optional
-        The picture that defines the plane's frame; the centre of the match graph if not given.
-    model : str
-        "rigid", "similarity", "tilting", "pose", "homography", or "auto": the least free one that the data allow.
-    lens_known : bool
-        Whether the lens is that of the cameras; estimated otherwise.
-    tilt : (float, float), optional
-        (ψ, θ), radians, where it is known.
-    attitudes : ndarray of shape (N, 2), optional
-        (ψ, θ) of each picture, radians, where an IMU or a gimbal has measured them; ``tilt`` is then how the camera
-        is mounted on that.
-    attitudes_std : float
-        Their standard deviation, radians; 0 for exact ones.
-    gravity : ndarray of shape (N, 3), optional
-        Direction down in the axes of each camera (right, down, ahead), where it is known; NaN elsewhere. It levels
-        panoramas.
-    lens : str
-        One of :data:`rdstitch.alignment.lens_selection.LENSES`, or "auto": the simplest that the data allow.
-    most : int
-        Correspondences used of each link at most; fewer where there are thousands of links.
-    """
-
-    reference: int | None = None
-    model: str = "auto"
-    lens_known: bool = False
-    tilt: tuple[float, float] | None = None
-    attitudes: ArrayLike | None = None
-    attitudes_std: float = 0.0
-    gravity: ArrayLike | None = None
-    lens: str = "auto"
-    most: int = 250
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        if self.model != "auto" and self.model not in MODELS:
-            raise ArgumentError(f"model must be auto, {', '.join(MODELS)}, not {self.model}")
-        if self.lens != "auto" and self.lens not in LENSES:
-            raise ArgumentError(f"lens must be auto, {', '.join(LENSES)}, not {self.lens}")
-        if self.attitudes_std < 0:
-            raise ArgumentError("a standard deviation cannot be negative")
-
-    def exact_tilts(self, count: int) -> list[tuple[float, float]] | None:
-        """(ψ, θ), radians, of each of ``count`` pictures, where they are known exactly; None where not."""
-        if self.tilt is None or (self.attitudes is not None and self.attitudes_std > 0.0):
-            return None
-        attitudes = np.zeros((count, 2)) if self.attitudes is None else np.asarray(self.attitudes, dtype=np.float64)
-        return [(psi, theta) for psi, theta in (attitudes + self.tilt).tolist()]
-
-    def camera_priors(self, cameras: Sequence[Camera]) -> CameraPriors:
-        """As the adjustment needs it."""
-        count = len(cameras)
-        attitudes = np.zeros((count, 2)) if self.attitudes is None else np.asarray(self.attitudes, dtype=np.float64)
-        if attitudes.shape != (count, 2) or not np.isfinite(attitudes).all():
-            raise ArgumentError(f"expected one attitude (psi, theta) for each of the {count} pictures")
-        return CameraPriors(
-            *focal_prior(cameras),
-            tilt=self.tilt or (0.0, 0.0),
-            tilt_known=self.tilt is not None,
-            attitudes=attitudes,
-            attitudes_std=None if self.attitudes is None else self.attitudes_std,
-            lens=np.zeros(len(LENS_STD)),
-            lens_std=LENS_STD,
-        )
-
-    @property
-    def lenses(self) -> list[str]:
-        """Lenses to be tried, from the simplest; none where the lens is given."""
-        if self.lens_known:
-            return []
-        return list(LENSES) if self.lens == "auto" else [self.lens]
-
-    @property
-    def models(self) -> list[str]:
-        """Models to be tried, from the least to the most free."""
-        if self.model != "auto":
-            return [self.model]
-        # Measured attitudes are a prior of the tilts; exact ones leave nothing of the tilts free.
-        measured, exact = self.attitudes is not None, self.attitudes is not None and self.attitudes_std == 0.0
-        without = {"tilting": exact, "pose": measured}
-        return [name for name in MODELS if not without.get(name, False)]
-
-
 def align(
     cameras: Sequence[Camera],
     links: Sequence[Link],
-    options: AlignmentOptions = AlignmentOptions(),
+    options: AlignmentOptions | None = None,
     *,
     former: Alignment | None = None,
     progress: Callable[[str], None] | None = None,
@@ -156,7 +67,7 @@ def align(
         One per picture, of one lens; sizes may differ.
     links : sequence of Link
         The pairs that overlap, each once.
-    options : AlignmentOptions
+    options : AlignmentOptions, optional
     former : Alignment, optional
         Of the same cameras with the same options and other links. Where these agree with it, the adjustment starts
         there, not at chained links.
@@ -170,7 +81,7 @@ def align(
     RegistrationError
         When no two pictures are linked.
     """
-    report = progress or (lambda stage: None)
+    report, options = progress or (lambda stage: None), options or AlignmentOptions()
     _check(cameras, links, options)
     known = options.camera_priors(cameras)
     # Thousands of links determine the lens and the poses many times over: memory and time grow with the links alone.
@@ -212,6 +123,7 @@ def align(
     full = replace(graph, observations=everything)
     problem, _ = full.problem(~wrong, pictures, choice.overdispersion)
     fit = problem.refine(choice.fit.model, choice.fit.adjusted.parameters, choice.fit.tilt_spread)
+    problem, fit, disagreement = hold_positions(problem, fit)
     found = AdjustedPictures(
         cameras,
         links,
@@ -222,6 +134,7 @@ def align(
         chosen.refined(fit.free_lens),
         observable,
         None if options.gravity is None else np.asarray(options.gravity, dtype=np.float64),
+        disagreement,
     )
     return build_alignment(found)
 

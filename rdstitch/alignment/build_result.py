@@ -58,6 +58,8 @@ class AdjustedPictures:
         Whether λ is observable, or known.
     gravity : ndarray of shape (M, 3), optional
         Direction down in the axes of every camera; NaN where it is unknown.
+    positions_disagree : str
+        Why the positions were not used; empty where they were, or where there are none.
     """
 
     cameras: Sequence[Camera]
@@ -69,6 +71,7 @@ class AdjustedPictures:
     lens: LensChoice
     observable: bool
     gravity: FloatArray | None = None
+    positions_disagree: str = ""
 
 
 def build_alignment(found: AdjustedPictures) -> Alignment:
@@ -265,4 +268,6 @@ def _warnings(found: AdjustedPictures, camera: Camera) -> tuple[Message, ...]:
             result.append(Message(text, code="few-pictures"))
     if not found.choice.fit.adjusted.converged:
         result.append(Message("the adjustment did not converge; judge the result with care", code="not-converged"))
+    if found.positions_disagree:
+        result.append(Message(found.positions_disagree))
     return tuple(result)

@@ -14,8 +14,9 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment.adjustment_problem import CameraPriors, homography_apart
+from rdstitch.alignment.adjustment_problem import homography_apart
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
+from rdstitch.alignment.camera_priors import CameraPriors
 from rdstitch.alignment.noise_model import NoiseModel
 from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.observations import Observations

@@ -13,6 +13,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.cache import Cache
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, RegistrationError
+from rdstitch.inputs.positions import positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import neighbours
 from rdstitch.matching.neighbours_around import neighbours_around
@@ -149,6 +150,7 @@ def alignment_options(sources: Sequence[Source], options: StitchOptions) -> Alig
         attitudes=np.array(attitudes) if attitudes else None,
         attitudes_std=options.attitude_std,
         gravity=_gravity(sources),
+        positions=positions_of(sources),
     )
 
 

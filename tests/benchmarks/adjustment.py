@@ -14,7 +14,7 @@ import time
 
 import numpy as np
 
-from rdstitch.alignment.align import AlignmentOptions, align
+from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.model_family import MODELS
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import PlanarPoses

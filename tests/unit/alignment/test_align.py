@@ -7,7 +7,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from rdstitch.alignment.align import AlignmentOptions, align
+from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.build_result import AdjustedPictures, build_alignment
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import CONTRADICTS, Alignment, PlanarPoses

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.adjustment_problem import Problem
-from rdstitch.alignment.align import AlignmentOptions, align
 from rdstitch.alignment.result import Alignment, PlanarPoses
 from tests.alignment_scenes import Scene, grid, jittered, scene
 
