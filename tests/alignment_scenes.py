@@ -96,7 +96,7 @@ def scene(
     size, distortion = lens.image_size, lens.nearest_distortion
     ratio = focal / lens.half_diagonal
     shared = TILTING.shared_from_physical(np.array([*tilt, np.log(ratio)]))
-    truth = TILTING.matrices(poses * [1, ratio, ratio, 1, 1, 1], shared).matrices
+    truth = TILTING.matrices(poses * [1, ratio, ratio, 1, 1 / ratio, 1 / ratio], shared).matrices
     cameras = [Camera(size, focal=guess or focal, focal_source=focal_source) for _ in poses]
     inverse = np.linalg.inv(truth)
     links = []

@@ -133,12 +133,15 @@ class Problem:
             return Fit(model, self._run(model, start, POSE_TILT_SPREAD), self.free_lens, POSE_TILT_SPREAD)
         if not self._has_free_tilts(model) or self.camera_priors.attitudes_std is not None:
             spread = self.camera_priors.attitudes_std or 0.0
-            own = spread if self._has_free_tilts(model) else 0.0
-            return Fit(model, self._run(model, start, spread), self.free_lens, own)
+            adjusted = self._run(model, start, spread)
+            if not self._has_free_tilts(model):
+                return Fit(model, adjusted, self.free_lens)
+            again = self._run(model, adjusted.parameters, spread)  # attitudes are divided by the focal length
+            return Fit(model, again, self.free_lens, spread)
         spread = tilt_spread or _TILT_SPREAD_START
         adjusted = self._run(model, start, spread)
         for _ in range(_TILT_SPREAD_ROUNDS):
-            tilts = adjusted.parameters.poses[:, [PSI, THETA]]
+            tilts = adjusted.parameters.poses[:, [PSI, THETA]] * math.exp(adjusted.parameters.shared[-1])
             previous, spread = spread, max(float(np.sqrt(np.mean(tilts**2))), _TILT_SPREAD_LEAST)
             if abs(spread - previous) <= 0.1 * previous:
                 break
@@ -155,16 +158,23 @@ class Problem:
         return PSI in getattr(model, "free", ())
 
     def _run(self, model: MotionModel, start: Parameters, tilt_spread: float) -> BundleAdjustmentResult:
-        adjuster = self.adjuster(model, tilt_spread)
+        adjuster = self.adjuster(model, tilt_spread, start.shared)
         medians = link_medians(adjuster.squared(start), self.observations)
         widest = _WIDEST_START * float(np.median(self.observations.scale2))
         width = min(1.5 * float(np.quantile(np.where(np.isfinite(medians), medians, 1e9), 0.95)), widest)
         return adjuster.run(start, width)
 
-    def adjuster(self, model: MotionModel, tilt_spread: float = _TILT_SPREAD_START) -> BundleAdjuster:
-        """Of one model, with the priors on it."""
+    def adjuster_of(self, fit: Fit) -> BundleAdjuster:
+        """Of a fit, with the priors on it."""
+        return self.adjuster(fit.model, fit.tilt_spread or 1.0, fit.adjusted.parameters.shared)
+
+    def adjuster(
+        self, model: MotionModel, tilt_spread: float = _TILT_SPREAD_START, shared: FloatArray | None = None
+    ) -> BundleAdjuster:
+        """Of one model, with the priors on it; those of tilts as they show with the ``shared`` parameters."""
         freedom = FreeParameters.fixing(model, self.count, [self.reference], self.free_lens)
-        priors = self.camera_priors.priors(model, self.count, tilt_spread)
+        log_focal = None if shared is None or not len(shared) else float(shared[-1])
+        priors = self.camera_priors.priors(model, self.count, tilt_spread, log_focal)
         return BundleAdjuster(model, self.observations, freedom, priors, self.overdispersion)
 
     def _chained(self, model: MotionModel, others: Sequence[Fit], start: FloatArray | None) -> Parameters:
@@ -241,8 +251,8 @@ class Problem:
     def _taken_over(self, model: MotionModel, other: Fit) -> Parameters:
         """Another model's solution as this model's start."""
         parameters = other.adjusted.parameters
-        if model.shared_names and other.model.shared_names:
-            return parameters
+        if isinstance(model, PlanarModel) and isinstance(other.model, PlanarModel):
+            return replace(parameters, poses=model.taken_over(other.model, parameters.poses, parameters.shared))
         shared = parameters.shared if model.shared_names else np.empty(0)
         poses = model.nearest_poses(other.adjusted.matrices.matrices, shared, self.camera_priors.attitudes)
         return Parameters(poses, shared, parameters.lens)

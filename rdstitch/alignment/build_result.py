@@ -11,7 +11,7 @@ from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.lens_description import radius_std
 from rdstitch.alignment.lens_selection import CENTER, ENOUGH_PICTURES, WORTH_SAYING, LensChoice
 from rdstitch.alignment.model_selection import ModelChoice
-from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y, metric_poses
+from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
 from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.planarity import coherence, judge_relief
 from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPoses, ShapeTest
@@ -138,7 +138,7 @@ def _inflation(found: AdjustedPictures) -> float:
         return 1.0
     distortion = len(fit.model.shared_names)
     stated = float(adjusted.covariance[distortion, distortion])
-    adjuster = found.problem.adjuster(fit.model, fit.tilt_spread or 1.0)
+    adjuster = found.problem.adjuster_of(fit)
     return max(1.0, sandwich_std(adjuster, adjusted) ** 2 / max(stated, 1e-300))
 
 
@@ -197,7 +197,7 @@ def _in_frame_of_reference(found: AdjustedPictures) -> tuple[FloatArray, PlanarP
         gravity = None if found.gravity is None else found.gravity[found.pictures]
         homographies[found.pictures] = levelled(matrices, reference, gravity)
         return homographies, None
-    if not fit.model.shared_names:
+    if not isinstance(fit.model, PlanarModel):
         homographies[found.pictures] = matrices[reference] @ np.linalg.inv(matrices)
         return homographies, None
     shared, poses = fit.adjusted.parameters.shared, fit.adjusted.parameters.poses.copy()
@@ -209,7 +209,7 @@ def _in_frame_of_reference(found: AdjustedPictures) -> tuple[FloatArray, PlanarP
     poses[:, LOG_HEIGHT] -= np.log(height)
     homographies[found.pictures] = np.linalg.inv(fit.model.matrices(poses, shared).matrices)
     every = np.full((count, 6), np.nan)
-    every[found.pictures] = metric_poses(poses, shared)
+    every[found.pictures] = fit.model.metric_poses(poses, shared)
     return homographies, PlanarPoses(
         every[:, YAW], every[:, [X, Y]], np.exp(every[:, LOG_HEIGHT]), every[:, [PSI, THETA]]
     )

@@ -1,5 +1,6 @@
 """What is known of the camera and of where the pictures were taken before they are aligned."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -49,8 +50,11 @@ class CameraPriors:
     places: FloatArray | None = None
     places_precision: FloatArray | None = None
 
-    def priors(self, model: MotionModel, count: int, tilt_spread: float) -> Priors:
-        """For ``count`` pictures whose tilts scatter by ``tilt_spread`` where nothing else is known of them."""
+    def priors(self, model: MotionModel, count: int, tilt_spread: float, log_focal: float | None = None) -> Priors:
+        """For ``count`` pictures whose tilts scatter by ``tilt_spread`` where nothing else is known of them.
+
+        Tilts are turned into what they do in the pictures with ``log_focal``, the prior one if not given.
+        """
         none = Priors.none(model, count)
         known = replace(none, lens=self.lens, lens_precision=self.lens_std**-2.0)
         if not model.shared_names:
@@ -62,10 +66,11 @@ class CameraPriors:
         tilt_precision = _EXACT if self.tilt_known else 0.0
         poses, precision = np.zeros_like(none.poses), np.zeros_like(none.poses)
         free = list(getattr(model, "free", ()))
+        focal = math.exp(self.log_focal if log_focal is None else log_focal)
         for axis, column in enumerate((PSI, THETA)):
             if column in free:
-                poses[:, free.index(column)] = self.attitudes[:, axis]
-                precision[:, free.index(column)] = max(tilt_spread, 1e-6) ** -2.0
+                poses[:, free.index(column)] = self.attitudes[:, axis] / focal
+                precision[:, free.index(column)] = (focal / max(tilt_spread, 1e-6)) ** 2.0
         if self.places is not None and self.places_precision is not None:
             columns = [free.index(column) for column in (X, Y)]
             poses[:, columns], precision[:, columns] = self.places, self.places_precision[:, None]

@@ -108,5 +108,5 @@ def _decomposed(relative: FloatArray, tilt: FloatArray, log_focal: float) -> Met
     poses[:, X] = -(c * flat[:, 0, 2] + s * flat[:, 1, 2]) * math.exp(log_focal)
     poses[:, Y] = -(-s * flat[:, 0, 2] + c * flat[:, 1, 2]) * math.exp(log_focal)
     poses[:, LOG_HEIGHT] = np.log(np.clip(np.abs(flat[:, 2, 2]), 1e-3, 1e3))
-    poses[:, [PSI, THETA]] = tilts - shared
+    poses[:, [PSI, THETA]] = (tilts - shared) / math.exp(log_focal)
     return MetricPoses(poses, shared, log_focal)

@@ -26,7 +26,7 @@ from rdstitch.alignment.motion_models import (
     PSI,
     THETA,
     MotionModel,
-    metric_poses,
+    PlanarModel,
 )
 from rdstitch.alignment.noise_model import EXACTNESS, NoiseModel, squared_lengths
 from rdstitch.alignment.normal_equations import whitened_errors
@@ -195,9 +195,9 @@ def _reason(fits: Sequence[Fit], best: int, names: Sequence[str]) -> str:
 
 def _largest_tilt(fit: Fit) -> float:
     """Largest angle between the optical axis and the normal of the plane, degrees; 0 for the general model."""
-    if not fit.model.shared_names:
+    if not isinstance(fit.model, PlanarModel):
         return 0.0
-    tilts = metric_poses(fit.adjusted.parameters.poses, fit.adjusted.parameters.shared)[:, [PSI, THETA]]
+    tilts = fit.model.metric_poses(fit.adjusted.parameters.poses, fit.adjusted.parameters.shared)[:, [PSI, THETA]]
     return math.degrees(float(np.arccos(np.cos(tilts).prod(axis=1)).max()))
 
 

@@ -19,8 +19,8 @@ homography 8                                               any motion, any camer
 All but the last share the tilt (ψ, θ) and the focal length:
 ``P_i = diag(f, f, 1) Rx(ψ + δψ_i) Ry(θ + δθ_i) Rz(φ_i) diag(1, 1, h_i) T(t_i)``, ``T = I - t e3'``.
 
-The pictures see ψ/f, θ/f and f t far better than f itself. The adjustment therefore moves those; otherwise it would
-have to follow a curved valley.
+The pictures see ψ/f, θ/f, their own δψ/f and δθ/f, and f t far better than f itself. The adjustment therefore moves
+those; otherwise it would have to follow a curved valley, and a prior on small tilts would ask for a short f.
 """
 
 from dataclasses import dataclass
@@ -106,7 +106,7 @@ class PlanarModel:
     """Camera that moves over a plane with a tilt that it keeps, or nearly keeps.
 
     Poses have six columns, :data:`YAW` to :data:`THETA`, of which only the free ones move; positions are multiplied by
-    the focal length. The shared parameters are ψ/f, θ/f and log f.
+    the focal length, tilts that are free divided by it. The shared parameters are ψ/f, θ/f and log f.
 
     Attributes
     ----------
@@ -134,16 +134,18 @@ class PlanarModel:
         count = len(poses)
         focal = np.exp(shared[2])
         calibration = np.diag([focal, focal, 1.0])
-        rotation = rotation_from_tilt(poses[:, [PSI, THETA]] + shared[:2] * focal)
+        tilts = self._tilts(poses, shared)
+        rotation = rotation_from_tilt(tilts + shared[:2] * focal)
         motion, by_motion = _motion_in_plane(poses, focal)
         left = calibration @ rotation
         matrices = left @ motion
 
         by_tilt = np.stack([calibration @ ABOUT_X @ rotation @ motion, left @ ABOUT_Y @ motion], axis=1)
-        by_columns = np.concatenate([left[:, None] @ by_motion, by_tilt], axis=1)
+        by_columns = np.concatenate([left[:, None] @ by_motion, by_tilt * focal], axis=1)
+        growing = shared[:2] * focal + (tilts if PSI in self.free else 0.0)
         by_focal = (
             matrices * np.array([1.0, 1.0, 0.0])[:, None]
-            + np.einsum("nkij,k->nij", by_tilt, shared[:2] * focal)
+            + np.einsum("nkij,nk->nij", by_tilt, np.broadcast_to(growing, (count, 2)))
             - np.einsum("nkij,nk->nij", by_columns[:, [X, Y]], poses[:, [X, Y]])
         )
         by_shared = np.concatenate([by_tilt * focal, by_focal[:, None]], axis=1)
@@ -172,32 +174,46 @@ class PlanarModel:
         """The free parameters themselves."""
         return poses[:, list(self.free)]
 
+    def _tilts(self, poses: FloatArray, shared: FloatArray) -> FloatArray:
+        """How the tilts of the pictures differ from the shared one (N, 2), radians."""
+        own: FloatArray = poses[:, [PSI, THETA]] * (np.exp(shared[2]) if PSI in self.free else 1.0)
+        return own
+
+    def _tilted(self, tilts: FloatArray, shared: FloatArray) -> FloatArray:
+        """Poses (N, 6) at the origin with tilts (N, 2) that differ by so much from the shared one, radians."""
+        poses = np.zeros((len(tilts), 6))
+        poses[:, [PSI, THETA]] = tilts / (np.exp(shared[2]) if PSI in self.free else 1.0)
+        return poses
+
+    def metric_poses(self, poses: FloatArray, shared: FloatArray) -> FloatArray:
+        """Poses (N, 6) with positions in units of the height, and with the whole tilt, radians."""
+        focal = np.exp(shared[2])
+        result = poses.copy()
+        result[:, [X, Y]] /= focal
+        result[:, [PSI, THETA]] = self._tilts(poses, shared) + shared[:2] * focal
+        return result
+
+    def taken_over(self, other: "PlanarModel", poses: FloatArray, shared: FloatArray) -> FloatArray:
+        """Poses (N, 6) of another planar model in the units of this one."""
+        result = poses.copy()
+        result[:, [PSI, THETA]] = self._tilted(other._tilts(poses, shared), shared)[:, [PSI, THETA]]
+        return result
+
     def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """``diag(f, f, 1) R_i``."""
-        poses = np.zeros((len(attitudes), 6))
-        poses[:, [PSI, THETA]] = attitudes
+        poses = self._tilted(attitudes, shared)
         matrices: FloatArray = self.matrices(poses, shared).matrices
         return matrices
 
     def nearest_poses(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """The nearest poses, given how the tilts of the pictures differ from the shared one."""
-        poses = np.zeros((len(homographies), 6))
-        poses[:, [PSI, THETA]] = attitudes
+        poses = self._tilted(attitudes, shared)
         motion = np.linalg.inv(self.origins(shared, attitudes)) @ homographies
         poses[:, YAW], translation, height = nearest_in_plane(motion)
         poses[:, [X, Y]] = translation * np.exp(shared[2])
         if LOG_HEIGHT in self.free:
             poses[:, LOG_HEIGHT] = np.log(np.clip(np.abs(height), 1e-3, 1e3))
         return poses
-
-
-def metric_poses(poses: FloatArray, shared: FloatArray) -> FloatArray:
-    """Poses (N, 6) of a planar model with positions in units of the height, and with the whole tilt."""
-    focal = np.exp(shared[2])
-    result = poses.copy()
-    result[:, [X, Y]] /= focal
-    result[:, [PSI, THETA]] += shared[:2] * focal
-    return result
 
 
 def _motion_in_plane(poses: FloatArray, focal: float) -> tuple[FloatArray, FloatArray]:

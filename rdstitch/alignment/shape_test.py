@@ -78,7 +78,7 @@ class _Directions:
         """From the normal equations, with the effects as more shared parameters."""
         noise = math.hypot(fit.adjusted.sigma, EXACTNESS)
         at = replace(fit.adjusted, sigma=noise)
-        adjuster = problem.adjuster(fit.model, fit.tilt_spread or 1.0)
+        adjuster = problem.adjuster_of(fit)
         adjuster = replace(adjuster, observations=_inliers(adjuster, fit))
         normal = adjuster.normal_equations(at, _NO_ROBUSTNESS)
         coupling = [normal.coupling]

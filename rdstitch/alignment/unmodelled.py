@@ -12,7 +12,7 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit
 from rdstitch.alignment.lens_selection import CENTER
-from rdstitch.alignment.motion_models import LOG_HEIGHT, PlanarModel, X, Y, inverses, metric_poses
+from rdstitch.alignment.motion_models import LOG_HEIGHT, PlanarModel, X, Y, inverses
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.division_model import distort, undistort
 from rdstitch.radial_homography import project
@@ -56,7 +56,7 @@ def unmodelled_effects(fit: Fit) -> list[Effect]:
     # The camera's motion shears and stretches what its rows see, and so do pixels that are no squares.
     effects += [Effect(ROLLING_SHUTTER, _sheared(np.array(matrix)), 0.01) for matrix in _SHEARS]
     if isinstance(fit.model, PlanarModel):
-        effects += [Effect(CURVED, _curved(fit, axes), 0.05) for axes in ((0, 0), (0, 1), (1, 1))]
+        effects += [Effect(CURVED, _curved(fit, fit.model, axes), 0.05) for axes in ((0, 0), (0, 1), (1, 1))]
     return effects
 
 
@@ -96,10 +96,10 @@ def _sheared(matrix: FloatArray) -> Correction:
     return correct
 
 
-def _curved(fit: Fit, axes: tuple[int, int]) -> Correction:
+def _curved(fit: Fit, model: PlanarModel, axes: tuple[int, int]) -> Correction:
     """The ground is a paraboloid, its height one half of ``size`` times two coordinates, in heights of the camera."""
     adjusted = fit.adjusted
-    poses = metric_poses(adjusted.parameters.poses, adjusted.parameters.shared)
+    poses = model.metric_poses(adjusted.parameters.poses, adjusted.parameters.shared)
     position, height = poses[:, [X, Y]], np.exp(poses[:, LOG_HEIGHT])
     to_picture, middle = adjusted.matrices.matrices, position.mean(axis=0)
     to_ground = inverses(to_picture)

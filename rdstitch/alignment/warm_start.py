@@ -54,7 +54,7 @@ class WarmStart:
         own[:, 0] = poses.yaw[pictures]
         own[:, [X, Y]] = poses.position[pictures] * focal / np.exp(median)
         own[:, LOG_HEIGHT] = logs - median
-        own[:, [PSI, THETA]] = poses.tilt[pictures] - np.array(tilt)
+        own[:, [PSI, THETA]] = (poses.tilt[pictures] - np.array(tilt)) / focal  # free, or zero
         found, given = former.cameras[0], cameras[0]
         center = (np.asarray(found.center) - np.asarray(given.center)) / given.half_diagonal
         lens = np.where(free_lens, [*found.coefficients, *center], lens)

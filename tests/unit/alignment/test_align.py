@@ -277,3 +277,13 @@ def test_a_picture_that_contradicts_the_others_names_them() -> None:
     (message,) = explain_unaligned(whole, ["left.png", "middle.png", "right.png"])
     assert message.images == ("right.png",)
     assert "its overlap with left.png contradicts" in message.text
+
+
+def test_small_tilts_do_not_ask_for_a_short_focal_length() -> None:
+    """Pictures show tilts divided by the focal length, and hardly show that itself over rough ground."""
+    rng = np.random.default_rng(3)
+    poses = jittered(grid(12, 1, (0.35, 0.1), 0.1, rng), 0.05, math.radians(1.5), rng)
+    given = scene(poses, noise=0.5, per_link=60, relief=0.02, reach=2, focal_source=None, rng=rng)
+    found = _run(given, model="tilting", lens="division")
+    assert found.focal is not None
+    assert abs(math.log(found.focal * given.cameras[0].half_diagonal / 520.0)) < 0.3

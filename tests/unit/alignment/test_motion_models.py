@@ -14,7 +14,6 @@ from rdstitch.alignment.motion_models import (
     MotionModel,
     X,
     Y,
-    metric_poses,
 )
 from rdstitch.planar_motion import PlanarMotion
 
@@ -78,7 +77,7 @@ def test_two_pictures_are_related_by_the_planar_motion_between_them() -> None:
     np.testing.assert_allclose(
         second @ np.linalg.inv(first), scale @ motion.homography() @ np.linalg.inv(scale), atol=1e-12
     )
-    metric = metric_poses(poses, shared)
+    metric = SIMILARITY.metric_poses(poses, shared)
     np.testing.assert_allclose(metric[1], [0.4, 0.3, -0.2, np.log(1.2), *tilt], atol=1e-12)
 
 
