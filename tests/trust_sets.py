@@ -38,8 +38,9 @@ ODD = ("odd lens",)
 """Solvable too, but only where asked for: the pictures of one lens that is no division model about their centre."""
 
 SPOILED = ("spoiled",)
-"""Ten pictures of which one to three show other ground, were zoomed, are blurred, noisy or taken aslant: solved from
-the rest. Those of the first two kinds are named; the others are used rightly, or named."""
+"""Ten pictures of which one to three show other ground or a repeated pattern, were zoomed, have a truncated file or one
+with flipped bits, are blurred, noisy or taken aslant: solved from the rest. Those that are blurred, noisy or aslant are
+used rightly, or named; all others are named."""
 
 HOPELESS = (
     "apart", "textureless", "repeated", "turning", "mixed lenses", "mixed by one", "little overlap", "mixed ground"
@@ -64,11 +65,28 @@ class MixedSequence(Sequence):
         Pictures that come from ``other``.
     usable : bool
         Whether these may be registered rightly with the rest.
+    damaged : bool
+        Whether their files are cut off or have flipped bits.
     """
 
     other: Sequence | None = None
     taken: frozenset[int] = frozenset()
     usable: bool = False
+    damaged: bool = False
+
+    def write(self, folder: str | Path, name: str = "frame_{:04d}.png") -> list[Path]:
+        """See :meth:`Sequence.write`."""
+        paths = super().write(folder, name)
+        rng = np.random.default_rng((self.seed, 78))
+        for index in sorted(self.taken) if self.damaged else ():
+            data = bytearray(paths[index].read_bytes())
+            if rng.random() < 0.5:
+                data = data[: int(rng.uniform(0.05, 0.95) * len(data))]
+            else:
+                for place in rng.integers(len(data) // 20, len(data) - 20, 8).tolist():
+                    data[place] ^= 1 << int(rng.integers(8))
+            paths[index].write_bytes(data)
+        return paths
 
     def _of(self, index: int) -> Sequence:
         own = Sequence(self.texture, self.lens, self.poses, self.photometry, seed=self.seed)
@@ -196,7 +214,7 @@ def _poses(kind: str, lens: Lens, tilt: tuple[float, float], rng: np.random.Gene
 
 def _mixed(kind: str, sequence: Sequence, rng: np.random.Generator, seed: int) -> MixedSequence:
     """Some pictures through another lens (a zoom), or over other ground."""
-    lens, usable = sequence.lens, False
+    lens, usable, damaged = sequence.lens, False, False
     if kind == "mixed lenses":
         assert isinstance(lens, Camera)
         assert lens.focal is not None
@@ -215,12 +233,16 @@ def _mixed(kind: str, sequence: Sequence, rng: np.random.Generator, seed: int) -
     elif kind in SPOILED:
         assert isinstance(lens, Camera)
         assert lens.focal is not None
-        how = str(rng.choice(["zoomed", "other ground", "blurred", "noisy", "aslant"]))
+        how = str(rng.choice(["zoomed", "other ground", "blurred", "noisy", "aslant", "pattern", "damaged"]))
         usable = how in ("blurred", "noisy", "aslant")
         if how == "zoomed":
             other = replace(sequence, lens=replace(lens, distortion=lens.distortion / 2, focal=1.4 * lens.focal))
         elif how == "other ground":
             other = replace(sequence, texture=ground(sequence.texture.size, seed + 1))
+        elif how == "pattern":
+            other = replace(sequence, texture=repeated(sequence.texture.size, seed + 1, int(rng.integers(48, 140))))
+        elif how == "damaged":
+            other, damaged = sequence, True
         elif how == "aslant":
             aside = rng.uniform(0.4, 0.6) * np.array([np.cos(seed), np.sin(seed)])
             other = replace(sequence, poses=replace(sequence.poses, tilt=sequence.poses.tilt + aside))
@@ -240,6 +262,7 @@ def _mixed(kind: str, sequence: Sequence, rng: np.random.Generator, seed: int) -
         other=other,
         taken=taken,
         usable=usable,
+        damaged=damaged,
     )
 
 

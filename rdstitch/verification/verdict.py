@@ -1,7 +1,7 @@
 """Every run judges itself: can the result be relied on?"""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import nullcontext
 
@@ -106,7 +106,7 @@ def judge(
         *([] if lens_only else _shape(paths, alignment)),
         *([] if lens_only else _pattern(ambiguous, checked)),
         *(suspicions[pair] for pair in decisive),
-        *_outvoted(paths, [pair for pair in suspicions if pair not in decisive]),
+        *_outvoted(paths, [pair for pair in suspicions if pair not in decisive], ambiguous),
         *([] if parallax else rival_messages(paths, rivals, share_alike(checked), lens_only=lens_only)),
         *_little_alike(paths, checked),
         *([] if lens_only else _settled(paths, checked)),
@@ -185,14 +185,17 @@ def _pattern(ambiguous: Mapping[Pair, Message], checked: Sequence[CheckedLink]) 
     return [_failure(f"{len(ambiguous)} of {len(checked)} pairs fit as well elsewhere (a repeated pattern?)")]
 
 
-def _outvoted(paths: Sequence[str], pairs: Sequence[Pair]) -> list[Message]:
-    """Suspicious pairs on which nothing depends, as one warning."""
-    if not pairs:
-        return []
-    named = shortened([" and ".join(names_of([paths[i], paths[j]])) for i, j in pairs])
-    text = f"{len(pairs)} of the pairs fit badly, and little depends on them: {named}; look at the seams between them"
-    images = tuple(paths[k] for k in sorted({k for pair in pairs for k in pair}))
-    return [Message(text, images, code="doubtful-seam")]
+def _outvoted(paths: Sequence[str], pairs: Sequence[Pair], ambiguous: Container[Pair] = ()) -> list[Message]:
+    """Suspicious pairs on which nothing depends: a warning of those that fit badly, one of those that fit twice."""
+    result = []
+    for twice, what in ((False, "badly"), (True, "as well elsewhere (a repeated pattern?)")):
+        own = [pair for pair in pairs if (pair in ambiguous) == twice]
+        if own:
+            named = shortened([" and ".join(names_of([paths[i], paths[j]])) for i, j in own])
+            text = f"{len(own)} of the pairs fit {what}, and little depends on them: {named}"
+            images = tuple(paths[k] for k in sorted({k for pair in own for k in pair}))
+            result.append(Message(f"{text}; look at the seams between them", images, code="doubtful-seam"))
+    return result
 
 
 def _mixed(paths: Sequence[str], registration: Registration) -> list[Message]:

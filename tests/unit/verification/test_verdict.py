@@ -201,6 +201,10 @@ def test_of_doubtful_pairs_on_which_nothing_depends_the_pictures_are_named() -> 
     (message,) = verdict._outvoted(paths, [(2, 3), (0, 2)])
     assert message.images == ("folder/a.jpg", "folder/c.jpg", "folder/d.jpg")
     assert "2 of the pairs fit badly, and little depends on them: c.jpg and d.jpg, a.jpg and c.jpg" in message.text
+    badly, twice = verdict._outvoted(paths, [(2, 3), (0, 2)], {(0, 2)})
+    assert "1 of the pairs fit badly, and little depends on them: c.jpg and d.jpg" in badly.text
+    assert "1 of the pairs fit as well elsewhere (a repeated pattern?)" in twice.text
+    assert twice.images == ("folder/a.jpg", "folder/c.jpg")
     assert verdict._outvoted(paths, []) == []
 
 
