@@ -54,11 +54,13 @@ def followed(
     every: int | None,
     idle: float | None,
     refresh: float | None = None,
+    plot: Path | None = None,
 ) -> Iterator[list["Named"]]:
     """Print a line for each frame as it arrives; then, inside the block, what all of them are as inputs of a recipe.
 
-    ``refresh`` is None where no picture is made.
+    ``refresh`` is None where no picture is made; ``plot`` will be written at the end too.
     """
+    from rdstitch.camera_files import CAMERA_SUFFIXES
     from rdstitch.inputs.arrivals import Arrivals
     from rdstitch.io.atomic import check_output
     from rdstitch.io.staging import temporary_folder
@@ -70,12 +72,19 @@ def followed(
     if source.is_dir() and output.resolve().parent == source.resolve():
         raise click.UsageError(f"{output}: lies in the folder that is followed; choose a name in another folder")
     # Before hours of frames, not after them.
+    preview = output.with_suffix(".preview.jpg") if refresh else None
+    others = [preview, plot]
     if refresh is None:
-        check_output(output, stitch.overwrite, suffixes=())
+        others.append(output)
     else:
         check_output(output, stitch.overwrite)
-        check_output(f"{output}.json", stitch.overwrite, suffixes=())
-    preview = output.with_suffix(".preview.jpg") if refresh else None
+        others.append(Path(f"{output}.json"))
+    for other in others:
+        if other is not None:
+            check_output(other, stitch.overwrite, suffixes=())
+    if stitch.save_camera is not None:
+        check_output(stitch.save_camera, stitch.overwrite, suffixes=CAMERA_SUFFIXES)
+    before = _state(preview)
     with temporary_folder() as folder:
         arrivals = Arrivals(str(inputs[0]), frames_folder=lambda: folder, names=sys.stdin, every=every or 1, idle=idle)
         try:
@@ -84,9 +93,17 @@ def followed(
         except KeyboardInterrupt:
             reporter.note("interrupted: registering what has arrived; interrupt once more to give up")
         yield arrivals.inputs
-    if preview is not None:
-        # What it was a sketch of is there now.
+    # What it was a sketch of is there now; a file that was there before and was not replaced is none of ours.
+    if preview is not None and _state(preview) != before:
         preview.unlink(missing_ok=True)
+
+
+def _state(file: Path | None) -> tuple[int, int] | None:
+    """Which file it is, and when it was changed; None where there is none."""
+    if file is None or not file.exists():
+        return None
+    status = file.stat()
+    return status.st_ino, status.st_mtime_ns
 
 
 def print_line(record: dict[str, object]) -> None:

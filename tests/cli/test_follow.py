@@ -126,8 +126,28 @@ def test_what_would_fail_at_the_end_fails_at_the_beginning(
     assert rdstitch("mosaic", folder, "-o", outside, "--follow").status == 6
     assert rdstitch("mosaic", folder, "-o", tmp_path / "out.xyz", "--follow").status == 6
     assert rdstitch("mosaic", folder, "-o", folder / "out.png", "--follow").status == 2
+    (folder.parent / "linked").symlink_to(folder)
+    assert rdstitch("mosaic", folder, "-o", tmp_path / "linked" / "out.png", "--follow").status == 2
+    used = tmp_path / "used.json"
+    used.write_text("{}")
+    assert rdstitch("mosaic", folder, "-o", tmp_path / "new.png", "--follow", "--save-camera", used).status == 6
+    assert rdstitch("trajectory", folder, "-o", tmp_path / "new.csv", "--follow", "--plot", used).status == 6
     assert rdstitch("mosaic", folder, drive[0], "-o", tmp_path / "other.png", "--follow").status == 2
     assert rdstitch("mosaic", tmp_path / "none", "-o", tmp_path / "other.png", "--follow").status == 3
     refused = rdstitch("mosaic", folder, "-o", tmp_path / "other.png", "--follow", "--idle", "0.05")
     assert refused.status == 3
     assert "no pictures" in refused.line
+
+
+def test_a_picture_of_the_users_with_the_name_of_the_preview_stays(
+    rdstitch: Run, drive: list[Path], folder: Path, tmp_path: Path
+) -> None:
+    own = tmp_path / "out.preview.jpg"
+    own.write_bytes(b"a picture of the user's")
+    refused = rdstitch("mosaic", folder, "-o", tmp_path / "out.png", "--follow", "--idle", "0.05")
+    assert refused.status == 6
+    assert own.name in refused.line
+    # It may be replaced, but what was never replaced is not removed.
+    forced = rdstitch("mosaic", folder, "-o", tmp_path / "out.png", "--follow", "--idle", "0.05", "--overwrite")
+    assert forced.status == 3
+    assert own.read_bytes() == b"a picture of the user's"

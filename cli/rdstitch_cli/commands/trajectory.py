@@ -86,7 +86,7 @@ def trajectory(
     with Reporter(-quiet + verbose) as reporter, ExitStack() as stack:
         stitch = stitch_options(reporter, **given)
         if following:
-            arrived = live.followed(inputs, stitch, reporter, output=output, every=every, idle=idle)
+            arrived = live.followed(inputs, stitch, reporter, output=output, plot=plot, every=every, idle=idle)
             paths: Sequence[Named] = stack.enter_context(arrived)
         else:
             paths = options.resolve(inputs)
