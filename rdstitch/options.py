@@ -182,6 +182,13 @@ class StitchOptions:
         return self.camera.nearest_distortion
 
     @property
+    def files(self) -> list[Path]:
+        """The files that are read besides the pictures, none of which may be written over."""
+        named = (self.mask, self.attitude, self.lightglue_model, self.features.aliked_model)
+        given = [Path(file) for file in named if file is not None]
+        return [file for path in given for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
+
+    @property
     def matching(self) -> MatchingOptions:
         """What concerns matching and the estimation of pairs."""
         pair = PairOptions(

@@ -63,7 +63,7 @@ def _check_place(file: Path, overwrite: bool, inputs: Iterable[str | Path]) -> N
         raise OutputError(f"{file}: is a link to nothing; remove it, or choose another name")
     if file.exists():
         if any(_same_file(file, Path(other)) for other in inputs):
-            raise OutputError(f"{file}: is one of the input pictures; choose another name")
+            raise OutputError(f"{file}: is read as input; choose another name")
         if not overwrite:
             raise OutputError(f"{file}: exists already; choose another name or use --overwrite")
         # A link stays, and what it leads to is replaced.

@@ -222,7 +222,7 @@ def trajectory(
     with found_pictures(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as found:
         files = [file for file in (output, plot) if file is not None]
         for file in files:
-            read = found.files if timestamps is None else [*found.files, timestamps]
+            read = [*found.files, *options.files, *([] if timestamps is None else [timestamps])]
             check_output(file, options.overwrite, read, suffixes=())
         check_distinct(files)
         sources, unread = _read(found.frames, options, skip_bad=True)
@@ -256,6 +256,7 @@ def _register_all(
 
 def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Sequence[str | Path]) -> None:
     """Find out before long work whether everything can be written."""
+    inputs = [*inputs, *options.files]
     if output is not None:
         check_output(output, options.overwrite, inputs)
         check_output(f"{output}.json", options.overwrite, inputs, suffixes=())

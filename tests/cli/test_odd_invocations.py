@@ -49,7 +49,7 @@ def place(tmp_path: Path, frames: list[Path], monkeypatch: pytest.MonkeyPatch) -
         ("trajectory a.png b.png -o path --height nan", 2, "height must be positive"),
         ("apply a.png --images more -o out.png", 3, "a.png: "),
         ("apply more --images more -o out.png", 3, "more: "),
-        ("undistort a.png -o . --lambda -0.2", 6, "a.png: is one of the input pictures"),
+        ("undistort a.png -o . --lambda -0.2", 6, "a.png: is read as input"),
         ("undistort a.png -o straight", 2, "--camera FILE or --lambda L"),
     ],
 )

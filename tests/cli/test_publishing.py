@@ -177,7 +177,7 @@ def test_the_next_run_gives_the_picture_of_a_killed_one_its_sidecar(
     assert finished(start("mosaic", tmp_path, "-o", output, *FAST, program=program)).status == -9
     shutil.copy(frames[0], output)
     done = rdstitch("mosaic", tmp_path, "-o", output, "--overwrite", *FAST)
-    assert (done.status, "is one of the input pictures" in done.line) == (6, True)
+    assert (done.status, "is read as input" in done.line) == (6, True)
     assert output.read_bytes() == frames[0].read_bytes()
 
 
@@ -261,7 +261,7 @@ def test_a_picture_of_the_folder_is_never_replaced(rdstitch: Run, located: Path,
     first = sorted(flight.iterdir())[1]
     before, output = first.read_bytes(), flight / name.replace("frame_0001.jpg", first.name)
     done = rdstitch("mosaic", flight, "-o", output, "--overwrite", *FAST)
-    assert (done.status, "is one of the input pictures" in done.line) == (6, True)
+    assert (done.status, "is read as input" in done.line) == (6, True)
     assert first.read_bytes() == before
     # What rdstitch wrote there is replaced.
     assert rdstitch("mosaic", flight, "-o", flight / "out.jpg", *FAST).status == 0
@@ -278,3 +278,19 @@ def test_a_list_of_pictures_and_of_times_is_never_replaced(rdstitch: Run, locate
         arguments = ("trajectory", f"@{names}", "--timestamps", times, "-o", output, "--overwrite", *FAST)
         assert rdstitch(*arguments).status == 6
         assert output.read_bytes() == before
+
+
+def test_a_mask_or_a_table_that_is_read_is_never_replaced(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    masks, table = tmp_path / "masks", tmp_path / "attitudes.csv"
+    masks.mkdir()
+    shutil.copy(frames[0], masks / frames[0].name)
+    table.write_text("name,psi,theta\n" + "".join(f"{frame.name},0,0\n" for frame in frames), encoding="utf-8")
+    for command, file, given in (
+        ("mosaic", masks / frames[0].name, ("--mask", masks)),
+        ("pano", masks / frames[0].name, ("--mask", masks / frames[0].name)),
+        ("trajectory", table, ("--attitude", table)),
+    ):
+        before = file.read_bytes()
+        done = rdstitch(command, *frames[:2], "-o", file, "--overwrite", *given)
+        assert (done.status, f"{file.name}: is read as input" in done.line) == (6, True)
+        assert file.read_bytes() == before
