@@ -16,6 +16,7 @@ from typing import Any
 _BLOCK = 2**18  # bytes of a file that are fetched at a time where only its header is wanted
 # Two letters or more: one is a drive.
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
+_LOCAL = ("file", "local")  # schemes of what is on this machine
 _SEVERAL = "::"  # between the parts of a chain, as in simplecache::s3://bucket/name
 _held: ContextVar[tuple[str, bytes] | None] = ContextVar("held", default=None)
 
@@ -30,9 +31,16 @@ def url_of(path: str | Path) -> str:
     chain = []
     for part in str(path).split(_SEVERAL):
         scheme, slash, rest = part.partition(":/")
-        absolute = "/" if scheme in ("file", "local") else ""
+        absolute = "/" if scheme in _LOCAL else ""
         chain.append(f"{scheme}://{absolute}{rest.lstrip('/')}" if slash else part)
     return _SEVERAL.join(chain)
+
+
+def local_file(path: str | Path) -> Path:
+    """The file of this machine that a URL like ``file:///place/name`` names; any other name as it is."""
+    url = url_of(path).rpartition(_SEVERAL)[2]
+    scheme, _, rest = url.partition("://")
+    return Path(rest) if scheme in _LOCAL and rest else Path(path)
 
 
 def open_remote(path: str | Path) -> BufferedReader:

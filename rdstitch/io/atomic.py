@@ -10,6 +10,7 @@ from typing import Any
 from rdstitch.errors import OutputError
 from rdstitch.io.deepzoom import check_tiles_folder, tiles_folder
 from rdstitch.io.outputs import Outputs, naming
+from rdstitch.remote_files import local_file
 
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".dzi")
 
@@ -91,7 +92,7 @@ def check_distinct(paths: Iterable[str | Path]) -> None:
 def _same_file(first: Path, second: Path) -> bool:
     """Whether two names lead to the same file; a missing file is the same as none."""
     try:
-        return first.samefile(second)
+        return first.samefile(local_file(second))
     except (OSError, ValueError):
         return False
 

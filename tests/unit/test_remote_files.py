@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rdstitch.errors import InputError
+from rdstitch.errors import InputError, OutputError
 from rdstitch.inputs.find import find_pictures
 from rdstitch.inputs.source import Source, read_sources
+from rdstitch.io.atomic import check_output
 from rdstitch.io.metadata import read_metadata
 from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
@@ -117,3 +118,13 @@ def test_a_message_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fsspec.core", None)
     with pytest.raises(InputError, match=r"URLs need the extra remote: pip install 'rdstitch\[remote\]'"):
         read_metadata(Path("s3://bucket/a.jpg"))
+
+
+@pytest.mark.parametrize("scheme", ["file://", "local://", "simplecache::file://"])
+def test_what_is_read_by_a_url_of_this_machine_is_never_replaced(tmp_path: Path, scheme: str) -> None:
+    picture = tmp_path / "a picture.png"
+    picture.write_bytes(b"the user's")
+    for url in (f"{scheme}{picture}", Path(f"{scheme}{picture}")):
+        with pytest.raises(OutputError, match="is read as input"):
+            check_output(picture, True, [url])
+    check_output(picture, True, ["memory://a picture.png", "s3://bucket/a.png", "other.png"])
