@@ -81,7 +81,7 @@ def followed(
         others.append(Path(f"{output}.json"))
     for other in others:
         if other is not None:
-            check_output(other, stitch.overwrite, suffixes=())
+            check_output(other, stitch.overwrite, [source], suffixes=())
     if stitch.save_camera is not None:
         check_output(stitch.save_camera, stitch.overwrite, suffixes=CAMERA_SUFFIXES)
     before = _state(preview)

@@ -39,21 +39,21 @@ class FoundPictures:
         In natural order within a folder or pattern.
     outputs : list of Path
         Pictures in folders and patterns that rdstitch wrote, by the sidecars beside them, and that are no input.
-    lists : tuple of Path
-        The ``@list`` files that were named.
+    containers : tuple of Path
+        The ``@list`` files, videos and bags that frames come from.
     notes : tuple of Message
         On videos of which not every frame was taken.
     """
 
     frames: list[Frame]
     outputs: list[Path]
-    lists: tuple[Path, ...] = ()
+    containers: tuple[Path, ...] = ()
     notes: tuple[Message, ...] = ()
 
     @property
     def files(self) -> list[Path]:
         """What no output may be written over."""
-        return [*files_of(self.frames), *self.lists]
+        return [*files_of(self.frames), *self.containers]
 
     @property
     def messages(self) -> list[Message]:
@@ -122,9 +122,9 @@ def find_pictures(
     frames: list[Frame] = []
     outputs: list[Path] = []
     notes: list[Message] = []
+    containers: list[Path] = []
     interrupted = cache(interrupted_outputs)
-    arguments = list(arguments)
-    for frame, named in _expand(arguments, frames_folder, every, notes, topic):
+    for frame, named in _expand(arguments, frames_folder, every, notes, containers, topic):
         is_output = (
             frame.picture is None
             and not is_url(frame.path)
@@ -138,9 +138,7 @@ def find_pictures(
             frames.append(frame)
     if outputs and not frames:
         raise InputError(f"{outputs[0].parent}: there are no pictures but those that rdstitch wrote")
-    texts = [str(argument) for argument in arguments if not isinstance(argument, Frame)]
-    lists = tuple(Path(text[1:]) for text in texts if text.startswith("@") and not _exists(Path(text)))
-    return FoundPictures(frames, outputs, lists, tuple(notes))
+    return FoundPictures(frames, outputs, tuple(containers), tuple(notes))
 
 
 def _entry(path: Path) -> Path:
@@ -159,10 +157,11 @@ def _expand(
     frames_folder: Callable[[], Path] | None,
     every: int | None,
     notes: list[Message],
+    containers: list[Path],
     topic: str | None,
     lists: tuple[Path, ...] = (),
 ) -> Iterator[tuple[Frame, bool]]:
-    """Every frame, and whether it was named one by one; ``notes`` on videos are added.
+    """Every frame, and whether it was named one by one; ``notes`` on videos and ``containers`` are added.
 
     ``lists`` are those that the arguments come from.
     """
@@ -178,9 +177,10 @@ def _expand(
                 file = Path(text[1:])
                 if file in lists:
                     raise InputError(f"{file}: the list of pictures names itself")
+                containers.append(file)
                 # Another program may write the list while we read it: @<(find ...) in a shell.
                 names = names_in(read_text(file, regular=False))
-                yield from _expand(names, frames_folder, every, notes, topic, (*lists, file))
+                yield from _expand(names, frames_folder, every, notes, containers, topic, (*lists, file))
             elif glob.has_magic(text):
                 yield from ((Frame(found), False) for found in _matching(text))
             else:
@@ -188,6 +188,7 @@ def _expand(
         elif is_bag(path):
             if frames_folder is None:
                 raise InputError(f"{path}: a ROS bag is no picture here; use 'rdstitch mosaic'")
+            containers += path.iterdir() if path.is_dir() else [path]
             images, wanted = extract_images(path, frames_folder(), every, topic)
             notes += wanted.messages(path)
             yield from ((frame, True) for frame in images)
@@ -196,6 +197,7 @@ def _expand(
         elif path.suffix.lower() in VIDEO_SUFFIXES:
             if frames_folder is None:
                 raise InputError(f"{path}: a video is no picture here; use 'rdstitch mosaic' or extract its frames")
+            containers.append(path)
             wanted = wanted_frames(every, partial(grey_frames, path))
             notes += wanted.messages(path)
             yield from ((Frame(*frame), True) for frame in extract_frames(path, frames_folder(), wanted.__contains__))

@@ -50,3 +50,15 @@ def test_frames_that_show_nothing_new_are_passed_over_and_counted(
     assert "--every 1 takes all" in done.err
     assert "warning" not in done.err
     assert abs(float(done.out) - DISTORTION) < 0.01
+
+
+@pytest.mark.parametrize("following", [(), ("--follow",)])
+def test_a_video_is_never_written_over(rdstitch: Run, video: Path, tmp_path: Path, following: tuple[str, ...]) -> None:
+    before = video.read_bytes()
+    inner, outer = tmp_path / "inner.txt", tmp_path / "outer.txt"
+    inner.write_text(f"{video}\n", encoding="utf-8")
+    outer.write_text(f"@{inner}\n", encoding="utf-8")
+    for named, output in ((video, video), *([] if following else [(f"@{outer}", inner)])):
+        done = rdstitch("trajectory", named, "-o", output, "--overwrite", *following, *FAST)
+        assert (done.status, "is read as input" in done.line) == (6, True)
+    assert video.read_bytes() == before
