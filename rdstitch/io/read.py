@@ -27,6 +27,8 @@ from rdstitch.regular_files import open_regular
 Pixels = NDArray[Any]
 
 _OPAQUE = 255
+# A page of a TIFF file that masks the picture, and how many pages are looked at for one.
+_MASK, _MASK_WITHIN = 4, 40
 _LARGEST_DECODED_REDUCTION = 8  # of the JPEG decoder
 _ROWS_AT_A_TIME = 128
 _PNG_PIXEL_CHUNKS = (b"IHDR", b"tRNS", b"IDAT", b"IEND")
@@ -205,7 +207,7 @@ def _split(samples: Pixels) -> tuple[Pixels, Pixels | None]:
 
 
 def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
-    """Samples and alpha of the first page, with any number of bands."""
+    """Samples and alpha of the first page, with any number of bands, or the mask on a page of its own."""
     with open_regular(file) as stream, tifffile.TiffFile(stream, name=str(file)) as tiff:
         page = tiff.pages.first
         plain = page.photometric in (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB)
@@ -217,6 +219,10 @@ def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
                 raise
             samples = None
         axes = page.axes
+        size = (page.imagelength, page.imagewidth)
+        others = (other for other in tiff.pages[1:_MASK_WITHIN] if isinstance(other, tifffile.TiffPage))
+        masks = (other for other in others if other.subfiletype == _MASK and other.shape == size)
+        mask = next((other.asarray() for other in masks), None)
     if samples is None:
         with open_regular(file) as stream:
             return _split(_decode_with_opencv(stream.read()))
@@ -229,7 +235,7 @@ def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
     if axes == "YXS" and has_alpha:
         samples, alpha = samples[..., :-1], samples[..., -1]
         return (samples[..., 0] if samples.shape[2] == 1 else samples), alpha
-    return samples, None
+    return samples, mask
 
 
 def as_picture(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Metadata) -> Picture:

@@ -1,7 +1,8 @@
 """TIFF from strips: compressed, BigTIFF where needed, with overviews of half the size again and again.
 
-Pictures are tiled, but for grey ones with alpha: OpenCV (4.11 to 5.0) reads tiles of two samples as stripes, and strips
-of them rightly.
+Pictures are tiled, but for grey ones of 8 bits with alpha: OpenCV (4.11 to 5.0) reads tiles of two samples as stripes,
+and strips of them rightly. Deeper grey samples with alpha are something that Pillow does not read and OpenCV reduces to
+8 bits; their transparency is a mask on a page of its own, as GDAL writes it, and every program reads the first page.
 
 Overviews are made while the strips pass, and wait in temporary files beside the output until their turn; memory is that
 of one strip, whatever the size of the picture.
@@ -24,6 +25,7 @@ from rdstitch.io.metadata import Metadata
 from rdstitch.io.reduction import halved
 
 _TILE = 256
+_REDUCED, _MASK = 1, 4  # kinds of pages (NewSubfileType)
 _STRIP = 64  # rows
 # Smaller pictures need no overview.
 _SMALLEST_OVERVIEW = 256
@@ -53,15 +55,27 @@ def write_tiff(path: Path, layout: Layout, strips: Iterable[Strip], extra_tags: 
     sizes = [layout.size, *_overview_sizes(layout.size)]
     total = sum(w * h for w, h in sizes) * layout.samples_per_pixel * layout.dtype.itemsize
     joined: Iterable[NDArray[Any]] = (with_alpha(*strip) if layout.transparent else strip[0] for strip in strips)
+    mask: list[bytes] | None = [] if _has_mask(layout) else None
     with ExitStack() as stack:
         tiff = stack.enter_context(tifffile.TiffWriter(path, bigtiff=total > _BIGTIFF_FROM))
         for level, size in enumerate(sizes):
             is_last = level + 1 == len(sizes)
             spill = None if is_last else stack.enter_context(tempfile.TemporaryFile(dir=path.parent))
             tags = [] if level else [*_copied_tags(layout.metadata), *extra_tags]
-            _write_page(tiff, layout, size, _spilling(joined, spill, layout.transparent), tags, bool(level))
+            passing = _spilling(joined, spill, layout.transparent)
+            shown = passing if mask is None else _without_alpha(passing, mask)
+            kind = _REDUCED if level else 0
+            _write_page(tiff, layout, size, shown, tags, kind)
+            if mask is not None:
+                _write_mask(tiff, size, mask, kind | _MASK)
+                mask.clear()
             if spill is not None:
                 joined = _reread(spill, sizes[level + 1], layout)
+
+
+def _has_mask(layout: Layout) -> bool:
+    """Whether transparency goes onto a page of its own."""
+    return layout.transparent and layout.channels == 1 and layout.dtype != np.uint8
 
 
 def _write_page(
@@ -70,14 +84,15 @@ def _write_page(
     size: tuple[int, int],
     strips: Iterable[NDArray[Any]],
     tags: list[ExtraTag],
-    reduced: bool,
+    kind: int,
 ) -> None:
-    """Write one page from strips that hold all samples."""
+    """Write one page from strips that hold all its samples."""
     width, height = size
-    samples = layout.samples_per_pixel
+    transparent = layout.transparent and not _has_mask(layout)
+    samples = layout.channels + transparent
     colour = 3 if layout.channels == 3 else 1
-    extra = ["unspecified"] * (layout.channels - colour) + ["unassalpha"] * layout.transparent
-    dpi = None if reduced else layout.metadata.dpi
+    extra = ["unspecified"] * (layout.channels - colour) + ["unassalpha"] * transparent
+    dpi = None if kind else layout.metadata.dpi
     tiled = samples != 2
     tiff.write(
         (_encoded(block) for block in (_tiles(strips) if tiled else _short_strips(strips))),
@@ -94,11 +109,34 @@ def _write_page(
         buffersize=_BUFFER,
         metadata=None,
         software="rdstitch",
-        subfiletype=int(reduced),
+        subfiletype=kind,
         resolution=dpi,
         resolutionunit="inch" if dpi else None,
-        iccprofile=None if reduced else layout.metadata.icc_profile or None,
+        iccprofile=None if kind else layout.metadata.icc_profile or None,
         extratags=tags,
+    )
+
+
+def _without_alpha(strips: Iterable[NDArray[Any]], mask: list[bytes]) -> Iterator[NDArray[Any]]:
+    """The strips without alpha; tiles of where that is not 0, one bit a pixel, are added to ``mask`` as stored."""
+    for strip in strips:
+        bits = (np.packbits(tile[..., 0], axis=1) for tile in _tiles([strip[..., -1:] > 0]))
+        mask += [isal_zlib.compress(tile, _LEVEL) for tile in bits]
+        yield strip[..., :-1]
+
+
+def _write_mask(tiff: tifffile.TiffWriter, size: tuple[int, int], tiles: list[bytes], kind: int) -> None:
+    """Write the page that says where the page before it has a picture."""
+    tiff.write(
+        iter(tiles),
+        shape=size[::-1],
+        dtype=np.bool_,
+        photometric="mask",
+        tile=(_TILE, _TILE),
+        compression="zlib",
+        metadata=None,
+        software="rdstitch",
+        subfiletype=kind,
     )
 
 

@@ -265,26 +265,27 @@ class TestCheckOutput:
             check_output(tmp_path / "a.jpg")
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_grey_with_alpha_is_shown_by_other_readers(tmp_path: Path, dtype: type[np.unsignedinteger[Any]]) -> None:
-    full = np.iinfo(dtype).max
-    pixels = (np.add.outer(np.arange(500), np.arange(700)) % 256 * (full // 255)).astype(dtype)
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_grey_with_alpha_is_shown_by_other_readers(tmp_path: Path, dtype: type[np.number[Any]]) -> None:
+    full = np.iinfo(dtype).max if issubclass(dtype, np.integer) else 1.0
+    pixels = (np.add.outer(np.arange(500), np.arange(700)) % 256 * (full / 255)).astype(dtype)
     alpha = np.full(pixels.shape, 255, np.uint8)
     alpha[:90] = 0
     file = tmp_path / "grey.tif"
     write_image(file, pixels, alpha)
-    seen = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)  # tiles would be read as stripes
+    seen = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     assert seen is not None
-    np.testing.assert_allclose(seen[90:].astype(float), pixels[90:] / (full / 255), atol=1.0)
+    assert seen.dtype == dtype
+    np.testing.assert_array_equal(seen[90:], pixels[90:])  # tiles of grey and alpha would be read as stripes
+    with Image.open(file) as image:
+        assert image.mode == {np.uint8: "LA", np.uint16: "I;16", np.float32: "F"}[dtype]
+        np.testing.assert_array_equal(np.asarray(image)[..., 0] if dtype is np.uint8 else np.asarray(image), pixels)
     with tifffile.TiffFile(file) as tiff:
-        stored = tiff.pages.first.asarray()
-        np.testing.assert_array_equal(stored[..., 0], pixels)
-        np.testing.assert_array_equal(stored[..., 1], alpha * dtype(full // 255))
+        stored = tiff.asarray()
+        np.testing.assert_array_equal(stored[..., 0] if dtype is np.uint8 else stored, pixels)
+        mask = stored[..., 1] if dtype is np.uint8 else tiff.pages[1].asarray() * np.uint8(255)
+        np.testing.assert_array_equal(mask, alpha)
         assert len(tiff.series[0].levels) > 1
-    if dtype is np.uint8:  # Pillow has no 16-bit grey with alpha
-        with Image.open(file) as image:
-            assert image.mode == "LA"
-            np.testing.assert_array_equal(np.asarray(image)[..., 0], pixels)
     ours = read_image(file)
     np.testing.assert_array_equal(ours.pixels, pixels)
     assert ours.alpha is not None
@@ -292,6 +293,21 @@ def test_grey_with_alpha_is_shown_by_other_readers(tmp_path: Path, dtype: type[n
     if shutil.which("gdalinfo"):
         told = subprocess.run(["gdalinfo", "-stats", file], capture_output=True, text=True, check=True)
         assert told.stderr == ""
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
+def test_gdal_sees_where_there_is_a_picture_at_every_size(tmp_path: Path, dtype: type[np.number[Any]]) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    pixels, alpha = np.full((600, 1100), 1, dtype), np.zeros((600, 1100), np.uint8)
+    alpha[100:500, 200:] = 255
+    write_image(tmp_path / "grey.tif", pixels, alpha)
+    with rasterio.open(tmp_path / "grey.tif") as seen:
+        np.testing.assert_array_equal(seen.read(1), pixels)
+        np.testing.assert_array_equal(seen.dataset_mask(), alpha)
+        assert seen.overviews(1) == [2, 4, 8]
+        small = seen.dataset_mask(out_shape=(150, 275))
+        np.testing.assert_array_equal(small, alpha[2::4, 2::4])
 
 
 def test_padding_of_camera_names_is_not_copied(tmp_path: Path) -> None:
