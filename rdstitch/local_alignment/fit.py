@@ -19,9 +19,10 @@ from rdstitch.camera import Camera
 from rdstitch.local_alignment.field import DisplacementField, bilinear, grid_shape, node_points
 from rdstitch.local_alignment.matches import PlaneMatches, jacobians
 
-_ROUNDS = 5
-# Residuals are trusted up to about this many times their median, but at least so many pixels.
+# Residuals are trusted up to about this many times their median, but at least so many pixels; at first, up to this
+# percentile of them, then by this factor less from round to round, and as many rounds at the end.
 _ROBUST, _LEAST_SCALE = 2.0, 0.3
+_WIDEST, _SHARPENED, _SHARP_ROUNDS = 95.0, 0.5, 3
 # A field vanishes over about this share of a picture where nothing supports it.
 _FADE = 0.2
 # Limit of the displacement's change per pixel: far from 1, where a picture would fold.
@@ -75,17 +76,21 @@ class PlaneFields:
 
 
 def fit_fields(matches: PlaneMatches, cameras: Sequence[Camera], stiffness: Stiffness) -> PlaneFields:
-    """Fields of all pictures, by iteratively reweighted least squares."""
+    """Fields of all pictures, by reweighted least squares with graduated non-convexity (Blake and Zisserman, 1987)."""
     shapes = tuple(grid_shape(camera.image_size, stiffness.cells) for camera in cameras)
     start = np.concatenate([[0], np.cumsum([rows * columns for rows, columns in shapes])])
     design = _design(matches, cameras, shapes, start)
     prior = sparse.block_diag(
         [_smoothness(shape, camera, stiffness) for shape, camera in zip(shapes, cameras, strict=True)], format="csr"
     )
-    left = matches.residual
-    for _ in range(_ROUNDS):
+    left, sharp = matches.residual, 0
+    # Graduated: the first rounds trust all that may be right, so that the fields reach what is far from the plane.
+    scale = float(np.percentile(np.linalg.norm(left, axis=1), _WIDEST))
+    while sharp < _SHARP_ROUNDS:
         length = np.linalg.norm(left, axis=1)
-        scale = max(_LEAST_SCALE, _ROBUST * float(np.median(length)))
+        sharpest = max(_LEAST_SCALE, _ROBUST * float(np.median(length)))
+        sharp += scale <= sharpest
+        scale = max(scale, sharpest)
         weight = (1.0 / (1.0 + (length / scale) ** 2)) ** 2 / scale**2
         weighted: Any = (sparse.diags_array(weight) @ design).T
         normal = sparse.csc_array(weighted @ design + prior)
@@ -93,6 +98,7 @@ def fit_fields(matches: PlaneMatches, cameras: Sequence[Camera], stiffness: Stif
         factor = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         solution = factor.solve(weighted @ matches.residual)
         left = matches.residual - design @ solution
+        scale *= _SHARPENED
     return PlaneFields(shapes, tuple(np.split(solution, start[1:-1])))
 
 

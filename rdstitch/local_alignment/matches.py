@@ -10,8 +10,9 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.radial_homography import to_plane
 
-# Matches that the alignment expects farther away than this share of the picture's diagonal are taken to be wrong.
-_SEARCH_RADIUS = 0.03
+# Matches that the alignment expects farther away than this share of the picture's diagonal are taken to be wrong; where
+# the ground rises by a tenth of the camera's height, right ones are up to half as far apart.
+_SEARCH_RADIUS = 0.08
 _FEWEST_MATCHES = 8
 
 

@@ -17,12 +17,15 @@ worse
     Sets in which the median or the 95 % across the seams grew by more than 5 % and 0.05 pixels.
 share
     Processor time of local alignment by that of the registration, per cent.
+
+``--folders`` prints for real pictures how far matches that are held out of the fit are apart, without and with.
 """
 
 import argparse
 import tempfile
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -166,21 +169,35 @@ def measure(kind: str, height: float, seed: int, pictures: int) -> Figures:
     """One set through the pipeline."""
     truth = sequence(kind, height, seed, pictures)
     with tempfile.TemporaryDirectory() as folder:
-        paths = truth.write(folder)
-        sources, _ = read_sources(paths, camera=None, focal=None, distortion=None, skip_bad=False)
-        options = StitchOptions(workers=1, threshold=3.0)
-        start = time.process_time()
-        with open_executor(1, len(sources)) as executor:
-            registration = accept(register(sources, options, executor, skip_bad=True), options, executor)
-        registered = time.process_time()
-        local = align_registration_locally(registration, "auto")
-        done = time.process_time()
+        registration, local, share = aligned(truth.write(folder))
         off = no_local_alignment("off")
         apart = [across_seams(truth, registration, which) for which in (off, local)]
         ideal = across_seams(truth, registration, off, ideal=True)
         bends = [line_bend(truth, registration, which, seed) for which in (off, local)]
-    share = 100.0 * (done - registered) / (registered - start)
     return Figures(apart[0], apart[1], ideal, (bends[0], bends[1]), share)
+
+
+def aligned(paths: list[Path]) -> tuple[Registration, LocalAlignment, float]:
+    """Registration, local alignment, and the processor time of this by the time of that, per cent."""
+    sources, _ = read_sources(paths, camera=None, focal=None, distortion=None, skip_bad=False)
+    options = StitchOptions(workers=1, threshold=3.0)
+    start = time.process_time()
+    with open_executor(1, len(sources)) as executor:
+        registration = accept(register(sources, options, executor, skip_bad=True), options, executor)
+    registered = time.process_time()
+    local = align_registration_locally(registration, "auto")
+    return registration, local, 100.0 * (time.process_time() - registered) / (registered - start)
+
+
+def held_out(folder: Path) -> str:
+    """A line on real pictures: how far matches that are held out of the fit are apart, without and with."""
+    names = (path for path in sorted(folder.iterdir()) if path.suffix.lower() in (".jpg", ".jpeg", ".png", ".tif"))
+    registration, local, share = aligned(list(names))
+    used = f"{folder.name}: {registration.alignment.used.sum()} pictures"
+    if local.before is None or local.after is None:
+        return f"{used}, {local.reason}"
+    apart = (f"{held.median:.2f}, {held.percentile95:.2f}" for held in (local.before, local.after))
+    return f"{used}, median and 95 % {' -> '.join(apart)} pixels, {share:.1f} % of the time; {local.reason}"
 
 
 def table(rows: dict[str, list[Figures]]) -> str:
@@ -208,9 +225,17 @@ def main() -> None:
     parser.add_argument("--sets", type=int, default=3)
     parser.add_argument("--first", type=int, default=1, help="seed of the first set")
     parser.add_argument("--pictures", type=int, default=6)
+    parser.add_argument("--heights", type=float, nargs="*", default=HEIGHTS, help="shares of the camera's height")
+    parser.add_argument("--folders", type=Path, nargs="*", help="of real pictures: matches held out of the fit instead")
     arguments = parser.parse_args()
+    if arguments.folders:
+        for folder in arguments.folders:
+            print(held_out(folder), flush=True)
+        return
     rows: dict[str, list[Figures]] = {}
-    kinds = [(name, height) for name in arguments.kinds for height in (HEIGHTS if name in RELIEFS else (0.0,))]
+    kinds = [
+        (name, height) for name in arguments.kinds for height in (arguments.heights if name in RELIEFS else (0.0,))
+    ]
     for kind, height in kinds:
         name = kind if kind == "flat" else f"{kind} {height:.0%}"
         rows[name] = []
@@ -219,7 +244,7 @@ def main() -> None:
                 rows[name].append(measure(kind, height, seed, arguments.pictures))
             except RdstitchError as error:
                 print(f"{name}, set {seed}: {error}")
-        print(table({name: rows[name]}), flush=True)
+            print(table({f"{name}, to {seed}": rows[name]}), flush=True)
     print(table(rows))
 
 

@@ -72,10 +72,10 @@ def displacements(sequence: Sequence, matrices: FloatArray, local: LocalAlignmen
     return np.concatenate(found)
 
 
-@pytest.mark.parametrize("kind", ["bumps", "slopes"])
+@pytest.mark.parametrize(("kind", "height"), [("bumps", 0.05), ("slopes", 0.05), ("bumps", 0.1), ("slopes", 0.1)])
 @pytest.mark.parametrize("wrong", [0.0, 0.1])
-def test_what_relief_moves_apart_comes_together(kind: str, wrong: float) -> None:
-    sequence = scene(kind)
+def test_what_relief_moves_apart_comes_together(kind: str, height: float, wrong: float) -> None:
+    sequence = scene(kind, height)
     matrices = homographies(sequence)
     local = align_locally(matches(sequence, wrong=wrong), CAMERAS, matrices)
     assert local.before is not None
@@ -83,7 +83,7 @@ def test_what_relief_moves_apart_comes_together(kind: str, wrong: float) -> None
     assert local.after.median < 0.5 * local.before.median
     off, on = (displacements(sequence, matrices, which) for which in (replace(local, fields=()), local))
     assert np.median(on) < 0.3 * np.median(off)
-    assert np.percentile(on, 95) < 0.5 * np.percentile(off, 95)
+    assert np.percentile(on, 95) < 0.25 * np.percentile(off, 95)
     assert max(field.steepest for field in local.fields) <= 0.25
 
 
