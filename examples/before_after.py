@@ -1,11 +1,12 @@
-"""The picture at the top of README: what goes in, and what comes out.
+"""What goes in, and what comes out: python -m examples.before_after PHOTO -o FILE.
 
-``python -m examples.before_after PHOTO docs/images/before_after.jpg`` lays a photograph flat, takes six pictures of it
-through a lens with λ = -0.35, stitches them, and puts them beside the result. The photograph in README is
-IMG_161122_163239_0001_RGB.JPG of OpenDroneMap's odm_data_garfield_msp, in the public domain (CC0).
+Lays a photograph flat, takes six pictures of it through a lens with λ = -0.35, stitches them, and puts them beside the
+result. README shows docs/images/before_after.jpg, of IMG_161122_163239_0001_RGB.JPG of OpenDroneMap's
+odm_data_garfield_msp, in the public domain (CC0).
 """
 
-import sys
+import argparse
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +20,13 @@ _DISTORTION = -0.35
 _TALL, _GAP = 700, 12
 
 
-def main(photo: str, output: str) -> None:
-    """Render, stitch, and lay out."""
-    with Image.open(photo) as image:
+def main() -> None:
+    """Read the command line, render, stitch, and lay out."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("photo", type=Path)
+    parser.add_argument("-o", "--output", type=Path, required=True)
+    given = parser.parse_args()
+    with Image.open(given.photo) as image:
         original = image.convert("RGB")
 
     def texture(plane: tuple[int, int]) -> Texture:
@@ -40,7 +45,7 @@ def main(photo: str, output: str) -> None:
     result = rdstitch.mosaic(pictures, options=options)
     print(f"{result!r}; the truth is {_DISTORTION}")
     mosaic = Image.fromarray(np.where(result.alpha[..., None] > 0, result.image, 255).astype(np.uint8))
-    side_by_side(pictures, mosaic).save(output, quality=88)
+    side_by_side(pictures, mosaic).save(given.output, quality=88)
 
 
 def side_by_side(pictures: list[NDArray[np.uint8]], mosaic: Image.Image) -> Image.Image:
@@ -58,4 +63,4 @@ def side_by_side(pictures: list[NDArray[np.uint8]], mosaic: Image.Image) -> Imag
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:3])
+    main()

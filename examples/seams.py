@@ -1,7 +1,9 @@
-"""Before and after: python -m examples.seams [PICTURE …] -o FILE [--at LEFT TOP].
+"""A seam, before and after: python -m examples.seams [PICTURE …] -o FILE [--at LEFT TOP] [--of local-alignment].
 
-Stitches pictures (by default the bundled pair), once plain, without exposure, seams and blending, and once with the
-defaults, and writes one place of both, by default that where they differ most, plain on the left, pixel for pixel.
+Stitches pictures (by default the bundled pair) twice and writes one place of both side by side, pixel for pixel, by
+default that where they differ most. Left: plain, without exposure, seams and blending; right: the defaults. With ``--of
+local-alignment``: off and auto, both cut where pictures are equally far from their borders and not blended, so that one
+sees how well they join over rough ground.
 """
 
 import argparse
@@ -18,15 +20,20 @@ from rdstitch.io import write_image
 from rdstitch.pipeline import StitchOptions, mosaic
 
 BUNDLED = sorted((Path(__file__).parent / "data" / "garfield_red").glob("*.jpg"))
-PLAIN = CompositeOptions(exposure="none", seam="none", blend="none")
+CUT = StitchOptions(composite=CompositeOptions(seam="voronoi", blend="none"))
+CHOICES = {
+    "seams": (StitchOptions(composite=CompositeOptions(exposure="none", seam="none", blend="none")), StitchOptions()),
+    "local-alignment": (replace(CUT, local_alignment="off"), CUT),
+}
 SIDE, GAP = 320, 8  # pixels
 
 
-def stitched(pictures: list[Path], composite: CompositeOptions) -> NDArray[Any]:
+def stitched(pictures: list[Path], options: StitchOptions) -> NDArray[Any]:
     """The composite with its alpha as last channel."""
-    done = mosaic(pictures, None, replace(StitchOptions(), composite=composite)).composite
-    assert done is not None
-    return np.dstack([done.pixels, done.alpha])
+    result = mosaic(pictures, None, options)
+    assert result.composite is not None
+    print(f"{result!r}; local alignment: {result.local_alignment.reason}")
+    return np.dstack([result.composite.pixels, result.composite.alpha])
 
 
 def largest_difference(first: NDArray[Any], second: NDArray[Any]) -> tuple[int, int]:
@@ -41,36 +48,20 @@ def largest_difference(first: NDArray[Any], second: NDArray[Any]) -> tuple[int, 
     return int(top), int(left)
 
 
-def arguments(description: str | None) -> argparse.Namespace:
-    """Read pictures, output and place from the command line."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main() -> None:
+    """Read the command line, stitch twice, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("pictures", nargs="*", type=Path, default=BUNDLED)
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--at", nargs=2, type=int, metavar=("LEFT", "TOP"), help="place, pixels of the output")
-    return parser.parse_args()
-
-
-def write_beside(given: argparse.Namespace, first: NDArray[Any], second: NDArray[Any]) -> tuple[int, int]:
-    """Write the same place of two mosaics side by side: the one given, or where they differ most.
-
-    Returns
-    -------
-    (int, int)
-        Left and top of the place, pixels.
-    """
+    parser.add_argument("--of", choices=CHOICES, default="seams", help="what is compared")
+    given = parser.parse_args()
+    first, second = (stitched(given.pictures, options) for options in CHOICES[given.of])
     top, left = given.at[::-1] if given.at else largest_difference(first, second)
     crops = [picture[top : top + SIDE, left : left + SIDE, :-1] for picture in (first, second)]
     gap = np.full((SIDE, GAP, crops[0].shape[2]), np.iinfo(first.dtype).max, first.dtype)
     write_image(given.output, np.concatenate([crops[0], gap, crops[1]], axis=1), quality=85)
-    return left, top
-
-
-def main() -> None:
-    """Read the command line, stitch twice, write."""
-    given = arguments(__doc__)
-    plain, default = (stitched(given.pictures, options) for options in (PLAIN, CompositeOptions()))
-    left, top = write_beside(given, plain, default)
-    print(f"pixel {left}, {top} of {plain.shape[1]} x {plain.shape[0]}")
+    print(f"pixel {left}, {top} of {first.shape[1]} x {first.shape[0]}")
 
 
 if __name__ == "__main__":

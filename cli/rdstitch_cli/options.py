@@ -217,23 +217,6 @@ trust = together(
     click.option("--force", is_flag=True, help="Write the result even when it fails its own checks."),
 )
 
-preview = click.option(
-    "--preview",
-    is_flag=True,
-    help="A quick small picture: at most 1200 pixels, few features of small versions of the pictures, straight seams; "
-    "options that are given stay as they are.",
-)
-
-local_alignment = click.option(
-    "--local-alignment",
-    type=WordOrNumber(("auto", "off"), 2, 100),
-    metavar="auto|off|N",
-    default="auto",
-    show_default=True,
-    help="Where the ground is not quite a plane, bring pictures together by a smooth displacement of each: auto where "
-    "matches that took no part in it come nearer; a number of cells along the longer side of a picture: always.",
-)
-
 compositing = together(
     click.option(
         "--exposure",
@@ -332,4 +315,35 @@ compositing = together(
     click.option(
         "--dry-run", is_flag=True, help="Say what compositing would take (size, memory, time); write nothing."
     ),
+)
+
+# What every command that registers pictures takes, and what those take that also compose them.
+registration = together(overwrite, known, estimation, report, trust, as_json, verbosity)
+
+stitching = together(
+    output,
+    click.option("--reference", metavar="NAME", help="Picture that sets the frame; otherwise the best connected one."),
+    click.option(
+        "--preview",
+        is_flag=True,
+        help="A quick small picture: at most 1200 pixels, few features of small versions of the pictures, straight "
+        "seams; options that are given stay as they are.",
+    ),
+    click.option(
+        "--local-alignment",
+        type=WordOrNumber(("auto", "off"), 2, 100),
+        metavar="auto|off|N",
+        default="auto",
+        show_default=True,
+        help="Where the ground is not quite a plane, bring pictures together by a smooth displacement of each: auto "
+        "where matches that took no part in it come nearer; a number of cells along a picture's longer side: always.",
+    ),
+    compositing,
+    click.option(
+        "--save-camera",
+        type=PICTURE,
+        metavar="FILE",
+        help="Write the estimated camera: .json, .yml (OpenCV), .pto (Hugin), camera_info.yaml (ROS) and others.",
+    ),
+    registration,
 )

@@ -2,6 +2,8 @@
 
 import json
 import math
+from collections.abc import Callable
+from collections.abc import Sequence as Many
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -9,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from examples.judging import PlaneComparison, compare_with_plane
+from examples.judging import compare_with_plane
 from examples.paper.common.report import Pixels, Report, Table
 from examples.paper.common.settings import Effort, Settings
 from examples.paper.common.stitchers import Stitcher, installed_stitchers
-from examples.paper.common.subprocesses import Run, run_all
+from examples.paper.common.subprocesses import run_all
 from rdstitch.camera import Camera
 from rdstitch.io.read import read_image
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
@@ -31,8 +33,9 @@ HEADER = (
     "last words",
 )
 
+SEARCH = 16  # px of the mosaic about each of its places, within which the place is looked for in the truth
 
-_SEARCH = 16  # px of the mosaic about each of its places, within which the place is looked for on the plane
+Measured = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -74,63 +77,68 @@ _TINY = PictureSet("2x1 views", (320, 240), (2, 1), 260.0, -0.25, (2.5, -2.0), 8
 def run(settings: Settings) -> Report:
     """Registration error, coverage, λ, time, memory and exit status of every stitcher that is installed."""
     stitchers, notes = installed_stitchers(settings.peer_python)
-    if settings.effort is Effort.TINY:
-        chosen, stitchers = [_TINY], stitchers[:2]
-    else:
-        chosen = list(SETS[: settings.count(1, 1, len(SETS))])
+    chosen = [_TINY] if settings.effort is Effort.TINY else SETS[: settings.count(1, 1, len(SETS))]
+    return compare(settings, "end_to_end", chosen, 100, stitchers, notes, _measured)
+
+
+def _measured(mosaic: Pixels, sequence: Sequence, _: PictureSet) -> Measured:
+    """Errors are given in px of the pictures, for mosaics of any scale."""
+    found = compare_with_plane(mosaic, sequence.texture, reachable=sequence.reachable(), search=SEARCH)
+    return found.median * found.texels_per_pixel, found.percentile95 * found.texels_per_pixel, found.coverage
+
+
+def compare(
+    settings: Settings,
+    name: str,
+    sets: Many[Any],
+    first_seed: int,
+    stitchers: Many[Stitcher],
+    notes: tuple[str, ...],
+    measured: Callable[[Pixels, Any, Any], Measured],
+) -> Report:
+    """Every set through every stitcher, a table a set.
+
+    Parameters
+    ----------
+    settings : Settings
+    name : str
+        Of the figure; pictures are named after it.
+    sets : sequence of PictureSet or of the like
+    first_seed : int
+        Of the first set.
+    stitchers : sequence of Stitcher
+    notes : tuple of str
+        On stitchers that are not installed.
+    measured : callable
+        Takes a mosaic, the truth and the set; gives the median error and 95 % of them, px of the pictures, inf
+        beyond what was searched, and the share that is covered.
+    """
     timeout = float(settings.count(60, 120, 600))
     tables, pictures = [], {}
-    for number, picture_set in enumerate(chosen):
+    for number, chosen in enumerate(sets):
         with TemporaryDirectory(prefix="rdstitch-peers-") as folder:
-            sequence = picture_set.sequence(seed=100 + number)
-            files = sequence.write(folder)
-            rows = []
-            for k, stitcher in enumerate(stitchers):
+            sequence = chosen.sequence(seed=first_seed + number)
+            files, rows = sequence.write(folder), []
+            for k, stitcher in enumerate(stitchers[:2] if settings.effort is Effort.TINY else stitchers):
                 own = Path(folder) / f"stitcher{k}"
                 own.mkdir()
-                row, mosaic = _judge(stitcher, sequence, files, own, picture_set, timeout)
-                rows.append(row)
+                done = run_all(stitcher.commands(files, own / "mosaic.tif", chosen.field_of_view), own, timeout)
+                mosaic = read_mosaic(own) if done.ok else None
+                figures = (None, None, None) if mosaic is None else _shown(*measured(mosaic, sequence, chosen))
+                distortion_error = distortion_error_of(own / "mosaic.tif", sequence)
+                status = "time is up" if done.status is None else str(done.status)
+                cost = (done.seconds, done.processor_seconds, done.megabytes, "" if done.ok else done.said)
+                rows.append((stitcher.name, status, *figures, distortion_error, *cost))
                 if mosaic is not None:
-                    pictures[f"end_to_end_set{number}_{k}.jpg"] = mosaic[:, :, :3] if mosaic.ndim == 3 else mosaic
-        title = f"End to end: {picture_set.name}, {picture_set.size[0]}x{picture_set.size[1]} px"
+                    pictures[f"{name}_set{number}_{k}.jpg"] = mosaic[:, :, :3] if mosaic.ndim == 3 else mosaic
+        title = f"{name.replace('_', ' ').capitalize()}: {chosen.name}, {chosen.size[0]}x{chosen.size[1]} px"
         tables.append(Table(title, HEADER, tuple(rows)))
     return Report(tuple(tables), pictures=pictures, notes=notes)
 
 
-def _judge(
-    stitcher: Stitcher, sequence: Sequence, files: list[Path], folder: Path, picture_set: PictureSet, timeout: float
-) -> tuple[tuple[object, ...], Pixels | None]:
-    """One row of the table, and the mosaic."""
-    output = folder / "mosaic.tif"
-    done = run_all(stitcher.commands(files, output, picture_set.field_of_view), folder, timeout)
-    mosaic = read_mosaic(folder) if done.ok else None
-    found = None if mosaic is None else _compared(mosaic, sequence)
-    return (stitcher.name, *row_of(done, found, distortion_error_of(output, sequence))), mosaic
-
-
-def row_of(done: Run, found: PlaneComparison | None, distortion_error: float | None) -> tuple[object, ...]:
-    """Errors are given in px of the pictures, for mosaics of any scale."""
-    status = "time is up" if done.status is None else str(done.status)
-    cost = (done.seconds, done.processor_seconds, done.megabytes, "" if done.ok else done.said)
-    if found is None:
-        return status, None, None, None, distortion_error, *cost
-    return (
-        status,
-        _in_pictures(found.median, found),
-        _in_pictures(found.percentile95, found),
-        100.0 * found.coverage,
-        distortion_error,
-        *cost,
-    )
-
-
-def _compared(mosaic: Pixels, sequence: Sequence) -> PlaneComparison:
-    return compare_with_plane(mosaic, sequence.texture, reachable=sequence.reachable(), search=_SEARCH)
-
-
-def _in_pictures(error: float, found: PlaneComparison) -> object:
-    """An error in px of the mosaic as px of the pictures, or that it is beyond what was searched."""
-    return error * found.texels_per_pixel if np.isfinite(error) else f"> {_SEARCH}"
+def _shown(median: float, percentile95: float, coverage: float) -> tuple[object, ...]:
+    """As the table has it."""
+    return *(error if np.isfinite(error) else f"> {SEARCH}" for error in (median, percentile95)), 100.0 * coverage
 
 
 def read_mosaic(folder: Path) -> Pixels | None:
@@ -149,7 +157,7 @@ def read_mosaic(folder: Path) -> Pixels | None:
     return np.concatenate([colours, alpha[:, :, None]], axis=2)
 
 
-def distortion_error_of(output: Path, sequence: Sequence) -> float | None:
+def distortion_error_of(output: Path, sequence: Any) -> float | None:
     """|λ - λ_true| where the stitcher has told its λ."""
     told = Path(f"{output}.json")
     if not told.is_file() or not isinstance(sequence.lens, Camera):

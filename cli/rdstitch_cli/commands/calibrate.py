@@ -30,15 +30,9 @@ Examples:
     help="Camera file to write: .json, .yml and .fisheye.yml (OpenCV), .pto (Hugin), cameras.json (OpenDroneMap), "
     "cameras.txt (COLMAP), camera_info.yaml (ROS), camchain.yaml (Kalibr).",
 )
-@options.overwrite
 @options.every
 @options.topic
-@options.known
-@options.estimation
-@options.report
-@options.trust
-@options.as_json
-@options.verbosity
+@options.registration
 def calibrate(
     inputs: tuple[Path, ...],
     output: Path,

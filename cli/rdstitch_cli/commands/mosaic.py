@@ -29,28 +29,11 @@ Examples:
 """,
 )
 @options.inputs
-@options.output
-@options.overwrite
+@options.stitching
 @options.every
 @options.topic
 @live.follow
 @live.refresh
-@click.option("--reference", metavar="NAME", help="Picture that sets the frame; otherwise the best connected one.")
-@options.preview
-@options.known
-@options.estimation
-@options.local_alignment
-@options.compositing
-@click.option(
-    "--save-camera",
-    type=options.PICTURE,
-    metavar="FILE",
-    help="Write the estimated camera to FILE: .json, .yml (OpenCV), .pto (Hugin), camera_info.yaml (ROS) and others.",
-)
-@options.report
-@options.trust
-@options.as_json
-@options.verbosity
 def mosaic(
     inputs: tuple[Path, ...],
     output: Path,

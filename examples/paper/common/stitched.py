@@ -1,6 +1,7 @@
 """Sequences through rdstitch's own recipes, and how far the result is from the truth."""
 
 from collections.abc import Sequence as Many
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -9,12 +10,10 @@ import numpy as np
 from examples.judging import AlignmentError, alignment_error
 from examples.paper.common.report import Pixels
 from rdstitch.alignment import Alignment
-from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.errors import RegistrationError
 from rdstitch.io.read import read_image
 from rdstitch.pipeline import StitchOptions, calibrate, mosaic
-from rdstitch.radial_homography import project
+from rdstitch.radial_homography import to_plane
 from rdstitch.registration import Registration
 from rdstitch.synthetic import Sequence
 
@@ -47,18 +46,5 @@ def registration_error(alignment: Alignment, sequence: Sequence) -> AlignmentErr
     A rectified plane may differ from the true one by a similarity only, the frame of a picture by a homography.
     """
     used = np.flatnonzero(alignment.used)
-    transfers = {int(i): ToPlane(alignment.cameras[i], alignment.homographies[i]) for i in used}
+    transfers = {int(i): partial(to_plane, alignment.cameras[i], alignment.homographies[i]) for i in used}
     return alignment_error(sequence, transfers, model="homography" if alignment.poses is None else "similarity")
-
-
-class ToPlane:
-    """Measured px of a picture to the estimated plane."""
-
-    def __init__(self, camera: Camera, homography: FloatArray) -> None:
-        self._camera = camera
-        self._homography = homography
-
-    def __call__(self, points: FloatArray) -> FloatArray:
-        """Points (N, 2); NaN where there is no such place."""
-        x = self._camera.normalize(self._camera.undistort(points))
-        return project(np.column_stack([x, np.ones(len(x))]) @ self._homography.T)

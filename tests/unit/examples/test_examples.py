@@ -1,0 +1,35 @@
+"""Every example is described in one place, and says itself how it is run."""
+
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+_ROOT = Path(__file__).parents[3]
+_FOLDER = _ROOT / "examples"
+_SCRIPTS = sorted(
+    ".".join(path.relative_to(_ROOT).with_suffix("").parts).removesuffix(".__main__")
+    for path in _FOLDER.rglob("*.py")
+    if '__name__ == "__main__"' in path.read_text(encoding="utf-8") and path.parent.name != "common"
+)
+
+
+@pytest.mark.parametrize("name", _SCRIPTS)
+def test_every_example_has_help_and_a_line_in_the_list(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    with pytest.raises(SystemExit) as done:
+        runpy.run_module(name, run_name="__main__", alter_sys=False)
+    assert not done.value.code
+    assert "usage:" in capsys.readouterr().out
+    assert f"`python -m {name} " in (_FOLDER / "README.md").read_text(encoding="utf-8")
+
+
+def test_every_folder_and_shell_script_is_in_the_list() -> None:
+    text = (_FOLDER / "README.md").read_text(encoding="utf-8")
+    assert len(_SCRIPTS) > 3
+    folders = {path.name for path in _FOLDER.iterdir() if path.is_dir() and not path.name.startswith("__")}
+    assert [name for name in sorted(folders) if f"[{name}/]" not in text and f"examples.{name} " not in text] == []
+    assert [path.name for path in sorted(_FOLDER.rglob("*.sh")) if f"`batch/{path.name} " not in text] == []
