@@ -76,7 +76,7 @@ def measure(folder: Path, count: int, shuffled: bool, register_only: bool) -> di
     return {
         "count": count,
         "seconds": seconds,
-        "memory": own.ru_maxrss / 1024,
+        "memory": own.ru_maxrss * 1024 / 1e6,
         "used": int(alignment.used.sum()),
         "pairs": len(registration.pairs),
         "distortion": alignment.distortion,
