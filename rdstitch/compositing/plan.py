@@ -20,7 +20,7 @@ _MOST_WORKERS = 4
 _MOST_BANDS = 4
 # Arrays of the size of a tile with its margin that live at one time (float32): samples and sums of the pyramids in each
 # channel, and coordinates, weights, owners.
-_LIVE_PER_CHANNEL, _LIVE_PLANES = 5.0, 12.0
+_LIVE_PER_CHANNEL, _LIVE_PLANES, _LIVE_STRIPS = 5.0, 12.0, 4.5
 # Seconds per megapixel of output, per megapixel of input, on one core of a machine of 2020; for an estimate only.
 _SECONDS_OUT, _SECONDS_IN = 0.15, 0.03
 
@@ -127,8 +127,8 @@ def _sides(options: CompositeOptions) -> tuple[int, ...]:
 def _working_set(
     canvas: Canvas, side: int, workers: int, bands: int, options: CompositeOptions, channels: int, itemsize: int
 ) -> int:
-    """Bytes of the tiles at work, and of strips: two of them are filled while a third is written."""
+    """Bytes of the tiles at work, and of strips: two are filled, and a third is written with its overviews."""
     outer = side + 2 * (margin(bands) if options.blend == "multiband" else 0)
     tile = 4.0 * outer**2 * (_LIVE_PER_CHANNEL * channels + _LIVE_PLANES)
-    strips = 3.0 * canvas.size[0] * min(side, canvas.size[1]) * (channels * itemsize + 1)
+    strips = _LIVE_STRIPS * canvas.size[0] * min(side, canvas.size[1]) * (channels * itemsize + 1)
     return int(workers * tile + strips)

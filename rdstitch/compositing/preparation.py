@@ -33,6 +33,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.io.layout import STRIP_ROWS
 from rdstitch.messages import Message
 from rdstitch.opencv_state import one_opencv_thread
+from rdstitch.process_memory import release_free_heap
 
 # Samples (h, W, C) and alpha (h, W).
 OutputStrip = tuple[NDArray[Any], NDArray[np.uint8]]
@@ -147,7 +148,9 @@ def prepare_composite(
     with closing(cache):
         same = no_exposure(len(pictures), channels)
         renderer = Renderer(warps, cache, same, None, options, plan.bands, channels, dtype)
-        yield _decided(renderer, reader, pictures, canvas, plan, _part_of(progress, 0.0, _PREPARATION))
+        decided = _decided(renderer, reader, pictures, canvas, plan, _part_of(progress, 0.0, _PREPARATION))
+        release_free_heap()
+        yield decided
 
 
 def _decided(
