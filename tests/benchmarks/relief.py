@@ -66,9 +66,10 @@ def main() -> None:
                     noticed += found.relief.found
                 error = abs(found.distortion - item.distortion)
                 own.setdefault(count, []).append((error, found.distortion_std))
+        shapes = shapes or [np.nan]
         print(
             f"{kind} {height:.0%}: one camera {cameras} of {arguments.sets}, "
-            f"shape {100 * np.median(np.array(shapes)):.2f} ({100 * max(shapes):.2f}) %, relief {noticed}, "
+            f"shape {100 * np.median(shapes):.2f} ({100 * max(shapes):.2f}) %, relief {noticed}, "
             + "; ".join(_of_distortion(count, pairs) for count, pairs in sorted(own.items()))
             + f"; {time.process_time() - start:.0f} s",
             flush=True,
