@@ -15,6 +15,10 @@ COMMON = "common"
 """The table that holds for every command."""
 
 
+CONFIG_FILE = "rdstitch_cli.config"
+"""Key of the file in the context's ``meta``."""
+
+
 def config_option() -> click.Option:
     """The option ``--config``, which sets defaults before any other option is looked at."""
     return click.Option(
@@ -68,6 +72,7 @@ def _apply(context: click.Context, option: click.Parameter, path: Path | None) -
     group = context.find_root().command
     if path is None or context.resilient_parsing or not isinstance(group, click.Group):
         return
+    context.meta[CONFIG_FILE] = path
     context.default_map = read_config(path, group.commands, str(context.command.name))
 
 

@@ -3,13 +3,14 @@
 import math
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from rdstitch_cli.config import CONFIG_FILE
 from rdstitch_cli.options import is_given
 from rdstitch_cli.progress import Reporter
 
@@ -52,6 +53,7 @@ def stitch_options(
     from rdstitch.features import FeatureOptions
     from rdstitch.pipeline import StitchOptions
 
+    _check_written([camera])
     if preview:
         max_features, work_megapixels = _preview(max_features, work_megapixels, given)
     composite = {
@@ -69,6 +71,17 @@ def stitch_options(
         solver=solver.replace("-", "_"),
         **given,
     )
+
+
+def _check_written(read: Iterable[Path | None]) -> None:
+    """Refuse to write over a file that an option names to be read, or over the configuration."""
+    from rdstitch.io.atomic import check_not_read
+
+    context = click.get_current_context()
+    files = [file for file in (*read, context.meta.get(CONFIG_FILE)) if file is not None]
+    for name in ("output", "save_camera", "plot", "report"):
+        if context.params.get(name) is not None:
+            check_not_read(context.params[name], files)
 
 
 def _preview(

@@ -63,14 +63,25 @@ def _check_place(file: Path, overwrite: bool, inputs: Iterable[str | Path]) -> N
     if file.is_symlink() and not file.exists():
         raise OutputError(f"{file}: is a link to nothing; remove it, or choose another name")
     if file.exists():
-        if any(_same_file(file, Path(other)) for other in inputs):
-            raise OutputError(f"{file}: is read as input; choose another name")
+        check_not_read(file, inputs)
         if not overwrite:
             raise OutputError(f"{file}: exists already; choose another name or use --overwrite")
         # A link stays, and what it leads to is replaced.
         folder = Path(os.path.realpath(file)).parent
     if not os.access(folder, os.W_OK | os.X_OK):
         raise OutputError(f"{file}: no permission to write into the folder {folder}")
+
+
+def check_not_read(file: Path, inputs: Iterable[str | Path]) -> None:
+    """Refuse to write over what is read, by whatever name.
+
+    Raises
+    ------
+    OutputError
+        When the file is one of the inputs.
+    """
+    if any(_same_file(file, Path(other)) for other in inputs):
+        raise OutputError(f"{file}: is read as input; choose another name")
 
 
 def check_distinct(paths: Iterable[str | Path]) -> None:

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from rdstitch.camera import Camera
+from rdstitch.camera_files import save_camera
 from rdstitch.io import read_image
 from tests.cli.running import FAST, Run, finished, start
 from tests.faults import OPERATIONS, Operation, failing_disk
@@ -280,8 +282,11 @@ def test_a_list_of_pictures_and_of_times_is_never_replaced(rdstitch: Run, locate
         assert output.read_bytes() == before
 
 
-def test_a_mask_or_a_table_that_is_read_is_never_replaced(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+def test_what_an_option_names_to_be_read_is_never_replaced(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     masks, table = tmp_path / "masks", tmp_path / "attitudes.csv"
+    camera, configuration = tmp_path / "camera.json", tmp_path / "options.toml"
+    save_camera(Camera((400, 300), -0.2), camera)
+    configuration.write_text("[common]\nseed = 1\n", encoding="utf-8")
     masks.mkdir()
     shutil.copy(frames[0], masks / frames[0].name)
     table.write_text("name,psi,theta\n" + "".join(f"{frame.name},0,0\n" for frame in frames), encoding="utf-8")
@@ -289,6 +294,8 @@ def test_a_mask_or_a_table_that_is_read_is_never_replaced(rdstitch: Run, frames:
         ("mosaic", masks / frames[0].name, ("--mask", masks)),
         ("pano", masks / frames[0].name, ("--mask", masks / frames[0].name)),
         ("trajectory", table, ("--attitude", table)),
+        ("trajectory", camera, ("--camera", camera)),
+        ("trajectory", configuration, ("--config", configuration)),
     ):
         before = file.read_bytes()
         done = rdstitch(command, *frames[:2], "-o", file, "--overwrite", *given)
