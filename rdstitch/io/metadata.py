@@ -15,7 +15,7 @@ from PIL import ExifTags, Image
 from rdstitch.camera import is_focal_length
 from rdstitch.io.attitude import Attitude, read_attitude
 from rdstitch.io.decoding import check_readable, decoding
-from rdstitch.io.opening import check_megapixels, opened_picture
+from rdstitch.io.opening import check_megapixels, has_late_metadata, opened_picture
 from rdstitch.io.optional_readers import is_raw, raw_exif, raw_size
 from rdstitch.io.orientation import SIDEWAYS, turned_direction
 from rdstitch.io.xmp import finite, xmp_number, xmp_text
@@ -28,6 +28,7 @@ _EXPOSURE_TAGS = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Ba
 LARGEST_PROFILE = 2**20 - 2**10
 """Bytes of a colour profile: PNG readers, such as Pillow's, refuse pictures whose profile takes a megabyte."""
 
+_EXIF_OF_PNG = {"exif", "Raw profile type exif"}
 _COLOUR_SPACE = slice(16, 20)  # of a profile's header
 _UNWRITABLE = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, struct.error)
 _HEADER = 16
@@ -123,6 +124,8 @@ def read_metadata(path: str | Path) -> Metadata:
             return _raw_metadata(file)
         try:
             with opened_picture(file) as image:
+                if image.format == "PNG" and not _EXIF_OF_PNG & image.info.keys() and not has_late_metadata(file):
+                    image.info["exif"] = b""  # so that Pillow does not decode the pixels in search of it
                 return metadata_of(image)
         except SyntaxError:
             # Pillow knows few sample layouts of TIFF (no 16-bit colour with alpha, no five bands).

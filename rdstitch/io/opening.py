@@ -1,5 +1,6 @@
 """Opening picture files: only the formats below, only regular files, and nothing of them decoded yet."""
 
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -40,6 +41,7 @@ _FORMATS: dict[bytes, Callable[[IO[bytes], str], ImageFile.ImageFile]] = {
 _LONGEST_MAGIC = max(map(len, _FORMATS))
 _NAMES = "JPEG, PNG, TIFF, WebP, AVIF, HEIC, BMP, TGA, GIF, JPEG 2000, PBM, PGM, PPM"
 _MOST_MEGAPIXELS = 178
+_PNG_METADATA = (b"eXIf", b"tEXt", b"zTXt", b"iTXt")
 
 
 @contextmanager
@@ -57,6 +59,25 @@ def opened_picture(file: Path) -> Iterator[ImageFile.ImageFile]:
     with open_regular(file) as stream, _factory(file, stream)(stream, str(file)) as image:
         check_megapixels(file, image.size)
         yield image
+
+
+def has_late_metadata(file: Path) -> bool:
+    """Whether a PNG file says something of itself after its pixels, or cannot be followed to its end.
+
+    Only the heads of its chunks are read. Pillow looks for EXIF there, and decodes all pixels to come there.
+    """
+    with open_regular(file) as stream:
+        stream.seek(len(PNG_MAGIC))
+        pixels = False
+        while len(head := stream.read(8)) == 8:
+            length, kind = struct.unpack(">I4s", head)
+            if kind == b"IEND":
+                return False
+            pixels |= kind == b"IDAT"
+            if pixels and kind in _PNG_METADATA:
+                return True
+            stream.seek(length + 4, 1)
+    return True
 
 
 def check_megapixels(file: Path, size: tuple[int, int]) -> None:
