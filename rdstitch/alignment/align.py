@@ -15,6 +15,7 @@ from rdstitch.alignment.build_result import AdjustedPictures, build_alignment
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult, sigma_of
 from rdstitch.alignment.camera_priors import CameraPriors
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
+from rdstitch.alignment.finer_lens import with_third_coefficient
 from rdstitch.alignment.initialization import relations_at
 from rdstitch.alignment.lens_selection import choose_lens
 from rdstitch.alignment.model_selection import ModelChoice, noise_of_links
@@ -123,6 +124,7 @@ def align(
     full = replace(graph, observations=everything)
     problem, _ = full.problem(~wrong, pictures, choice.overdispersion)
     fit = problem.refine(choice.fit.model, choice.fit.adjusted.parameters, choice.fit.tilt_spread)
+    problem, fit = with_third_coefficient(problem, fit, options.lenses)
     problem, fit, disagreement = hold_positions(problem, fit)
     found = AdjustedPictures(
         cameras,
@@ -153,14 +155,10 @@ def _check(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentO
 
 def _lens_start(cameras: Sequence[Camera], options: AlignmentOptions, votes: Consensus) -> tuple[FloatArray, BoolArray]:
     """Where the lens starts, and which of its parameters are free."""
-    lens = _lens_of(cameras[0])
-    free = np.zeros(len(lens), dtype=np.bool_)
+    first = np.arange(len(LENS_STD)) == 0
     if options.lens_known:
-        return lens, free
-    lens[:] = 0.0
-    lens[0] = votes.distortion if votes.votes else 0.0
-    free[0] = True
-    return lens, free
+        return _lens_of(cameras[0]), np.zeros_like(first)
+    return np.where(first, votes.distortion if votes.votes else 0.0, 0.0), first
 
 
 def _lens_of(camera: Camera) -> FloatArray:

@@ -41,7 +41,7 @@ _FARTHEST_CENTER, _FARTHEST_CENTER_OF_CROPS = 0.08, 0.25
 """Half diagonals: a distortion centre farther off than the first is no lens, but something else that it takes the blame
 for, or the centre of pictures that were cropped; one farther off than the second is neither."""
 
-_NO_COHERENCE = 0.3
+NO_COHERENCE = 0.3
 """Correlation of the errors of neighbours up to which nothing else can be to blame: relief leaves more."""
 
 _SHARED_GAIN, _SHARED_GAIN_OF_SERIES = 2.5, 1.0
@@ -180,7 +180,7 @@ def has_plausible_center(adjusted: BundleAdjustmentResult, observations: Observa
     errors = whitened_errors(observations, adjusted.homographies, adjusted.parameters.lens)
     inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
     agree = coherence(observations, errors, inliers).correlation
-    return farthest < _FARTHEST_CENTER_OF_CROPS and agree < _NO_COHERENCE
+    return farthest < _FARTHEST_CENTER_OF_CROPS and agree < NO_COHERENCE
 
 
 @dataclass(frozen=True)

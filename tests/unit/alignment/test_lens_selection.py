@@ -1,5 +1,6 @@
 """The ladder of lenses: as simple as the pictures allow, and never taken in by relief."""
 
+import importlib
 import re
 from dataclasses import replace
 from typing import Any
@@ -19,6 +20,7 @@ from tests.alignment_scenes import Scene, grid, scene
 from tests.alignment_stubs import adjusted, independent_errors, observations
 
 SIZE = (640, 480)
+align_module = importlib.import_module("rdstitch.alignment.align")
 FISHEYE = Camera(SIZE, -0.49, -0.055, (335.0, 226.0), distortion3=-0.008)
 OFF_CENTRE = Camera(SIZE, -0.25, 0.0, (339.0, 229.0))
 
@@ -64,6 +66,28 @@ def test_a_fisheye_off_centre_is_found() -> None:
     offset = np.array(found.cameras[0].center) - FISHEYE.center
     assert (np.abs(offset) < 5.0 * np.sqrt(np.diag(covariance))[3:] * found.cameras[0].half_diagonal + 0.1).all()
     assert "simpler lenses more" in found.lens_reason
+
+
+def test_all_pictures_together_show_a_third_coefficient_that_pairs_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = _scene(replace(FISHEYE, distortion2=-0.03, distortion3=-0.03), 0)
+    chosen = []
+
+    def choose(seen: Observations, apart: Any, names: object, known: Any) -> LensChoice:
+        chosen.append(lens_selection.choose_lens(seen, apart, ["division", "division2"], known))
+        return chosen[-1]
+
+    monkeypatch.setattr(align_module, "choose_lens", choose)
+    found, simpler = _align(given), _align(given, lens="division2")
+    assert chosen[0].name == "division2"
+    assert found.lens == "division3"
+    assert "distortion3" in found.parameters
+    truth = replace(FISHEYE, distortion2=-0.03, distortion3=-0.03)
+    assert _apart(found.cameras[0], truth) < _apart(simpler.cameras[0], truth)
+
+
+def test_a_third_coefficient_is_not_taken_from_relief() -> None:
+    given = _scene(replace(FISHEYE, distortion3=0.0), 0, relief=0.01)
+    assert _align(given).lens == "division2"
 
 
 def test_a_centre_off_the_middle_is_found_alone() -> None:
