@@ -23,12 +23,12 @@ from rdstitch.io.packing import digest, pack, unpack
 from rdstitch.io.staging import lock, remove_dead_files
 from rdstitch.regular_files import open_regular, read_limited
 from rdstitch.remote_files import is_url, remote_status
-from rdstitch.stored import LARGEST_ENTRY, Stored, TemporaryFolder, entry_name
+from rdstitch.stored import MAX_ENTRY, Stored, TemporaryFolder, entry_name
 
 Value = TypeVar("Value")
 
 _FORMAT = 1
-_WRONG = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError)
+_CORRUPT_ENTRY_ERRORS = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError)
 _OPENCV = tuple(f"opencv-{kind}" for kind in ("contrib-python-headless", "contrib-python", "python-headless", "python"))
 _PACKAGES = ("numpy", "scipy", *_OPENCV, "pillow", "simplejpeg", "tifffile")
 
@@ -223,8 +223,8 @@ def _sources(folder: Traversable, prefix: str) -> Iterator[tuple[str, bytes]]:
 
 def _read(file: Path, kinds: tuple[type, ...], valid: Callable[[Value], bool]) -> list[Value]:
     """The result that a file holds; none where it is missing, damaged, or no result for these inputs."""
-    with suppress(InputError, ArgumentError, OSError, *_WRONG):
-        kept: tuple[str, Value] = unpack(read_limited(file, LARGEST_ENTRY), kinds)
+    with suppress(InputError, ArgumentError, OSError, *_CORRUPT_ENTRY_ERRORS):
+        kept: tuple[str, Value] = unpack(read_limited(file, MAX_ENTRY), kinds)
         if isinstance(kept, tuple) and kept[0] == entry_name(file) and valid(kept[1]):
             return [kept[1]]
     return []

@@ -46,7 +46,7 @@ _FOCAL_LIMITS = 0.05, 1e3  # half diagonals; the widest fisheyes have 0.3
 
 _NEAREST_HORIZON = 0.2  # half diagonals: a circle of 180 degrees that is smaller is a wrong camera file
 
-_LARGEST_STRETCH = 20.0
+_MAX_STRETCH = 20.0
 """How much the lens may stretch what is drawn where it sees beyond the horizon: to 77 degrees off the axis."""
 
 _GUESSED_FOCAL = 1.2  # half diagonals: a 26 mm lens on 36 x 24 mm, in the middle of what phones and drones carry
@@ -200,7 +200,7 @@ class Camera:
         """Measured radius, pixels, up to which pictures are drawn; inf where that is all of them."""
         if not self.sees_beyond_horizon:
             return math.inf
-        return stretch_radius(self.distortion, self.higher, _LARGEST_STRETCH) * self.half_diagonal
+        return stretch_radius(self.distortion, self.higher, _MAX_STRETCH) * self.half_diagonal
 
     @property
     def half_diagonal(self) -> float:

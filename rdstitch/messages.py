@@ -7,7 +7,7 @@ from typing import Literal
 
 Severity = Literal["note", "warning", "left out", "failure"]
 
-MOST_NAMED = 3
+MAX_NAMED = 3
 """Pictures or pairs that one message names."""
 
 
@@ -65,6 +65,6 @@ def names_of(paths: Iterable[str]) -> list[str]:
     return [Path(path).name for path in paths]
 
 
-def shortened(names: Sequence[str], most: int = MOST_NAMED) -> str:
+def shortened(names: Sequence[str], most: int = MAX_NAMED) -> str:
     """Names, or the first of them where they are many."""
     return ", ".join(names[:most]) + ", …" * (len(names) > most)

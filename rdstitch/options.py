@@ -14,7 +14,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.executors import LOCAL, open_executor
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.frame import ChannelOrder
-from rdstitch.local_alignment import MOST_CELLS, LocalAlignmentMode
+from rdstitch.local_alignment import MAX_CELLS, LocalAlignmentMode
 from rdstitch.matching.options import MatchingOptions, PairOptions
 from rdstitch.robust import SOLVERS
 
@@ -159,8 +159,8 @@ class StitchOptions:
             raise ArgumentError("threshold and max_iterations must be positive, confidence between 0 and 1")
         if not self.threshold <= _MAX_THRESHOLD:
             raise ArgumentError(f"the threshold of an inlier must be at most {_MAX_THRESHOLD:g} pixels")
-        if isinstance(self.local_alignment, int) and not 2 <= self.local_alignment <= MOST_CELLS:
-            raise ArgumentError(f"local_alignment has from 2 to {MOST_CELLS} cells, not {self.local_alignment}")
+        if isinstance(self.local_alignment, int) and not 2 <= self.local_alignment <= MAX_CELLS:
+            raise ArgumentError(f"local_alignment has from 2 to {MAX_CELLS} cells, not {self.local_alignment}")
         if isinstance(self.local_alignment, str) and self.local_alignment not in ("auto", "off"):
             raise ArgumentError(f"local_alignment is auto, off or a number of cells, not {self.local_alignment!r}")
         if self.scheduler not in (None, LOCAL) and self.cache is None:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from rdstitch.errors import InputError
 from rdstitch.regular_files import read_limited
 
-LARGEST_FILE = 256 * 2**20  # bytes; a sidecar of ten thousand pictures has about 30 MB
-_LARGEST_SIDE = 10**7  # pixels
-_SMALLEST_ENTRY, _LARGEST_ENTRY = 1e-30, 1e30  # of matrices
+MAX_FILE = 256 * 2**20  # bytes; a sidecar of ten thousand pictures has about 30 MB
+_MAX_SIDE = 10**7  # pixels
+_MIN_ENTRY, _MAX_ENTRY = 1e-30, 1e30  # of matrices
 _DEEPEST = 50  # objects and lists within one another
 
 
@@ -34,7 +34,7 @@ def read_text(path: str | Path, *, regular: bool = True) -> str:
     """
     try:
         # Names of files that are not UTF-8 are written as they are, and come back as they were.
-        return read_limited(path, LARGEST_FILE, regular=regular).decode("utf-8-sig", "surrogateescape")
+        return read_limited(path, MAX_FILE, regular=regular).decode("utf-8-sig", "surrogateescape")
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
 
@@ -196,7 +196,7 @@ class Record:
     def side(self) -> int:
         """Width or height of a picture, pixels."""
         value = self.integer(1)
-        if value > _LARGEST_SIDE:
+        if value > _MAX_SIDE:
             self.expected("a width or height in pixels")
         return value
 
@@ -207,8 +207,8 @@ class Record:
             self.expected("three rows of three numbers")
         array = np.array(rows, dtype=np.float64)
         # Products of several of them must be numbers too.
-        if not _SMALLEST_ENTRY <= np.abs(array).max() <= _LARGEST_ENTRY:
-            self.fail(f"the matrix needs entries of {_SMALLEST_ENTRY:g} to {_LARGEST_ENTRY:g}")
+        if not _MIN_ENTRY <= np.abs(array).max() <= _MAX_ENTRY:
+            self.fail(f"the matrix needs entries of {_MIN_ENTRY:g} to {_MAX_ENTRY:g}")
         with np.errstate(all="ignore"):
             scale = np.abs(array).max()
             if scale == 0.0 or not np.linalg.cond(array / scale) < 1e12:

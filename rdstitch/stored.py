@@ -17,8 +17,8 @@ from rdstitch.regular_files import read_limited
 
 Value = TypeVar("Value")
 
-LARGEST_ENTRY = 2**31  # bytes
-_ROOM = 16 * 2**20  # bytes of files whose content is kept in memory
+MAX_ENTRY = 2**31  # bytes
+_CAPACITY = 16 * 2**20  # bytes of files whose content is kept in memory
 
 
 class TemporaryFolder:
@@ -95,7 +95,7 @@ class Stored(Generic[Value]):
     def _read(self) -> tuple[Value, int]:
         assert self.file is not None
         try:
-            data = read_limited(self.file, LARGEST_ENTRY)
+            data = read_limited(self.file, MAX_ENTRY)
             name, value = unpack(data, self.kinds)
             if name == self.name:
                 return value, len(data)
@@ -131,4 +131,4 @@ class _RecentlyUsed:
         return value
 
 
-_recent = _RecentlyUsed(_ROOM)
+_recent = _RecentlyUsed(_CAPACITY)

@@ -49,7 +49,7 @@ HOPELESS = (
 OTHERS = ((1.15, 0.0), (1.4, 0.0), (1.0, 0.05), (1.0, 0.1), (1.0, 0.2))
 """Other lenses: their focal length in units of the first lens's, and how far λ differs beyond what the zoom does."""
 
-LARGEST_MEDIAN, LARGEST_OF_A_PICTURE = 1.5, 4.0
+MAX_MEDIAN, MAX_OF_A_PICTURE = 1.5, 4.0
 """px of the pictures: more is a wrong registration."""
 
 
@@ -279,7 +279,7 @@ def judge_set(item: TrustSet, folder: Path, options: StitchOptions | None = None
     measure = registration_error if np.isfinite(alignment.distortion_std) else overlap_error
     error, worst = measure(item.sequence, registration)
     text = "; ".join(map(str, registration.messages))
-    right = error < LARGEST_MEDIAN and worst < LARGEST_OF_A_PICTURE
+    right = error < MAX_MEDIAN and worst < MAX_OF_A_PICTURE
     mixed = item.sequence if item.kind in SPOILED and isinstance(item.sequence, MixedSequence) else None
     missing = {_number(message.images[0]) for message in registration.left_out}
     complete = not missing if mixed is None else missing == mixed.taken or (mixed.usable and missing < mixed.taken)

@@ -52,7 +52,7 @@ Examples:
 """
 
 _UNEXPECTED, _USAGE, _INTERRUPTED, _BROKEN_PIPE = 1, 2, 130, 141
-_ASKED_TO_END = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+_TERMINATION_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 _M_ARENA_MAX = -8
 _OPENCV_NO_MEMORY = -4  # cv2.Error.StsNoMem
 _OUT_OF_MEMORY = "out of memory; try smaller pictures or a smaller --scale"
@@ -88,7 +88,7 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _share_memory()
     _silence_decoders()
-    for number in _ASKED_TO_END:
+    for number in _TERMINATION_SIGNALS:
         signal.signal(number, _end)
     sys.exit(run(sys.argv[1:]))
 

@@ -20,7 +20,7 @@ _FEATURES = 4000
 _FEATURE_PIXELS = 1_500_000
 # Matches that agree with the first rough homography to this share of the mosaic's size are used to place it.
 _ROUGH_AGREEMENT = 0.04
-_LEAST_MATCHES = 12
+_MIN_MATCHES = 12
 
 
 @dataclass(frozen=True)
@@ -235,16 +235,16 @@ def _place_by_features(grey: LinearPixels, filled: NDArray[np.bool_], truth: Lin
     whole, not by the part of it that is right.
     """
     found = [features(grey, filled), features(truth, None)]
-    if any(len(descriptors) < _LEAST_MATCHES for _, descriptors in found):
+    if any(len(descriptors) < _MIN_MATCHES for _, descriptors in found):
         return None
     (points1, descriptors1), (points2, descriptors2) = found
     best = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors1, descriptors2, k=2)
     pairs = [(m[0].queryIdx, m[0].trainIdx) for m in best if m[0].distance < 0.75 * m[1].distance]
-    if len(pairs) < _LEAST_MATCHES:
+    if len(pairs) < _MIN_MATCHES:
         return None
     a, b = points1[[i for i, _ in pairs]], points2[[j for _, j in pairs]]
     rough, mask = cv2.findHomography(a, b, cv2.RANSAC, 8.0, maxIters=5000, confidence=0.9999)
-    if rough is None or mask.sum() < _LEAST_MATCHES:
+    if rough is None or mask.sum() < _MIN_MATCHES:
         return None
     distance = np.linalg.norm(apply(rough, a) - b, axis=1)
     agreed = distance < _ROUGH_AGREEMENT * max(grey.shape)

@@ -17,7 +17,7 @@ from rdstitch.synthetic import TurningSequence
 from rdstitch.synthetic.textures import LinearPixels
 
 _ROUNDS = 3
-_LEAST_MATCHES = 12
+_MIN_MATCHES = 12
 _ROUGH = np.radians(2.0)
 _GRID = 25  # places of a picture, along each axis
 
@@ -98,7 +98,7 @@ def compare_with_sphere(panorama: NDArray[Any], sequence: TurningSequence, searc
         y, x = np.mgrid[: grey.shape[0], : grey.shape[1]].astype(np.float64)
         drawn = _drawn(truth, placed.directions(np.stack([x, y], axis=-1)))
         moves = patch_displacements(grey, drawn, filled, search=search)
-        if moves.found.sum() < _LEAST_MATCHES:
+        if moves.found.sum() < _MIN_MATCHES:
             return SphereComparison(np.empty(0), 0.0)
         there = placed.directions(moves.center + moves.displacement)
         parameters = _fitted(parameters, moves.center[moves.found], there[moves.found], column, 1.0 / placed.scale)
@@ -119,10 +119,10 @@ def _matches(grey: LinearPixels, filled: NDArray[np.bool_], truth: LinearPixels)
 
 def _rough(shown: FloatArray, seen: FloatArray, width: int, column: float) -> FloatArray | None:
     """Heading, size and horizon by a similarity of both pictures, since both are nearly level."""
-    if len(shown) < _LEAST_MATCHES:
+    if len(shown) < _MIN_MATCHES:
         return None
     similarity, inliers = cv2.estimateAffinePartial2D(shown, seen, ransacReprojThreshold=30.0, maxIters=5000)
-    if similarity is None or inliers.sum() < _LEAST_MATCHES:
+    if similarity is None or inliers.sum() < _MIN_MATCHES:
         return None
     ratio = float(np.hypot(*similarity[:, 0]))
     per_radian = width / (2.0 * np.pi)

@@ -14,7 +14,7 @@ from rdstitch.alignment.bundle_adjustment import (
 )
 from rdstitch.alignment.camera_priors import CameraPriors
 from rdstitch.alignment.cycle_consistency import link_medians
-from rdstitch.alignment.initialization import MOST_ITERATIONS, adjust_pairs_independently
+from rdstitch.alignment.initialization import MAX_ITERATIONS, adjust_pairs_independently
 from rdstitch.alignment.metric_upgrade import metric_upgrade
 from rdstitch.alignment.motion_models import (
     HOMOGRAPHY,
@@ -45,7 +45,7 @@ POSE_TILT_SPREAD = math.radians(35.0)
 """Of pictures of which nothing is known: half of the tilts lie below 40 degrees."""
 
 _TILT_SPREAD_START = math.radians(3.0)
-_TILT_SPREAD_LEAST = math.radians(0.05)
+_MIN_TILT_SPREAD = math.radians(0.05)
 _TILT_SPREAD_ROUNDS = 3
 
 
@@ -142,7 +142,7 @@ class Problem:
         adjusted = self._run(model, start, spread)
         for _ in range(_TILT_SPREAD_ROUNDS):
             tilts = adjusted.parameters.poses[:, [PSI, THETA]] * math.exp(adjusted.parameters.shared[-1])
-            previous, spread = spread, max(float(np.sqrt(np.mean(tilts**2))), _TILT_SPREAD_LEAST)
+            previous, spread = spread, max(float(np.sqrt(np.mean(tilts**2))), _MIN_TILT_SPREAD)
             if abs(spread - previous) <= 0.1 * previous:
                 break
             adjusted = self._run(model, adjusted.parameters, spread)
@@ -232,12 +232,12 @@ class Problem:
 
         starts = self._shared_to_try(model, priors.shared)
         if len(starts) == 1:
-            return adjusted(starts[0], self.lens, MOST_ITERATIONS)
+            return adjusted(starts[0], self.lens, MAX_ITERATIONS)
         trials = [adjusted(shared, self.lens, _TRIAL_ITERATIONS) for shared in starts]
         width = ALIGNMENT_WIDTH * min(trial.sigma for trial in trials)
         cost = [float(robust_cost(trial.squared, width).sum()) for trial in trials]
         best = trials[int(np.argmin(cost))].parameters
-        return adjusted(best.shared, best.lens, MOST_ITERATIONS)
+        return adjusted(best.shared, best.lens, MAX_ITERATIONS)
 
     def _shared_to_try(self, model: MotionModel, physical: FloatArray) -> list[FloatArray]:
         """Focal lengths; or shared parameters for the known or zero tilt, and for four around it, 0.2 radians away."""

@@ -22,10 +22,10 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.pose_blocks import PoseBlocks
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import LENS_PARAMETERS
-from rdstitch.robust.levenberg_marquardt import FIRST_DAMPING, LARGEST_DAMPING, LEAST_GAIN, next_damping
+from rdstitch.robust.levenberg_marquardt import FIRST_DAMPING, MAX_DAMPING, MIN_GAIN, next_damping
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, RAYLEIGH_MEDIAN, robust_cost
 
-_SMALLEST_SIGMA = 1e-3
+_MIN_SIGMA = 1e-3
 """Pixels; a smaller one is not measurable, and errors are divided by it."""
 
 
@@ -226,7 +226,7 @@ class BundleAdjuster:
             predicted = -(
                 normal.gradient_poses @ flat + normal.gradient_shared @ step_shared
             )  # of the quadratic model, to first order twice the decrease
-            if not np.isfinite(predicted) or predicted <= LEAST_GAIN * max(state.cost, 1e-12):
+            if not np.isfinite(predicted) or predicted <= MIN_GAIN * max(state.cost, 1e-12):
                 return state, used, True
             moved = state.parameters.retract(self.model, step_poses, step_shared, self.free.lens)
             used += 1
@@ -235,7 +235,7 @@ class BundleAdjuster:
             damping = next_damping(damping, np.asarray(better))
             if better and there is not None:
                 state = there
-            elif damping > LARGEST_DAMPING:
+            elif damping > MAX_DAMPING:
                 return state, used, True
         return state, used, False
 
@@ -333,9 +333,9 @@ class BundleAdjuster:
 def sigma_of(squared: FloatArray) -> float:
     """Standard deviation of an error's coordinate, pixels, from the median of the squared lengths (M,)."""
     if not len(squared):
-        return _SMALLEST_SIGMA
+        return _MIN_SIGMA
     median = float(np.sqrt(np.median(squared)))
-    return max(median / RAYLEIGH_MEDIAN, _SMALLEST_SIGMA) if np.isfinite(median) else 1e3
+    return max(median / RAYLEIGH_MEDIAN, _MIN_SIGMA) if np.isfinite(median) else 1e3
 
 
 def _covariance(information: FloatArray) -> FloatArray:

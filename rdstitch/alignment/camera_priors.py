@@ -12,7 +12,7 @@ from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
 
-_EXACT = 1e12  # precision of what is known: a standard deviation of 1e-6 radians
+_EXACT_PRECISION = 1e12  # precision of what is known: a standard deviation of 1e-6 radians
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class CameraPriors:
             return replace(
                 known, shared=np.array([self.log_focal]), shared_precision=np.array([self.log_focal_std**-2.0])
             )
-        tilt_precision = _EXACT if self.tilt_known else 0.0
+        tilt_precision = _EXACT_PRECISION if self.tilt_known else 0.0
         poses, precision = np.zeros_like(none.poses), np.zeros_like(none.poses)
         free = list(getattr(model, "free", ()))
         focal = math.exp(self.log_focal if log_focal is None else log_focal)

@@ -18,9 +18,9 @@ from rdstitch.radial_homography import transfer_jacobian
 _PROBES = 6
 """Points of a link that are transferred round each triangle."""
 
-_MOST_TRIANGLES = 20_000
+_MAX_TRIANGLES = 20_000
 
-_LEAST_ERROR = 0.02
+_MIN_ERROR = 0.02
 """Half diagonals: a link that is off by less is no wrong pair."""
 
 
@@ -43,7 +43,7 @@ def triangles(count: int, image1: IntArray, image2: IntArray) -> IntArray:
             ik = number.data[number.indptr[i] : number.indptr[i + 1]][np.searchsorted(own, third)] - 1
             found.append(np.column_stack([np.full(len(third), link), jk, ik]))
     result = np.concatenate(found).astype(np.intp) if found else np.empty((0, 3), dtype=np.intp)
-    every = -(-len(result) // _MOST_TRIANGLES) if len(result) else 1
+    every = -(-len(result) // _MAX_TRIANGLES) if len(result) else 1
     return result[::every]
 
 
@@ -120,7 +120,7 @@ def _open_triangles(apart: BundleAdjustmentResult, observations: Observations, c
     middle = np.nanmedian(normalized[seen], axis=1)
     absolute = np.nanmedian(np.where(visible, size, np.nan)[seen], axis=1)
     usual = max(1.0, float(np.quantile(middle, 0.25)))
-    result[seen] = (middle > 8.0 * usual) & (absolute > _LEAST_ERROR)
+    result[seen] = (middle > 8.0 * usual) & (absolute > _MIN_ERROR)
     return result
 
 
@@ -159,7 +159,7 @@ def misfitting_links(squared: FloatArray, observations: Observations) -> BoolArr
     typical = link_medians(squared, observations)
     finite = typical[np.isfinite(typical)]
     usual = float(np.median(finite)) if len(finite) else 0.0
-    least = _LEAST_ERROR * np.sqrt(observations.scale1 * observations.scale2)
+    least = _MIN_ERROR * np.sqrt(observations.scale1 * observations.scale2)
     outlying: BoolArray = ~(typical <= np.maximum(8.0 * usual, least))
     return outlying
 

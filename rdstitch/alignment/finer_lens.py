@@ -18,7 +18,7 @@ from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.planarity import coherence
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
-_LEAST_GAIN = 1.0
+_MIN_GAIN = 1.0
 """Squared standard deviations that ν must gain: less than Akaike's criterion asks for, since the noise model takes the
 points of all links of a picture for the same, of which each link uses others."""
 
@@ -39,6 +39,6 @@ def with_third_coefficient(problem: Problem, fit: Fit, names: Sequence[str]) -> 
     wider = problem.extend(fit, finer)
     noise = NoiseModel.of_errors(observations, errors)
     gain = float((noise.misfit(adjusted.squared) - noise.misfit(wider.adjusted.squared)).sum())
-    if gain <= _LEAST_GAIN or not has_plausible_center(wider.adjusted, observations):
+    if gain <= _MIN_GAIN or not has_plausible_center(wider.adjusted, observations):
         return problem, fit
     return replace(problem, free_lens=finer), wider

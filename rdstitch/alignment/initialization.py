@@ -22,7 +22,7 @@ from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.division_model import undistort
 from rdstitch.radial_homography import RadialHomography, transfer
 
-MOST_ITERATIONS = 24
+MAX_ITERATIONS = 24
 """A start need not be the minimum."""
 
 
@@ -66,7 +66,7 @@ def adjust_pairs_independently(
     free_lens: BoolArray,
     priors: Priors,
     attitudes: FloatArray,
-    iterations: int = MOST_ITERATIONS,
+    iterations: int = MAX_ITERATIONS,
 ) -> BundleAdjustmentResult:
     """Adjust every link on its own, with the shared parameters in common.
 

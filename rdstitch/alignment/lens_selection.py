@@ -61,7 +61,7 @@ WORTH_SAYING = 0.5
 
 _RADII, _SCALE_STEPS, _SCALE_STEP = 64, 6, 1e-6
 
-_ENOUGH_LINKS = 8
+_SUFFICIENT_LINKS = 8
 """Links from which on each is a part."""
 
 
@@ -223,7 +223,7 @@ class _Judge:
 def _parts(observations: Observations) -> IntArray:
     """Which part each correspondence falls into, shape (M,)."""
     link = observations.link
-    if len(observations) >= _ENOUGH_LINKS:
+    if len(observations) >= _SUFFICIENT_LINKS:
         return link
     cell = np.zeros(len(link), dtype=np.intp)
     for number in range(len(observations)):

@@ -15,7 +15,7 @@ from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y, 
 from rdstitch.arrays import FloatArray
 from rdstitch.planar_motion import rotation_from_tilt, tilt_from_normal
 
-_LARGEST_TILT = math.radians(75.0)
+_MAX_TILT = math.radians(75.0)
 _TILT_STEPS = 31
 """Five degrees a step, less than the adjustment bridges."""
 
@@ -59,7 +59,7 @@ def metric_upgrade(homographies: FloatArray, reference: int, log_focal: float, l
         Prior on the logarithm of the focal length in half diagonals.
     """
     relative = homographies @ inverses(homographies[reference : reference + 1])[0]
-    angles = np.linspace(-_LARGEST_TILT, _LARGEST_TILT, _TILT_STEPS)
+    angles = np.linspace(-_MAX_TILT, _MAX_TILT, _TILT_STEPS)
     tilts = np.stack(np.meshgrid(angles, angles, indexing="ij"), axis=-1).reshape(-1, 2)
     best, best_cost, best_focal = tilts[0], math.inf, log_focal
     for step in _FOCAL_RANGE:

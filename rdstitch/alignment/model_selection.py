@@ -30,16 +30,16 @@ from rdstitch.alignment.motion_models import (
 )
 from rdstitch.alignment.noise_model import EXACTNESS, NoiseModel, squared_lengths
 from rdstitch.alignment.normal_equations import whitened_errors
-from rdstitch.alignment.planarity import LARGE
+from rdstitch.alignment.planarity import LARGE_RELIEF
 from rdstitch.arrays import BoolArray
 
 NOT_ONE_CAMERA = "the pictures do not come from one camera with one focal length"
 """Why free homographies were taken."""
 
-_LEAST_RATIO = 1.5
+_MIN_RATIO = 1.5
 """Times by which the errors of one camera must exceed those of free homographies."""
 
-_LEAST_RATIO_OVER_RELIEF = 3.0
+_MIN_RATIO_OVER_RELIEF = 3.0
 """The same where neighbours agree in the errors of free homographies, too."""
 
 _FOCAL_LIMITS = 0.2, 50.0
@@ -115,7 +115,7 @@ def _cannot_gain(bound: NoiseModel, problem: Problem, fits: Sequence[Fit], model
     if model is not HOMOGRAPHY or not fits or problem.count == 2:
         return False
     least = min(math.hypot(fit.adjusted.sigma, EXACTNESS) for fit in fits)
-    return least < _LEAST_RATIO * bound.noise
+    return least < _MIN_RATIO * bound.noise
 
 
 def _beyond_one_camera(problem: Problem, camera: Fit, free: Fit) -> bool:
@@ -124,8 +124,8 @@ def _beyond_one_camera(problem: Problem, camera: Fit, free: Fit) -> bool:
     The variance of the errors is unknown, and only as many of them are independent as those of the camera show:
     ``n log σ² + k log n`` decides (Schwarz's criterion). Two pictures need no more than one homography.
     """
-    rough = _noise_of_fit(problem, free).common > LARGE
-    least = _LEAST_RATIO_OVER_RELIEF if rough else _LEAST_RATIO
+    rough = _noise_of_fit(problem, free).common > LARGE_RELIEF
+    least = _MIN_RATIO_OVER_RELIEF if rough else _MIN_RATIO
     noise = _noise_of_fit(problem, camera)
     variance = [fit.adjusted.sigma**2 + EXACTNESS**2 for fit in (camera, free)]
     count = [parameter_count(problem, fit.model, fit.free_lens) for fit in (camera, free)]

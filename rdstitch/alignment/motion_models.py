@@ -34,7 +34,7 @@ from rdstitch.planar_motion import ABOUT_X, ABOUT_Y, nearest_in_plane, rigid_in_
 YAW, X, Y, LOG_HEIGHT, PSI, THETA = range(6)
 """Columns of a planar model's poses."""
 
-_LARGEST_LOG_HEIGHT = 10.0  # where the model does not describe the motion, heights may diverge
+_MAX_LOG_HEIGHT = 10.0  # where the model does not describe the motion, heights may diverge
 
 _TRACELESS = np.zeros((8, 3, 3))
 _TRACELESS[[0, 1, 2, 3, 4, 5], [0, 0, 1, 1, 2, 2], [1, 2, 0, 2, 0, 1]] = 1.0
@@ -167,7 +167,7 @@ class PlanarModel:
         """Poses after a step of shape (N, D)."""
         result = poses.copy()
         result[:, list(self.free)] += step
-        result[:, LOG_HEIGHT] = np.clip(result[:, LOG_HEIGHT], -_LARGEST_LOG_HEIGHT, _LARGEST_LOG_HEIGHT)
+        result[:, LOG_HEIGHT] = np.clip(result[:, LOG_HEIGHT], -_MAX_LOG_HEIGHT, _MAX_LOG_HEIGHT)
         return result
 
     def prior_coordinates(self, poses: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ from rdstitch.robust.loss import ALIGNMENT_WIDTH
 EXACTNESS = 0.1
 """Pixels: how exactly a lens and a plane can be described at all."""
 
-_LARGEST_ERROR2 = 1e12  # px²: what cannot be transferred counts as this
+_MAX_ERROR2 = 1e12  # px²: what cannot be transferred counts as this
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class NoiseModel:
 
     def misfit(self, squared: FloatArray) -> FloatArray:
         """Robust squares of the errors that count, in units of the noise, from the squares of all (M,)."""
-        ratio = np.minimum(squared[self.counted], _LARGEST_ERROR2) / self.noise**2
+        ratio = np.minimum(squared[self.counted], _MAX_ERROR2) / self.noise**2
         misfit: FloatArray = ALIGNMENT_WIDTH**2 * np.log1p(ratio / ALIGNMENT_WIDTH**2) / self.overdispersion
         return misfit
 

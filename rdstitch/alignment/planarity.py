@@ -17,16 +17,16 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 _CELLS = (2, 3, 4)
 """Cells per side of a link's overlap within which errors are added up; the worst counts."""
 
-_COHERENT = 0.5
+_COHERENT_CORRELATION = 0.5
 """Correlation of neighbours from which on a scene does not count as flat, if what they have in common is large."""
 
-LARGE = 0.00075
+LARGE_RELIEF = 0.00075
 """Of a picture's diagonal: lenses that one λ describes roughly leave less, flights over trees and houses more."""
 
-_ENOUGH = 200_000
+_MAX_SAMPLES = 200_000
 """Correspondences of which the agreement is measured."""
 
-_LEAST_DISTANCE = 0.005
+_MIN_DISTANCE = 0.005
 """Half diagonals; nearer points are the same feature found twice."""
 
 
@@ -56,7 +56,7 @@ class Coherence:
 
 def coherence(observations: Observations, errors: FloatArray, inliers: BoolArray) -> Coherence:
     """Agreement of the residuals (M, 2) of neighbouring inliers of the same link; of very many links, every n-th."""
-    every = max(1, -(-len(inliers) // _ENOUGH))
+    every = max(1, -(-len(inliers) // _MAX_SAMPLES))
     inliers = inliers & (observations.link % every == 0)
     link, points, residual = observations.link[inliers], observations.points1[inliers], errors[inliers]
     pictures = len(np.unique(np.concatenate([observations.image1, observations.image2])))
@@ -65,7 +65,7 @@ def coherence(observations: Observations, errors: FloatArray, inliers: BoolArray
     apart = np.column_stack([points, link * 10.0])
     nearby = cKDTree(apart).query(apart, k=min(4, len(apart)))
     distance, neighbour = np.asarray(nearby[0]), np.asarray(nearby[1])
-    pairs = (distance[:, 1:] > _LEAST_DISTANCE) & (distance[:, 1:] < 0.25)
+    pairs = (distance[:, 1:] > _MIN_DISTANCE) & (distance[:, 1:] < 0.25)
     nearest = np.argmax(pairs, axis=1)
     found = pairs.any(axis=1)
     other = neighbour[np.arange(len(apart)), nearest + 1]
@@ -111,7 +111,7 @@ def judge_relief(found: Coherence, model: str, links: int) -> ReliefTest:
         Pairs of pictures; what is as wide as the overlap of one pair alone, its homography and λ absorb.
     """
     agreement = f"errors of neighbours agree (correlation {found.correlation:.2f}, {found.size:.1f} pixels in common)"
-    relief = found.correlation > _COHERENT and found.relative_size > LARGE
+    relief = found.correlation > _COHERENT_CORRELATION and found.relative_size > LARGE_RELIEF
     if model == "rotation":
         moved = "the camera moved between the pictures (parallax): what is near does not fit; turn about the lens"
         text = f"{agreement}: {moved}" if relief else f"the camera hardly moved (correlation {found.correlation:.2f})"
@@ -119,7 +119,7 @@ def judge_relief(found: Coherence, model: str, links: int) -> ReliefTest:
         text = (
             f"{agreement}: the scene is not one plane, or the {model} model does not describe the camera; λ may be off"
         )
-    elif found.correlation > _COHERENT:
+    elif found.correlation > _COHERENT_CORRELATION:
         text = f"{agreement}, as over a scene that is nearly flat"
     else:
         seen = "the scene is flat" if links > 1 else "no relief shows, but hills as wide as one overlap would not"

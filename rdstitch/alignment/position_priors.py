@@ -19,7 +19,7 @@ from rdstitch.arrays import FloatArray
 POSITION_STD = 3.0
 """Metres: of one coordinate of a position by a receiver without corrections, within one flight."""
 
-_FEWEST, _LEAST_SPREAD = 4, 5.0
+_MIN_POSITIONS, _MIN_SPREAD = 4, 5.0
 """Positions, and standard deviations that they must be spread over, to say anything of the shape."""
 
 _ROUNDS, _SETTLED = 6, 0.1
@@ -28,7 +28,7 @@ _ROUNDS, _SETTLED = 6, 0.1
 _OUTLYING = 3.0
 """Standard deviations from which on a position counts little."""
 
-_LARGEST_GROWTH = 1.1
+_MAX_GROWTH = 1.1
 """Times by which the errors of the pictures may grow."""
 
 
@@ -51,7 +51,7 @@ def hold_positions(problem: Problem, fit: Fit) -> tuple[Problem, Fit, str]:
     positions = problem.camera_priors.positions
     metres = positions @ np.array([1.0, -1.0j])
     known = np.isfinite(metres)
-    if not isinstance(fit.model, PlanarModel) or known.sum() < _FEWEST or _spread(metres[known]) < _LEAST_SPREAD:
+    if not isinstance(fit.model, PlanarModel) or known.sum() < _MIN_POSITIONS or _spread(metres[known]) < _MIN_SPREAD:
         return problem, fit, ""
     held, found = problem, fit
     for _ in range(_ROUNDS):
@@ -65,7 +65,7 @@ def hold_positions(problem: Problem, fit: Fit) -> tuple[Problem, Fit, str]:
     there, precision = _prior(metres, _places(found), known)
     off = np.abs(_places(found) - there @ np.array([1.0, 1.0j]))[known] * math.sqrt(precision.max())
     growth = math.hypot(found.adjusted.sigma, EXACTNESS) / math.hypot(fit.adjusted.sigma, EXACTNESS)
-    if growth <= _LARGEST_GROWTH and np.median(off) <= _OUTLYING:
+    if growth <= _MAX_GROWTH and np.median(off) <= _OUTLYING:
         return held, found, ""
     return (
         problem,

@@ -16,7 +16,7 @@ FOCAL_STARTS = tuple(math.log(focal) for focal in (0.6, 0.9, 1.4, 2.2, 3.6, 6.0)
 """Logarithms of focal lengths in half diagonals: from fisheyes to long lenses, near enough to each other that the
 adjustment of pairs converges from the nearest."""
 
-_LARGEST_STEP = 0.5  # radians; where the motion is no rotation, steps may diverge
+_MAX_STEP = 0.5  # radians; where the motion is no rotation, steps may diverge
 _LOG_FOCAL_LIMITS = math.log(0.2), math.log(50.0)
 
 _CROSS = np.zeros((3, 3, 3))
@@ -97,8 +97,8 @@ def nearest_rotation(matrices: FloatArray) -> FloatArray:
 def rotation_from_vector(vectors: FloatArray) -> FloatArray:
     """Rotations (N, 3, 3) about axes (N, 3) by their length, radians (Rodrigues); long ones are shortened."""
     angle = np.linalg.norm(vectors, axis=1)
-    vectors = vectors * np.minimum(1.0, _LARGEST_STEP / np.maximum(angle, 1e-300))[:, None]
-    angle = np.minimum(angle, _LARGEST_STEP)
+    vectors = vectors * np.minimum(1.0, _MAX_STEP / np.maximum(angle, 1e-300))[:, None]
+    angle = np.minimum(angle, _MAX_STEP)
     cross = np.einsum("nk,kij->nij", vectors, _CROSS)
     first = np.sinc(angle / np.pi)[:, None, None]
     second = 0.5 * np.sinc(angle / (2.0 * np.pi))[:, None, None] ** 2

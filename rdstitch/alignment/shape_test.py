@@ -35,7 +35,7 @@ _STEP = 1e-4
 _SIDE = 6
 """Points along a side of each picture whose places are compared."""
 
-_ENOUGH, _LEAST_OF_A_LINK = 6000, 8
+_ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 8
 """Correspondences in all, and of each link at least, that say what the shape is."""
 
 _NO_ROBUSTNESS = 1e9
@@ -196,7 +196,7 @@ def _cause(effects: Sequence[Effect], sizes: FloatArray, covariance: FloatArray)
 
 def _inliers(adjuster: BundleAdjuster, fit: Fit) -> Observations:
     """As many observations as say what the shape is, without those that the fit does not explain."""
-    few = adjuster.observations.thinned(max(_ENOUGH // max(len(adjuster.observations), 1), _LEAST_OF_A_LINK))
+    few = adjuster.observations.thinned(max(_ENOUGH // max(len(adjuster.observations), 1), _MIN_MATCHES_PER_LINK))
     squared = replace(adjuster, observations=few).squared(fit.adjusted.parameters)
     kept = squared <= (ALIGNMENT_WIDTH * fit.adjusted.sigma) ** 2
     before = np.concatenate([[0], np.cumsum(kept)])

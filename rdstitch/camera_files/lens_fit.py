@@ -18,8 +18,8 @@ Forward = Callable[[FloatArray], FloatArray]
 
 _GRID = 65  # points along each side of the picture that polynomials are fitted at
 _RATIONAL_STEPS, _DIVISION_STEPS = 12, 8
-_CLOSE = 0.1  # pixels: as exactly as a lens can be described at all
-_FAR = 0.1  # half diagonals: then the file is no lens of these pictures
+_EXACT_ERROR = 0.1  # pixels: as exactly as a lens can be described at all
+_MAX_ERROR = 0.1  # half diagonals: then the file is no lens of these pictures
 _RAYS, _STEPS, _REACH = 64, 1200, 8.0  # where other models are looked at: directions, steps, half diagonals
 
 
@@ -161,9 +161,9 @@ def fit_lens(forward: Forward, camera: Camera) -> tuple[Camera, LensFit]:
         fit = LensFit(float(np.sqrt(weights @ error**2 / weights.sum())), float(error.max()))
         if best is None or fit.largest < 0.5 * best[1].largest:
             best = lens, fit
-        if best[1].largest <= _CLOSE:
+        if best[1].largest <= _EXACT_ERROR:
             break
-    if best is None or best[1].largest > _FAR * camera.half_diagonal:
+    if best is None or best[1].largest > _MAX_ERROR * camera.half_diagonal:
         raise ArgumentError("the lens is far from every lens that the division model can describe")
     return best
 

@@ -28,8 +28,8 @@ from rdstitch.compositing.survey import Survey, SurveyTile
 
 _NODES = 7  # along each side of a picture
 # Pictures are compared by the means of cells: so many along a picture that is not cut off.
-_CELLS, _MOST_CELLS = 16, 150_000  # along a side of an overlap, and of all overlaps together
-_DARKEST = 0.02
+_CELLS, _MAX_CELLS = 16, 150_000  # along a side of an overlap, and of all overlaps together
+_MIN_BRIGHTNESS = 0.02
 # How well the means of a cell agree, log units, where nothing but light differs; what differs by more counts less.
 _CELL_SIGMA, _HUBER = 0.03, 1.345
 _ROUNDS = 5
@@ -41,7 +41,7 @@ _RISE_SIGMA, _BEND_SIGMA = 0.1, 0.5
 # From here on, as a share of the full range, brightened samples are compressed instead of clipped.
 _KNEE = 0.75
 # Of a picture, and of all together.
-_MEDIAN_SAMPLES, _MOST_MEDIAN_SAMPLES, _MEDIAN_ROUNDS = 2000, 400_000, 4
+_MEDIAN_SAMPLES, _MAX_MEDIAN_SAMPLES, _MEDIAN_ROUNDS = 2000, 400_000, 4
 
 
 def estimate_exposure(
@@ -102,12 +102,12 @@ def _compare(survey: Survey, exposure: Exposure) -> _Cells | None:
         side = max(2, round(max(*seen.shape, *a.inside.shape, *b.inside.shape) / _CELLS))
         pixels, x, y = _cell_means(seen, box, side)
         means = [_cell_values(tile, box, seen, side, pixels) for tile in (a, b)]
-        good = (pixels > side**2 / 2) & (np.minimum(*means).min(axis=-1) > _DARKEST)
+        good = (pixels > side**2 / 2) & (np.minimum(*means).min(axis=-1) > _MIN_BRIGHTNESS)
         values = [np.log(mean[good] + exposure.offset) for mean in means]
         found.append((x[good], y[good], values[0] - values[1]))
     which = np.repeat(np.arange(len(pairs)), [len(entry[0]) for entry in found])
     # Of thousands of overlaps, each needs fewer.
-    few = np.s_[:: max(1, -(-len(which) // _MOST_CELLS))]
+    few = np.s_[:: max(1, -(-len(which) // _MAX_CELLS))]
     if not len(which):
         return None
     x, y, difference = (np.concatenate([entry[k] for entry in found])[few] for k in range(3))
@@ -215,7 +215,7 @@ def _field_prior(sigma: float) -> tuple[sparse.csr_array, sparse.csr_array]:
 def _with_median_kept(exposure: Exposure, survey: Survey, cameras: Sequence[Camera]) -> Exposure:
     """Gains with a common factor that leaves the median of all samples where it was."""
     values, logs = [], []
-    limit = min(_MEDIAN_SAMPLES, max(1, _MOST_MEDIAN_SAMPLES // len(cameras)))
+    limit = min(_MEDIAN_SAMPLES, max(1, _MAX_MEDIAN_SAMPLES // len(cameras)))
     for index, tile in enumerate(survey.tiles):
         if tile is None:
             continue

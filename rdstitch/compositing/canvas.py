@@ -22,8 +22,8 @@ from rdstitch.radial_homography import to_plane
 
 # Straight sides are curved after undistortion: 64 points a side put the extremes within 0.02 pixels on 4000 pixels.
 _POINTS_PER_SIDE = 64
-_LARGEST_GROWTH = 100.0
-_LARGEST_ENLARGEMENT = 400.0  # pixels of the canvas for each of the pictures, where --scale requests it
+_MAX_GROWTH = 100.0
+_MAX_ENLARGEMENT = 400.0  # pixels of the canvas for each of the pictures, where --scale requests it
 
 
 @dataclass(frozen=True)
@@ -242,16 +242,16 @@ def _refuse_absurd(
     pixels = [c.image_size[0] * c.image_size[1] * scale**2 for c in cameras]
     for outline, own, name in zip(outlines, pixels, names, strict=True):
         growth = float(np.prod(np.ptp(outline, axis=0))) / own
-        if growth > _LARGEST_GROWTH:
+        if growth > _MAX_GROWTH:
             raise LimitError(
                 f"{name}: would be stretched to {growth:.0f} times its size (near the horizon, or wrongly placed); "
                 "leave it out, or choose another reference picture"
             )
-    if float(np.prod(extent)) > _LARGEST_GROWTH * sum(pixels):
+    if float(np.prod(extent)) > _MAX_GROWTH * sum(pixels):
         middle = np.median([outline.mean(axis=0) for outline in outlines], axis=0)
         farthest = int(np.argmax([np.linalg.norm(outline.mean(axis=0) - middle) for outline in outlines]))
         raise LimitError(
-            f"the canvas would have {extent[0]:.0f} x {extent[1]:.0f} pixels, over {_LARGEST_GROWTH:.0f} times all "
+            f"the canvas would have {extent[0]:.0f} x {extent[1]:.0f} pixels, over {_MAX_GROWTH:.0f} times all "
             f"pictures; {names[farthest]} lies farthest off: leave it out"
         )
 
@@ -259,5 +259,5 @@ def _refuse_absurd(
 def refuse_scale(cameras: Sequence[Camera], extent: FloatArray) -> None:
     """Refuse a scale that leaves nothing of the pictures, or blows them up beyond all sense."""
     pixels = sum(c.image_size[0] * c.image_size[1] for c in cameras)
-    if float(extent.min()) < 1.0 or float(np.prod(extent)) > _LARGEST_ENLARGEMENT * pixels:
+    if float(extent.min()) < 1.0 or float(np.prod(extent)) > _MAX_ENLARGEMENT * pixels:
         raise LimitError(f"the canvas would have {extent[0]:.3g} x {extent[1]:.3g} pixels; use a --scale nearer to 1")

@@ -15,7 +15,7 @@ from rdstitch.compositing.warp import locate, plan_warps
 # Coverage is computed with this many pixels along the longer side of the canvas.
 _RESOLUTION = 1500
 # A rectangle that keeps less of what is covered is not worth cropping to.
-_LEAST_KEPT = 0.25
+_MIN_KEPT = 0.25
 
 
 def coverage_map(
@@ -60,7 +60,7 @@ def crop_box(covered: NDArray[np.bool_], factor: int, size: tuple[int, int]) -> 
     cells = whole[: rows * coarse, : columns * coarse].reshape(rows, coarse, columns, coarse).min(axis=(1, 3)) > 0
     x0, y0, x1, y1 = largest_rectangle(cells)
     kept = (x1 - x0) * (y1 - y0) * coarse**2 / max(1, int(covered.sum()))
-    if kept < _LEAST_KEPT:
+    if kept < _MIN_KEPT:
         return None, f"not cropped: the largest rectangle without holes would keep {100 * kept:.0f} % of the picture"
     unit = coarse * factor
     return (x0 * unit, y0 * unit, min(x1 * unit, size[0]), min(y1 * unit, size[1])), ""
@@ -83,7 +83,7 @@ def crop_rows(covered: NDArray[np.bool_], factor: int, size: tuple[int, int], wh
     # A reduced pixel stands for those around its centre: one row less on each side makes sure of all of them.
     first, last = first + (first > 0), last - (last < len(covered))
     kept = (last - first) * covered.shape[1] / max(1, int(covered.sum()))
-    if kept < _LEAST_KEPT:
+    if kept < _MIN_KEPT:
         return None, f"not cropped: the rows without holes would keep {max(0.0, 100 * kept):.0f} % of the picture"
     return (whole[0], int(first) * factor, whole[2], min(int(last) * factor, size[1])), ""
 

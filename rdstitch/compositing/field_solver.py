@@ -15,7 +15,7 @@ from scipy.sparse.linalg import splu
 from rdstitch.arrays import FloatArray
 
 # Energy norm of the error, as a share of that of the solution: far below a grey level.
-_TOLERANCE, _MOST_STEPS = 1e-8, 3000
+_TOLERANCE, _MAX_STEPS = 1e-8, 3000
 _DEGREE = 2
 _ROWS = 10_000  # of the design that are taken at a time
 
@@ -83,7 +83,7 @@ def _conjugate_gradients(
     direction = better = precondition(left)
     enough = _TOLERANCE**2 * _dots(right, precondition(right))
     error = _dots(left, better)
-    for _ in range(_MOST_STEPS):
+    for _ in range(_MAX_STEPS):
         # Columns that are done stand still.
         going = error > enough
         if not going.any():

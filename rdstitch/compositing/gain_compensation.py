@@ -25,8 +25,8 @@ from rdstitch.compositing.survey import Survey, SurveyTile
 _SRGB_OFFSET = 0.055
 # Samples outside this part of the range are clipped or mostly noise.
 _DARKEST, _BRIGHTEST = 0.02, 0.97
-_SAMPLES_PER_PAIR, _LARGEST_SAMPLES = 800, 200_000
-_FEWEST_SAMPLES = 30
+_SAMPLES_PER_PAIR, _MAX_SAMPLES = 800, 200_000
+_MIN_SAMPLES = 30
 # How well two pictures' brightness can agree, and how far gains stray (log units): keeps long chains from drifting.
 _PAIR_SIGMA, _GAIN_SIGMA = 0.02, 0.5
 # The same where the camera has written its exposure down: tone curves and apertures are not exact.
@@ -37,7 +37,7 @@ _VIGNETTING_SIGMA, _VIGNETTING_RANGE = 1.0, (0.15, 1.25)
 _HUBER = 1.345
 _ROUNDS = 6
 # A model with more freedom must explain the data better by this share to be taken.
-_WORTHWHILE = 0.02
+_MIN_RELATIVE_GAIN = 0.02
 
 
 def estimate_gains(survey: Survey, pictures: Sequence[PlacedPicture]) -> Exposure:
@@ -101,7 +101,7 @@ class _Samples:
 def _collect(survey: Survey, cameras: Sequence[Camera]) -> _Samples | None:
     """Samples from every pair of overlapping pictures, evenly spread."""
     pairs = overlapping_pairs([None if tile is None else tile.box for tile in survey.tiles]).tolist()
-    limit = max(_FEWEST_SAMPLES, min(_SAMPLES_PER_PAIR, _LARGEST_SAMPLES // max(1, len(pairs))))
+    limit = max(_MIN_SAMPLES, min(_SAMPLES_PER_PAIR, _MAX_SAMPLES // max(1, len(pairs))))
     found: list[tuple[Any, ...]] = []
     for i, j in pairs:
         a, b = survey.tiles[i], survey.tiles[j]
@@ -111,7 +111,7 @@ def _collect(survey: Survey, cameras: Sequence[Camera]) -> _Samples | None:
         assert box is not None
         inside = cut(a.inside, a.box, box) & cut(b.inside, b.box, box)
         where = np.flatnonzero(inside)
-        if len(where) < _FEWEST_SAMPLES:
+        if len(where) < _MIN_SAMPLES:
             continue
         where = where[:: max(1, len(where) // limit)]
         va, vb = (_values(tile, box, where) for tile in (a, b))
@@ -119,7 +119,7 @@ def _collect(survey: Survey, cameras: Sequence[Camera]) -> _Samples | None:
         if a.pixels.dtype.kind != "u":
             usable = ((va > 0) & (vb > 0)).all(axis=1)
         where, va, vb = where[usable], va[usable], vb[usable]
-        if len(where) < _FEWEST_SAMPLES:
+        if len(where) < _MIN_SAMPLES:
             continue
         y, x = (index.astype(np.float64) for index in np.unravel_index(where, inside.shape))
         pa, pb = (survey.warps[k].source_points(x + box[0], y + box[1]) for k in (i, j))
@@ -143,7 +143,7 @@ def _values(tile: SurveyTile, box: Box, where: NDArray[np.intp]) -> FloatArray:
 def _fit_light(samples: _Samples, offset: float, prior: tuple[FloatArray, FloatArray]) -> Exposure:
     """Gains, and vignetting where it explains the data better."""
     gains, vignetted = (_fit(samples, offset, prior, vignetting) for vignetting in (False, True))
-    return vignetted if vignetted.rms_after < (1.0 - _WORTHWHILE) * gains.rms_after else gains
+    return vignetted if vignetted.rms_after < (1.0 - _MIN_RELATIVE_GAIN) * gains.rms_after else gains
 
 
 def _fit(samples: _Samples, offset: float, prior: tuple[FloatArray, FloatArray], vignetting: bool) -> Exposure:

@@ -11,10 +11,10 @@ from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import Box
 
 # All of them in ordinary folders; a survey with 70 and 50 % of overlap has about 20.
-_MOST_NEIGHBOURS = 40
+_MAX_NEIGHBOURS = 40
 
 
-def overlapping_pairs(boxes: Sequence[Box | None], most: int = _MOST_NEIGHBOURS) -> NDArray[np.intp]:
+def overlapping_pairs(boxes: Sequence[Box | None], most: int = _MAX_NEIGHBOURS) -> NDArray[np.intp]:
     """Pairs of boxes that have pixels in common.
 
     Parameters

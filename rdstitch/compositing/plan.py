@@ -16,8 +16,8 @@ from rdstitch.process_memory import memory_left
 # What the compositor takes at most by default; more memory means that fewer pictures are read twice.
 DEFAULT_MEMORY = 256 * 2**20
 _TILE_SIZES = (512, 256)
-_MOST_WORKERS = 4
-_MOST_BANDS = 4
+_MAX_WORKERS = 4
+_MAX_BANDS = 4
 # Arrays of the size of a tile with its margin that live at one time (float32): samples and sums of the pyramids in each
 # channel, and coordinates, weights, owners.
 _LIVE_PER_CHANNEL, _LIVE_PLANES, _LIVE_STRIPS = 5.0, 12.0, 4.5
@@ -86,7 +86,7 @@ def plan_composite(
     limit = options.max_memory or min(DEFAULT_MEMORY, memory_left(len(cameras)))
     picture = max(c.image_size[0] * c.image_size[1] for c in cameras) * channels * itemsize
     # While a picture is decoded it is there twice, beside those in the cache.
-    workers = options.workers or min(_MOST_WORKERS, os.cpu_count() or 1)
+    workers = options.workers or min(_MAX_WORKERS, os.cpu_count() or 1)
     choices = [(side, count) for side in _sides(options) for count in range(workers, 0, -1)]
     needs = {
         choice: 2 * picture + _working_set(canvas, *choice, bands, options, channels, itemsize) for choice in choices
@@ -116,7 +116,7 @@ def plan_composite(
 def usual_bands(cameras: Sequence[Camera]) -> int:
     """Bands that suit the smallest picture: the widest transition is a few per cent of its side."""
     side = min(min(c.image_size) for c in cameras)
-    return int(np.clip(np.log2(max(side, 1)) - 4.5, 1, _MOST_BANDS))
+    return int(np.clip(np.log2(max(side, 1)) - 4.5, 1, _MAX_BANDS))
 
 
 def _sides(options: CompositeOptions) -> tuple[int, ...]:

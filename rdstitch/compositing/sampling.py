@@ -14,7 +14,7 @@ INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos"
 
 # OpenCV resamples from no side as long as this, pixels.
 _TOO_LONG = 32767
-_LEAST_WEIGHT = np.float32(1e-6)
+_MIN_WEIGHT = np.float32(1e-6)
 
 
 def read_part(geometry: Geometry) -> Box:
@@ -34,7 +34,7 @@ def border_weight(geometry: Geometry) -> Float32Array:
     down = (map_y + half) * np.float32(2.0 / height) - one
     weight *= one - np.abs(down, out=down)
     # Never 0 inside: a border pixels that one picture alone covers must not get lost.
-    np.maximum(weight, _LEAST_WEIGHT, out=weight)
+    np.maximum(weight, _MIN_WEIGHT, out=weight)
     weight[~geometry.inside] = 0.0
     return weight
 

@@ -23,10 +23,10 @@ from rdstitch.io.reduction import block_mean
 NO_OWNER = -1
 
 # Band in which a seam may wander: the new picture's share of both border weights.
-_LEAST_SHARE, _LARGEST_SHARE = 0.2, 0.8
+_MIN_SHARE, _MAX_SHARE = 0.2, 0.8
 _AROUND_FREE = 2
 # pixels from which on a cut is found at half the size first, and by how much it may then move.
-_LARGEST_CUT = 30_000
+_MAX_CUT = 30_000
 _MOVED = 3
 
 
@@ -146,8 +146,8 @@ def _cut(
     """
     both = inside & covered
     alone: NDArray[np.bool_] = inside & ~covered
-    free = both & (share > _LEAST_SHARE) & (share < _LARGEST_SHARE)
-    surely_new: NDArray[np.bool_] = alone | (both & (share >= _LARGEST_SHARE))
+    free = both & (share > _MIN_SHARE) & (share < _MAX_SHARE)
+    surely_new: NDArray[np.bool_] = alone | (both & (share >= _MAX_SHARE))
     surely_old = covered & ~(surely_new | free)
     if not free.any():
         return surely_new
@@ -188,7 +188,7 @@ def _graph_cut(images: list[Float32Array], masks: list[NDArray[np.uint8]]) -> ND
 
     A large cut is found at half the size first, and then only moved by a few pixels.
     """
-    if masks[0].size > _LARGEST_CUT:
+    if masks[0].size > _MAX_CUT:
         masks = _near_cut(_graph_cut([_halved(i) for i in images], [m[::2, ::2] for m in masks]), masks)
     won = masks[1] > 0
     free = won & (masks[0] > 0)

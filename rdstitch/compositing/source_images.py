@@ -27,7 +27,7 @@ KERNEL_MARGIN = 8
 # Pixels read for one of the output, at least: a Gaussian needs nearly two to smooth them.
 _PIXELS_PER_OUTPUT_PIXEL = 1.9
 # Largest reduction at which previews are read, a power of two.
-_LARGEST_PREVIEW = 8
+_MAX_PREVIEW = 8
 # Share of the pixels below which a part is cut out.
 _WORTH_CUTTING = 0.8
 
@@ -206,7 +206,7 @@ class PictureReader:
         return self._masked[index]
 
     def _read_small(self, index: int) -> None:
-        self(index, 1 if self._pictures[index].preview is None else _LARGEST_PREVIEW)
+        self(index, 1 if self._pictures[index].preview is None else _MAX_PREVIEW)
 
     @property
     def samples(self) -> tuple[int, np.dtype[Any]]:

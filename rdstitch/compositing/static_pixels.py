@@ -12,22 +12,22 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray
 
-LEAST_PICTURES = 4
+MIN_PICTURES = 4
 """Fewer may show the same by chance."""
 
 _BLACK = 0.02
 """Of the brightest sample, up to which a pixel is black."""
 
-_LEAST_AREA = 0.005
+_MIN_AREA = 0.005
 """Of the picture, for a region to count."""
 
-_MOST_AREA = 0.6
+_MAX_AREA = 0.6
 """Of the picture: where more than this seems to stay, the pictures differ too little to say."""
 
 _STAYS = 0.5
 """Agreement of the corners of the pictures: 1 for what stays, about 0 for what moves."""
 
-_LEAST_TEXTURE = 0.1
+_MIN_TEXTURE = 0.1
 """Of what is usual in the pictures, for corners to count."""
 
 _WINDOW = 0.05
@@ -40,7 +40,7 @@ def static_pixels(pictures: Sequence[NDArray[np.generic]]) -> BoolArray | None:
     Parameters
     ----------
     pictures : sequence of ndarray of shape (h, w) or (h, w, C)
-        At least :data:`LEAST_PICTURES` of one camera that moved between them, some hundred pixels wide.
+        At least :data:`MIN_PICTURES` of one camera that moved between them, some hundred pixels wide.
 
     Returns
     -------
@@ -56,7 +56,7 @@ def static_pixels(pictures: Sequence[NDArray[np.generic]]) -> BoolArray | None:
     closed = cv2.morphologyEx((_agreement(grey, window) > _STAYS).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
     static = black | _regions(cv2.morphologyEx(closed, cv2.MORPH_OPEN, kernel) > 0, at_border=False)
     share = float(static.mean())
-    return static if _LEAST_AREA < share < _MOST_AREA else None
+    return static if _MIN_AREA < share < _MAX_AREA else None
 
 
 def _grey(picture: NDArray[np.generic]) -> NDArray[np.float32]:
@@ -74,7 +74,7 @@ def _agreement(grey: NDArray[np.float32], window: int) -> FloatArray:
     # Products of the slopes of one picture with those of all others, against those with its own.
     others = (_tensor(total) - own) / (len(grey) - 1)
     corners, common = (_smaller_eigenvalue(tensor, window) for tensor in (own, others))
-    agreement: FloatArray = common / np.maximum(corners, _LEAST_TEXTURE * float(np.median(corners)) + 1e-12)
+    agreement: FloatArray = common / np.maximum(corners, _MIN_TEXTURE * float(np.median(corners)) + 1e-12)
     return agreement
 
 
@@ -96,7 +96,7 @@ def _regions(found: NDArray[np.bool_], *, at_border: bool) -> NDArray[np.bool_]:
     large = [
         k
         for k in range(1, count)
-        if stats[k, cv2.CC_STAT_AREA] >= _LEAST_AREA * found.size and (not at_border or k in border)
+        if stats[k, cv2.CC_STAT_AREA] >= _MIN_AREA * found.size and (not at_border or k in border)
     ]
     kept = np.isin(labels, large).astype(np.uint8)
     return np.asarray(cv2.dilate(kept, np.ones((5, 5), dtype=np.uint8)), dtype=np.bool_)

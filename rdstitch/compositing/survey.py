@@ -16,8 +16,8 @@ from rdstitch.compositing.sampling import border_weight, sample, sample_opacity
 from rdstitch.compositing.source_images import PictureReader
 from rdstitch.compositing.warp import Geometry, Warp, locate, plan_warps
 
-_LARGEST_PICTURE = 150_000
-_LARGEST_TOTAL = 16_000_000
+_MAX_PICTURE = 150_000
+_MAX_TOTAL = 16_000_000
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def survey_factor(canvas: Canvas) -> int:
     """Reduction at which all pictures together fit easily into memory, a power of two."""
     areas = canvas.areas()
     factor = 1
-    while max(areas) > _LARGEST_PICTURE * factor**2 or sum(areas) > _LARGEST_TOTAL * factor**2:
+    while max(areas) > _MAX_PICTURE * factor**2 or sum(areas) > _MAX_TOTAL * factor**2:
         factor *= 2
     return factor
 

@@ -22,11 +22,11 @@ from rdstitch.progress import Progress, silent
 
 _GLANCE = FeatureOptions(max_features=500, work_megapixels=None)
 _MEGAPIXELS = 0.3  # of the versions that are examined
-_ALL_PAIRS = 24  # pictures of which every pair is compared; of more, those up to three apart
-_APART = 3
+_EXHAUSTIVE_UP_TO = 24  # pictures of which every pair is compared; of more, those up to three apart
+_MAX_SEQUENCE_GAP = 3
 _BLURRED = 0.6  # of the median sharpness
 _DARK, _BURNT = 0.06, 0.05  # mean brightness; share of burnt-out pixels
-_LEAST_OVERLAP = 0.3
+_MIN_OVERLAP = 0.3
 _ZOOMED = 1.03  # ratio of focal lengths by EXIF
 # Bytes, fitted to the sets of python -m tests.benchmarks.doctor: interpreter and libraries, detection in each thread,
 # features and matches of a picture, and of the compositor for each byte of the mosaic.
@@ -135,7 +135,7 @@ def _conclude(
 def _overlaps(features: Sequence[Features]) -> dict[tuple[int, int], float]:
     """Share of overlap of the pairs that are compared: all of a few pictures, neighbours of many."""
     count = len(features)
-    reach = count if count <= _ALL_PAIRS else _APART
+    reach = count if count <= _EXHAUSTIVE_UP_TO else _MAX_SEQUENCE_GAP
     pairs = [(i, j) for i in range(count) for j in range(i + 1, min(i + reach + 1, count))]
     return {(i, j): overlap_of(features[i], features[j]) for i, j in pairs}
 
@@ -212,7 +212,7 @@ def _advice(
         advice.append("the lens was zoomed between the pictures: stitch those of one zoom on their own")
     if unreadable:
         advice.append(f"{len(unreadable)} file{'s' * (len(unreadable) != 1)} cannot be read: {unreadable[0]}")
-    if overlap is not None and overlap < _LEAST_OVERLAP:
+    if overlap is not None and overlap < _MIN_OVERLAP:
         advice.append(f"pictures overlap by about {overlap:.0%} only: take more pictures, a third is the least")
     if overlap is not None and alone:
         named = ", ".join(alone[:3]) + ", …" * (len(alone) > 3)

@@ -11,8 +11,8 @@ from rdstitch.features import Features, match
 from rdstitch.io.read import Picture
 
 _SAMPLES = 200  # minimal samples of a pair
-_REACH = 0.05  # of the diagonal: error of a similarity that stands for distortion and perspective
-_LEAST_SUPPORT = 8  # matches beyond the two that define it; chance gives about one in 50
+_THRESHOLD = 0.05  # of the diagonal: error of a similarity that stands for distortion and perspective
+_MIN_SUPPORT = 8  # matches beyond the two that define it; chance gives about one in 50
 _GRID = 24  # points a side by which an overlap is measured
 
 
@@ -62,24 +62,24 @@ def overlap_of(features1: Features, features2: Features, seed: int = 0) -> float
     """
     found = match(features1, features2)
     size1, size2 = features1.image_size, features2.image_size
-    if len(found) < _LEAST_SUPPORT + 2 or size1 is None or size2 is None:
+    if len(found) < _MIN_SUPPORT + 2 or size1 is None or size2 is None:
         return 0.0
     # As complex numbers, a similarity is z2 = a z1 + b.
     z1, z2 = (points @ np.array([1.0, 1.0j]) for points in (found.points1, found.points2))
     rng = np.random.default_rng(seed)
     i, j = rng.integers(0, len(z1), (2, _SAMPLES))
-    apart = np.abs(z1[i] - z1[j]) > _REACH * np.hypot(*size1)
+    apart = np.abs(z1[i] - z1[j]) > _THRESHOLD * np.hypot(*size1)
     i, j = i[apart], j[apart]
     if not len(i):
         return 0.0
     a = (z2[i] - z2[j]) / (z1[i] - z1[j])
     b = z2[i] - a * z1[i]
     off = np.abs(a[:, None] * z1 + b[:, None] - z2)
-    support = (off < _REACH * np.hypot(*size2)).sum(axis=1)
+    support = (off < _THRESHOLD * np.hypot(*size2)).sum(axis=1)
     # Zooms of more than two are no neighbours of a row.
     support[(np.abs(a) < 0.5) | (np.abs(a) > 2.0)] = 0
     best = int(np.argmax(support))
-    if support[best] < _LEAST_SUPPORT + 2:
+    if support[best] < _MIN_SUPPORT + 2:
         return 0.0
     return _share(a[best], b[best], size1, size2)
 

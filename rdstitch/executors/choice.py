@@ -7,7 +7,7 @@ from pathlib import Path
 from rdstitch.executors.dask_cluster import DaskExecutor
 from rdstitch.executors.processes import ProcessExecutor
 
-_MANY = 60
+_PROCESSES_FROM = 60
 """Pictures from which on it pays to start worker processes, each of which takes a second to begin with. Threads share
 the interpreter, which matching and estimation keep busy."""
 
@@ -27,6 +27,6 @@ def open_executor(workers: int, pictures: int, *, scheduler: str | None = None, 
     """
     if scheduler is not None:
         return DaskExecutor(scheduler, workers, store)
-    if workers > 1 and pictures >= _MANY and sys.executable:
+    if workers > 1 and pictures >= _PROCESSES_FROM and sys.executable:
         return ProcessExecutor(workers)
     return ThreadPoolExecutor(workers)

@@ -8,7 +8,7 @@ from typing import TypeVar
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-_AHEAD = 256  # tasks that have been submitted and whose results were not taken: enough for that many workers
+_MAX_PENDING = 256  # tasks that have been submitted and whose results were not taken: enough for that many workers
 
 
 def in_order(executor: Executor, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
@@ -30,7 +30,7 @@ def in_order(executor: Executor, function: Callable[[Task], Result], tasks: Iter
     try:
         for task in tasks:
             under_way.append(executor.submit(function, task))
-            if len(under_way) >= _AHEAD:
+            if len(under_way) >= _MAX_PENDING:
                 yield under_way.popleft().result()
         while under_way:
             yield under_way.popleft().result()

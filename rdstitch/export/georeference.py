@@ -18,10 +18,10 @@ from rdstitch.io.metadata import GpsPosition
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.radial_homography import to_plane
 
-_FEWEST_POSITIONS = 3
+_MIN_POSITIONS = 3
 # Positions must agree with the picture to this share of their own spread: else it is no view from above, or the GPS
 # says less than nothing.
-_LARGEST_ERROR = 0.25
+_MAX_ERROR = 0.25
 _AXIS, _FLATTENING, _SCALE = 6378137.0, 1 / 298.257223563, 0.9996
 _FALSE_EASTING, _FALSE_NORTHING = 500_000.0, 10_000_000.0
 _MODEL_TRANSFORMATION, _GEO_KEYS = 34264, 34735
@@ -105,7 +105,7 @@ def world_file_paths(picture: str | Path) -> tuple[Path, ...]:
 
 def has_place(positions: Sequence[GpsPosition | None]) -> bool:
     """Whether enough pictures have a position for a place to be expected."""
-    return sum(position is not None for position in positions) >= _FEWEST_POSITIONS
+    return sum(position is not None for position in positions) >= _MIN_POSITIONS
 
 
 def georeference(
@@ -139,7 +139,7 @@ def georeference(
     spread = math.sqrt(float(np.mean(np.abs(there) ** 2)))
     scale = complex(np.vdot(here, there) / max(float(np.vdot(here, here).real), 1e-12))
     error = math.sqrt(float(np.mean(np.abs(there - scale * here) ** 2)))
-    if not error < _LARGEST_ERROR * spread:
+    if not error < _MAX_ERROR * spread:
         return None, f"not georeferenced: the GPS positions are {error:.1f} m off, and spread over {spread:.1f} m only"
     return Georeference(zone, scale, complex(places.mean() - scale * middles.mean()), error), ""
 

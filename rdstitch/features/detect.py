@@ -18,7 +18,7 @@ __all__ = ["KINDS", "FeatureOptions", "Features", "View", "ViewLoader", "detect"
 ViewLoader = Callable[[float | None], View]
 """Loads one picture when it is called with the 10⁶ pixels that are needed of it; None: all. More pixels may come."""
 
-_FEW = 0.5  # of the keypoints wanted: where a reduced picture shows fewer, a larger one is used
+_MIN_KEYPOINT_SHARE = 0.5  # of the keypoints wanted: where a reduced picture shows fewer, a larger one is used
 
 
 def detect(image: PixelArray, options: FeatureOptions | None = None, mask: Mask | None = None) -> Features:
@@ -71,7 +71,7 @@ def _detect(source: ViewLoader, options: FeatureOptions) -> Features:
     """The same for a picture that is loaded as large as it is needed."""
     most, megapixels = options.limits
     picture, detection, usable = _look(source, options, megapixels)
-    if megapixels is not None and picture.reduced and len(usable) < _FEW * most:
+    if megapixels is not None and picture.reduced and len(usable) < _MIN_KEYPOINT_SHARE * most:
         picture, detection, usable = _look(source, options, CLOSER * megapixels)
     points, response = detection.points[usable], detection.response[usable]
     if options.spread:

@@ -17,7 +17,7 @@ Grey = NDArray[np.uint8]
 
 _ROOTSIFT_NORM = 512.0
 # Side in pixels below which some detectors raise, and none finds a thing.
-_SMALLEST_PICTURE = 16
+_MIN_PICTURE = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class OpenCVDetection:
     def find(cls, grey: Grey, options: FeatureOptions) -> Self:
         """Find keypoints; see :func:`create_detector` for errors."""
         detector = create_detector(options)
-        keypoints = detector.detect(grey, None) if min(grey.shape) >= _SMALLEST_PICTURE else ()
+        keypoints = detector.detect(grey, None) if min(grey.shape) >= _MIN_PICTURE else ()
         table = _table(keypoints, "size", "angle", "octave", "response")
         # OpenCV promises no order: sort, so that the choice among equals is the same everywhere.
         order = np.lexsort(table.T)

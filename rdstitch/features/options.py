@@ -16,7 +16,7 @@ CLOSER = 4.0
 
 _BUDGET = 8
 """Pictures of a large set whose pixels and keypoints fewer pictures may share among them."""
-_MOST_PIXELS, _MOST_FEATURES = 4.0, 2.0
+_MAX_PIXELS, _MAX_FEATURES = 4.0, 2.0
 """Times as many pixels, and keypoints, that a picture of a small set gets at most: keypoints beyond the strongest 4,000
 made λ of single pairs of a flight less certain, not more."""
 
@@ -124,8 +124,8 @@ class FeatureOptions:
         share = max(_BUDGET / max(count, 1), 1.0)
         return replace(
             self,
-            max_features=self.max_features or round(MAX_FEATURES * min(share, _MOST_FEATURES)),
-            work_megapixels=WORK_MEGAPIXELS * min(share, _MOST_PIXELS)
+            max_features=self.max_features or round(MAX_FEATURES * min(share, _MAX_FEATURES)),
+            work_megapixels=WORK_MEGAPIXELS * min(share, _MAX_PIXELS)
             if self.work_megapixels == "auto"
             else self.work_megapixels,
         )

@@ -10,11 +10,11 @@ from rdstitch.features.correspondences import Correspondences
 from rdstitch.features.keypoints import Features
 from rdstitch.features.match import Matcher
 
-_ENOUGH, _MOST = 50, 300  # matches that an overlap takes at least, and that are used at most
+_MIN_MATCHES, _MAX_MATCHES = 50, 300  # matches that an overlap takes at least, and that are used at most
 _SUPPORTING_NEIGHBOURS = 6  # other matches that a right one has near it, in both pictures
-_NEAR = 0.2  # how near, diagonals of a picture
+_NEIGHBOURHOOD = 0.2  # how near, diagonals of a picture
 _STRAY = 8  # matches without such company that chance explains; more may be of a part with little texture
-_LEAST_REACH, _REACH = 0.12, 2.0  # how far an overlap goes on beside a match: diagonals, times the way to its company
+_MIN_REACH, _REACH = 0.12, 2.0  # how far an overlap goes on beside a match: diagonals, times the way to its company
 _CELLS = 24  # a side, by which places are distinguished
 
 Part = NDArray[np.intp]
@@ -39,16 +39,16 @@ def overlapping(features1: Features, features2: Features, matches: Correspondenc
         None where the matches are too few or too scattered.
     """
     size1, size2 = features1.image_size, features2.image_size
-    if len(matches) < _ENOUGH or size1 is None or size2 is None:
+    if len(matches) < _MIN_MATCHES or size1 is None or size2 is None:
         return None
-    points1, points2 = matches.points1[:_MOST], matches.points2[:_MOST]
+    points1, points2 = matches.points1[:_MAX_MATCHES], matches.points2[:_MAX_MATCHES]
     apart = np.maximum(_distances(points1, points1, size1), _distances(points2, points2, size2))
     # Each is the first in its own company.
     company = np.partition(apart, _SUPPORTING_NEIGHBOURS, axis=1)[:, _SUPPORTING_NEIGHBOURS]
-    right = company <= _NEAR
+    right = company <= _NEIGHBOURHOOD
     if np.count_nonzero(~right) > _STRAY:
         return None
-    reach = np.maximum(_LEAST_REACH, _REACH * company[right])
+    reach = np.maximum(_MIN_REACH, _REACH * company[right])
     return _around(features1, size1, points1[right], reach), _around(features2, size2, points2[right], reach)
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rdstitch.features.keypoints import Descriptors, Features
 
-_LARGEST_HALF = 60000.0  # half precision ends a little above
+_MAX_HALF = 60000.0  # half precision ends a little above
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,5 +52,5 @@ def _smallest(descriptors: Descriptors) -> NDArray[Any]:
         integers = descriptors.astype(np.uint8)
         if np.array_equal(integers, descriptors):
             return integers
-    half = np.abs(descriptors).max() <= _LARGEST_HALF
+    half = np.abs(descriptors).max() <= _MAX_HALF
     return descriptors.astype(np.float16 if half else np.float32)

@@ -13,7 +13,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.features.keypoints import Descriptors
 
 # |a|² + |b|² and 2 a·b then stay below 2²³, where float32 still knows halves.
-_LARGEST_NORM = 1024.0
+_MAX_NORM = 1024.0
 
 
 class Similarity(Protocol):
@@ -57,7 +57,7 @@ class Euclidean:
         norms = (float(np.linalg.norm(d, axis=1).max(initial=0.0)) for d in (descriptors1, descriptors2))
         largest = max(norms)
         # A power of two, so that integers stay integers.
-        scale = np.float32(2.0 ** np.floor(np.log2(_LARGEST_NORM / largest)) if largest > 0 else 1.0)
+        scale = np.float32(2.0 ** np.floor(np.log2(_MAX_NORM / largest)) if largest > 0 else 1.0)
         a, b = np.rint(descriptors1 * scale), np.rint(descriptors2 * scale)
         half_a, half_b = (np.einsum("ij,ij->i", v, v)[:, None] / np.float32(2.0) for v in (a, b))
         self._left = np.hstack([a, np.ones_like(half_a), -half_a])

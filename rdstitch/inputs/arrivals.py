@@ -14,9 +14,9 @@ from rdstitch.inputs.find import is_rdstitch_output, natural_key, pictures_in
 from rdstitch.inputs.frame import Frame, Named, array_as_picture
 from rdstitch.io.video import VIDEO_SUFFIXES, write_frame
 
-_POLL = 0.2  # seconds between two looks at a folder
-_SETTLED = 1.0  # seconds after its last change from which on a file counts as complete
-_WAITING = 256  # names that are read ahead
+_POLL_SECONDS = 0.2  # seconds between two looks at a folder
+_COMPLETE_AFTER_SECONDS = 1.0  # seconds after its last change from which on a file counts as complete
+_MAX_PENDING = 256  # names that are read ahead
 
 
 class Arrivals:
@@ -98,7 +98,7 @@ class Arrivals:
                     continue
                 grown = sizes.get(path) != status.st_size
                 sizes[path] = status.st_size
-                if status.st_size and (not grown or time.time() - status.st_mtime > _SETTLED):
+                if status.st_size and (not grown or time.time() - status.st_mtime > _COMPLETE_AFTER_SECONDS):
                     complete.append(path)
             for path in sorted(complete, key=natural_key):
                 done.add(path)
@@ -109,17 +109,17 @@ class Arrivals:
             if not complete:
                 if self._is_over(last):
                     return
-                time.sleep(_POLL)
+                time.sleep(_POLL_SECONDS)
 
     def _of_names(self) -> Iterator[Frame]:
         """The pictures whose names are read, by a thread that may wait for them."""
         assert self._names is not None
-        read: queue.Queue[str | None] = queue.Queue(_WAITING)
+        read: queue.Queue[str | None] = queue.Queue(_MAX_PENDING)
         threading.Thread(target=_read_lines, args=(self._names, read), daemon=True).start()
         while True:
             try:
                 # Not endlessly: an interrupt is noticed between two waits only on Windows.
-                name = read.get(timeout=_POLL if self._idle is None else self._idle)
+                name = read.get(timeout=_POLL_SECONDS if self._idle is None else self._idle)
             except queue.Empty:
                 if self._idle is None:
                     continue
@@ -144,7 +144,7 @@ class Arrivals:
                 if not capture.grab():
                     if not live or self._idle is None or self._is_over(last):
                         return
-                    time.sleep(_POLL)
+                    time.sleep(_POLL_SECONDS)
                     continue
                 last = time.monotonic()
                 stamp = time.time() if live else capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0

@@ -15,8 +15,8 @@ XMP = "xmp"
 """The value of ``attitude`` that stands for the pictures' own XMP."""
 
 _COLUMNS = ("name", "psi", "theta")
-_NAMED = 3  # pictures in a message
-_LARGEST_TILT = math.radians(80.0)  # beyond, hardly a picture shows ground, and more likely angles mean something else
+_MAX_NAMED = 3  # pictures in a message
+_MAX_TILT = math.radians(80.0)  # beyond, hardly a picture shows ground, and more likely angles mean something else
 
 
 def with_attitudes(sources: Sequence[Source], wanted: str | Path | None) -> list[Source]:
@@ -51,7 +51,7 @@ def _of_pictures(sources: Sequence[Source]) -> list[tuple[float, float]]:
             lacking.append(source.name)
             continue
         away = math.acos(nadir[2])
-        if away > _LARGEST_TILT:
+        if away > _MAX_TILT:
             raise InputError(
                 f"{source.path}: by its XMP the camera looks {math.degrees(away):.0f} degrees away from straight down; "
                 "give a CSV file if that is wrong"
@@ -59,8 +59,8 @@ def _of_pictures(sources: Sequence[Source]) -> list[tuple[float, float]]:
         psi, theta = tilt_from_normal(nadir).tolist()
         tilts.append((psi, theta))
     if lacking:
-        more = f" and {len(lacking) - _NAMED} more" if len(lacking) > _NAMED else ""
-        named = ", ".join(lacking[:_NAMED])
+        more = f" and {len(lacking) - _MAX_NAMED} more" if len(lacking) > _MAX_NAMED else ""
+        named = ", ".join(lacking[:_MAX_NAMED])
         raise InputError(f"{named}{more}: no attitude of the camera can be read from the XMP; give a CSV file instead")
     return tilts
 

@@ -5,7 +5,7 @@ from threading import Lock
 
 from rdstitch.io.read import Picture
 
-_ROOM = 32 * 2**20
+_CAPACITY = 32 * 2**20
 
 
 class DecodedImageCache:
@@ -19,7 +19,7 @@ class DecodedImageCache:
         Bytes.
     """
 
-    def __init__(self, room: int = _ROOM) -> None:
+    def __init__(self, room: int = _CAPACITY) -> None:
         self._room = room
         self._held: dict[Hashable, Picture] = {}
         self._lock = Lock()

@@ -19,7 +19,7 @@ from rdstitch.io.optional_readers import HEIF_SUFFIXES, RAW_SUFFIXES
 from rdstitch.io.staging import temporary_folder
 from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames, grey_frames
 from rdstitch.messages import Message, names_of, shortened
-from rdstitch.records import LARGEST_FILE, read_text
+from rdstitch.records import MAX_FILE, read_text
 from rdstitch.regular_files import read_limited
 from rdstitch.remote_files import is_url, remote_names
 
@@ -278,7 +278,7 @@ def _matching(pattern: str) -> list[Path]:
 def is_rdstitch_output(path: Path) -> bool:
     """Whether rdstitch wrote this picture: the sidecar beside it says so, and means this one."""
     try:
-        record = json.loads(read_limited(path.with_name(path.name + ".json"), LARGEST_FILE))
+        record = json.loads(read_limited(path.with_name(path.name + ".json"), MAX_FILE))
         return bool(record["format"] == "rdstitch sidecar" and record["output"]["file"] == path.name)
     except (OSError, ValueError, TypeError, LookupError, RecursionError):
         return False

@@ -11,7 +11,7 @@ from rdstitch.messages import Message
 from rdstitch.regular_files import open_regular
 from rdstitch.remote_files import is_url, remote_status
 
-_PIECE = 2**20
+_BLOCK_BYTES = 2**20
 _DIGITS = 16
 
 _Stamp = tuple[int, int, int, int]
@@ -119,7 +119,7 @@ def _checksum(path: Path) -> int:
     value = 0
     try:
         with open_regular(path) as stream:
-            while piece := stream.read(_PIECE):
+            while piece := stream.read(_BLOCK_BYTES):
                 value = zlib.crc32(piece, value)
     except OSError as error:
         raise InputError(f"{path}: cannot be read any more: {error.strerror}; run again") from error

@@ -23,7 +23,7 @@ _UNSEEN = 0.03  # share of a frame that none of the chosen ones around it need s
 _SIDE = 320  # pixels of the longer side that frames are tracked at
 _CORNERS, _QUALITY, _APART = 120, 0.01, 8.0
 _WINDOW = (15, 15)  # pixels, in which a corner is found again
-_FEWEST = 12  # corners that a motion is believed by
+_MIN_CORNERS = 12  # corners that a motion is believed by
 _AGREEING = 0.4  # share of the corners that must agree
 _ERROR = 0.02  # of a motion, in sides: lenses and tilts are not affine
 _STILL, _MOVED = 0.5, 3.0  # pixels: what stays in the picture, such as a robot's body, and what moves with the ground
@@ -175,7 +175,7 @@ class _Corners:
 
     def follow(self, picture: NDArray[np.uint8]) -> FloatArray | None:
         """The motion (3, 3) from the frame of the corners to the next one; None where it is not known."""
-        if picture.shape != self._last.shape or len(self._at) < _FEWEST:
+        if picture.shape != self._last.shape or len(self._at) < _MIN_CORNERS:
             return None
         at, status, _ = cv2.calcOpticalFlowPyrLK(
             self._last, picture, self._at, np.empty_like(self._at), winSize=_WINDOW
@@ -186,15 +186,19 @@ class _Corners:
         self._from, self._at = self._from[kept], at[kept]
         way = np.linalg.norm(self._at - self._from, axis=2)[:, 0]
         ground = np.ones(len(way), dtype=np.bool_)
-        if (way > _MOVED).sum() >= _FEWEST:
+        if (way > _MOVED).sum() >= _MIN_CORNERS:
             ground = way > _STILL
-        if ground.sum() < _FEWEST:
+        if ground.sum() < _MIN_CORNERS:
             return None
         side = max(picture.shape)
         motion, agree = cv2.estimateAffine2D(
             self._from[ground], self._at[ground], method=cv2.RANSAC, ransacReprojThreshold=_ERROR * side
         )
-        if motion is None or agree.sum() < max(_FEWEST, _AGREEING * len(agree)) or np.linalg.det(motion[:, :2]) <= 0.0:
+        if (
+            motion is None
+            or agree.sum() < max(_MIN_CORNERS, _AGREEING * len(agree))
+            or np.linalg.det(motion[:, :2]) <= 0.0
+        ):
             return None
         self.worn = bool(len(self._at) < _WORN * self._count or np.median(way) > _WORN * side / 2)
         return np.vstack([motion, [0.0, 0.0, 1.0]])

@@ -21,7 +21,7 @@ from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import read_image
 from rdstitch.io.reduction import halved, reduced_size
 
-LARGEST_TILE_PROFILE = 2**16
+MAX_TILE_PROFILE = 2**16
 """Bytes of a colour profile that is written into every tile; the larger ones of RGB pictures have 60 kB."""
 
 TILE, OVERLAP = 254, 1
@@ -82,7 +82,7 @@ def write_deep_zoom(description: Path, folder: Path, layout: Layout, strips: Ite
     """
     width, height = layout.size
     # The profile belongs to the pixels, and so into every tile; EXIF does not.
-    kept = layout.metadata.icc_profile if len(layout.metadata.icc_profile) <= LARGEST_TILE_PROFILE else b""
+    kept = layout.metadata.icc_profile if len(layout.metadata.icc_profile) <= MAX_TILE_PROFILE else b""
     profile = Metadata(layout.size, icc_profile=kept)
     eight = replace(layout, dtype=np.dtype(np.uint8), transparent=True, metadata=profile)
     largest = _levels(folder, eight)

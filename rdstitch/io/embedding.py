@@ -9,7 +9,7 @@ from rdstitch.io.metadata import Metadata
 _EXIF_HEADER = b"Exif\0\0"
 _XMP_HEADER = b"http://ns.adobe.com/xap/1.0/\0"
 _ICC_HEADER = b"ICC_PROFILE\0"
-_LARGEST_SEGMENT = 65533
+_MAX_SEGMENT = 65533
 _JFIF = 0xE0
 _METRES_PER_INCH = 0.0254
 
@@ -28,7 +28,7 @@ def embed_in_jpeg(head: bytes, metadata: Metadata) -> list[bytes]:
             jfif = jfif[:11] + struct.pack(">BHH", 1, *(round(d) for d in metadata.dpi)) + jfif[16:]
     exif = bare_exif(metadata)
     segments = [_segment(0xE1, _EXIF_HEADER + exif)] if exif else []
-    if metadata.xmp and len(metadata.xmp) + len(_XMP_HEADER) <= _LARGEST_SEGMENT:
+    if metadata.xmp and len(metadata.xmp) + len(_XMP_HEADER) <= _MAX_SEGMENT:
         segments.append(_segment(0xE1, _XMP_HEADER + metadata.xmp))
     return [head[:2], jfif, *segments, *_icc_segments(metadata.icc_profile), head[after_header:]]
 
@@ -53,7 +53,7 @@ def png_chunk(kind: bytes, body: bytes) -> bytes:
 def bare_exif(metadata: Metadata) -> bytes:
     """EXIF as a TIFF structure, without the header that JPEG puts before it; empty when too large."""
     exif = metadata.exif.removeprefix(_EXIF_HEADER)
-    return exif if len(exif) + len(_EXIF_HEADER) + 2 <= _LARGEST_SEGMENT else b""
+    return exif if len(exif) + len(_EXIF_HEADER) + 2 <= _MAX_SEGMENT else b""
 
 
 def _segment(marker: int, body: bytes) -> bytes:
@@ -63,7 +63,7 @@ def _segment(marker: int, body: bytes) -> bytes:
 
 def _icc_segments(profile: bytes) -> Iterator[bytes]:
     """A profile in numbered APP2 segments, since a segment holds 64 kB."""
-    room = _LARGEST_SEGMENT - len(_ICC_HEADER) - 4
+    room = _MAX_SEGMENT - len(_ICC_HEADER) - 4
     pieces = [profile[k : k + room] for k in range(0, len(profile), room)]
     if len(pieces) <= 255:
         for number, piece in enumerate(pieces, start=1):

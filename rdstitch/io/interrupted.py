@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rdstitch.io.deepzoom import tiles_folder
 from rdstitch.io.fingerprint import Fingerprint, fingerprint
-from rdstitch.records import LARGEST_FILE
+from rdstitch.records import MAX_FILE
 from rdstitch.regular_files import read_limited
 
 
@@ -35,7 +35,7 @@ def _staged_sidecars(staging: Path) -> Iterator[tuple[Path, Path]]:
         with suppress(OSError, ValueError, TypeError, LookupError, RecursionError):
             if file.is_symlink():
                 continue
-            record = json.loads(read_limited(file, LARGEST_FILE))
+            record = json.loads(read_limited(file, MAX_FILE))
             output = record["output"]
             picture = staging.parent / Path(output["file"]).name
             # The digest takes long, and can agree only if the size does.

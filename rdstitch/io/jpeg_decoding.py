@@ -13,7 +13,7 @@ from rdstitch.regular_files import open_regular
 
 _END_OF_IMAGE = b"\xff\xd9"
 _PADDING = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
-_SMALLEST = 8  # pixels a side; below, different reductions give pictures of the same size
+_MIN_SIDE = 8  # pixels a side; below, different reductions give pictures of the same size
 
 
 def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) -> tuple[NDArray[Any] | None, str]:
@@ -38,7 +38,7 @@ def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) 
     complaint : str
         The decoder's; empty where it has none, or one that says nothing of the pixels.
     """
-    if min(size) < _SMALLEST:
+    if min(size) < _MIN_SIDE:
         return None, ""
     width, height = reduced_size(size, factor)
     with open_regular(file) as stream:

@@ -25,7 +25,7 @@ _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _BIT_DEPTHS = {"1": 1, "I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
 _EXPOSURE_TAGS = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings)
-LARGEST_PROFILE = 2**20 - 2**10
+MAX_PROFILE = 2**20 - 2**10
 """Bytes of a colour profile: PNG readers, such as Pillow's, refuse pictures whose profile takes a megabyte."""
 
 _EXIF_OF_PNG = {"exif", "Raw profile type exif"}
@@ -217,7 +217,7 @@ def _colour_profile(image: Image.Image) -> tuple[bytes, str]:
     profile = image.info.get("icc_profile")
     if not isinstance(profile, bytes):
         return b"", ""
-    if len(profile) > LARGEST_PROFILE:
+    if len(profile) > MAX_PROFILE:
         return b"", f"its colour profile of {len(profile) / 1e6:.1f} MB is too large for PNG readers"
     if profile[_COLOUR_SPACE] == b"CMYK":
         return b"", "its colour profile is one of inks (CMYK), and the output is RGB"

@@ -38,9 +38,9 @@ _FORMATS: dict[bytes, Callable[[IO[bytes], str], ImageFile.ImageFile]] = {
     b"\0\0\0\x0cjP  \r\n\x87\n": Jpeg2KImagePlugin.Jpeg2KImageFile,
     **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6"), PpmImagePlugin.PpmImageFile),
 }
-_LONGEST_MAGIC = max(map(len, _FORMATS))
+_MAX_MAGIC = max(map(len, _FORMATS))
 _NAMES = "JPEG, PNG, TIFF, WebP, AVIF, HEIC, BMP, TGA, GIF, JPEG 2000, PBM, PGM, PPM"
-_MOST_MEGAPIXELS = 178
+_MAX_MEGAPIXELS = 178
 _PNG_METADATA = (b"eXIf", b"tEXt", b"zTXt", b"iTXt")
 
 
@@ -89,16 +89,16 @@ def check_megapixels(file: Path, size: tuple[int, int]) -> None:
         The text says what to do.
     """
     megapixels = size[0] * size[1] / 1e6
-    if megapixels > _MOST_MEGAPIXELS:
+    if megapixels > _MAX_MEGAPIXELS:
         raise InputError(
-            f"{file}: {size[0]} x {size[1]} pixels are {megapixels:.0f} megapixels, more than {_MOST_MEGAPIXELS}; "
+            f"{file}: {size[0]} x {size[1]} pixels are {megapixels:.0f} megapixels, more than {_MAX_MEGAPIXELS}; "
             "cut it up or make it smaller first"
         )
 
 
 def _factory(file: Path, stream: BinaryIO) -> Callable[[IO[bytes], str], ImageFile.ImageFile]:
     """What opens the format of a file, by its first bytes."""
-    beginning = stream.read(_LONGEST_MAGIC)
+    beginning = stream.read(_MAX_MAGIC)
     stream.seek(0)
     for magic, factory in _FORMATS.items():
         if beginning.startswith(magic):

@@ -13,7 +13,7 @@ from rdstitch.io.deepzoom import read_deep_zoom
 from rdstitch.io.read import read_image
 
 _JPEG_QUALITY = 80
-_LARGE = 60_000_000  # pixels; of larger TIFF files an overview is read
+_OVERVIEW_FROM = 60_000_000  # pixels; of larger TIFF files an overview is read
 
 
 def read_preview(path: Path, size: tuple[int, int], side: int) -> tuple[NDArray[Any], NDArray[np.uint8] | None]:
@@ -30,7 +30,7 @@ def read_preview(path: Path, size: tuple[int, int], side: int) -> tuple[NDArray[
     suffix = path.suffix.lower()
     if suffix == ".dzi":
         return read_deep_zoom(path, size, side), None
-    if size[0] * size[1] > _LARGE and suffix in (".tif", ".tiff"):
+    if size[0] * size[1] > _OVERVIEW_FROM and suffix in (".tif", ".tiff"):
         return _overview(path, side), None
     picture = read_image(path)
     return picture.pixels, picture.alpha

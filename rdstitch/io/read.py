@@ -29,7 +29,7 @@ Pixels = NDArray[Any]
 _OPAQUE = 255
 # A page of a TIFF file that masks the picture, and how many pages are looked at for one.
 _MASK, _MASK_WITHIN = 4, 40
-_LARGEST_DECODED_REDUCTION = 8  # of the JPEG decoder
+_MAX_DECODED_REDUCTION = 8  # of the JPEG decoder
 _ROWS_AT_A_TIME = 128
 _PNG_PIXEL_CHUNKS = (b"IHDR", b"tRNS", b"IDAT", b"IEND")
 _JPEG = ("JPEG", "MPO")
@@ -114,7 +114,7 @@ def reduced(picture: Picture, factor: int) -> Picture:
 
 def _decoders_share(image: Image.Image, metadata: Metadata, reduction: int) -> int:
     """By how much of a reduction the decoder can make the picture smaller; 1 for nothing."""
-    factor = math.gcd(reduction, _LARGEST_DECODED_REDUCTION)
+    factor = math.gcd(reduction, _MAX_DECODED_REDUCTION)
     # Blocks begin at the stored picture's first pixel; in one that is to be mirrored they must end at its last.
     crosswise = metadata.orientation != 1 and any(n % factor for n in image.size)
     return 1 if image.format not in _JPEG or min(image.size) < factor or crosswise else factor

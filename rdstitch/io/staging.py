@@ -16,7 +16,7 @@ if sys.platform != "win32":
     import fcntl
 
 _LOCK = "lock"
-_TRIES = 10
+_MAX_ATTEMPTS = 10
 _UNLOCKED_SECONDS = 60.0
 """After which a file that nobody has locked is not one that somebody has just made."""
 
@@ -39,7 +39,7 @@ class StagingFolder:
 
     def __init__(self, parent: Path, prefix: str = ".rdstitch-") -> None:
         _remove_dead(parent, prefix)
-        for _ in range(_TRIES):
+        for _ in range(_MAX_ATTEMPTS):
             self.path = Path(tempfile.mkdtemp(prefix=prefix, suffix=".part", dir=parent))
             self._lock = _locked(self.path / _LOCK, create=True)
             if self._lock is not None:

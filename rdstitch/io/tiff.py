@@ -28,7 +28,7 @@ _TILE = 256
 _REDUCED, _MASK = 1, 4  # kinds of pages (NewSubfileType)
 _STRIP = 64  # rows
 # Smaller pictures need no overview.
-_SMALLEST_OVERVIEW = 256
+_MIN_OVERVIEW = 256
 # Rows that are reduced at a time, even.
 _HALVED_ROWS = 32
 _BUFFER = 2**24
@@ -210,7 +210,7 @@ def _overview_sizes(size: tuple[int, int]) -> list[tuple[int, int]]:
     """Sizes of the overviews, each half of the one before, rounded up."""
     sizes = []
     width, height = size
-    while max(width, height) > _SMALLEST_OVERVIEW:
+    while max(width, height) > _MIN_OVERVIEW:
         width, height = -(-width // 2), -(-height // 2)
         sizes.append((width, height))
     return sizes

@@ -1,7 +1,7 @@
 """Local alignment: a smooth residual warp per picture, where the ground is not quite a plane."""
 
 from rdstitch.local_alignment.estimate import (
-    MOST_CELLS,
+    MAX_CELLS,
     HeldOut,
     LocalAlignment,
     LocalAlignmentMode,
@@ -12,7 +12,7 @@ from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.matches import Match
 
 __all__ = [
-    "MOST_CELLS",
+    "MAX_CELLS",
     "DisplacementField",
     "HeldOut",
     "LocalAlignment",

@@ -15,17 +15,17 @@ from rdstitch.local_alignment.matches import Match, PlaneMatches, place_matches,
 
 LocalAlignmentMode = Literal["auto", "off"] | int
 
-MOST_CELLS = 100
+MAX_CELLS = 100
 _CELLS = 12
 # The stiffest fields first: they are taken unless freer ones are better by a share that matters.
 _SLOPES = (0.02, 0.06, 0.2)
 _HELD_OUT = 5  # every fifth match
 # Share by which held-out residuals must get smaller for local alignment to be worth while, and for freer fields.
 _WORTHWHILE, _BETTER = 0.15, 0.03
-_FEWEST_MATCHES = 100
+_MIN_MATCHES = 100
 # Correlation of the residuals of neighbouring matches below which no smooth field is worth while: one that brings the
 # median down by 15 % takes away a quarter of the variance, and that quarter neighbours would have in common.
-_LEAST_AGREEMENT = 0.1
+_MIN_AGREEMENT = 0.1
 _OUTLYING = 3.0  # medians beyond which a residual counts no more than there
 
 
@@ -95,9 +95,9 @@ def align_locally(
         return no_local_alignment("switched off")
     scale = plane_scale(cameras, homographies)
     placed = place_matches(matches, cameras, homographies, scale)
-    if placed is None or len(placed) < _FEWEST_MATCHES:
+    if placed is None or len(placed) < _MIN_MATCHES:
         return no_local_alignment("there are too few matches")
-    if choice == "auto" and (agreement := _agreement_of_neighbours(placed)) < _LEAST_AGREEMENT:
+    if choice == "auto" and (agreement := _agreement_of_neighbours(placed)) < _MIN_AGREEMENT:
         return no_local_alignment(f"not worth while; residuals of neighbouring matches agree by {agreement:.0%} only")
     cells = _CELLS if choice == "auto" else choice
     held_out = np.arange(len(placed)) % _HELD_OUT == 0

@@ -21,12 +21,12 @@ from rdstitch.local_alignment.matches import PlaneMatches, jacobians
 
 # Residuals are trusted up to about this many times their median, but at least so many pixels; at first, up to this
 # percentile of them, then by this factor less from round to round, and as many rounds at the end.
-_ROBUST, _LEAST_SCALE = 2.0, 0.3
+_ROBUST, _MIN_SCALE = 2.0, 0.3
 _WIDEST, _SHARPENED, _SHARP_ROUNDS = 95.0, 0.5, 3
 # A field vanishes over about this share of a picture where nothing supports it.
 _FADE = 0.2
 # Limit of the displacement's change per pixel: far from 1, where a picture would fold.
-_STEEPEST = 0.25
+_MAX_GRADIENT = 0.25
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def fit_fields(matches: PlaneMatches, cameras: Sequence[Camera], stiffness: Stif
     scale = float(np.percentile(np.linalg.norm(left, axis=1), _WIDEST))
     while sharp < _SHARP_ROUNDS:
         length = np.linalg.norm(left, axis=1)
-        sharpest = max(_LEAST_SCALE, _ROBUST * float(np.median(length)))
+        sharpest = max(_MIN_SCALE, _ROBUST * float(np.median(length)))
         sharp += scale <= sharpest
         scale = max(scale, sharpest)
         weight = (1.0 / (1.0 + (length / scale) ** 2)) ** 2 / scale**2
@@ -152,7 +152,7 @@ def picture_fields(
         found = np.zeros_like(values)
         found[usable] = np.linalg.solve(jacobian[usable], values[usable, :, None])[..., 0]
         field = DisplacementField.of(camera.image_size, found.reshape(*shape, 2))
-        if field.steepest > _STEEPEST:
-            field = DisplacementField.of(camera.image_size, field.values * (_STEEPEST / field.steepest))
+        if field.steepest > _MAX_GRADIENT:
+            field = DisplacementField.of(camera.image_size, field.values * (_MAX_GRADIENT / field.steepest))
         done.append(field)
     return tuple(done)

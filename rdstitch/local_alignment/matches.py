@@ -13,7 +13,7 @@ from rdstitch.radial_homography import to_plane
 # Matches that the alignment expects farther away than this share of the picture's diagonal are taken to be wrong; where
 # the ground rises by a tenth of the camera's height, right ones are up to half as far apart.
 _SEARCH_RADIUS = 0.08
-_FEWEST_MATCHES = 8
+_MIN_MATCHES = 8
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def place_matches(
         residual = placed[0] - placed[1]
         radius = _SEARCH_RADIUS * min(2.0 * cameras[k].half_diagonal for k in pair)
         near = np.linalg.norm(residual, axis=1) < radius
-        if near.sum() >= _FEWEST_MATCHES:
+        if near.sum() >= _MIN_MATCHES:
             images.append(np.broadcast_to(np.array(pair), (int(near.sum()), 2)))
             points.append(np.stack([match.points1[near], match.points2[near]], axis=1))
             residuals.append(residual[near])

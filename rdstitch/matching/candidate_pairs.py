@@ -25,13 +25,13 @@ EXHAUSTIVE_UP_TO = 30
 CANDIDATES = 15
 """Other pictures that one is compared with, in the mean: the sides and corners of a survey's frame, twice over."""
 
-_FOLLOWING = 3  # pictures after each one that are tried
-_LOOKALIKES = 4  # pictures most like each one that are tried, whatever the others are like
+_SEQUENCE_NEIGHBOURS = 3  # pictures after each one that are tried
+_RETRIEVED = 4  # pictures most like each one that are tried, whatever the others are like
 _NEAREST = 8  # pictures taken nearest to each one that are tried
 _NEIGHBOURS = 10  # nearest pictures in the plane that are considered for each one
-_LEAST_OVERLAP = 0.15  # share of the smaller footprint
+_MIN_OVERLAP = 0.15  # share of the smaller footprint
 _PARTNERS = 6  # pairs of a picture that its place is found by; those that others choose come on top
-_CELLS_ASIDE = 4  # cells of a picture, a side, that its partners are to cover
+_CELLS_PER_SIDE = 4  # cells of a picture, a side, that its partners are to cover
 
 Pairs = list[tuple[int, int]]
 
@@ -73,7 +73,7 @@ def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None 
     alike = similarity(features, seed)
     chosen = set() if positions is None else _nearest_positions(positions)
     if alike is None or alike.ordered:
-        chosen |= {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + _FOLLOWING, count))}
+        chosen |= {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + _SEQUENCE_NEIGHBOURS, count))}
     if alike is not None:
         chosen |= _alike_to_each(alike, set(np.flatnonzero(features.counts).tolist()))
         chosen |= _most_alike(alike, chosen, CANDIDATES * count // 2)
@@ -88,8 +88,8 @@ def _alike_to_each(alike: Similarity, known: set[int]) -> set[tuple[int, int]]:
     chosen = set()
     for i, (row, peak) in enumerate(zip(alike.most_alike.tolist(), alike.peak.tolist(), strict=True)):
         if alike.ordered:
-            row = [j for j, own in zip(row, peak, strict=True) if own and abs(i - j) > _FOLLOWING]
-        chosen |= {(min(i, j), max(i, j)) for j in row[:_LOOKALIKES] if i in known and j in known}
+            row = [j for j, own in zip(row, peak, strict=True) if own and abs(i - j) > _SEQUENCE_NEIGHBOURS]
+        chosen |= {(min(i, j), max(i, j)) for j in row[:_RETRIEVED] if i in known and j in known}
     return chosen
 
 
@@ -132,12 +132,12 @@ def pairs_that_matter(
     partners: dict[int, list[tuple[tuple[int, int], FloatArray]]] = {}
     for pair, found in shared.items():
         for image, points in zip(pair, (found.points1, found.points2), strict=True):
-            cell = np.clip(points / cameras[image].image_size * _CELLS_ASIDE, 0, _CELLS_ASIDE - 1).astype(np.intp)
-            counts = np.bincount(cell @ [1, _CELLS_ASIDE], minlength=_CELLS_ASIDE**2)
+            cell = np.clip(points / cameras[image].image_size * _CELLS_PER_SIDE, 0, _CELLS_PER_SIDE - 1).astype(np.intp)
+            counts = np.bincount(cell @ [1, _CELLS_PER_SIDE], minlength=_CELLS_PER_SIDE**2)
             partners.setdefault(image, []).append((pair, counts.astype(np.float64)))
     chosen: set[tuple[int, int]] = set()
     for own in partners.values():
-        counts, covered = np.array([cells for _, cells in own]), np.zeros(_CELLS_ASIDE**2)
+        counts, covered = np.array([cells for _, cells in own]), np.zeros(_CELLS_PER_SIDE**2)
         for _ in range(min(_PARTNERS, len(own))):
             best = int(np.sqrt(covered + counts).sum(axis=1).argmax())
             chosen.add(own[best][0])
@@ -180,7 +180,7 @@ def neighbours(cameras: Sequence[Camera], homographies: FloatArray, tried: set[t
             pair = (known[min(a, b)], known[max(a, b)])
             if a == b or pair in tried or not needed(*pair):
                 continue
-            if _overlap(boxes[a], boxes[b]) >= _LEAST_OVERLAP:
+            if _overlap(boxes[a], boxes[b]) >= _MIN_OVERLAP:
                 found.add(pair)
     return sorted(found)
 

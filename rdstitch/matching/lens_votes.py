@@ -13,10 +13,10 @@ from rdstitch.matching.two_view import PairRegistration
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.own_lenses import OwnLenses, own_lenses
 
-_FARTHEST = 10.0  # thresholds from where one λ puts them, within which correspondences may fit with two
-_MOST = 250  # matches of a pair that are used
-_LEAST_STD = 2e-4  # λ; no pair knows it better than that the division model holds
-_LEAST_INLIERS = 30  # of a pair that votes: three times the parameters of a homography and two λ
+_MAX_DISTANCE = 10.0  # thresholds from where one λ puts them, within which correspondences may fit with two
+_MAX_MATCHES = 250  # matches of a pair that are used
+_MIN_STD = 2e-4  # λ; no pair knows it better than that the division model holds
+_MIN_INLIERS = 30  # of a pair that votes: three times the parameters of a homography and two λ
 _COMMON_STD = 0.05  # λ; by so much relief and lenses of another kind change what a pair sees, of both pictures alike
 _ROUNDS = 6
 _PAIRS_AT_ONCE = 64
@@ -48,7 +48,7 @@ class Votes:
             for pair in pairs
             if pair.relation
             and np.isfinite(pair.relation.distortion_std)
-            and int(pair.relation.inliers.sum()) >= _LEAST_INLIERS
+            and int(pair.relation.inliers.sum()) >= _MIN_INLIERS
         ]
         found = list(zip(registered, _votes(registered, threshold), strict=True))
         seen = [(pair, vote) for pair, vote in found if np.isfinite(vote.covariance).all()]
@@ -71,7 +71,7 @@ class Votes:
     def differences(self) -> tuple[FloatArray, FloatArray]:
         """λ of the second picture of each pair less that of the first, and its standard deviation, both (L,)."""
         sign = np.array([-1.0, 1.0])
-        return self.distortion @ sign, np.sqrt(sign @ self.covariance @ sign + 2.0 * _LEAST_STD**2)
+        return self.distortion @ sign, np.sqrt(sign @ self.covariance @ sign + 2.0 * _MIN_STD**2)
 
     def which(self, second: BoolArray) -> IntArray:
         """From which lens, 0 or 1, the two pictures of each pair come, shape (L, 2)."""
@@ -99,7 +99,7 @@ class Votes:
     @cached_property
     def _whitening(self) -> FloatArray:
         """W (L, 2, 2), with W'W the inverse of each covariance."""
-        covariance = self.covariance + _LEAST_STD**2 * np.eye(2) + _COMMON_STD**2
+        covariance = self.covariance + _MIN_STD**2 * np.eye(2) + _COMMON_STD**2
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
 
     def _whitened(self, values: FloatArray) -> FloatArray:
@@ -122,6 +122,6 @@ def _near(pair: PairRegistration, threshold: float) -> tuple[FloatArray, FloatAr
     """Matches not too far from where one λ puts them, evenly spread, pixels."""
     matched = pair.correspondences
     apart = np.linalg.norm(pair.relation.transfer(matched.points1) - matched.points2, axis=1)
-    near = np.flatnonzero(apart < _FARTHEST * threshold)
-    near = near[spread_choice(matched.points1[near], _MOST)]
+    near = np.flatnonzero(apart < _MAX_DISTANCE * threshold)
+    near = near[spread_choice(matched.points1[near], _MAX_MATCHES)]
     return matched.points1[near], matched.points2[near]

@@ -15,18 +15,16 @@ from rdstitch.matching.lens_votes import Votes
 from rdstitch.matching.match_graph import connected_components, spanning_forest
 from rdstitch.matching.two_view import PairRegistration
 
-_DIFFERENT = 5.0  # standard deviations from which on a pair is taken to see two lenses, until all votes are heard
+_DIFFERENT_SIGMA = 5.0  # standard deviations from which on a pair is taken to see two lenses, until all votes are heard
 _STARTS = 5  # divisions that are begun with
 _ROUNDS = 6
 _MOVES = 12
-_LEAST_GAP = 0.01  # λ; what is nearer is one lens that one λ does not quite describe
-_LEAST_GAP_PX = (
-    4.0  # the same at a corner, pixels; with one λ, pictures are off by a tenth of that, rows of them by half
-)
-_MEAN_MISS = 1.25  # standard deviations that a vote, two numbers, is off on average; less is luck
+_MIN_GAP = 0.01  # λ; what is nearer is one lens that one λ does not quite describe
+_MIN_GAP_PX = 4.0  # the same at a corner, pixels; with one λ, pictures are off by a tenth of that, rows of them by half
+_MAX_MEAN_RESIDUAL = 1.25  # standard deviations that a vote, two numbers, is off on average; less is luck
 # How many times better two lenses must explain the votes of pairs of both: at least, and times one over their number.
-_LEAST_GAIN, _GAIN_OF_FEW = 4.0, 2.8
-_LEAST_MARGIN = 5.0  # standard deviations by which votes must tell of which of the two lenses a picture is
+_MIN_GAIN, _GAIN_OF_FEW = 4.0, 2.8
+_MIN_MARGIN = 5.0  # standard deviations by which votes must tell of which of the two lenses a picture is
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,7 @@ def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
     """
     if not len(votes):
         return None
-    count, gap = len(cameras), max(_LEAST_GAP, _LEAST_GAP_PX / min(camera.half_diagonal for camera in cameras))
+    count, gap = len(cameras), max(_MIN_GAP, _MIN_GAP_PX / min(camera.half_diagonal for camera in cameras))
     divisions = [_divide(count, votes, *guess) for guess in _guesses(count, votes)]
     divisions = [(second, lenses) for second, lenses in divisions if abs(lenses[1] - lenses[0]) >= gap]
     if not divisions:
@@ -78,11 +76,11 @@ def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
     which = votes.which(second)
     between = which[:, 0] != which[:, 1]
     number, missed = int(between.sum()), votes.mahalanobis_residuals(lenses[which])
-    least = max(float(missed[between].sum()), max(_MEAN_MISS, float(missed.mean())) * number)
+    least = max(float(missed[between].sum()), max(_MAX_MEAN_RESIDUAL, float(missed.mean())) * number)
     by_one = votes.mahalanobis_residuals(votes.fitted(np.zeros_like(which), lenses[:1]))[between].sum()
-    if not number or by_one < (_LEAST_GAIN + _GAIN_OF_FEW / number) * least:
+    if not number or by_one < (_MIN_GAIN + _GAIN_OF_FEW / number) * least:
         return None
-    clear = _margins(count, votes, second, lenses)[seen].min() >= _LEAST_MARGIN
+    clear = _margins(count, votes, second, lenses)[seen].min() >= _MIN_MARGIN
     return TwoLenses(second, (float(lenses[0]), float(lenses[1])), bool(clear and not between.all()))
 
 
@@ -152,7 +150,7 @@ def _guesses(count: int, votes: Votes) -> list[tuple[BoolArray, FloatArray]]:
     """Divisions to start from: of the groups that the most certain votes connect, those with the larger λ."""
     difference, std = votes.differences
     held = spanning_forest(count, votes.image1, votes.image2, -std)
-    alike = held[np.abs(difference[held]) < _DIFFERENT * std[held]]
+    alike = held[np.abs(difference[held]) < _DIFFERENT_SIGMA * std[held]]
     group = np.empty(count, dtype=np.intp)
     for number, pictures in enumerate(connected_components(count, votes.image1[alike], votes.image2[alike])):
         group[pictures] = number

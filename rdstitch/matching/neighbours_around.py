@@ -8,7 +8,7 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 
-_LEAST_OVERLAP = 0.15
+_MIN_OVERLAP = 0.15
 """Share of the picture of which more is seen in the other."""
 
 _PLACES = 7
@@ -35,7 +35,7 @@ def neighbours_around(
         (i, j)
         for i, j in combinations(known, 2)
         if (i, j) not in tried
-        and max(_share_seen(rays[a], cameras[b], back[b]) for a, b in ((i, j), (j, i))) >= _LEAST_OVERLAP
+        and max(_share_seen(rays[a], cameras[b], back[b]) for a, b in ((i, j), (j, i))) >= _MIN_OVERLAP
     ]
 
 

@@ -12,34 +12,34 @@ from numpy.typing import NDArray
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.features import Correspondences, Features
 
-LEAST_REPETITION = 0.1
+MIN_REPETITION = 0.1
 """Of :func:`repetition`: pictures with more show a repeated pattern. Boards have 0.15 to 0.8, flights up to 0.01."""
 
-_ALIKE = 0.45  # of the median distance between descriptors of a picture: nearer ones look the same
-_OTHERS = 4  # keypoints elsewhere that look the same, of one that repeats itself
-_STRONGEST = 1000  # keypoints that are looked at for that
+_SIMILAR_DISTANCE = 0.45  # of the median distance between descriptors of a picture: nearer ones look the same
+_MIN_REPETITIONS = 4  # keypoints elsewhere that look the same, of one that repeats itself
+_MAX_KEYPOINTS = 1000  # keypoints that are looked at for that
 _PARTNERS = 6  # likely partners of each keypoint
 _HYPOTHESES = 400  # motions that are tried, each by one keypoint and one partner
 _REFINED = 4  # of them, the best, that are refined
-_LARGEST_SCALE = 2.5  # of one picture in the other
+_MAX_SCALE = 2.5  # of one picture in the other
 _TURN, _LOG_SCALE = 0.5, 0.5  # radians, and logarithm, by which one keypoint's motion may differ from another's
 _NEAR, _FAR, _SPREAD = 0.01, 0.06, 0.12  # half diagonals: error beside the keypoint, at most, and its growth
 _TOLERANCES = (0.05, 0.035, 0.025, 0.02, 0.015, 0.015)  # half diagonals, of the rounds of refinement
 _AFFINE_ROUNDS = 2  # the first ones; then the quadratic one, which perspective and lens ask for
-_LEAST_MATCHES = 20
+_MIN_MATCHES = 20
 
 
 def repetition(features: Features) -> float:
     """Share of the keypoints that look like at least four others elsewhere in the picture, in [0, 1]."""
-    strongest = features.take(np.arange(min(len(features), _STRONGEST)))
-    if features.binary or len(strongest) <= _OTHERS:
+    strongest = features.take(np.arange(min(len(features), _MAX_KEYPOINTS)))
+    if features.binary or len(strongest) <= _MIN_REPETITIONS:
         return 0.0
     distance = np.sqrt(_squared_distances(strongest, strongest))
     apart = np.linalg.norm(strongest.points[:, None] - strongest.points, axis=2)
     elsewhere = apart > 2.0 * np.maximum(strongest.scale[:, None], strongest.scale)
     others = np.where(elsewhere, distance, np.inf)
-    nearest = np.partition(others, _OTHERS - 1, axis=1)[:, _OTHERS - 1]
-    return float(np.mean(nearest < _ALIKE * np.median(distance)))
+    nearest = np.partition(others, _MIN_REPETITIONS - 1, axis=1)[:, _MIN_REPETITIONS - 1]
+    return float(np.mean(nearest < _SIMILAR_DISTANCE * np.median(distance)))
 
 
 def match_pattern(features1: Features, features2: Features) -> Correspondences:
@@ -74,7 +74,7 @@ def match_pattern(features1: Features, features2: Features) -> Correspondences:
     chosen = np.flatnonzero(best)[np.argsort(error[best], kind="stable")]
     for index in (own, partner):  # each keypoint once, with the partner that fits best
         chosen = chosen[np.sort(np.unique(index[chosen], return_index=True)[1])]
-    if len(chosen) < _LEAST_MATCHES:
+    if len(chosen) < _MIN_MATCHES:
         return nothing
     indices = np.column_stack([own[chosen], partner[chosen]])
     return Correspondences.of(features1, features2, indices, error[chosen] / _TOLERANCES[-1])
@@ -94,7 +94,7 @@ def _partners(features1: Features, features2: Features) -> tuple[IntArray, IntAr
     distance = np.sqrt(np.take_along_axis(squared, nearest, axis=1)).ravel()
     own, partner = np.repeat(np.arange(len(features1)), _PARTNERS), nearest.ravel()
     scale = np.abs(np.log(features2.scale[partner] / features1.scale[own]))
-    kept = scale < np.log(_LARGEST_SCALE)
+    kept = scale < np.log(_MAX_SCALE)
     return own[kept], partner[kept], distance[kept]
 
 
@@ -123,7 +123,7 @@ def _refined(
     errors = np.full(len(z1), np.inf)
     for number, tolerance in enumerate(_TOLERANCES):
         used = terms[:, :3] if number < _AFFINE_ROUNDS else terms
-        if agreeing.sum() < max(2 * used.shape[1], _LEAST_MATCHES // 2):
+        if agreeing.sum() < max(2 * used.shape[1], _MIN_MATCHES // 2):
             return np.zeros_like(agreeing), errors
         fitted = np.linalg.lstsq(used[agreeing], z2[agreeing], rcond=None)[0]
         errors = np.abs(used @ fitted - z2)

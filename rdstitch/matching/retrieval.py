@@ -17,20 +17,22 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.features import Features
 from rdstitch.matching.feature_store import FeatureStore
 
-_DESCRIBING = 1000  # strongest features that describe a picture
+_FEATURES_PER_IMAGE = 1000  # strongest features that describe a picture
 _DESCRIPTORS_PER_WORD = 16  # few enough that a word is rare, enough that one place on the ground is one word
-_MOST_WORDS = 65_536
-_LEAST_DESCRIPTORS = 640  # fewer are no vocabulary
+_MAX_WORDS = 65_536
+_MIN_DESCRIPTORS = 640  # fewer are no vocabulary
 _TRAINING_PER_WORD = 5  # descriptors that words are learned from
 _TRAINING_PER_BRANCH = 50
 _ROUNDS = 3  # of Lloyd's algorithm
-_KEPT = 40  # most similar pictures of each that are looked at further
-_FRIENDS = 10  # most similar pictures of each that two pictures may have in common
-_FRIENDSHIP = 0.3  # what having all friends in common counts, in units of the usual best similarity
-_BACKGROUND = 0.75  # share of the other pictures that are less alike than the next one where the order means something
+_SHORTLIST = 40  # most similar pictures of each that are considered further
+_SHARED_NEIGHBOURS = 10  # most similar pictures of each that two pictures may have in common
+_SHARED_NEIGHBOUR_WEIGHT = 0.3  # weight of having all neighbours in common, in units of the usual best similarity
+_SEQUENCE_RANK = (
+    0.75  # share of the other pictures that are less alike than the next one where the order means something
+)
 _ONE_SIGMA = 0.16  # quantile of a normal distribution one standard deviation below its median
-_BEYOND_CHANCE = 5.0  # standard deviations above the median of all pictures
-_ORDERED = 0.5  # share of the pictures of which that is true of the next one; a quarter by chance
+_SIGNIFICANT_SIGMA = 5.0  # standard deviations above the median of all pictures
+_MIN_SEQUENTIAL_SHARE = 0.5  # share of the pictures of which that is true of the next one; a quarter by chance
 _BLOCK = 8192  # descriptors assigned at a time
 _ROWS = 256  # pictures compared with all others at a time
 
@@ -123,12 +125,12 @@ def similarity(features: FeatureStore, seed: int) -> Similarity | None:
 
 def _weighted_words(features: FeatureStore, seed: int) -> sparse.csr_array | None:
     """The words of each picture, as unit vectors (N, words); zero for pictures without features."""
-    counts = np.minimum(features.counts, _DESCRIBING)
+    counts = np.minimum(features.counts, _FEATURES_PER_IMAGE)
     total = int(counts.sum())
-    if total < _LEAST_DESCRIPTORS:
+    if total < _MIN_DESCRIPTORS:
         return None
     random = np.random.default_rng([seed, 2])
-    branches = int(np.sqrt(min(total / _DESCRIPTORS_PER_WORD, _MOST_WORDS)))
+    branches = int(np.sqrt(min(total / _DESCRIPTORS_PER_WORD, _MAX_WORDS)))
     wanted = min(_TRAINING_PER_WORD * branches**2, total)
     chosen = np.sort(random.choice(total, wanted, replace=False))
     starts = np.cumsum(counts) - counts
@@ -162,14 +164,14 @@ def _training(features: FeatureStore, parts: list[IntArray], starts: IntArray) -
 
 def _describing(features: Features) -> Array32:
     """The descriptors that stand for a picture."""
-    descriptors = features.descriptors[:_DESCRIBING]
+    descriptors = features.descriptors[:_FEATURES_PER_IMAGE]
     return (np.unpackbits(descriptors.astype(np.uint8), axis=1) if features.binary else descriptors).astype(np.float32)
 
 
 def _compare(weights: sparse.csr_array) -> Similarity:
     """Compare all pictures with one another, some rows of the matrix at a time."""
     count = weights.shape[0]
-    kept = min(_KEPT, count - 1)
+    kept = min(_SHORTLIST, count - 1)
     best, values = np.empty((count, kept), dtype=np.intp), np.empty((count, kept))
     peak = np.zeros((count, kept), dtype=np.bool_)
     usual, spread, next_one = np.empty(count), np.empty(count), np.zeros(count, dtype=np.bool_)
@@ -177,7 +179,7 @@ def _compare(weights: sparse.csr_array) -> Similarity:
     for first in range(0, count, _ROWS):
         rows = np.arange(first, min(first + _ROWS, count))
         alike = np.asarray((weights[rows] @ across).todense(), dtype=np.float64)
-        low, usual[rows], high = np.quantile(alike, (_ONE_SIGMA, 0.5, _BACKGROUND), axis=1)
+        low, usual[rows], high = np.quantile(alike, (_ONE_SIGMA, 0.5, _SEQUENCE_RANK), axis=1)
         spread[rows] = usual[rows] - low  # the other half has the pictures that are truly alike
         following = alike[np.arange(len(rows)), np.minimum(rows + 1, count - 1)]
         next_one[rows] = following > high
@@ -188,15 +190,17 @@ def _compare(weights: sparse.csr_array) -> Similarity:
         is_peak = (alike >= padded[:, :-2]) & (alike >= padded[:, 2:])
         peak[rows] = np.take_along_axis(is_peak, best[rows], axis=1)
     excess = np.maximum(values - (usual[:, None] + usual[best]) / 2.0, 0.0)
-    peak &= excess > _BEYOND_CHANCE * spread[:, None]
-    return Similarity(_with_friends(best, excess), best, peak, bool(next_one[:-1].mean() > _ORDERED))
+    peak &= excess > _SIGNIFICANT_SIGMA * spread[:, None]
+    return Similarity(
+        _with_shared_neighbours(best, excess), best, peak, bool(next_one[:-1].mean() > _MIN_SEQUENTIAL_SHARE)
+    )
 
 
-def _with_friends(best: IntArray, excess: FloatArray) -> sparse.csr_array:
+def _with_shared_neighbours(best: IntArray, excess: FloatArray) -> sparse.csr_array:
     """Similarities (N, N), raised where pictures are alike to the same others."""
     own = _symmetric(best, excess)
-    friends = _unit_rows(_symmetric(best[:, :_FRIENDS], excess[:, :_FRIENDS]))
-    return sparse.csr_array(own + _FRIENDSHIP * float(np.mean(excess[:, 0])) * (friends @ friends.T))
+    neighbours = _unit_rows(_symmetric(best[:, :_SHARED_NEIGHBOURS], excess[:, :_SHARED_NEIGHBOURS]))
+    return sparse.csr_array(own + _SHARED_NEIGHBOUR_WEIGHT * float(np.mean(excess[:, 0])) * (neighbours @ neighbours.T))
 
 
 def _symmetric(columns: IntArray, values: FloatArray) -> sparse.csr_array:

@@ -16,10 +16,10 @@ from rdstitch.matching.match_graph import connected_components
 from rdstitch.matching.static_places import StaticPlaces
 from rdstitch.matching.two_view import PairRegistration
 
-_LEAST_PICTURES, _LEAST_SHARE = 3, 0.5
+_MIN_PICTURES, _MIN_SHARE = 3, 0.5
 """Pictures, in number and as a share, that pairs which move must connect: two could agree by chance."""
 
-_STATIC = 1.0 / 3.0
+_MAX_STATIC_MOTION = 1.0 / 3.0
 """Motion of a static match at most, in thresholds: its two keypoints are localised to better than that."""
 
 _MIN_STATIC_MATCHES = 8
@@ -34,7 +34,9 @@ _MIN_OVERLAID_PAIRS, _MIN_OVERLAID_SHARE = 2, 0.2
 
 def is_static_pair(pair: PairRegistration, threshold: float) -> bool:
     """Whether a pair is registered as if nothing had moved; ``threshold`` is that of its inliers, pixels."""
-    return bool(pair.relation) and float(np.median(_moved(pair)[pair.relation.inliers])) < threshold * _STATIC
+    return (
+        bool(pair.relation) and float(np.median(_moved(pair)[pair.relation.inliers])) < threshold * _MAX_STATIC_MOTION
+    )
 
 
 def has_static_background(pairs: Sequence[PairRegistration], threshold: float) -> bool:
@@ -63,7 +65,7 @@ def static_places(pairs: Sequence[PairRegistration], threshold: float) -> Static
     found = np.concatenate(
         [np.empty((0, 2)), *(pair.correspondences.points1[_static_matches(pair, threshold)] for pair in pairs)]
     )
-    radius = threshold * _STATIC
+    radius = threshold * _MAX_STATIC_MOTION
     matches = cKDTree(found).query_ball_point(found, radius, return_length=True)
     return StaticPlaces(cKDTree(found[matches >= _MIN_CONFIRMATIONS]), radius)
 
@@ -77,7 +79,7 @@ def _static_matches(pair: PairRegistration, threshold: float) -> BoolArray:
 
 def _overlay(pair: PairRegistration, threshold: float) -> BoolArray:
     """Which matches (M,) are static although the rest of the pair moves."""
-    static: BoolArray = (_moved(pair) < threshold * _STATIC) & ~pair.relation.inliers
+    static: BoolArray = (_moved(pair) < threshold * _MAX_STATIC_MOTION) & ~pair.relation.inliers
     return static
 
 
@@ -98,7 +100,7 @@ def moving_images(pairs: Sequence[PairRegistration], count: int, threshold: floa
 
 def show_motion(pairs: Sequence[PairRegistration], count: int, threshold: float) -> bool:
     """Whether pairs that do move connect a good part of the ``count`` pictures, so that this is no chance."""
-    return moving_images(pairs, count, threshold) >= max(_LEAST_PICTURES, _LEAST_SHARE * count)
+    return moving_images(pairs, count, threshold) >= max(_MIN_PICTURES, _MIN_SHARE * count)
 
 
 def _moved(pair: PairRegistration) -> FloatArray:

@@ -26,10 +26,10 @@ Item = TypeVar("Item")
 
 Pair = tuple[int, int]
 
-_SELECT_BELOW = 50
+_SELECT_MODEL_BELOW = 50
 """Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them."""
 
-_LEAST_BATCHES = 8
+_MIN_BATCHES = 8
 """Batches that pairs are at least divided into for matching, so that a few pairs keep several workers busy."""
 
 _PAIRS_MATCHED_AT_ONCE, _PAIRS_ESTIMATED_AT_ONCE = 32, 128
@@ -162,7 +162,7 @@ def estimate_pairs(task: EstimationTask) -> list[tuple[StoredMatches, RadialHomo
     ]
     options = task.options
     limits = RansacOptions(options.threshold, options.confidence, options.max_iterations, options.seed)
-    how = EstimationOptions(options.solver, options.distortion, limits, _SELECT_BELOW)
+    how = EstimationOptions(options.solver, options.distortion, limits, _SELECT_MODEL_BELOW)
 
     def estimate(places: list[int]) -> list[RadialHomography]:
         pairs = [_pair_matches(task.cameras[k], matches[k].load(), task.tilts[k]) for k in places]
@@ -200,7 +200,7 @@ def _pair_matches(
 
 def matching_batches(items: Sequence[Item]) -> Iterator[Sequence[Item]]:
     """Pairs by the tasks of :func:`match_pairs`."""
-    size = min(_PAIRS_MATCHED_AT_ONCE, -(-len(items) // _LEAST_BATCHES))
+    size = min(_PAIRS_MATCHED_AT_ONCE, -(-len(items) // _MIN_BATCHES))
     return (items[start : start + size] for start in range(0, len(items), size or 1))
 
 

@@ -16,7 +16,7 @@ from rdstitch.matching.candidate_pairs import pairs_that_matter
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.options import MatchingOptions, PairOptions
-from rdstitch.matching.repeated_pattern import LEAST_REPETITION, match_pattern, repetition
+from rdstitch.matching.repeated_pattern import MIN_REPETITION, match_pattern, repetition
 from rdstitch.matching.static_background import (
     has_static_background,
     moving_features,
@@ -40,11 +40,11 @@ from rdstitch.progress import Progress
 Transfer = Callable[[int, int, FloatArray], FloatArray]
 
 _PRESCREEN_FEATURES = 1000  # strongest features of a picture, by which pairs are prescreened
-_PROMISING = 8  # matches among these; pictures that share nothing have three to six by chance
-_WORTHWHILE = 0.05  # share of the matches that a picture has with the one most like it; less adds nothing
-_ENOUGH_MATCHES = 200  # of a picture with all others, from which on it needs no more
+_MIN_PRESCREEN_MATCHES = 8  # matches among these; pictures that share nothing have three to six by chance
+_MIN_RELATIVE_MATCHES = 0.05  # share of the matches that a picture has with the one most like it; less adds nothing
+_SUFFICIENT_MATCHES = 200  # of a picture with all others, from which on it needs no more
 _FEW_INLIERS = 50  # of a pair of a repeated pattern, which shows hundreds of keypoints
-_SURE_SHARE = 0.7  # of such matches that agree: right pairs have 0.8 to 1, lattices that hardly match half
+_MIN_INLIER_RATIO = 0.7  # of such matches that agree: right pairs have 0.8 to 1, lattices that hardly match half
 _SAMPLED = 5  # pictures that are looked at for a repeated pattern
 _SEARCH_RADIUS = 3.0  # thresholds around the place where a match is expected
 
@@ -96,7 +96,7 @@ class Pairing:
         promising = {
             pair: matches
             for pair, matches in shared.items()
-            if len(matches) >= max(_PROMISING, _WORTHWHILE * most[[*pair]].min())
+            if len(matches) >= max(_MIN_PRESCREEN_MATCHES, _MIN_RELATIVE_MATCHES * most[[*pair]].min())
         }
         return pairs_that_matter(promising, self.cameras)
 
@@ -161,7 +161,7 @@ class Pairing:
         result = list(pairs)
         for k, pair in zip(weak, again, strict=True):
             inliers = pair.relation.inliers.sum()
-            if pair.relation and inliers > max(_SURE_SHARE * len(pair.matches), pairs[k].relation.inliers.sum()):
+            if pair.relation and inliers > max(_MIN_INLIER_RATIO * len(pair.matches), pairs[k].relation.inliers.sum()):
                 result[k] = pair
         return result
 
@@ -171,7 +171,7 @@ class Pairing:
         if self.options.lightglue_model is not None:
             return False
         sampled = np.unique(np.linspace(0, len(self.features) - 1, _SAMPLED).astype(np.intp)).tolist()
-        return bool(np.median([repetition(self.features[k]) for k in sampled]) >= LEAST_REPETITION)
+        return bool(np.median([repetition(self.features[k]) for k in sampled]) >= MIN_REPETITION)
 
     def rematch_elsewhere(self, pairs: Sequence[PairRegistration], transfer: Transfer) -> list[PairRegistration]:
         """Match registered pairs again, only near where ``transfer`` puts them; see :meth:`guided_rematch`."""
@@ -220,7 +220,7 @@ class Pairing:
         held = np.zeros(len(self.features), dtype=np.intp)
         for images, inliers in support.items():
             held[[*images]] += inliers
-        weak = {images for images in support if held[[*images]].min() < _ENOUGH_MATCHES}
+        weak = {images for images in support if held[[*images]].min() < _SUFFICIENT_MATCHES}
         chosen = [index for index, pair in enumerate(pairs) if pair.relation and (pair.image1, pair.image2) in weak]
         again = self._relate(
             [(pairs[index].image1, pairs[index].image2) for index in chosen],

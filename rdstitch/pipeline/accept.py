@@ -20,7 +20,7 @@ from rdstitch.registration import Registration
 from rdstitch.verification.verdict import RefusedError, judge
 
 _MAX_SCALE_UNCERTAINTY = 0.05  # share that lengths may be off by, as far as the focal length is, without a word
-_MOST_ROUNDS = 20
+_MAX_ROUNDS = 20
 """Times that something is left out; each takes one adjustment."""
 
 
@@ -78,7 +78,7 @@ def accept(
     if not first.ok and not options.force:
         aligner = Aligner.of(registration.sources, options, cache)
         left = _Offenders({}, {})
-        for _ in range(_MOST_ROUNDS):
+        for _ in range(_MAX_ROUNDS):
             if current.with_messages(found).ok:
                 break
             if _concerns_all(found):

@@ -17,7 +17,7 @@ from rdstitch.compositing import (
 from rdstitch.export.georeference import Georeference, georeference, has_place, world_file_paths
 from rdstitch.inputs.source import Source
 from rdstitch.io.atomic import check_output, text_bytes
-from rdstitch.io.deepzoom import LARGEST_TILE_PROFILE
+from rdstitch.io.deepzoom import MAX_TILE_PROFILE
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.io.outputs import Outputs
 from rdstitch.io.tiff import ExtraTag
@@ -29,7 +29,7 @@ from rdstitch.progress import Progress
 from rdstitch.viewer import viewer_path
 
 # Reduction of a picture of which only the kind of its samples is wanted.
-_SMALLEST = 8
+_PROBE_REDUCTION = 8
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def compose_pictures(
     if dry_run:
         preview = pictures[0].preview
         assert preview is not None
-        pixels = preview(_SMALLEST).pixels
+        pixels = preview(_PROBE_REDUCTION).pixels
         channels = 1 if pixels.ndim == 2 else pixels.shape[2]
         return Composed(canvas, plan=plan_composite(placed.cameras, canvas, options, channels, pixels.dtype.itemsize))
 
@@ -159,6 +159,6 @@ def _files_beside(output: str | Path | None, placed: PlacedImages, overwrite: bo
 def _profile_lost(source: Source, output: Path) -> list[Message]:
     """Why the output lacks the colour profile of the picture whose metadata it has."""
     lost, size = source.metadata.profile_lost, len(source.metadata.icc_profile)
-    if output.suffix.lower() == ".dzi" and size > LARGEST_TILE_PROFILE:
+    if output.suffix.lower() == ".dzi" and size > MAX_TILE_PROFILE:
         lost = f"its colour profile of {size / 1e3:.0f} kB is too large to be in every tile"
     return [Message(f"{lost}; colours are as if it had none", (str(source.path),))] if lost else []

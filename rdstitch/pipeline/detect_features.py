@@ -17,7 +17,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.matching.feature_store import FeatureStore, StoredFeatures
 from rdstitch.progress import Progress
 
-_LEAST_BATCHES = 16
+_MIN_BATCHES = 16
 """Batches that pictures are at least divided into, so that a few keep several workers busy."""
 
 _PICTURES_AT_ONCE = 8
@@ -103,7 +103,7 @@ def detect_features(
 
 
 def _tasks(sources: Sequence[Source], options: FeatureOptions, store: Cache) -> Iterator[DetectionTask]:
-    size = min(_PICTURES_AT_ONCE, -(-len(sources) // _LEAST_BATCHES))
+    size = min(_PICTURES_AT_ONCE, -(-len(sources) // _MIN_BATCHES))
     return (DetectionTask(sources[start : start + size], options, store) for start in range(0, len(sources), size))
 
 

@@ -15,13 +15,13 @@ from rdstitch.radial_homography import RadialHomography, from_plane, to_plane
 from rdstitch.verification.overlap_check import placed_picture
 from rdstitch.verification.unique_places import unique_shifts
 
-_MOST_PICTURES = 60
+_MAX_PICTURES = 60
 """Pictures whose departures are in memory at once; of more, a repeated pattern is refused as before."""
 
 _PAIRS_OF_A_PICTURE = 6
 """Pairs that are compared, by picture on average: those taken one soon after the other first."""
 
-_LEAST_PLACED = 0.5
+_MIN_PLACED = 0.5
 """Of the pictures, that must find their place; of fewer nobody is helped."""
 
 _UNDECIDED = "shows a repeated pattern, and nothing unique in it decides where it lies"
@@ -64,7 +64,7 @@ def settle_repeated_pattern(
         When a picture can no longer be read.
     """
     alignment = aligned.alignment
-    if alignment.poses is None or len(sources) > _MOST_PICTURES or not pairing.shows_repeated_pattern:
+    if alignment.poses is None or len(sources) > _MAX_PICTURES or not pairing.shows_repeated_pattern:
         return aligned, {}
     used = [pair for pair in aligned.pairs if pair.relation and alignment.used[[pair.image1, pair.image2]].all()]
     compared = sorted(used, key=lambda pair: pair.image2 - pair.image1)[: _PAIRS_OF_A_PICTURE * len(sources)]
@@ -85,7 +85,7 @@ def settle_repeated_pattern(
     except RegistrationError:
         return aligned, {}
     placed = settled.alignment.used
-    if placed.sum() < max(2, _LEAST_PLACED * len(sources)):
+    if placed.sum() < max(2, _MIN_PLACED * len(sources)):
         return aligned, {}
     return settled, dict.fromkeys(np.flatnonzero(alignment.used & ~placed).tolist(), _UNDECIDED)
 

@@ -14,7 +14,7 @@ from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
 from rdstitch.compositing.near_part import NearPart
 from rdstitch.compositing.placed_picture import Displacement, PlacedPicture, place_pictures
-from rdstitch.compositing.static_pixels import LEAST_PICTURES, static_pixels
+from rdstitch.compositing.static_pixels import MIN_PICTURES, static_pixels
 from rdstitch.errors import ArgumentError
 from rdstitch.inputs.source import Source, readers
 from rdstitch.io.metadata import GpsPosition
@@ -72,7 +72,7 @@ class PlacedImages:
         A few pictures of the commonest size are compared, reduced; those of other sizes count as a whole.
         """
         size, count = Counter(camera.image_size for camera in self.cameras).most_common(1)[0]
-        if count < LEAST_PICTURES:
+        if count < MIN_PICTURES:
             return None
         alike = [s for s, camera in zip(self.sources, self.cameras, strict=True) if camera.image_size == size]
         chosen = np.linspace(0, count - 1, min(count, _COMPARED)).astype(np.intp).tolist()

@@ -10,10 +10,10 @@ from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.arrays import FloatArray
 from rdstitch.matching.two_view import PairRegistration
 
-_WIDTH_PER_SIGMA, _LEAST_THRESHOLD = 4.0, 0.5
+_WIDTH_PER_SIGMA, _MIN_THRESHOLD = 4.0, 0.5
 """Up to how many standard deviations a match is an inlier, but at least up to so many pixels."""
 
-_LEAST_KEPT = 0.5
+_MIN_KEPT = 0.5
 """Share of its inliers that a pair must keep; otherwise the alignment does not fit it, and it stays as it is."""
 
 
@@ -39,12 +39,12 @@ def reselect_inliers(
     errors = {k: _errors(pairs[k], alignment) for k in used}
     known = [errors[k][pairs[k].relation.inliers] for k in used]
     sigma = sigma_of(np.concatenate([np.zeros(0), *known]) ** 2)
-    farthest = min(max(_WIDTH_PER_SIGMA * sigma, _LEAST_THRESHOLD), threshold)
+    farthest = min(max(_WIDTH_PER_SIGMA * sigma, _MIN_THRESHOLD), threshold)
     selected = {k: replace(pairs[k].relation, inliers=errors[k] < farthest) for k in used}
     return {
         k: replace(pairs[k], relation=relation)
         for k, relation in selected.items()
-        if relation.inliers.sum() >= _LEAST_KEPT * pairs[k].relation.inliers.sum()
+        if relation.inliers.sum() >= _MIN_KEPT * pairs[k].relation.inliers.sum()
     }
 
 

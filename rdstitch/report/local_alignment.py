@@ -9,7 +9,7 @@ from rdstitch.stitch_result import StitchResult
 _WIDTH, _COLUMNS, _GAP, _TEXT = 940.0, 4, 12.0, 18.0
 _ARROWS = 9  # along the longer side of a picture
 _LONGEST = 0.8  # of the distance between arrows, for the largest displacement of all pictures
-_MOST_PICTURES = 60
+_MAX_PICTURES = 60
 
 
 def local_alignment(result: StitchResult) -> str:
@@ -21,7 +21,7 @@ def local_alignment(result: StitchResult) -> str:
     used = np.flatnonzero(result.registration.alignment.used)
     names = [result.registration.sources[index].name for index in used]
     # The largest first: they are what one wants to look at.
-    order = sorted(range(len(names)), key=lambda k: -local.fields[k].largest)[:_MOST_PICTURES]
+    order = sorted(range(len(names)), key=lambda k: -local.fields[k].largest)[:_MAX_PICTURES]
     largest = max(max(field.largest for field in local.fields), 1e-9)
     side = (_WIDTH - (_COLUMNS - 1) * _GAP) / _COLUMNS
     row = side + _TEXT + _GAP

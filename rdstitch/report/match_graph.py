@@ -9,7 +9,7 @@ from rdstitch.report.geometry import footprint, middle
 from rdstitch.report.svg import BLUE, GREEN, GREY, RED, counted, drawing, element, fit_into, label, path, section
 
 _SIDE, _MARGIN = 900.0, 20.0
-_LINE = 11.0  # height of a name
+_LINE_HEIGHT = 11.0  # height of a name
 
 
 def match_graph(registration: Registration) -> str:
@@ -63,7 +63,7 @@ def match_graph(registration: Registration) -> str:
 def _overlap(first: tuple[float, float, float], second: tuple[float, float, float]) -> bool:
     """Whether two names (left, baseline, width) lie on one another."""
     apart = first[0] > second[0] + second[2] or second[0] > first[0] + first[2]
-    return not apart and abs(first[1] - second[1]) <= _LINE
+    return not apart and abs(first[1] - second[1]) <= _LINE_HEIGHT
 
 
 def _mixed(share: float) -> str:

@@ -13,7 +13,7 @@ from rdstitch.report.svg import GREEN, RED, drawing, element, section
 from rdstitch.report.thumbnails import of_source
 
 _WIDTH, _GAP = 440.0, 10.0
-_MOST_LINES = 150
+_MAX_LINES = 150
 _FADED = 0.6  # opacity of the pictures, so that lines can be seen on them
 
 
@@ -29,7 +29,7 @@ def matched(registration: Registration) -> str:
     shown = {"Best pair": best, "Worst pair": others[-1]} if others else {"The pair": best}
     return section(
         "Matches",
-        f"Inliers are green, matches that were taken for wrong red; at most {_MOST_LINES} of each are drawn.",
+        f"Inliers are green, matches that were taken for wrong red; at most {_MAX_LINES} of each are drawn.",
         *(_pair(registration, title, fit) for title, fit in shown.items()),
     )
 
@@ -67,7 +67,7 @@ def _pair(registration: Registration, title: str, fit: LinkFit) -> str:
 
 def _lines(starts: FloatArray, stops: FloatArray, colour: str, opacity: float) -> list[str]:
     """Lines between points, spread evenly over the matches where there are too many."""
-    chosen = np.unique(np.linspace(0, max(len(starts) - 1, 0), min(len(starts), _MOST_LINES)).astype(int))
+    chosen = np.unique(np.linspace(0, max(len(starts) - 1, 0), min(len(starts), _MAX_LINES)).astype(int))
     return [
         element(
             "line",

@@ -11,7 +11,7 @@ from rdstitch.stitch_result import StitchResult
 from rdstitch.viewer import viewer_path
 
 _SIDE = 1200
-_MOST_NAMES = 12
+_MAX_NAMES = 12
 
 
 def mosaic(result: StitchResult, staged: Path | None = None) -> str:
@@ -29,7 +29,7 @@ def mosaic(result: StitchResult, staged: Path | None = None) -> str:
         places = [(outline + 0.5) * scale for outline in outlines]
         shapes = (path(place, closed=True, stroke=YELLOW, stroke_opacity=0.7, pointer_events="all") for place in places)
         parts.append(element("g", element("title", escape(text)) + "".join(shapes)))
-        if len(names) <= _MOST_NAMES:
+        if len(names) <= _MAX_NAMES:
             x, y = min((place.mean(axis=0) for place in places), key=lambda middle: abs(middle[0] - width * scale / 2))
             style = {"fill": "white", "stroke": "black", "stroke_width": 3.0, "paint_order": "stroke"}
             parts.append(label(float(x), float(y), text, text_anchor="middle", font_size=14, **style))

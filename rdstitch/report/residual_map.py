@@ -7,7 +7,7 @@ from rdstitch.report.geometry import residuals
 from rdstitch.report.svg import RED, drawing, element, label, section
 
 _WIDTH, _COLUMNS = 640.0, 16
-_LEAST = 4  # matches in a cell that make a mean
+_MIN_MATCHES = 4  # matches in a cell that make a mean
 _ARROW = 0.9  # of a cell's width, for the largest mean
 
 
@@ -28,7 +28,7 @@ def residual_map(registration: Registration) -> str:
     count = np.bincount(cell, minlength=cells)
     mean = np.stack([np.bincount(cell, off[:, k], cells) for k in (0, 1)], axis=1) / np.maximum(count, 1)[:, None]
     rms = np.sqrt(np.bincount(cell, (off**2).sum(axis=1), cells) / np.maximum(count, 1))
-    enough = count >= _LEAST
+    enough = count >= _MIN_MATCHES
     if not enough.any():
         return section("Residuals", f"There are too few matches ({len(off)}) to draw them over the picture.")
     side, darkest = _WIDTH / _COLUMNS, float(rms[enough].max())

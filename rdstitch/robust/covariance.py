@@ -7,7 +7,7 @@ from rdstitch.robust.measurements import Measurements
 
 _SINGULAR = 1e-13  # eigenvalue of the correlation matrix of the parameters
 _CELLS_PER_HALF_DIAGONAL = 5.0
-_CELLS_ASIDE = 64  # more than a picture has, wherever its distortion centre is
+_CELLS_PER_SIDE = 64  # more than a picture has, wherever its distortion centre is
 
 
 def covariances(information: FloatArray, influence: FloatArray, noise: FloatArray, data: Measurements) -> FloatArray:
@@ -50,11 +50,11 @@ def covariances(information: FloatArray, influence: FloatArray, noise: FloatArra
 def _summed_over_cells(values: FloatArray, points: FloatArray) -> tuple[FloatArray, IntArray]:
     """Sums (C, P) of values (B, N, P) over the cells of a grid in which points (B, 2, N) lie, and each cell's pair."""
     batch, count, size = values.shape
-    cell = np.floor(points * _CELLS_PER_HALF_DIAGONAL + _CELLS_ASIDE // 2)
-    cell = np.clip(cell, 0, _CELLS_ASIDE - 1).astype(np.intp)
-    key = ((np.arange(batch)[:, None] * _CELLS_ASIDE + cell[:, 0]) * _CELLS_ASIDE + cell[:, 1]).ravel()
+    cell = np.floor(points * _CELLS_PER_HALF_DIAGONAL + _CELLS_PER_SIDE // 2)
+    cell = np.clip(cell, 0, _CELLS_PER_SIDE - 1).astype(np.intp)
+    key = ((np.arange(batch)[:, None] * _CELLS_PER_SIDE + cell[:, 0]) * _CELLS_PER_SIDE + cell[:, 1]).ravel()
     order = np.argsort(key, kind="stable")
     found = key[order]
     starts = np.flatnonzero(np.diff(found, prepend=-1))
     sums: FloatArray = np.add.reduceat(values.reshape(batch * count, size)[order], starts, axis=0)
-    return sums, found[starts] // _CELLS_ASIDE**2
+    return sums, found[starts] // _CELLS_PER_SIDE**2

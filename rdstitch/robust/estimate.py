@@ -16,11 +16,11 @@ from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.model_selection import PairFit, PairSelection, rms_of, select_models
 from rdstitch.robust.pair_models import PlanarPairModel
 from rdstitch.robust.ransac import RansacOptions, ransac
-from rdstitch.robust.verification import LEAST_PLACES, places, rejection_reason
+from rdstitch.robust.verification import MIN_PLACES, places, rejection_reason
 
 SOLVERS = ("auto", "two_point", "three_point", "three_point_similarity", "four_point", "five_point")
 
-_AUTO_LEAVES_OUT = "four_point"  # finds what three points find, from more samples
+_NOT_IN_AUTO = "four_point"  # finds what three points find, from more samples
 _MATCHES_AT_ONCE = 1 << 14
 """Matches, with padding, of the pairs in one batch: enough to hide Python's overhead, few enough for the caches."""
 
@@ -174,7 +174,7 @@ def estimate_radial_homography(
     """
     camera1 = Camera(image_size, focal=focal, focal_source=None if focal is None else focal_source or "option")
     camera1 = (camera1 if center is None else replace(camera1, center=center)).with_focal()
-    limits = RansacOptions(threshold, confidence, max_iterations, seed, LEAST_PLACES)
+    limits = RansacOptions(threshold, confidence, max_iterations, seed, MIN_PLACES)
     options = EstimationOptions(solver, distortion, limits)
     tilts = _tilts(tilt)
     p1, p2 = checked_matches(points1, points2)
@@ -198,7 +198,7 @@ def estimate_radial_homographies(pairs: Sequence[PairMatches], options: Estimati
     result: dict[int, RadialHomography] = {}
     batches: dict[tuple[int, float, float, bool], list[int]] = {}
     for index, pair in enumerate(pairs):
-        if (found := places(pair.points1, pair.points2, pair.camera2.image_size)) < LEAST_PLACES:
+        if (found := places(pair.points1, pair.points2, pair.camera2.image_size)) < MIN_PLACES:
             reason = f"only {len(pair)} matches, in {found} places of the image"
             result[index] = RadialHomography.failed(reason, pair.camera1, pair.camera2, len(pair))
         else:
@@ -273,7 +273,7 @@ def _tilts(tilt: ArrayLike | None) -> FloatArray | None:
 def _solvers(options: EstimationOptions, focal: float, focal_std: float, tilts_known: bool) -> list[MinimalSolver]:
     solvers = minimal_solvers(focal, focal_std, tilts_known, options.distortion)
     if options.solver == "auto":
-        return [solver for solver in solvers if solver.name != _AUTO_LEAVES_OUT]
+        return [solver for solver in solvers if solver.name != _NOT_IN_AUTO]
     if options.solver == "three_point":
         solvers = minimal_solvers(focal, focal_std, False, options.distortion)
     return [solver for solver in solvers if solver.name == options.solver]

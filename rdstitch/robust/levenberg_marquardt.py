@@ -8,16 +8,16 @@ import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 
-LEAST_GAIN = 1e-5
+MIN_GAIN = 1e-5
 """Expected relative fall of the loss of all pictures that is worth another step: a hundredth of the noise."""
 
 PAIR_GAIN, ROUGH_GAIN = 1e-4, 1e-3
 """The same of a pair, which has fewer matches; and where another descent goes on from there."""
 
-FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e4
+FIRST_DAMPING, MAX_DAMPING = 1e-4, 1e4
 """Of the diagonal of the normal matrix: where a descent begins, and beyond which it has got stuck."""
 
-_LEAST_DAMPING = 1e-9
+_MIN_DAMPING = 1e-9
 
 _SETTLED, _OPTIMISM = 3, 20.0
 """Steps after which a descent is given up that would have to gain so many times what its next step promises."""
@@ -103,7 +103,7 @@ def descend(
     for taken in range(iterations):
         step = _damped_step(current, damping)
         gain = -np.einsum("bp,bp->b", step, current.gradient)
-        going = (gain > least_gain * current.cost) & (damping <= LARGEST_DAMPING)
+        going = (gain > least_gain * current.cost) & (damping <= MAX_DAMPING)
         if useful is not None and taken >= _SETTLED:
             going &= current.cost - _OPTIMISM * gain < useful[rows]
         if not going.any():
@@ -124,7 +124,7 @@ def descend(
 
 def next_damping(damping: FloatArray, better: BoolArray) -> FloatArray:
     """Damping of the next step, from that of a step and whether it made the loss smaller (Marquardt 1963)."""
-    return np.where(better, np.maximum(damping / 10.0, _LEAST_DAMPING), damping * 20.0)
+    return np.where(better, np.maximum(damping / 10.0, _MIN_DAMPING), damping * 20.0)
 
 
 def _damped_step(equations: BatchedNormalEquations, damping: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
 
 _STEPS_PER_OCTAVE = 4
-_LEAST_WIDTH = 16
+_MIN_WIDTH = 16
 
 
 @dataclass(frozen=True)
@@ -93,8 +93,8 @@ def padded_length(count: int) -> int:
 
     It depends on the pair alone, and so does every sum over its matches: whatever the pairs beside it.
     """
-    if count <= _LEAST_WIDTH:
-        return _LEAST_WIDTH
+    if count <= _MIN_WIDTH:
+        return _MIN_WIDTH
     step = 1 << ((count - 1).bit_length() - _STEPS_PER_OCTAVE.bit_length())
     return -(-count // step) * step
 

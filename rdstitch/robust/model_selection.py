@@ -15,8 +15,8 @@ from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPa
 from rdstitch.robust.refinement import Fits, PairProblems, refine_pairs
 
 # Halved or doubled, these change the median error of λ by a sixth at most (``python -m tests.benchmarks.constants``).
-_LEAST_NOISE = 0.02  # pixels; below, noise-free data would reject every model over rounding
-_NEAR = 3.0  # errors, in thresholds, beyond which a match is left out of the choice
+_MIN_NOISE = 0.02  # pixels; below, noise-free data would reject every model over rounding
+_MAX_RESIDUAL = 3.0  # errors, in thresholds, beyond which a match is left out of the choice
 _FREE_STEPS, _STEPS = 8, 15
 
 
@@ -163,7 +163,7 @@ def select_models(planar: Sequence[PlanarPairModel], pairs: PairSelection) -> li
     threshold, homography = pairs.threshold, HomographyPairModel()
     free = pairs.fit(homography, np.full(len(pairs.data), threshold), _FREE_STEPS, rough=True)
     noise = noise_of(free.errors, threshold)
-    near = replace(pairs.at(free.fits), noise=noise, data=pairs.data.only(free.errors < _NEAR * threshold))
+    near = replace(pairs.at(free.fits), noise=noise, data=pairs.data.only(free.errors < _MAX_RESIDUAL * threshold))
     inliers = np.maximum((free.errors < threshold).sum(axis=1), 1)
     width, price = loss_width(noise, threshold), noise**2 * np.log(2 * inliers)
     freest = near.fit(homography, width, _STEPS)
@@ -267,7 +267,7 @@ def noise_of(errors: FloatArray, threshold: float) -> FloatArray:
     middle = np.stack([np.maximum(count - 1, 0) // 2, count // 2], axis=1)
     middle = np.minimum(middle, errors.shape[1] - 1)
     median = np.take_along_axis(ordered, middle, axis=1).mean(axis=1)
-    return np.where(count > 0, np.maximum(median / RAYLEIGH_MEDIAN, _LEAST_NOISE), _LEAST_NOISE)
+    return np.where(count > 0, np.maximum(median / RAYLEIGH_MEDIAN, _MIN_NOISE), _MIN_NOISE)
 
 
 def loss_width(noise: FloatArray, threshold: float) -> FloatArray:

@@ -18,9 +18,9 @@ from rdstitch.solvers.solutions import Solutions
 
 # Halved or doubled, none of these changes what is found, only the time (``python -m tests.benchmarks.constants``).
 _FIRST_BATCH, _SECOND_BATCH = 64, 160  # samples of five points; then of each solver: three of 60 % outliers need 140
-_LARGEST_BATCH = 512
+_MAX_BATCH = 512
 _SAMPLES_AT_ONCE = 4096
-_LEAST_EXPLORATION = 96  # samples that every solver draws unless its own confidence is reached before
+_MIN_EXPLORATION = 96  # samples that every solver draws unless its own confidence is reached before
 _QUICK_SCORE = 128  # matches on which hypotheses are compared before the best are scored on all
 _SOLVER_SUCCESS = 0.8  # share of all-inlier samples that lead to the model, in the face of noise
 _NOVELTY = 0.1  # share of a hypothesis's inliers that must be new for it to be worth optimising
@@ -153,12 +153,12 @@ def ransac(
             lane.advance(best, active[lane.drawn[active] < lane.needed(best, active, explore=True)], batch)
         needed = np.stack([lane.needed(best, active) for lane in lanes])
         drawn = np.stack([lane.drawn[active] for lane in lanes])
-        explored = (drawn >= np.minimum(_LEAST_EXPLORATION, needed)).all(axis=0)
+        explored = (drawn >= np.minimum(_MIN_EXPLORATION, needed)).all(axis=0)
         # Where the solver that assumes least is confident, nothing is left to explore.
         sure = (drawn[-1] >= needed[-1]) | (explored & (drawn >= needed).any(axis=0))
         confident[active[sure]] = True
         active = active[~sure & (drawn.sum(axis=0) < options.max_iterations)]
-        batch = _SECOND_BATCH if turns is not lanes else min(2 * batch, _LARGEST_BATCH)
+        batch = _SECOND_BATCH if turns is not lanes else min(2 * batch, _MAX_BATCH)
         turns = lanes
     return Search(best, np.sum([lane.drawn for lane in lanes], axis=0), confident)
 
@@ -192,7 +192,7 @@ class _Lane:
         agreeing = np.maximum(best.inliers[rows].sum(axis=1), self._options.least_inliers)
         good = _SOLVER_SUCCESS * np.minimum(agreeing / counts, 1.0) ** self._solver.sample_size
         needed = np.log1p(-self._options.confidence) / np.log1p(-np.minimum(good, 1.0 - 1e-12))
-        return np.asarray(np.maximum(needed, _LEAST_EXPLORATION) if explore else needed)
+        return np.asarray(np.maximum(needed, _MIN_EXPLORATION) if explore else needed)
 
     def advance(self, best: Hypotheses, rows: IntArray, batch: int) -> None:
         """Draw a batch of samples of some pairs, and put the best hypotheses where they are better."""

@@ -8,7 +8,7 @@ from rdstitch.solvers.solutions import Solutions
 
 _BLOCK = 1 << 15  # hypotheses x matches at once: the temporaries stay in cache
 
-_LEAST_DETERMINANT = 1e-6  # of H at unit norm; an image is then squeezed to a millionth of its area
+_MIN_DETERMINANT = 1e-6  # of H at unit norm; an image is then squeezed to a millionth of its area
 
 
 def plausible(solutions: Solutions, corner_radius: float) -> BoolArray:
@@ -22,7 +22,7 @@ def plausible(solutions: Solutions, corner_radius: float) -> BoolArray:
         size = np.sqrt(np.einsum("mij,mij->m", h, h))
         determinant = np.linalg.det(h) / size**3
         bend = solutions.distortion * corner_radius**2
-        return np.asarray(np.isfinite(size) & (determinant > _LEAST_DETERMINANT) & (np.abs(bend) < 1.0))
+        return np.asarray(np.isfinite(size) & (determinant > _MIN_DETERMINANT) & (np.abs(bend) < 1.0))
 
 
 def transfer_errors2(homography: FloatArray, distortion: FloatArray, pair: IntArray, data: Measurements) -> FloatArray:

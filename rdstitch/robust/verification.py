@@ -7,9 +7,9 @@ from scipy.special import betainc
 from rdstitch.arrays import FloatArray
 
 _CELLS_PER_DIAGONAL = 32
-_CELLS_APART = 2.0**20
+_CELL_STRIDE = 2.0**20
 
-LEAST_PLACES = 8
+MIN_PLACES = 8
 """Cells in which the inliers must lie.
 
 With half as many, 14 % of 72 pairs come out wrong instead of 3 %, mostly clusters of wrong matches; with twice as many,
@@ -17,7 +17,7 @@ With half as many, 14 % of 72 pairs come out wrong instead of 3 %, mostly cluste
 the cells and the limit of chance, halved or doubled, change nothing there.
 """
 
-_LARGEST_CHANCE = 1e-4
+_MAX_CHANCE = 1e-4
 """Probability that as many wrong matches agree by chance."""
 
 
@@ -30,7 +30,7 @@ def places(points1: FloatArray, points2: FloatArray, image_size: tuple[int, int]
 def numbered_cells(points: FloatArray) -> FloatArray:
     """A number for the cell of the unit grid that each point (N, 2) lies in, of points within half a million cells."""
     column, row = np.floor(points).T
-    numbers: FloatArray = column * _CELLS_APART + row
+    numbers: FloatArray = column * _CELL_STRIDE + row
     return numbers
 
 
@@ -55,10 +55,10 @@ def rejection_reason(
     """
     count = int(inliers.sum())
     cells = places(points1[inliers], points2[inliers], image_size)
-    if cells < LEAST_PLACES:
+    if cells < MIN_PLACES:
         return f"{count} of {len(inliers)} matches agree, in only {cells} places of the picture"
     by_chance = min(0.5, np.pi * threshold**2 / (image_size[0] * image_size[1]) + 0.01)
     trials = len(inliers) - 4
-    if trials > 0 and betainc(max(1, count - 4), trials - count + 5, by_chance) > _LARGEST_CHANCE:
+    if trials > 0 and betainc(max(1, count - 4), trials - count + 5, by_chance) > _MAX_CHANCE:
         return f"{count} of {len(inliers)} matches agree, no more than chance allows"
     return None

@@ -38,7 +38,7 @@ _NEWTON_STEPS = 40
 # In units of half the interval. Newton's method squares the error: the next step would be below rounding error.
 _NEWTON_CONVERGED = 1e-7
 # In the same units. A longer step belongs to a double root, whose slope says nothing.
-_LONGEST_POLISHING_STEP = 1e-2
+_MAX_POLISHING_STEP = 1e-2
 
 
 class Equation(Protocol):
@@ -105,7 +105,7 @@ def polish(equation: Equation, start: FloatArray, slope: FloatArray, half: Float
     """
     value = equation.polynomial(start)
     step = value / np.where(slope != 0.0, slope, np.inf)
-    step = np.where(np.abs(step) < _LONGEST_POLISHING_STEP * half, step, 0.0)
+    step = np.where(np.abs(step) < _MAX_POLISHING_STEP * half, step, 0.0)
     closer = start - step
     remainder = equation.polynomial(closer)
     improved = np.abs(remainder) < np.abs(value)

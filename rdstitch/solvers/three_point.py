@@ -34,14 +34,14 @@ DEFAULT_STARTS: FloatArray = np.array(
 
 _ROUGH_STEPS = 5
 _STEPS = 10
-_LONGEST_STEP = 0.4
+_MAX_STEP = 0.4
 # Newton's method squares the error: after a step this short there is only rounding error left.
 _CONVERGED = 1e-8
-_MET = 1e-2
+_MAX_FINAL_RESIDUAL = 1e-2
 _SAME = 1e-6
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 # A plane seen at more than 63 degrees from the vertical is given up.
-_STEEPEST = 2.0
+_MAX_TILT_TANGENT = 2.0
 _STATES_IN_BLOCK = 9216
 
 
@@ -192,7 +192,7 @@ def newton(system: DistanceSystem, starts: FloatArray) -> tuple[IndexArray, Floa
     rough = np.repeat(starts.T.astype(np.float32), count, axis=1)
     for _ in range(_ROUGH_STEPS):
         step = single.step(rough)
-        rough += step * np.minimum(np.float32(1.0), np.float32(_LONGEST_STEP) / np.abs(step).max(axis=0))
+        rough += step * np.minimum(np.float32(1.0), np.float32(_MAX_STEP) / np.abs(step).max(axis=0))
     origin = np.flatnonzero(_leaders(rough.reshape(3, len(starts), count)))
     state = rough[:, origin].astype(np.float64)
     origin %= count
@@ -202,9 +202,9 @@ def newton(system: DistanceSystem, starts: FloatArray) -> tuple[IndexArray, Floa
     for _ in range(_STEPS):
         step = system.step(state)
         length = np.abs(step).max(axis=0)
-        state = state + step * np.minimum(1.0, _LONGEST_STEP / length)
+        state = state + step * np.minimum(1.0, _MAX_STEP / length)
         done = length < _CONVERGED
-        going = (length >= _CONVERGED) & (np.abs(state).max(axis=0) < _STEEPEST)
+        going = (length >= _CONVERGED) & (np.abs(state).max(axis=0) < _MAX_TILT_TANGENT)
         samples.append(origin[done])
         states.append(state[:, done])
         if not going.any():
@@ -216,10 +216,10 @@ def newton(system: DistanceSystem, starts: FloatArray) -> tuple[IndexArray, Floa
 
 def _leaders(state: RealArray) -> BoolArray:
     """Of the states (3, S, B) of each sample the first of all that have met, unless it makes no sense; (S B,)."""
-    leads: BoolArray = np.abs(state).max(axis=0) < _STEEPEST
+    leads: BoolArray = np.abs(state).max(axis=0) < _MAX_TILT_TANGENT
     for later in range(1, state.shape[1]):
         distance = np.abs(state[:, :later] - state[:, later, None]).max(axis=0)
-        leads[later] &= ~(distance < _MET).any(axis=0)
+        leads[later] &= ~(distance < _MAX_FINAL_RESIDUAL).any(axis=0)
     return leads.ravel()
 
 

@@ -21,14 +21,14 @@ _PARTNERS = 2  # last keyframes that a frame is matched with
 _SEARCHED = 12  # last keyframes among which a lost frame looks for its place
 _FIRST_ALIGNMENT = 5  # keyframes that the first alignment takes
 _GROWTH = 1.5  # from one alignment to the next, while λ is not known
-_EVERY = 24  # keyframes from one alignment to the next afterwards
+_ALIGNMENT_INTERVAL = 24  # keyframes from one alignment to the next afterwards
 _KNOWN_STD = 0.002  # of λ: a tenth of a pixel in the corner of a picture of 640 x 480 pixels, over half of it
-_KNOWN_AFTER = 12  # keyframes that λ is not known before
-_STILL_SHARED = 0.75  # share of a frame that its last keyframe shows, below which it becomes a keyframe
+_MIN_KEYFRAMES_FOR_LENS = 12  # keyframes that λ is not known before
+_KEYFRAME_OVERLAP = 0.75  # share of a frame that its last keyframe shows, below which it becomes a keyframe
 _GRID = 8  # points a side by which that is measured
-_LOST = 10  # frames in a row without a place, after which a new map begins
-_FEWEST_INLIERS = 15
-_SELECT_BELOW = 50  # inliers below which motions of the plane compete with a free homography
+_MAX_LOST_FRAMES = 10  # frames in a row without a place, after which a new map begins
+_MIN_INLIERS = 15
+_SELECT_MODEL_BELOW = 50  # inliers below which motions of the plane compete with a free homography
 _MATCHES = 80  # of a link, that the alignment uses
 _SAME_TILT = ("rigid", "similarity")
 
@@ -150,7 +150,7 @@ class Tracker:
             return [self._without_place(frame)]
         self._lost = 0
         frame.placement = self._placed(frame, links)
-        if self._shown_by_last(frame, links) >= _STILL_SHARED:
+        if self._shown_by_last(frame, links) >= _KEYFRAME_OVERLAP:
             return [self._tracked(frame, keyframe=False, inliers=inliers)]
         return [*self._add_keyframe(frame, links), self._tracked(frame, keyframe=True, inliers=inliers)]
 
@@ -164,7 +164,7 @@ class Tracker:
         """A frame that no keyframe shows; after many of them, a new map begins with the last."""
         self._lost += 1
         waiting = self._planar_model is None and len(self._keyframes) == 1
-        if self._lost >= _LOST or waiting:
+        if self._lost >= _MAX_LOST_FRAMES or waiting:
             self._map += not waiting
             self._lost = 0
             self._start_map()
@@ -184,7 +184,7 @@ class Tracker:
             return []
         options = self._options.pair
         limits = RansacOptions(options.threshold, options.confidence, options.max_iterations, options.seed)
-        how = EstimationOptions(options.solver, options.distortion, limits, _SELECT_BELOW)
+        how = EstimationOptions(options.solver, options.distortion, limits, _SELECT_MODEL_BELOW)
         matched = [self._match(other.features, frame.features) for other in others]
         pairs = [
             PairMatches(
@@ -196,7 +196,7 @@ class Tracker:
         return [
             Link(other.number, frame.number, found.points1[fit.inliers], found.points2[fit.inliers], fit)
             for other, found, fit in zip(others, matched, relations, strict=True)
-            if fit and fit.inliers.sum() >= _FEWEST_INLIERS
+            if fit and fit.inliers.sum() >= _MIN_INLIERS
         ]
 
     def _placed(self, frame: _Keyframe, links: Sequence[Link]) -> Placement | None:
@@ -238,8 +238,8 @@ class Tracker:
             self._vote()
         if self._keyframes_seen + 1 < self._next_alignment:
             return []
-        steps = _EVERY if self.distortion_known else max(2, round(self._next_alignment * (_GROWTH - 1.0)))
-        self._next_alignment += min(steps, _EVERY)
+        steps = _ALIGNMENT_INTERVAL if self.distortion_known else max(2, round(self._next_alignment * (_GROWTH - 1.0)))
+        self._next_alignment += min(steps, _ALIGNMENT_INTERVAL)
         without = [keyframe for keyframe in self._keyframes[:-1] if keyframe.placement is None]
         self._align_window()
         found = [keyframe for keyframe in without if keyframe.placement is not None]
@@ -299,7 +299,7 @@ class Tracker:
         for keyframe, placement in zip(self._keyframes, placements, strict=True):
             if placement is not None:
                 keyframe.placement = move.applied(placement)
-        if not self.distortion_known and self._std <= _KNOWN_STD and len(self._keyframes) >= _KNOWN_AFTER:
+        if not self.distortion_known and self._std <= _KNOWN_STD and len(self._keyframes) >= _MIN_KEYFRAMES_FOR_LENS:
             self._options = replace(
                 self._options, pair=replace(self._options.pair, distortion=self._distortion, solver="auto")
             )

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from rdstitch.inputs.source import Source
-from rdstitch.messages import MOST_NAMED, Message, shortened
+from rdstitch.messages import MAX_NAMED, Message, shortened
 
 _FOCAL_SPREAD = 1.03
 """Ratio of focal lengths in EXIF from which on the lens was zoomed; they are rounded to about one per cent."""
@@ -31,7 +31,7 @@ def _several_cameras(sources: Sequence[Source]) -> list[Message]:
         m = source.metadata
         bodies.setdefault(" ".join(filter(None, (m.make, m.model, m.serial))), []).append(source.name)
     if len(bodies) > 1:
-        commonest = sorted(bodies.items(), key=lambda body: -len(body[1]))[:MOST_NAMED]
+        commonest = sorted(bodies.items(), key=lambda body: -len(body[1]))[:MAX_NAMED]
         listed = "; ".join(f"{body} ({len(names)}: {shortened(names)})" for body, names in commonest)
         text = f"the pictures come from {len(bodies)} cameras: {listed}; stitch those of each on their own"
         return [Message(text, code="mixed-lenses")]

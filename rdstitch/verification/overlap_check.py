@@ -28,7 +28,7 @@ from rdstitch.verification.photometric_agreement import (
 from rdstitch.verification.self_similarity import SLACK, Ambiguity, Drawing, draw, drawing_scale, placement_ambiguity
 from rdstitch.verification.unique_places import unique_shifts
 
-_MOST_LINKS = 40
+_MAX_LINKS = 40
 """Links that are looked at in a large set; the least confirmed ones."""
 
 _LINKS_AT_ONCE = 5
@@ -233,5 +233,5 @@ def _least_confirmed(links: Sequence[LinkFit]) -> list[LinkFit]:
         beside.setdefault(fit.image1, set()).add(fit.image2)
         beside.setdefault(fit.image2, set()).add(fit.image1)
     doubtful = sorted(links, key=lambda fit: (len(beside[fit.image1] & beside[fit.image2]), fit.inliers))
-    chosen = {(fit.image1, fit.image2) for fit in doubtful[:_MOST_LINKS]}
+    chosen = {(fit.image1, fit.image2) for fit in doubtful[:_MAX_LINKS]}
     return [fit for fit in links if (fit.image1, fit.image2) in chosen]

@@ -16,14 +16,14 @@ from rdstitch.camera import Camera
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.messages import Message, names_of
 
-_LEAST_ERROR, _MOST_ERROR = 0.002, 0.15
+_MIN_ERROR, _MAX_ERROR = 0.002, 0.15
 """Of a picture's diagonal: between what noise does and what only wrong matches do."""
 
 _MIN_MATCHES = 12
 _MIN_SHARE = 0.05
 """Of the matches of a pair that are nearly right."""
 
-_LEAST_CONSISTENCY = 0.6
+_MIN_CONSISTENCY = 0.6
 """Share of the matches that are off that must be off along one translation."""
 
 _TOLERANCE = 0.00125
@@ -87,15 +87,15 @@ def _parallax(alignment: Alignment, pair: PairRegistration, rng: np.random.Gener
     i, j, matched = pair.image1, pair.image2, pair.correspondences
     diagonal = 2.0 * alignment.cameras[j].half_diagonal
     error = np.linalg.norm(alignment.transfer(i, j, matched.points1) - matched.points2, axis=1) / diagonal
-    nearly = error < _MOST_ERROR
-    off = nearly & (error > _LEAST_ERROR)
+    nearly = error < _MAX_ERROR
+    off = nearly & (error > _MIN_ERROR)
     if off.sum() < max(_MIN_MATCHES, _MIN_SHARE * nearly.sum()):
         return None
     focal = (alignment.focal or 1.0) / 2.0  # of half diagonals, in diagonals
     first = _directions(alignment.cameras[i], alignment.homographies[i], matched.points1[off])
     second = _directions(alignment.cameras[j], alignment.homographies[j], matched.points2[off])
     along = _along_one_translation(first, second, _TOLERANCE / focal, rng)
-    if along.sum() < max(_MIN_MATCHES, _LEAST_CONSISTENCY * off.sum(), _MIN_SHARE * nearly.sum()):
+    if along.sum() < max(_MIN_MATCHES, _MIN_CONSISTENCY * off.sum(), _MIN_SHARE * nearly.sum()):
         return None
     size = float(np.percentile(error[off][along], 95)) * diagonal
     return Parallax(i, j, size, float(along.sum() / nearly.sum()))

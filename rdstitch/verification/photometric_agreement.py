@@ -26,11 +26,11 @@ Grey = NDArray[np.float32]
 
 COMPARED_SIDE = 512  # pixels of the longer side of the pictures that are compared
 _CELL = 24  # pixels
-_REACH = 8  # pixels
-_LEAST_TEXTURE = 0.012  # standard deviation in a cell, of full range
-_ALIKE = 0.5  # correlation from which on two cells show the same
-_SLACK = 2.5  # pixels
-_MOST_CELLS = 120
+_SEARCH_RADIUS = 8  # pixels
+_MIN_TEXTURE = 0.012  # standard deviation in a cell, of full range
+_MIN_CORRELATION = 0.5  # correlation from which on two cells show the same
+_MAX_OFFSET = 2.5  # pixels
+_MAX_CELLS = 120
 _OPAQUE = 250
 _LATTICE = 8  # pixels between the places that are computed; those between are interpolated
 
@@ -127,13 +127,13 @@ def overlap_agreement(first: PlacedPicture, second: PlacedPicture) -> Agreement:
     height, width = second.grey.shape
     # The first picture as the second one's lens would have seen it.
     seen = first.sampled(partial(to_plane, second.camera, second.homography), (0, 0, width, height))
-    margin = _CELL // 2 + _REACH
+    margin = _CELL // 2 + _SEARCH_RADIUS
     rows, columns = (np.arange(margin, n - margin + 1, _CELL) for n in (height, width))
     corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2) - _CELL // 2
     textured = corners[_have_texture(_cells(seen, corners))]
-    looked_at = textured[:: max(1, -(-len(textured) // _MOST_CELLS))]
-    windows = _cells(second.grey, looked_at, _REACH)
-    inner = windows[:, _REACH:-_REACH, _REACH:-_REACH]
+    looked_at = textured[:: max(1, -(-len(textured) // _MAX_CELLS))]
+    windows = _cells(second.grey, looked_at, _SEARCH_RADIUS)
+    inner = windows[:, _SEARCH_RADIUS:-_SEARCH_RADIUS, _SEARCH_RADIUS:-_SEARCH_RADIUS]
     known = np.isfinite(windows).all(axis=(1, 2)) & _have_texture(inner)
     cells = _cells(seen, looked_at[known])
     return Agreement(len(cells), sum(_confirms(*both) for both in zip(cells, windows[known], strict=True)))
@@ -151,11 +151,14 @@ def _cells(picture: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:
 
 def _have_texture(cells: Grey) -> NDArray[np.bool_]:
     """Which cells (N, h, w) are distinctive; not those with transparent pixels, whose deviation is NaN."""
-    return np.asarray(cells.std(axis=(1, 2)) > _LEAST_TEXTURE)
+    return np.asarray(cells.std(axis=(1, 2)) > _MIN_TEXTURE)
 
 
 def _confirms(cell: Grey, window: Grey) -> bool:
     """Whether a cell correlates best, and well, with the middle of a window."""
     scores = np.asarray(cv2.matchTemplate(window, cell, cv2.TM_CCOEFF_NORMED))
     row, column = np.unravel_index(int(scores.argmax()), scores.shape)
-    return bool(scores[row, column] >= _ALIKE and np.hypot(row - _REACH, column - _REACH) <= _SLACK)
+    return bool(
+        scores[row, column] >= _MIN_CORRELATION
+        and np.hypot(row - _SEARCH_RADIUS, column - _SEARCH_RADIUS) <= _MAX_OFFSET
+    )

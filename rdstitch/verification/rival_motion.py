@@ -36,7 +36,7 @@ _MIN_SHARE = 0.1
 _CONTESTED_SHARE = 0.45
 """From here on nobody can say which of the two motions is the plane's."""
 
-_LEAST_AGREEMENT = 0.4
+_MIN_AGREEMENT = 0.4
 """Share of the overlaps that must look alike where there is a rival. The plane fills what two pictures share of it, but
 for the rival: 0.5 to 0.9 in the same sets, where a vehicle was registered instead 0.15 to 0.29."""
 
@@ -130,7 +130,7 @@ def rival_messages(
         f"{share:.0%} of what the pictures have in common moves otherwise than the rest, most of it around "
         f"({u:.0f}, {v:.0f}) of {first} when compared with {second}, by {worst.disagreement:.0f} pixels"
     )
-    if lens_only or (share < _CONTESTED_SHARE and not agreement < _LEAST_AGREEMENT):
+    if lens_only or (share < _CONTESTED_SHARE and not agreement < _MIN_AGREEMENT):
         return [Message(f"{what} (a vehicle, a second plane?); a mask keeps it out", images, code="rival-motion")]
     # It concerns all pictures: without the one that shows it best, the rival would only be harder to see.
     shown = sorted({k for rival in rivals for k in (rival.image1, rival.image2)})

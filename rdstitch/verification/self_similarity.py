@@ -15,15 +15,15 @@ from rdstitch.camera import Camera
 from rdstitch.radial_homography import to_plane
 from rdstitch.verification.photometric_agreement import Grey, PlacedPicture
 
-LONGEST_SIDE = 256  # pixels of the pictures that are compared
-_MOST_PX = 4  # times the sides of a picture that its outline on the plane may have
+MAX_SIDE = 256  # pixels of the pictures that are compared
+_MAX_PX = 4  # times the sides of a picture that its outline on the plane may have
 _COARSEST = 8.0  # pixels, standard deviation of the blur that brightness is measured by
-_NEAR = 14  # pixels: shifts that are none
+_MIN_SHIFT = 14  # pixels: shifts that are none
 SLACK = 3  # pixels by which the registration may be off
-_LEAST_NORM = 1e-4  # of the largest: where fewer pixels overlap, rounding decides
-_LEAST_SHARE = 0.5  # of the overlap that a shift must keep
-_ALIKE = 0.5  # correlation from which on two pictures look alike
-_AS_GOOD = 0.9  # of the correlation here; a repeated pattern reaches 0.97, other pictures seldom 0.5
+_MIN_NORM = 1e-4  # of the largest: where fewer pixels overlap, rounding decides
+_MIN_SHARE = 0.5  # of the overlap that a shift must keep
+_MIN_CORRELATION = 0.5  # correlation from which on two pictures look alike
+_COMPARABLE_CORRELATION = 0.9  # of the correlation here; a repeated pattern reaches 0.97, other pictures seldom 0.5
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Ambiguity:
     @property
     def ambiguous(self) -> bool:
         """Whether the pictures fit elsewhere as well as here."""
-        return self.elsewhere > max(_ALIKE, _AS_GOOD * self.here)
+        return self.elsewhere > max(_MIN_CORRELATION, _COMPARABLE_CORRELATION * self.here)
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Drawing:
     origin: FloatArray
 
 
-def drawing_scale(camera: Camera, homography: FloatArray, longest_side: int = LONGEST_SIDE) -> float:
+def drawing_scale(camera: Camera, homography: FloatArray, longest_side: int = MAX_SIDE) -> float:
     """Pixels per unit of the plane at which the middle of a picture keeps its size, made small."""
     width, height = camera.image_size
     around = np.array([[width / 2 + dx, height / 2 + dy] for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1))])
@@ -75,13 +75,13 @@ def drawing_scale(camera: Camera, homography: FloatArray, longest_side: int = LO
     return float(min(1.0, longest_side / max(height, width)) / np.sqrt(area))
 
 
-def draw(picture: PlacedPicture, scale: float, longest_side: int = LONGEST_SIDE) -> Drawing:
+def draw(picture: PlacedPicture, scale: float, longest_side: int = MAX_SIDE) -> Drawing:
     """Draw a picture on the plane with so many pixels a unit; ``longest_side`` is that of :func:`drawing_scale`."""
     outline = to_plane(picture.camera, picture.homography, picture.camera.outline(16)) * scale
     if not np.isfinite(outline).any():  # all of it behind the horizon
         return Drawing(np.full((1, 1), np.nan, dtype=np.float32), np.zeros(2))
     middle = np.nanmedian(outline, axis=0)
-    reach = _MOST_PX / 2.0 * longest_side
+    reach = _MAX_PX / 2.0 * longest_side
     low, high = (
         np.clip(edge, middle - reach, middle + reach) for edge in (np.nanmin(outline, 0), np.nanmax(outline, 0))
     )
@@ -108,16 +108,16 @@ def placement_ambiguity(first: Drawing, second: Drawing) -> Ambiguity:
     most = float(overlaps.area[close][within].max(initial=0.0))
     if not most > 0:
         return Ambiguity(0.0, 0.0, 0.0)
-    enough = overlaps.area >= _LEAST_SHARE * most
+    enough = overlaps.area >= _MIN_SHARE * most
     box = _box_around(enough, SLACK)
     score, distance = overlaps.correlation(box), np.hypot(down[box[0], None], right[None, box[1]])
     near = distance <= SLACK
     # A peak of its own, not the flank of the one here.
     peak = score >= cv2.dilate(score, np.ones((2 * SLACK + 1, 2 * SLACK + 1), dtype=np.uint8))
-    other = np.where(peak & (distance > _NEAR) & enough[box], score, np.float32(0.0))
+    other = np.where(peak & (distance > _MIN_SHIFT) & enough[box], score, np.float32(0.0))
     best = int(other.argmax())
     here = float(score[near].max(initial=0.0))
-    return Ambiguity(here, float(other.flat[best]), float(distance.flat[best]) / LONGEST_SIDE)
+    return Ambiguity(here, float(other.flat[best]), float(distance.flat[best]) / MAX_SIDE)
 
 
 def _box_around(chosen: NDArray[np.bool_], margin: int) -> tuple[slice, slice]:
@@ -171,7 +171,7 @@ class Overlaps:
     def correlation(self, box: tuple[slice, slice] = (slice(None), slice(None))) -> Grey:
         """Normalized correlation at the positions in a box; at all of them if not given."""
         norm = np.sqrt(np.maximum(self.squares1[box], 0.0) * np.maximum(self.squares2[box], 0.0))
-        floor = _LEAST_NORM * max(float(norm.max()), 1e-12)
+        floor = _MIN_NORM * max(float(norm.max()), 1e-12)
         correlation: Grey = np.where(norm > floor, self.products[box] / np.maximum(norm, floor), np.float32(0.0))
         return correlation
 

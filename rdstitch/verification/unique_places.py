@@ -17,16 +17,16 @@ from rdstitch.radial_homography import from_plane, to_plane
 from rdstitch.verification.photometric_agreement import COMPARED_SIDE, Grey, PlacedPicture
 from rdstitch.verification.self_similarity import Drawing, Overlaps, draw, drawing_scale
 
-_NEAR = 10  # pixels: a shorter shift is no period that could be told from the peak itself
+_MIN_SHIFT = 10  # pixels: a shorter shift is no period that could be told from the peak itself
 _PERIODIC = 0.4  # correlation from which on a shift is a period
 _OWN_OVERLAP, _OVERLAP = 0.15, 0.05  # of a picture, that a shift must keep; of two, of the most that one keeps
-_FEWEST_PERIODS, _MOST_PERIODS = 4, 16  # shifts that a picture is compared with itself at
-_FEWEST_COPIES = 3  # other copies of a place, of which the median is clean though one of them has dirt
+_MIN_PERIODS, _MAX_PERIODS = 4, 16  # shifts that a picture is compared with itself at
+_MIN_COPIES = 3  # other copies of a place, of which the median is clean though one of them has dirt
 _MARGIN = 6  # pixels at the border of a picture, where brightness cannot be removed well
 _DEPARTS, _MOST = 5.0, 25.0  # spreads of the copies: less is no departure, more counts as this
-_LEAST_MATCHED = 400.0  # squared spreads times pixels: a stain of sixteen pixels, five spreads beyond what is none
-_LEAST_SHARE = 0.8  # of the departures in the overlap that must be the same; right ones have 0.87 to 0.99
-_LEAST_LEAD = 3.0  # of what is matched here, over what is matched at any other shift
+_MIN_MATCHED = 400.0  # squared spreads times pixels: a stain of sixteen pixels, five spreads beyond what is none
+_MIN_SHARE = 0.8  # of the departures in the overlap that must be the same; right ones have 0.87 to 0.99
+_MIN_LEAD = 3.0  # of what is matched here, over what is matched at any other shift
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ class UniqueShift:
     @property
     def decides(self) -> bool:
         """Whether the pictures lie here and nowhere else."""
-        clear = self.matched >= max(_LEAST_MATCHED, _LEAST_LEAD * self.rival)
-        return clear and self.share >= _LEAST_SHARE
+        clear = self.matched >= max(_MIN_MATCHED, _MIN_LEAD * self.rival)
+        return clear and self.share >= _MIN_SHARE
 
 
 def unique_shifts(
@@ -109,15 +109,15 @@ def departures(pixels: Grey) -> Grey | None:
         0 where it does not; NaN where nothing is known. None for a picture that shows too few periods.
     """
     found = _peaks(Overlaps.of(pixels, pixels), pixels, np.zeros(2), _OWN_OVERLAP)
-    periods = found.shift[np.hypot(*found.shift.T) > _NEAR]
-    periods = periods[np.argsort(np.hypot(*periods.T), kind="stable")][:_MOST_PERIODS]
-    if len(periods) < _FEWEST_PERIODS:
+    periods = found.shift[np.hypot(*found.shift.T) > _MIN_SHIFT]
+    periods = periods[np.argsort(np.hypot(*periods.T), kind="stable")][:_MAX_PERIODS]
+    if len(periods) < _MIN_PERIODS:
         return None
     copies = np.stack([_shifted(pixels, shift) for shift in periods])
     count = np.isfinite(copies).sum(axis=0)
     middle = _median(copies, count)
     spread = 1.4826 * _median(np.abs(copies - middle), count)
-    known = (count >= _FEWEST_COPIES) & np.isfinite(pixels)
+    known = (count >= _MIN_COPIES) & np.isfinite(pixels)
     inside = cv2.erode(np.isfinite(pixels).astype(np.uint8), np.ones((2 * _MARGIN + 1,) * 2, np.uint8), borderValue=0)
     if not known.any():
         return None
@@ -146,7 +146,7 @@ def unique_shift(first: Drawing, second: Drawing, unique1: Grey, unique2: Grey) 
         share[k] = overlaps.correlation(box).max(initial=0.0)
         matched[k] = share[k] * overlaps.products[box].max(initial=0.0)
     best = int(matched.argmax())
-    elsewhere = np.hypot(*(found.shift - found.shift[best]).T) > _NEAR
+    elsewhere = np.hypot(*(found.shift - found.shift[best]).T) > _MIN_SHIFT
     rival = float(matched[elsewhere].max(initial=0.0))
     return UniqueShift(found.shift[best], float(matched[best]), float(share[best]), rival)
 
@@ -162,7 +162,7 @@ class _Peaks:
 def _peaks(overlaps: Overlaps, first: Grey, offset: FloatArray, least_overlap: float) -> _Peaks:
     """The peaks of the correlation, to a part of a pixel, from the shift ``offset`` (x, y) on."""
     score = overlaps.correlation()
-    kernel = np.ones((2 * _NEAR + 1, 2 * _NEAR + 1), dtype=np.uint8)
+    kernel = np.ones((2 * _MIN_SHIFT + 1, 2 * _MIN_SHIFT + 1), dtype=np.uint8)
     enough = overlaps.area >= least_overlap * overlaps.area.max()
     peak = (score >= cv2.dilate(score, kernel)) & enough & (score > _PERIODIC)
     peak[[0, -1]] = peak[:, [0, -1]] = False
@@ -206,4 +206,4 @@ def _moves(first: PlacedPicture, second: PlacedPicture, shift: FloatArray) -> bo
     height, width = first.grey.shape
     middle = np.array([[width / 2.0, height / 2.0]])
     seen = from_plane(second.camera, second.homography, to_plane(first.camera, first.homography, middle) + shift)
-    return not bool(np.linalg.norm(seen - middle) <= _NEAR)
+    return not bool(np.linalg.norm(seen - middle) <= _MIN_SHIFT)

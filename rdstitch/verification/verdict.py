@@ -21,17 +21,17 @@ from rdstitch.verification.rival_motion import find_rival_motions, rival_message
 
 Pair = tuple[int, int]
 
-_LARGEST_RMS = 1.0  # of the whole, in thresholds
-_LARGEST_RMS_OF_RELIEF = 3.0  # the same where neighbours' errors agree and the pictures look alike
-_MOST_AMBIGUOUS = 0.4  # share of the pairs that may fit elsewhere: more is a pattern all over
-_LEAST_INLIERS = 0.5  # share of a pair's own inliers that agree with the whole
+_MAX_RMS = 1.0  # of the whole, in thresholds
+_MAX_RMS_OF_RELIEF = 3.0  # the same where neighbours' errors agree and the pictures look alike
+_MAX_AMBIGUITY = 0.4  # share of the pairs that may fit elsewhere: more is a pattern all over
+_MIN_INLIERS = 0.5  # share of a pair's own inliers that agree with the whole
 # The same over all pairs of a picture; right ones have been seen to have 83 % even with relief, others 52 %.
-_LEAST_OF_A_PICTURE = 0.6
+_MIN_MATCHES_PER_PICTURE = 0.6
 # Of the cells of an overlap that agree: chance lets up to 7 % do so, and right registrations of difficult pictures
 # (low sun, parallax, blur) have been seen to have 20 %.
-_LEAST_AGREEMENT, _DOUBTFUL_AGREEMENT = 0.10, 0.15
+_MIN_AGREEMENT, _DOUBTFUL_AGREEMENT = 0.10, 0.15
 _USUAL_AGREEMENT = 0.25
-_LEAST_CELLS = 8  # below, the overlap has too little texture to say anything
+_MIN_CELLS = 8  # below, the overlap has too little texture to say anything
 
 
 class RefusedError(RegistrationError):
@@ -121,10 +121,10 @@ def _failure(text: str, images: Sequence[str] = ()) -> Message:
 def _error_of_the_whole(alignment: Alignment, threshold: float, checked: Sequence[CheckedLink]) -> list[Message]:
     """Errors of all pairs together; those of rough ground are a warning where the pixels agree."""
     rms = alignment.rms
-    if rms <= _LARGEST_RMS * threshold:
+    if rms <= _MAX_RMS * threshold:
         return []
     text = f"the pictures disagree by {rms:.1f} pixels, more than the threshold of {threshold:g} pixels"
-    rough = alignment.relief.found and rms <= _LARGEST_RMS_OF_RELIEF * threshold and _look_alike(checked)
+    rough = alignment.relief.found and rms <= _MAX_RMS_OF_RELIEF * threshold and _look_alike(checked)
     return [Message(f"{text}: the ground is rough", code="relief") if rough else _failure(text)]
 
 
@@ -167,20 +167,20 @@ def _shape(paths: Sequence[str], alignment: Alignment) -> list[Message]:
 def _agreement_of_all(used: Sequence[LinkFit]) -> list[Message]:
     """Matches of all pairs together."""
     given, kept = sum(fit.count for fit in used), sum(fit.inliers for fit in used)
-    if kept >= _LEAST_INLIERS * given:
+    if kept >= _MIN_INLIERS * given:
         return []
     return [_failure(f"only {kept} of {given} matches of the pairs agree with the whole")]
 
 
 def _look_alike(checked: Sequence[CheckedLink]) -> bool:
     """Whether pictures look alike where most pairs put them, as far as there is something to see."""
-    shares = [link.agreement.share for link in checked if link.agreement.cells >= _LEAST_CELLS]
+    shares = [link.agreement.share for link in checked if link.agreement.cells >= _MIN_CELLS]
     return bool(shares) and float(np.median(shares)) >= _USUAL_AGREEMENT
 
 
 def _pattern(ambiguous: Mapping[Pair, Message], checked: Sequence[CheckedLink]) -> list[Message]:
     """A pattern that repeats itself over so many pairs that leaving some of them out proves nothing."""
-    if len(ambiguous) <= _MOST_AMBIGUOUS * len(checked):
+    if len(ambiguous) <= _MAX_AMBIGUITY * len(checked):
         return []
     return [_failure(f"{len(ambiguous)} of {len(checked)} pairs fit as well elsewhere (a repeated pattern?)")]
 
@@ -223,7 +223,7 @@ def _misfits(paths: Sequence[str], used: Sequence[LinkFit]) -> list[Message]:
             f"only {kept[k]} of {given[k]} of its matches agree with the whole; another camera or zoom?",
             [paths[k]],
         )
-        for k in np.flatnonzero(kept < _LEAST_OF_A_PICTURE * given).tolist()
+        for k in np.flatnonzero(kept < _MIN_MATCHES_PER_PICTURE * given).tolist()
     ]
 
 
@@ -252,7 +252,7 @@ def _disagreeing(paths: Sequence[str], used: Sequence[LinkFit]) -> dict[Pair, Me
             "stitch them on their own",
         )
         for fit in used
-        if fit.inliers < _LEAST_INLIERS * fit.count
+        if fit.inliers < _MIN_INLIERS * fit.count
     }
 
 
@@ -266,7 +266,7 @@ def _unlike(paths: Sequence[str], checked: Sequence[CheckedLink]) -> dict[Pair, 
             "places agree)",
         )
         for link in checked
-        if link.agreement.cells >= _LEAST_CELLS and link.agreement.share < _LEAST_AGREEMENT
+        if link.agreement.cells >= _MIN_CELLS and link.agreement.share < _MIN_AGREEMENT
     }
 
 
@@ -310,5 +310,5 @@ def _little_alike(paths: Sequence[str], checked: Sequence[CheckedLink]) -> list[
             "warning",
         )
         for link in checked
-        if link.agreement.cells >= _LEAST_CELLS and _LEAST_AGREEMENT <= link.agreement.share < _DOUBTFUL_AGREEMENT
+        if link.agreement.cells >= _MIN_CELLS and _MIN_AGREEMENT <= link.agreement.share < _DOUBTFUL_AGREEMENT
     ]

@@ -25,9 +25,9 @@ from rdstitch.synthetic.correspondences import SyntheticMatches
 SIZE = (1000, 800)
 
 CONSTANTS: dict[str, tuple[str, ...]] = {
-    "robust.model_selection": ("PAIR_WIDTH", "_LEAST_NOISE", "_NEAR", "_STEPS", "OBSERVABLE_STD"),
-    "robust.ransac": ("_SOLVER_SUCCESS", "_LEAST_EXPLORATION", "_NOVELTY", "_FREE_REFINEMENT", "_LOCAL_STEPS"),
-    "robust.verification": ("_CELLS_PER_DIAGONAL", "LEAST_PLACES", "_LARGEST_CHANCE"),
+    "robust.model_selection": ("PAIR_WIDTH", "_MIN_NOISE", "_NEAR", "_STEPS", "OBSERVABLE_STD"),
+    "robust.ransac": ("_SOLVER_SUCCESS", "_MIN_EXPLORATION", "_NOVELTY", "_FREE_REFINEMENT", "_LOCAL_STEPS"),
+    "robust.verification": ("_CELLS_PER_DIAGONAL", "MIN_PLACES", "_MAX_CHANCE"),
     "robust.covariance": ("_CELLS_PER_HALF_DIAGONAL",),
     "robust.levenberg_marquardt": ("PAIR_GAIN", "ROUGH_GAIN", "FIRST_DAMPING"),
 }

@@ -52,7 +52,7 @@ TESTS = ("unit/robust", "unit/verification", "unit/matching", "unit/alignment")
 
 # Numbers that decide nothing: changed, the same comes out, only sooner or later, or in other steps.
 SPEED_ONLY = frozenset(
-    ("_BLOCK", "_CHUNK", "_FIRST_BATCH", "_LARGEST_BATCH", "_QUICK_SCORE", "_MOST_TRIANGLES", "_LATTICE", "_TRAINING")
+    ("_BLOCK", "_CHUNK", "_FIRST_BATCH", "_MAX_BATCH", "_QUICK_SCORE", "_MAX_TRIANGLES", "_LATTICE", "_TRAINING")
 )
 _COUNT = 8  # from which on one more of something would make no difference
 _SMALLEST = 1e-5  # numbers below keep divisions and logarithms finite

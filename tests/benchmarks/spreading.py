@@ -22,7 +22,7 @@ from rdstitch.synthetic import Photometry, ground, pair_poses, sequence_over
 
 SIZE = (1000, 750)
 PAIRS = 10
-LARGEST_ERROR = 0.2
+MAX_ERROR = 0.2
 
 Pictures = tuple[list[NDArray[np.uint8]], list[tuple[int, int]], list[float]]
 
@@ -94,7 +94,7 @@ def main() -> None:
     for choice, options in choices:
         rows = list(errors([detect(picture, options) for picture in pictures], pairs, truth))
         error, inliers, outer = np.array(rows).reshape(-1, 3).T
-        rms = np.sqrt(np.mean(np.minimum(error, LARGEST_ERROR) ** 2))
+        rms = np.sqrt(np.mean(np.minimum(error, MAX_ERROR) ** 2))
         print(
             f"| {options.kind}, {options.max_features} | {choice} | {len(rows)} of {len(pairs)} "
             f"| {np.median(inliers):.0f} | {np.median(error):.4f} | {rms:.4f} | {np.median(outer):.2f} |",

@@ -190,7 +190,7 @@ def test_of_a_large_tiff_an_overview_is_read(
 ) -> None:
     result = pano(frames[:2], tmp_path / "large.tif", StitchOptions(workers=1, composite=CompositeOptions(scale=3.0)))
     whole = _decoded(thumbnails.of_mosaic(result, 300))
-    monkeypatch.setattr(preview, "_LARGE", 1000)
+    monkeypatch.setattr(preview, "_OVERVIEW_FROM", 1000)
     monkeypatch.setattr(preview, "read_image", None)
     overview = _decoded(thumbnails.of_mosaic(result, 300))
     assert overview.shape == whole.shape

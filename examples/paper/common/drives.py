@@ -17,7 +17,7 @@ from rdstitch.synthetic.poses import pixels_of_texels, texels_of_pixels
 PATHS = {"line": line_poses, "turn": turn_poses, "parallel parking": parking_poses}
 
 _STEPS = (1, 2, 4)
-_LEAST_MATCHES = 30
+_MIN_MATCHES = 30
 _PER_PICTURE = 200
 _WRONG = 0.1  # share of the matches
 
@@ -88,7 +88,7 @@ def drive(path: str, frames: int, *, seed: int, noise: float = 0.5) -> Drive:
         for step in _STEPS:
             if first + step < frames:
                 points = _matches(camera, poses.from_plane()[[first, first + step]], noise, rng)
-                if len(points[0]) >= _LEAST_MATCHES:
+                if len(points[0]) >= _MIN_MATCHES:
                     pairs.append(FramePair(first, first + step, *points))
     return Drive(camera, tilt, poses, tuple(pairs))
 

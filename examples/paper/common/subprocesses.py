@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _LAUNCHER = Path(__file__).with_name("launcher.py")
-_MOST_MEMORY = 8 << 30  # bytes of address space: a mosaic that runs away must not take the machine with it
+_MAX_MEMORY = 8 << 30  # bytes of address space: a mosaic that runs away must not take the machine with it
 _SAID = 120  # characters of a program's last line that are kept
 
 
@@ -59,7 +59,7 @@ def run_all(commands: Sequence[Sequence[str]], folder: Path, timeout: float) -> 
     processor, megabytes, said = 0.0, 0.0, ""
     for command in commands:
         left = timeout - (time.perf_counter() - begun)
-        launched = [sys.executable, "-I", "-S", str(_LAUNCHER), str(left), str(_MOST_MEMORY), *command]
+        launched = [sys.executable, "-I", "-S", str(_LAUNCHER), str(left), str(_MAX_MEMORY), *command]
         done = subprocess.run(launched, cwd=folder, capture_output=True, text=True, errors="replace", check=True)
         told = json.loads(done.stdout)
         status, lines = told["status"], done.stderr.strip().splitlines()

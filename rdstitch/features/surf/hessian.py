@@ -13,7 +13,7 @@ from rdstitch.features.surf.quadric import vertex
 
 # The box filter of 9 pixels stands for a Gaussian of σ = 1.2 pixels; larger ones in proportion (§3.3).
 SIGMA_PER_SIZE = 1.2 / 9
-_SMALLEST_LOBE = 3
+_MIN_LOBE = 3
 # Weight of the mixed derivative, which the box filters get relatively wrong (§3.2).
 _MIXED_WEIGHT = 0.9
 # Rows worked on at a time, few enough that the intermediate results stay in the cache.
@@ -92,7 +92,7 @@ def find_blobs(grey: Grey, threshold: float, octaves: int, layers: int) -> Blobs
 def _blobs_of_rows(level: Grey, start: int, stop: int, threshold: float, layers: int) -> Blobs:
     """Blobs centred in rows ``start`` to ``stop`` of a level, pixels of the level."""
     height, width = level.shape
-    lobes = [_SMALLEST_LOBE + 2 * k for k in range(layers + 2)]
+    lobes = [_MIN_LOBE + 2 * k for k in range(layers + 2)]
     # One row more on either side, to compare with.
     first, last = max(start - 1, 0), min(stop + 1, height)
     reach = (3 * lobes[-1]) // 2
@@ -114,7 +114,7 @@ def _blobs_of_rows(level: Grey, start: int, stop: int, threshold: float, layers:
     layer, row, column, offset = layer[kept], row[kept], column[kept], offset[kept]
     return Blobs(
         points=np.column_stack([column, row + first]) + offset[:, :2],
-        size=3.0 * (_SMALLEST_LOBE + 2.0 * (layer + offset[:, 2])),
+        size=3.0 * (_MIN_LOBE + 2.0 * (layer + offset[:, 2])),
         response=determinant[layer, row, column].astype(np.float64),
         laplacian_sign=np.where(trace[layer, row, column] >= 0, 1, -1).astype(np.int8),
     )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 
-_LARGEST_SUM = 2.0**24 / 255 - 1000  # of the absolute values of one filter, with room for rounding
+_MAX_SUM = 2.0**24 / 255 - 1000  # of the absolute values of one filter, with room for rounding
 
 
 def integer_kernels(kernels: FloatArray) -> tuple[NDArray[np.float32], float]:
@@ -25,7 +25,7 @@ def integer_kernels(kernels: FloatArray) -> tuple[NDArray[np.float32], float]:
     factor : float
         Divide the products by this.
     """
-    factor = float(_LARGEST_SUM / np.abs(kernels).sum(axis=0).max())
+    factor = float(_MAX_SUM / np.abs(kernels).sum(axis=0).max())
     rounded = np.rint(kernels * factor)
     # What rounding adds to the sum, a handful of units in 65,000, goes to the largest weight.
     rounded[np.abs(rounded).argmax(axis=0), np.arange(kernels.shape[1])] -= rounded.sum(axis=0)

@@ -23,7 +23,7 @@ _SPACING = 0.5  # of samples, units of s
 _SAMPLES = 24  # along each side of a patch
 _STEP = 0.5  # between the places compared, units of s
 _FACTOR = 1.2  # between the scales compared
-_FARTHEST = 1.5  # that a blob may move, in steps
+_MAX_OFFSET = 1.5  # that a blob may move, in steps
 _BLOBS = 2048  # worked on at a time
 
 
@@ -53,7 +53,7 @@ def _refine(levels: list[Grey], blobs: Blobs) -> Blobs:
     uu, vv, uv = np.moveaxis((apply(patches, _KERNELS) / np.float32(_KERNEL_FACTOR)).reshape(-1, 3, 27), 1, 0)
     determinant = (uu * vv - uv**2).reshape(-1, 3, 3, 3)
     offset, is_maximum = vertex(determinant)
-    near = is_maximum & (np.abs(offset) <= _FARTHEST).all(axis=1)
+    near = is_maximum & (np.abs(offset) <= _MAX_OFFSET).all(axis=1)
     blobs, offset = blobs.take(near), offset[near]
     return replace(
         blobs,

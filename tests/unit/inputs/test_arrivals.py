@@ -41,7 +41,7 @@ def test_what_is_in_a_folder_comes_in_natural_order_and_then_it_ends(tmp_path: P
 def test_files_that_come_later_are_found_once_and_only_when_they_are_complete(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "_POLL", 0.02)
+    monkeypatch.setattr(module, "_POLL_SECONDS", 0.02)
     frames = iter(Arrivals(tmp_path, frames_folder=_nowhere, idle=1.5))
     _picture(tmp_path / "a.png")
     assert next(frames).path.name == "a.png"

@@ -12,8 +12,8 @@ from PIL.PngImagePlugin import PngInfo
 
 from rdstitch.errors import InputError
 from rdstitch.io import Metadata, read_image, read_metadata, write_image
-from rdstitch.io.deepzoom import LARGEST_TILE_PROFILE
-from rdstitch.io.metadata import LARGEST_PROFILE
+from rdstitch.io.deepzoom import MAX_TILE_PROFILE
+from rdstitch.io.metadata import MAX_PROFILE
 from rdstitch.io.xmp import xmp_number
 from rdstitch.records import read_text
 from rdstitch.regular_files import open_regular, read_limited
@@ -98,7 +98,7 @@ def _profile(size: int, space: bytes = b"RGB ") -> bytes:
 
 
 def test_large_profiles_are_left_out(tmp_path: Path) -> None:
-    for size, kept in ((3000, True), (LARGEST_PROFILE, True), (8_000_000, False)):
+    for size, kept in ((3000, True), (MAX_PROFILE, True), (8_000_000, False)):
         Image.fromarray(_RGB).save(tmp_path / "in.jpg", icc_profile=_profile(size))
         metadata = read_metadata(tmp_path / "in.jpg")
         assert (len(metadata.icc_profile) == size, metadata.profile_lost == "") == (kept, kept)
@@ -107,7 +107,7 @@ def test_large_profiles_are_left_out(tmp_path: Path) -> None:
         for name in ("a.png", "a.jpg", "a.tif"):
             assert read_metadata(tmp_path / name).icc_profile == metadata.icc_profile
         in_tile = read_metadata(tmp_path / "a_files" / "6" / "0_0.jpg").icc_profile
-        assert in_tile == (metadata.icc_profile if size <= LARGEST_TILE_PROFILE else b"")
+        assert in_tile == (metadata.icc_profile if size <= MAX_TILE_PROFILE else b"")
     Image.fromarray(_RGB).convert("CMYK").save(tmp_path / "ink.jpg", icc_profile=_profile(3000, b"CMYK"))
     assert "inks" in read_metadata(tmp_path / "ink.jpg").profile_lost
 

@@ -9,7 +9,7 @@ import pytest
 import rdstitch
 from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions, Features, detect
-from rdstitch.matching.repeated_pattern import LEAST_REPETITION, match_pattern, repetition
+from rdstitch.matching.repeated_pattern import MIN_REPETITION, match_pattern, repetition
 from rdstitch.synthetic import PictureTexture, Sequence, grid_poses, ground, sequence_over
 
 _SIDE = 40
@@ -34,8 +34,8 @@ def _features(sequence: Sequence, index: int) -> Features:
 
 def test_boards_repeat_themselves_and_ground_does_not(board: Sequence) -> None:
     plain = sequence_over(partial(ground, seed=3), _LENS, board.poses)
-    assert repetition(_features(board, 0)) > 2 * LEAST_REPETITION
-    assert repetition(_features(plain, 0)) < LEAST_REPETITION / 2
+    assert repetition(_features(board, 0)) > 2 * MIN_REPETITION
+    assert repetition(_features(plain, 0)) < MIN_REPETITION / 2
 
 
 def test_matches_are_right_or_off_by_whole_squares(board: Sequence) -> None:

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import binom
 
 from rdstitch.arrays import FloatArray
-from rdstitch.robust.verification import LEAST_PLACES, numbered_cells, places, rejection_reason
+from rdstitch.robust.verification import MIN_PLACES, numbered_cells, places, rejection_reason
 
 SIZE = (1000, 800)
 CELL = np.hypot(*SIZE) / 32
@@ -26,12 +26,12 @@ def test_chance_is_that_of_a_wrong_match_near_its_place(matches: int, threshold:
     points = _apart(matches)
     for count, reliable in ((enough, True), (enough - 1, False)):
         reason = rejection_reason(points, points, np.arange(matches) < count, SIZE, threshold)
-        if count >= LEAST_PLACES:
+        if count >= MIN_PLACES:
             assert (reason is None) is reliable, count
 
 
 def test_few_matches_that_all_agree_are_no_chance() -> None:
-    points = _apart(LEAST_PLACES)
+    points = _apart(MIN_PLACES)
     assert rejection_reason(points, points, np.ones(len(points), dtype=np.bool_), SIZE, 3.0) is None
 
 
@@ -44,13 +44,13 @@ def test_a_wide_threshold_is_taken_for_even_odds_at_most() -> None:
 
 
 def test_neighbouring_matches_count_once() -> None:
-    points = np.repeat(_apart(LEAST_PLACES - 1), 50, axis=0)
+    points = np.repeat(_apart(MIN_PLACES - 1), 50, axis=0)
     everything = np.ones(len(points), dtype=np.bool_)
     assert (
         rejection_reason(points, points, everything, SIZE, 3.0)
         == "350 of 350 matches agree, in only 7 places of the picture"
     )
-    one_more = np.vstack([points, _apart(LEAST_PLACES)[-1:]])
+    one_more = np.vstack([points, _apart(MIN_PLACES)[-1:]])
     assert rejection_reason(one_more, one_more, np.ones(len(one_more), dtype=np.bool_), SIZE, 3.0) is None
 
 

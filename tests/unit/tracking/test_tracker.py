@@ -149,13 +149,13 @@ def test_a_frame_of_something_else_has_no_place_and_the_next_one_has() -> None:
 
 
 def test_a_new_map_begins_where_the_track_is_lost_for_good(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_LOST", 3)
+    monkeypatch.setattr(module, "_MAX_LOST_FRAMES", 3)
     frames, tracker = _features(_drive(8)), _tracker()
     elsewhere = _features(_drive(11, path="line"), world=7)
     before = [tracker.add(frame, Camera(SIZE))[-1] for frame in frames]
     after = [tracker.add(frame, Camera(SIZE))[-1] for frame in elsewhere]
     assert {result.map_number for result in before} == {0}
-    assert [result.placement for result in after[: module._LOST]] == [None] * module._LOST
+    assert [result.placement for result in after[: module._MAX_LOST_FRAMES]] == [None] * module._MAX_LOST_FRAMES
     assert after[-1].map_number == 1
     assert after[-1].placement is not None
 
