@@ -150,7 +150,7 @@ def alignment_options(sources: Sequence[Source], options: StitchOptions) -> Alig
         attitudes=np.array(attitudes) if attitudes else None,
         attitudes_std=options.attitude_std,
         gravity=_gravity(sources),
-        positions=positions_of(sources),
+        positions=positions_of(sources) if sources else None,
     )
 
 

@@ -72,7 +72,7 @@ def test_defaults_are_the_librarys(name: str) -> None:
     of_command = {"inputs", "output", "every", "preview", "report", "as_json", "quiet", "verbose"}
     of_command |= {"layout", "plot", "height", "timestamps", "following", "idle", "refresh"}
     given = {key: value for key, value in context.params.items() if key not in of_command}
-    with Reporter(-1) as reporter:
+    with context.scope(cleanup=False), Reporter(-1) as reporter:
         assert stitch_options(reporter, **given) == StitchOptions()
 
 
