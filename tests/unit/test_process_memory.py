@@ -11,6 +11,7 @@ from rdstitch.process_memory import memory_left, release_free_heap
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system does not say what a process holds")
 def test_what_the_process_holds_counts() -> None:
+    release_free_heap()
     before = memory_left(0)
     held = np.ones(50_000_000, dtype=np.uint8)
     assert before - memory_left(0) == pytest.approx(held.nbytes, rel=0.1)

@@ -46,7 +46,7 @@ def test_a_turn_by_hand_is_warned_of_with_the_pair_and_the_size(tmp_path: Path, 
 
 
 def test_the_size_is_that_of_what_is_near(tmp_path: Path) -> None:
-    (warning,) = _warnings(tmp_path, 0.02)[1]
+    (warning,) = [message for message in _warnings(tmp_path, 0.02)[1] if message.code == "parallax"]
     size = float(warning.text.split(" pixels")[0].rsplit(" ", 1)[1])
     # Between neighbours the camera moves by 2 r sin(17.5°) at right angles to what lies between them, whose nearest
     # point is 0.45 (1 - 0.4) away, before a scene at a distance of 1.
