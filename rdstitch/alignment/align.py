@@ -124,7 +124,7 @@ def align(
     full = replace(graph, observations=everything)
     problem, _ = full.problem(~wrong, pictures, choice.overdispersion)
     fit = problem.refine(choice.fit.model, choice.fit.adjusted.parameters, choice.fit.tilt_spread)
-    problem, fit = with_third_coefficient(problem, fit, options.lenses)
+    problem, fit = with_third_coefficient(problem, fit) if options.lens_chosen else (problem, fit)
     problem, fit, disagreement = hold_positions(problem, fit)
     found = AdjustedPictures(
         cameras,

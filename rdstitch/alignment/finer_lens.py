@@ -3,7 +3,6 @@
 Only where the errors are noise. Over relief a motion model would take ν for the ground, as it would μ.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
@@ -23,14 +22,10 @@ _MIN_GAIN = 1.0
 points of all links of a picture for the same, of which each link uses others."""
 
 
-def with_third_coefficient(problem: Problem, fit: Fit, names: Sequence[str]) -> tuple[Problem, Fit]:
-    """A problem and its fit, with ν free where that is worth it, μ and the centre are free, and there is a choice."""
+def with_third_coefficient(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
+    """A problem and its fit, with ν free where that is worth it, and μ and the centre are free."""
     adjusted, observations, finer = fit.adjusted, problem.observations, free_parameters("division3")
-    if (
-        "division3" not in names[1:]
-        or problem.count < ENOUGH_PICTURES
-        or (fit.free_lens != free_parameters("division2")).any()
-    ):
+    if problem.count < ENOUGH_PICTURES or (fit.free_lens != free_parameters("division2")).any():
         return problem, fit
     errors = whitened_errors(observations, adjusted.homographies, adjusted.parameters.lens)
     inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2

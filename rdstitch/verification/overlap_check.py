@@ -210,12 +210,15 @@ def _by_what_is_unique(placed: Mapping[int, PlacedPicture], checked: Sequence[Ch
 
 
 def _compare_around(fit: LinkFit, first: PlacedPicture, second: PlacedPicture) -> CheckedLink:
-    """No plane shows all pictures of a turn; one between the two shows both, and stretches neither much."""
+    """No plane shows all pictures of a turn; one between the two shows both, and stretches what both show the least.
+
+    What both show has the pixels there that the middle of a picture has on a plane that it sees straight on.
+    """
     both = np.stack([first.homography, second.homography])
-    rotations = both / np.linalg.norm(both, axis=1, keepdims=True)
-    to_plane = nearest_rotation(rotations.sum(axis=0)).T @ both
+    intrinsics = np.linalg.norm(both, axis=1)
+    scale = drawing_scale(second.camera, np.diag(intrinsics[1]))
+    to_plane = nearest_rotation((both / intrinsics[:, None]).sum(axis=0)).T @ both
     first, second = replace(first, homography=to_plane[0]), replace(second, homography=to_plane[1])
-    scale = drawing_scale(second.camera, second.homography)
     ambiguity = placement_ambiguity(draw(first, scale), draw(second, scale))
     return CheckedLink(fit, overlap_agreement(first, second), ambiguity)
 

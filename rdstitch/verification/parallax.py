@@ -2,7 +2,7 @@
 
 With the turn taken away, a match of directions d1, d2 whose camera moved by t fulfils ``t · (d1 × d2) = 0``: what is
 near moves along great circles through t, all of it the same way, and the farther the nearer it is (epipolar geometry of
-a known rotation). Wrong matches and noise move anywhere.
+a known rotation). Wrong matches and noise move anywhere. A thing that moves on its own may look like it.
 """
 
 from collections.abc import Sequence
@@ -76,8 +76,9 @@ def parallax_messages(paths: Sequence[str], found: Sequence[Parallax]) -> list[M
     images = (paths[worst.image1], paths[worst.image2])
     first, second = names_of(images)
     text = (
-        f"the camera moved while it turned (parallax): what is near is off by up to {worst.size:.0f} pixels between "
-        f"{first} and {second} ({worst.share:.0%} of their matches); turn about the lens, not about yourself"
+        "the camera moved while it turned (parallax), or things moved before it: they are off by up to "
+        f"{worst.size:.0f} pixels between {first} and {second} ({worst.share:.0%} of their matches); turn about the "
+        "lens, not about yourself"
     )
     return [Message(text, images, code="parallax")]
 

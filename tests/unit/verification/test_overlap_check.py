@@ -56,19 +56,24 @@ def test_pictures_are_drawn_at_powers_of_two_of_the_median_scale() -> None:
 
 
 def test_a_turn_is_compared_between_the_two_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Halfway between two directions, each picture is tilted by half the angle."""
+    """Halfway between two directions, each picture is tilted by half the angle; the scale is that of neither."""
     seen: list[PlacedPicture] = []
+    straight_on: list[FloatArray] = []
 
     def agreement(*both: PlacedPicture) -> Agreement:
         seen.extend(both)
         return Agreement(1, 1)
+
+    def scale(camera: Camera, homography: FloatArray) -> float:
+        straight_on.append(homography)
+        return 1.0
 
     def of(picture: None, camera: Camera, matrix: FloatArray, stretch: None) -> PlacedPicture:
         return PlacedPicture(np.zeros((2, 2), np.float32), camera, matrix)
 
     monkeypatch.setattr(overlap_check, "placement_ambiguity", lambda first, second: Ambiguity(1.0, 0.0, 0.0))
     monkeypatch.setattr(overlap_check, "draw", lambda picture, scale: picture)
-    monkeypatch.setattr(overlap_check, "drawing_scale", lambda camera, homography: 1.0)
+    monkeypatch.setattr(overlap_check, "drawing_scale", scale)
     monkeypatch.setattr(overlap_check, "overlap_agreement", agreement)
     monkeypatch.setattr(PlacedPicture, "of", of)
     first, last, half = (rotation_from_vector(np.array([[0.0, angle, 0.0]]))[0] for angle in (0.1, 0.4, 0.15))
@@ -83,6 +88,7 @@ def test_a_turn_is_compared_between_the_two_pictures(monkeypatch: pytest.MonkeyP
     overlap_check.compare_overlaps(task)
     np.testing.assert_allclose(seen[0].homography, half.T @ focal, atol=1e-9)
     np.testing.assert_allclose(seen[1].homography, half @ focal, atol=1e-9)
+    np.testing.assert_allclose(straight_on, [focal], atol=1e-9)
 
 
 def test_cached_overlaps_are_those_of_the_same_links(monkeypatch: pytest.MonkeyPatch) -> None:
