@@ -18,7 +18,7 @@ from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_l
 from rdstitch.alignment.finer_lens import with_third_coefficient
 from rdstitch.alignment.initialization import relations_at
 from rdstitch.alignment.lens_selection import choose_lens
-from rdstitch.alignment.model_selection import ModelChoice, noise_of_links
+from rdstitch.alignment.model_selection import ModelChoice, choose_model, noise_of_links
 from rdstitch.alignment.noise_model import EXACTNESS
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.options import AlignmentOptions
@@ -111,7 +111,7 @@ def align(
     graph = _Graph(len(cameras), few, relations, trust, lens, free_lens, known, options)
     problem, pictures = graph.problem(~wrong)
     choice = None
-    if former is not None and former.lens == chosen.name:
+    if former is not None:
         choice = _choose_from(former, cameras, problem, pictures, options, chosen.refinements)
     choice = choice or choose_motion(problem, options.models, chosen.refinements)
     graph = replace(graph, free_lens=choice.fit.free_lens)
@@ -182,7 +182,8 @@ def _choose_from(
     sigma = sigma_of(squared)
     if misfitting_links(squared, problem.observations).any() or sigma > _AS_GOOD * math.hypot(noise, EXACTNESS):
         return None
-    choice = choose_motion(replace(problem, warm=warm), options.models, refinements)
+    planar = [name for name in options.models if name != ROTATION.name]  # what came before was no turn
+    choice = choose_model(replace(problem, warm=warm), planar, refinements)
     costs = [robust_cost(errors, ALIGNMENT_WIDTH * sigma).sum() for errors in (choice.fit.adjusted.squared, squared)]
     return choice if choice.fit.model is warm.model and costs[0] <= costs[1] else None
 

@@ -76,7 +76,7 @@ def _without_one(former: Alignment) -> Alignment:
 
 
 def _of_another_lens(former: Alignment) -> Alignment:
-    return replace(former, lens="division2")
+    return replace(former, cameras=tuple(replace(camera, distortion=-0.1) for camera in former.cameras))
 
 
 def _of_another_focal_length(former: Alignment) -> Alignment:
@@ -90,6 +90,15 @@ def test_an_earlier_alignment_that_the_links_contradict_changes_nothing(spoil) -
     cold = align(given.cameras, given.links)
     assert not _same(align(given.cameras, given.links, former=cold), cold)
     assert _same(align(given.cameras, given.links, former=spoil(cold)), cold)
+
+
+def test_pairs_that_ask_for_a_richer_lens_start_at_the_simpler_one(links_apart: list[str]) -> None:
+    given = _drone(0.2, 3.0)
+    former = align(given.cameras, given.links, AlignmentOptions(lens="division"))
+    links_apart.clear()
+    found = align(given.cameras, given.links, AlignmentOptions(lens="division2"), former=former)
+    assert not {"rigid", "similarity", "rotation"} & set(links_apart)
+    assert (former.lens, found.lens) == ("division", "division2")
 
 
 def test_a_lens_that_was_given_stays() -> None:
