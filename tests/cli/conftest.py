@@ -1,5 +1,6 @@
 """Small rendered pictures, and the command line run in this process."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,14 @@ def frames(sequence: Sequence, tmp_path_factory: pytest.TempPathFactory) -> list
 def stranger(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A picture of other ground."""
     return flight(9, 1).write(tmp_path_factory.mktemp("stranger"), "stranger_{}.png")[0]
+
+
+@pytest.fixture
+def place(tmp_path: Path, frames: list[Path]) -> Path:
+    """A folder with two good pictures, ``a.png`` and ``b.png``."""
+    for name, frame in zip("ab", frames[:2], strict=True):
+        shutil.copy(frame, tmp_path / f"{name}.png")
+    return tmp_path
 
 
 @pytest.fixture

@@ -98,6 +98,27 @@ def finished(process: "subprocess.Popen[bytes]", data: bytes | None = None) -> O
     return Outcome.of(process.returncode, out.decode("utf-8", "replace"), err.decode("utf-8", "replace"))
 
 
+def state_of(folder: Path) -> dict[str, bytes | None]:
+    """Every file with its content."""
+    return {
+        os.fsencode(path.relative_to(folder)).decode("latin-1"): path.read_bytes() if path.is_file() else None
+        for path in folder.rglob("*")
+    }
+
+
+def shown(path: Path) -> str:
+    """A name as it appears within a line."""
+    return str(path).encode("utf-8", "backslashreplace").decode("utf-8").replace("\n", " ")
+
+
+def check_refused(done: Outcome, status: int, named: Path | str) -> None:
+    """Status, and one line that says which file."""
+    assert done.status == status, done.err
+    assert done.out == ""
+    assert done.line.startswith("rdstitch: ")
+    assert shown(Path(named)) in done.line
+
+
 def check_sidecar(file: Path) -> None:
     """A sidecar, where there is one, must be what the schema says."""
     if file.is_file():

@@ -1,16 +1,22 @@
-"""Ctrl-C with worker processes: everything ends at once, and the next run goes on from the cache."""
+"""Runs that end in the middle: nothing is left behind or half-written, and the next run goes on from the cache."""
 
+import json
 import os
+import random
 import signal
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from rdstitch_cli.main import run
 
+from rdstitch.io import read_image
+from rdstitch.pipeline import recipes
 from rdstitch.synthetic import ground
-from tests.cli.running import finished, start
+from tests.cli.running import FAST, Outcome, Run, finished, start, state_of
 
 _PICTURES = 64  # enough for worker processes
 
@@ -55,3 +61,69 @@ def test_an_interrupted_run_ends_its_workers_and_can_be_continued(strip: Path, t
     assert len(kept) == _PICTURES
     assert finished(start(*arguments)).status == 0
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
+
+
+@pytest.mark.parametrize(
+    ("raised", "status"), [(KeyboardInterrupt(), 130), (MemoryError(), 7), (ZeroDivisionError("x\ny"), 1)]
+)
+def test_bad_luck_in_the_middle(
+    rdstitch: Run, place: Path, monkeypatch: pytest.MonkeyPatch, raised: BaseException, status: int
+) -> None:
+    def fail(*arguments: Any, **options: Any) -> None:
+        raise raised
+
+    monkeypatch.setattr(recipes, "sidecar", fail)
+    done = rdstitch("pano", place / "a.png", place / "b.png", "-o", place / "out.png", *FAST)
+    assert done.status == status
+    assert done.line
+
+
+def test_debug_shows_where(capsys: pytest.CaptureFixture[str], place: Path) -> None:
+    status = run(["--debug", "pano", str(place / "a.png"), str(place / "missing.png"), "-o", str(place / "out.png")])
+    assert status == 3
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_nobody_reads_the_output(place: Path) -> None:
+    process = start("pano", place / "a.png", place / "b.png", "-o", place / "out.png", *FAST)
+    assert process.stdout is not None
+    process.stdout.close()
+    assert process.stderr is not None
+    said = process.stderr.read()
+    process.stderr.close()
+    assert process.wait() == 141
+    assert Outcome.of(0, "", said.decode()).err == ""
+    assert (place / "out.png").exists()
+
+
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
+def test_termination_leaves_nothing_behind(place: Path, signal_number: int) -> None:
+    before = state_of(place)
+    process = start("pano", place / "a.png", place / "b.png", "-o", place / "out.png", "-v", *FAST)
+    assert process.stderr is not None
+    assert process.stderr.readline().startswith(b"rdstitch: detecting")
+    process.send_signal(signal_number)
+    done = finished(process)
+    assert done.status == 128 + signal_number
+    assert done.line.endswith("interrupted")
+    assert state_of(place) == before
+
+
+@pytest.mark.parametrize("attempt", range(int(os.environ.get("RDSTITCH_KILLS", "4"))))
+def test_killed_at_any_moment(place: Path, attempt: int) -> None:
+    command = ("pano", place / "a.png", place / "b.png", "-o", place / "out.png", "--overwrite", *FAST)
+    assert finished(start(*command, "--max-size", "100")).status == 0
+    old = (place / "out.png").read_bytes()
+    process = start(*command, "-v")
+    assert process.stderr is not None
+    assert process.stderr.readline()
+    time.sleep(random.Random(attempt).uniform(0.0, 1.5))
+    process.kill()
+    finished(process)
+    if (place / "out.png").read_bytes() != old:
+        assert read_image(place / "out.png").pixels.size > 0
+    assert json.loads((place / "out.png.json").read_text(encoding="utf-8"))["verdict"]["ok"]
+    # What a killed run leaves is hidden, and no input of the next one.
+    done = finished(start("mosaic", place, "-o", place / "out.png", "--overwrite", *FAST))
+    assert (done.status, done.err) == (0, "")
+    assert read_image(place / "out.png").pixels.size > 0

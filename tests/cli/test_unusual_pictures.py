@@ -1,0 +1,93 @@
+"""Pictures that are unusual, yet pictures: stitched like any other."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from rdstitch.io import read_image
+from tests.cli.faulty import Make
+from tests.cli.running import DISTORTION, FAST, Run, check_refused
+
+
+def _saved(good: Path, file: Path, change: Callable[[Image.Image], Image.Image], **options: Any) -> Path:
+    with Image.open(good) as image:
+        change(image).save(file, **options)
+    return file
+
+
+def _cmyk(good: Path, folder: Path) -> Path:
+    return _saved(good, folder / "odd.jpg", lambda image: image.convert("CMYK"))
+
+
+def _palette(good: Path, folder: Path) -> Path:
+    return _saved(good, folder / "odd.png", lambda image: image.quantize(200))
+
+
+def _transparent(good: Path, folder: Path) -> Path:
+    def change(image: Image.Image) -> Image.Image:
+        image.putalpha(Image.fromarray(np.where(np.indices((300, 400))[0] < 20, 0, 255).astype(np.uint8)))
+        return image
+
+    return _saved(good, folder / "odd.png", change)
+
+
+def _grey(good: Path, folder: Path) -> Path:
+    return _saved(good, folder / "odd.png", lambda image: image.convert("L"))
+
+
+def _turned(good: Path, folder: Path) -> Path:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    return _saved(good, folder / "odd.jpg", lambda image: image.transpose(Image.Transpose.ROTATE_90), exif=exif)
+
+
+def _with_a_hole(good: Path, folder: Path) -> Path:
+    """Floating-point samples, some of them NaN."""
+    for name in "ab":
+        samples = read_image(folder / f"{name}.png").pixels.astype(np.float32) / 255.0
+        samples[:30, :50] = np.nan
+        tifffile.imwrite(folder / f"{name}.tif", samples, photometric="rgb")
+    (folder / "a.tif").rename(folder / "a.png")
+    return folder / "b.tif"
+
+
+def _sixteen_bit(good: Path, folder: Path) -> Path:
+    for name in "ab":
+        deep = read_image(folder / f"{name}.png").pixels.astype(np.uint16) * 257
+        assert cv2.imwrite(str(folder / f"{name}.png"), deep[..., ::-1])
+    return folder / "b.png"
+
+
+def _hostile_exif(good: Path, folder: Path) -> Path:
+    exif = Image.Exif()
+    exif[0x010F] = "\x1b[31m" * 500
+    exif[0x8769] = {0x920A: (0, 0)}
+    return _saved(good, folder / "odd.jpg", lambda image: image, exif=exif)
+
+
+@pytest.mark.parametrize(
+    "make", [_cmyk, _palette, _transparent, _grey, _turned, _with_a_hole, _sixteen_bit, _hostile_exif]
+)
+def test_unusual_pictures_are_stitched(rdstitch: Run, place: Path, make: Make) -> None:
+    odd = make(place / "b.png", place)
+    done = rdstitch("pano", place / "a.png", odd, "-o", place / "out.tif", *FAST)
+    assert (done.status, done.err) == (0, "")
+    assert abs(float(done.out) - DISTORTION) < 0.02
+    record = json.loads((place / "out.tif.json").read_text(encoding="utf-8"))
+    assert all(image["used"] for image in record["images"])
+    assert [image["size"] for image in record["images"]] == [[400, 300]] * 2
+
+
+def test_samples_of_two_kinds_arecheck_refused(rdstitch: Run, place: Path) -> None:
+    deep = place / "deep.png"
+    assert cv2.imwrite(str(deep), read_image(place / "b.png").pixels.astype(np.uint16) * 257)
+    done = rdstitch("pano", place / "a.png", deep, "-o", place / "out.png", *FAST)
+    check_refused(done, 3, deep)
+    assert not (place / "out.png").exists()
