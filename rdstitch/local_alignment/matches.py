@@ -1,5 +1,6 @@
 """Matches of all overlapping pictures on the common plane, and what the alignment leaves over at each of them."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -56,12 +57,12 @@ class PlaneMatches:
 
 
 def plane_scale(cameras: Sequence[Camera], homographies: FloatArray) -> float:
-    """Pixels of the median picture per unit of the plane, at the pictures' centres."""
-    areas = []
-    for camera, matrix in zip(cameras, homographies, strict=True):
-        middle = (np.array(camera.image_size, dtype=np.float64) - 1.0) / 2.0
-        areas.append(abs(np.linalg.det(jacobians(camera, matrix, middle[None])[0])))
-    return float(1.0 / np.sqrt(np.nanmedian(areas)))
+    """Pixels of the median picture per unit of the plane, at the pictures' centres; NaN if it shows none of them."""
+    middles = [(np.array(camera.image_size) - 1.0) / 2.0 for camera in cameras]
+    found = [jacobians(c, g, m[None])[0] for c, g, m in zip(cameras, homographies, middles, strict=True)]
+    # A centre beyond the horizon is nowhere on the plane.
+    areas = [abs(np.linalg.det(jacobian)) for jacobian in found if np.isfinite(jacobian).all()]
+    return float(np.median(areas) ** -0.5) if areas else math.nan
 
 
 def jacobians(camera: Camera, homography: FloatArray, points: FloatArray) -> FloatArray:

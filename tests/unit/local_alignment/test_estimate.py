@@ -155,3 +155,10 @@ def test_too_few_matches_are_said() -> None:
     sequence = scene(None)
     few = [Match(m.image1, m.image2, m.points1[:9], m.points2[:9]) for m in matches(sequence)[:2]]
     assert align_locally(few, CAMERAS, homographies(sequence)).reason == "there are too few matches"
+
+
+def test_pictures_beyond_the_horizon_are_nowhere() -> None:
+    nowhere = -np.broadcast_to(np.eye(3), (6, 3, 3))
+    some = np.concatenate([nowhere[:3], homographies(scene(None))[3:]])
+    assert np.isfinite(plane_scale(CAMERAS, some))
+    assert align_locally(matches(scene(None)), CAMERAS, nowhere).reason == "there are too few matches"
