@@ -102,7 +102,7 @@ class ShapeTest:
         The picture that may be off the most.
     shift, shift_std : float
         How far that picture would move with what is left out, and the standard deviation of that, pixels; up to one
-        homography of the whole.
+        homography of the whole. The latter grows with ``gain``: what is left out is more than what was tried.
     cause : str
         What is most likely to be left out.
     """

@@ -5,6 +5,11 @@ wall that is slightly curved, adds up along a row of pictures: homographies, til
 end is off by pixels where every seam is good. So the fit is tried against what it leaves out
 (:mod:`rdstitch.alignment.unmodelled`): how much smaller would the errors be, how well do the pictures exclude it, and
 how far would the pictures move, up to one homography of the whole?
+
+What is tried is a sample of what may be missing. So the fit is probed besides for what differs from picture to picture:
+where that would make the errors smaller by more than noise does, the model is wrong even with the effects, and standard
+deviations that suppose it right are too small by as much: they are multiplied by the Birge ratio (R. T. Birge, The
+calculation of errors by the method of least squares, 1932).
 """
 
 import math
@@ -23,7 +28,7 @@ from rdstitch.alignment.noise_model import EXACTNESS
 from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import ShapeTest
-from rdstitch.alignment.unmodelled import Effect, mapped, unmodelled_effects
+from rdstitch.alignment.unmodelled import CROPPED, Effect, cropping_effects, mapped, unmodelled_effects
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
 from rdstitch.division_model import distort, undistort
@@ -153,16 +158,19 @@ def judge_shape(problem: Problem, fit: Fit, cameras: Sequence[Camera]) -> ShapeT
     cameras : sequence of Camera
         Of the problem's pictures.
     """
-    effects = unmodelled_effects(fit)
-    found = _Directions.of(problem, fit, effects)
+    effects, probes = unmodelled_effects(fit), cropping_effects(problem.count)
+    found = _Directions.of(problem, fit, [*effects, *probes])
     information, gradient = found.information()
+    tried = len(gradient) - len(probes)
+    kept = tried - len(effects)
+    gains = [_gain(information[:size, :size], gradient[:size]) for size in (kept, tried, len(gradient))]
+    gain, probed = gains[1] - gains[0], gains[2] - gains[1]
+    information, gradient = information[:tried, :tried], gradient[:tried]
     covariance = np.linalg.inv(information)
     step = -covariance @ gradient
-    kept = len(step) - len(effects)
-    within = -np.linalg.solve(information[:kept, :kept], gradient[:kept])  # what the fit lacks without any effect
-    gain = float(gradient[:kept] @ within - gradient @ step)
-    step[:kept] -= within
-    places, pictures = _places(found, cameras)
+    step[:kept] += np.linalg.solve(information[:kept, :kept], gradient[:kept])  # what the fit lacks without any effect
+    covariance *= max(1.0, probed / len(probes))
+    places, pictures = _places(found, cameras, tried)
     shift = (places @ step) ** 2
     variance = np.einsum("pas,st,pat->p", places, covariance, places)
     counts = np.maximum(np.bincount(pictures, minlength=problem.count), 1)
@@ -171,16 +179,23 @@ def judge_shape(problem: Problem, fit: Fit, cameras: Sequence[Camera]) -> ShapeT
         for squared in (shift.sum(axis=1), variance)
     )
     worst = int(np.argmax(np.hypot(shifts, stds)))
-    diagonal, shown = 2.0 * cameras[worst].half_diagonal, gain > _SHOWN_PER_EFFECT * len(effects)
+    diagonal, by_effects, by_probes = 2.0 * cameras[worst].half_diagonal, gain / len(effects), probed / len(probes)
     return ShapeTest(
         doubtful=bool(np.hypot(shifts[worst], stds[worst]) > _LARGE * diagonal),
         gain=gain,
-        shown=shown,
+        shown=max(by_effects, by_probes) > _SHOWN_PER_EFFECT,
         image=worst,
         shift=float(shifts[worst]),
         shift_std=float(stds[worst]),
-        cause=_cause(effects, step[kept:], np.asarray(covariance[kept:, kept:], dtype=np.float64)),
+        cause=CROPPED
+        if by_probes > max(by_effects, _SHOWN_PER_EFFECT)
+        else _cause(effects, step[kept:], np.asarray(covariance[kept:, kept:], dtype=np.float64)),
     )
+
+
+def _gain(information: FloatArray, gradient: FloatArray) -> float:
+    """By how much a step lessens the cost, in squared standard deviations."""
+    return float(gradient @ np.linalg.solve(information, gradient))
 
 
 def _cause(effects: Sequence[Effect], sizes: FloatArray, covariance: FloatArray) -> str:
@@ -213,12 +228,12 @@ def _corrected(observations: Observations, effect: Effect, size: float) -> Obser
     )
 
 
-def _places(found: _Directions, cameras: Sequence[Camera]) -> tuple[FloatArray, IntArray]:
-    """How far points of the pictures move in them with a step in each direction, and the picture of each point.
+def _places(found: _Directions, cameras: Sequence[Camera], count: int) -> tuple[FloatArray, IntArray]:
+    """How far points of the pictures move in them with a step in each of the first directions, and their pictures.
 
     Returns
     -------
-    places : ndarray of shape (P, 2, S)
+    places : ndarray of shape (P, 2, count)
         Pixels, without what one homography of the whole does.
     pictures : ndarray of shape (P,), intp
     """
@@ -228,7 +243,7 @@ def _places(found: _Directions, cameras: Sequence[Camera]) -> tuple[FloatArray, 
     here = _Ground.of(found.fit, found.fit.adjusted.parameters, pictures)
     ground = here.of_points(points)
     columns = []
-    for index, size in enumerate(found.size.tolist()):
+    for index, size in enumerate(found.size[:count].tolist()):
         parameters, effect = found.moved(index, size)
         measured = points if effect is None else effect.correct(points, pictures, size)
         columns.append((_Ground.of(found.fit, parameters, pictures).of_points(measured) - ground) / size)

@@ -25,6 +25,10 @@ OFF_CENTER = "a lens whose axis is off the middle (were the pictures cropped?)"
 OTHER_LENS = "a lens of another kind"
 ROLLING_SHUTTER = "rows that were read while the camera moved (a rolling shutter)"
 CURVED = "a curved surface"
+CROPPED = "pictures that were cropped, or stabilised, each differently"
+
+_PATTERNS = 8
+"""Random ways in which pictures are tried to be cropped: as many for few pictures as for many."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,12 @@ def unmodelled_effects(fit: Fit) -> list[Effect]:
     return effects
 
 
+def cropping_effects(count: int) -> list[Effect]:
+    """The lens's axis lies elsewhere in each of so many pictures, in several random ways."""
+    patterns = np.random.default_rng(0).normal(0.0, 1.0, (_PATTERNS, count, 2))
+    return [Effect(CROPPED, _cropped(pattern), 0.03) for pattern in patterns]
+
+
 _SHEARS = ([[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [0.0, 0.0]])
 
 
@@ -69,6 +79,16 @@ def _shifted(axis: int) -> Correction:
 
     def correct(points: FloatArray, pictures: IntArray, size: float) -> FloatArray:
         moved: FloatArray = points - size * direction
+        return moved
+
+    return correct
+
+
+def _cropped(pattern: FloatArray) -> Correction:
+    """The distortion centre lies elsewhere in each picture, by its row of (N, 2)."""
+
+    def correct(points: FloatArray, pictures: IntArray, size: float) -> FloatArray:
+        moved: FloatArray = points - size * pattern[pictures]
         return moved
 
     return correct

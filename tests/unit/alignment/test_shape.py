@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.motion_models import X
@@ -42,6 +43,22 @@ def test_a_plain_row_is_not_doubted() -> None:
 
 def test_a_rolling_shutter_is_shown_and_named() -> None:
     found = _aligned(_sheared(_row(), 0.1), lens="division").shape
+    assert found is not None
+    assert found.doubtful
+    assert found.shown
+
+
+@pytest.mark.parametrize("seed", [1, 6, 7])
+def test_pictures_cropped_each_elsewhere_are_doubted(seed: int) -> None:
+    """None of the effects that are tried, but some of them grow with it."""
+    rng = np.random.default_rng(seed)
+    row = scene(grid(5, 1, (0.45, 0.0), 0.1, rng), rng=rng, reach=1, overlap=0.1, outliers=0.0, noise=0.2)
+    corner = rng.uniform(-40.0, 40.0, (len(row.cameras), 2))
+    links = [
+        replace(link, points1=link.points1 - corner[link.image1], points2=link.points2 - corner[link.image2])
+        for link in row.links
+    ]
+    found = _aligned(replace(row, links=links)).shape
     assert found is not None
     assert found.doubtful
     assert found.shown
