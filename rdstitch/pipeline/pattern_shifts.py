@@ -13,6 +13,7 @@ from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.radial_homography import RadialHomography, from_plane, to_plane
 from rdstitch.verification.overlap_check import placed_picture
+from rdstitch.verification.self_similarity import ambiguous_pairs
 from rdstitch.verification.unique_places import unique_shifts
 
 _MAX_PICTURES = 60
@@ -37,9 +38,10 @@ def settle_repeated_pattern(
 ) -> tuple[AlignedPairs, dict[int, str]]:
     """Move pictures of a repeated pattern by whole periods, to where dirt, marks and objects in them agree.
 
-    Matches of such pictures agree as well some periods away, above all where the pictures share the most. Pairs of
-    which nothing unique decides where they lie are taken for unregistered then, so that no place rests on them. Where
-    too few are left, or the plane is not metric, everything stays as it was: the checks judge that.
+    Matches of such pictures agree as well some periods away, above all where the pictures share the most. Pairs that
+    look as much alike elsewhere, and of which nothing unique decides where they lie, are taken for unregistered then,
+    so that no place rests on them; those that look alike here alone stay as they are, marked parking beside a meadow
+    for one. Where too few are left, or the plane is not metric, everything stays as it was: the checks judge that.
 
     Parameters
     ----------
@@ -72,14 +74,18 @@ def settle_repeated_pattern(
         k: placed_picture(sources[k], alignment.cameras[k], alignment.homographies[k], stretch)
         for k in np.flatnonzero(alignment.used).tolist()
     }
-    shifts = unique_shifts(shown, [(pair.image1, pair.image2) for pair in compared], workers)
+    doubtful = ambiguous_pairs(shown, [(pair.image1, pair.image2) for pair in compared], workers)
+    if not doubtful:
+        return aligned, {}
+    shifts = unique_shifts(shown, doubtful, workers)
 
     def transfer(i: int, j: int, points: FloatArray) -> FloatArray:
         there = to_plane(alignment.cameras[i], alignment.homographies[i], points) + shifts[i, j].shift
         return from_plane(alignment.cameras[j], alignment.homographies[j], there)
 
     decided = [pair for pair in compared if (pair.image1, pair.image2) in shifts]
-    again = {(pair.image1, pair.image2): pair for pair in pairing.rematch_elsewhere(decided, transfer)}
+    sound = [pair for pair in compared if (pair.image1, pair.image2) not in doubtful]
+    again = {(pair.image1, pair.image2): pair for pair in [*sound, *pairing.rematch_elsewhere(decided, transfer)]}
     try:
         settled = aligner.align([again.get((pair.image1, pair.image2), _undecided(pair)) for pair in aligned.pairs])
     except RegistrationError:

@@ -4,6 +4,8 @@ Both pictures are drawn on the plane, and correlated at every shift at once (mas
 Padfield 2012). Where the plane is metric a shift by a period of the pattern is as good as the right one.
 """
 
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -118,6 +120,20 @@ def placement_ambiguity(first: Drawing, second: Drawing) -> Ambiguity:
     best = int(other.argmax())
     here = float(score[near].max(initial=0.0))
     return Ambiguity(here, float(other.flat[best]), float(distance.flat[best]) / MAX_SIDE)
+
+
+def ambiguous_pairs(
+    placed: Mapping[int, PlacedPicture], pairs: Sequence[tuple[int, int]], workers: int = 1
+) -> list[tuple[int, int]]:
+    """The pairs of pictures that look as much alike elsewhere, drawn at one scale by ``workers`` threads."""
+    pictures = sorted({k for pair in pairs for k in pair})
+    if not pictures:
+        return []
+    scale = float(np.median([drawing_scale(placed[k].camera, placed[k].homography) for k in pictures]))
+    with ThreadPoolExecutor(workers) as pool:
+        drawings = dict(zip(pictures, pool.map(lambda k: draw(placed[k], scale), pictures), strict=True))
+        found = pool.map(lambda pair: placement_ambiguity(drawings[pair[0]], drawings[pair[1]]).ambiguous, pairs)
+        return [pair for pair, ambiguous in zip(pairs, found, strict=True) if ambiguous]
 
 
 def _box_around(chosen: NDArray[np.bool_], margin: int) -> tuple[slice, slice]:

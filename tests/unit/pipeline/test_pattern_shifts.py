@@ -3,12 +3,16 @@
 from functools import partial
 
 import numpy as np
+import pytest
 
 import rdstitch
 from examples.judging import alignment_error
 from rdstitch.camera import Camera
+from rdstitch.matching.two_view_rounds import Pairing
+from rdstitch.pipeline import pattern_shifts
 from rdstitch.radial_homography import to_plane
-from rdstitch.synthetic import Photometry, PictureTexture, Sequence, grid_poses, repeated, sequence_over
+from rdstitch.synthetic import Photometry, PictureTexture, Sequence, grid_poses, ground, repeated, sequence_over
+from rdstitch.verification.unique_places import UniqueShift
 
 LENS = Camera((320, 240), distortion=-0.15, focal=350.0)
 OPTIONS = rdstitch.StitchOptions(workers=1, features=rdstitch.FeatureOptions(max_features=500))
@@ -35,3 +39,13 @@ def test_stained_tiles_are_stitched_where_the_stains_agree() -> None:
     transfers = {k: partial(to_plane, alignment.cameras[k], alignment.homographies[k]) for k in range(len(sequence))}
     assert alignment_error(sequence, transfers, model="homography").median < 0.3
     assert "repeated-pattern" in [message.code for message in result.registration.warnings]
+
+
+def test_pictures_that_look_alike_nowhere_else_keep_their_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    # As over a car park beside a meadow: keypoints repeat, but a picture shows too few periods to find stains in.
+    sequence = sequence_over(partial(ground, seed=2), LENS, grid_poses(LENS, 3, 1, overlap=0.6, seed=3), seed=3)
+    decided = {(0, 1): UniqueShift(np.zeros(2), 1.0, 1.0, 0.0)}
+    monkeypatch.setattr(Pairing, "shows_repeated_pattern", property(lambda pairing: True))
+    monkeypatch.setattr(pattern_shifts, "unique_shifts", lambda placed, pairs, workers: decided)
+    result = rdstitch.mosaic([sequence.frame(k) for k in range(3)], None, OPTIONS)
+    assert result.registration.alignment.used.all(), result.registration.messages
