@@ -11,6 +11,10 @@ _MAX_GRAVITY_SPREAD = np.radians(5.0)
 """Median angle between measured directions of gravity and their mean, up to which they are believed."""
 
 
+_STEEP = np.cos(np.radians(30.0))
+"""Pictures that look within 30 degrees of straight up or down do not show how the camera was held."""
+
+
 def levelled(matrices: FloatArray, reference: int, gravity: FloatArray | None = None) -> FloatArray:
     """Matrices from undistorted coordinates of each picture to directions in a level frame.
 
@@ -57,9 +61,10 @@ def level_frame(rotations: FloatArray, reference: int, down_by_gravity: FloatArr
 
     People hold cameras so that the horizon is level, whichever way they turn: the x axes of all pictures lie in one
     plane, and the direction down is the one they have least in common with (Brown and Lowe 2007, section 5). The less
-    the pictures turn, the more counts what is down in them. Gravity, where cameras have measured it, decides alone.
+    the pictures turn, the more counts what is down in them; a few may be taken with the camera on its side. Gravity,
+    where cameras have measured it, decides alone.
     """
-    right, down, ahead = np.moveaxis(rotations, 1, 0)
+    right, down, ahead = _upright(rotations)
     mean_down = _unit(down.mean(axis=0))
     spread, axes = np.linalg.eigh(right.T @ right)
     axis = axes[:, 0] * (1.0 if axes[:, 0] @ mean_down > 0.0 else -1.0)
@@ -70,6 +75,15 @@ def level_frame(rotations: FloatArray, reference: int, down_by_gravity: FloatArr
     heading = _middle(np.arctan2(ahead @ x, ahead @ z))
     x, z = np.cos(heading) * x - np.sin(heading) * z, np.sin(heading) * x + np.cos(heading) * z
     return np.stack([x, y, z])
+
+
+def _upright(rotations: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Axes right, down and ahead (N, 3) of cameras, turned by quarters about the last so that most agree on down."""
+    right, down, ahead = np.moveaxis(rotations, 1, 0)
+    usual = down[np.argmax((down @ down.T).sum(axis=1))]
+    roll = np.rint(np.arctan2(right @ usual, down @ usual) / (np.pi / 2)) * (np.pi / 2)
+    roll = np.where(np.abs(ahead @ usual) < _STEEP, roll, 0.0)[:, None]
+    return np.cos(roll) * right - np.sin(roll) * down, np.sin(roll) * right + np.cos(roll) * down, ahead
 
 
 def _middle(headings: FloatArray) -> float:

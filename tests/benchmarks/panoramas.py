@@ -108,17 +108,17 @@ def main() -> None:
             found = pano(paths, Path(folder) / "out.jpg", StitchOptions(workers=1)).registration.alignment
             seconds = time.process_time() - start
             pictures = [np.asarray(cv2.imread(str(path)), np.uint8) for path in paths]
-        used, peer = stitched_by_opencv(pictures, given.seeds)
-        shown = (
-            f"{seconds / np.median(peer):5.2f}: {min(used)} to {max(used)} used, {' '.join(f'{t:.1f}' for t in peer)}"
-        )
         focal = (found.focal or np.nan) * np.hypot(*SIZE) / 2
         print(
             f"{name:12s}{found.used.sum():4d}/{len(truth):<3d}{found.distortion - SETS[name][3]:10.5f}"
             f"{100 * (focal / FOCAL - 1):9.4f}{np.median(direction_errors(truth, found)):11.4f}"
-            f"{closing_error(truth, found) if SETS[name][0] == 13 else np.nan:11.3f}{seconds:7.1f}  {shown}",
+            f"{closing_error(truth, found) if SETS[name][0] == 13 else np.nan:11.3f}{seconds:7.1f}",
+            end="  ",
             flush=True,
         )
+        used, peer = stitched_by_opencv(pictures, given.seeds)
+        times = " ".join(f"{t:.1f}" for t in peer)
+        print(f"{seconds / np.median(peer):5.2f}: {min(used)} to {max(used)} used, {times}", flush=True)
 
 
 if __name__ == "__main__":

@@ -79,6 +79,14 @@ def test_the_horizon_is_level_whatever_the_frame(pitch: float) -> None:
     assert middle.max() == pytest.approx(65.0, abs=1e-6)
 
 
+def test_pictures_taken_with_the_camera_on_its_side_do_not_tip_the_horizon() -> None:
+    heading, roll = np.radians(np.arange(6) * 25.0), np.radians([2.0, -1.0, 91.0, -2.0, -89.0, 1.0])
+    rotations = camera_rotations(heading, 0.1, roll)
+    down = (rotations @ level_frame(rotations, 0).T)[:, :, 1]
+    np.testing.assert_allclose(down[:, 2], -np.sin(0.1), atol=0.03)
+    np.testing.assert_allclose(np.degrees(np.arctan2(down[:, 0], down[:, 1])), np.degrees(roll), atol=2.0)
+
+
 def test_a_full_turn_has_the_reference_picture_ahead() -> None:
     rotations = camera_rotations(np.arange(12) * np.pi / 6)
     ahead = (rotations @ level_frame(rotations, 5).T)[5, 2]
