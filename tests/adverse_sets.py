@@ -47,12 +47,15 @@ class AlteredSequence(Sequence):
         How far the camera moves while a picture is read out from its first to its last row, texels.
     offset : ndarray of shape (N, 2)
         Where the corner of each picture lies in the uncropped one, pixels.
+    dispensable : frozenset of int
+        Pictures without which the set is solved, too.
     """
 
     alter: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]] = _unchanged
     height: Surface | None = None
     shutter: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
     offset: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
+    dispensable: frozenset[int] = frozenset()
 
     def frame(self, index: int) -> NDArray[np.uint8]:
         """See :meth:`Sequence.frame`."""
@@ -237,7 +240,7 @@ def _blurred(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
     def blur(index: int, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return np.asarray(cv2.GaussianBlur(pixels, (0, 0), sigma), dtype=np.uint8) if index == which else pixels
 
-    return replace(altered, alter=blur)
+    return replace(altered, alter=blur, dispensable=frozenset({which}))
 
 
 def _crops(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:

@@ -31,7 +31,7 @@ from rdstitch.synthetic import (
     rotation_poses,
     sequence_over,
 )
-from tests.adverse_sets import ADVERSE, adverse_set
+from tests.adverse_sets import ADVERSE, AlteredSequence, adverse_set
 
 SOLVABLE = ("pair", "chain", "grid")
 ODD = ("odd lens",)
@@ -132,7 +132,7 @@ class Judged:
     right : bool
         Whether the registration of all pictures used agrees with the truth; True without one.
     complete : bool
-        Whether every picture was used.
+        Whether every picture was used that is needed.
     error : float
         Median error, px.
     text : str
@@ -282,7 +282,10 @@ def judge_set(item: TrustSet, folder: Path, options: StitchOptions | None = None
     right = error < MAX_MEDIAN and worst < MAX_OF_A_PICTURE
     mixed = item.sequence if item.kind in SPOILED and isinstance(item.sequence, MixedSequence) else None
     missing = {_number(message.images[0]) for message in registration.left_out}
-    complete = not missing if mixed is None else missing == mixed.taken or (mixed.usable and missing < mixed.taken)
+    dispensable = item.sequence.dispensable if isinstance(item.sequence, AlteredSequence) else frozenset()
+    complete = (
+        missing <= dispensable if mixed is None else missing == mixed.taken or (mixed.usable and missing < mixed.taken)
+    )
     warned = any(message.images and message.severity == "warning" for message in registration.messages)
     return Judged(item.kind, 0, right, complete, error, text, warned)
 
