@@ -220,7 +220,7 @@ def _misfits(paths: Sequence[str], used: Sequence[LinkFit]) -> list[Message]:
         kept[[fit.image1, fit.image2]] += fit.inliers
     return [
         _failure(
-            f"only {kept[k]} of {given[k]} of its matches agree with the whole; another camera or zoom?",
+            f"only {kept[k]} of {given[k]} of its matches agree with the whole; another camera or zoom, or no plane?",
             [paths[k]],
         )
         for k in np.flatnonzero(kept < _MIN_MATCHES_PER_PICTURE * given).tolist()
