@@ -59,13 +59,14 @@ class Cache:
         return cls(None if folder is None else Path(folder).absolute())
 
     @classmethod
-    def for_this_run(cls) -> Self:
+    def for_this_run(cls, parent: Path | None = None) -> Self:
         """A cache that goes with this run: it takes what need not be in memory all the time.
 
-        Where nothing can be written, everything stays in memory.
+        It is made in the folder for temporary files, or in another one. Where nothing can be written, everything stays
+        in memory.
         """
         try:
-            owner = TemporaryFolder()
+            owner = TemporaryFolder(parent=None if parent is None else Path(parent).absolute())
         except OSError:
             return cls()
         return cls(owner.path, owner)

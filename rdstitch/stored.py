@@ -30,14 +30,16 @@ class TemporaryFolder:
     ----------
     path : Path, optional
         That of another process; a new one if not given.
+    parent : Path, optional
+        Where a new one is made; among the system's temporary files if not given.
     """
 
-    def __init__(self, path: Path | None = None) -> None:
+    def __init__(self, path: Path | None = None, *, parent: Path | None = None) -> None:
         if path is not None:
             self.path = path
             return
         # Locked by this process: the next run removes it where this one is killed.
-        folder = StagingFolder(Path(tempfile.gettempdir()), prefix="rdstitch-")
+        folder = StagingFolder(Path(parent or tempfile.gettempdir()), prefix="rdstitch-")
         self.path = folder.path
         _own[self.path] = self
         weakref.finalize(self, folder.close)
@@ -91,6 +93,12 @@ class Stored(Generic[Value]):
     def name(self) -> str:
         """What stands for the result in the inputs of later ones; empty without a file."""
         return "" if self.file is None else entry_name(self.file)
+
+    def remove(self) -> None:
+        """Remove its file; it can not be loaded any more then."""
+        if self.file is not None:
+            with suppress(OSError):
+                self.file.unlink()
 
     def _read(self) -> tuple[Value, int]:
         assert self.file is not None

@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rdstitch.compositing.blocks import BlockRunner
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photo_sphere import photo_sphere_xmp
 from rdstitch.compositing.photometric import Exposure
 from rdstitch.compositing.placed_picture import PlacedPicture
-from rdstitch.compositing.preparation import OutputStrip, ShareProgress, prepare_composite
+from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.seam_finder import SeamMap
+from rdstitch.compositing.tiles import OutputStrip, ShareProgress
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.io.layout import Layout
 from rdstitch.io.metadata import Metadata
@@ -113,6 +115,7 @@ def compose(
     canvas: Canvas,
     options: CompositeOptions | None = None,
     progress: ShareProgress | None = None,
+    elsewhere: BlockRunner | None = None,
 ) -> Composite:
     """Put pictures together on a canvas, in memory.
 
@@ -124,6 +127,8 @@ def compose(
     options : CompositeOptions, optional
     progress : callable, optional
         Called with the share of the work done, 0 to 1.
+    elsewhere : callable, optional
+        Computes the pixels, in blocks, in other processes; see :mod:`rdstitch.compositing.blocks`.
 
     Returns
     -------
@@ -143,7 +148,7 @@ def compose(
         pixels = np.zeros((height, width, renderer.channels), dtype=renderer.dtype)
         alpha = np.zeros((height, width), dtype=np.uint8)
         top = 0
-        with closing(prepared.strips(progress)) as strips:
+        with closing(prepared.strips(progress, elsewhere)) as strips:
             for samples, opaque in strips:
                 pixels[top : top + len(samples)], alpha[top : top + len(samples)] = samples, opaque
                 top += len(samples)
@@ -157,13 +162,14 @@ def compose_to_file(
     canvas: Canvas,
     options: CompositeOptions | None = None,
     progress: ShareProgress | None = None,
+    elsewhere: BlockRunner | None = None,
 ) -> FileComposite:
     """Put pictures together straight into a file, whatever its size: memory is that of a strip of tiles.
 
     Parameters
     ----------
     file : OutputFile
-    pictures, canvas, options, progress
+    pictures, canvas, options, progress, elsewhere
         As for :func:`compose`.
 
     Raises
@@ -196,7 +202,7 @@ def compose_to_file(
         check_memory(file.path, size, renderer.options.max_memory)
         tags = () if file.extra_tags is None else file.extra_tags(prepared.canvas)
         # Nothing goes on behind a writer that fails.
-        with closing(prepared.strips(progress)) as strips:
+        with closing(prepared.strips(progress, elsewhere)) as strips:
             written = write_strips(file.path, layout, counted(strips), tags, outputs=file.outputs)
     share = covered / (size[0] * size[1])
     return FileComposite(
@@ -207,5 +213,5 @@ def compose_to_file(
         written,
         prepared.messages,
         renderer.seams,
-        prepared.origin,
+        prepared.tiles.box[:2],
     )

@@ -35,6 +35,14 @@ class PictureCache:
         # One picture is read at a time; meanwhile those that are held can be had.
         self._lock, self._reading = Lock(), Lock()
 
+    def part(self, pictures: Sequence[int]) -> "PictureCache":
+        """An empty one for some of the pictures, which reads nothing ahead."""
+        return PictureCache(self._reader.part(pictures), [self._shrinks[index] for index in pictures], self._limit)
+
+    def __reduce__(self) -> tuple[type["PictureCache"], tuple[PictureReader, Sequence[float], int]]:
+        """Other processes get an empty one, which reads nothing ahead."""
+        return PictureCache, (self._reader, self._shrinks, self._limit)
+
     def masked(self, index: int) -> bool:
         """Whether a picture has transparent parts."""
         return self._reader.masked(index)

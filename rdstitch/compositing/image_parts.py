@@ -62,7 +62,7 @@ def shown_parts(warps: Sequence[Warp], seams: SeamMap, around: int) -> list[Show
     around : int
         How far from what a picture owns it is requested too, canvas pixels.
     """
-    labels, factor = seams.labels, seams.factor
+    labels, factor, (left, top) = seams.labels, seams.factor, seams.origin
     ends = np.ones((labels.shape[0], labels.shape[1] + 1), dtype=np.bool_)
     ends[:, 1:-1] = labels[:, 1:] != labels[:, :-1]
     # Runs begin after an end and stop before the next.
@@ -72,8 +72,8 @@ def shown_parts(warps: Sequence[Warp], seams: SeamMap, around: int) -> list[Show
     parts = []
     for index, warp in enumerate(warps):
         own = owners == index
-        y = np.tile((rows[own] + 0.5) * factor - 0.5, 2)
-        x = (np.concatenate([first[own], last[own]]) + 0.5) * factor - 0.5
+        y = np.tile((rows[own] + top + 0.5) * factor - 0.5, 2)
+        x = (np.concatenate([first[own], last[own]]) + left + 0.5) * factor - 0.5
         points = warp.source_points(x, y)
         known = np.isfinite(points).all(axis=1)
         room = math.ceil(_UNEVENNESS * warp.shrink * (around + factor))

@@ -9,7 +9,8 @@ is linear in all unknowns: ``q_i`` per picture and channel, the vignetting ``a``
 the distortion centre, and a smooth field ``f_i`` per picture.
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -56,6 +57,12 @@ class Exposure:
     knee: float = 1.0
     rms_before: float = 0.0
     rms_after: float = 0.0
+
+    def part(self, pictures: Sequence[int]) -> "Exposure":
+        """The same for some of the pictures."""
+        chosen = list(pictures)
+        fields = self.fields[chosen] if self.fields.size else self.fields
+        return replace(self, log_gain=self.log_gain[chosen], fields=fields)
 
     def smooth_part(self, index: int, camera: Camera, points: FloatArray) -> FloatArray:
         """Vignetting and field at measured pixels (..., 2), log units, shape (..., 1) or (..., C)."""

@@ -1,24 +1,17 @@
 """From what is decided on small pictures, exposure, seams and crop, to strips of the output at full size."""
 
-from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from rdstitch.compositing.blender import margin
+from rdstitch.compositing.blocks import BlockRunner, strips_of_blocks
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.brightness import estimate_exposure
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.crop import coverage_map, crop_box, crop_rows
 from rdstitch.compositing.image_cache import PictureCache
-from rdstitch.compositing.image_parts import ShownPart, shown_parts
 from rdstitch.compositing.lattice import LATTICE_STEPS
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photometric import no_exposure
@@ -28,17 +21,11 @@ from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seam_finder import find_seams
 from rdstitch.compositing.source_images import PictureReader
 from rdstitch.compositing.survey import survey_factor, survey_pictures
+from rdstitch.compositing.tiles import OutputStrip, ShareProgress, TiledOutput
 from rdstitch.compositing.warp import plan_warps
 from rdstitch.errors import ArgumentError
-from rdstitch.io.layout import STRIP_ROWS
 from rdstitch.messages import Message
-from rdstitch.opencv_state import one_opencv_thread
 from rdstitch.process_memory import release_free_heap
-
-# Samples (h, W, C) and alpha (h, W).
-OutputStrip = tuple[NDArray[Any], NDArray[np.uint8]]
-# Called with the share of the work done, 0 to 1.
-ShareProgress = Callable[[float], None]
 
 _PREPARATION = 0.25
 # Pictures that the survey reads at one time: what the tiles need is not there yet.
@@ -54,74 +41,27 @@ class Prepared:
     renderer : Renderer
     canvas : Canvas
         After cropping.
-    origin : (int, int)
-        Its top-left pixel on the canvas of the renderer.
-    plan : CompositePlan
+    tiles : TiledOutput
+        Its pixels; their box is on the canvas of the renderer, before cropping.
     messages : tuple of Message
-    shown : sequence of ShownPart
-        Which part of each picture shows, where that is known before; else empty.
-    around : int
-        How far from there pictures are requested too, canvas pixels.
     """
 
     renderer: Renderer
     canvas: Canvas
-    origin: tuple[int, int]
-    plan: CompositePlan
+    tiles: TiledOutput
     messages: tuple[Message, ...]
-    shown: Sequence[ShownPart]
-    around: int
 
-    def strips(self, progress: ShareProgress | None = None) -> Generator[OutputStrip]:
-        """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
+    def strips(
+        self, progress: ShareProgress | None = None, elsewhere: BlockRunner | None = None
+    ) -> Generator[OutputStrip]:
+        """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time.
+
+        ``elsewhere`` computes it in blocks, see :mod:`rdstitch.compositing.blocks`.
+        """
         progress = _part_of(progress, _PREPARATION, 1.0)
-        if self.plan.workers == 1:
-            yield from self._strips(map, progress)
-            return
-        with one_opencv_thread(), ThreadPoolExecutor(self.plan.workers) as pool:
-            yield from self._strips(pool.map, progress)
-
-    def _strips(self, run: Callable[..., Iterator[Any]], progress: ShareProgress | None) -> Iterator[OutputStrip]:
-        """The same, with tiles computed by ``run``, which works like ``map`` and may work ahead."""
-        (width, height), side = self.canvas.size, self.plan.tile_size
-        tops = iter(range(0, height, side))
-        # Two rows at a time, so that no worker waits for the last tile of a row.
-        under_way = deque(self._start(top, run) for top in islice(tops, 2))
-        done = 0
-        while under_way:
-            (samples, alpha), tiles = under_way.popleft()
-            for box in tiles:
-                if progress is not None:
-                    done += (box[2] - box[0]) * (box[3] - box[1])
-                    progress(done / (width * height))
-            # Computed while this strip is written.
-            under_way.extend(self._start(top, run) for top in islice(tops, 1))
-            for start in range(0, len(samples), STRIP_ROWS):
-                yield samples[start : start + STRIP_ROWS], alpha[start : start + STRIP_ROWS]
-
-    def _start(self, top: int, run: Callable[..., Iterator[Any]]) -> tuple[OutputStrip, Iterator[Box]]:
-        """Begin with a row of tiles, when all but one above are done: the strip they fill, and each once it is done."""
-        (width, height), (x, y), side = self.canvas.size, self.origin, self.plan.tile_size
-        bottom = min(top + side, height)
-        # In alternating directions, so that the pictures used last are the ones needed next.
-        backwards = top // side % 2 == 1
-        if self.shown:
-            pictures, warps = self.renderer.pictures, self.renderer.warps
-            pictures.expect([part.from_row(y + top - side - self.around) for part in self.shown])
-            rows = y + top - self.around, y + bottom + self.around
-            due = [index for index, part in enumerate(self.shown) if part.on_rows(*rows)]
-            pictures.prefetch(sorted(due, key=lambda index: warps[index].box, reverse=backwards))
-        boxes = [(x + k, y + top, x + min(k + side, width), y + bottom) for k in range(0, width, side)]
-        samples = np.zeros((bottom - top, width, self.renderer.channels), dtype=self.renderer.dtype)
-        alpha = np.zeros((bottom - top, width), dtype=np.uint8)
-
-        def fill(box: Box) -> Box:
-            columns = slice(box[0] - x, box[2] - x)
-            samples[:, columns], covered = self.renderer.tile(box)
-            alpha[:, columns][covered] = 255
-            return box
-
-        return (samples, alpha), run(fill, boxes[::-1] if backwards else boxes)
+        if elsewhere is None:
+            return self.tiles.strips(progress)
+        return strips_of_blocks(self.tiles, elsewhere, progress)
 
 
 @contextmanager
@@ -185,12 +125,9 @@ def _decided(
         found, note = find(covered, factor, canvas.size)
         box = found or box
     cropped = canvas if box is None else canvas.cropped(box)
-    # The support of a tile's blending is aligned to the coarsest band.
-    around = margin(plan.bands) + (2 << plan.bands)
-    shown = [] if seams is None else shown_parts(warps, seams, around)
-    origin, messages = (0, 0) if box is None else box[:2], (Message(note),) if note else ()
     renderer = replace(renderer, exposure=exposure, seams=seams)
-    return Prepared(renderer, cropped, origin, plan, messages, shown, around)
+    tiles = TiledOutput(renderer, box or (0, 0, *canvas.size), plan.tile_size, plan.workers)
+    return Prepared(renderer, cropped, tiles, (Message(note),) if note else ())
 
 
 def _wrap_margin(canvas: Canvas, bands: int) -> int:

@@ -100,6 +100,19 @@ class Renderer:
             cv2.copyTo(self._multiband(layers, zone), _as_mask(cut(covered, box, zone)), cut(pixels, box, zone))
         return pixels, covered
 
+    def part(self, box: Box) -> tuple["Renderer", tuple[int, ...]]:
+        """What the tiles of a box need, which it gives the same samples; and the pictures that are left in it."""
+        around = self._blend_support(box) if self.options.blend == "multiband" else box
+        chosen = [index for index, warp in enumerate(self.warps) if intersection(warp.box, around) is not None]
+        part = replace(
+            self,
+            warps=[self.warps[index] for index in chosen],
+            pictures=self.pictures.part(chosen),
+            exposure=self.exposure.part(chosen),
+            seams=None if self.seams is None else self.seams.part(around, chosen),
+        )
+        return part, tuple(chosen)
+
     def _contact_zone(self, layers: Sequence[Layer], box: Box) -> Box | None:
         """The part of a box in which blending can mix pictures; elsewhere it would return the only one there."""
         supports = [self._blend_support(layer.box) for layer in layers]

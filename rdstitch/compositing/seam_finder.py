@@ -6,7 +6,7 @@ cut), so that what moved or stands out of the plane is taken from one of them wh
 other, so that memory is that of one label per pixel of the reduced canvas.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -42,11 +42,14 @@ class SeamMap:
         Canvas pixels per reduced pixel, even or 1.
     softness : int
         Shares pass from one owner to the next over so many reduced pixels on either side of a seam, for feathering.
+    origin : (int, int)
+        Where ``labels`` begin on the reduced canvas: x, y.
     """
 
     labels: NDArray[np.int32]
     factor: int
     softness: int = 0
+    origin: tuple[int, int] = (0, 0)
 
     def owners(self, box: Box) -> list[int]:
         """Pictures that own anything on a box (canvas pixels), ascending; -1 first where a part has no owner."""
@@ -79,12 +82,24 @@ class SeamMap:
         margin = (self.labels.shape[1] - turn) // 2
         return replace(self, labels=np.take(self.labels, np.arange(-margin, turn + margin) % turn + margin, axis=1))
 
+    def part(self, box: Box, pictures: Sequence[int]) -> "SeamMap":
+        """The map of a box (canvas pixels), of some of the pictures, numbered anew; nobody has what others own."""
+        around = 1 + self.softness
+        (left, right), (top, bottom) = (
+            (max(0, start // self.factor - around - first), max(1, -(-stop // self.factor) + around - first))
+            for start, stop, first in zip(box[:2], box[2:], self.origin, strict=True)
+        )
+        labels = self.labels[top:bottom, left:right]
+        number = np.full(max(int(labels.max(initial=0)), *pictures, 0) + 2, NO_OWNER, dtype=np.int32)
+        number[list(pictures)] = np.arange(len(pictures))
+        return replace(self, labels=number[labels], origin=(self.origin[0] + left, self.origin[1] + top))
+
     def _window(self, box: Box) -> NDArray[np.int32]:
         """The labels that affect a box, one and the softness more on each side; the border repeats itself."""
         around = 1 + self.softness
         columns, rows = (
-            np.clip(np.arange(start // self.factor - around, -(-stop // self.factor) + around), 0, count - 1)
-            for start, stop, count in zip(box[:2], box[2:], self.labels.shape[::-1], strict=True)
+            np.clip(np.arange(start // self.factor - around, -(-stop // self.factor) + around) - first, 0, count - 1)
+            for start, stop, first, count in zip(box[:2], box[2:], self.origin, self.labels.shape[::-1], strict=True)
         )
         return self.labels[np.ix_(rows, columns)]
 

@@ -152,6 +152,13 @@ class PictureReader:
         self._samples: tuple[tuple[int, ...], np.dtype[Any]] | None = None
         self._masked: dict[int, bool] = {}
 
+    def part(self, pictures: Sequence[int]) -> "PictureReader":
+        """A reader of some of the pictures, which knows of them what this one does."""
+        part = PictureReader([self._pictures[index] for index in pictures])
+        part._samples = self._samples
+        part._masked = {new: self._masked[old] for new, old in enumerate(pictures) if old in self._masked}
+        return part
+
     def prepared(self, index: int, shrink: float) -> LoadedPicture:
         """Read picture ``index``, no larger than needed, for an output that shrinks it so much."""
         reduction = self._reduction(index, shrink)

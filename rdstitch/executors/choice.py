@@ -8,8 +8,9 @@ from rdstitch.executors.dask_cluster import DaskExecutor
 from rdstitch.executors.processes import ProcessExecutor
 
 _PROCESSES_FROM = 60
-"""Pictures from which on it pays to start worker processes, each of which takes a second to begin with. Threads share
-the interpreter, which matching and estimation keep busy."""
+"""Pictures from which on it pays to start worker processes: each takes a second to begin with, and a picture a third of
+one, so that the start is at most a twentieth of the work. Threads share the interpreter, which matching and estimation
+keep busy."""
 
 
 def open_executor(workers: int, pictures: int, *, scheduler: str | None = None, store: Path | None = None) -> Executor:

@@ -1,7 +1,7 @@
 """Results of tasks, in the order of the tasks, with few of them under way."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Executor, Future
 from typing import TypeVar
 
@@ -11,7 +11,7 @@ Result = TypeVar("Result")
 _MAX_PENDING = 256  # tasks that have been submitted and whose results were not taken: enough for that many workers
 
 
-def in_order(executor: Executor, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
+def in_order(executor: Executor, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Generator[Result]:
     """The result of each task, in their order; tasks are taken as they are needed.
 
     Parameters

@@ -144,21 +144,21 @@ def readers(sources: Sequence[Source]) -> list[Callable[..., Picture]]:
     InputError
         By a reader: see :meth:`Source.read`, and when its samples are unlike those of the picture read first.
     """
-    first: list[tuple[Source, str]] = []
+    first: list[tuple[str, str]] = []
+    return [partial(_read_alike, first, source) for source in sources]
 
-    def read(source: Source, reduction: int = 1) -> Picture:
-        picture = source.read(reduction)
-        bands = 1 if picture.pixels.ndim == 2 else picture.pixels.shape[2]
-        # Grey becomes colour where it must.
-        kind = f"{picture.pixels.dtype} samples" + ("" if bands in (1, 3) else f" in {bands} bands")
-        first.append((source, kind))
-        if kind != first[0][1]:
-            raise InputError(
-                f"{source.path}: has {kind}, but {first[0][0].name} has {first[0][1]}; convert them to one kind"
-            )
-        return picture
 
-    return [partial(read, source) for source in sources]
+def _read_alike(first: list[tuple[str, str]], source: Source, reduction: int = 1) -> Picture:
+    """Read a picture whose samples must be as those that were read first: name and kind, noted where none were."""
+    picture = source.read(reduction)
+    bands = 1 if picture.pixels.ndim == 2 else picture.pixels.shape[2]
+    # Grey becomes colour where it must.
+    kind = f"{picture.pixels.dtype} samples" + ("" if bands in (1, 3) else f" in {bands} bands")
+    if not first:
+        first.append((source.name, kind))
+    if kind != first[0][1]:
+        raise InputError(f"{source.path}: has {kind}, but {first[0][0]} has {first[0][1]}; convert them to one kind")
+    return picture
 
 
 def read_sources(

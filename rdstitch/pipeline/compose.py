@@ -14,6 +14,7 @@ from rdstitch.compositing import (
     compose_to_file,
     plan_composite,
 )
+from rdstitch.compositing.blocks import BlockRunner
 from rdstitch.export.georeference import Georeference, georeference, has_place, world_file_paths
 from rdstitch.inputs.source import Source
 from rdstitch.io.atomic import check_output, text_bytes
@@ -69,6 +70,7 @@ def compose_pictures(
     *,
     overwrite: bool,
     outputs: Outputs,
+    elsewhere: BlockRunner | None = None,
     dry_run: bool = False,
 ) -> Composed:
     """Plan the canvas, see whether a file can hold it, and put the pictures on it.
@@ -86,6 +88,8 @@ def compose_pictures(
         Replace an existing world file.
     outputs : Outputs
         Where the files are staged.
+    elsewhere : callable, optional
+        See :func:`rdstitch.compositing.compose`.
     dry_run : bool
         Only plan.
 
@@ -114,7 +118,7 @@ def compose_pictures(
         progress("compositing", round(100 * share), 100)
 
     if output is None:
-        composite = compose(pictures, canvas, options, report)
+        composite = compose(pictures, canvas, options, report, elsewhere)
         return Composed(composite.canvas, composite, messages=(*_masked(placed), *composite.messages))
     located: list[tuple[Georeference | None, str]] = []
 
@@ -123,7 +127,7 @@ def compose_pictures(
         return located[0][0].tiff_tags() if located[0][0] is not None else []
 
     file = OutputFile(output, placed.sources[0].metadata, tags, outputs)
-    written = compose_to_file(file, pictures, canvas, options, report)
+    written = compose_to_file(file, pictures, canvas, options, report, elsewhere)
     place, note = located[0]
     if place is not None and world_files:
         for path, text in zip(world_files, place.world_file_texts(), strict=True):

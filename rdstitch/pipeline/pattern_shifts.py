@@ -13,11 +13,12 @@ from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.radial_homography import RadialHomography, from_plane, to_plane
 from rdstitch.verification.overlap_check import placed_picture
+from rdstitch.verification.photometric_agreement import COMPARED_SIDE
 from rdstitch.verification.self_similarity import ambiguous_pairs
 from rdstitch.verification.unique_places import unique_shifts
 
-_MAX_PICTURES = 60
-"""Pictures whose departures are in memory at once; of more, a repeated pattern is refused as before."""
+_MAX_PICTURES = 2**27 // (2 * COMPARED_SIDE**2 * np.dtype(np.float32).itemsize)
+"""Pictures whose drawings and departures fit into 128 MB at once; of more, a repeated pattern is refused as before."""
 
 _PAIRS_OF_A_PICTURE = 6
 """Pairs that are compared, by picture on average: those taken one soon after the other first."""

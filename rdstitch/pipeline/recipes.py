@@ -1,21 +1,17 @@
 """The recipes: each reads as the sequence of its stages."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.camera_files import CAMERA_SUFFIXES, camera_file_text
-from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.path_plot import path_as_svg
 from rdstitch.export.trajectory_files import WRITERS, has_times
-from rdstitch.inputs.attitudes import with_attitudes
 from rdstitch.inputs.find import FoundPictures, found_pictures
-from rdstitch.inputs.frame import Frame, Images, as_inputs
-from rdstitch.inputs.input_guard import InputGuard
-from rdstitch.inputs.masks import with_masks
-from rdstitch.inputs.selection import selected
-from rdstitch.inputs.source import Source, read_sources
+from rdstitch.inputs.frame import Images, as_inputs
 from rdstitch.inputs.timestamps import timestamps_of
 from rdstitch.io.atomic import check_distinct, check_output, json_bytes, text_bytes
 from rdstitch.io.outputs import Outputs
@@ -23,9 +19,11 @@ from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.align_locally import align_registration_locally
+from rdstitch.pipeline.blocks_elsewhere import blocks_on
 from rdstitch.pipeline.compose import compose_pictures
 from rdstitch.pipeline.page import viewed_pictures, write_page
 from rdstitch.pipeline.placed_images import PlacedImages
+from rdstitch.pipeline.read_inputs import read_inputs
 from rdstitch.pipeline.register import register, with_frontal_reference
 from rdstitch.progress import Progress, silent
 from rdstitch.registration import Registration
@@ -87,11 +85,11 @@ def pano(
         as_inputs(inputs, options.channel_order), output=output, every=every, topic=options.topic
     ) as found:
         _check_outputs(output, options, found.files)
-        sources, _ = _read(found.frames, options, skip_bad=False)
+        sources, _ = read_inputs(found.frames, options, skip_bad=False)
         with options.executor(len(sources)) as executor:
             registration = register(sources, options, executor, skip_bad=False, progress=progress)
             accepted = accept(registration.with_messages(found.messages), options, executor)
-        return _composite(accepted, output, options, progress, beside, frontal=True)
+            return _composite(accepted, executor, output, options, progress, beside, frontal=True)
 
 
 def mosaic(
@@ -139,8 +137,8 @@ def mosaic(
         as_inputs(inputs, options.channel_order), output=output, every=every, topic=options.topic
     ) as found:
         _check_outputs(output, options, found.files)
-        registration = _register_all(found, options, progress)
-        return _composite(registration, output, options, progress, beside)
+        with _registered(found, options, progress) as (registration, executor):
+            return _composite(registration, executor, output, options, progress, beside)
 
 
 def calibrate(
@@ -173,7 +171,8 @@ def calibrate(
     options = options or StitchOptions()
     with found_pictures(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as found:
         _check_outputs(None, options, found.files)
-        registration = _register_all(found, options, progress, lens_only=True)
+        with _registered(found, options, progress, lens_only=True) as (registration, _):
+            pass
     _release_decoded_images(registration)
     result = _with_damage(registration)
     with Outputs(options.overwrite) as outputs:
@@ -225,7 +224,7 @@ def trajectory(
             read = [*found.files, *options.files, *([] if timestamps is None else [timestamps])]
             check_output(file, options.overwrite, read, suffixes=())
         check_distinct(files)
-        sources, unread = _read(found.frames, options, skip_bad=True)
+        sources, unread = read_inputs(found.frames, options, skip_bad=True)
         times = timestamps_of(sources, timestamps)
         with options.executor(len(sources)) as executor:
             registration = register(sources, options, executor, skip_bad=True, metric=True, progress=progress)
@@ -244,14 +243,16 @@ def trajectory(
     return path, registration
 
 
-def _register_all(
+@contextmanager
+def _registered(
     found: FoundPictures, options: StitchOptions, progress: Progress, *, lens_only: bool = False
-) -> Registration:
-    """Register and check a sequence, leaving out what cannot be read."""
-    sources, unread = _read(found.frames, options, skip_bad=True)
+) -> Iterator[tuple[Registration, Executor]]:
+    """A sequence registered and checked, without what cannot be read; and who computed it, until the block ends."""
+    sources, unread = read_inputs(found.frames, options, skip_bad=True)
     with options.executor(len(sources)) as executor:
         registration = register(sources, options, executor, skip_bad=True, lens_only=lens_only, progress=progress)
-        return accept(registration.with_messages([*unread, *found.messages]), options, executor, lens_only=lens_only)
+        registration = registration.with_messages([*unread, *found.messages])
+        yield accept(registration, options, executor, lens_only=lens_only), executor
 
 
 def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Sequence[str | Path]) -> None:
@@ -265,26 +266,9 @@ def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Se
         check_distinct([options.save_camera, *([] if output is None else [f"{output}.json"])])
 
 
-def _read(frames: Sequence[Frame], options: StitchOptions, *, skip_bad: bool) -> tuple[list[Source], list[Message]]:
-    sources, unread = read_sources(
-        selected(frames, options.exclude, options.include_only),
-        camera=options.camera,
-        focal=options.focal,
-        distortion=options.distortion,
-        skip_bad=skip_bad,
-        guard=InputGuard(options.strict),
-        max_memory=options.composite.max_memory,
-    )
-    if len(sources) < 2:
-        if unread:
-            raise InputError(f"fewer than two pictures can be read; {unread[0].images[0]}: {unread[0].text}")
-        raise ArgumentError("stitching needs two different pictures or more; name at least one more")
-    sources = with_attitudes(with_masks(sources, options.mask), options.attitude)
-    return (sources if options.scheduler is None else [s.with_absolute_paths() for s in sources]), unread
-
-
 def _composite(
     registration: Registration,
+    executor: Executor,
     output: str | Path | None,
     options: StitchOptions,
     progress: Progress,
@@ -308,6 +292,7 @@ def _composite(
             progress,
             overwrite=options.overwrite,
             outputs=outputs,
+            elsewhere=blocks_on(executor, placed.sources, options.cache),
             dry_run=options.dry_run,
         )
         _release_decoded_images(registration)
@@ -333,9 +318,8 @@ def _composite(
 
 
 def _with_damage(registration: Registration) -> Registration:
-    """The registration with what the decoders have found wrong, in whichever stage."""
-    guards = {id(source.guard): source.guard for source in registration.sources}
-    return registration.with_messages(message for guard in guards.values() for message in guard.messages)
+    """The registration with what the decoders have found wrong, in whichever stage; all sources have one guard."""
+    return registration.with_messages(registration.sources[0].guard.messages)
 
 
 def _release_decoded_images(registration: Registration) -> None:

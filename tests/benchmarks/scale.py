@@ -24,6 +24,7 @@ from rdstitch.camera import Camera
 from rdstitch.io.write import write_image
 from rdstitch.radial_homography import to_plane
 from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over, survey_poses
+from tests.benchmarks.peak_memory import peak_memory
 from tests.benchmarks.registration import StageTimes
 
 COUNTS = (100, 300, 1000, 3000)
@@ -76,7 +77,7 @@ def measure(folder: Path, count: int, shuffled: bool, register_only: bool) -> di
     return {
         "count": count,
         "seconds": seconds,
-        "memory": own.ru_maxrss * 1024 / 1e6,
+        "memory": peak_memory(),
         "used": int(alignment.used.sum()),
         "pairs": len(registration.pairs),
         "distortion": alignment.distortion,

@@ -24,6 +24,7 @@ from examples.judging import alignment_error
 from rdstitch.radial_homography import to_plane
 from rdstitch.synthetic import Sequence
 from rdstitch.synthetic.poses import plane_outline
+from tests.benchmarks.peak_memory import peak_memory
 from tests.benchmarks.registration import StageTimes
 from tests.floor_drives import DISTORTION, PATHS, floor_drive
 
@@ -74,7 +75,7 @@ def measure(file: Path, sequence: Sequence, every: int | None) -> dict[str, Any]
     error = alignment_error(sequence, places, points_per_side=_GRID)
     return {
         "seconds": own.ru_utime + own.ru_stime - before.ru_utime - before.ru_stime,
-        "memory": own.ru_maxrss / 1024,
+        "memory": peak_memory(),
         "taken": len(numbers),
         "used": len(used),
         "distortion": alignment.distortion,

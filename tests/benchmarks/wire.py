@@ -1,6 +1,6 @@
 """What travels between the stages and the workers, a frame: ``python -m tests.benchmarks.wire [--frames N]``.
 
-The tasks of a registration and their results are pickled as they are for worker processes and for Dask; beside them is
+The tasks of a mosaic and their results are pickled as they are for worker processes and for Dask; beside them is
 what lies in the store, and the processor time of each stage, which docs/scale.md reckons with.
 """
 
@@ -13,10 +13,9 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest.mock import patch
 
-from rdstitch import FeatureOptions, StitchOptions
-from rdstitch.inputs.source import read_sources
-from rdstitch.pipeline.register import register
+from rdstitch import FeatureOptions, StitchOptions, mosaic
 from tests.floor_drives import floor_drive
 
 
@@ -54,11 +53,11 @@ def main() -> None:
         folder = Path(name)
         (folder / "frames").mkdir()
         files = floor_drive("parking", frames, seed=7, size=(480, 360)).write(folder / "frames")
-        sources, _ = read_sources(files, camera=None, focal=None, distortion=None, skip_bad=False)
         executor = CountingExecutor()
-        options = StitchOptions(features=FeatureOptions(), cache=folder / "store", workers=1)
+        options = StitchOptions(features=FeatureOptions(), cache=folder / "store", workers=1, force=True)
         begun = time.process_time()
-        registration = register(sources, options, executor, skip_bad=False)
+        with patch("rdstitch.options.open_executor", lambda *_, **__: executor):
+            registration = mosaic(files, folder / "out.tif", options).registration
         rest = time.process_time() - begun - sum(executor.seconds.values())
         print(f"{frames} frames of 480 x 360 pixels, {len(registration.pairs)} pairs; of a frame:")
         print(f"{'':24s}{'tasks':>7s}{'kB there':>10s}{'kB back':>9s}{'ms':>7s}")

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import rdstitch
+from rdstitch.compositing.tiles import TiledOutput
 from rdstitch.executors import ProcessExecutor
 from tests.cli.running import FAST, Run, flight
 
@@ -59,12 +60,15 @@ def _record(output: Path) -> dict[str, Any]:
     return record
 
 
-def test_a_cluster_gives_the_same_bytes_though_a_worker_dies(pictures: list[Path], tmp_path: Path) -> None:
+def test_a_cluster_gives_the_same_bytes_though_a_worker_dies(
+    pictures: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     features = rdstitch.FeatureOptions(max_features=600)
     here, there = tmp_path / "here" / "out.png", tmp_path / "there" / "out.png"
     here.parent.mkdir()
     there.parent.mkdir()
     rdstitch.mosaic(pictures, here, rdstitch.StitchOptions(features=features, workers=1))
+    monkeypatch.setattr(TiledOutput, "strips", lambda *_: pytest.fail("pixels are for the workers, in this process"))
     with _cluster(tmp_path, 2) as (address, workers):
         steps: list[tuple[str, int]] = []
 
@@ -79,6 +83,7 @@ def test_a_cluster_gives_the_same_bytes_though_a_worker_dies(pictures: list[Path
         assert workers[1].poll() is None
     assert there.read_bytes() == here.read_bytes()
     assert _record(there) == _record(here)
+    assert not list((tmp_path / "store").glob("rdstitch-*")), "what the workers had composed is removed"
     assert [done for stage, done in steps if stage == "detecting features"] == list(range(1, _PICTURES + 1))
 
 
@@ -102,7 +107,7 @@ def test_one_and_four_worker_processes_give_the_same_bytes(
         rdstitch.mosaic(pictures, outputs[-1], rdstitch.StitchOptions(features=features, workers=workers))
     assert outputs[0].read_bytes() == outputs[1].read_bytes()
     assert _record(outputs[0]) == _record(outputs[1])
-    assert handed == {"detect_batch", "match_pairs", "estimate_pairs", "compare_overlaps"}
+    assert handed == {"detect_batch", "match_pairs", "estimate_pairs", "compare_overlaps", "compose_block"}
 
 
 def test_a_cluster_is_started_here_and_ended(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:

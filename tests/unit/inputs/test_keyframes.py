@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from rdstitch.inputs.find import find_pictures
-from rdstitch.inputs.keyframes import Wanted, choose, keyframes, tracked, wanted_frames
+from rdstitch.inputs.frame_tracking import tracked
+from rdstitch.inputs.keyframes import Wanted, choose, keyframes, wanted_frames
 
 _WIDTH, _HEIGHT = 160, 120
 _GROUND = np.asarray(

@@ -1,0 +1,120 @@
+"""A part of a canvas, computed tile by tile, as strips from top to bottom."""
+
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import islice
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.compositing.blender import margin
+from rdstitch.compositing.boxes import Box
+from rdstitch.compositing.image_parts import ShownPart, shown_parts
+from rdstitch.compositing.render import Renderer
+from rdstitch.io.layout import STRIP_ROWS
+from rdstitch.opencv_state import one_opencv_thread
+
+OutputStrip = tuple[NDArray[Any], NDArray[np.uint8]]
+"""Samples (h, W, C) and alpha (h, W)."""
+
+ShareProgress = Callable[[float], None]
+"""Called with the share of the work done, 0 to 1."""
+
+
+@dataclass(frozen=True)
+class TiledOutput:
+    """A part of a canvas that is not yet computed.
+
+    Attributes
+    ----------
+    renderer : Renderer
+    box : (int, int, int, int)
+        The part: x0, y0, x1, y1 on the canvas of the renderer, pixels, end exclusive.
+    tile_size : int
+        Side of the square tiles, pixels.
+    workers : int
+        Tiles at one time.
+    """
+
+    renderer: Renderer
+    box: Box
+    tile_size: int
+    workers: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, pixels."""
+        return self.box[2] - self.box[0], self.box[3] - self.box[1]
+
+    @property
+    def _around(self) -> int:
+        """How far from where they show pictures are requested too, canvas pixels.
+
+        The support of a tile's blending is aligned to the coarsest band.
+        """
+        return margin(self.renderer.bands) + (2 << self.renderer.bands)
+
+    @cached_property
+    def _shown(self) -> Sequence[ShownPart]:
+        """Which part of each picture shows, where that is known before; else empty."""
+        seams = self.renderer.seams
+        return [] if seams is None else shown_parts(self.renderer.warps, seams, self._around)
+
+    def part(self, box: Box) -> tuple["TiledOutput", tuple[int, ...]]:
+        """A smaller part, one tile at a time, with nothing but the pictures that reach it; and which these are."""
+        renderer, pictures = self.renderer.part(box)
+        return TiledOutput(renderer, box, self.tile_size, 1), pictures
+
+    def strips(self, progress: ShareProgress | None = None) -> Generator[OutputStrip]:
+        """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
+        if self.workers == 1:
+            yield from self._strips(map, progress)
+            return
+        with one_opencv_thread(), ThreadPoolExecutor(self.workers) as pool:
+            yield from self._strips(pool.map, progress)
+
+    def _strips(self, run: Callable[..., Iterator[Any]], progress: ShareProgress | None) -> Iterator[OutputStrip]:
+        """The same, with tiles computed by ``run``, which works like ``map`` and may work ahead."""
+        (width, height), side = self.size, self.tile_size
+        tops = iter(range(0, height, side))
+        # Two rows at a time, so that no worker waits for the last tile of a row.
+        under_way = deque(self._start(top, run) for top in islice(tops, 2))
+        done = 0
+        while under_way:
+            (samples, alpha), tiles = under_way.popleft()
+            for box in tiles:
+                if progress is not None:
+                    done += (box[2] - box[0]) * (box[3] - box[1])
+                    progress(done / (width * height))
+            # Computed while this strip is written.
+            under_way.extend(self._start(top, run) for top in islice(tops, 1))
+            for start in range(0, len(samples), STRIP_ROWS):
+                yield samples[start : start + STRIP_ROWS], alpha[start : start + STRIP_ROWS]
+
+    def _start(self, top: int, run: Callable[..., Iterator[Any]]) -> tuple[OutputStrip, Iterator[Box]]:
+        """Begin with a row of tiles, when all but one above are done: the strip they fill, and each once it is done."""
+        (width, height), (x, y), side = self.size, self.box[:2], self.tile_size
+        bottom = min(top + side, height)
+        # In alternating directions, so that the pictures used last are the ones needed next.
+        backwards = top // side % 2 == 1
+        if self._shown:
+            pictures, warps = self.renderer.pictures, self.renderer.warps
+            pictures.expect([part.from_row(y + top - side - self._around) for part in self._shown])
+            rows = y + top - self._around, y + bottom + self._around
+            due = [index for index, part in enumerate(self._shown) if part.on_rows(*rows)]
+            pictures.prefetch(sorted(due, key=lambda index: warps[index].box, reverse=backwards))
+        boxes = [(x + k, y + top, x + min(k + side, width), y + bottom) for k in range(0, width, side)]
+        samples = np.zeros((bottom - top, width, self.renderer.channels), dtype=self.renderer.dtype)
+        alpha = np.zeros((bottom - top, width), dtype=np.uint8)
+
+        def fill(box: Box) -> Box:
+            columns = slice(box[0] - x, box[2] - x)
+            samples[:, columns], covered = self.renderer.tile(box)
+            alpha[:, columns][covered] = 255
+            return box
+
+        return (samples, alpha), run(fill, boxes[::-1] if backwards else boxes)

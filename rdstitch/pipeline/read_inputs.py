@@ -1,0 +1,40 @@
+"""From frames and options to the pictures that are registered."""
+
+from collections.abc import Sequence
+
+from rdstitch.errors import ArgumentError, InputError
+from rdstitch.inputs.attitudes import with_attitudes
+from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.input_guard import InputGuard
+from rdstitch.inputs.masks import with_masks
+from rdstitch.inputs.selection import selected
+from rdstitch.inputs.source import Source, read_sources
+from rdstitch.messages import Message
+from rdstitch.options import StitchOptions
+
+
+def read_inputs(
+    frames: Sequence[Frame], options: StitchOptions, *, skip_bad: bool
+) -> tuple[list[Source], list[Message]]:
+    """The pictures that options leave, with masks and attitudes; and why others cannot be read.
+
+    Raises
+    ------
+    ArgumentError, InputError, LimitError
+        See :func:`rdstitch.inputs.source.read_sources`; also when fewer than two are left.
+    """
+    sources, unread = read_sources(
+        selected(frames, options.exclude, options.include_only),
+        camera=options.camera,
+        focal=options.focal,
+        distortion=options.distortion,
+        skip_bad=skip_bad,
+        guard=InputGuard(options.strict),
+        max_memory=options.composite.max_memory,
+    )
+    if len(sources) < 2:
+        if unread:
+            raise InputError(f"fewer than two pictures can be read; {unread[0].images[0]}: {unread[0].text}")
+        raise ArgumentError("stitching needs two different pictures or more; name at least one more")
+    sources = with_attitudes(with_masks(sources, options.mask), options.attitude)
+    return (sources if options.scheduler is None else [s.with_absolute_paths() for s in sources]), unread
