@@ -9,13 +9,21 @@ _USUAL = 180 * 2**20  # bytes; where the system does not say it: the libraries, 
 _BOUND, _BOUND_OF_A_PICTURE = 400 * 10**6, 150 * 10**3  # bytes; of the whole process, see docs/scale.md
 
 
+_MMAP_THRESHOLD = -3  # of mallopt
+_LARGE = 8 * 2**20  # bytes: more than any array of a tile, which are made again and again; less than a picture
+
+
 def release_free_heap() -> None:
     """Give memory that earlier stages have freed back to the system, where the C library would keep it (glibc).
 
-    What the threads of one stage have freed is of little use to those of the next, and would count twice.
+    What the threads of one stage have freed is of little use to those of the next, and would count twice. From then on
+    large arrays go back as soon as they are freed: the library would soon put them onto its heaps, with small ones
+    between them.
     """
     with suppress(AttributeError, OSError, TypeError):
-        ctypes.CDLL(None).malloc_trim(0)
+        library = ctypes.CDLL(None)
+        library.mallopt(_MMAP_THRESHOLD, _LARGE)
+        library.malloc_trim(0)
 
 
 def memory_left(pictures: int) -> int:

@@ -20,6 +20,19 @@ def test_what_the_process_holds_counts() -> None:
     assert memory_left(0) == pytest.approx(before, abs=10e6)
 
 
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system does not say what a process holds")
+def test_large_arrays_go_back_though_small_ones_were_made_between_them() -> None:
+    release_free_heap()
+    # After this the C library would put all up to this size onto its heap.
+    np.ones(28_000_000, dtype=np.uint8)
+    before, arrays, between = memory_left(0), [], []
+    for _ in range(8):
+        arrays.append(np.ones(12_000_000, dtype=np.uint8))
+        between.append(np.ones(3000, dtype=np.uint8))
+    arrays.clear()
+    assert memory_left(0) == pytest.approx(before, abs=10e6)
+
+
 def test_the_bound_is_400_mb_and_150_kb_a_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process_memory, "_resident", lambda: 100_000_000)
     assert memory_left(0) == 300_000_000
