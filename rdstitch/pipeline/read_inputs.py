@@ -11,6 +11,7 @@ from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
+from rdstitch.process_memory import release_free_heap
 
 
 def read_inputs(
@@ -23,6 +24,8 @@ def read_inputs(
     ArgumentError, InputError, LimitError
         See :func:`rdstitch.inputs.source.read_sources`; also when fewer than two are left.
     """
+    # Before the first large picture is freed.
+    release_free_heap()
     sources, unread = read_sources(
         selected(frames, options.exclude, options.include_only),
         camera=options.camera,

@@ -77,7 +77,6 @@ def register(
     RegistrationError
         When no two pictures overlap.
     """
-    release_free_heap()
     options = options.for_pictures(len(sources))
     cache = Cache.at(options.cache)
     aligner = Aligner.of(sources, options, cache)
