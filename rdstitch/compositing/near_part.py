@@ -22,8 +22,8 @@ _PROBES = 33
 _POINTS_PER_SIDE = 64
 """As the canvas samples outlines: undistorted, straight sides are curved."""
 
-_ROWS = 256
-"""Rows of a mask that are computed at a time."""
+_ROWS = 64
+"""Rows of a mask that are computed at a time, so that they stay in the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,10 @@ class NearPart:
         for top in range(0, height, _ROWS):
             y = ((np.arange(top, min(top + _ROWS, height)) - camera.center[1]) / camera.half_diagonal)[:, None]
             radius2 = x**2 + y**2
-            lens = 1.0 + radius2 * np.polynomial.polynomial.polyval(radius2, np.array(camera.coefficients))
+            lens = np.zeros_like(radius2)
+            for coefficient in (*reversed(camera.coefficients), 1.0):  # Horner's scheme, in place
+                lens *= radius2
+                lens += coefficient
             shown[top : top + _ROWS] = self.depth[0] * x + self.depth[1] * y + self.depth[2] * lens > 0.0
         return shown
 

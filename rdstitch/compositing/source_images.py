@@ -120,15 +120,18 @@ def prepare_picture(picture: Picture, shrink: float, reduction: int = 1) -> Load
 
 def _filled(pixels: NDArray[Any], opaque: NDArray[np.bool_]) -> NDArray[Any]:
     """Every transparent pixel gets the value of the nearest opaque one, so that no kernel mixes in its colour."""
-    if not opaque.any():
+    hidden = (~opaque).astype(np.uint8)
+    # The nearest opaque pixel of a transparent one touches a transparent one itself.
+    border = np.flatnonzero(cv2.dilate(hidden, np.ones((3, 3), np.uint8)).view(np.bool_) & opaque)
+    if not len(border):
         return pixels
-    _, labels = cv2.distanceTransformWithLabels(
-        (~opaque).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    position = np.zeros(int(labels.max()) + 1, dtype=np.intp)
-    position[labels[opaque]] = np.flatnonzero(opaque)
-    flat = pixels.reshape(-1, *pixels.shape[2:])
-    return np.ascontiguousarray(flat[position[labels]])
+    _, labels = cv2.distanceTransformWithLabels(hidden, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    label, unseen = labels.ravel(), np.flatnonzero(hidden)
+    position = np.zeros(int(label.max()) + 1, dtype=np.intp)
+    position[label[border]] = border
+    filled = pixels.copy()
+    filled.reshape(-1, *pixels.shape[2:])[unseen] = pixels.reshape(-1, *pixels.shape[2:])[position[label[unseen]]]
+    return filled
 
 
 def _opacity(opaque: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float]:
