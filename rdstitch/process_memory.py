@@ -7,8 +7,6 @@ from pathlib import Path
 
 _USUAL = 180 * 2**20  # bytes; where the system does not say it: the libraries, and a few hundred registered pictures
 _BOUND, _BOUND_OF_A_PICTURE = 400 * 10**6, 150 * 10**3  # bytes; of the whole process, see docs/scale.md
-
-
 _MMAP_THRESHOLD = -3  # of mallopt
 _LARGE = 8 * 2**20  # bytes: more than any array of a tile, which are made again and again; less than a picture
 
@@ -16,9 +14,9 @@ _LARGE = 8 * 2**20  # bytes: more than any array of a tile, which are made again
 def release_free_heap() -> None:
     """Give memory that earlier stages have freed back to the system, where the C library would keep it (glibc).
 
-    What the threads of one stage have freed is of little use to those of the next, and would count twice. From then on
-    large arrays go back as soon as they are freed: the library would soon put them onto its heaps, with small ones
-    between them.
+    What the threads of one stage have freed is of little use to those of the next, and would count twice. From the
+    first call on, large arrays go back as soon as they are freed; otherwise the library would soon put them onto its
+    heaps, where small ones between them keep what is freed.
     """
     with suppress(AttributeError, OSError, TypeError):
         library = ctypes.CDLL(None)

@@ -10,7 +10,6 @@ _FULL_CIRCLE = np.pi / 2
 _MAX_GRAVITY_SPREAD = np.radians(5.0)
 """Median angle between measured directions of gravity and their mean, up to which they are believed."""
 
-
 _STEEP = np.cos(np.radians(30.0))
 """Pictures that look within 30 degrees of straight up or down do not show how the camera was held."""
 

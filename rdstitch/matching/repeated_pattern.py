@@ -13,8 +13,8 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.features import Correspondences, Features
 
 MIN_REPETITION = 0.1
-"""Of :func:`repetition`: pictures with more may show a repeated pattern. Boards have 0.15 to 0.8, flights
-up to 0.01, but over a car park or mown grass up to 0.6."""
+"""Of :func:`repetition`: pictures with more may show a repeated pattern. Boards have 0.15 to 0.8, flights up to
+0.01, but up to 0.6 over a car park or mown grass."""
 
 _SIMILAR_DISTANCE = 0.45  # of the median distance between descriptors of a picture: nearer ones look the same
 _MIN_REPETITIONS = 4  # keypoints elsewhere that look the same, of one that repeats itself
