@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from rdstitch.errors import ArgumentError, InputError, OutputError
+from rdstitch.file_access import is_url, open_regular, read_limited, remote_status
 from rdstitch.io.packing import digest, pack, unpack
 from rdstitch.io.staging import lock, remove_dead_files
-from rdstitch.regular_files import open_regular, read_limited
-from rdstitch.remote_files import is_url, remote_status
 from rdstitch.stored import MAX_ENTRY, Stored, TemporaryFolder, entry_name
 
 Value = TypeVar("Value")

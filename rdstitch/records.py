@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.errors import InputError
-from rdstitch.regular_files import read_limited
+from rdstitch.file_access import read_limited
 
 MAX_FILE = 256 * 2**20  # bytes; a sidecar of ten thousand pictures has about 30 MB
 _MAX_SIDE = 10**7  # pixels

@@ -11,9 +11,9 @@ from threading import Lock
 from typing import Any, Generic, TypeVar, cast
 
 from rdstitch.errors import ArgumentError, InputError
+from rdstitch.file_access import read_limited
 from rdstitch.io.packing import unpack
 from rdstitch.io.staging import StagingFolder
-from rdstitch.regular_files import read_limited
 
 Value = TypeVar("Value")
 

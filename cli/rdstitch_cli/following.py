@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import click
 
 from rdstitch_cli import options
-from rdstitch_cli.progress import Reporter
 from rdstitch_cli.stitching import warn_of
+from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
     from rdstitch.inputs.frame import Named

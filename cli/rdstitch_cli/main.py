@@ -26,8 +26,7 @@ from rdstitch_cli.commands.trajectory import trajectory
 from rdstitch_cli.commands.undistort import undistort
 from rdstitch_cli.config import config_option
 from rdstitch_cli.help_pages import help_command
-from rdstitch_cli.progress import one_line
-from rdstitch_cli.terminal import write_whatever_the_encoding
+from rdstitch_cli.terminal import one_line, write_whatever_the_encoding
 
 EXIT_STATUSES = """\b
 Exit status:

@@ -12,7 +12,7 @@ import click
 
 from rdstitch_cli.config import CONFIG_FILE
 from rdstitch_cli.options import is_given
-from rdstitch_cli.progress import Reporter
+from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
     from rdstitch.camera import Camera

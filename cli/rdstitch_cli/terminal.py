@@ -1,9 +1,15 @@
-"""Text on terminals and in pipes that know fewer characters than UTF-8: nothing fails there, λ is written lambda."""
+"""What the user sees while a command runs: bars on a terminal, lines of log, in whatever encoding there is."""
 
 import codecs
 import sys
-from contextlib import suppress
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from io import TextIOWrapper
+from types import TracebackType
+from typing import Never, Self
+
+from tqdm import tqdm
 
 _ASCII = {
     "λ": "lambda",
@@ -39,3 +45,91 @@ def spell_out(error: UnicodeError) -> tuple[str | bytes, int]:
     if "\udc80" <= first <= "\udcff":
         return first.encode("utf-8", "surrogateescape"), end
     return _ASCII.get(first) or first.encode("ascii", "backslashreplace").decode("ascii"), end
+
+
+def one_line(text: str) -> str:
+    """Text that a terminal shows as one line, whatever file names and cameras are called."""
+    shown = (c if c.isprintable() else " " if c.isspace() else c.encode("unicode_escape").decode() for c in text)
+    return "".join(shown).strip()
+
+
+class Reporter:
+    """Receives what the library has to say while it works.
+
+    It is the ``progress`` callable of the library: called with a stage's name, how much is done and how much there is
+    to do.
+
+    Parameters
+    ----------
+    verbosity : int
+        -1 says nothing but errors, 0 warnings and, on a terminal, bars; 1 and above also the log.
+    """
+
+    def __init__(self, verbosity: int) -> None:
+        self._verbosity = verbosity
+        self._bars = verbosity >= 0 and sys.stderr.isatty()
+        self._bar: tqdm[Never] | None = None
+        self._stage = ""
+        self._began = time.perf_counter()
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Show that ``done`` of ``total`` steps of a stage are done."""
+        if stage != self._stage:
+            self._close()
+            self._stage = stage
+            self.log(f"{stage} ({total})")
+            if self._bars:
+                self._bar = tqdm(total=total, desc=stage, leave=False, file=sys.stderr, dynamic_ncols=True)
+        if self._bar is not None:
+            self._bar.update(done - self._bar.n)
+
+    def warn(self, text: str) -> None:
+        """Say what the user should know even though the command succeeds."""
+        if self._verbosity >= 0:
+            self._line(f"rdstitch: warning: {text}")
+
+    def note(self, text: str) -> None:
+        """Say what belongs to the result but not to standard output."""
+        if self._verbosity >= 0:
+            self._line(f"rdstitch: {text}")
+
+    def log(self, text: str) -> None:
+        """Log what is going on, under ``-v``."""
+        if self._verbosity >= 1:
+            self._line(f"rdstitch: {text}")
+
+    def finish(self) -> None:
+        """Take the bar away before anything goes to standard output."""
+        self._close()
+
+    def made(self, text: str) -> None:
+        """End by saying what was made, and how long it took."""
+        if self._verbosity >= 0:
+            self._line(f"{text}, {time.perf_counter() - self._began:.1f} s")
+
+    def __enter__(self) -> Self:
+        """Begin reporting."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Take the bar away, whatever happened."""
+        self._close()
+
+    def _line(self, text: str) -> None:
+        with self._paused():
+            print(one_line(text), file=sys.stderr)
+
+    @contextmanager
+    def _paused(self) -> Iterator[None]:
+        if self._bar is not None:
+            self._bar.clear()
+        yield
+        if self._bar is not None:
+            self._bar.refresh()
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None

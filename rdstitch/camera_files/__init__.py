@@ -21,16 +21,19 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rdstitch.camera import Camera
-from rdstitch.camera_files.colmap import colmap_text
-from rdstitch.camera_files.comments import read_comments
-from rdstitch.camera_files.division import CameraFile
 from rdstitch.camera_files.hugin import hugin_project, is_hugin, read_hugin
-from rdstitch.camera_files.kalibr import camera_chain_yaml
 from rdstitch.camera_files.lens_fit import LensFit
-from rdstitch.camera_files.opencv import is_opencv, opencv_fisheye_yaml, opencv_json, opencv_yaml, read_opencv
-from rdstitch.camera_files.opencv_yaml import parse_yaml
+from rdstitch.camera_files.opencv import (
+    is_opencv,
+    opencv_fisheye_yaml,
+    opencv_json,
+    opencv_yaml,
+    parse_yaml,
+    read_opencv,
+)
 from rdstitch.camera_files.opendronemap import is_opendronemap, opendronemap_json, read_opendronemap
-from rdstitch.camera_files.ros import camera_info_yaml
+from rdstitch.camera_files.own_camera import CameraFile, read_comments
+from rdstitch.camera_files.text_formats import camera_chain_yaml, camera_info_yaml, colmap_text
 from rdstitch.camera_record import camera_from_record
 from rdstitch.errors import OutputError
 from rdstitch.io.atomic import write_text_atomic

@@ -12,11 +12,10 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.camera_files.brown import CLOSE
-from rdstitch.camera_files.comments import comments, read_comments
-from rdstitch.camera_files.division import CameraFile, fitted_camera
 from rdstitch.camera_files.lens_fit import LensFit, LensSamples
-from rdstitch.errors import ArgumentError, InputError
+from rdstitch.camera_files.lens_models import CLOSE
+from rdstitch.camera_files.own_camera import CameraFile, comments, fitted_camera, read_comments
+from rdstitch.errors import InputError
 from rdstitch.records import Record
 
 _KIND = "Hugin"
@@ -74,11 +73,7 @@ def read_hugin(text: str, file: str) -> CameraFile:
         result: FloatArray = np.where(radius > 0.0, bent / np.maximum(radius, 1e-300), focal) * rays + center
         return result
 
-    try:
-        camera = Camera(size, center=center, focal=focal, focal_source="file")
-    except ArgumentError as error:
-        lens.fail(str(error))
-    return fitted_camera(lens, _KIND, forward, camera)
+    return fitted_camera(lens, _KIND, forward, size, center, focal)
 
 
 def hugin_project(camera: Camera) -> str:
@@ -87,9 +82,7 @@ def hugin_project(camera: Camera) -> str:
     from scipy.optimize import brentq
 
     (width, height), unit = camera.image_size, min(camera.image_size) / 2
-    focal = camera.with_focal().focal
-    assert focal is not None
-    samples = LensSamples.of(camera, focal)
+    samples = LensSamples.of(camera)
     projection, found, fit = _RECTILINEAR, *_fit(samples, samples.straight, unit)
     fisheye, fisheye_fit = _fit(samples, np.arctan(samples.straight), unit)
     if fit.largest > CLOSE and fisheye_fit.largest < fit.largest:
@@ -99,7 +92,7 @@ def hugin_project(camera: Camera) -> str:
         lambda s: s - 1.0 - sum(k / s ** (p - 1) for k, p in zip(found, _POWERS, strict=True)), 0.2, 5.0
     )
     a, b, c = (float(k / scale**p) for k, p in zip(found, _POWERS, strict=True))
-    half_width = width / 2 / (focal * scale)
+    half_width = width / 2 / (samples.focal * scale)
     view = 2.0 * math.degrees(math.atan(half_width) if projection == _RECTILINEAR else half_width)
     d, e = camera.center[0] - (width - 1) / 2, camera.center[1] - (height - 1) / 2
     lens = f"v{view!r} a{a!r} b{b!r} c{c!r} d{d!r} e{e!r} g0 t0"
@@ -111,7 +104,7 @@ def hugin_project(camera: Camera) -> str:
 
 def _fit(samples: LensSamples, straight: FloatArray, unit: float) -> tuple[FloatArray, LensFit]:
     """Coefficients of :data:`_POWERS`, in ``unit``, that turn ideal radii (N,), focal lengths, into measured ones."""
-    size = samples.unit / unit
+    size = samples.focal / unit
     return samples.fit(straight, (straight[:, None] * size) ** np.array(_POWERS) / size)
 
 

@@ -4,7 +4,7 @@ Every model is a *forward* map: pixels of a lens without distortion to measured 
 others so that the measured pixels agree; others are fitted to the division model in the same way.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
@@ -44,24 +44,26 @@ class LensSamples:
     Attributes
     ----------
     straight, bent : ndarray of shape (N,)
-        From the distortion centre, undistorted and measured, in ``unit``.
-    unit : float
-        Pixels.
+        From the distortion centre, undistorted and measured, focal lengths.
+    focal : float
+        Pixels; guessed where the camera has none.
     """
 
     straight: FloatArray
     bent: FloatArray
-    unit: float
+    focal: float
 
     @classmethod
-    def of(cls, camera: Camera, unit: float) -> Self:
+    def of(cls, camera: Camera) -> Self:
         """Of a camera."""
+        focal = camera.with_focal().focal
+        assert focal is not None
         width, height = camera.image_size
         u, v = np.meshgrid(np.linspace(-0.5, width - 0.5, _GRID), np.linspace(-0.5, height - 0.5, _GRID))
         measured = np.column_stack([u.ravel(), v.ravel()])
         measured = measured[np.linalg.norm(measured - camera.center, axis=1) <= camera.drawn_radius]
-        straight = np.linalg.norm(camera.undistort(measured) - camera.center, axis=1) / unit
-        return cls(straight, np.linalg.norm(measured - camera.center, axis=1) / unit, unit)
+        straight = np.linalg.norm(camera.undistort(measured) - camera.center, axis=1) / focal
+        return cls(straight, np.linalg.norm(measured - camera.center, axis=1) / focal, focal)
 
     def fit(self, start: FloatArray, terms: FloatArray) -> tuple[FloatArray, LensFit]:
         """Coefficients (K,) for which ``start + terms k`` are the measured radii; ``terms`` of shape (N, K)."""
@@ -92,28 +94,8 @@ class LensSamples:
 
     def compare(self, bent: FloatArray) -> LensFit:
         """How far a model's measured radii (N,) are from these."""
-        error = np.abs(bent - self.bent) * self.unit
+        error = np.abs(bent - self.bent) * self.focal
         return LensFit(float(np.sqrt(np.mean(error**2))), float(error.max()))
-
-
-def fit_polynomial(camera: Camera, unit: float, powers: Sequence[int]) -> tuple[FloatArray, LensFit]:
-    """Fit ``r_d = r_u + Σ k_j r_u^p_j`` to the division model of a camera.
-
-    Parameters
-    ----------
-    camera : Camera
-    unit : float
-        What radii are measured in, pixels.
-    powers : sequence of int
-        Exponents, each above 1, so that the scale at the centre stays.
-
-    Returns
-    -------
-    ndarray of shape (len(powers),), LensFit
-        The coefficients.
-    """
-    samples = LensSamples.of(camera, unit)
-    return samples.fit(samples.straight, samples.straight[:, None] ** np.asarray(powers))
 
 
 def _least_squares(terms: FloatArray, values: FloatArray) -> FloatArray:

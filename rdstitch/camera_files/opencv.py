@@ -2,21 +2,98 @@
 
 The model is Brown's with 5 coefficients, the rational one with 8 where 5 are not close to the lens, or that of
 ``cv2.fisheye`` with 4, marked by ``fisheye_model`` as OpenCV's samples do and by ``distortion_model`` as ROS does.
+
+OpenCV's own reader is not used: it says on standard error what it does not like, and crashes on some of it.
 """
 
 import json
+import re
 from collections.abc import Sequence
 from typing import Any
 
 from rdstitch.camera import Camera
-from rdstitch.camera_files.brown import Brown, least_brown_of
-from rdstitch.camera_files.division import CameraFile, fitted_camera, own_node
-from rdstitch.camera_files.fisheye import Fisheye, fisheye_of
 from rdstitch.camera_files.lens_fit import LensFit
-from rdstitch.camera_files.opencv_yaml import to_yaml
+from rdstitch.camera_files.lens_models import Brown, Fisheye, fisheye_of, least_brown_of
+from rdstitch.camera_files.own_camera import CameraFile, fitted_camera, own_node
 from rdstitch.camera_record import camera_from_record
-from rdstitch.errors import ArgumentError
-from rdstitch.records import Record
+from rdstitch.errors import InputError
+from rdstitch.records import Record, parse_json
+
+_FIELD = re.compile(r"(?P<indent> *)(?P<key>[^\s:#\[\]{}\"']+) *:(?: +(?P<value>.*))?")
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+
+
+def to_yaml(content: dict[str, Any]) -> str:
+    """Numbers, texts, lists and one level of objects as FileStorage writes them."""
+    lines = ["%YAML:1.0", "---"]
+    for key, value in content.items():
+        if not isinstance(value, dict):
+            lines.append(f"{key}: {_plain(value)}")
+            continue
+        matrix = value.get("type_id") == "opencv-matrix"
+        lines.append(f"{key}: !!opencv-matrix" if matrix else f"{key}:")
+        lines.extend(f"   {name}: {_plain(item)}" for name, item in value.items() if name != "type_id")
+    return "\n".join(lines) + "\n"
+
+
+def parse_yaml(text: str, file: str) -> Record:
+    """What FileStorage wrote, as a record.
+
+    Raises
+    ------
+    InputError
+        When there is anything else in the text; the line is named.
+    """
+    content: dict[str, Any] = {}
+    nested: dict[str, Any] | None = None
+    for number, line in _logical_lines(text):
+        match = _FIELD.fullmatch(line)
+        if match is None:
+            raise InputError(f"{file}: line {number}: is not what OpenCV writes as YAML; no camera file?")
+        value = (match["value"] or "").strip()
+        if match["indent"]:
+            if nested is None:
+                raise InputError(f"{file}: line {number}: belongs to no field")
+            nested[match["key"]] = _value(value, file, number)
+        elif value in ("", "!!opencv-matrix"):
+            nested = content[match["key"]] = {}
+        else:
+            nested = None
+            content[match["key"]] = _value(value, file, number)
+    return Record(file, "", content)
+
+
+def _logical_lines(text: str) -> list[tuple[int, str]]:
+    """Lines with their numbers; lists that go on are one line, comments and document marks none."""
+    lines: list[tuple[int, str]] = []
+    opened = False
+    for number, raw in enumerate(text.splitlines(), start=1):
+        line = raw.rstrip()
+        if opened:
+            lines[-1] = (lines[-1][0], f"{lines[-1][1]} {line.strip()}")
+        elif line.strip() and not line.lstrip().startswith(("#", "%", "---", "...")):
+            lines.append((number, line))
+        else:
+            continue
+        opened = lines[-1][1].count("[") > lines[-1][1].count("]")
+    return lines
+
+
+def _value(text: str, file: str, number: int) -> Any:
+    """A number, a list or a text; JSON's, and numbers like ``1.`` that OpenCV writes."""
+    if text.startswith(("[", '"')):
+        whole = _NUMBER.sub(lambda found: str(float(found[0])), text) if text.startswith("[") else text
+        return parse_json(whole, f"{file}: line {number}").value
+    return _number(text) if _NUMBER.fullmatch(text) else text
+
+
+def _number(text: str) -> float | int:
+    return int(text) if re.fullmatch(r"[-+]?\d{1,15}", text) else float(text)
+
+
+def _plain(value: Any) -> str:
+    return json.dumps(value)
+
 
 _KIND = "OpenCV"
 _OWN = "rdstitch"
@@ -55,11 +132,7 @@ def read_opencv(record: Record) -> CameraFile:
         lens = Fisheye((fx, fy), (cx, cy), tuple(k))
     else:
         lens = _brown(given, k, (fx, fy), (cx, cy))
-    try:
-        camera = Camera(size, center=lens.center, focal=lens.mean_focal, focal_source="file")
-    except ArgumentError as error:
-        record.fail(str(error))
-    return fitted_camera(given, _KIND, lens.distort, camera)
+    return fitted_camera(record, _KIND, lens.distort, size, lens.center, lens.mean_focal, given)
 
 
 def _is_fisheye(record: Record) -> bool:

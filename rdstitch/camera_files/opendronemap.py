@@ -3,11 +3,9 @@
 import json
 
 from rdstitch.camera import Camera
-from rdstitch.camera_files.brown import CLOSE, Brown, brown_of
-from rdstitch.camera_files.division import CameraFile, fitted_camera, own_node
-from rdstitch.camera_files.fisheye import Fisheye, fisheye_of
+from rdstitch.camera_files.lens_models import Brown, Fisheye, brown_of, closer_fisheye
+from rdstitch.camera_files.own_camera import CameraFile, fitted_camera, own_node
 from rdstitch.camera_record import camera_from_record
-from rdstitch.errors import ArgumentError
 from rdstitch.records import Record
 
 _KIND = "OpenDroneMap"
@@ -50,22 +48,17 @@ def read_opendronemap(record: Record) -> CameraFile:
     lens: Brown | Fisheye = Brown(focal, center, (k1, k2, k3), (p1, p2))
     if kind == _FISHEYE:
         lens = Fisheye(focal, center, (k1, k2, k3, k4))
-    try:
-        camera = Camera(size, center=lens.center, focal=lens.mean_focal, focal_source="file")
-    except ArgumentError as error:
-        entry.fail(str(error))
-    return fitted_camera(entry, _KIND, lens.distort, camera)
+    return fitted_camera(entry, _KIND, lens.distort, size, lens.center, lens.mean_focal)
 
 
 def opendronemap_json(camera: Camera) -> str:
     """The camera as OpenDroneMap takes it with ``--cameras``: Brown's model, or a fisheye's where that is closer."""
     lens, fit = brown_of(camera)
-    fisheye, fisheye_fit = fisheye_of(camera)
     kind, (k1, k2, k3) = "brown", lens.radial
     coefficients = {"k1": k1, "k2": k2, "p1": 0.0, "p2": 0.0, "k3": k3}
-    if fit.largest > CLOSE and fisheye_fit.largest < fit.largest:
-        kind, fit = _FISHEYE, fisheye_fit
-        coefficients = {f"k{i}": k for i, k in enumerate(fisheye.coefficients, start=1)}
+    if (fisheye := closer_fisheye(camera, fit)) is not None:
+        kind, fit = _FISHEYE, fisheye[1]
+        coefficients = {f"k{i}": k for i, k in enumerate(fisheye[0].coefficients, start=1)}
     (width, height), longer = camera.image_size, max(camera.image_size)
     focal = lens.mean_focal / longer
     entry = {

@@ -17,11 +17,10 @@ from scipy import sparse
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.compositing.boxes import Box, cut, intersection
+from rdstitch.compositing.boxes import Box, cut, intersection, overlapping_pairs
 from rdstitch.compositing.field_solver import solve_fields
 from rdstitch.compositing.gain_compensation import estimate_gains
 from rdstitch.compositing.options import ExposureMethod
-from rdstitch.compositing.overlaps import overlapping_pairs
 from rdstitch.compositing.photometric import Exposure, bilinear_weights, full_scale
 from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.survey import Survey, SurveyTile

@@ -16,8 +16,7 @@ from scipy.sparse.linalg import spsolve
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.compositing.boxes import Box, cut, intersection
-from rdstitch.compositing.overlaps import overlapping_pairs
+from rdstitch.compositing.boxes import Box, cut, intersection, overlapping_pairs
 from rdstitch.compositing.photometric import Exposure, full_scale, no_exposure, squared_radius
 from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.survey import Survey, SurveyTile

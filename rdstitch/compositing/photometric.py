@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Float32Array
-from rdstitch.compositing.lattice import LATTICE_STEPS, interpolated
-from rdstitch.compositing.warp import Geometry
+from rdstitch.compositing.warp import LATTICE_STEPS, Geometry, interpolated
 
 # The correction is smooth: it is computed at this spacing, canvas pixels, and interpolated.
 _LATTICE = LATTICE_STEPS[0]

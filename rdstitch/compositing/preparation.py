@@ -6,13 +6,11 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from rdstitch.compositing.blender import margin
-from rdstitch.compositing.blocks import BlockRunner, strips_of_blocks
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.brightness import estimate_exposure
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.crop import coverage_map, crop_box, crop_rows
 from rdstitch.compositing.image_cache import PictureCache
-from rdstitch.compositing.lattice import LATTICE_STEPS
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photometric import no_exposure
 from rdstitch.compositing.placed_picture import PlacedPicture
@@ -21,8 +19,8 @@ from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seam_finder import find_seams
 from rdstitch.compositing.source_images import PictureReader
 from rdstitch.compositing.survey import survey_factor, survey_pictures
-from rdstitch.compositing.tiles import OutputStrip, ShareProgress, TiledOutput
-from rdstitch.compositing.warp import plan_warps
+from rdstitch.compositing.tiles import BlockRunner, OutputStrip, ShareProgress, TiledOutput, strips_of_blocks
+from rdstitch.compositing.warp import LATTICE_STEPS, plan_warps
 from rdstitch.errors import ArgumentError
 from rdstitch.messages import Message
 from rdstitch.process_memory import release_free_heap
@@ -56,7 +54,7 @@ class Prepared:
     ) -> Generator[OutputStrip]:
         """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time.
 
-        ``elsewhere`` computes it in blocks, see :mod:`rdstitch.compositing.blocks`.
+        ``elsewhere`` computes it in blocks, see :mod:`rdstitch.compositing.tiles`.
         """
         progress = _part_of(progress, _PREPARATION, 1.0)
         if elsewhere is None:

@@ -1,6 +1,5 @@
 """What a run will meet, found out at a glance: pictures, lenses, sharpness, exposure, overlap, effort."""
 
-from rdstitch.doctor.examination import Examination
-from rdstitch.doctor.examine import examine
+from rdstitch.doctor.examine import Examination, examine
 
 __all__ = ["Examination", "examine"]

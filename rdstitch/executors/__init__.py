@@ -4,9 +4,73 @@ Stages take a :class:`concurrent.futures.Executor` and use nothing but its ``sub
 package with small arguments and results; what is large lies in the cache of the run.
 """
 
-from rdstitch.executors.choice import open_executor
+import sys
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import TypeVar
+
 from rdstitch.executors.dask_cluster import LOCAL, DaskExecutor
-from rdstitch.executors.in_order import in_order
 from rdstitch.executors.processes import ProcessExecutor
 
 __all__ = ["LOCAL", "DaskExecutor", "ProcessExecutor", "in_order", "open_executor"]
+
+_PROCESSES_FROM = 60
+"""Pictures from which on it pays to start worker processes: each takes a second to begin with, and a picture a third of
+one, so that the start is at most a twentieth of the work. Threads share the interpreter, which matching and estimation
+keep busy."""
+
+
+def open_executor(workers: int, pictures: int, *, scheduler: str | None = None, store: Path | None = None) -> Executor:
+    """The executor for a set of so many pictures, to be used in a ``with`` block.
+
+    Parameters
+    ----------
+    workers : int
+        Tasks at the same time on this machine.
+    pictures : int
+    scheduler : str, optional
+        Address of a Dask scheduler, or "local"; see :class:`rdstitch.executors.dask_cluster.DaskExecutor`.
+    store : Path, optional
+        Folder of features and matches that the workers of that scheduler must see.
+    """
+    if scheduler is not None:
+        return DaskExecutor(scheduler, workers, store)
+    if workers > 1 and pictures >= _PROCESSES_FROM and sys.executable:
+        return ProcessExecutor(workers)
+    return ThreadPoolExecutor(workers)
+
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+_MAX_PENDING = 256  # tasks that have been submitted and whose results were not taken: enough for that many workers
+
+
+def in_order(executor: Executor, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Generator[Result]:
+    """The result of each task, in their order; tasks are taken as they are needed.
+
+    Parameters
+    ----------
+    executor : concurrent.futures.Executor
+    function : callable
+        Of one task.
+    tasks : iterable
+
+    Raises
+    ------
+    Exception
+        What the first task that fails raises; those not yet begun are then cancelled.
+    """
+    under_way: deque[Future[Result]] = deque()
+    try:
+        for task in tasks:
+            under_way.append(executor.submit(function, task))
+            if len(under_way) >= _MAX_PENDING:
+                yield under_way.popleft().result()
+        while under_way:
+            yield under_way.popleft().result()
+    finally:
+        for future in under_way:
+            future.cancel()

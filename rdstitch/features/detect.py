@@ -1,19 +1,89 @@
-"""Feature detection: pictures in, keypoints with descriptors out."""
+"""Feature detection, alike for all detectors: they find keypoints, some are chosen, and those are described."""
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.features.detection import Detection, find
+from rdstitch.arrays import FloatArray
 from rdstitch.features.keypoints import Features
-from rdstitch.features.options import CLOSER, KINDS, FeatureOptions
+from rdstitch.features.learned import AlikedDetection
+from rdstitch.features.opencv import LARGE, OpenCVDetection, StripsDetection
+from rdstitch.features.options import CLOSER, FeatureOptions
 from rdstitch.features.picture import Mask, PixelArray, PreparedPicture, View, prepare
-from rdstitch.features.spread import spread, strongest
+from rdstitch.features.surf.descriptor import SurfDetection
 from rdstitch.opencv_state import one_opencv_thread
 
-__all__ = ["KINDS", "FeatureOptions", "Features", "View", "ViewLoader", "detect", "detect_view"]
+
+class Detection(Protocol):
+    """Keypoints of one picture, not yet described; always in the same order for the same picture."""
+
+    @property
+    def points(self) -> FloatArray:
+        """Places, pixels of the picture, (N, 2)."""
+        ...
+
+    @property
+    def scale(self) -> FloatArray:
+        """Diameters, pixels, (N,)."""
+        ...
+
+    @property
+    def response(self) -> FloatArray:
+        """Strengths, (N,)."""
+        ...
+
+    def describe(self, chosen: NDArray[np.intp]) -> Features:
+        """Features of the chosen keypoints, in their order; some may have no descriptor and drop out."""
+        ...
+
+
+def find(grey: NDArray[np.uint8], options: FeatureOptions) -> Detection:
+    """Find the keypoints of a picture by the detector that the options name."""
+    if options.kind == "surf":
+        return SurfDetection.find(grey, options)
+    if options.kind == "aliked":
+        return AlikedDetection.find(grey, options)
+    if options.kind in ("sift", "rootsift") and grey.size > LARGE:
+        return StripsDetection.find(grey, options)
+    return OpenCVDetection.find(grey, options)
+
+
+def strongest(response: FloatArray, count: int) -> NDArray[np.intp]:
+    """Indices of the ``count`` strongest keypoints, strongest first, ties in input order."""
+    return np.argsort(-response, kind="stable")[:count]
+
+
+def spread(points: FloatArray, response: FloatArray, count: int, cell: float) -> NDArray[np.intp]:
+    """Indices of ``count`` keypoints that are spread over the picture, strongest first.
+
+    The cells of a grid take turns, each giving its strongest keypoint that is left, until ``count`` are
+    taken: no cell gets more than another that still has some. The corners, where the distortion is seen, thus
+    keep what they have however strong the middle of the picture is.
+
+    Parameters
+    ----------
+    points : ndarray of shape (N, 2)
+        pixels.
+    response : ndarray of shape (N,)
+    count : int
+        Keypoints to keep at most.
+    cell : float
+        Side of a cell, pixels.
+    """
+    if len(points) <= count:
+        return strongest(response, count)
+    column, row = np.floor(points / cell).astype(np.int64).T
+    by_cell = np.lexsort((-response, column, row))
+    is_first = np.ones(len(points), dtype=bool)
+    is_first[1:] = (np.diff(column[by_cell]) != 0) | (np.diff(row[by_cell]) != 0)
+    starts = np.flatnonzero(is_first)
+    turn = np.arange(len(points)) - np.repeat(starts, np.diff(np.append(starts, len(points))))
+    kept = by_cell[np.lexsort((by_cell, -response[by_cell], turn))[:count]]
+    return kept[strongest(response[kept], count)]
+
 
 ViewLoader = Callable[[float | None], View]
 """Loads one picture when it is called with the 10⁶ pixels that are needed of it; None: all. More pixels may come."""

@@ -5,10 +5,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rdstitch.arrays import FloatArray
-from rdstitch.features.correspondences import Correspondences
-from rdstitch.features.keypoints import Features
+from rdstitch.features.keypoints import Correspondences, Features
 from rdstitch.features.match import check_ratio
-from rdstitch.features.similarity import compare
+from rdstitch.features.nearest import compare
 
 _USUAL = 0.95
 """Share of the known matches' distances that a new match may not exceed."""

@@ -1,4 +1,4 @@
-"""What feature detection hands on: keypoints and descriptors of one picture."""
+"""What detection and matching hand on: keypoints and descriptors of a picture, and points of two that show the same."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -104,3 +104,97 @@ class Features:
     def binary(self) -> bool:
         """Whether descriptors are bits, compared by the Hamming distance."""
         return self.descriptors.dtype == np.uint8
+
+
+_MAX_HALF = 60000.0  # half precision ends a little above
+
+
+@dataclass(frozen=True, eq=False)
+class PackedFeatures:
+    """Features of one picture.
+
+    Attributes
+    ----------
+    features : Features
+        Their descriptors are replaced by none.
+    descriptors : ndarray of shape (N, D), uint8, float16 or float32
+        Bits; integers up to 255 such as SIFT's and, but for rare ones, RootSIFT's, which lose nothing; else half
+        precision, which is finer than the grid of 1/512 of the largest norm on which descriptors are compared.
+    bits : bool
+        Whether descriptors are bits.
+    """
+
+    features: Features
+    descriptors: NDArray[Any]
+    bits: bool
+
+    @classmethod
+    def pack(cls, features: Features) -> Self:
+        """Pack the features of a picture."""
+        bare = replace(features, descriptors=np.zeros((len(features), 0), dtype=features.descriptors.dtype))
+        return cls(bare, _smallest(features.descriptors), features.binary)
+
+    def unpack(self) -> Features:
+        """The features, with descriptors that can be compared."""
+        descriptors: Descriptors = self.descriptors if self.bits else self.descriptors.astype(np.float32)
+        return replace(self.features, descriptors=descriptors)
+
+
+def _smallest(descriptors: Descriptors) -> NDArray[Any]:
+    """Descriptors in the smallest type that holds them."""
+    if descriptors.dtype == np.uint8:
+        return descriptors
+    if not len(descriptors):
+        return descriptors.astype(np.float16)
+    if descriptors.min() >= 0.0 and descriptors.max() <= 255.0:
+        integers = descriptors.astype(np.uint8)
+        if np.array_equal(integers, descriptors):
+            return integers
+    half = np.abs(descriptors).max() <= _MAX_HALF
+    return descriptors.astype(np.float16 if half else np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """Points of two pictures that show the same, the most distinctive match first (PROSAC's order).
+
+    Attributes
+    ----------
+    indices : ndarray of shape (M, 2), intp
+        Indices into the features of picture 1 and picture 2.
+    points1, points2 : ndarray of shape (M, 2), float64
+        pixels of the full-size pictures.
+    ratio : ndarray of shape (M,), float64
+        Distance to the match over distance to the second-best, the worse of both directions; in [0, 1],
+        ascending.
+
+    Raises
+    ------
+    ArgumentError
+        When the shapes do not fit together.
+    """
+
+    indices: NDArray[np.intp]
+    points1: FloatArray
+    points2: FloatArray
+    ratio: FloatArray
+
+    def __post_init__(self) -> None:
+        """Check shapes."""
+        count = len(self.ratio)
+        shapes = (self.indices.shape, self.points1.shape, self.points2.shape, self.ratio.shape)
+        if shapes != ((count, 2), (count, 2), (count, 2), (count,)):
+            raise ArgumentError(f"correspondences of different lengths: {shapes}")
+
+    @classmethod
+    def of(cls, features1: Features, features2: Features, indices: NDArray[np.intp], ratio: FloatArray) -> Self:
+        """Correspondences between the features of two pictures."""
+        return cls(indices, features1.points[indices[:, 0]], features2.points[indices[:, 1]], ratio)
+
+    def take(self, index: NDArray[np.intp]) -> Self:
+        """The correspondences at the given positions."""
+        return type(self)(self.indices[index], self.points1[index], self.points2[index], self.ratio[index])
+
+    def __len__(self) -> int:
+        """Number of correspondences."""
+        return len(self.ratio)

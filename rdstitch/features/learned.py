@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.features.correspondences import Correspondences
-from rdstitch.features.keypoints import Features
+from rdstitch.features.keypoints import Correspondences, Features
 from rdstitch.features.options import FeatureOptions
 from rdstitch.opencv_state import silent_opencv
 

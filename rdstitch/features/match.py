@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.features.correspondences import Correspondences
-from rdstitch.features.keypoints import Features
+from rdstitch.features.keypoints import Correspondences, Features
 from rdstitch.features.nearest import mutual_nearest
 
 __all__ = ["Correspondences", "Matcher", "match"]

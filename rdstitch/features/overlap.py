@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.features.correspondences import Correspondences
-from rdstitch.features.keypoints import Features
+from rdstitch.features.keypoints import Correspondences, Features
 from rdstitch.features.match import Matcher
 
 _MIN_MATCHES, _MAX_MATCHES = 50, 300  # matches that an overlap takes at least, and that are used at most

@@ -11,17 +11,16 @@ from functools import cache, partial
 from pathlib import Path
 
 from rdstitch.errors import InputError
+from rdstitch.file_access import is_url, read_limited, remote_names
 from rdstitch.inputs.frame import Frame, Named, files_of
 from rdstitch.inputs.keyframes import wanted_frames
 from rdstitch.inputs.rosbag import extract_images, is_bag
-from rdstitch.io.interrupted import interrupted_outputs
+from rdstitch.io.fingerprint import interrupted_outputs
 from rdstitch.io.optional_readers import HEIF_SUFFIXES, RAW_SUFFIXES
 from rdstitch.io.staging import temporary_folder
 from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames, grey_frames
 from rdstitch.messages import Message, names_of, shortened
 from rdstitch.records import MAX_FILE, read_text
-from rdstitch.regular_files import read_limited
-from rdstitch.remote_files import is_url, remote_names
 
 PICTURE_SUFFIXES = frozenset(
     [".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".bmp", ".tga", ".jp2", ".ppm", ".pgm", ".pnm", ".gif"]

@@ -6,10 +6,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from rdstitch.errors import InputError
+from rdstitch.file_access import is_url, open_regular, remote_status
 from rdstitch.io.read import Picture
 from rdstitch.messages import Message
-from rdstitch.regular_files import open_regular
-from rdstitch.remote_files import is_url, remote_status
 
 _BLOCK_BYTES = 2**20
 _DIGITS = 16

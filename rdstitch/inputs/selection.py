@@ -1,10 +1,15 @@
-"""Which of the pictures that were named are used: the user's --exclude and --include-only."""
+"""Which of the pictures that were named are used (the user's --exclude and --include-only), and which part of each."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from fnmatch import fnmatchcase
+from pathlib import Path
 
-from rdstitch.errors import ArgumentError
+from rdstitch.errors import ArgumentError, InputError
+from rdstitch.inputs.find import PICTURE_SUFFIXES
 from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.source import Source
+from rdstitch.io.mask import check_mask
 
 
 def selected(frames: Sequence[Frame], exclude: Sequence[str], include_only: Sequence[str]) -> list[Frame]:
@@ -37,3 +42,48 @@ def is_selected(frame: Frame, exclude: Sequence[str], include_only: Sequence[str
 def _fits(frame: Frame, pattern: str) -> bool:
     names = frame.path.name, str(frame.path)
     return pattern in names or any(fnmatchcase(name, pattern) for name in names)
+
+
+def with_masks(sources: Sequence[Source], mask: str | Path | None) -> list[Source]:
+    """The sources, each with its mask, if it has one.
+
+    Parameters
+    ----------
+    sources : sequence of Source
+    mask : path or None
+        A picture: the mask of all pictures, such as of a camera that sees its own vehicle. Or a folder with a mask for
+        each picture, or for some, of the picture's name; the suffix may differ.
+
+    Raises
+    ------
+    InputError
+        When there is no such file or folder, nothing in the folder is the mask of a picture, or a mask has another
+        shape than its picture.
+    """
+    if mask is None:
+        return list(sources)
+    path = Path(mask)
+    masks = _by_stem(path) if path.is_dir() else dict.fromkeys((source.path.stem for source in sources), path)
+    masked = [replace(source, mask=masks.get(source.path.stem)) for source in sources]
+    if sources and all(source.mask is None for source in masked):
+        raise InputError(f"{path}: none of the masks has the name of a picture, such as {sources[0].path.stem}.png")
+    for source in masked:
+        if source.mask is not None:
+            if source.mask.resolve() == source.path.resolve():
+                raise InputError(f"{source.mask}: is the picture itself, not its mask; masks lie in another folder")
+            check_mask(source.mask, source.path, source.metadata.size)
+    return masked
+
+
+def _by_stem(folder: Path) -> Mapping[str, Path]:
+    """The masks in a folder, by their names before the suffix."""
+    try:
+        files = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot read the folder: {error.strerror}") from error
+    masks: dict[str, Path] = {}
+    for path in files:
+        other = masks.setdefault(path.stem, path)
+        if other != path:
+            raise InputError(f"{path}: {other.name} is a mask for the same picture; remove one of them")
+    return masks

@@ -13,6 +13,7 @@ from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError, LimitError, RdstitchError
 from rdstitch.features.options import WORK_MEGAPIXELS
 from rdstitch.features.picture import halving
+from rdstitch.file_access import held_in_memory, is_url
 from rdstitch.inputs.decoded_image_cache import DecodedImageCache
 from rdstitch.inputs.frame import Frame, Named
 from rdstitch.inputs.input_guard import InputGuard
@@ -22,7 +23,6 @@ from rdstitch.io.read import Picture, read_image, reduced
 from rdstitch.io.reduction import block_minimum, fitting_reduction, reduced_size
 from rdstitch.messages import Message, left_out
 from rdstitch.planar_motion import rotation_from_tilt
-from rdstitch.remote_files import held_in_memory, is_url
 
 
 @dataclass(frozen=True)

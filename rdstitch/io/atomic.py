@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from rdstitch.errors import OutputError
+from rdstitch.file_access import local_file
 from rdstitch.io.deepzoom import check_tiles_folder, tiles_folder
 from rdstitch.io.outputs import Outputs, naming
-from rdstitch.remote_files import local_file
 
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".dzi")
 

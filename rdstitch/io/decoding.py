@@ -17,8 +17,8 @@ import tifffile
 from PIL import Image
 
 from rdstitch.errors import InputError
+from rdstitch.file_access import is_url, remote_status
 from rdstitch.io.optional_readers import check_reader, is_raw
-from rdstitch.remote_files import is_url, remote_status
 
 # What Pillow, tifffile and OpenCV have been seen to raise on damaged files; warnings, where filters make them errors.
 _DAMAGE = (

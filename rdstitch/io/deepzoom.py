@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.errors import OutputError
-from rdstitch.io.jpeg import jpeg_pieces
+from rdstitch.io.encoding import jpeg_pieces
 from rdstitch.io.layout import Layout, Strip, as_eight_bit, with_alpha
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import read_image

@@ -9,17 +9,41 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tifffile
+from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 from rdstitch.camera import is_focal_length
-from rdstitch.io.attitude import Attitude, read_attitude
+from rdstitch.file_access import open_regular
+from rdstitch.io.attitude import Attitude, finite, read_attitude, xmp_number, xmp_text
 from rdstitch.io.decoding import check_readable, decoding
 from rdstitch.io.opening import check_megapixels, has_late_metadata, opened_picture
 from rdstitch.io.optional_readers import is_raw, raw_exif, raw_size
-from rdstitch.io.orientation import SIDEWAYS, turned_direction
-from rdstitch.io.xmp import finite, xmp_number, xmp_text
-from rdstitch.regular_files import open_regular
+
+SIDEWAYS = (5, 6, 7, 8)
+"""Orientations that exchange the axes; what runs backwards, runs so after that."""
+
+_X_BACKWARDS, _Y_BACKWARDS = (2, 3, 6, 7), (3, 4, 7, 8)
+
+
+def turned(samples: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """Samples (h, w) or (h, w, C) with an orientation (1 to 8) applied; a view."""
+    if orientation in SIDEWAYS:
+        samples = np.swapaxes(samples, 0, 1)
+    if orientation in _Y_BACKWARDS:
+        samples = samples[::-1]
+    if orientation in _X_BACKWARDS:
+        samples = samples[:, ::-1]
+    return samples
+
+
+def turned_direction(x: float, y: float, orientation: int) -> tuple[float, float]:
+    """A direction in a stored picture, to the right and down, as it is after :func:`turned`."""
+    if orientation in SIDEWAYS:
+        x, y = y, x
+    return (-x if orientation in _X_BACKWARDS else x), (-y if orientation in _Y_BACKWARDS else y)
+
 
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}

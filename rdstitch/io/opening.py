@@ -20,8 +20,8 @@ from PIL import (
 )
 
 from rdstitch.errors import InputError
+from rdstitch.file_access import open_regular
 from rdstitch.io.optional_readers import avif_factory, heif_factory
-from rdstitch.regular_files import open_regular
 
 TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from rdstitch.io.interrupted import publish_sidecars
+from rdstitch.io.fingerprint import publish_sidecars
 
 # On Windows nothing proves a process dead, and its leftovers stay.
 if sys.platform != "win32":

@@ -17,12 +17,11 @@ from PIL import Image
 from rdstitch.errors import ArgumentError, LimitError, OutputError
 from rdstitch.io.atomic import PICTURE_SUFFIXES
 from rdstitch.io.deepzoom import check_tiles_folder, tiles_folder, write_deep_zoom
+from rdstitch.io.encoding import jpeg_pieces, png_pieces
 from rdstitch.io.fingerprint import Fingerprint, fingerprint
-from rdstitch.io.jpeg import jpeg_pieces
 from rdstitch.io.layout import STRIP_ROWS, Layout, Strip, as_eight_bit, check_strips
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.outputs import Outputs, naming
-from rdstitch.io.png import png_pieces
 from rdstitch.io.tiff import ExtraTag, write_tiff
 
 # Width and height that the formats (or their one encoder) can hold.

@@ -13,8 +13,7 @@ from rdstitch.cache import Cache
 from rdstitch.errors import PartialResultError, RegistrationError
 from rdstitch.messages import Message, left_out, names_of
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.aligner import Aligner
-from rdstitch.pipeline.estimates import impossible_estimates_fail
+from rdstitch.pipeline.aligner import Aligner, impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.registration import Registration
 from rdstitch.verification.verdict import RefusedError, judge

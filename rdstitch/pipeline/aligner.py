@@ -1,6 +1,7 @@
 """Stages: registered pairs become one alignment, which finds more pairs, which make a better alignment."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Self
@@ -8,12 +9,13 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
+from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.result import LinkFit, PlanarPoses, ReliefTest, ShapeTest
 from rdstitch.arrays import FloatArray
 from rdstitch.cache import Cache
 from rdstitch.camera import Camera
-from rdstitch.errors import ArgumentError, RegistrationError
-from rdstitch.inputs.positions import positions_of
+from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationError
+from rdstitch.inputs.measurements import positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import neighbours
 from rdstitch.matching.neighbours_around import neighbours_around
@@ -21,8 +23,25 @@ from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.messages import Message, names_of
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.reselect_inliers import reselect_inliers
 from rdstitch.pipeline.working_size import at_working_size
+
+
+@contextmanager
+def impossible_estimates_fail() -> Iterator[None]:
+    """An estimated camera that cannot be is a failed registration; a block, or a decorator of a stage.
+
+    Raises
+    ------
+    RegistrationError
+    """
+    try:
+        yield
+    except ImpossibleCameraError as error:
+        raise RegistrationError(
+            f"no reliable result: the pictures agree best on a lens that cannot be ({error}); "
+            "give the lens with --camera or --lambda, or take pictures that overlap more"
+        ) from error
+
 
 _CLOSURE_ROUNDS = 2
 
@@ -181,3 +200,49 @@ def _no_overlap(paths: Sequence[str], pairs: Sequence[PairRegistration]) -> str:
         f"no two pictures overlap: of the likeliest pair, {first} and {second}, {best.relation.reason}; "
         "take pictures that overlap by a third or more"
     )
+
+
+_WIDTH_PER_SIGMA, _MIN_THRESHOLD = 4.0, 0.5
+"""Up to how many standard deviations a match is an inlier, but at least up to so many pixels."""
+
+_MIN_KEPT = 0.5
+"""Share of its inliers that a pair must keep; otherwise the alignment does not fit it, and it stays as it is."""
+
+
+def reselect_inliers(
+    pairs: Sequence[PairRegistration], alignment: Alignment, threshold: float
+) -> dict[int, PairRegistration]:
+    """Select the inliers of the pairs again, by what an alignment expects of their putative matches.
+
+    Parameters
+    ----------
+    pairs : sequence of PairRegistration
+    alignment : Alignment
+        Of these pairs.
+    threshold : float
+        Distance up to which a match can be an inlier, pixels; it is less where the inliers scatter less.
+
+    Returns
+    -------
+    dict of int to PairRegistration
+        The pairs that the alignment uses with their inliers, by their position in ``pairs``.
+    """
+    used = [k for k, pair in enumerate(pairs) if (pair.image1, pair.image2) in alignment.support]
+    errors = {k: _errors(pairs[k], alignment) for k in used}
+    known = [errors[k][pairs[k].relation.inliers] for k in used]
+    sigma = sigma_of(np.concatenate([np.zeros(0), *known]) ** 2)
+    farthest = min(max(_WIDTH_PER_SIGMA * sigma, _MIN_THRESHOLD), threshold)
+    selected = {k: replace(pairs[k].relation, inliers=errors[k] < farthest) for k in used}
+    return {
+        k: replace(pairs[k], relation=relation)
+        for k, relation in selected.items()
+        if relation.inliers.sum() >= _MIN_KEPT * pairs[k].relation.inliers.sum()
+    }
+
+
+def _errors(pair: PairRegistration, alignment: Alignment) -> FloatArray:
+    """Distances (M,) of the putative matches of a pair from where the alignment expects them, pixels; inf for none."""
+    matches = pair.correspondences
+    expected = alignment.transfer(pair.image1, pair.image2, matches.points1)
+    distance: FloatArray = np.nan_to_num(np.linalg.norm(expected - matches.points2, axis=1), nan=np.inf)
+    return distance

@@ -14,7 +14,7 @@ from rdstitch.errors import ArgumentError, InputError, OutputError, PartialResul
 from rdstitch.inputs.find import found_pictures
 from rdstitch.inputs.frame import ChannelOrder, Frame, Images, as_inputs, files_of
 from rdstitch.inputs.input_guard import InputGuard
-from rdstitch.inputs.masks import with_masks
+from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.atomic import check_output, json_bytes
 from rdstitch.io.decoding import check_readable
@@ -23,8 +23,7 @@ from rdstitch.local_alignment import DisplacementField
 from rdstitch.messages import Message
 from rdstitch.messages import left_out as left_out_message
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.compose import compose_pictures
-from rdstitch.pipeline.page import plainly_viewed, write_page
+from rdstitch.pipeline.compose import compose_pictures, plainly_viewed, write_page
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.recomposition import Recomposition, applied_sidecar
 from rdstitch.progress import Progress, silent

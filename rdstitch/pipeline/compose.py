@@ -1,8 +1,14 @@
-"""The last stage of every picture: from registered pictures to pixels, in memory or in a file."""
+"""The last stage of every picture: from registered pictures to pixels, in memory or in a file with a page beside it."""
 
+from collections.abc import Generator, Iterable, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
+from rdstitch.cache import Cache
 from rdstitch.compositing import (
     Canvas,
     Composite,
@@ -14,8 +20,10 @@ from rdstitch.compositing import (
     compose_to_file,
     plan_composite,
 )
-from rdstitch.compositing.blocks import BlockRunner
+from rdstitch.compositing.tiles import Block, BlockRunner, BlockStrip
+from rdstitch.executors import in_order
 from rdstitch.export.georeference import Georeference, georeference, has_place, world_file_paths
+from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.io.atomic import check_output, text_bytes
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
@@ -27,7 +35,9 @@ from rdstitch.messages import Message
 from rdstitch.pipeline.placed_images import PlacedImages, plan
 from rdstitch.process_memory import release_free_heap
 from rdstitch.progress import Progress
-from rdstitch.viewer import viewer_path
+from rdstitch.stitch_result import StitchResult
+from rdstitch.stored import Stored
+from rdstitch.viewer import ViewedPicture, viewer_page, viewer_path
 
 # Reduction of a picture of which only the kind of its samples is wanted.
 _PROBE_REDUCTION = 8
@@ -166,3 +176,98 @@ def _profile_lost(source: Source, output: Path) -> list[Message]:
     if output.suffix.lower() == ".dzi" and size > MAX_TILE_PROFILE:
         lost = f"its colour profile of {size / 1e3:.0f} kB is too large to be in every tile"
     return [Message(f"{lost}; colours are as if it had none", (str(source.path),))] if lost else []
+
+
+@dataclass(frozen=True, eq=False)
+class BlockTask:
+    """A block, and what its worker must know beside.
+
+    Attributes
+    ----------
+    block : Block
+    sources : tuple of Source
+        Its pictures.
+    store : Cache
+        Where its strips go.
+    """
+
+    block: Block
+    sources: tuple[Source, ...]
+    store: Cache
+
+
+def blocks_on(executor: Executor, sources: Sequence[Source], folder: Path | None) -> BlockRunner | None:
+    """What computes blocks of an output on the workers of an executor; None for threads, which need no blocks.
+
+    Parameters
+    ----------
+    executor : concurrent.futures.Executor
+    sources : sequence of Source
+        The pictures of the composite.
+    folder : Path or None
+        What all machines see by the same name, for the strips; None where there is one machine.
+    """
+    if isinstance(executor, ThreadPoolExecutor):
+        return None
+
+    def run(blocks: Iterable[Block]) -> Generator[list[Stored[BlockStrip]]]:
+        store = Cache.for_this_run(folder)
+        tasks = (BlockTask(block, tuple(sources[k] for k in block.pictures), store) for block in blocks)
+        with closing(in_order(executor, compose_block, tasks)) as done:
+            for strips, notes in done:
+                sources[0].guard.learn(notes)
+                yield strips
+
+    return run
+
+
+def compose_block(task: BlockTask) -> tuple[list[Stored[BlockStrip]], GuardNotes]:
+    """Compute a block; and what was noticed of its files."""
+    strips = task.block.compute(task.store)
+    if not task.sources:
+        return strips, ({}, {}, {})
+    # All have one guard, which travels with them.
+    return strips, task.sources[0].guard.notes_on([source.path for source in task.sources])
+
+
+def write_page(outputs: Outputs, output: str | Path, composed: Composed, pictures: Sequence[ViewedPicture]) -> None:
+    """Write the page of a ``.dzi`` output; others have none."""
+    page, written = viewer_path(output), composed.written
+    if page is not None and written is not None:
+        text = viewer_page(output, composed.canvas.size, pictures, written.seams, written.origin)
+        # Names of files need not be UTF-8.
+        outputs.write(page, text.encode("utf-8", "backslashreplace"))
+
+
+def plainly_viewed(canvas: Canvas, names: Sequence[str]) -> list[ViewedPicture]:
+    """The pictures on a canvas, of which nothing was estimated."""
+    return [ViewedPicture(name, outlines, ()) for name, outlines in zip(names, canvas.outlines, strict=True)]
+
+
+def viewed_pictures(result: StitchResult) -> list[ViewedPicture]:
+    """The pictures of a result with what was found of each."""
+    alignment, registration = result.registration.alignment, result.registration
+    names = [source.name for source in registration.sources]
+    viewed = []
+    for outlines, index in zip(result.canvas.outlines, np.flatnonzero(alignment.used).tolist(), strict=True):
+        source = registration.sources[index]
+        links = [fit for fit in alignment.links if fit.used and index in (fit.image1, fit.image2)]
+        facts = [
+            ("size", "{} x {} pixels".format(*source.camera.image_size)),
+            ("features", str(registration.keypoints[index])),
+            ("matches", str(sum(fit.inliers for fit in links))),
+        ]
+        partners = [f"{names[fit.image1 + fit.image2 - index]} ({fit.inliers}, {fit.rms:.2f} pixels)" for fit in links]
+        facts.append(("pairs", ", ".join(partners)))
+        if alignment.poses is not None:
+            poses = alignment.poses
+            facts += [
+                ("position", "{:.3f}, {:.3f} heights".format(*poses.position[index])),
+                ("height", f"{poses.height[index]:.3f}"),
+                ("yaw", f"{np.degrees(poses.yaw[index]):.2f}°"),
+                ("tilt", "{:.2f}°, {:.2f}°".format(*np.degrees(poses.tilt[index]))),
+            ]
+        if index == alignment.reference:
+            facts.append(("reference", "yes"))
+        viewed.append(ViewedPicture(names[index], outlines, tuple(facts)))
+    return viewed

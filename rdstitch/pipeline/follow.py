@@ -12,10 +12,9 @@ from rdstitch.errors import InputError
 from rdstitch.features import FeatureOptions, View, detect_view, match
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.input_guard import InputGuard
-from rdstitch.inputs.masks import with_masks
-from rdstitch.inputs.selection import is_selected
+from rdstitch.inputs.measurements import timestamps_of
+from rdstitch.inputs.selection import is_selected, with_masks
 from rdstitch.inputs.source import Source, read_sources
-from rdstitch.inputs.timestamps import timestamps_of
 from rdstitch.io.write import write_image
 from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.options import StitchOptions

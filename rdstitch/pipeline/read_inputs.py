@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.inputs.attitudes import with_attitudes
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.input_guard import InputGuard
-from rdstitch.inputs.masks import with_masks
-from rdstitch.inputs.selection import selected
+from rdstitch.inputs.measurements import with_attitudes
+from rdstitch.inputs.selection import selected, with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions

@@ -8,21 +8,17 @@ from typing import Literal
 
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.camera_files import CAMERA_SUFFIXES, camera_file_text
-from rdstitch.export.path_plot import path_as_svg
-from rdstitch.export.trajectory_files import WRITERS, has_times
+from rdstitch.export.trajectory_files import WRITERS, has_times, path_as_svg
 from rdstitch.inputs.find import FoundPictures, found_pictures
 from rdstitch.inputs.frame import Images, as_inputs
-from rdstitch.inputs.timestamps import timestamps_of
+from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.io.atomic import check_distinct, check_output, json_bytes, text_bytes
 from rdstitch.io.outputs import Outputs
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.accept import accept, scale_uncertainty
-from rdstitch.pipeline.align_locally import align_registration_locally
-from rdstitch.pipeline.blocks_elsewhere import blocks_on
-from rdstitch.pipeline.compose import compose_pictures
-from rdstitch.pipeline.page import viewed_pictures, write_page
-from rdstitch.pipeline.placed_images import PlacedImages
+from rdstitch.pipeline.compose import blocks_on, compose_pictures, viewed_pictures, write_page
+from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally
 from rdstitch.pipeline.read_inputs import read_inputs
 from rdstitch.pipeline.register import register, with_frontal_reference
 from rdstitch.progress import Progress, silent
@@ -205,8 +201,8 @@ def trajectory(
     layout : str
         "csv", "tum" or "kitti"; see :mod:`rdstitch.export.trajectory_files`.
     timestamps : path, optional
-        File of the time stamps of the pictures; see :func:`rdstitch.inputs.timestamps.timestamps_of`. Without it, they
-        are those of the video, the bag, or EXIF.
+        File of the time stamps of the pictures; see :func:`rdstitch.inputs.measurements.timestamps_of`. Without it,
+        they are those of the video, the bag, or EXIF.
     plot : path, optional
         SVG file to draw the path to.
     height : float

@@ -12,16 +12,15 @@ from rdstitch.alignment.reference_frame import frontal_reference, in_frame_of
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.cache import Cache
 from rdstitch.features import LightGlue, Matcher, match
-from rdstitch.inputs.positions import positions_of
+from rdstitch.inputs.measurements import positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import first_pairs
 from rdstitch.matching.mixed_lenses import separate_lenses
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.messages import Message, left_out
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.aligner import Aligner, close_loops, rematch_weak_pairs
+from rdstitch.pipeline.aligner import Aligner, close_loops, impossible_estimates_fail, rematch_weak_pairs
 from rdstitch.pipeline.contrast import detect_by_contrast
-from rdstitch.pipeline.estimates import impossible_estimates_fail
 from rdstitch.pipeline.pattern_shifts import settle_repeated_pattern
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.process_memory import release_free_heap

@@ -1,13 +1,23 @@
-"""Where pictures and matches lie: what several sections draw."""
+"""What several sections draw: where pictures and matches lie, and small pictures, as data addresses."""
+
+import base64
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rdstitch.alignment.result import LinkFit
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.projection import Projection
+from rdstitch.errors import InputError
+from rdstitch.inputs.source import Source
+from rdstitch.io.preview import encode_preview, read_preview
+from rdstitch.io.reduction import fitting_reduction
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.radial_homography import to_plane
 from rdstitch.registration import Registration
+from rdstitch.stitch_result import StitchResult
 
 _POINTS_PER_SIDE = 16
 
@@ -53,3 +63,27 @@ def _on_plane(registration: Registration, index: int, points: FloatArray) -> Flo
     own = np.arctan2(matrix[0, 2], matrix[2, 2])
     places[:, 0] = own + np.mod(places[:, 0] - own + np.pi, 2.0 * np.pi) - np.pi
     return places
+
+
+def of_source(source: Source, side: int) -> str | None:
+    """A thumbnail of an input picture; None where it is gone, as frames of videos are."""
+    try:
+        reduction = fitting_reduction(max(source.camera.image_size) / (2 * side))
+        return data_address(source.read(reduction).pixels, side)
+    except InputError:
+        return None
+
+
+def of_mosaic(result: StitchResult, side: int, staged: Path | None = None) -> str | None:
+    """A thumbnail of the output, or of its staged file; None where there is none, as after a dry run."""
+    if result.composite is not None:
+        return data_address(result.composite.pixels, side)
+    file = staged or result.output
+    if file is None or not file.exists():
+        return None
+    return data_address(read_preview(file, result.canvas.size, side)[0], side)
+
+
+def data_address(pixels: NDArray[Any], side: int) -> str:
+    """A picture of any sample type as JPEG inside a ``data:`` address, its longer side at most ``side`` pixels."""
+    return "data:image/jpeg;base64," + base64.b64encode(encode_preview(pixels, side)).decode("ascii")

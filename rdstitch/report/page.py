@@ -8,17 +8,10 @@ from pathlib import Path
 from rdstitch.io.outputs import Outputs
 from rdstitch.registration import Registration
 from rdstitch.report.camera_path import path_over_plane
-from rdstitch.report.grid import grid
-from rdstitch.report.lens_curve import lens_curve
-from rdstitch.report.local_alignment import local_alignment
-from rdstitch.report.match_graph import match_graph
-from rdstitch.report.matched import matched
-from rdstitch.report.mosaic import mosaic
-from rdstitch.report.residual_map import residual_map
-from rdstitch.report.run import run
-from rdstitch.report.summary import notices, summary
-from rdstitch.report.timings import timings
-from rdstitch.report.votes import votes
+from rdstitch.report.lens import grid, lens_curve, votes
+from rdstitch.report.output import local_alignment, mosaic
+from rdstitch.report.pairs import match_graph, matched, residual_map
+from rdstitch.report.summary import notices, run, summary, timings
 from rdstitch.stitch_result import StitchResult
 
 REPORT_SUFFIXES = (".html", ".htm")

@@ -1,14 +1,19 @@
-"""What came out, in words and numbers; what the user should know; what is missing."""
+"""What came out, in words and numbers; what the user should know; what is missing; how and how fast it was made."""
 
 import math
 from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
+from datetime import datetime
 from html import escape
+from importlib.metadata import version
+from typing import Any
 
 import numpy as np
 
+from rdstitch.options import StitchOptions
 from rdstitch.registration import Registration
-from rdstitch.report.svg import element, section, table
-from rdstitch.report.thumbnails import of_source
+from rdstitch.report.geometry import of_source
+from rdstitch.report.svg import BLUE, drawing, element, label, section, table
 from rdstitch.stitch_result import StitchResult
 
 _THUMBNAIL = 200  # pixels of the longer side
@@ -42,7 +47,7 @@ def notices(registration: Registration) -> str:
     return section(
         "Warnings and left-out pictures",
         "",
-        _list("What to look at", warnings, "No warnings."),
+        _bullets("What to look at", warnings, "No warnings."),
         _left_out(registration),
     )
 
@@ -88,7 +93,50 @@ def _unread(registration: Registration) -> int:
     return sum(message.images[0] not in known for message in registration.left_out)
 
 
-def _list(title: str, items: Sequence[str], none: str) -> str:
+def _bullets(title: str, items: Sequence[str], none: str) -> str:
     if not items:
         return element("p", escape(none))
     return element("h3", escape(title)) + element("ul", "".join(element("li", escape(item)) for item in items))
+
+
+def run(options: StitchOptions | None, command: str) -> str:
+    """Date, version, command line, and the options that are not the defaults."""
+    rows = [("date", datetime.now().astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")), ("rdstitch", version("rdstitch"))]
+    if command:
+        rows.append(("command", command))
+    if options is not None:
+        changed = _changed(options, type(options)())
+        rows.append(("options", "; ".join(changed) if changed else "all as usual"))
+    return section("Run", "", table((), rows))
+
+
+def _changed(options: Any, defaults: Any, prefix: str = "") -> list[str]:
+    """``name = value`` of every option that differs."""
+    found = []
+    for field in fields(options):
+        value, default = getattr(options, field.name), getattr(defaults, field.name)
+        if is_dataclass(value) and type(value) is type(default):
+            found += _changed(value, default, f"{prefix}{field.name}.")
+        elif value != default:
+            found.append(f"{prefix}{field.name} = {value}")
+    return found
+
+
+_WIDTH, _ROW, _LEFT = 640.0, 22.0, 190.0
+
+
+def timings(stages: Sequence[tuple[str, float]]) -> str:
+    """A bar for each stage, in their order."""
+    if not stages:
+        return section("Timings", "They were not measured.")
+    total = sum(seconds for _, seconds in stages)
+    longest = max(max(seconds for _, seconds in stages), 1e-9)
+    parts = []
+    for row, (name, seconds) in enumerate(stages):
+        y, length = row * _ROW, seconds / longest * (_WIDTH - _LEFT - 90.0)
+        parts.append(label(_LEFT - 8, y + 15, name, text_anchor="end"))
+        parts.append(element("rect", x=_LEFT, y=y + 3, width=length, height=_ROW - 6, fill=BLUE))
+        parts.append(label(_LEFT + length + 6, y + 15, f"{seconds:.2f} s"))
+    return section(
+        "Timings", f"{total:.1f} s on the clock in all.", drawing(_WIDTH, len(stages) * _ROW, parts, "timings")
+    )

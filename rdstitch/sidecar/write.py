@@ -12,7 +12,7 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas
-from rdstitch.compositing.photo_sphere import center_of_view, field_of_view
+from rdstitch.compositing.panorama_canvas import center_of_view, field_of_view
 from rdstitch.compositing.projection import PLANE
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.local_alignment import DisplacementField, LocalAlignment

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.camera_files.brown import Brown
 from rdstitch.camera_files.lens_fit import fit_lens
+from rdstitch.camera_files.lens_models import Brown
 from rdstitch.errors import ArgumentError
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box
-from rdstitch.compositing.lattice import Lattice
+from rdstitch.compositing.warp import Lattice
 from rdstitch.io.read import Picture
 from rdstitch.io.reduction import fitting_reduction, reduced_size
 from rdstitch.radial_homography import from_plane, to_plane

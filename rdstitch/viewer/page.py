@@ -1,6 +1,7 @@
 """The page: OpenSeadragon's released file, our script, and the data, all in one HTML file beside the tiles."""
 
 import base64
+import io
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,11 +12,43 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
+from PIL import Image
 
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.io.deepzoom import OVERLAP, TILE, tiles_folder
-from rdstitch.viewer.seams import seam_picture
+
+_COLOUR = (0, 229, 255)
+
+
+def seam_picture(
+    seams: SeamMap, origin: tuple[int, int], size: tuple[int, int]
+) -> tuple[bytes, tuple[float, float, float, float]]:
+    """Seams as PNG, and the box (x, y, width, height) that it fills, pixels of the mosaic from its corner.
+
+    Parameters
+    ----------
+    seams : SeamMap
+    origin, size : (int, int)
+        Where the mosaic begins in the canvas of the seams, and how large it is, pixels.
+    """
+    labels, factor = seams.labels, seams.factor
+    left, top = origin[0] // factor, origin[1] // factor
+    right, bottom = -(-(origin[0] + size[0]) // factor), -(-(origin[1] + size[1]) // factor)
+    labels = labels[top:bottom, left:right]
+    meets = np.zeros(labels.shape, dtype=bool)
+    for axis in (0, 1):
+        first = (slice(None, -1), slice(None)) if axis == 0 else (slice(None), slice(None, -1))
+        second = (slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))
+        # Where a picture ends at nothing there is no seam.
+        meets[first] |= (labels[first] != labels[second]) & (labels[first] >= 0) & (labels[second] >= 0)
+    samples = np.zeros((*labels.shape, 4), dtype=np.uint8)
+    samples[meets] = (*_COLOUR, 255)
+    stream = io.BytesIO()
+    Image.fromarray(samples).save(stream, "PNG", optimize=True)
+    x, y = float(left * factor - origin[0]), float(top * factor - origin[1])
+    return stream.getvalue(), (x, y, float(labels.shape[1] * factor), float(labels.shape[0] * factor))
+
 
 _CORNERS = 64  # of an outline, at most
 

@@ -35,15 +35,15 @@ import tifffile
 from PIL import Image
 from rdstitch_cli.config import read_config
 from rdstitch_cli.main import cli
-from rdstitch_cli.progress import one_line
+from rdstitch_cli.terminal import one_line
 
 from rdstitch.alignment.result import PlanarPoses, ReliefTest
 from rdstitch.camera import Camera
 from rdstitch.camera_files import load_camera
 from rdstitch.errors import RdstitchError
 from rdstitch.features import Features
-from rdstitch.inputs.attitudes import with_attitudes
 from rdstitch.inputs.find import find_pictures
+from rdstitch.inputs.measurements import with_attitudes
 from rdstitch.inputs.source import Source
 from rdstitch.io import packing, read_image, read_metadata, write_image
 from rdstitch.io.deepzoom import holds_only_tiles

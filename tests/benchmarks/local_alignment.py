@@ -46,7 +46,7 @@ from rdstitch.inputs.source import read_sources, readers
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.accept import accept
-from rdstitch.pipeline.align_locally import align_registration_locally
+from rdstitch.pipeline.placed_images import align_registration_locally
 from rdstitch.pipeline.register import register
 from rdstitch.radial_homography import to_plane
 from rdstitch.registration import Registration

@@ -26,7 +26,7 @@ import rdstitch
 from examples.judging.fitting import apply, fit_homography, fit_similarity
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.camera_files.brown import Brown
+from rdstitch.camera_files.lens_models import Brown
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 

@@ -8,7 +8,7 @@ import pytest
 
 import rdstitch as library
 from rdstitch.camera_files import load_camera
-from rdstitch.camera_files.fisheye import Fisheye, fisheye_of
+from rdstitch.camera_files.lens_models import Fisheye, fisheye_of
 from rdstitch.synthetic import FisheyeLens, ground
 from tests.cli.running import FAST, Run
 

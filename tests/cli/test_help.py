@@ -7,8 +7,8 @@ import sys
 import click
 import pytest
 from rdstitch_cli.main import EXIT_STATUSES, cli
-from rdstitch_cli.progress import Reporter
 from rdstitch_cli.stitching import stitch_options
+from rdstitch_cli.terminal import Reporter
 
 from rdstitch.pipeline import StitchOptions
 from tests.cli.running import Run

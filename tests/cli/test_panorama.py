@@ -13,7 +13,7 @@ from rdstitch.alignment.model_family import MODELS
 from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions
 from rdstitch.pipeline import StitchOptions, pano
-from rdstitch.pipeline.page import viewed_pictures
+from rdstitch.pipeline.compose import viewed_pictures
 from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, panorama_rotations, turning_sequence
 from rdstitch.synthetic.rendering import Photometry
 from rdstitch.viewer import viewer_page

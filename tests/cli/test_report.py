@@ -20,8 +20,9 @@ from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline import accept, calibrate, pano
 from rdstitch.pipeline.timing import StageTimer
-from rdstitch.report import report_page, thumbnails, write_report
-from rdstitch.report.matched import matched
+from rdstitch.report import geometry as thumbnails
+from rdstitch.report import report_page, write_report
+from rdstitch.report.pairs import matched
 from rdstitch.report.summary import _motion
 from rdstitch.report.svg import counted
 from tests.cli.running import FAST, Run

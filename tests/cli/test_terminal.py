@@ -11,8 +11,7 @@ import pytest
 from rdstitch_cli.help_pages import place_of
 from rdstitch_cli.main import cli
 from rdstitch_cli.parameter_types import UserPath
-from rdstitch_cli.progress import Reporter
-from rdstitch_cli.terminal import spell_out
+from rdstitch_cli.terminal import Reporter, spell_out
 
 from rdstitch.io import read_image
 from tests.cli.running import FAST, Run

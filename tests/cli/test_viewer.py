@@ -14,7 +14,7 @@ import pytest
 
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.io import read_image
-from rdstitch.viewer.seams import seam_picture
+from rdstitch.viewer.page import seam_picture
 from tests.cli.running import FAST, Run
 
 _ROOT = Path(__file__).parents[2]

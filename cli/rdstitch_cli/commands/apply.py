@@ -8,8 +8,8 @@ import click
 
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import GroupedCommand
-from rdstitch_cli.progress import Reporter
 from rdstitch_cli.stitching import show_plan
+from rdstitch_cli.terminal import Reporter
 
 
 @click.command(

@@ -7,8 +7,8 @@ import click
 
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import GroupedCommand
-from rdstitch_cli.progress import Reporter
 from rdstitch_cli.stitching import Report, report_registration, stitch_options
+from rdstitch_cli.terminal import Reporter
 
 
 @click.command(

@@ -10,8 +10,8 @@ import click
 from rdstitch_cli import following as live
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import GroupedCommand
-from rdstitch_cli.progress import Reporter
 from rdstitch_cli.stitching import Report, stitch_options, summarize
+from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
     from rdstitch.inputs.frame import Named

@@ -1,6 +1,5 @@
 """SURF, speeded-up robust features (Bay, Ess, Tuytelaars, Van Gool: CVIU 110, 2008), whose patents have expired.
 
-No OpenCV wheel contains it. ``hessian`` finds blobs (§3 of the paper) and ``refinement`` makes them accurate,
-``orientation`` turns them (§4.1), ``descriptor`` describes them (§4.2); all but the first read the picture through
-``patches`` of a ``pyramid``.
+No OpenCV wheel contains it. ``hessian`` finds blobs (§3 of the paper), ``refinement`` makes them accurate, and
+``descriptor`` turns (§4.1) and describes them (§4.2); all but the first read the picture through ``patches``.
 """

@@ -1,18 +1,98 @@
-"""The descriptor: sums of Haar responses in 4 x 4 cells of a rotated patch (Bay et al., §4.2)."""
+"""Orientation (Bay et al., §4.1) and descriptor (§4.2) of keypoints, and SURF in the steps that all detectors take.
+
+The orientation is the strongest sum of gradients within 60°. Two departures from the paper, which for turned pictures
+bring its error from 6° to 0.6° (median) at no cost: the gradients are derivatives of Gaussians instead of Haar
+wavelets, which are not isotropic; and the window has a smooth edge, so that a gradient near it does not decide by being
+just in or out. The descriptor holds sums of Haar responses in 4 x 4 cells of a patch that is turned by it.
+"""
+
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.features.surf.patches import sample_patches
-from rdstitch.features.surf.pyramid import Grey
+from rdstitch.features.keypoints import Features
+from rdstitch.features.options import FeatureOptions
+from rdstitch.features.surf.hessian import Blobs, Grey, find_blobs, pyramid
+from rdstitch.features.surf.patches import apply_kernels, integer_kernels, sample_patches
+from rdstitch.features.surf.refinement import refine
+
+_RADIUS = 6  # of the disc of gradients, units of s
+_GRADIENT_SIGMA = 1.5  # of the derivatives, units of s; about as wide as the paper's wavelets of 4s
+_GRADIENT_WEIGHT_SIGMA = 2.5  # of the gradients' weight, units of s
+_PATCH = 2 * (_RADIUS + 3)
+_BINS = 72  # directions in which the window is tried
+_WINDOW_WIDTH = np.pi / 3  # width of the window at half its height, radians
+_ORIENTED_AT_ONCE = 4096  # worked on at a time
+
+
+def orientations(levels: list[Grey], points: FloatArray, scale: FloatArray) -> FloatArray:
+    """Dominant direction of the gradient at each point, radians in [0, 2π), from u towards v.
+
+    Parameters
+    ----------
+    levels : list of ndarray
+        The picture's pyramid.
+    points : ndarray of shape (N, 2)
+        pixels.
+    scale : ndarray of shape (N,)
+        The s of the paper, pixels.
+    """
+    angles = np.empty(len(points))
+    for start in range(0, len(points), _ORIENTED_AT_ONCE):
+        part = slice(start, start + _ORIENTED_AT_ONCE)
+        patches = sample_patches(levels, points[part], scale[part], np.zeros(len(points[part])), _PATCH)
+        angles[part] = _dominant(
+            apply_kernels(patches, _ALONG_U) * _GRADIENT_WEIGHTS, apply_kernels(patches, _ALONG_V) * _GRADIENT_WEIGHTS
+        )
+    return angles
+
+
+def _dominant(du: NDArray[np.float32], dv: NDArray[np.float32]) -> FloatArray:
+    """Direction of the largest sum of gradients (N, places) that a window holds."""
+    count = len(du)
+    bins = np.floor(np.arctan2(dv, du) * (_BINS / (2 * np.pi))).astype(np.intp) % _BINS
+    address = (bins + _BINS * np.arange(count)[:, None]).ravel()
+    sums = np.stack([np.bincount(address, d.ravel(), count * _BINS).reshape(count, _BINS) for d in (du, dv)])
+    window = np.fft.irfft(np.fft.rfft(sums) * _WINDOW_SPECTRUM, _BINS)
+    best = (window**2).sum(axis=0).argmax(axis=1)
+    u, v = window[:, np.arange(count), best]
+    direction: FloatArray = np.arctan2(v, u) % (2 * np.pi)
+    return direction
+
+
+def _gradients() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Derivatives along u and v at the places of the disc, each (pixels, places), and the places' weights."""
+    step = np.arange(-_RADIUS, _RADIUS + 1)
+    row, column = (axis.ravel() for axis in np.meshgrid(step, step, indexing="ij"))
+    inside = row**2 + column**2 <= _RADIUS**2
+    row, column = row[inside], column[inside]
+    pixel = np.arange(_PATCH) - (_PATCH - 1) / 2
+    v, u = np.broadcast_arrays(pixel[:, None, None] - row, pixel[None, :, None] - column)
+    gauss = np.exp(-(u**2 + v**2) / (2 * _GRADIENT_SIGMA**2))
+    along_u, along_v = (integer_kernels((axis * gauss).reshape(_PATCH**2, -1))[0] for axis in (u, v))
+    return along_u, along_v, np.exp(-(row**2 + column**2) / (2 * _GRADIENT_WEIGHT_SIGMA**2)).astype(np.float32)
+
+
+def _window_spectrum() -> NDArray[np.complex128]:
+    """Transform of the window over the bins: cos², half as high at half its width."""
+    bins = (np.arange(_BINS) + _BINS // 2) % _BINS - _BINS // 2
+    angle = bins * (2 * np.pi / _BINS)
+    return np.fft.rfft(np.where(np.abs(angle) < _WINDOW_WIDTH, np.cos(angle * (np.pi / 2 / _WINDOW_WIDTH)) ** 2, 0.0))
+
+
+_ALONG_U, _ALONG_V, _GRADIENT_WEIGHTS = _gradients()
+_WINDOW_SPECTRUM = _window_spectrum()
+
 
 _CELLS = 4  # along each side
 _SAMPLES = 5  # along each side of a cell
 _SIDE = _CELLS * _SAMPLES  # of the region, in units of s
-_SIGMA = 3.3  # of the Gaussian weight, in units of s
+_RESPONSE_SIGMA = 3.3  # of the Gaussian weight, in units of s
 _SUPERSAMPLING = 2  # samples along each side of a square of s
-_KEYPOINTS = 512  # worked on at a time
+_DESCRIBED_AT_ONCE = 512  # worked on at a time
 
 
 def describe_patches(
@@ -34,8 +114,8 @@ def describe_patches(
         Sum responses of either sign of the other direction separately.
     """
     descriptors = np.empty((len(points), _CELLS**2 * (8 if extended else 4)), np.float32)
-    for start in range(0, len(points), _KEYPOINTS):
-        part = slice(start, start + _KEYPOINTS)
+    for start in range(0, len(points), _DESCRIBED_AT_ONCE):
+        part = slice(start, start + _DESCRIBED_AT_ONCE)
         patches = sample_patches(
             levels, points[part], scale[part] / _SUPERSAMPLING, angle[part], _SUPERSAMPLING * (_SIDE + 1)
         )
@@ -56,9 +136,9 @@ def _describe(patches: NDArray[np.float32], extended: bool) -> NDArray[np.float3
     """Descriptors of patches (N, 21, 21)."""
     # Haar wavelets of side 2s, at steps of s.
     down = patches[:, 1:] + patches[:, :-1]
-    du = (down[:, :, 1:] - down[:, :, :-1]) * _WEIGHTS
+    du = (down[:, :, 1:] - down[:, :, :-1]) * _RESPONSE_WEIGHTS
     right = patches[:, :, 1:] + patches[:, :, :-1]
-    dv = (right[:, 1:] - right[:, :-1]) * _WEIGHTS
+    dv = (right[:, 1:] - right[:, :-1]) * _RESPONSE_WEIGHTS
     if extended:
         parts = []
         for values, other in ((du, dv), (dv, du)):
@@ -78,10 +158,58 @@ def _cell_sums(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return total
 
 
-def _weights() -> NDArray[np.float32]:
+def _response_weights() -> NDArray[np.float32]:
     """Gaussian weight of each response, shape (20, 20)."""
     place = np.arange(_SIDE) - (_SIDE - 1) / 2
-    return np.exp(-(place[:, None] ** 2 + place**2) / (2 * _SIGMA**2)).astype(np.float32)
+    return np.exp(-(place[:, None] ** 2 + place**2) / (2 * _RESPONSE_SIGMA**2)).astype(np.float32)
 
 
-_WEIGHTS = _weights()
+_RESPONSE_WEIGHTS = _response_weights()
+
+
+@dataclass(frozen=True, eq=False)
+class SurfDetection:
+    """Blobs of a picture, to be described."""
+
+    levels: list[Grey]
+    blobs: Blobs
+    upright: bool
+    extended: bool
+
+    @classmethod
+    def find(cls, grey: Grey, options: FeatureOptions) -> Self:
+        """Find the blobs of a picture."""
+        blobs = find_blobs(grey, options.surf_threshold, options.surf_octaves, options.surf_layers)
+        levels = pyramid(grey, options.surf_octaves + 3)
+        if options.surf_refine:
+            blobs = refine(levels, blobs)
+        return cls(levels, blobs, options.surf_upright, options.surf_extended)
+
+    @property
+    def points(self) -> FloatArray:
+        """Places, pixels of the picture, (N, 2)."""
+        return self.blobs.points
+
+    @property
+    def scale(self) -> FloatArray:
+        """Diameters, pixels, (N,)."""
+        return self.blobs.size
+
+    @property
+    def response(self) -> FloatArray:
+        """Strengths, (N,)."""
+        return self.blobs.response
+
+    def describe(self, chosen: NDArray[np.intp]) -> Features:
+        """Orient and describe the chosen blobs."""
+        blobs = self.blobs.take(chosen)
+        angle = np.zeros(len(blobs)) if self.upright else orientations(self.levels, blobs.points, blobs.scale)
+        return Features(
+            points=blobs.points,
+            descriptors=describe_patches(self.levels, blobs.points, blobs.scale, angle, self.extended),
+            scale=blobs.size,
+            angle=angle,
+            response=blobs.response,
+            laplacian_sign=blobs.laplacian_sign,
+            kind="surf",
+        )

@@ -1,4 +1,9 @@
-"""Blobs: maxima of the determinant of the Hessian over place and scale, by box filters (Bay et al., §3)."""
+"""Blobs: maxima of the determinant of the Hessian over place and scale, by box filters (Bay et al., §3).
+
+Box filters of twice the size, sampled at every second pixel, are the same filters on the picture of half the size.
+So an octave of SURF is the first octave on the next level of a pyramid, and needs neither large filters nor code of
+its own.
+"""
 
 from dataclasses import dataclass, fields
 from typing import Self
@@ -8,8 +13,65 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.features.surf.pyramid import Grey, from_level, pyramid
-from rdstitch.features.surf.quadric import vertex
+
+Grey = NDArray[np.uint8]
+
+
+def pyramid(grey: Grey, levels: int) -> list[Grey]:
+    """At most ``levels`` levels, the picture itself first; an odd last row or column is left out of the next."""
+    result = [grey]
+    while len(result) < levels and min(result[-1].shape) >= 4:
+        height, width = result[-1].shape
+        even = result[-1][: height // 2 * 2, : width // 2 * 2]
+        result.append(np.asarray(cv2.resize(even, (width // 2, height // 2), interpolation=cv2.INTER_AREA), np.uint8))
+    return result
+
+
+def to_level(points: FloatArray, level: int) -> FloatArray:
+    """Pixels of the picture to pixels of a level; (0, 0) is the centre of the first pixel in both."""
+    return (points + 0.5) / float(2**level) - 0.5
+
+
+def from_level(points: FloatArray, level: int) -> FloatArray:
+    """Pixels of a level to pixels of the picture."""
+    return (points + 0.5) * float(2**level) - 0.5
+
+
+def vertex(values: NDArray[np.floating]) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Where the quadric through each neighbourhood is largest.
+
+    Parameters
+    ----------
+    values : ndarray of shape (N, 3, 3, 3)
+        Axes scale, row, column.
+
+    Returns
+    -------
+    offset : ndarray of shape (N, 3)
+        Vertex relative to the middle, in steps along column, row, scale.
+    is_maximum : ndarray of shape (N,), bool
+        Whether the quadric has a maximum there; elsewhere the offset is zero.
+    """
+    n = values.astype(np.float64)
+    middle = n[:, 1, 1, 1]
+    gradient = np.stack(
+        [n[:, 1, 1, 2] - n[:, 1, 1, 0], n[:, 1, 2, 1] - n[:, 1, 0, 1], n[:, 2, 1, 1] - n[:, 0, 1, 1]], axis=-1
+    )
+    uu = n[:, 1, 1, 2] + n[:, 1, 1, 0] - 2 * middle
+    vv = n[:, 1, 2, 1] + n[:, 1, 0, 1] - 2 * middle
+    ss = n[:, 2, 1, 1] + n[:, 0, 1, 1] - 2 * middle
+    uv = (n[:, 1, 2, 2] - n[:, 1, 2, 0] - n[:, 1, 0, 2] + n[:, 1, 0, 0]) / 4
+    us = (n[:, 2, 1, 2] - n[:, 2, 1, 0] - n[:, 0, 1, 2] + n[:, 0, 1, 0]) / 4
+    vs = (n[:, 2, 2, 1] - n[:, 2, 0, 1] - n[:, 0, 2, 1] + n[:, 0, 0, 1]) / 4
+    # Negative definite: leading minors alternate in sign (Sylvester).
+    minor = uu * vv - uv**2
+    determinant = ss * minor - us * (us * vv - uv * vs) + vs * (us * uv - uu * vs)
+    is_maximum = (uu < 0) & (minor > 0) & (determinant < 0)
+    second = np.stack([np.stack(row, axis=-1) for row in ((uu, uv, us), (uv, vv, vs), (us, vs, ss))], axis=-2)
+    second[~is_maximum] = np.eye(3)
+    offset = np.linalg.solve(second, -gradient[..., None] / 2)[..., 0]
+    return np.where(is_maximum[:, None], offset, 0.0), is_maximum
+
 
 # The box filter of 9 pixels stands for a Gaussian of σ = 1.2 pixels; larger ones in proportion (§3.3).
 SIGMA_PER_SIZE = 1.2 / 9

@@ -11,11 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.features.surf.hessian import Blobs
-from rdstitch.features.surf.integer_kernels import apply, integer_kernels
-from rdstitch.features.surf.patches import sample_patches
-from rdstitch.features.surf.pyramid import Grey
-from rdstitch.features.surf.quadric import vertex
+from rdstitch.features.surf.hessian import Blobs, Grey, vertex
+from rdstitch.features.surf.patches import apply_kernels, integer_kernels, sample_patches
 
 # The box filters' maximum over scale is at s = σ / 1.43 for a Gaussian blob of σ pixels.
 _SIGMA = 1.43  # units of s
@@ -50,7 +47,7 @@ def refine(levels: list[Grey], blobs: Blobs) -> Blobs:
 def _refine(levels: list[Grey], blobs: Blobs) -> Blobs:
     """One batch of :func:`refine`."""
     patches = sample_patches(levels, blobs.points, blobs.scale * _SPACING, np.zeros(len(blobs)), _SAMPLES)
-    uu, vv, uv = np.moveaxis((apply(patches, _KERNELS) / np.float32(_KERNEL_FACTOR)).reshape(-1, 3, 27), 1, 0)
+    uu, vv, uv = np.moveaxis((apply_kernels(patches, _KERNELS) / np.float32(_KERNEL_FACTOR)).reshape(-1, 3, 27), 1, 0)
     determinant = (uu * vv - uv**2).reshape(-1, 3, 3, 3)
     offset, is_maximum = vertex(determinant)
     near = is_maximum & (np.abs(offset) <= _MAX_OFFSET).all(axis=1)

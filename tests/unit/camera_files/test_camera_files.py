@@ -13,8 +13,8 @@ import pytest
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.camera_files import load_camera, read_camera_file, save_camera
-from rdstitch.camera_files.brown import Brown
-from rdstitch.camera_files.opencv_yaml import parse_yaml
+from rdstitch.camera_files.lens_models import Brown
+from rdstitch.camera_files.opencv import parse_yaml
 from rdstitch.errors import InputError, OutputError
 
 OPENCV = ["c.yml", "c.yaml", "opencv.json", "left.opencv.json", "a.fisheye.yml"]

@@ -11,9 +11,8 @@ from scipy.sparse.linalg import splu
 
 from rdstitch.camera import Camera
 from rdstitch.compositing import brightness, field_solver, place_pictures, plan_canvas
-from rdstitch.compositing.boxes import intersection
+from rdstitch.compositing.boxes import intersection, overlapping_pairs
 from rdstitch.compositing.field_solver import solve_fields
-from rdstitch.compositing.overlaps import overlapping_pairs
 from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.source_images import PictureReader
 from rdstitch.compositing.survey import Survey, survey_pictures

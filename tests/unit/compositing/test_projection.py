@@ -7,8 +7,13 @@ import pytest
 
 from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, compose, plan_panorama
-from rdstitch.compositing.panorama_canvas import choose_projection, seen_directions
-from rdstitch.compositing.photo_sphere import center_of_view, field_of_view, photo_sphere_xmp
+from rdstitch.compositing.panorama_canvas import (
+    center_of_view,
+    choose_projection,
+    field_of_view,
+    photo_sphere_xmp,
+    seen_directions,
+)
 from rdstitch.compositing.placed_picture import place_pictures
 from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.compositing.warp import plan_warp

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.features import FeatureOptions, Features, View, detect, detect_view, match
+from rdstitch.features.detect import spread, strongest
 from rdstitch.features.opencv import to_rootsift
 from rdstitch.features.picture import halving
-from rdstitch.features.spread import spread, strongest
 from rdstitch.synthetic import ground
 
 KINDS = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk")

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rdstitch.features import FeatureOptions
-from rdstitch.features.opencv import OpenCVDetection
-from rdstitch.features.strips import StripsDetection
+from rdstitch.features.opencv import OpenCVDetection, StripsDetection
 from rdstitch.synthetic import ground
 
 OPTIONS = FeatureOptions()

@@ -10,7 +10,7 @@ from PIL import Image
 
 from rdstitch.camera import Camera
 from rdstitch.errors import InputError
-from rdstitch.inputs.masks import with_masks
+from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source
 from rdstitch.io.mask import check_mask, read_mask
 from rdstitch.io.metadata import Metadata

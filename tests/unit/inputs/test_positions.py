@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from rdstitch.camera import Camera
-from rdstitch.inputs.positions import positions_of
+from rdstitch.inputs.measurements import positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import GpsPosition, Metadata
 

@@ -10,7 +10,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from rdstitch.io import Attitude, Metadata, read_metadata
 from rdstitch.io.attitude import read_attitude
-from rdstitch.io.orientation import turned, turned_direction
+from rdstitch.io.metadata import turned, turned_direction
 from rdstitch.planar_motion import tilt_from_normal
 from rdstitch.synthetic import Poses
 from tests.drone_xmp import DIALECTS, euler_angles, xmp_of

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.io import read_image
-from rdstitch.io.jpeg_decoding import decoded_jpeg
+from rdstitch.io.read import decoded_jpeg
 from rdstitch.io.reduction import reduced_size
 from rdstitch.synthetic import ground
 

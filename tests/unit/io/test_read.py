@@ -212,7 +212,7 @@ class TestBadFiles:
 
     def test_lying_sizes(self, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
         header = struct.pack(">IIBBBBB", 2_000_000, 2_000_000, 8, 2, 0, 0, 0)
-        from rdstitch.io.embedding import png_chunk
+        from rdstitch.io.encoding import png_chunk
 
         (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", header) + png_chunk(b"IEND", b""))
         _expect_one_line(tmp_path / "a.png", read_image, capfd)

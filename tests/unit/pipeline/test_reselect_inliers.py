@@ -15,8 +15,7 @@ from rdstitch.features import Correspondences
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.links import Link
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.pipeline.aligner import Aligner, rematch_weak_pairs
-from rdstitch.pipeline.reselect_inliers import reselect_inliers
+from rdstitch.pipeline.aligner import Aligner, rematch_weak_pairs, reselect_inliers
 from tests.alignment_scenes import grid, scene
 
 FISHEYE = Camera((640, 480), -0.49, -0.055, (335.0, 226.0), distortion3=-0.008)

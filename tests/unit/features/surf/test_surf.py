@@ -8,12 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from rdstitch.features import FeatureOptions, detect, match
-from rdstitch.features.surf.descriptor import describe_patches
-from rdstitch.features.surf.hessian import find_blobs
-from rdstitch.features.surf.integer_kernels import apply, integer_kernels
-from rdstitch.features.surf.orientation import orientations
-from rdstitch.features.surf.pyramid import from_level, pyramid, to_level
-from rdstitch.features.surf.quadric import vertex
+from rdstitch.features.surf.descriptor import describe_patches, orientations
+from rdstitch.features.surf.hessian import find_blobs, from_level, pyramid, to_level, vertex
+from rdstitch.features.surf.patches import apply_kernels, integer_kernels
 from rdstitch.features.surf.refinement import refine
 from rdstitch.synthetic import ground
 
@@ -184,7 +181,7 @@ def test_integer_kernels_are_exact_in_any_order() -> None:
     kernels, factor = integer_kernels(rng.normal(size=(576, 20)) - 0.5)
     patches = rng.integers(0, 256, (50, 24, 24), dtype=np.uint8)
     exact = patches.reshape(50, -1).astype(np.int64) @ kernels.astype(np.int64)
-    np.testing.assert_array_equal(apply(patches, kernels), exact)
+    np.testing.assert_array_equal(apply_kernels(patches, kernels), exact)
     assert np.abs(exact).max() < 2**24
     np.testing.assert_array_equal(kernels.sum(axis=0), 0)
     assert factor > 0

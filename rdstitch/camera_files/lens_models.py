@@ -1,4 +1,4 @@
-"""Brown's lens model, as OpenCV and OpenDroneMap have it: a polynomial of the undistorted radius, in focal lengths."""
+"""Lens models of others that several formats share: Brown's polynomial, and Kannala and Brandt's fisheye."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.camera_files.lens_fit import LensFit, LensSamples, fit_polynomial
+from rdstitch.camera_files.lens_fit import LensFit, LensSamples
 
 _POWERS = (3, 5, 7)
 _NEWTON_STEPS, _NEWTON_TOLERANCE = 20, 1e-10
@@ -16,8 +16,8 @@ CLOSE = 0.1
 
 
 @dataclass(frozen=True)
-class Brown:
-    """A lens of Brown's model with the denominator of OpenCV's rational one.
+class _ForeignLens:
+    """What both models have.
 
     Attributes
     ----------
@@ -25,6 +25,23 @@ class Brown:
         Along x and y, pixels.
     center : (float, float)
         Pixels.
+    """
+
+    focal: tuple[float, float]
+    center: tuple[float, float]
+
+    @property
+    def mean_focal(self) -> float:
+        """One focal length for both directions, pixels."""
+        return float(np.sqrt(self.focal[0] * self.focal[1]))
+
+
+@dataclass(frozen=True)
+class Brown(_ForeignLens):
+    """Brown's model, a polynomial of the undistorted radius in focal lengths, with OpenCV's rational denominator.
+
+    Attributes
+    ----------
     radial : tuple of float
         k1, k2, k3.
     tangential : (float, float)
@@ -33,16 +50,9 @@ class Brown:
         k4, k5, k6.
     """
 
-    focal: tuple[float, float]
-    center: tuple[float, float]
     radial: tuple[float, ...]
     tangential: tuple[float, float] = (0.0, 0.0)
     denominator: tuple[float, ...] = ()
-
-    @property
-    def mean_focal(self) -> float:
-        """One focal length for both directions, pixels."""
-        return float(np.sqrt(self.focal[0] * self.focal[1]))
 
     def distort(self, points: FloatArray) -> FloatArray:
         """Pixels (..., 2) of a lens without distortion and with square pixels to measured pixels.
@@ -83,27 +93,42 @@ class Brown:
         return np.stack([bent_x, bent_y], axis=-1), jacobian
 
 
-def brown_of(camera: Camera, terms: int = 3) -> tuple[Brown, LensFit]:
-    """Brown's model of a camera by least squares; the focal length is guessed where it is not known.
+@dataclass(frozen=True)
+class Fisheye(_ForeignLens):
+    """A lens that measures a ray at angle θ from the axis ``f (θ + k1 θ³ + k2 θ⁵ + k3 θ⁷ + k4 θ⁹)`` from the centre.
 
-    Parameters
+    Attributes
     ----------
-    camera : Camera
-    terms : int
-        How many of k1, k2, k3 the format has.
+    coefficients : tuple of float
+        k1, k2, k3, k4.
     """
-    focal = camera.with_focal().focal
-    assert focal is not None
-    radial, fit = fit_polynomial(camera, focal, _POWERS[:terms])
-    return Brown((focal, focal), camera.center, (*radial.tolist(), *[0.0] * (3 - terms))), fit
+
+    coefficients: tuple[float, ...]
+
+    def distort(self, points: FloatArray) -> FloatArray:
+        """Pixels (..., 2) of a lens without distortion and with square pixels to measured pixels."""
+        x = (points - self.center) / self.mean_focal
+        radius = np.linalg.norm(x, axis=-1)
+        angle = np.arctan(radius)
+        bent = angle * (1.0 + sum(k * angle ** (2 * i) for i, k in enumerate(self.coefficients, start=1)))
+        ratio = np.where(radius > 0.0, bent / np.maximum(radius, 1e-300), 1.0)
+        return x * ratio[..., None] * self.focal + self.center
+
+
+def brown_of(camera: Camera, terms: int = 3) -> tuple[Brown, LensFit]:
+    """Brown's model of a camera by least squares, with the first ``terms`` of k1, k2, k3."""
+    samples = LensSamples.of(camera)
+    radial, fit = samples.fit(samples.straight, samples.straight[:, None] ** np.array(_POWERS[:terms]))
+    return Brown((samples.focal,) * 2, camera.center, (*radial.tolist(), *[0.0] * (3 - terms))), fit
 
 
 def rational_of(camera: Camera) -> tuple[Brown, LensFit]:
     """OpenCV's rational model of a camera: Brown's with a denominator, which also describes strong lenses."""
-    focal = camera.with_focal().focal
-    assert focal is not None
-    found, fit = LensSamples.of(camera, focal).fit_rational()
-    return Brown((focal, focal), camera.center, tuple(found[:3].tolist()), denominator=tuple(found[3:].tolist())), fit
+    samples = LensSamples.of(camera)
+    found, fit = samples.fit_rational()
+    return Brown(
+        (samples.focal,) * 2, camera.center, tuple(found[:3].tolist()), denominator=tuple(found[3:].tolist())
+    ), fit
 
 
 def least_brown_of(camera: Camera) -> tuple[Brown, LensFit]:
@@ -112,6 +137,22 @@ def least_brown_of(camera: Camera) -> tuple[Brown, LensFit]:
     if plain[1].largest <= CLOSE:
         return plain
     return min(plain, rational_of(camera), key=lambda found: found[1].largest)
+
+
+def fisheye_of(camera: Camera) -> tuple[Fisheye, LensFit]:
+    """The fisheye model of a camera by least squares."""
+    samples = LensSamples.of(camera)
+    angle = np.arctan(samples.straight)
+    coefficients, fit = samples.fit(angle, angle[:, None] ** np.array([3, 5, 7, 9]))
+    return Fisheye((samples.focal,) * 2, camera.center, tuple(coefficients.tolist())), fit
+
+
+def closer_fisheye(camera: Camera, other: LensFit, close: float = CLOSE) -> tuple[Fisheye, LensFit] | None:
+    """The fisheye model of a camera, if another one is not close enough (pixels) to the lens and this one is closer."""
+    if other.largest <= close:
+        return None
+    fisheye, fit = fisheye_of(camera)
+    return (fisheye, fit) if fit.largest < other.largest else None
 
 
 def _series(coefficients: tuple[float, ...], r2: FloatArray) -> FloatArray:

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from rdstitch.errors import InputError, OutputError
+from rdstitch.file_access import is_url, url_of
 from rdstitch.inputs.find import find_pictures
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.atomic import check_output
 from rdstitch.io.metadata import read_metadata
 from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
-from rdstitch.remote_files import is_url, url_of
 
 fsspec = pytest.importorskip("fsspec")
 

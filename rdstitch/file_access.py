@@ -1,10 +1,13 @@
-"""Files that lie elsewhere, by a URL of any kind that fsspec knows: ``s3://``, ``gs://``, ``https://``, ``memory://`` …
+"""Opening files that someone else made, here or at a URL of any kind that fsspec knows (``s3://``, ``https://``, …).
 
-A URL travels as a path, like the name of any input. :class:`pathlib.Path` writes ``s3://bucket/name`` with one slash,
-which is undone here before anything is opened.
+A pipe, a socket or a device among them must not block, or feed without end. A URL travels as a path, like the name of
+any input. :class:`pathlib.Path` writes ``s3://bucket/name`` with one slash, which is undone before anything is opened.
 """
 
+import errno
+import os
 import re
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -130,3 +133,38 @@ def _as_os_error() -> Iterator[None]:
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise OSError(f"cannot be fetched: {reason}") from error
+
+
+def open_regular(path: str | Path) -> BufferedReader:
+    """Open a regular file for reading bytes, at once whatever lies there; or one that a URL names.
+
+    Raises
+    ------
+    OSError
+        When it cannot be opened, or is no regular file.
+    """
+    if is_url(path):
+        return open_remote(path)
+    # Opening a pipe would wait for a writer.
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    mode = os.fstat(descriptor).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(descriptor)
+        number, text = (errno.EISDIR, "is a folder") if stat.S_ISDIR(mode) else (errno.EINVAL, "is not a regular file")
+        raise OSError(number, text, str(path))
+    return open(descriptor, "rb")  # noqa: PTH123 - a descriptor has no path
+
+
+def read_limited(path: str | Path, most: int, *, regular: bool = True) -> bytes:
+    """The content of a file of at most so many bytes; of a regular one, unless pipes are allowed.
+
+    Raises
+    ------
+    OSError
+        When it cannot be opened, is no regular file, or is larger.
+    """
+    with open_regular(path) if regular else Path(path).open("rb") as stream:
+        data = stream.read(most + 1)
+    if len(data) > most:
+        raise OSError(errno.EFBIG, "too large to be such a file", str(path))
+    return data

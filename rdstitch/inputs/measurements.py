@@ -1,0 +1,186 @@
+"""What was measured of each picture besides: tilt, place and time, by the picture's metadata or a table."""
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from rdstitch.arrays import FloatArray
+from rdstitch.errors import InputError
+from rdstitch.inputs.source import Source
+from rdstitch.planar_motion import tilt_from_normal
+from rdstitch.records import read_text
+
+XMP = "xmp"
+"""The value of ``attitude`` that stands for the pictures' own XMP."""
+
+_TILT_COLUMNS = ("name", "psi", "theta")
+_MAX_NAMED = 3  # pictures in a message
+_MAX_TILT = math.radians(80.0)  # beyond, hardly a picture shows ground, and more likely angles mean something else
+
+
+def with_attitudes(sources: Sequence[Source], wanted: str | Path | None) -> list[Source]:
+    """The sources, each with its attitude, if these are wanted.
+
+    Parameters
+    ----------
+    sources : sequence of Source
+    wanted : str, path or None
+        The text :data:`XMP`: what drones write into pictures, see :mod:`rdstitch.io.attitude`; the plane is then taken
+        to be level. Or a CSV file with a header that names the columns ``name`` (of the picture's file), ``psi`` and
+        ``theta``, degrees; others are ignored.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, is no such table, or has no line for a picture; when a picture's XMP has no
+        attitude of the camera, or one that is far from looking down.
+    """
+    if wanted is None:
+        return list(sources)
+    attitudes = _of_pictures(sources) if wanted == XMP else _of_table(sources, wanted)
+    return [replace(source, attitude=attitude) for source, attitude in zip(sources, attitudes, strict=True)]
+
+
+def _of_pictures(sources: Sequence[Source]) -> list[tuple[float, float]]:
+    """(ψ, θ), radians, of each source by its XMP."""
+    tilts, lacking = [], []
+    for source in sources:
+        nadir = source.metadata.nadir
+        if nadir is None:
+            lacking.append(source.name)
+            continue
+        away = math.acos(nadir[2])
+        if away > _MAX_TILT:
+            raise InputError(
+                f"{source.path}: by its XMP the camera looks {math.degrees(away):.0f} degrees away from straight down; "
+                "give a CSV file if that is wrong"
+            )
+        psi, theta = tilt_from_normal(nadir).tolist()
+        tilts.append((psi, theta))
+    if lacking:
+        more = f" and {len(lacking) - _MAX_NAMED} more" if len(lacking) > _MAX_NAMED else ""
+        named = ", ".join(lacking[:_MAX_NAMED])
+        raise InputError(f"{named}{more}: no attitude of the camera can be read from the XMP; give a CSV file instead")
+    return tilts
+
+
+def _of_table(sources: Sequence[Source], file: str | Path) -> list[tuple[float, float]]:
+    """(ψ, θ), radians, of each source by its line."""
+    table = _read_table(file)
+    for source in sources:
+        if source.name not in table:
+            raise InputError(f"{file}: has no line for {source.name}; add one with its psi and theta")
+    return [table[source.name] for source in sources]
+
+
+def _read_table(file: str | Path) -> dict[str, tuple[float, float]]:
+    """(ψ, θ), radians, of each name."""
+    rows = csv.DictReader(read_text(file).splitlines(), skipinitialspace=True)
+    missing = [name for name in _TILT_COLUMNS if name not in (rows.fieldnames or ())]
+    if missing:
+        raise InputError(f"{file}: has no column {missing[0]!r}; its first line must be {','.join(_TILT_COLUMNS)}")
+    attitudes: dict[str, tuple[float, float]] = {}
+    for row in rows:
+        name = row["name"] or ""
+        try:
+            psi, theta = (math.radians(float(row[column])) for column in _TILT_COLUMNS[1:])
+        except (TypeError, ValueError):
+            raise InputError(f"{file}: line {rows.line_num}: psi and theta must be numbers, in degrees") from None
+        if not (abs(psi) < math.pi / 2 and abs(theta) < math.pi / 2):
+            raise InputError(f"{file}: line {rows.line_num}: psi and theta must lie between -90 and 90 degrees")
+        if name in attitudes:
+            raise InputError(f"{file}: line {rows.line_num}: {name} is here twice; remove one")
+        attitudes[name] = psi, theta
+    return attitudes
+
+
+_EARTH = 6_371_000.0  # m
+
+
+def positions_of(sources: Sequence[Source]) -> FloatArray:
+    """Metres east and north (N, 2) of the middle of the pictures' GPS positions; NaN where unknown."""
+    known = [source.metadata.gps for source in sources]
+    degrees = [(np.nan, np.nan) if gps is None else (gps.latitude, gps.longitude) for gps in known]
+    latitude, longitude = np.radians(np.array(degrees, dtype=np.float64).reshape(-1, 2)).T
+    if np.isnan(latitude).all():
+        return np.full((len(known), 2), np.nan)
+    up = np.stack([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
+    x, y, z = np.nanmean(up, axis=1)
+    level = max(float(np.hypot(x, y)), 1e-12)
+    east = np.array([-y, x, 0.0]) / level
+    north = np.array([-x * z / level, -y * z / level, level])
+    metres: FloatArray = _EARTH * (np.stack([east, north / np.linalg.norm(north)]) @ up).T
+    return metres
+
+
+_TIME_COLUMNS = ("name", "timestamp")
+
+
+def timestamps_of(sources: Sequence[Source], file: str | Path | None = None) -> FloatArray:
+    """Time stamps (N,), s; NaN where nothing is known.
+
+    Without a file, that of the video (from its beginning) or bag, else that of EXIF (since 1970, in UTC where EXIF has
+    no time zone).
+
+    Parameters
+    ----------
+    sources : sequence of Source
+    file : path, optional
+        CSV with a header that names the columns ``name`` and ``timestamp``; or lines ``TIMESTAMP NAME`` as in the lists
+        of the TUM benchmark; or one time a line, the n-th for the n-th picture or frame of the video, as KITTI's
+        ``times.txt``. Lines that begin with ``#`` are ignored.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, or has no time for a picture.
+    """
+    if file is None:
+        return np.array([_own_time(source) for source in sources])
+    lines = [line.strip() for line in read_text(file).splitlines()]
+    lines = [line for line in lines if line and not line.startswith("#")]
+    if lines and all(_is_number(line) for line in lines):
+        return _by_number(sources, [float(line) for line in lines], file)
+    named = _by_name(lines, file)
+    for source in sources:
+        if source.name not in named:
+            raise InputError(f"{file}: has no time for {source.name}; add a line with its name and time")
+    return np.array([named[source.name] for source in sources])
+
+
+def _own_time(source: Source) -> float:
+    if source.frame is not None and source.frame.timestamp is not None:
+        return source.frame.timestamp
+    return math.nan if source.metadata.timestamp is None else source.metadata.timestamp
+
+
+def _by_number(sources: Sequence[Source], times: Sequence[float], file: str | Path) -> FloatArray:
+    """One time for each picture in order, or for each frame of the video that pictures were taken from."""
+    numbers = [source.number(position) for position, source in enumerate(sources)]
+    if max(numbers) >= len(times):
+        raise InputError(f"{file}: has {len(times)} times, but picture or frame {max(numbers)} (from 0) needs one")
+    return np.array([times[number] for number in numbers])
+
+
+def _by_name(lines: Sequence[str], file: str | Path) -> dict[str, float]:
+    if lines and all(name in lines[0] for name in _TIME_COLUMNS):
+        rows = [(row["timestamp"], row["name"]) for row in csv.DictReader(lines, skipinitialspace=True)]
+    else:
+        rows = [(line.split(maxsplit=1)[0], line.split(maxsplit=1)[-1]) for line in lines]
+    times: dict[str, float] = {}
+    for time, name in rows:
+        if not name or not _is_number(time):
+            raise InputError(f"{file}: expected a time and a name in each line, found {time!r} and {name!r}")
+        times[Path(name).name] = float(time)
+    return times
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False

@@ -1,0 +1,212 @@
+"""The pairs: over the outlines of the pictures, the best and the worst one, and what the model leaves over."""
+
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from rdstitch.alignment.result import LinkFit
+from rdstitch.arrays import FloatArray
+from rdstitch.registration import Registration
+from rdstitch.report.geometry import footprint, middle, of_source, pairs_of, residuals
+from rdstitch.report.svg import BLUE, GREEN, GREY, RED, counted, drawing, element, fit_into, label, path, section
+
+_GRAPH_SIDE, _GRAPH_MARGIN = 900.0, 20.0
+_LINE_HEIGHT = 11.0  # height of a name
+
+
+def match_graph(registration: Registration) -> str:
+    """Outlines of all pictures, and a line for each pair: thick where there are many matches, red where errors are."""
+    alignment = registration.alignment
+    used = np.flatnonzero(alignment.used)
+    outlines = {int(k): footprint(registration, int(k)) for k in used}
+    centers = {int(k): middle(registration, int(k)) for k in used}
+    shift, scale, (width, height) = fit_into(np.concatenate(list(outlines.values())), _GRAPH_SIDE, _GRAPH_MARGIN)
+    parts = [
+        path((outline + shift) * scale, closed=True, stroke=BLUE, fill=BLUE, fill_opacity=0.05, stroke_opacity=0.5)
+        for outline in outlines.values()
+    ]
+    links = [fit for fit in alignment.links if fit.used]
+    for fit in sorted(links, key=lambda fit: fit.rms):
+        (x1, y1), (x2, y2) = ((centers[k] + shift) * scale for k in (fit.image1, fit.image2))
+        share = float(np.nan_to_num(np.clip(fit.rms / alignment.rms - 0.75, 0.0, 1.0)))
+        names = " and ".join(registration.sources[k].name for k in (fit.image1, fit.image2))
+        parts.append(
+            element(
+                "line",
+                element("title", f"{escape(names)}: {fit.inliers} of {fit.count} matches, {fit.rms:.2f} pixels"),
+                x1=float(x1),
+                y1=float(y1),
+                x2=float(x2),
+                y2=float(y2),
+                stroke=_mixed(share),
+                stroke_width=float(np.clip(np.log10(fit.inliers + 1.0), 0.5, 4.0)),
+            )
+        )
+    named: list[tuple[float, float, float]] = []  # left, baseline, width
+    for index, center in centers.items():
+        x, y = (center + shift) * scale
+        fill = RED if index == alignment.reference else GREY
+        parts.append(element("circle", cx=float(x), cy=float(y), r=4, fill=fill))
+        name = registration.sources[index].name
+        # A name that would lie on another one is left out; the picture's own line has it as its title.
+        box = (float(x) + 6, float(y) - 6, 5.6 * len(name))
+        if not any(_overlap(box, other) for other in named):
+            named.append(box)
+            parts.append(label(box[0], box[1], name, font_size=10))
+    return section(
+        "Match graph",
+        f"{counted(len(links), 'pair')} over the outlines of {counted(len(used), 'picture')}. Thicker lines have more "
+        "matches; green ones "
+        "fit well into the whole, red ones badly. The red dot is the reference picture.",
+        drawing(width, height, parts, "match graph"),
+    )
+
+
+def _overlap(first: tuple[float, float, float], second: tuple[float, float, float]) -> bool:
+    """Whether two names (left, baseline, width) lie on one another."""
+    apart = first[0] > second[0] + second[2] or second[0] > first[0] + first[2]
+    return not apart and abs(first[1] - second[1]) <= _LINE_HEIGHT
+
+
+def _mixed(share: float) -> str:
+    """From green at 0 to red at 1."""
+    low, high = ([int(colour[k : k + 2], 16) for k in (1, 3, 5)] for colour in (GREEN, RED))
+    return "#" + "".join(f"{round(a + share * (b - a)):02x}" for a, b in zip(low, high, strict=True))
+
+
+_PICTURE_WIDTH, _PICTURE_GAP = 440.0, 10.0
+_MAX_LINES = 150
+_FADED = 0.6  # opacity of the pictures, so that lines can be seen on them
+
+
+def matched(registration: Registration) -> str:
+    """The used pairs with the smallest and the largest error; the best one is among those with many matches."""
+    links = sorted((fit for fit in registration.alignment.links if fit.used), key=lambda fit: fit.rms)
+    if not links:
+        return section("Matches", "No pair was used.")
+    # A few matches fit anything.
+    usual = np.median([fit.inliers for fit in links])
+    best = next(fit for fit in links if fit.inliers >= usual)
+    others = [fit for fit in links if fit is not best]
+    shown = {"Best pair": best, "Worst pair": others[-1]} if others else {"The pair": best}
+    return section(
+        "Matches",
+        f"Inliers are green, matches that were taken for wrong red; at most {_MAX_LINES} of each are drawn.",
+        *(_pair(registration, title, fit) for title, fit in shown.items()),
+    )
+
+
+def _pair(registration: Registration, title: str, fit: LinkFit) -> str:
+    pair = pairs_of(registration)[fit.image1, fit.image2]
+    sources = [registration.sources[k] for k in (fit.image1, fit.image2)]
+    sizes = [registration.alignment.cameras[k].image_size for k in (fit.image1, fit.image2)]
+    scales = [_PICTURE_WIDTH / width for width, _ in sizes]
+    lefts = [0.0, _PICTURE_WIDTH + _PICTURE_GAP]
+    parts = []
+    for source, (_, height), scale, left in zip(sources, sizes, scales, lefts, strict=True):
+        place: dict[str, Any] = {"x": left, "width": _PICTURE_WIDTH, "height": height * scale}
+        picture = of_source(source, int(_PICTURE_WIDTH))
+        parts.append(
+            element("rect", fill="#ddd", **place)
+            if picture is None
+            else element("image", href=picture, opacity=_FADED, **place)
+        )
+    ends = [
+        (points + 0.5) * scale + (left, 0.0)
+        for points, scale, left in zip(
+            (pair.correspondences.points1, pair.correspondences.points2), scales, lefts, strict=True
+        )
+    ]
+    inliers = pair.relation.inliers
+    parts += _match_lines(ends[0][~inliers], ends[1][~inliers], RED, 0.25)
+    parts += _match_lines(ends[0][inliers], ends[1][inliers], GREEN, 0.6)
+    tall = max(height * scale for (_, height), scale in zip(sizes, scales, strict=True))
+    names = " and ".join(source.name for source in sources)
+    agree = f"{fit.inliers} of {int(inliers.sum())} inliers agree with the whole, rms {fit.rms:.2f} pixels"
+    text = f"{title}: {names}; {agree}"
+    return element("h3", escape(text)) + drawing(2 * _PICTURE_WIDTH + _PICTURE_GAP, tall, parts, text)
+
+
+def _match_lines(starts: FloatArray, stops: FloatArray, colour: str, opacity: float) -> list[str]:
+    """Lines between points, spread evenly over the matches where there are too many."""
+    chosen = np.unique(np.linspace(0, max(len(starts) - 1, 0), min(len(starts), _MAX_LINES)).astype(int))
+    return [
+        element(
+            "line",
+            x1=float(a[0]),
+            y1=float(a[1]),
+            x2=float(b[0]),
+            y2=float(b[1]),
+            stroke=colour,
+            stroke_opacity=opacity,
+        )
+        for a, b in zip(starts[chosen], stops[chosen], strict=True)
+    ]
+
+
+_MAP_WIDTH, _COLUMNS = 640.0, 16
+_MIN_MATCHES = 4  # matches in a cell that make a mean
+_ARROW = 0.9  # of a cell's width, for the largest mean
+
+
+def residual_map(registration: Registration) -> str:
+    """Errors of all pairs over the area of the picture: rms as grey, mean as an arrow."""
+    alignment = registration.alignment
+    found = [residuals(registration, fit) for fit in alignment.links if fit.used and fit.rms > 0.0]
+    cameras = [alignment.cameras[fit.image2] for fit in alignment.links if fit.used and fit.rms > 0.0]
+    if not found:
+        return section("Residuals", "There are none.")
+    # Pictures of several sizes are laid over one another.
+    places = np.concatenate([(p + 0.5) / camera.image_size for (p, _), camera in zip(found, cameras, strict=True)])
+    off = np.concatenate([residual for _, residual in found])
+    width, height = registration.camera.image_size
+    rows = max(1, round(_COLUMNS * height / width))
+    cell = np.clip((places * (_COLUMNS, rows)).astype(int), 0, (_COLUMNS - 1, rows - 1)) @ (1, _COLUMNS)
+    cells = _COLUMNS * rows
+    count = np.bincount(cell, minlength=cells)
+    mean = np.stack([np.bincount(cell, off[:, k], cells) for k in (0, 1)], axis=1) / np.maximum(count, 1)[:, None]
+    rms = np.sqrt(np.bincount(cell, (off**2).sum(axis=1), cells) / np.maximum(count, 1))
+    enough = count >= _MIN_MATCHES
+    if not enough.any():
+        return section("Residuals", f"There are too few matches ({len(off)}) to draw them over the picture.")
+    side, darkest = _MAP_WIDTH / _COLUMNS, float(rms[enough].max())
+    longest = max(float(np.linalg.norm(mean[enough], axis=1).max()), 1e-9)
+    parts = [
+        '<defs><marker id="residual" markerWidth="5" markerHeight="5" refX="3" refY="2.5" orient="auto">'
+        f'<path d="M0,0 L5,2.5 L0,5 z" fill="{RED}"/></marker></defs>'
+    ]
+    for index in np.flatnonzero(enough):
+        y, x = divmod(int(index), _COLUMNS)
+        shade = 255 - round(150 * rms[index] / max(darkest, 1e-9))
+        tip = mean[index] / longest * _ARROW * side
+        title = f"{count[index]} matches, rms {rms[index]:.2f} pixels, mean {np.linalg.norm(mean[index]):.2f} pixels"
+        box = {"x": x * side, "y": y * side, "width": side, "height": side}
+        parts.append(element("rect", element("title", title), fill=f"rgb({shade},{shade},{shade})", **box))
+        start = np.array([(x + 0.5) * side, (y + 0.5) * side])
+        parts.append(
+            element(
+                "line",
+                x1=float(start[0] - tip[0] / 2),
+                y1=float(start[1] - tip[1] / 2),
+                x2=float(start[0] + tip[0] / 2),
+                y2=float(start[1] + tip[1] / 2),
+                stroke=RED,
+                stroke_width=1.5,
+                marker_end="url(#residual)",
+            )
+        )
+    tall = rows * side
+    parts.append(
+        label(
+            0.0,
+            tall + 16,
+            f"darkest cell: rms {darkest:.2f} pixels; longest arrow: mean of {longest:.2f} pixels in that direction",
+        )
+    )
+    return section(
+        "Residuals",
+        f"{len(off)} inliers of all pairs over the area of the picture. Arrows that follow a pattern tell of something "
+        "that the model does not describe: relief, a rolling shutter, a lens that one λ is not enough for.",
+        drawing(_MAP_WIDTH, tall + 22, parts, "residuals over the picture"),
+    )
