@@ -1,7 +1,7 @@
 """What a user should know of a result, as one type: what it is, which pictures it concerns, and how grave it is."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -23,7 +23,8 @@ class Message:
         Paths of the pictures that it concerns; empty where it concerns all of them.
     severity : str
         "note": how the result was made. "warning": there is a result, to be looked at. "left out": the one picture
-        named is not in the result, for the reason that the text gives. "failure": the result cannot be relied on.
+        named, or each of several, is not in the result, for the reason that the text gives. "failure": the result
+        cannot be relied on.
     code : str
         Heading in docs/troubleshooting.md; empty where the text says it all.
     """
@@ -37,7 +38,7 @@ class Message:
         """The line for standard error."""
         code = f" [{self.code}]" if self.code else ""
         if self.severity == "left out":
-            return f"left out {self.images[0]}: {self.text}{code}"
+            return f"left out {_listed(self.images)}: {self.text}{code}"
         return f"not reliable: {self.clause}{code}" if self.severity == "failure" else f"{self.clause}{code}"
 
     @property
@@ -55,6 +56,15 @@ def left_out(path: str | Path, reason: str) -> Message:
     return Message(reason.removeprefix(f"{path}: "), (str(path),), "left out", "left-out")
 
 
+def told_once(messages: Iterable[Message]) -> list[Message]:
+    """The same; pictures that were left out for the same reason are named in one, which stands where the first did."""
+    told: dict[object, Message] = {}
+    for number, message in enumerate(messages):
+        key = message.text if message.severity == "left out" else number
+        told[key] = replace(message, images=told[key].images + message.images) if key in told else message
+    return list(told.values())
+
+
 def of_severity(messages: Iterable[Message], *severities: Severity) -> tuple[Message, ...]:
     """The messages that are so grave, in their order."""
     return tuple(message for message in messages if message.severity in severities)
@@ -68,3 +78,10 @@ def names_of(paths: Iterable[str]) -> list[str]:
 def shortened(names: Sequence[str], most: int = MAX_NAMED) -> str:
     """Names, or the first of them where they are many."""
     return ", ".join(names[:most]) + ", …" * (len(names) > most)
+
+
+def _listed(paths: Sequence[str]) -> str:
+    """All of them; the folder is named where it changes."""
+    folders = [None, *(Path(path).parent for path in paths)]
+    named = zip(paths, names_of(paths), folders[:-1], folders[1:], strict=True)
+    return ", ".join(name if own == before else path for path, name, before, own in named)

@@ -207,8 +207,10 @@ def report_registration(registration: "Registration", reporter: Reporter, *, as_
 
 def warn_of(registration: "Registration", reporter: Reporter) -> None:
     """What the user must know of a registration."""
+    from rdstitch.messages import told_once
+
     alignment = registration.alignment
-    for message in (*registration.failures, *registration.warnings, *registration.left_out):
+    for message in told_once((*registration.failures, *registration.warnings, *registration.left_out)):
         reporter.warn(str(message))
     for message in registration.notes:
         reporter.note(str(message))

@@ -119,9 +119,22 @@ def _open_triangles(apart: BundleAdjustmentResult, observations: Observations, c
         return result
     middle = np.nanmedian(normalized[seen], axis=1)
     absolute = np.nanmedian(np.where(visible, size, np.nan)[seen], axis=1)
-    usual = max(1.0, float(np.quantile(middle, 0.25)))
+    usual = max(1.0, _usual_misclosure(middle, corners[seen], observations))
     result[seen] = (middle > 8.0 * usual) & (absolute > _MIN_ERROR)
     return result
+
+
+def _usual_misclosure(misclosure: FloatArray, corners: IntArray, observations: Observations) -> float:
+    """The lower quartile of the triangles (T,) with a link, as half of the matches have it.
+
+    Not that of all triangles: each wrong link between pictures far apart opens many.
+    """
+    links = corners.ravel()
+    counts = np.bincount(links, minlength=len(observations))
+    values = np.repeat(misclosure, 3)
+    ordered = np.append(values[np.lexsort((values, links))], np.inf)
+    quartile = ordered[np.cumsum(counts) - counts + np.maximum(counts - 1, 0) // 4]
+    return _weighted_median(quartile, np.where(counts > 0, observations.matches, 0))
 
 
 def _probes(observations: Observations, link: int, backward: bool) -> FloatArray:
@@ -149,7 +162,8 @@ def _oriented(apart: BundleAdjustmentResult, backward: BoolArray) -> tuple[Float
 def misfitting_links(squared: FloatArray, observations: Observations) -> BoolArray:
     """Links whose errors after the adjustment are far beyond those of the others, shape (L,).
 
-    A model that is too rigid leaves larger errors in all links; a wrong pair stands out.
+    A model that is too rigid leaves larger errors in all links; a wrong pair stands out. What is usual is what half of
+    the matches have, not half of the links: many pairs far apart may show a vehicle only, with few matches each.
 
     Parameters
     ----------
@@ -157,8 +171,7 @@ def misfitting_links(squared: FloatArray, observations: Observations) -> BoolArr
         ``|r|²``, px².
     """
     typical = link_medians(squared, observations)
-    finite = typical[np.isfinite(typical)]
-    usual = float(np.median(finite)) if len(finite) else 0.0
+    usual = _weighted_median(typical, np.where(np.isfinite(typical), observations.matches, 0))
     least = _MIN_ERROR * np.sqrt(observations.scale1 * observations.scale2)
     outlying: BoolArray = ~(typical <= np.maximum(8.0 * usual, least))
     return outlying
@@ -167,3 +180,10 @@ def misfitting_links(squared: FloatArray, observations: Observations) -> BoolArr
 def link_medians(squared: FloatArray, observations: Observations) -> FloatArray:
     """Median length of the errors of each link, pixels, shape (L,)."""
     return observations.medians(np.sqrt(squared))
+
+
+def _weighted_median(values: FloatArray, weights: IntArray) -> float:
+    """The smallest of the values (L,) up to which half of the weights lie; 0 where all weights are."""
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order[np.searchsorted(total, total[-1] / 2.0)]]) if total[-1] > 0 else 0.0

@@ -20,17 +20,17 @@ def explain_unaligned(alignment: Alignment, paths: Sequence[str]) -> list[Messag
         if not fit.used and fit.reason == CONTRADICTS:
             contradicting.setdefault(fit.image1, []).append(fit.image2)
             contradicting.setdefault(fit.image2, []).append(fit.image1)
-    aligned = int(alignment.used.sum())
-    group_of = {picture: group for group in alignment.components for picture in group}
+    blocks = [group for group in alignment.components if len(group) > 1]
+    block_of = {picture: number for number, block in enumerate(blocks) for picture in block}
     messages = []
     for picture, path in enumerate(paths):
         if alignment.used[picture]:
             continue
-        size = len(group_of[picture])
-        if size > 1:
+        if picture in block_of:
+            number, size = block_of[picture], len(blocks[block_of[picture]])
             reason = (
-                f"one of {size} pictures that overlap with none of the {aligned} aligned ones; "
-                "add pictures between them, or stitch them on their own"
+                f"in block {number + 1} of {len(blocks)}, whose {size} pictures overlap with none of the others; "
+                "stitch them on their own, or add pictures between the blocks"
             )
         elif picture in contradicting:
             others = ", ".join(names_of(paths[other] for other in sorted(contradicting[picture])))

@@ -11,7 +11,7 @@ from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.cache import Cache
 from rdstitch.errors import PartialResultError, RegistrationError
-from rdstitch.messages import Message, left_out, names_of
+from rdstitch.messages import Message, left_out, names_of, told_once
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner, impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_full_size
@@ -93,7 +93,7 @@ def accept(
     if not accepted.ok and not options.force:
         raise RefusedError(at_full_size(first))
     if options.strict and accepted.left_out:
-        raise PartialResultError("; ".join(map(str, accepted.left_out)))
+        raise PartialResultError("; ".join(map(str, told_once(accepted.left_out))))
     return accepted
 
 

@@ -20,7 +20,7 @@ from rdstitch.io.atomic import check_output, json_bytes
 from rdstitch.io.decoding import check_readable
 from rdstitch.io.outputs import Outputs
 from rdstitch.local_alignment import DisplacementField
-from rdstitch.messages import Message
+from rdstitch.messages import Message, told_once
 from rdstitch.messages import left_out as left_out_message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.compose import compose_pictures, plainly_viewed, write_page
@@ -161,7 +161,7 @@ def _used(
 ) -> dict[int, Source]:
     """The pictures of the output, with their masks, by their number in the registration; at least one, or all."""
     if strict and left_out:
-        raise PartialResultError("; ".join(map(str, left_out.values())))
+        raise PartialResultError("; ".join(map(str, told_once(left_out.values()))))
     used = {index: source for index, source in enumerate(sources) if source is not None}
     if not used:
         first = next(iter(left_out.values()))

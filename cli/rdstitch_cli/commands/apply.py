@@ -66,6 +66,7 @@ def apply(
     another band of the same flight, the originals of reduced pictures, masks. They may have another size of the same
     shape. Compositing options that are not given are those of the sidecar.
     """
+    from rdstitch.messages import told_once
     from rdstitch.pipeline import apply as recipe
     from rdstitch.sidecar.read import read_sidecar
 
@@ -86,7 +87,7 @@ def apply(
             progress=reporter,
         )
         reporter.finish()
-        for missing in result.left_out.values():
+        for missing in told_once(result.left_out.values()):
             reporter.warn(str(missing))
         if result.matched == "order" and match == "auto":
             reporter.warn("no picture has a name of the sidecar; they were taken in order")

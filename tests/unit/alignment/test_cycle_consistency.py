@@ -4,14 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from rdstitch.alignment.bundle_adjustment import Priors
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links, triangles
 from rdstitch.alignment.initialization import adjust_pairs_independently, relations_at
-from rdstitch.alignment.motion_models import HOMOGRAPHY
+from rdstitch.alignment.motion_models import HOMOGRAPHY, Y
 from rdstitch.alignment.observations import Observations
+from rdstitch.arrays import BoolArray
 from rdstitch.camera import LENS_PARAMETERS
-from tests.alignment_scenes import grid, scene
+from rdstitch.matching.links import Link
+from tests.alignment_scenes import Scene, grid, scene
 
 
 def test_triangles_of_a_complete_graph() -> None:
@@ -43,6 +46,9 @@ def test_a_link_far_worse_than_the_others_misfits() -> None:
     assert misfitting_links(errors.ravel() ** 2, seen).tolist() == [False, False, False, True, False, True]
     errors[:] = 6.0  # all alike: too rigid a model, not wrong pairs
     assert not misfitting_links(errors.ravel() ** 2, seen).any()
+    errors[:] = [[0.5], [0.5], [90.0], [90.0], [90.0], [90.0]]  # most pairs, not most matches
+    few = replace(seen, matches=np.array([200, 200, 50, 50, 50, 50]))
+    assert misfitting_links(errors.ravel() ** 2, few).tolist() == [False, False, True, True, True, True]
 
 
 @pytest.mark.parametrize(
@@ -63,6 +69,27 @@ def test_a_link_is_suspected_by_what_its_covariance_allows(shift: float, noise: 
     link = given.links[wrong]
     moved = link.points2 + shift * given.cameras[0].half_diagonal * np.array([0.6, 0.8])
     links = [replace(link, points2=moved) if k == wrong else other for k, other in enumerate(given.links)]
+    suspects, confirmed = _judged(given, links)
+    assert np.flatnonzero(suspects).tolist() == [wrong] * suspected
+    assert (np.delete(confirmed, wrong) > 0).all()
+
+
+def test_pairs_that_show_a_vehicle_only_are_suspected_though_they_open_most_triangles() -> None:
+    """Six pictures in a row; those far apart have only in common what drives ahead."""
+    rng = np.random.default_rng(12)
+    path = grid(6, 1, (0.45, 0.0), 0.1, rng)
+    swaying = 0.15 * path + rng.normal(0.0, 0.04, path.shape) * (np.arange(6) == Y)
+    plane, ahead = scene(path, per_link=200, rng=rng), scene(swaying, per_link=50, rng=rng)
+    near = {(0, 1), (0, 2), (1, 2), (1, 3), (2, 3), (3, 4), (3, 5), (4, 5)}
+    links = [link for link in plane.links if (link.image1, link.image2) in near]
+    links += [link for link in ahead.links if (link.image1, link.image2) not in near]
+    suspects, _ = _judged(plane, links)
+    assert not suspects[:8].any()
+    assert suspects[8:].sum() >= 5  # of seven; then no triangle is left
+
+
+def _judged(given: Scene, links: list[Link]) -> tuple[BoolArray, NDArray[np.intp]]:
+    """What :func:`cycle_consistency` says of links between the pictures of a scene."""
     observations = Observations.from_links(links, given.cameras)
     lens = np.zeros(len(LENS_PARAMETERS))
     lens[0] = given.distortion
@@ -76,6 +103,4 @@ def test_a_link_is_suspected_by_what_its_covariance_allows(shift: float, noise: 
         Priors.none(HOMOGRAPHY, 0),
         np.zeros((9, 2)),
     )
-    suspects, confirmed = cycle_consistency(apart, observations, 9)
-    assert np.flatnonzero(suspects).tolist() == [wrong] * suspected
-    assert (np.delete(confirmed, wrong) > 0).all()
+    return cycle_consistency(apart, observations, len(given.cameras))
