@@ -13,14 +13,19 @@ from rdstitch.cache import Cache
 from rdstitch.errors import PartialResultError, RegistrationError
 from rdstitch.messages import Message, left_out, names_of, told_once
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.aligner import Aligner, impossible_estimates_fail
+from rdstitch.pipeline.aligner import AlignedPairs, Aligner, impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.registration import Registration
+from rdstitch.verification.overlap_check import check_overlaps, share_alike
+from rdstitch.verification.rival_motion import find_rival_motions, pairs_of_rivals
 from rdstitch.verification.verdict import RefusedError, judge
 
 _MAX_SCALE_UNCERTAINTY = 0.05  # share that lengths may be off by, as far as the focal length is, without a word
 _MAX_ROUNDS = 20
 """Times that something is left out; each takes one adjustment."""
+
+_CLEARLY = 1.5
+"""How many times as much of the overlaps must look alike by one motion as by another one."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,12 @@ def accept(
     if not first.ok and not options.force:
         aligner = Aligner.of(registration.sources, options, cache)
         left = _Offenders({}, {})
+        if any(message.severity == "failure" and message.code == "rival-motion" for message in found):
+            larger = _larger_motion(registration, options.threshold, aligner, executor)
+            if larger is not None:
+                checked = partial(checked, larger=True)
+                registration = current = larger
+                found = checked(larger)
         for _ in range(_MAX_ROUNDS):
             if current.with_messages(found).ok:
                 break
@@ -95,6 +106,26 @@ def accept(
     if options.strict and accepted.left_out:
         raise PartialResultError("; ".join(map(str, told_once(accepted.left_out))))
     return accepted
+
+
+def _larger_motion(
+    registration: Registration, threshold: float, aligner: Aligner, executor: Executor
+) -> Registration | None:
+    """Of two motions in the pictures that which fills clearly more of the overlaps; None where neither does."""
+    if registration.static_background:
+        return None
+    rivals = find_rival_motions(registration.alignment, registration.pairs, threshold)
+    try:
+        aligned = aligner.align(pairs_of_rivals(registration.pairs, rivals))
+    except RegistrationError:
+        return None
+    other = _aligned_anew(replace(registration, pairs=aligned.pairs), aligned, aligner.paths, {})
+    both = (registration, other)
+    own, others = (share_alike(check_overlaps(motion, executor, aligner.cache)) for motion in both)
+    most = 2 * aligned.alignment.used.sum() > len(registration.sources)
+    if others >= _CLEARLY * own and most:
+        return other
+    return registration if own >= _CLEARLY * others else None
 
 
 def _concerns_all(found: Iterable[Message]) -> bool:
@@ -161,15 +192,24 @@ def _without(registration: Registration, offenders: _Offenders, aligner: Aligner
     for picture, others in _held_by(registration, offenders).items():
         named_others = ", ".join(names_of(aligner.paths[k] for k in sorted(others)))
         reasons.setdefault(picture, Message(f"hangs on {named_others}, which was left out; add pictures around it"))
+    return _aligned_anew(registration, aligned, aligner.paths, reasons)
+
+
+def _aligned_anew(
+    registration: Registration, aligned: AlignedPairs, paths: Sequence[str], reasons: Mapping[int, Message]
+) -> Registration:
+    """The registration with another alignment, and why pictures are not in it."""
     known = {message.images: message for message in registration.left_out}
-    explained = zip(np.flatnonzero(~used).tolist(), explain_unaligned(aligned.alignment, aligner.paths), strict=True)
+    unaligned = np.flatnonzero(~aligned.alignment.used).tolist()
+    explained = zip(unaligned, explain_unaligned(aligned.alignment, paths), strict=True)
     unused = [
-        known.get(message.images, left_out(aligner.paths[k], reasons[k].text) if k in reasons else message)
+        known.get(message.images, left_out(paths[k], reasons[k].text) if k in reasons else message)
         for k, message in explained
     ]
     dropped = (*registration.alignment.messages, *registration.left_out)
     whole = [message for message in registration.messages if message not in dropped]
-    return replace(registration, alignment=aligned.alignment, messages=(*aligned.alignment.messages, *whole, *unused))
+    messages = (*aligned.alignment.messages, *whole, *unused)
+    return replace(registration, alignment=aligned.alignment, messages=messages)
 
 
 def scale_uncertainty(alignment: Alignment) -> list[Message]:

@@ -6,7 +6,7 @@ between two motions is the area that they cover, not the number of their matches
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import Camera
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.messages import Message, names_of
+from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust import estimate_radial_homography
 
 _MIN_MATCHES = 12
@@ -34,9 +35,12 @@ _MIN_SHARE = 0.1
 (``python -m tests.benchmarks.trust --kind vehicle``)."""
 
 _CONTESTED_SHARE = 0.45
-"""From here on nobody can say which of the two motions is the plane's."""
+"""From here on nobody can say which of the two motions is the plane's, unless the pixels do."""
 
-_MIN_AGREEMENT = 0.4
+_CLEAR_AGREEMENT = 0.55
+"""Share of the overlaps from which on what looks alike there is the larger part: matches are where texture is."""
+
+MIN_AGREEMENT = 0.4
 """Share of the overlaps that must look alike where there is a rival. The plane fills what two pictures share of it, but
 for the rival: 0.5 to 0.9 in the same sets, where a vehicle was registered instead 0.15 to 0.29."""
 
@@ -57,6 +61,8 @@ class RivalMotion:
         Median place of the rival's inliers in ``image1``, pixels.
     disagreement : float
         Median distance of the rival's inliers from where the alignment expects them, pixels.
+    relation : RadialHomography, optional
+        How the rival moves, of all matches of the pair; None where there is no rival.
     """
 
     image1: int
@@ -65,6 +71,7 @@ class RivalMotion:
     plane_area: int
     center: tuple[float, float]
     disagreement: float
+    relation: RadialHomography | None = None
 
     @property
     def share(self) -> float:
@@ -104,8 +111,38 @@ def rival_share(rivals: Sequence[RivalMotion]) -> float:
     return sum(rival.area for rival in rivals) / max(total, 1)
 
 
+def pairs_of_rivals(pairs: Sequence[PairRegistration], rivals: Sequence[RivalMotion]) -> list[PairRegistration]:
+    """The pairs as the rivals move; those that contradicted the alignment stay, and those without a rival say nothing.
+
+    Parameters
+    ----------
+    pairs : sequence of PairRegistration
+    rivals : sequence of RivalMotion
+        What :func:`find_rival_motions` found in them.
+    """
+    found = {(rival.image1, rival.image2): rival.relation for rival in rivals}
+    result = []
+    for pair in pairs:
+        own = pair.relation
+        relation = found.get((pair.image1, pair.image2), own)
+        if relation is None:
+            relation = RadialHomography.failed("nothing moves otherwise", own.camera, own.camera2, len(own.inliers))
+        result.append(replace(pair, relation=relation))
+    return result
+
+
+def is_rival(rivals: Sequence[RivalMotion]) -> bool:
+    """Whether something that covers a good part of the pictures moves otherwise."""
+    return rival_share(rivals) >= _MIN_SHARE
+
+
 def rival_messages(
-    paths: Sequence[str], rivals: Sequence[RivalMotion], agreement: float, *, lens_only: bool = False
+    paths: Sequence[str],
+    rivals: Sequence[RivalMotion],
+    agreement: float,
+    *,
+    lens_only: bool = False,
+    larger: bool = False,
 ) -> list[Message]:
     """What to say of the rivals: nothing where they cover little, a failure where they may be the plane.
 
@@ -118,10 +155,12 @@ def rival_messages(
         Share of the overlaps, [0, 1], that looks alike where the alignment puts the pictures; NaN where unknown.
     lens_only : bool
         Only the lens is wanted, which both motions show.
+    larger : bool
+        Whether the rival was registered, too, and found to be the smaller one.
     """
-    share = rival_share(rivals)
-    if share < _MIN_SHARE:
+    if not is_rival(rivals):
         return []
+    share = rival_share(rivals)
     worst = max(rivals, key=lambda rival: rival.area)
     images = (paths[worst.image1], paths[worst.image2])
     first, second = names_of(images)
@@ -130,8 +169,11 @@ def rival_messages(
         f"{share:.0%} of what the pictures have in common moves otherwise than the rest, most of it around "
         f"({u:.0f}, {v:.0f}) of {first} when compared with {second}, by {worst.disagreement:.0f} pixels"
     )
-    if lens_only or (share < _CONTESTED_SHARE and not agreement < _MIN_AGREEMENT):
-        return [Message(f"{what} (a vehicle, a second plane?); a mask keeps it out", images, code="rival-motion")]
+    decided = larger or share < _CONTESTED_SHARE
+    clear = agreement >= _CLEAR_AGREEMENT or (decided and not agreement < MIN_AGREEMENT)
+    if lens_only or clear:
+        more = f"; what was stitched fills {agreement:.0%} of the overlaps" if share >= _CONTESTED_SHARE else ""
+        return [Message(f"{what} (a vehicle, a second plane?){more}; a mask keeps it out", images, code="rival-motion")]
     # It concerns all pictures: without the one that shows it best, the rival would only be harder to see.
     shown = sorted({k for rival in rivals for k in (rival.image1, rival.image2)})
     text = f"{what}, and it is not clear which of the two is the plane; mask what does not belong to it"
@@ -167,7 +209,8 @@ def _rival(alignment: Alignment, pair: PairRegistration, threshold: float, seed:
         return nothing
     area = _cells(matched.points1[inliers], camera) - plane
     u, v = np.median(matched.points1[inliers], axis=0).tolist()
-    return RivalMotion(pair.image1, pair.image2, len(area), len(plane), (u, v), disagreement)
+    relation = replace(found, inliers=np.isin(np.arange(len(error)), inliers))
+    return RivalMotion(pair.image1, pair.image2, len(area), len(plane), (u, v), disagreement, relation)
 
 
 def _agreeing(alignment: Alignment, pair: PairRegistration, threshold: float) -> BoolArray:

@@ -17,7 +17,7 @@ from rdstitch.registration import Registration
 from rdstitch.verification.input_doubts import doubtful_inputs
 from rdstitch.verification.overlap_check import CheckedLink, check_overlaps, share_alike
 from rdstitch.verification.parallax import find_parallax, parallax_messages
-from rdstitch.verification.rival_motion import find_rival_motions, rival_messages
+from rdstitch.verification.rival_motion import MIN_AGREEMENT, find_rival_motions, is_rival, rival_messages
 
 Pair = tuple[int, int]
 
@@ -57,6 +57,7 @@ def judge(
     cache: Cache = NO_CACHE,
     *,
     lens_only: bool = False,
+    larger: bool = False,
 ) -> tuple[Message, ...]:
     """Check an alignment against the pairs that it was made from, and against the pixels.
 
@@ -74,6 +75,8 @@ def judge(
     cache : Cache
     lens_only : bool
         Only the lens is wanted, so that doubts about the places of pictures do not make the result fail.
+    larger : bool
+        Whether what moves otherwise was registered, too, and found to be the smaller one.
 
     Returns
     -------
@@ -98,7 +101,9 @@ def judge(
     ambiguous = _ambiguous(paths, checked)
     rivals = find_rival_motions(alignment, registration.pairs, threshold)
     parallax = find_parallax(alignment, registration.pairs) if alignment.on_sphere else []
-    suspicions = {**disagreeing, **_unlike(paths, checked), **ambiguous}
+    # What two pictures share of a plane looks alike; where something else moves, it may be that which holds them.
+    least = MIN_AGREEMENT if is_rival(rivals) else _MIN_AGREEMENT
+    suspicions = {**disagreeing, **_unlike(paths, checked, least), **ambiguous}
     decisive = [] if lens_only or resting else _decisive(suspicions, used, len(paths))
     return (
         *_error_of_the_whole(alignment, threshold, checked),
@@ -107,8 +112,8 @@ def judge(
         *([] if lens_only else _pattern(ambiguous, checked)),
         *(suspicions[pair] for pair in decisive),
         *_outvoted(paths, [pair for pair in suspicions if pair not in decisive], ambiguous),
-        *([] if parallax else rival_messages(paths, rivals, share_alike(checked), lens_only=lens_only)),
-        *_little_alike(paths, checked),
+        *([] if parallax else rival_messages(paths, rivals, share_alike(checked), lens_only=lens_only, larger=larger)),
+        *_little_alike(paths, [link for link in checked if link.pair not in suspicions]),
         *([] if lens_only else _settled(paths, checked)),
         *doubtful_inputs(registration.sources),
     )
@@ -256,7 +261,7 @@ def _disagreeing(paths: Sequence[str], used: Sequence[LinkFit]) -> dict[Pair, Me
     }
 
 
-def _unlike(paths: Sequence[str], checked: Sequence[CheckedLink]) -> dict[Pair, Message]:
+def _unlike(paths: Sequence[str], checked: Sequence[CheckedLink], least: float) -> dict[Pair, Message]:
     """Pictures that were put together and do not look alike there."""
     return {
         link.pair: _of_pair(
@@ -266,7 +271,7 @@ def _unlike(paths: Sequence[str], checked: Sequence[CheckedLink]) -> dict[Pair, 
             "places agree)",
         )
         for link in checked
-        if link.agreement.cells >= _MIN_CELLS and link.agreement.share < _MIN_AGREEMENT
+        if link.agreement.cells >= _MIN_CELLS and link.agreement.share < least
     }
 
 
@@ -310,5 +315,5 @@ def _little_alike(paths: Sequence[str], checked: Sequence[CheckedLink]) -> list[
             "warning",
         )
         for link in checked
-        if link.agreement.cells >= _MIN_CELLS and _MIN_AGREEMENT <= link.agreement.share < _DOUBTFUL_AGREEMENT
+        if link.agreement.cells >= _MIN_CELLS and link.agreement.share < _DOUBTFUL_AGREEMENT
     ]

@@ -3,18 +3,26 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rdstitch.cache import NO_CACHE
 from rdstitch.executors import open_executor
 from rdstitch.features import FeatureOptions
-from rdstitch.inputs.source import read_sources
+from rdstitch.inputs.source import Source, read_sources
+from rdstitch.io import write_image
 from rdstitch.messages import Message, Severity, left_out
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.accept import _concerns_all, _Offenders, _without
+from rdstitch.pipeline.accept import _concerns_all, _Offenders, _without, accept
 from rdstitch.pipeline.aligner import Aligner
 from rdstitch.pipeline.register import register
 from tests.cli.running import flight
+
+OPTIONS = StitchOptions(workers=1, features=FeatureOptions(max_features=600))
+
+
+def _read(frames: list[Path]) -> list[Source]:
+    return read_sources(frames, camera=None, focal=380.0, distortion=None, skip_bad=False)[0]
 
 
 @pytest.mark.parametrize(
@@ -36,10 +44,9 @@ def test_only_failures_of_many_pictures_concern_all(
 def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Path) -> None:
     """The pair of the other two pictures had been dropped for contradicting the third one, and 0 with it."""
     frames = flight(3, 3).write(tmp_path)
-    sources, _ = read_sources(frames, camera=None, focal=380.0, distortion=None, skip_bad=False)
-    options = StitchOptions(workers=1, features=FeatureOptions(max_features=600))
+    sources = _read(frames)
     with open_executor(1, len(sources)) as executor:
-        found = register(sources, options, executor, skip_bad=False)
+        found = register(sources, OPTIONS, executor, skip_bad=False)
     links = tuple(replace(fit, used=2 in (fit.image1, fit.image2)) for fit in found.alignment.links)
     spoiled = replace(
         found,
@@ -47,8 +54,29 @@ def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Pat
         messages=(left_out(frames[0], "contradicts"),),
     )
     rest = _without(
-        spoiled, _Offenders({2: Message("shows something else")}, {}), Aligner.of(sources, options, NO_CACHE)
+        spoiled, _Offenders({2: Message("shows something else")}, {}), Aligner.of(sources, OPTIONS, NO_CACHE)
     )
     assert rest is not None
     assert rest.alignment.used.tolist() == [True, True, False]
     assert [str(message) for message in rest.left_out] == [f"left out {frames[2]}: shows something else [left-out]"]
+
+
+def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path: Path) -> None:
+    """What drives ahead fills a good third of every picture, and has more matches where pictures overlap little."""
+    plane, ahead = flight(3, 3, overlap=0.4), flight(5, 3, overlap=0.4)
+    middle = ahead.poses.position.mean(axis=0)
+    slow = middle + 0.15 * (ahead.poses.position - middle) + [[0.0, 25.0], [0.0, -25.0], [0.0, 25.0]]
+    ahead = replace(ahead, poses=replace(ahead.poses, position=slow))
+    frames = plane.write(tmp_path)
+    for k, frame in enumerate(frames):
+        write_image(frame, np.concatenate([plane.frame(k)[:192], ahead.frame(k)[192:]]))
+    sources = _read(frames)
+    with open_executor(1, len(sources)) as executor:
+        found = register(sources, OPTIONS, executor, skip_bad=False)
+        accepted = accept(found, OPTIONS, executor)
+    steps = [np.diff(k.alignment.homographies[:, 0, 2]) for k in (found, accepted)]
+    assert np.all(np.abs(steps[0]) < 0.2)  # heights above the ground: what drives ahead moves by a sixth
+    assert np.all(np.abs(steps[1]) > 0.7)
+    (message,) = accepted.messages
+    assert (message.code, message.severity) == ("rival-motion", "warning")
+    assert "what was stitched fills" in message.text

@@ -1,15 +1,24 @@
 """A motion other than the plane's: how it is found, and what is said of it, by the area that it covers."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.verification.rival_motion import RivalMotion, find_rival_motions, rival_messages, rival_share
+from rdstitch.matching.two_view import PairRegistration
+from rdstitch.radial_homography import RadialHomography
+from rdstitch.verification.rival_motion import (
+    RivalMotion,
+    find_rival_motions,
+    pairs_of_rivals,
+    rival_messages,
+    rival_share,
+)
 
 PATHS = ("folder/a.png", "folder/b.png")
 
@@ -27,7 +36,9 @@ def _rival(area: int, plane: int) -> RivalMotion:
         (11, math.nan, "warning"),
         (11, 0.39, "failure"),
         (44, 0.41, "warning"),
-        (46, 0.9, "failure"),
+        (46, 0.54, "failure"),
+        (46, math.nan, "failure"),
+        (46, 0.56, "warning"),  # more than half of what is shared looks alike, whatever has more matches
     ],
 )
 def test_area_and_agreement_decide(area: int, agreement: float, severity: str | None) -> None:
@@ -85,6 +96,16 @@ def test_a_second_motion_is_found_with_its_place_and_area() -> None:
     assert found.share == pytest.approx(20 / 116)
     assert found.center == pytest.approx((325.0, 450.0))
     assert found.disagreement == pytest.approx(50.0, abs=0.1)
+
+
+def test_pairs_move_as_their_rivals_do() -> None:
+    relation = RadialHomography(np.eye(3), LENS, LENS, np.array([True, False]))
+    rival = replace(relation, inliers=np.array([False, True]))
+    pairs: Any = [PairRegistration(0, second, cast(Any, None), relation) for second in (1, 2, 3)]
+    found = pairs_of_rivals(pairs, [replace(_rival(9, 9), relation=rival), replace(_rival(0, 9), image2=2)])
+    assert found[0].relation is rival
+    assert not found[1].relation  # it shows the plane alone
+    assert found[2].relation is relation  # it contradicts the alignment, so that it is none of its rivals
 
 
 def test_area_that_the_plane_covers_too_does_not_count() -> None:

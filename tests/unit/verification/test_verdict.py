@@ -19,6 +19,7 @@ from rdstitch.registration import Registration
 from rdstitch.verification import verdict
 from rdstitch.verification.overlap_check import CheckedLink
 from rdstitch.verification.photometric_agreement import Agreement
+from rdstitch.verification.rival_motion import RivalMotion
 from rdstitch.verification.self_similarity import Ambiguity
 from rdstitch.verification.verdict import judge
 from tests.cli.running import flight
@@ -157,6 +158,17 @@ def test_a_tenth_of_an_overlap_must_look_alike(
     found = _checked_by(monkeypatch, good, _checked(cells, confirming))
     assert [message.severity for message in found] == ([] if severity is None else [severity])
     assert all(f"({confirming} of {cells}" in m.text or f"only {confirming} of {cells}" in m.text for m in found)
+
+
+@pytest.mark.parametrize(("share", "severities"), [(0.39, ["failure", "warning"]), (0.41, ["warning"])])
+def test_where_something_moves_otherwise_two_fifths_must_look_alike(
+    good: Registration, monkeypatch: pytest.MonkeyPatch, share: float, severities: list[str]
+) -> None:
+    """A vehicle that two pictures have in common alone fills less of what a plane would fill."""
+    rival = RivalMotion(0, 1, 20, 80, (30.0, 40.0), 120.0)
+    monkeypatch.setattr(verdict, "find_rival_motions", lambda *_: [rival])
+    found = _checked_by(monkeypatch, good, _checked(100, int(100 * share)), _checked(100, 90, pair=(1, 2)))
+    assert [message.severity for message in found] == severities
 
 
 @pytest.mark.parametrize(("ambiguous", "of_all"), [(1, False), (2, True)])
