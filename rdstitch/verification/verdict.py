@@ -15,6 +15,7 @@ from rdstitch.matching.match_graph import connected_components
 from rdstitch.messages import Message, Severity, names_of, shortened
 from rdstitch.registration import Registration
 from rdstitch.verification.input_doubts import doubtful_inputs
+from rdstitch.verification.misfits import agreement_of_all, disagreeing_pairs, misfitting_pictures
 from rdstitch.verification.overlap_check import CheckedLink, check_overlaps, share_alike
 from rdstitch.verification.parallax import find_parallax, parallax_messages
 from rdstitch.verification.rival_motion import MIN_AGREEMENT, find_rival_motions, is_rival, rival_messages
@@ -24,9 +25,6 @@ Pair = tuple[int, int]
 _MAX_RMS = 1.0  # of the whole, in thresholds
 _MAX_RMS_OF_RELIEF = 3.0  # the same where neighbours' errors agree and the pictures look alike
 _MAX_AMBIGUITY = 0.4  # share of the pairs that may fit elsewhere: more is a pattern all over
-_MIN_INLIERS = 0.5  # share of a pair's own inliers that agree with the whole
-# The same over all pairs of a picture; right ones have been seen to have 83 % even with relief, others 52 %.
-_MIN_MATCHES_PER_PICTURE = 0.6
 # Of the cells of an overlap that agree: chance lets up to 7 % do so, and right registrations of difficult pictures
 # (low sun, parallax, blur) have been seen to have 20 %.
 _MIN_AGREEMENT, _DOUBTFUL_AGREEMENT = 0.10, 0.15
@@ -87,11 +85,12 @@ def judge(
     paths = [str(source.path) for source in registration.sources]
     used = [fit for fit in alignment.links if fit.used]
     resting = registration.static_background
-    disagreeing = _disagreeing(paths, used)
+    disagreeing = disagreeing_pairs(registration)
+    agreeing = [fit for fit in used if (fit.image1, fit.image2) not in disagreeing]
     geometric = [
         *_mixed(paths, registration),
-        *_agreement_of_all(used),
-        *([] if resting else _misfits(paths, [fit for fit in used if (fit.image1, fit.image2) not in disagreeing])),
+        *agreement_of_all(used),
+        *([] if resting else misfitting_pictures(registration, agreeing)),
         *([] if resting else (disagreeing[pair] for pair in _decisive(disagreeing, used, len(paths)))),
     ]
     if geometric:  # what the pixels say of pictures that may be left out need not be known
@@ -169,14 +168,6 @@ def _shape(paths: Sequence[str], alignment: Alignment) -> list[Message]:
     return [Message(text, (image,), code="shape")]
 
 
-def _agreement_of_all(used: Sequence[LinkFit]) -> list[Message]:
-    """Matches of all pairs together."""
-    given, kept = sum(fit.count for fit in used), sum(fit.inliers for fit in used)
-    if kept >= _MIN_INLIERS * given:
-        return []
-    return [_failure(f"only {kept} of {given} matches of the pairs agree with the whole")]
-
-
 def _look_alike(checked: Sequence[CheckedLink]) -> bool:
     """Whether pictures look alike where most pairs put them, as far as there is something to see."""
     shares = [link.agreement.share for link in checked if link.agreement.cells >= _MIN_CELLS]
@@ -217,21 +208,6 @@ def _mixed(paths: Sequence[str], registration: Registration) -> list[Message]:
     ]
 
 
-def _misfits(paths: Sequence[str], used: Sequence[LinkFit]) -> list[Message]:
-    """Pictures of whose matches too many do not fit into the whole, over all their pairs but those that disagree."""
-    given, kept = np.zeros(len(paths), dtype=np.intp), np.zeros(len(paths), dtype=np.intp)
-    for fit in used:
-        given[[fit.image1, fit.image2]] += fit.count
-        kept[[fit.image1, fit.image2]] += fit.inliers
-    return [
-        _failure(
-            f"only {kept[k]} of {given[k]} of its matches agree with the whole; another camera or zoom, or no plane?",
-            [paths[k]],
-        )
-        for k in np.flatnonzero(kept < _MIN_MATCHES_PER_PICTURE * given).tolist()
-    ]
-
-
 def _decisive(suspicions: Mapping[Pair, Message], used: Sequence[LinkFit], count: int) -> list[Pair]:
     """The suspicious pairs without which the pictures fall apart; those of the others are held by better ones."""
     sound = [fit for fit in used if (fit.image1, fit.image2) not in suspicions]
@@ -245,20 +221,6 @@ def _of_pair(paths: Sequence[str], link: LinkFit, text: str, severity: Severity 
     both = paths[link.image1], paths[link.image2]
     code = "doubtful-seam" if severity == "warning" else ""
     return Message(f"{' and '.join(names_of(both))}{text}", both, severity, code)
-
-
-def _disagreeing(paths: Sequence[str], used: Sequence[LinkFit]) -> dict[Pair, Message]:
-    """Pairs whose matches do not fit into the whole."""
-    return {
-        (fit.image1, fit.image2): _of_pair(
-            paths,
-            fit,
-            f": only {fit.inliers} of {fit.count} matches agree with the whole; another camera or zoom, or no plane? "
-            "stitch them on their own",
-        )
-        for fit in used
-        if fit.inliers < _MIN_INLIERS * fit.count
-    }
 
 
 def _unlike(paths: Sequence[str], checked: Sequence[CheckedLink], least: float) -> dict[Pair, Message]:
