@@ -2,13 +2,16 @@
 
 import ctypes
 import os
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Condition
 
 _USUAL = 180 * 2**20  # bytes; where the system does not say it: the libraries, and a few hundred registered pictures
 _BOUND, _BOUND_OF_A_PICTURE = 400 * 10**6, 150 * 10**3  # bytes; of the whole process, see docs/scale.md
 _MMAP_THRESHOLD = -3  # of mallopt
 _LARGE = 8 * 2**20  # bytes: more than any array of a tile, which are made again and again; less than a picture
+_SCRATCH = 280 * 10**6  # bytes that the threads of this process may take at once for what they give back soon
 
 
 def release_free_heap() -> None:
@@ -27,6 +30,32 @@ def release_free_heap() -> None:
 def memory_left(pictures: int) -> int:
     """Bytes that a process may still take for so many pictures within its usual bound; negative beyond it."""
     return _BOUND + _BOUND_OF_A_PICTURE * pictures - _resident()
+
+
+class _Scratch:
+    """Memory that the threads of this process take for a while, and give back."""
+
+    def __init__(self) -> None:
+        self._changed, self._taken = Condition(), 0
+
+    @contextmanager
+    def take(self, size: int) -> Iterator[None]:
+        """Wait until there is room for so many bytes; one thread alone always has it.
+
+        Blocks of it must not be nested: two threads would wait for each other.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._taken == 0 or self._taken + size <= _SCRATCH)
+            self._taken += size
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._taken -= size
+                self._changed.notify_all()
+
+
+scratch_memory = _Scratch().take
 
 
 def _resident() -> int:

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.features.keypoints import Features
 from rdstitch.features.learned import AlikedDetection
-from rdstitch.features.opencv import LARGE, OpenCVDetection, StripsDetection
+from rdstitch.features.opencv import OpenCVDetection
 from rdstitch.features.options import CLOSER, FeatureOptions
 from rdstitch.features.picture import Mask, PixelArray, PreparedPicture, View, prepare
+from rdstitch.features.sift_tiles import LARGE, SiftTilesDetection
 from rdstitch.features.surf.descriptor import SurfDetection
 from rdstitch.opencv_state import one_opencv_thread
 
@@ -47,7 +48,7 @@ def find(grey: NDArray[np.uint8], options: FeatureOptions) -> Detection:
     if options.kind == "aliked":
         return AlikedDetection.find(grey, options)
     if options.kind in ("sift", "rootsift") and grey.size > LARGE:
-        return StripsDetection.find(grey, options)
+        return SiftTilesDetection.find(grey, options)
     return OpenCVDetection.find(grey, options)
 
 

@@ -16,7 +16,7 @@ import cv2
 import rdstitch
 from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
-from tests.benchmarks.peak_memory import peak_memory
+from tests.benchmarks.peak_memory import StagePeaks
 
 _BOUND, _BOUND_OF_A_PICTURE = 400.0, 0.15  # MB
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".tif")
@@ -32,21 +32,15 @@ def enlarge(pictures: list[Path], width: int, folder: Path) -> None:
 
 def stitch(folder: Path, workers: int) -> None:
     """Stitch a folder in this process, and print the peak of each stage."""
-    peaks: dict[str, float] = {}
-
-    def note(stage: str, done: int, total: int) -> None:
-        # Stages report what they have done. The peak begins anew then: see proc(5).
-        peaks[stage] = max(peaks.get(stage, 0.0), peak_memory())
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-
+    peaks = StagePeaks()
     with TemporaryDirectory() as output:
         options = rdstitch.StitchOptions(workers=workers, force=True)
-        rdstitch.mosaic([folder], Path(output) / "out.tif", options, progress=note)
-    note("writing", 1, 1)
+        rdstitch.mosaic([folder], Path(output) / "out.tif", options, progress=peaks)
+    peaks("writing", 1, 1)
     count = sum(1 for _ in folder.iterdir())
-    for stage, peak in peaks.items():
+    for stage, peak in peaks.held.items():
         print(f"{stage:24s}{peak:6.0f} MB")
-    print(f"{'all':24s}{max(peaks.values()):6.0f} MB of {_BOUND + _BOUND_OF_A_PICTURE * count:.0f}")
+    print(f"{'all':24s}{max(peaks.held.values()):6.0f} MB of {_BOUND + _BOUND_OF_A_PICTURE * count:.0f}")
 
 
 def main() -> None:

@@ -3,6 +3,7 @@
 import resource
 import sys
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 
 
@@ -17,3 +18,16 @@ def peak_memory() -> float:
                 return int(line.split()[1]) * 1024 / 1e6
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+
+
+@dataclass
+class StagePeaks:
+    """Most memory that was held in each stage, MB; a progress of recipes. Linux only."""
+
+    held: dict[str, float] = field(default_factory=dict)
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """What was held since the last report belongs to the stage that now reports."""
+        self.held[stage] = max(self.held.get(stage, 0.0), peak_memory())
+        # The peak begins anew: see proc(5).
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")

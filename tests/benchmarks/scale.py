@@ -1,7 +1,7 @@
 """Cost and accuracy by the number of frames: ``python -m tests.benchmarks.scale [COUNT …] [--shuffled] [--register]``.
 
 A drone's survey of 480 x 360 frames, one lane beside the other, is rendered frame by frame into a temporary folder (60
-kB a frame) and stitched by one worker in a process of its own. Printed are processor time and peak memory a frame, the
+kB a frame) and stitched by one worker in a process of its own. Printed are processor time and peak memory by stage, the
 error of λ, and the largest position error of any frame, also as a share of the path. Times depend on the machine: only
 those of one run compare.
 """
@@ -24,7 +24,7 @@ from rdstitch.camera import Camera
 from rdstitch.io.write import write_image
 from rdstitch.radial_homography import to_plane
 from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over, survey_poses
-from tests.benchmarks.peak_memory import peak_memory
+from tests.benchmarks.peak_memory import StagePeaks
 from tests.benchmarks.registration import StageTimes
 
 COUNTS = (100, 300, 1000, 3000)
@@ -55,16 +55,21 @@ def write_frames(sequence: Sequence, order: list[int], folder: Path) -> None:
 
 def measure(folder: Path, count: int, shuffled: bool, register_only: bool) -> dict[str, Any]:
     """Stitch a folder of rendered frames in this process; what that cost, and how near it came to the truth."""
-    stages, before = StageTimes(), resource.getrusage(resource.RUSAGE_SELF)
+    stages, peaks, before = StageTimes(), StagePeaks(), resource.getrusage(resource.RUSAGE_SELF)
+
+    def note(stage: str, done: int, total: int) -> None:
+        stages(stage, done, total)
+        peaks(stage, done, total)
+
     options = rdstitch.StitchOptions(workers=1, overwrite=True, force=True)
     if register_only:
-        registration = rdstitch.calibrate([folder], options, progress=stages)
+        registration = rdstitch.calibrate([folder], options, progress=note)
     else:
         with TemporaryDirectory() as output:
-            registration = rdstitch.mosaic([folder], Path(output) / "out.tif", options, progress=stages).registration
+            registration = rdstitch.mosaic([folder], Path(output) / "out.tif", options, progress=note).registration
     own, begun = resource.getrusage(resource.RUSAGE_SELF), before.ru_utime + before.ru_stime
     seconds = own.ru_utime + own.ru_stime - begun
-    stages("the rest", 0, 0)
+    note("the rest", 0, 0)
     alignment = registration.alignment
     sequence, order = survey(count), frame_order(count, shuffled)
     places = {
@@ -77,7 +82,7 @@ def measure(folder: Path, count: int, shuffled: bool, register_only: bool) -> di
     return {
         "count": count,
         "seconds": seconds,
-        "memory": peak_memory(),
+        "memory": max(peaks.held.values()),
         "used": int(alignment.used.sum()),
         "pairs": len(registration.pairs),
         "distortion": alignment.distortion,
@@ -85,6 +90,7 @@ def measure(folder: Path, count: int, shuffled: bool, register_only: bool) -> di
         "median": error.median,
         "path": path,
         "stages": stages.spent,
+        "peaks": peaks.held,
     }
 
 
@@ -97,10 +103,12 @@ def print_row(row: dict[str, Any], first: dict[str, Any]) -> None:
     line += f"{growth:10.2f}" if row is not first else f"{'':10s}"
     line += f"{row['used']:8d}{row['pairs'] / count:10.1f}{row['distortion'] - DISTORTION:11.6f}"
     print(line + f"{row['median']:9.3f}{row['largest']:9.3f}{100 * row['largest'] / row['path']:10.4f}", flush=True)
-    costliest = sorted(row["stages"].items(), key=lambda stage: -stage[1])[:_STAGES_SHOWN]
-    print(
-        "        ms/frame: " + ", ".join(f"{stage} {1e3 * taken / count:.1f}" for stage, taken in costliest), flush=True
-    )
+    for unit, values in (
+        ("ms/frame", {stage: 1e3 * taken / count for stage, taken in row["stages"].items()}),
+        ("MB", row["peaks"]),
+    ):
+        most = sorted(values.items(), key=lambda stage: -stage[1])[:_STAGES_SHOWN]
+        print(f"{'':8s}{unit}: " + ", ".join(f"{stage} {value:.1f}" for stage, value in most), flush=True)
 
 
 def main() -> None:

@@ -1,14 +1,18 @@
-"""What memory is left of the usual bound."""
+"""What memory is left of the usual bound, and how threads share it."""
 
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
 
 from rdstitch import process_memory
-from rdstitch.process_memory import memory_left, release_free_heap
+from rdstitch.process_memory import memory_left, release_free_heap, scratch_memory
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system does not say what a process holds")
@@ -48,3 +52,38 @@ def test_the_bound_is_400_mb_and_150_kb_a_picture(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(process_memory, "_resident", lambda: 100_000_000)
     assert memory_left(0) == 300_000_000
     assert memory_left(1000) == 450_000_000
+
+
+def test_threads_share_the_memory_that_they_give_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process_memory, "_SCRATCH", 100)
+    held: list[int] = []
+    most: list[int] = []
+
+    def work(size: int) -> None:
+        with scratch_memory(size):
+            held.append(size)
+            most.append(sum(held))
+            time.sleep(0.01)
+            held.remove(size)
+
+    with ThreadPoolExecutor(4) as threads:
+        # One that is larger than all that there is goes on alone.
+        list(threads.map(work, [60, 40, 150, 30, 30, 30, 30]))
+    assert max(most) == 150
+    assert sorted(most)[-2] <= 100
+
+
+def test_what_fails_gives_its_memory_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process_memory, "_SCRATCH", 100)
+    with suppress(ValueError), scratch_memory(100):
+        raise ValueError
+    done = []
+
+    def work() -> None:
+        with scratch_memory(100):
+            done.append(True)
+
+    thread = Thread(target=work, daemon=True)
+    thread.start()
+    thread.join(5)
+    assert done

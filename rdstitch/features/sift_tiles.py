@@ -1,0 +1,164 @@
+"""SIFT of a large picture in tiles, in bounded memory: its finest octave has four times the picture's pixels.
+
+The two finest octaves, most of the memory and most of the keypoints, are found in overlapping tiles, where they are
+what they would be in the whole; the coarser ones are those of the picture at half its size, and so on.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.arrays import FloatArray
+from rdstitch.features.keypoints import Features
+from rdstitch.features.opencv import Grey, OpenCVDetection
+from rdstitch.features.options import FeatureOptions
+
+LARGE = 1_250_000
+"""Pixels from which on a picture is taken in tiles: a whole one takes 230 bytes a pixel."""
+
+_SIDE = 640  # pixels of a tile without its overlap, at most
+# How far the descriptors of the two finest octaves reach, pixels: sigma of 4, times 3 a cell, 2.5 cells, diagonally,
+# and what is smoothed there.
+_OVERLAP = 64
+_UPSAMPLED, _FIRST = 255, 0  # octaves -1 and 0, as OpenCV packs them
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Keypoints of a tile.
+
+    Attributes
+    ----------
+    detection : OpenCVDetection
+    corner : ndarray of shape (2,)
+        Of the tile, pixels of the reduced picture that it is cut from.
+    factor : ndarray of shape (2,)
+        Pixels of the picture itself for one of the reduced one, horizontally and vertically.
+    """
+
+    detection: OpenCVDetection
+    corner: NDArray[np.intp]
+    factor: FloatArray
+
+    @property
+    def points(self) -> FloatArray:
+        """Places in the whole picture, pixels."""
+        return self._in_whole(self.detection.points)
+
+    @property
+    def enlargement(self) -> float:
+        """Pixels of the picture itself for one of the reduced one, in the mean of both directions."""
+        return float(np.sqrt(self.factor.prod()))
+
+    def describe(self, chosen: NDArray[np.intp]) -> Features:
+        """Features in pixels of the whole picture."""
+        found = self.detection.describe(chosen)
+        return replace(
+            found,
+            points=self._in_whole(found.points),
+            scale=found.scale * self.enlargement,
+            response=found.response * self.enlargement,
+        )
+
+    def _in_whole(self, points: FloatArray) -> FloatArray:
+        return (points + self.corner + 0.5) * self.factor - 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class SiftTilesDetection:
+    """Keypoints of a picture, found in parts of it."""
+
+    parts: tuple[_Part, ...]
+
+    @classmethod
+    def find(cls, grey: Grey, options: FeatureOptions) -> Self:
+        """Find the keypoints of a picture by SIFT."""
+        return cls(tuple(_parts(grey, options)))
+
+    @property
+    def points(self) -> FloatArray:
+        """Places, pixels of the picture, (N, 2)."""
+        return np.concatenate([part.points for part in self.parts])
+
+    @property
+    def scale(self) -> FloatArray:
+        """Diameters, pixels, (N,)."""
+        return np.concatenate([part.enlargement * part.detection.scale for part in self.parts])
+
+    @property
+    def response(self) -> FloatArray:
+        """Strengths, (N,): contrast times diameter, as of a picture that is taken whole."""
+        return np.concatenate([part.enlargement * part.detection.response for part in self.parts])
+
+    def describe(self, chosen: NDArray[np.intp]) -> Features:
+        """Describe the chosen keypoints, part by part."""
+        stops = np.cumsum([len(part.detection.points) for part in self.parts])
+        found = []
+        for part, stop in zip(self.parts, stops, strict=True):
+            start = stop - len(part.detection.points)
+            found.append(part.describe(chosen[(chosen >= start) & (chosen < stop)] - start))
+        return Features.concatenate(found)
+
+
+def _parts(grey: Grey, options: FeatureOptions) -> Iterator[_Part]:
+    """The finest octaves in tiles of the picture, and of its halves while these are large; then the rest."""
+    whole = np.array(grey.shape[::-1])
+    octaves = [_UPSAMPLED, _FIRST]
+    while True:
+        yield from _tiles(grey, whole / grey.shape[::-1], octaves, options)
+        # The finest octave of the half is the second of this one, but less exact.
+        octaves = [_FIRST]
+        size = (grey.shape[1] // 2, grey.shape[0] // 2)
+        grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        if grey.size <= LARGE:
+            break
+    found = OpenCVDetection.find(grey, options)
+    coarse = np.flatnonzero(_octave(found) != _UPSAMPLED)
+    yield _Part(found.take(coarse), np.zeros(2, dtype=np.intp), whole / grey.shape[::-1])
+
+
+def _tiles(grey: Grey, factor: FloatArray, octaves: list[int], options: FeatureOptions) -> Iterator[_Part]:
+    """What a picture shows in some octaves, tile by tile."""
+    for y in _intervals(grey.shape[0]):
+        for x in _intervals(grey.shape[1]):
+            found = OpenCVDetection.find(grey[y.seen, x.seen], options)
+            own = x.owns(found.points[:, 0]) & y.owns(found.points[:, 1]) & np.isin(_octave(found), octaves)
+            yield _Part(found.take(np.flatnonzero(own)), np.array([x.seen.start, y.seen.start]), factor)
+
+
+@dataclass(frozen=True)
+class _Interval:
+    """What a tile sees of a side of the picture, and which of that is its own: infinite at the picture's border."""
+
+    seen: slice
+    start: float
+    stop: float
+
+    def owns(self, places: FloatArray) -> NDArray[np.bool_]:
+        """Whether places, pixels of the tile, are the tile's own."""
+        places = places + self.seen.start
+        inside: NDArray[np.bool_] = (places >= self.start) & (places < self.stop)
+        return inside
+
+
+def _intervals(length: int) -> list[_Interval]:
+    """The tiles along a side."""
+    borders = np.linspace(0, length, -(-length // _SIDE) + 1).astype(int).tolist()
+    return [
+        _Interval(
+            slice(max(0, start - _OVERLAP), min(length, stop + _OVERLAP)),
+            start if start > 0 else -np.inf,
+            stop if stop < length else np.inf,
+        )
+        for start, stop in pairwise(borders)
+    ]
+
+
+def _octave(found: OpenCVDetection) -> NDArray[np.intp]:
+    """The octave of each keypoint, as OpenCV packs it."""
+    return np.array([keypoint.octave & 255 for keypoint in found.keypoints], dtype=np.intp)
