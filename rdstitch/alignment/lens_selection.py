@@ -98,7 +98,8 @@ class LensChoice:
         if (free == self.free).all():
             return self
         name = next(name for name in LENSES if not (free & ~free_parameters(name)).any())
-        return replace(self, name=name, free=free, reason=f"{name}: the motion is more regular with that")
+        more = "ν is the next term of a series that needs μ" if free[2] else "the motion is more regular with that"
+        return replace(self, name=name, free=free, reason=f"{name}: {more}")
 
 
 def free_parameters(name: str) -> BoolArray:

@@ -4,7 +4,9 @@ Every folder is calibrated as a user would do it, without knowledge of what it s
 
 Chessboards are judged by their corners, which the estimation does not use: the root mean square distance of the corners
 of rows and columns from straight lines, and from a grid with one homography a board, both in pixels of the picture;
-beside it the same for OpenCV's rational model (``calibrateCamera``), fitted to these very corners.
+beside it the same for OpenCV's rational model (``calibrateCamera``), fitted to these very corners. "λ there" is the
+one-parameter lens nearest to ours at the radii of the corners, which is what a fit of one λ to them finds; the λ before
+is that over the whole picture, beyond the corners of most boards.
 
 Flights are judged by the maker's fisheye polynomial, where a picture carries it in its XMP: points all over the picture
 are undistorted by both lenses, and ours brought onto the maker's by the best similarity, or by the best homography
@@ -27,6 +29,7 @@ from examples.judging.fitting import apply, fit_homography, fit_similarity
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.camera_files.lens_models import Brown
+from rdstitch.division_model import nearest_one_parameter
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 
@@ -203,7 +206,9 @@ def main() -> None:
             for what, off in (("lines", off_lines), ("grid", off_grid)):
                 own, best = off(grids, camera.undistort), off(grids, other)
                 line += f"; off {what} {own:.3f}, rational {best:.3f}: {own / best:.2f} times"
-            line += f" ({len(grids)} boards)"
+            squared = np.sum(camera.normalize(grids) ** 2, axis=-1).ravel()
+            there = nearest_one_parameter(squared, camera.distortion, camera.higher)[0]
+            line += f" ({len(grids)} boards, λ there {there:+.4f})"
         if name in FLIGHTS:
             for gauge, (rms, largest) in differences(
                 camera, maker_undistort(files_of(SHARED / FLIGHTS[name])[0])

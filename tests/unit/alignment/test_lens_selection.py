@@ -85,6 +85,28 @@ def test_all_pictures_together_show_a_third_coefficient_that_pairs_do_not(monkey
     assert _apart(found.cameras[0], truth) < _apart(simpler.cameras[0], truth)
 
 
+def test_a_third_coefficient_that_is_smaller_than_its_deviation_does_no_harm() -> None:
+    truth = replace(FISHEYE, distortion3=0.0)
+    given = _scene(truth, 0)
+    found, simpler = _align(given), _align(given, lens="division2")
+    assert found.lens == "division3"
+    assert abs(found.cameras[0].distortion3) < 2.0 * np.sqrt(np.array(found.cameras[0].lens_covariance)[2, 2]) < 0.01
+    assert _apart(found.cameras[0], truth) < _apart(simpler.cameras[0], truth) + 0.03
+
+
+def test_a_third_coefficient_is_small_where_no_matches_show_it() -> None:
+    """An equidistant fisheye of 120 degrees; matches in the middle alone leave ν to its prior."""
+    truth = Camera(SIZE, -0.366, -0.026, (335.0, 226.0), distortion3=-0.0036)
+    given = _scene(truth, 3)
+    links = []
+    for link in given.links:
+        near = [np.linalg.norm(truth.normalize(points), axis=1) < 0.6 for points in (link.points1, link.points2)]
+        kept = near[0] & near[1]
+        links.append(replace(link, points1=link.points1[kept], points2=link.points2[kept]))
+    found = _align(replace(given, links=[link for link in links if len(link) >= 30]), lens="division3")
+    assert _apart(found.cameras[0], truth) < 1.0
+
+
 def test_a_third_coefficient_is_not_taken_from_relief() -> None:
     given = _scene(replace(FISHEYE, distortion3=0.0), 0, relief=0.01)
     assert _align(given).lens == "division2"
@@ -299,7 +321,12 @@ def test_the_ladder() -> None:
 
 @pytest.mark.parametrize(
     ("freed", "name"),
-    [([1, 0, 0, 0, 0], "division"), ([1, 0, 0, 1, 1], "division-center"), ([1, 1, 0, 1, 1], "division2")],
+    [
+        ([1, 0, 0, 0, 0], "division"),
+        ([1, 0, 0, 1, 1], "division-center"),
+        ([1, 1, 0, 1, 1], "division2"),
+        ([1, 1, 1, 1, 1], "division3"),
+    ],
 )
 def test_a_lens_with_more_freed_is_the_next_that_has_it_all(freed: list[int], name: str) -> None:
     plain = LensChoice("division", free_parameters("division"), adjusted(SEEN, BASE), "enough")
@@ -307,6 +334,7 @@ def test_a_lens_with_more_freed_is_the_next_that_has_it_all(freed: list[int], na
     assert found.name == name
     assert (found.free == np.array(freed, dtype=np.bool_)).all()
     assert (found is plain) is (name == "division")
+    assert ("series" in found.reason) is (name == "division3")
 
 
 @pytest.mark.parametrize(
