@@ -144,16 +144,17 @@ def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candi
 def rematch_weak_pairs(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs) -> AlignedPairs:
     """Match pairs of weakly supported pictures again, only near where the alignment expects the matches.
 
-    Where the lens has more than λ, the inliers of all other pairs are selected again with it: pairs on their own have
-    one λ, with which matches at the corners of such a lens are outliers, and relief is not.
+    Where the lens has more than λ, the inliers of all pairs, these among them, are selected again with it: pairs on
+    their own have one λ, with which matches at the corners of such a lens are outliers, and relief is not.
     """
     alignment = aligned.alignment
-    stronger = pairing.guided_rematch(list(aligned.pairs), alignment.support, alignment.transfer)
+    changed = pairing.guided_rematch(list(aligned.pairs), alignment.support, alignment.transfer)
     if alignment.lens != "division" or alignment.cameras[alignment.reference].higher:
-        stronger = {**reselect_inliers(aligned.pairs, alignment, pairing.options.pair.threshold), **stronger}
-    if not stronger:
+        pairs = [changed.get(k, pair) for k, pair in enumerate(aligned.pairs)]
+        changed = {**changed, **reselect_inliers(pairs, alignment, pairing.options.pair.threshold)}
+    if not changed:
         return aligned
-    return aligner.align([stronger.get(k, pair) for k, pair in enumerate(aligned.pairs)], alignment)
+    return aligner.align([changed.get(k, pair) for k, pair in enumerate(aligned.pairs)], alignment)
 
 
 def alignment_options(sources: Sequence[Source], options: StitchOptions) -> AlignmentOptions:

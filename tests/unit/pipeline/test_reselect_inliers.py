@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -87,3 +87,18 @@ def test_only_a_rich_lens_calls_for_it(
     else:
         gained = sum(found.alignment.support.values()) - sum(aligned.alignment.support.values())
         assert gained > 100
+
+
+def test_pairs_that_were_matched_again_are_selected_by_the_lens_too(
+    registered: tuple[Aligner, list[PairRegistration], list[Link]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their relation has one λ like any other."""
+    aligner, pairs, _ = registered
+    aligned = aligner.align(pairs)
+    taken: list[PairRegistration] = []
+    monkeypatch.setattr(Aligner, "align", lambda self, pairs, former: taken.extend(pairs))
+    options = SimpleNamespace(pair=SimpleNamespace(threshold=3.0))
+    again = dict(enumerate(pairs))
+    rematch_weak_pairs(aligner, cast(Any, SimpleNamespace(options=options, guided_rematch=lambda *_: again)), aligned)
+    gained = [pair.relation.inliers.sum() - again[k].relation.inliers.sum() for k, pair in enumerate(taken)]
+    assert sum(gained) > 100
