@@ -37,33 +37,25 @@ if TYPE_CHECKING:
     __version__: str
 
 _HOMES = {
-    "Alignment": "rdstitch.alignment",
-    "Camera": "rdstitch.camera",
-    "CompositeOptions": "rdstitch.compositing",
-    "Examination": "rdstitch.doctor",
-    "FeatureOptions": "rdstitch.features",
-    "Message": "rdstitch.messages",
-    "RadialHomography": "rdstitch.radial_homography",
-    "RdstitchError": "rdstitch.errors",
-    "Recomposition": "rdstitch.pipeline",
-    "Registration": "rdstitch.pipeline",
-    "StitchOptions": "rdstitch.pipeline",
-    "StitchResult": "rdstitch.pipeline",
-    "Trajectory": "rdstitch.alignment.trajectory",
-    "examine": "rdstitch.doctor",
-    "apply": "rdstitch.pipeline",
-    "calibrate": "rdstitch.pipeline",
-    "errors": "rdstitch",
-    "estimate_radial_homography": "rdstitch.robust",
-    "load_camera": "rdstitch.camera_files",
-    "mosaic": "rdstitch.pipeline",
-    "pano": "rdstitch.pipeline",
-    "save_camera": "rdstitch.camera_files",
-    "solvers": "rdstitch",
-    "synthetic": "rdstitch",
-    "trajectory": "rdstitch.pipeline",
-    "undistort": "rdstitch.pipeline",
-    "write_report": "rdstitch.report",
+    name: home
+    for home, names in {
+        "rdstitch": "errors solvers synthetic",
+        "rdstitch.alignment": "Alignment",
+        "rdstitch.alignment.trajectory": "Trajectory",
+        "rdstitch.camera": "Camera",
+        "rdstitch.camera_files": "load_camera save_camera",
+        "rdstitch.compositing": "CompositeOptions",
+        "rdstitch.doctor": "Examination examine",
+        "rdstitch.errors": "RdstitchError",
+        "rdstitch.features": "FeatureOptions",
+        "rdstitch.messages": "Message",
+        "rdstitch.pipeline": "Recomposition Registration StitchOptions StitchResult "
+        "apply calibrate mosaic pano trajectory undistort",
+        "rdstitch.radial_homography": "RadialHomography",
+        "rdstitch.report": "write_report",
+        "rdstitch.robust": "estimate_radial_homography",
+    }.items()
+    for name in names.split()
 }
 
 __all__ = [

@@ -87,7 +87,6 @@ class Cache:
         kinds: tuple[type, ...],
         inputs: tuple[Any, ...],
         compute: Callable[[], Value],
-        unless: Callable[[], bool] = lambda: False,
         valid: Callable[[Value], bool] = lambda value: True,
     ) -> Value:
         """What a stage gives for its inputs: from an earlier run, else computed now and kept.
@@ -102,8 +101,6 @@ class Cache:
             Everything that the result depends on, as :func:`rdstitch.io.packing.pack` takes it.
         compute : callable
             Gives the result.
-        unless : callable
-            Asked after the computation: whether its result must not be kept.
         valid : callable
             Whether an entry is a result for these inputs by its shapes and ranges; else it is computed again, as where
             it raises one of the errors that wrong values lead to.
@@ -115,8 +112,7 @@ class Cache:
         if kept:
             return kept[0]
         value = compute()
-        if not unless():
-            _keep(file, value)
+        _keep(file, value)
         return value
 
     def stored(

@@ -59,6 +59,21 @@ def is_focal_length(focal: float, image_size: tuple[int, int]) -> bool:
     return low < focal / (math.hypot(*image_size) / 2) < high
 
 
+def border_of(image_size: tuple[int, int], points_per_side: int) -> FloatArray:
+    """Outer border of a whole picture, clockwise from the top-left corner, pixels, (4 points_per_side, 2)."""
+    width, height = image_size
+    corners = np.array([(0, 0), (width, 0), (width, height), (0, height)], dtype=np.float64) - 0.5
+    steps = np.arange(points_per_side)[:, None] / points_per_side
+    sides = [a + steps * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    return np.concatenate(sides)
+
+
+def points_over(image_size: tuple[int, int], per_side: int) -> FloatArray:
+    """Points on a grid from edge to edge of a whole picture, row by row, pixels, (per_side², 2)."""
+    u, v = (np.linspace(-0.5, side - 0.5, per_side) for side in image_size)
+    return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+
+
 @dataclass(frozen=True)
 class Camera:
     """One camera with one lens.
@@ -186,13 +201,12 @@ class Camera:
     @property
     def _corner_radius(self) -> float:
         """Distance of the farthest corner from the centre, half diagonals."""
-        return float(np.linalg.norm(self.normalize(self._border(1)), axis=1).max())
+        return float(np.linalg.norm(self.normalize(border_of(self.image_size, 1)), axis=1).max())
 
     def _radii2(self) -> FloatArray:
         """Squared radii, half diagonals, of points evenly over the picture, as far as it can be undistorted."""
-        u, v = (np.linspace(-0.5, side - 0.5, _GRID) for side in self.image_size)
-        x, y = np.meshgrid((u - self.center[0]) / self.half_diagonal, (v - self.center[1]) / self.half_diagonal)
-        squares: FloatArray = (x**2 + y**2).ravel()
+        x, y = self.normalize(points_over(self.image_size, _GRID)).T
+        squares: FloatArray = x**2 + y**2
         farthest = self.drawn_radius / self.half_diagonal
         return squares[(squares > 0.0) & (squares <= farthest**2)]
 
@@ -256,20 +270,12 @@ class Camera:
         Clockwise from the top-left corner. Where the lens sees beyond the horizon, that lies within the circle up to
         which it stretches what it shows by less than 20 times.
         """
-        border, farthest = self._border(points_per_side), self.drawn_radius
+        border, farthest = border_of(self.image_size, points_per_side), self.drawn_radius
         if farthest == math.inf:
             return border
         offset = border - self.center
         radius = np.linalg.norm(offset, axis=1, keepdims=True)
         return np.asarray(self.center + offset * np.minimum(1.0, farthest / radius))
-
-    def _border(self, points_per_side: int) -> FloatArray:
-        """Outer border of the whole picture, clockwise from the top-left corner, pixels, (4 points_per_side, 2)."""
-        width, height = self.image_size
-        corners = np.array([(0, 0), (width, 0), (width, height), (0, height)], dtype=np.float64) - 0.5
-        steps = np.arange(points_per_side)[:, None] / points_per_side
-        sides = [a + steps * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
-        return np.concatenate(sides)
 
     def resized(self, image_size: tuple[int, int]) -> Self:
         """The same lens on a picture of another size: λ stays, centre and focal length scale."""

@@ -1,5 +1,7 @@
 """Cameras from what :meth:`rdstitch.camera.Camera.as_dict` gave: records of camera files and sidecars."""
 
+from dataclasses import replace
+
 from rdstitch.camera import FILE_VERSION, LENS_PARAMETERS, Camera
 from rdstitch.errors import ArgumentError
 from rdstitch.records import Record
@@ -15,32 +17,38 @@ def camera_from_record(record: Record) -> Camera:
     """
     if record["format"].value != "rdstitch camera" or record["version"].value not in range(1, FILE_VERSION + 1):
         record.fail(f"is not an rdstitch camera of version 1 to {FILE_VERSION}")
-    focal, std = record.get("focal_px"), record.get("lambda_std")
-    distortion, second, third = read_coefficients(record)
-    try:
-        return Camera(
-            image_size=record["image_size"].size(),
-            distortion=distortion,
-            distortion2=second,
-            distortion3=third,
-            center=record["center_px"].pair(),
-            focal=None if focal is None else focal.number(),
-            focal_source=None if focal is None else "file",
-            distortion_std=None if std is None else std.number(),
-            lens_covariance=_read_covariance(record.get("lens_covariance")),
-        )
-    except ArgumentError as error:
-        record.fail(str(error))
+    std, source = record.get("lambda_std"), None if record.get("focal_px") is None else "file"
+    camera = read_lens(record, record["image_size"].size(), source)
+    deviation = None if std is None else std.number()
+    return replace(camera, distortion_std=deviation, lens_covariance=_read_covariance(record.get("lens_covariance")))
 
 
-def read_coefficients(record: Record) -> tuple[float, float, float]:
-    """λ, μ and ν of a record: ``coefficients``, or ``lambda`` and ``lambda2`` as version 1 has them.
+def read_lens(record: Record, size: tuple[int, int], focal_source: str | None) -> Camera:
+    """The lens that a record describes, on a picture of a size; not how far it is determined.
 
     Raises
     ------
     InputError
         When a field is missing or wrong.
     """
+    focal = record.get("focal_px")
+    distortion, second, third = _read_coefficients(record)
+    try:
+        return Camera(
+            image_size=size,
+            distortion=distortion,
+            distortion2=second,
+            distortion3=third,
+            center=record["center_px"].pair(),
+            focal=None if focal is None else focal.number(),
+            focal_source=focal_source,
+        )
+    except ArgumentError as error:
+        record.fail(str(error))
+
+
+def _read_coefficients(record: Record) -> tuple[float, float, float]:
+    """λ, μ and ν of a record: ``coefficients``, or ``lambda`` and ``lambda2`` as version 1 has them."""
     if (given := record.get("coefficients")) is None:
         second = record.get("lambda2")
         return record["lambda"].number(), 0.0 if second is None else second.number(), 0.0

@@ -75,9 +75,19 @@ def names_of(paths: Iterable[str]) -> list[str]:
     return [Path(path).name for path in paths]
 
 
-def shortened(names: Sequence[str], most: int = MAX_NAMED) -> str:
+def bytes_in_words(size: int) -> str:
+    """An amount of memory for people."""
+    return f"{size / 2**30:.1f} GB" if size >= 2**30 else f"{max(1, round(size / 2**20))} MB"
+
+
+def seconds_in_words(seconds: float) -> str:
+    """A time for people."""
+    return f"{seconds / 60:.0f} min" if seconds >= 120 else f"{max(1, round(seconds))} s"
+
+
+def shortened(names: Sequence[str]) -> str:
     """Names, or the first of them where they are many."""
-    return ", ".join(names[:most]) + ", …" * (len(names) > most)
+    return ", ".join(names[:MAX_NAMED]) + ", …" * (len(names) > MAX_NAMED)
 
 
 def _listed(paths: Sequence[str]) -> str:

@@ -15,7 +15,6 @@ class _SharedSetting:
 
     Parameters
     ----------
-    read, write : callable
     held : int
         Value inside the blocks.
     """

@@ -136,7 +136,6 @@ class StitchOptions:
     dry_run: bool = False
 
     def __post_init__(self) -> None:
-        """Check ranges and contradictions."""
         if self.solver not in SOLVERS:
             raise ArgumentError(f"unknown solver {self.solver!r}; choose one of {', '.join(SOLVERS)}")
         if self.model not in ("auto", *MODELS):

@@ -113,11 +113,7 @@ def motions_from_homographies(homography: FloatArray, normal: FloatArray | None 
     h = homography / np.linalg.norm(homography, axis=(1, 2), keepdims=True)
     turned = h - np.eye(3) * np.trace(h, axis1=1, axis2=2)[:, None, None] / 3
     normals = np.concatenate(
-        [
-            np.swapaxes(np.linalg.eig(np.swapaxes(h, 1, 2))[1].real, 1, 2),
-            np.linalg.svd(turned)[2][:, :1],
-        ],
-        axis=1,
+        [np.swapaxes(np.linalg.eig(np.swapaxes(h, 1, 2))[1].real, 1, 2), np.linalg.svd(turned)[2][:, :1]], axis=1
     )
     motions = _motions_for_normals(np.repeat(h, 4, axis=0), normals.reshape(-1, 3)).reshape(-1, 4, 6)
     rotation = rotation_from_tilt(motions[..., :2])
@@ -160,37 +156,3 @@ def nearest_in_plane(motion: FloatArray) -> tuple[FloatArray, FloatArray, FloatA
     yaw = np.arctan2(motion[:, 1, 0] - motion[:, 0, 1], motion[:, 0, 0] + motion[:, 1, 1])
     c, s, x, y = np.cos(yaw), np.sin(yaw), motion[:, 0, 2], motion[:, 1, 2]
     return yaw, np.stack([-c * x - s * y, s * x - c * y], axis=1), motion[:, 2, 2]
-
-
-def constraint_residuals(homography: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Residuals of two constraints that every planar-motion homography satisfies (Valtonen Örnhag et al., §3).
-
-    With ``S = (H + H')/2``, ``[v]x = (H - H')/2``, ``A = tr S``, ``t2 = tr S²``, ``t3 = tr S³``:
-
-    * the quartic that is invariant to rotations of the camera frame,
-      ``3A⁴ - 14A² t2 + 3 t2² - 4 t2 |v|² - 4|v|⁴ + 12 A t3 + 4 A v'Sv = 0``;
-    * the sextic ``tr(adj H)³ = det(H) tr(H)³``.
-
-    Parameters
-    ----------
-    homography : array_like of shape (..., 3, 3)
-        In focal-normalized coordinates. The scale cancels: both are computed for unit Frobenius norm.
-
-    Returns
-    -------
-    quartic, sextic : ndarray of shape (...)
-    """
-    h = np.asarray(homography, dtype=np.float64)
-    h = h / np.linalg.norm(h, axis=(-2, -1), keepdims=True)
-    transposed = np.swapaxes(h, -2, -1)
-    s, skew = (h + transposed) / 2, (h - transposed) / 2
-    v = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
-    a = np.einsum("...ii->...", s)
-    t2 = np.einsum("...ij,...ji->...", s, s)
-    t3 = np.einsum("...ij,...jk,...ki->...", s, s, s)
-    v2 = np.einsum("...i,...i->...", v, v)
-    vsv = np.einsum("...i,...ij,...j->...", v, s, v)
-    quartic = 3 * a**4 - 14 * a**2 * t2 + 3 * t2**2 - 4 * t2 * v2 - 4 * v2**2 + 12 * a * t3 + 4 * a * vsv
-    trace_adjugate = (a**2 - np.einsum("...ij,...ji->...", h, h)) / 2
-    sextic = trace_adjugate**3 - np.linalg.det(h) * a**3
-    return quartic, sextic

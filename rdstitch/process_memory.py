@@ -14,8 +14,8 @@ _LARGE = 8 * 2**20  # bytes: more than any array of a tile, which are made again
 _SCRATCH = 280 * 10**6  # bytes that the threads of this process may take at once for what they give back soon
 
 
-def release_free_heap() -> None:
-    """Give memory that earlier stages have freed back to the system, where the C library would keep it (glibc).
+def return_freed_memory() -> None:
+    """Return what is freed, now and from now on, to the system, where the C library would keep it (glibc).
 
     What the threads of one stage have freed is of little use to those of the next, and would count twice. From the
     first call on, large arrays go back as soon as they are freed; otherwise the library would soon put them onto its

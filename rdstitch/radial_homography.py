@@ -37,7 +37,6 @@ def to_plane(camera: Camera, homography: FloatArray, points: ArrayLike) -> Float
 
     Parameters
     ----------
-    camera : Camera
     homography : ndarray of shape (3, 3)
         From undistorted normalized coordinates to the plane, with positive third coordinates in front of the camera.
     points : array_like of shape (N, 2)
@@ -49,6 +48,16 @@ def from_plane(camera: Camera, homography: FloatArray, points: ArrayLike) -> Flo
     """Pixels where a picture shows points (N, 2) of the plane: the inverse of :func:`to_plane`; NaN where it cannot."""
     back = np.asarray(np.linalg.inv(homography), dtype=np.float64)
     return camera.distort(camera.denormalize(_mapped(back, np.asarray(points, dtype=np.float64))))
+
+
+def to_directions(camera: Camera, matrix: FloatArray, points: ArrayLike) -> FloatArray:
+    """Directions (N, 3), of any length, of measured points of a picture, pixels (N, 2), of a camera that only turned.
+
+    ``matrix`` (3, 3) leads from undistorted normalized coordinates to directions.
+    """
+    flat = camera.normalize(camera.undistort(points))
+    directions: FloatArray = np.concatenate([flat, np.ones((len(flat), 1))], axis=1) @ matrix.T
+    return directions
 
 
 def _mapped(homography: FloatArray, points: FloatArray) -> FloatArray:
@@ -121,10 +130,7 @@ class TransferJacobian:
 
 
 def transfer_jacobian(
-    homography: FloatArray,
-    distortion: float,
-    points: FloatArray,
-    higher: Sequence[float] = (),
+    homography: FloatArray, distortion: float, points: FloatArray, higher: Sequence[float] = ()
 ) -> TransferJacobian:
     """:func:`transfer` with its analytic derivatives.
 
@@ -277,7 +283,6 @@ class RadialHomography:
         return cls(h, camera, camera2, none, iterations=iterations, reason=reason, ok=False)
 
     def __repr__(self) -> str:
-        """One line: the model, its inliers and λ, or why the fit failed."""
         if not self.ok:
             return f"<RadialHomography failed: {self.reason}>"
         agreeing = f"{int(self.inliers.sum())} of {len(self.inliers)} inliers"

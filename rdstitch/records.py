@@ -23,7 +23,6 @@ def read_text(path: str | Path, *, regular: bool = True) -> str:
 
     Parameters
     ----------
-    path : path
     regular : bool
         Refuse pipes and devices, of which reading may not come to an end.
 

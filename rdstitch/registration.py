@@ -45,7 +45,6 @@ class Registration:
     stretch: tuple[float, float] | None = None
 
     def __repr__(self) -> str:
-        """One line: of how many pictures, and λ."""
         return f"<Registration {self.summary}>"
 
     def with_messages(self, messages: Iterable[Message]) -> Self:

@@ -1,17 +1,86 @@
-"""What stitching gives."""
+"""What stitching gives: the picture, in memory or in a file, and everything that was estimated for it."""
 
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rdstitch.compositing import Canvas, Composite, CompositePlan
-from rdstitch.inputs.frame import ChannelOrder
+from rdstitch.errors import ArgumentError
+from rdstitch.inputs.frame import ChannelOrder, in_order
 from rdstitch.io.fingerprint import Fingerprint
+from rdstitch.io.preview import encode_preview, read_preview
+from rdstitch.io.read import read_image
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
-from rdstitch.output_image import OutputImage
 from rdstitch.registration import Registration
+
+_PREVIEW = 800  # pixels of the longer side
+
+
+class OutputImage:
+    """Base of results that have a picture."""
+
+    canvas: Canvas
+    output: Path | None
+    composite: Composite | None
+    plan: CompositePlan | None
+
+    @property
+    def image_order(self) -> ChannelOrder:
+        """Order of the channels of :attr:`image`."""
+        raise NotImplementedError
+
+    @property
+    def summary(self) -> str:
+        """What was made, in one line."""
+        raise NotImplementedError
+
+    @property
+    def image(self) -> NDArray[Any]:
+        """The picture (H, W) or (H, W, C), channels in the order that was chosen for arrays; 0 where there is none.
+
+        A picture that went to a file is read from there.
+
+        Raises
+        ------
+        ArgumentError
+            When there is none: after a dry run, or where it is a pyramid of Deep Zoom tiles.
+        InputError
+            When the file cannot be read any more.
+        """
+        return in_order(self._samples()[0], self.image_order)
+
+    @property
+    def alpha(self) -> NDArray[np.uint8]:
+        """255 where the picture is, (H, W), elsewhere 0; 255 everywhere where its file holds no alpha, as JPEG."""
+        pixels, alpha = self._samples()
+        return np.full(pixels.shape[:2], 255, np.uint8) if alpha is None else alpha
+
+    def _samples(self) -> tuple[NDArray[Any], NDArray[np.uint8] | None]:
+        """In RGB order."""
+        if self.composite is not None:
+            return self.composite.pixels, self.composite.alpha
+        if self.plan is not None or self.output is None or self.output.suffix.lower() == ".dzi":
+            raise ArgumentError("there is no picture in memory: stitch without an output, or with one of another type")
+        picture = read_image(self.output)
+        return picture.pixels, picture.alpha
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.summary}>"
+
+    def _repr_png_(self) -> bytes | None:
+        """A preview for notebooks; None where there is no picture."""
+        if self.composite is not None:
+            return encode_preview(self.composite.pixels, _PREVIEW, self.composite.alpha, "PNG")
+        if self.plan is not None or self.output is None or not self.output.is_file():
+            return None
+        pixels, alpha = read_preview(self.output, self.canvas.size, _PREVIEW)
+        return encode_preview(pixels, _PREVIEW, alpha, "PNG")
 
 
 @dataclass(frozen=True, repr=False)

@@ -39,7 +39,6 @@ def read_config(path: Path, commands: Mapping[str, click.Command], running: str)
     ----------
     path : Path
         TOML with a table for each command, and one that holds for all of them. Keys are long options without dashes.
-    commands : mapping of str to Command
     running : str
         Name of the command that runs.
 

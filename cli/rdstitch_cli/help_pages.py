@@ -9,63 +9,17 @@ import click
 
 _FIRST = "Options that matter first"
 _GROUPS = {
-    _FIRST: (
-        "output",
-        "overwrite",
-        "images",
-        "preview",
-        "reference",
-        "camera",
-        "focal",
-        "mask",
-        "scale",
-        "report",
-        "layout",
-        "height",
-        "view",
-        "quiet",
-    ),
-    "Input": ("following", "idle", "refresh", "every", "exclude", "include_only", "match", "topic", "timestamps"),
-    "Camera": ("distortion", "lens_model", "lens", "tilt", "attitude", "attitude_std", "save_camera"),
+    _FIRST: "output overwrite images preview reference camera focal mask scale report layout height view quiet",
+    "Input": "following idle refresh every exclude include_only match topic timestamps",
+    "Camera": "distortion lens tilt attitude attitude_std save_camera",
     "Features and registration": (
-        "features",
-        "aliked_model",
-        "lightglue_model",
-        "max_features",
-        "work_megapixels",
-        "solver",
-        "model",
-        "threshold",
+        "features aliked_model lightglue_model max_features work_megapixels solver model threshold"
     ),
     "Output": (
-        "rotate",
-        "crop",
-        "projection",
-        "max_stretch",
-        "max_size",
-        "local_alignment",
-        "exposure",
-        "seam",
-        "blend",
-        "interpolation",
-        "background",
-        "quality",
-        "plot",
-        "as_json",
+        "rotate crop projection max_stretch max_size local_alignment exposure seam blend interpolation background "
+        "quality plot as_json"
     ),
-    "Control": (
-        "strict",
-        "force",
-        "dry_run",
-        "cache",
-        "max_memory",
-        "workers",
-        "scheduler",
-        "seed",
-        "verbose",
-        "config",
-        "help",
-    ),
+    "Control": "strict force dry_run cache max_memory workers scheduler seed verbose config help",
 }
 _OTHERS = "Other options"
 
@@ -90,8 +44,8 @@ class GroupedCommand(click.Command):
 def place_of(name: str) -> tuple[str, int]:
     """The group of an option, and its rank there."""
     for group, names in _GROUPS.items():
-        if name in names:
-            return group, names.index(name)
+        if name in names.split():
+            return group, names.split().index(name)
     return _OTHERS, 0
 
 

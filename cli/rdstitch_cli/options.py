@@ -2,7 +2,8 @@
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -10,6 +11,7 @@ import click
 from click.core import ParameterSource
 
 from rdstitch_cli.parameter_types import Angle, Angles, Bytes, FileOr, UserPath, WordOrNumber
+from rdstitch_cli.terminal import Reporter
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 Decorator = Callable[[Command], Command]
@@ -49,13 +51,22 @@ def is_given(name: str) -> bool:
     return click.get_current_context().get_parameter_source(name) not in (None, ParameterSource.DEFAULT)
 
 
-inputs = click.argument(
-    "inputs",
-    nargs=-1,
-    required=True,
-    type=UserPath(allow_dash=True),
-    metavar="INPUT...",
-)
+def _choice(name: str, words: Sequence[str], usual: str, text: str) -> Decorator[Any]:
+    """An option that is one of some words."""
+    return click.option(name, type=click.Choice(words), default=usual, show_default=True, help=text)
+
+
+def _number(name: str, kind: Any, usual: float, text: str, called: str | None = None) -> Decorator[Any]:
+    """An option that is a number."""
+    return click.option(name, type=kind, default=usual, show_default=True, metavar=called, help=text)
+
+
+def _file(name: str, called: str, text: str) -> Decorator[Any]:
+    """An option that names a file or folder."""
+    return click.option(name, type=PICTURE, metavar=called, help=text)
+
+
+inputs = click.argument("inputs", nargs=-1, required=True, type=UserPath(allow_dash=True), metavar="INPUT...")
 
 
 def _every(otherwise: int | None) -> Decorator[Any]:
@@ -84,17 +95,25 @@ as_json = click.option(
     "--json", "as_json", is_flag=True, help="Print everything as JSON: the sidecar, the camera, or what doctor found."
 )
 
-verbosity = together(
-    click.option("-q", "--quiet", is_flag=True, help="Say nothing on standard error but errors."),
-    click.option("-v", "--verbose", is_flag=True, help="Say what is going on."),
-)
+
+def verbosity(command: Callable[..., Any]) -> Callable[..., Any]:
+    """-q and -v, by which the command gets its ``reporter``."""
+
+    @click.option("-q", "--quiet", is_flag=True, help="Say nothing on standard error but errors.")
+    @click.option("-v", "--verbose", is_flag=True, help="Say what is going on.")
+    @wraps(command)
+    def run(*, quiet: bool, verbose: bool, **given: Any) -> Any:
+        with Reporter(verbose - quiet) as reporter:
+            return command(reporter=reporter, **given)
+
+    return run
+
 
 lens = together(
-    click.option(
+    _file(
         "--camera",
-        type=PICTURE,
-        metavar="FILE",
-        help="Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap or Hugin; its lens is kept.",
+        "FILE",
+        "Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap or Hugin; its lens is kept.",
     ),
     click.option(
         "--lambda", "distortion", type=float, metavar="L", help="Known λ for half the image diagonal; it is kept."
@@ -120,11 +139,8 @@ known = together(
     ),
 )
 
-mask = click.option(
-    "--mask",
-    type=PICTURE,
-    metavar="DIR|FILE",
-    help="Black is excluded: a folder of masks with the pictures' names, or one mask for all pictures.",
+mask = _file(
+    "--mask", "DIR|FILE", "Black is excluded: a folder of masks with the pictures' names, or one mask for all pictures."
 )
 
 workers = click.option(
@@ -145,13 +161,9 @@ estimation = together(
         metavar="NAME",
         help="Use only the pictures of this name or pattern; repeatable.",
     ),
-    click.option(
-        "--features", type=click.Choice(FEATURES), default="rootsift", show_default=True, help="Features to match."
-    ),
-    click.option("--aliked-model", type=PICTURE, metavar="FILE", help="ONNX file of the network of --features aliked."),
-    click.option(
-        "--lightglue-model", type=PICTURE, metavar="FILE", help="Match by this LightGlue network for these features."
-    ),
+    _choice("--features", FEATURES, "rootsift", "Features to match."),
+    _file("--aliked-model", "FILE", "ONNX file of the network of --features aliked."),
+    _file("--lightglue-model", "FILE", "Match by this LightGlue network for these features."),
     click.option(
         "--max-features",
         type=click.IntRange(1),
@@ -166,33 +178,26 @@ estimation = together(
         help="Pictures are halved until they have no more megapixels before features are detected, once less where "
         "that shows too few; 0 is full size.  [default: 0.6; of fewer than 8 pictures 4.8 together, at most 2.4 each]",
     ),
-    click.option(
-        "--solver", type=click.Choice(SOLVERS), default="auto", show_default=True, help="Minimal solver of the pairs."
-    ),
-    click.option(
+    _choice("--solver", SOLVERS, "auto", "Minimal solver of the pairs."),
+    _choice(
         "--lens",
-        type=click.Choice(LENSES),
-        default="auto",
-        show_default=True,
-        help="Lens to estimate: λ; λ and the distortion centre; besides them a second or a third coefficient.",
+        LENSES,
+        "auto",
+        "Lens to estimate: λ; λ and the distortion centre; besides them a second or a third coefficient.",
     ),
-    click.option(
-        "--model", type=click.Choice(MODELS), default="auto", show_default=True, help="How freely the camera moved."
-    ),
-    click.option(
+    _choice("--model", MODELS, "auto", "How freely the camera moved."),
+    _number(
         "--threshold",
-        type=float,
-        default=3.0,
-        show_default=True,
-        metavar="PX",
-        help="Largest error of an inlier, pixels of the size that features are detected at (see --work-megapixels).",
+        float,
+        3.0,
+        "Largest error of an inlier, pixels of the size that features are detected at (see --work-megapixels).",
+        "PX",
     ),
-    click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of random sampling."),
-    click.option(
+    _number("--seed", click.IntRange(0), 0, "Seed of random sampling."),
+    _file(
         "--cache",
-        type=PICTURE,
-        metavar="DIR",
-        help="Keep features, pairs and alignments in this folder, and continue from what is there; made if missing.",
+        "DIR",
+        "Keep features, pairs and alignments in this folder, and continue from what is there; made if missing.",
     ),
     click.option(
         "--scheduler",
@@ -205,90 +210,60 @@ estimation = together(
 
 strict = click.option("--strict", is_flag=True, help="Fail with status 5 when a picture is left out.")
 
-report = click.option(
-    "--report",
-    type=PICTURE,
-    metavar="FILE",
-    help="Write a report to FILE (.html): graph, votes on λ, matches, residuals.",
-)
+report = _file("--report", "FILE", "Write a report to FILE (.html): graph, votes on λ, matches, residuals.")
 
 trust = together(
-    strict,
-    click.option("--force", is_flag=True, help="Write the result even when it fails its own checks."),
+    strict, click.option("--force", is_flag=True, help="Write the result even when it fails its own checks.")
 )
 
 compositing = together(
-    click.option(
+    _choice(
         "--exposure",
-        type=click.Choice(["none", "gain", "blocks", "balanced"]),
-        default="balanced",
-        show_default=True,
-        help="Brightness: balanced leaves no step at seams, keeps every region near its own pictures' brightness and "
+        ["none", "gain", "blocks", "balanced"],
+        "balanced",
+        "Brightness: balanced leaves no step at seams, keeps every region near its own pictures' brightness and "
         "clips nothing; gain makes the whole comparable (one factor per picture, one vignetting); blocks adds a "
         "smooth field per picture to that.",
     ),
-    click.option(
+    _choice(
         "--seam",
-        type=click.Choice(["none", "voronoi", "graphcut"]),
-        default="graphcut",
-        show_default=True,
-        help="Where pictures meet: round what differs, midway, or wherever they overlap.",
+        ["none", "voronoi", "graphcut"],
+        "graphcut",
+        "Where pictures meet: round what differs, midway, or wherever they overlap.",
     ),
-    click.option(
+    _choice(
         "--blend",
-        type=click.Choice(["none", "feather", "multiband"]),
-        default="multiband",
-        show_default=True,
-        help="How pictures pass into one another; none cuts, for measuring.",
+        ["none", "feather", "multiband"],
+        "multiband",
+        "How pictures pass into one another; none cuts, for measuring.",
     ),
-    click.option(
-        "--crop",
-        type=click.Choice(["none", "auto"]),
-        default="none",
-        show_default=True,
-        help="Cut to the largest rectangle without holes.",
-    ),
-    click.option(
+    _choice("--crop", ["none", "auto"], "none", "Cut to the largest rectangle without holes."),
+    _choice(
         "--projection",
-        type=click.Choice(["auto", "plane", "cylinder", "sphere", "mercator"]),
-        default="auto",
-        show_default=True,
-        help="How pictures taken by turning on the spot are laid out.",
+        ["auto", "plane", "cylinder", "sphere", "mercator"],
+        "auto",
+        "How pictures taken by turning on the spot are laid out.",
     ),
-    click.option(
-        "--interpolation",
-        type=click.Choice(["linear", "cubic", "lanczos"]),
-        default="cubic",
-        show_default=True,
-        help="Kernel of the one resampling.",
-    ),
-    click.option(
+    _choice("--interpolation", ["linear", "cubic", "lanczos"], "cubic", "Kernel of the one resampling."),
+    _number(
         "--background",
-        type=click.IntRange(0, 255),
-        default=0,
-        show_default=True,
-        metavar="GREY",
-        help="What no picture covers, in JPEG and .dzi: 0 black to 255 white.",
+        click.IntRange(0, 255),
+        0,
+        "What no picture covers, in JPEG and .dzi: 0 black to 255 white.",
+        "GREY",
     ),
     click.option(
         "--max-memory",
         type=Bytes(),
         help="Memory that compositing may take, as 800M; otherwise up to 256M, or more for a large canvas.",
     ),
-    click.option(
-        "--scale",
-        type=float,
-        default=1.0,
-        show_default=True,
-        help="Factor to the size of the output; 1 keeps resolution.",
-    ),
-    click.option(
+    _number("--scale", float, 1.0, "Factor to the size of the output; 1 keeps resolution."),
+    _number(
         "--max-stretch",
-        type=click.FloatRange(1.0, min_open=True),
-        default=3.0,
-        show_default=True,
-        metavar="N",
-        help="What an oblique picture shows N times coarser than the reference picture is not drawn.",
+        click.FloatRange(1.0, min_open=True),
+        3.0,
+        "What an oblique picture shows N times coarser than the reference picture is not drawn.",
+        "N",
     ),
     click.option(
         "--max-size",
@@ -296,22 +271,8 @@ compositing = together(
         metavar="N",
         help="Longest side of the output, pixels; smaller than --scale makes it where that is more.",
     ),
-    click.option(
-        "--quality",
-        type=click.IntRange(1, 100),
-        default=95,
-        show_default=True,
-        metavar="Q",
-        help="Quality of JPEG and WebP, 1 to 100.",
-    ),
-    click.option(
-        "--rotate",
-        type=float,
-        default=0.0,
-        show_default=True,
-        metavar="DEG",
-        help="Turn the output clockwise, degrees.",
-    ),
+    _number("--quality", click.IntRange(1, 100), 95, "Quality of JPEG and WebP, 1 to 100.", "Q"),
+    _number("--rotate", float, 0.0, "Turn the output clockwise, degrees.", "DEG"),
     click.option(
         "--dry-run", is_flag=True, help="Say what compositing would take (size, memory, time); write nothing."
     ),
@@ -339,11 +300,10 @@ stitching = together(
         "where matches that took no part in it come nearer; a number of cells along a picture's longer side: always.",
     ),
     compositing,
-    click.option(
+    _file(
         "--save-camera",
-        type=PICTURE,
-        metavar="FILE",
-        help="Write the estimated camera: .json, .yml (OpenCV), .pto (Hugin), camera_info.yaml (ROS) and others.",
+        "FILE",
+        "Write the estimated camera: .json, .yml (OpenCV), .pto (Hugin), camera_info.yaml (ROS) and others.",
     ),
     registration,
 )

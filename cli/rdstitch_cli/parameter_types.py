@@ -38,7 +38,6 @@ class Angles(click.ParamType):  # type: ignore[type-arg]  # generic since click 
     name = "PSI,THETA"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        """Parse the text."""
         if isinstance(value, tuple):
             return value[0], value[1]
         try:
@@ -71,7 +70,6 @@ class WordOrNumber(click.ParamType):  # type: ignore[type-arg]  # generic since 
         self.words, self.least, self.most = words, least, most
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str | int:
-        """Parse the text."""
         if value in self.words:
             return str(value)
         try:
@@ -94,7 +92,6 @@ class Bytes(click.ParamType):  # type: ignore[type-arg]  # generic since click 8
     units: ClassVar[dict[str, int]] = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Parse the text."""
         if isinstance(value, int):
             return value
         parts = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([KMGT]?)(?:i?B)?\s*", str(value), re.IGNORECASE)
@@ -110,7 +107,6 @@ class Angle(click.ParamType):  # type: ignore[type-arg]  # generic since click 8
     name = "DEG"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Parse the text."""
         try:
             angle = math.radians(float(value))
         except ValueError:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from rdstitch.messages import bytes_in_words, seconds_in_words
 from rdstitch_cli.config import CONFIG_FILE
 from rdstitch_cli.options import is_given
 from rdstitch_cli.terminal import Reporter
@@ -90,10 +91,7 @@ def _preview(
     """Features and megapixels of a quick result; changes the other options that the user did not set."""
     quick = {"max_size": 1200, "seam": "voronoi"}
     given |= {name: value for name, value in quick.items() if not is_given(name)}
-    return (
-        max_features if is_given("max_features") else 1500,
-        work_megapixels if is_given("work_megapixels") else 0.5,
-    )
+    return (max_features if is_given("max_features") else 1500, work_megapixels if is_given("work_megapixels") else 0.5)
 
 
 class Report:
@@ -103,23 +101,16 @@ class Report:
     ----------
     file : Path or None
         None writes nothing.
-    reporter : Reporter
     inputs : sequence of Path
         Files that it must not be written over.
-    overwrite : bool
     output : Path, optional
         Picture that is made, beside which there may be a page.
     """
 
     def __init__(
-        self,
-        file: Path | None,
-        reporter: Reporter,
-        inputs: Sequence[Path],
-        overwrite: bool,
-        output: Path | None = None,
+        self, file: Path | None, reporter: Reporter, inputs: Sequence[Path], overwrite: bool, output: Path | None = None
     ) -> None:
-        from rdstitch.pipeline.timing import StageTimer
+        from rdstitch.progress import StageTimer
 
         self._file, self.progress = file, StageTimer(reporter)
         if file is not None:
@@ -176,21 +167,11 @@ def show_plan(plan: "CompositePlan") -> None:
     (width, height), megapixels = plan.canvas_size, plan.canvas_size[0] * plan.canvas_size[1] / 1e6
     click.echo(f"pictures: {plan.pictures}")
     click.echo(f"canvas: {width} x {height} pixels, {megapixels:.4g} megapixels")
-    click.echo(f"output: {_amount(plan.output_bytes)} of samples, before compression")
+    click.echo(f"output: {bytes_in_words(plan.output_bytes)} of samples, before compression")
     click.echo(
-        f"memory: about {_amount(plan.memory_bytes)} for {plan.workers} tiles of side {plan.tile_size} at a time"
+        f"memory: about {bytes_in_words(plan.memory_bytes)} for {plan.workers} tiles of side {plan.tile_size} at a time"
     )
-    click.echo(f"time: about {_duration(plan.seconds)} for compositing")
-
-
-def _amount(size: int) -> str:
-    """Bytes for people."""
-    return f"{size / 2**30:.1f} GB" if size >= 2**30 else f"{max(1, round(size / 2**20))} MB"
-
-
-def _duration(seconds: float) -> str:
-    """Seconds for people."""
-    return f"{seconds / 60:.0f} min" if seconds >= 120 else f"{max(1, round(seconds))} s"
+    click.echo(f"time: about {seconds_in_words(plan.seconds)} for compositing")
 
 
 def report_registration(registration: "Registration", reporter: Reporter, *, as_json: bool = False) -> None:

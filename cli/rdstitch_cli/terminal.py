@@ -3,10 +3,8 @@
 import codecs
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from io import TextIOWrapper
-from types import TracebackType
 from typing import Never, Self
 
 from tqdm import tqdm
@@ -75,7 +73,7 @@ class Reporter:
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Show that ``done`` of ``total`` steps of a stage are done."""
         if stage != self._stage:
-            self._close()
+            self.finish()
             self._stage = stage
             self.log(f"{stage} ({total})")
             if self._bars:
@@ -100,7 +98,9 @@ class Reporter:
 
     def finish(self) -> None:
         """Take the bar away before anything goes to standard output."""
-        self._close()
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
 
     def made(self, text: str) -> None:
         """End by saying what was made, and how long it took."""
@@ -108,28 +108,15 @@ class Reporter:
             self._line(f"{text}, {time.perf_counter() - self._began:.1f} s")
 
     def __enter__(self) -> Self:
-        """Begin reporting."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *failure: object) -> None:
         """Take the bar away, whatever happened."""
-        self._close()
+        self.finish()
 
     def _line(self, text: str) -> None:
-        with self._paused():
-            print(one_line(text), file=sys.stderr)
-
-    @contextmanager
-    def _paused(self) -> Iterator[None]:
         if self._bar is not None:
             self._bar.clear()
-        yield
+        print(one_line(text), file=sys.stderr)
         if self._bar is not None:
             self._bar.refresh()
-
-    def _close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None

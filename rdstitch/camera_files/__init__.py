@@ -18,6 +18,7 @@ What is written follows from the name, as above; what is read is known by its co
 import json
 import re
 from collections.abc import Callable
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from rdstitch.camera import Camera
@@ -36,13 +37,16 @@ from rdstitch.camera_files.own_camera import CameraFile, read_comments
 from rdstitch.camera_files.text_formats import camera_chain_yaml, camera_info_yaml, colmap_text
 from rdstitch.camera_record import camera_from_record
 from rdstitch.errors import OutputError
-from rdstitch.io.atomic import write_text_atomic
+from rdstitch.io.atomic import text_bytes, write_bytes_atomic
 from rdstitch.records import parse_json, read_text
 
 __all__ = ["CAMERA_SUFFIXES", "CameraFile", "LensFit", "export_note", "load_camera", "read_camera_file", "save_camera"]
 
 CAMERA_SUFFIXES = (".json", ".yml", ".yaml", ".pto", ".txt")
 """How names of camera files end, lower case."""
+
+_STATED = re.compile(r"(?<!lambda_)fit_largest_px\"?: ([-+.\de]+)")
+"""The residual that files of others state."""
 
 
 def load_camera(path: str | Path) -> Camera:
@@ -103,7 +107,7 @@ def save_camera(camera: Camera, path: str | Path) -> None:
     OutputError
         When the name says none, or the file cannot be written.
     """
-    write_text_atomic(path, camera_file_text(camera, path))
+    write_bytes_atomic(path, text_bytes(camera_file_text(camera, path)))
 
 
 def camera_file_text(camera: Camera, path: str | Path) -> str:
@@ -122,7 +126,6 @@ def export_note(camera: Camera, path: str | Path) -> tuple[str, ...]:
 
     Parameters
     ----------
-    camera : Camera
     path : path
         As :func:`save_camera` takes it.
     """
@@ -131,37 +134,31 @@ def export_note(camera: Camera, path: str | Path) -> tuple[str, ...]:
 
 
 def _writer(path: Path) -> Callable[[Camera], str]:
-    name = path.name.lower()
-    if (named := _NAMES.get(name)) is not None:
-        return named
-    for ending, writer in _ENDINGS.items():
-        if name.endswith(ending):
+    for pattern, writer in _WRITERS.items():
+        if fnmatchcase(path.name.lower(), pattern):
             return writer
-    writers = {".json": _own_json, ".yml": opencv_yaml, ".yaml": opencv_yaml, ".pto": hugin_project}
-    if path.suffix.lower() not in writers:
-        raise OutputError(f"{path}: not the name of a camera file; use one of {' '.join(CAMERA_SUFFIXES)}")
-    return writers[path.suffix.lower()]
-
-
-_STATED = re.compile(r"(?<!lambda_)fit_largest_px\"?: ([-+.\de]+)")
-"""The residual that files of others state."""
-
-_NAMES: dict[str, Callable[[Camera], str]] = {
-    "cameras.json": opendronemap_json,
-    "opencv.json": opencv_json,
-    "fisheye.yml": opencv_fisheye_yaml,
-    "fisheye.yaml": opencv_fisheye_yaml,
-    "camera_info.yaml": camera_info_yaml,
-    "camera_info.yml": camera_info_yaml,
-    "camchain.yaml": camera_chain_yaml,
-    "cameras.txt": colmap_text,
-}
-_ENDINGS: dict[str, Callable[[Camera], str]] = {
-    ".opencv.json": opencv_json,
-    ".fisheye.yml": opencv_fisheye_yaml,
-    ".fisheye.yaml": opencv_fisheye_yaml,
-}
+    raise OutputError(f"{path}: not the name of a camera file; use one of {' '.join(CAMERA_SUFFIXES)}")
 
 
 def _own_json(camera: Camera) -> str:
     return json.dumps(camera.as_dict(), indent=2) + "\n"
+
+
+_WRITERS: dict[str, Callable[[Camera], str]] = {
+    "cameras.json": opendronemap_json,
+    "opencv.json": opencv_json,
+    "*.opencv.json": opencv_json,
+    "?*.json": _own_json,
+    "camera_info.yml": camera_info_yaml,
+    "camera_info.yaml": camera_info_yaml,
+    "camchain.yaml": camera_chain_yaml,
+    "fisheye.yml": opencv_fisheye_yaml,
+    "fisheye.yaml": opencv_fisheye_yaml,
+    "*.fisheye.yml": opencv_fisheye_yaml,
+    "*.fisheye.yaml": opencv_fisheye_yaml,
+    "?*.yml": opencv_yaml,
+    "?*.yaml": opencv_yaml,
+    "cameras.txt": colmap_text,
+    "?*.pto": hugin_project,
+}
+"""By the name of the file, the first that fits."""

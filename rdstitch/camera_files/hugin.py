@@ -49,7 +49,7 @@ def read_hugin(text: str, file: str) -> CameraFile:
     projection = lens["f"].integer()
     if projection not in (_RECTILINEAR, _CIRCULAR_FISHEYE, _FISHEYE):
         lens["f"].fail("only rectilinear lenses (f0) and fisheyes (f2, f3) are known here")
-    bend = _unbent if projection == _RECTILINEAR else np.arctan
+    bend = np.positive if projection == _RECTILINEAR else np.arctan
     size = (lens["w"].side(), lens["h"].side())
     a, b, c, d, e = (0.0 if lens.get(name) is None else lens[name].number() for name in "abcde")
     view = lens["v"].number()
@@ -106,10 +106,6 @@ def _fit(samples: LensSamples, straight: FloatArray, unit: float) -> tuple[Float
     """Coefficients of :data:`_POWERS`, in ``unit``, that turn ideal radii (N,), focal lengths, into measured ones."""
     size = samples.focal / unit
     return samples.fit(straight, (straight[:, None] * size) ** np.array(_POWERS) / size)
-
-
-def _unbent(radius: FloatArray) -> FloatArray:
-    return radius
 
 
 def _number(text: str) -> float | str:

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
+from rdstitch.camera import Camera, points_over
 from rdstitch.errors import ArgumentError
 
 Forward = Callable[[FloatArray], FloatArray]
@@ -58,9 +58,7 @@ class LensSamples:
         """Of a camera."""
         focal = camera.with_focal().focal
         assert focal is not None
-        width, height = camera.image_size
-        u, v = np.meshgrid(np.linspace(-0.5, width - 0.5, _GRID), np.linspace(-0.5, height - 0.5, _GRID))
-        measured = np.column_stack([u.ravel(), v.ravel()])
+        measured = points_over(camera.image_size, _GRID)
         measured = measured[np.linalg.norm(measured - camera.center, axis=1) <= camera.drawn_radius]
         straight = np.linalg.norm(camera.undistort(measured) - camera.center, axis=1) / focal
         return cls(straight, np.linalg.norm(measured - camera.center, axis=1) / focal, focal)

@@ -21,6 +21,14 @@ from rdstitch.records import Record, parse_json
 
 _FIELD = re.compile(r"(?P<indent> *)(?P<key>[^\s:#\[\]{}\"']+) *:(?: +(?P<value>.*))?")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_KIND = "OpenCV"
+_OWN = "rdstitch"
+_FISHEYE = ("equidistant", "fisheye")
+# The first is what is written; others are found in files of OpenCV's samples and of ROS.
+_MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
+
+_COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "Distortion_Coefficients", "D")
+_WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height")
 
 
 def to_yaml(content: dict[str, Any]) -> str:
@@ -28,16 +36,16 @@ def to_yaml(content: dict[str, Any]) -> str:
     lines = ["%YAML:1.0", "---"]
     for key, value in content.items():
         if not isinstance(value, dict):
-            lines.append(f"{key}: {_plain(value)}")
+            lines.append(f"{key}: {json.dumps(value)}")
             continue
         matrix = value.get("type_id") == "opencv-matrix"
         lines.append(f"{key}: !!opencv-matrix" if matrix else f"{key}:")
-        lines.extend(f"   {name}: {_plain(item)}" for name, item in value.items() if name != "type_id")
+        lines.extend(f"   {name}: {json.dumps(item)}" for name, item in value.items() if name != "type_id")
     return "\n".join(lines) + "\n"
 
 
 def parse_yaml(text: str, file: str) -> Record:
-    """What FileStorage wrote, as a record.
+    """What FileStorage wrote, as a record: fields, one level of nested fields, lists of numbers and texts.
 
     Raises
     ------
@@ -84,24 +92,9 @@ def _value(text: str, file: str, number: int) -> Any:
     if text.startswith(("[", '"')):
         whole = _NUMBER.sub(lambda found: str(float(found[0])), text) if text.startswith("[") else text
         return parse_json(whole, f"{file}: line {number}").value
-    return _number(text) if _NUMBER.fullmatch(text) else text
-
-
-def _number(text: str) -> float | int:
+    if not _NUMBER.fullmatch(text):
+        return text
     return int(text) if re.fullmatch(r"[-+]?\d{1,15}", text) else float(text)
-
-
-def _plain(value: Any) -> str:
-    return json.dumps(value)
-
-
-_KIND = "OpenCV"
-_OWN = "rdstitch"
-_FISHEYE = ("equidistant", "fisheye")
-# The first is what is written; others are found in files of OpenCV's samples and of ROS.
-_MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
-_COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "Distortion_Coefficients", "D")
-_WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height")
 
 
 def is_opencv(record: Record) -> bool:

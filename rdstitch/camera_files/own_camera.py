@@ -10,6 +10,8 @@ from rdstitch.camera_record import camera_from_record
 from rdstitch.errors import ArgumentError
 from rdstitch.records import Record, parse_json
 
+_OWN = "#rdstitch "
+
 
 @dataclass(frozen=True)
 class CameraFile:
@@ -60,9 +62,6 @@ def fitted_camera(
     except ArgumentError as error:
         (model or record).fail(str(error))
     return CameraFile(lens, kind, fit)
-
-
-_OWN = "#rdstitch "
 
 
 def comments(camera: Camera, fit: LensFit, model: str) -> str:

@@ -15,6 +15,7 @@ def colmap_text(camera: Camera) -> str:
     if (fisheye := closer_fisheye(camera, fit, close=0.0)) is not None:
         model, values, fit = "OPENCV_FISHEYE", fisheye[0].coefficients, fisheye[1]
     (width, height), focal = camera.image_size, rational.mean_focal
+    # COLMAP's pixels have their centres at halves.
     numbers = (focal, focal, camera.center[0] + 0.5, camera.center[1] + 0.5, *values)
     return (
         comments(camera, fit, model)

@@ -51,8 +51,6 @@ class MultibandBlender:
     ----------
     box : (int, int, int, int)
         On the canvas, aligned to the coarsest band.
-    bands : int
-    channels : int
     constant : float32
         From :func:`rounding_constant`.
     """

@@ -14,6 +14,8 @@ Box = tuple[int, int, int, int]
 """x0, y0, x1, y1, pixels, end exclusive."""
 
 Float32Array = NDArray[np.float32]
+# All of them in ordinary folders; a survey with 70 and 50 % of overlap has about 20.
+_MAX_NEIGHBOURS = 40
 
 
 def intersection(first: Box, second: Box) -> Box | None:
@@ -63,12 +65,8 @@ def cut(values: NDArray[Any], box: Box, part: Box) -> NDArray[Any]:
     return values[y : y + part[3] - part[1], x : x + part[2] - part[0]]
 
 
-# All of them in ordinary folders; a survey with 70 and 50 % of overlap has about 20.
-_MAX_NEIGHBOURS = 40
-
-
 def overlapping_pairs(boxes: Sequence[Box | None], most: int = _MAX_NEIGHBOURS) -> NDArray[np.intp]:
-    """Pairs of boxes that have pixels in common.
+    """Pairs of boxes that have pixels in common, found without looking at every pair.
 
     Parameters
     ----------

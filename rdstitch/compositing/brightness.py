@@ -17,7 +17,7 @@ from scipy import sparse
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.compositing.boxes import Box, cut, intersection, overlapping_pairs
+from rdstitch.compositing.boxes import Box, cut
 from rdstitch.compositing.field_solver import solve_fields
 from rdstitch.compositing.gain_compensation import estimate_gains
 from rdstitch.compositing.options import ExposureMethod
@@ -50,8 +50,6 @@ def estimate_exposure(
 
     Parameters
     ----------
-    survey : Survey
-    pictures : sequence of PlacedPicture
     method : str
         "gain": one factor per picture and channel, and one vignetting for all. "blocks": also a smooth field per
         picture. "balanced": gains and fields that stay near the pictures' own brightness at large scale, and nothing
@@ -87,16 +85,11 @@ class _Cells:
 
 def _compare(survey: Survey, exposure: Exposure) -> _Cells | None:
     """Means of the cells of every overlap, clipped samples included: a burnt-out sky must not end in a step either."""
-    tiles, count = survey.tiles, len(survey.tiles)
-    pairs = overlapping_pairs([None if tile is None else tile.box for tile in tiles])
+    pairs, count = survey.pairs(), len(survey.tiles)
     found: list[tuple[FloatArray, ...]] = []
     shares = np.zeros(len(pairs))
-    for index, (a, b) in enumerate((tiles[i], tiles[j]) for i, j in pairs.tolist()):
-        assert a is not None
-        assert b is not None
-        box = intersection(a.box, b.box)
-        assert box is not None
-        seen = cut(a.inside, a.box, box) & cut(b.inside, b.box, box)
+    for index, (i, j) in enumerate(pairs.tolist()):
+        a, b, box, seen = survey.overlap(i, j)
         shares[index] = seen.sum() / min(a.inside.sum(), b.inside.sum())
         side = max(2, round(max(*seen.shape, *a.inside.shape, *b.inside.shape) / _CELLS))
         pixels, x, y = _cell_means(seen, box, side)

@@ -8,6 +8,7 @@ on the spot, G maps them to directions, and the canvas is what a projection make
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +19,7 @@ from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.near_part import NearPart, near_parts
 from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.errors import ArgumentError, LimitError
-from rdstitch.radial_homography import to_plane
+from rdstitch.radial_homography import to_directions, to_plane
 
 # Straight sides are curved after undistortion: 64 points a side put the extremes within 0.02 pixels on 4000 pixels.
 _POINTS_PER_SIDE = 64
@@ -95,8 +96,7 @@ class Canvas:
         """Canvas pixels (N, 2) of measured pixels (N, 2) of a picture; NaN where it has no place."""
         if self.projection == PLANE:
             return to_plane(camera, self.matrix @ homography, points)
-        flat = camera.normalize(camera.undistort(points))
-        directions = np.concatenate([flat, np.ones((len(flat), 1))], axis=1) @ homography.T
+        directions = to_directions(camera, homography, points)
         places: FloatArray = self.projection.project(directions) @ self.matrix[:2, :2].T + self.matrix[:2, 2]
         return places
 
@@ -135,7 +135,6 @@ def plan_canvas(
 
     Parameters
     ----------
-    cameras : sequence of Camera
     homographies : array_like of shape (N, 3, 3)
         ``G`` of each picture: normalized undistorted to plane coordinates.
     scale : float
@@ -149,10 +148,6 @@ def plan_canvas(
     max_stretch : float
         What a picture shows so many times coarser than the reference picture has no place on the canvas; see
         :mod:`rdstitch.compositing.near_part`. Without a limit, a picture that shows the horizon is refused.
-
-    Returns
-    -------
-    Canvas
 
     Raises
     ------
@@ -174,19 +169,31 @@ def plan_canvas(
     _refuse_mirrored(px_per_unit, called)
     resolution = scale * float(usual)
 
-    angle = math.radians(rotate)
-    cos, sin = resolution * math.cos(angle), resolution * math.sin(angle)
-    linear = np.array([[cos, -sin], [sin, cos]])
+    linear = turned_and_scaled(rotate, resolution)
     placed = [outline @ linear.T for outline in outlines]
     low = np.min([outline.min(axis=0) for outline in placed], axis=0)
     high = np.max([outline.max(axis=0) for outline in placed], axis=0)
     _refuse_absurd(cameras, placed, high - low, scale, called)
     refuse_scale(cameras, high - low)
+    return canvas_between(low, high, linear, placed, near=tuple(near))
+
+
+def turned_and_scaled(rotate: float, resolution: float) -> FloatArray:
+    """The linear part (2, 2) of a canvas: so many pixels per unit, turned by so many degrees clockwise."""
+    angle = math.radians(rotate)
+    cos, sin = resolution * math.cos(angle), resolution * math.sin(angle)
+    return np.array([[cos, -sin], [sin, cos]])
+
+
+def canvas_between(
+    low: FloatArray, high: FloatArray, linear: FloatArray, outlines: Sequence[FloatArray], **more: Any
+) -> Canvas:
+    """The canvas from ``low`` to ``high``, which outlines are counted in after the linear part was applied to them."""
     # The outermost edge is the canvas' edge, half a pixel before the centre of the first pixel.
     size = np.maximum(np.ceil(high - low - 1e-6), 1).astype(int)
     matrix = np.eye(3)
     matrix[:2, :2], matrix[:2, 2] = linear, -low - 0.5
-    return Canvas((int(size[0]), int(size[1])), matrix, tuple(p - low - 0.5 for p in placed), near=tuple(near))
+    return Canvas((int(size[0]), int(size[1])), matrix, tuple(outline - low - 0.5 for outline in outlines), **more)
 
 
 def _check(cameras: Sequence[Camera], matrices: FloatArray, scale: float, rotate: float, names: Sequence[str]) -> None:

@@ -51,7 +51,6 @@ class Composite:
     messages: tuple[Message, ...] = ()
 
     def __repr__(self) -> str:
-        """One line: its size and sample type."""
         return f"<Composite {self.canvas.size[0]} x {self.canvas.size[1]} pixels, {self.pixels.dtype}>"
 
 
@@ -82,7 +81,6 @@ class FileComposite:
     origin: tuple[int, int] = (0, 0)
 
     def __repr__(self) -> str:
-        """One line: its file and size."""
         return f"<FileComposite {self.path}: {self.canvas.size[0]} x {self.canvas.size[1]} pixels>"
 
 
@@ -120,18 +118,12 @@ def compose(
 
     Parameters
     ----------
-    pictures : sequence of PlacedPicture
     canvas : Canvas
         From :func:`rdstitch.compositing.plan_canvas` with the same cameras and homographies.
-    options : CompositeOptions, optional
     progress : callable, optional
         Called with the share of the work done, 0 to 1.
     elsewhere : callable, optional
         Computes the pixels, in blocks, in other processes; see :mod:`rdstitch.compositing.tiles`.
-
-    Returns
-    -------
-    Composite
 
     Raises
     ------
@@ -167,7 +159,6 @@ def compose_to_file(
 
     Parameters
     ----------
-    file : OutputFile
     pictures, canvas, options, progress, elsewhere
         As for :func:`compose`.
 

@@ -16,7 +16,7 @@ from scipy.sparse.linalg import spsolve
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.compositing.boxes import Box, cut, intersection, overlapping_pairs
+from rdstitch.compositing.boxes import Box, cut
 from rdstitch.compositing.photometric import Exposure, full_scale, no_exposure, squared_radius
 from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.survey import Survey, SurveyTile
@@ -44,7 +44,6 @@ def estimate_gains(survey: Survey, pictures: Sequence[PlacedPicture]) -> Exposur
 
     Parameters
     ----------
-    survey : Survey
     pictures : sequence of PlacedPicture
         The distortion centre is the centre of the vignetting, and the exposure that the camera wrote down is a weak
         prior of the gain.
@@ -99,16 +98,11 @@ class _Samples:
 
 def _collect(survey: Survey, cameras: Sequence[Camera]) -> _Samples | None:
     """Samples from every pair of overlapping pictures, evenly spread."""
-    pairs = overlapping_pairs([None if tile is None else tile.box for tile in survey.tiles]).tolist()
+    pairs = survey.pairs().tolist()
     limit = max(_MIN_SAMPLES, min(_SAMPLES_PER_PAIR, _MAX_SAMPLES // max(1, len(pairs))))
     found: list[tuple[Any, ...]] = []
     for i, j in pairs:
-        a, b = survey.tiles[i], survey.tiles[j]
-        assert a is not None
-        assert b is not None
-        box = intersection(a.box, b.box)
-        assert box is not None
-        inside = cut(a.inside, a.box, box) & cut(b.inside, b.box, box)
+        a, b, box, inside = survey.overlap(i, j)
         where = np.flatnonzero(inside)
         if len(where) < _MIN_SAMPLES:
             continue

@@ -34,7 +34,7 @@ class ShownPart:
     points : ndarray of shape (K, 2)
         ... and places in the picture, pixels: both ends of every run of the seam map that the picture owns.
     room : int
-        Px of the picture around them that may be requested too.
+        Pixels of the picture around them that may be requested too.
     size : (int, int)
         Width and height of the picture, pixels.
     """
@@ -64,8 +64,6 @@ def shown_parts(warps: Sequence[Warp], seams: SeamMap, around: int) -> list[Show
 
     Parameters
     ----------
-    warps : sequence of Warp
-    seams : SeamMap
     around : int
         How far from what a picture owns it is requested too, canvas pixels.
     """
@@ -93,7 +91,6 @@ class PictureCache:
 
     Parameters
     ----------
-    reader : PictureReader
     shrinks : sequence of float
         Picture pixels per output pixel.
     limit : int

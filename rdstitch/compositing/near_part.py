@@ -13,17 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
+from rdstitch.camera import Camera, points_over
 from rdstitch.io.read import Picture
 
-_PROBES = 33
-"""Points of a grid over the picture, a side, at which the stretch is measured."""
-
-_POINTS_PER_SIDE = 64
-"""As the canvas samples outlines: undistorted, straight sides are curved."""
-
-_ROWS = 64
-"""Rows of a mask that are computed at a time, so that they stay in the processor's cache."""
+_PROBES = 33  # points of a grid over the picture, a side, at which the stretch is measured
+_POINTS_PER_SIDE = 64  # as the canvas samples outlines: undistorted, straight sides are curved
+_ROWS = 64  # rows of a mask that are computed at a time, so that they stay in the processor's cache
 
 
 @dataclass(frozen=True)
@@ -98,7 +93,6 @@ def near_parts(
 
     Parameters
     ----------
-    cameras : sequence of Camera
     homographies : sequence of ndarray of shape (3, 3)
         Normalized undistorted coordinates to the plane, with positive third coordinates in front of the camera.
     resolution : float
@@ -123,10 +117,7 @@ def near_parts(
 
 def _stretch(camera: Camera, matrix: FloatArray, resolution: float) -> tuple[FloatArray, FloatArray]:
     """Canvas pixels per undistorted pixel, in the direction in which they are most, and depth, over a picture (K,)."""
-    width, height = camera.image_size
-    sides = np.linspace(-0.5, width - 0.5, _PROBES), np.linspace(-0.5, height - 0.5, _PROBES)
-    points = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
-    flat = camera.normalize(camera.undistort(points))
+    flat = camera.normalize(camera.undistort(points_over(camera.image_size, _PROBES)))
     flat = flat[np.isfinite(flat).all(axis=1)]  # a fisheye may see beyond its horizon
     moved = flat @ matrix[:, :2].T + matrix[:, 2]
     depth: FloatArray = moved[:, 2]

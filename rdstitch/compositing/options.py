@@ -88,7 +88,6 @@ class CompositeOptions:
     workers: int | None = None
 
     def __post_init__(self) -> None:
-        """Check every value."""
         hints = get_type_hints(type(self))
         for option in fields(self):
             allowed = get_args(hints[option.name])

@@ -3,14 +3,16 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.compositing.canvas import Canvas, plan_canvas, refuse_scale
+from rdstitch.compositing.canvas import Canvas, canvas_between, plan_canvas, refuse_scale, turned_and_scaled
 from rdstitch.compositing.projection import PLANE, TURN, Projection
 from rdstitch.errors import ArgumentError, LimitError
+from rdstitch.radial_homography import to_directions
 
 _POINTS_PER_SIDE = 64
 # Radians: the view up to which a plane shows it without much stretching, and the height up to which a cylinder does.
@@ -19,6 +21,14 @@ _CYLINDER_HEIGHT = math.radians(70.0)
 # A full turn is a multiple of this many pixels, or of less than 1/256 of it, so that both ends of a canvas have the
 # same lattices, reduced pixels and bands.
 _UNIT, _UNITS_PER_TURN = 32, 256
+_PROPERTIES = (
+    "FullPanoWidthPixels",
+    "FullPanoHeightPixels",
+    "CroppedAreaLeftPixels",
+    "CroppedAreaTopPixels",
+    "CroppedAreaImageWidthPixels",
+    "CroppedAreaImageHeightPixels",
+)
 
 
 @dataclass(frozen=True)
@@ -54,7 +64,6 @@ def seen_directions(cameras: Sequence[Camera], directions: FloatArray) -> SeenDi
 
     Parameters
     ----------
-    cameras : sequence of Camera
     directions : ndarray of shape (N, 3, 3)
         From undistorted normalized coordinates of each picture to directions.
     """
@@ -98,7 +107,6 @@ def plan_panorama(
 
     Parameters
     ----------
-    cameras : sequence of Camera
     directions : ndarray of shape (N, 3, 3)
         From undistorted normalized coordinates of each picture to directions.
     projection : str
@@ -119,15 +127,8 @@ def plan_panorama(
     seen = seen_directions(cameras, directions)
     chosen = choose_projection(seen) if projection == "auto" else Projection(projection)
     if chosen == PLANE:
-        return plan_canvas(
-            cameras,
-            directions,
-            scale=scale,
-            rotate=rotate,
-            reference=reference,
-            names=names,
-            max_stretch=max_stretch,
-        )
+        how: dict[str, Any] = {"scale": scale, "rotate": rotate, "reference": reference, "names": names}
+        return plan_canvas(cameras, directions, max_stretch=max_stretch, **how)
     called = [f"picture {k + 1}" for k in range(len(cameras))] if names is None else list(names)
     lengths = np.linalg.norm(directions, axis=1)
     focal = lengths[:, 2] / lengths[:, 0] * [camera.half_diagonal for camera in cameras]
@@ -158,7 +159,6 @@ def _lay_out(
 
     Parameters
     ----------
-    seen : SeenDirections
     projection : Projection
         Not the plane.
     resolution : float
@@ -182,25 +182,18 @@ def _lay_out(
         unit = max(_UNIT, 1 << int(math.log2(max(width / _UNITS_PER_TURN, 1.0))))
         period = float(math.ceil(width / unit) * unit)
         resolution = period / TURN
-    angle = math.radians(rotate)
-    cos, sin = resolution * math.cos(angle), resolution * math.sin(angle)
-    linear = np.array([[cos, -sin], [sin, cos]])
+    linear = turned_and_scaled(rotate, resolution)
     placed = [outline @ linear.T for outline in places]
     everything = np.concatenate(placed)
     low, high = everything.min(axis=0), everything.max(axis=0)
     if period is not None:
         low[0], high[0] = -period / 2.0, period / 2.0
-    size = np.maximum(np.ceil(high - low - 1e-6), 1).astype(int)
-    matrix = np.eye(3)
-    matrix[:2, :2], matrix[:2, 2] = linear, -low - 0.5
-    footprints = tuple(outline - low - 0.5 for outline in placed)
-    return Canvas((int(size[0]), int(size[1])), matrix, footprints, projection, period)
+    return canvas_between(low, high, linear, placed, projection=projection, period=period)
 
 
 def _outline(camera: Camera, matrix: FloatArray) -> FloatArray:
     """Longitude and latitude (K, 2) of a picture's border, and of the pole that it shows with all longitudes."""
-    border = camera.normalize(camera.undistort(camera.outline(_POINTS_PER_SIDE)))
-    rays = np.concatenate([border, np.ones((len(border), 1))], axis=1) @ matrix.T
+    rays = to_directions(camera, matrix, camera.outline(_POINTS_PER_SIDE))
     ahead = matrix[:, 2]
     middle = math.atan2(ahead[0], ahead[2])
     longitude = middle + np.mod(np.arctan2(rays[:, 0], rays[:, 2]) - middle + np.pi, TURN) - np.pi
@@ -241,16 +234,6 @@ def _widest_gap(low: FloatArray, high: FloatArray) -> float | None:
     gaps = start - reach
     widest = int(np.argmax(gaps))
     return float(start[widest] - gaps[widest] / 2.0) if gaps[widest] > 0.0 else None
-
-
-_PROPERTIES = (
-    "FullPanoWidthPixels",
-    "FullPanoHeightPixels",
-    "CroppedAreaLeftPixels",
-    "CroppedAreaTopPixels",
-    "CroppedAreaImageWidthPixels",
-    "CroppedAreaImageHeightPixels",
-)
 
 
 def directions_on(canvas: Canvas, points: FloatArray) -> FloatArray:

@@ -21,6 +21,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Float32Array
 from rdstitch.compositing.warp import LATTICE_STEPS, Geometry, interpolated
+from rdstitch.local_alignment.field import nodes_around
 
 # The correction is smooth: it is computed at this spacing, canvas pixels, and interpolated.
 _LATTICE = LATTICE_STEPS[0]
@@ -155,14 +156,7 @@ def squared_radius(camera: Camera, points: FloatArray) -> FloatArray:
 
 def bilinear_weights(camera: Camera, points: FloatArray, side: int) -> tuple[NDArray[np.intp], FloatArray]:
     """Interpolation on a grid of ``side`` x ``side`` nodes over a picture: four nodes (..., 4) and their shares."""
-    width, height = camera.image_size
-    place = (np.asarray(points) + 0.5) / (width, height) * (side - 1)
-    place = np.clip(place, 0.0, side - 1.0)
-    cell = np.minimum(place.astype(np.intp), side - 2)
-    x, y = np.moveaxis(place - cell, -1, 0)
-    node = cell[..., 1] * side + cell[..., 0]
-    nodes = np.stack([node, node + 1, node + side, node + side + 1], axis=-1)
-    return nodes, np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=-1)
+    return nodes_around((np.asarray(points) + 0.5) / camera.image_size * (side - 1), (side, side))
 
 
 def _joined(planes: list[Float32Array]) -> Float32Array:

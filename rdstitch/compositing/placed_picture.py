@@ -35,6 +35,8 @@ class PlacedPicture:
         As the camera wrote it down (time x sensitivity / f-number²), up to a factor common to all pictures.
     displacement : callable, optional
         What local alignment adds to its measured pixels; see :class:`rdstitch.compositing.warp.Warp`.
+    path : str
+        What messages call it; its number if empty.
     """
 
     read: PictureLoader
@@ -43,6 +45,7 @@ class PlacedPicture:
     preview: Preview | None = None
     exposure: float | None = None
     displacement: Displacement | None = None
+    path: str = ""
 
 
 def place_pictures(
@@ -53,6 +56,7 @@ def place_pictures(
     preview: Sequence[Preview] | None = None,
     exposure: Sequence[float | None] | None = None,
     displacement: Sequence[Displacement | None] | None = None,
+    paths: Sequence[str] | None = None,
 ) -> list[PlacedPicture]:
     """Pictures from lists of what is known of each; see :class:`PlacedPicture`.
 
@@ -62,9 +66,9 @@ def place_pictures(
         When the lists are not of one length.
     """
     count, matrices = len(loaders), np.asarray(homographies, dtype=np.float64)
-    given = (cameras, matrices, preview, exposure, displacement)
+    given = (cameras, matrices, preview, exposure, displacement, paths)
     if any(values is not None and len(values) != count for values in given):
         raise ArgumentError("pictures, cameras, homographies and what else is given must be equally many")
     nothing = [None] * count
-    more = (preview or nothing, exposure or nothing, displacement or nothing)
+    more = (preview or nothing, exposure or nothing, displacement or nothing, paths or [""] * count)
     return [PlacedPicture(*known) for known in zip(loaders, cameras, matrices, *more, strict=True)]

@@ -61,19 +61,12 @@ class CompositePlan:
 
 
 def plan_composite(
-    cameras: Sequence[Camera],
-    canvas: Canvas,
-    options: CompositeOptions,
-    channels: int = 3,
-    itemsize: int = 1,
+    cameras: Sequence[Camera], canvas: Canvas, options: CompositeOptions, channels: int = 3, itemsize: int = 1
 ) -> CompositePlan:
     """Tile size and cache that keep within the memory limit, with estimates for a dry run.
 
     Parameters
     ----------
-    cameras : sequence of Camera
-    canvas : Canvas
-    options : CompositeOptions
     channels, itemsize : int
         Channels and bytes per sample of the pictures.
 
@@ -87,7 +80,8 @@ def plan_composite(
     picture = max(c.image_size[0] * c.image_size[1] for c in cameras) * channels * itemsize
     # While a picture is decoded it is there twice, beside those in the cache.
     workers = options.workers or min(_MAX_WORKERS, os.cpu_count() or 1)
-    choices = [(side, count) for side in _sides(options) for count in range(workers, 0, -1)]
+    sides = _TILE_SIZES if options.tile_size is None else (options.tile_size,)
+    choices = [(side, count) for side in sides for count in range(workers, 0, -1)]
     needs = {
         choice: 2 * picture + _working_set(canvas, *choice, bands, options, channels, itemsize) for choice in choices
     }
@@ -117,11 +111,6 @@ def usual_bands(cameras: Sequence[Camera]) -> int:
     """Bands that suit the smallest picture: the widest transition is a few per cent of its side."""
     side = min(min(c.image_size) for c in cameras)
     return int(np.clip(np.log2(max(side, 1)) - 4.5, 1, _MAX_BANDS))
-
-
-def _sides(options: CompositeOptions) -> tuple[int, ...]:
-    """Tile sizes that may be used, largest first."""
-    return _TILE_SIZES if options.tile_size is None else (options.tile_size,)
 
 
 def _working_set(

@@ -23,7 +23,7 @@ from rdstitch.compositing.tiles import BlockRunner, OutputStrip, ShareProgress, 
 from rdstitch.compositing.warp import LATTICE_STEPS, plan_warps
 from rdstitch.errors import ArgumentError
 from rdstitch.messages import Message
-from rdstitch.process_memory import release_free_heap
+from rdstitch.process_memory import return_freed_memory
 
 _PREPARATION = 0.25
 # Pictures that the survey reads at one time: what the tiles need is not there yet.
@@ -87,7 +87,7 @@ def prepare_composite(
         same = no_exposure(len(pictures), channels)
         renderer = Renderer(warps, cache, same, None, options, plan.bands, channels, dtype)
         decided = _decided(renderer, reader, pictures, canvas, plan, _part_of(progress, 0.0, _PREPARATION))
-        release_free_heap()
+        return_freed_memory()
         yield decided
 
 

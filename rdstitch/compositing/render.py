@@ -145,7 +145,8 @@ class Renderer:
     def _multiband(self, layers: Sequence[Layer], box: Box) -> NDArray[Any]:
         """Blend in bands, with the margin around the box that they need."""
         outer = self._blend_support(box)
-        blender = MultibandBlender(outer, self.bands, self.channels, self._rounding)
+        constant = rounding_constant(full_scale(self.dtype), self.dtype.kind == "u")
+        blender = MultibandBlender(outer, self.bands, self.channels, constant)
         for layer in layers:
             part, common = intersection(self._blend_support(layer.box), outer), intersection(layer.box, outer)
             if part is None or common is None:
@@ -160,11 +161,6 @@ class Renderer:
         if self.dtype.kind != "u":
             return values.astype(self.dtype)
         return np.clip(np.rint(values), 0, np.float32(full_scale(self.dtype))).astype(self.dtype)
-
-    @property
-    def _rounding(self) -> np.float32:
-        """See :func:`rdstitch.compositing.blender.rounding_constant`."""
-        return rounding_constant(full_scale(self.dtype), self.dtype.kind == "u")
 
     def _samples(self, layer: Layer, box: Box) -> NDArray[Any]:
         """Resampled and exposure-corrected samples (h, w, C) of one picture; mirrored content outside of it."""

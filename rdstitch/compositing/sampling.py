@@ -71,7 +71,7 @@ def sample_opacity(picture: LoadedPicture, geometry: Geometry) -> Float32Array |
 
 
 def _mirrored(picture: LoadedPicture, geometry: Geometry) -> tuple[Float32Array, Float32Array]:
-    """Px of the (reduced) picture, all inside it."""
+    """Pixels of the (reduced) picture, all inside it."""
     map_x, map_y = geometry.maps
     if not geometry.inside.all():
         # Mirroring rounds: what is inside keeps its coordinates, whatever else the box holds.
@@ -80,7 +80,8 @@ def _mirrored(picture: LoadedPicture, geometry: Geometry) -> tuple[Float32Array,
             np.copyto(values, own, where=geometry.inside)
         map_x, map_y = mirrored
     if picture.reduction > 1:
-        map_x, map_y = (_reduce(m, picture.reduction) for m in (map_x, map_y))
+        half, factor = np.float32(0.5), np.float32(picture.reduction)
+        map_x, map_y = ((m + half) / factor - half for m in (map_x, map_y))
     return map_x, map_y
 
 
@@ -127,8 +128,3 @@ def _mirror(values: Float32Array, length: int) -> Float32Array:
     np.maximum(mirrored, np.float32(0.0), out=mirrored)
     mirrored -= half
     return mirrored
-
-
-def _reduce(values: Float32Array, reduction: int) -> Float32Array:
-    """Px of the original to pixels of the picture reduced by a whole factor."""
-    return (values + np.float32(0.5)) / np.float32(reduction) - np.float32(0.5)

@@ -111,7 +111,6 @@ def find_seams(
 
     Parameters
     ----------
-    survey : Survey
     exposure : Exposure
         Differences in brightness must not steer the seams.
     graphcut : bool
@@ -204,7 +203,8 @@ def _graph_cut(images: list[Float32Array], masks: list[NDArray[np.uint8]]) -> ND
     A large cut is found at half the size first, and then only moved by a few pixels.
     """
     if masks[0].size > _MAX_CUT:
-        masks = _near_cut(_graph_cut([_halved(i) for i in images], [m[::2, ::2] for m in masks]), masks)
+        halved = [np.asarray(block_mean(image, 2), dtype=np.float32) for image in images]
+        masks = _near_cut(_graph_cut(halved, [mask[::2, ::2] for mask in masks]), masks)
     won = masks[1] > 0
     free = won & (masks[0] > 0)
     if not free.any():
@@ -216,11 +216,6 @@ def _graph_cut(images: list[Float32Array], masks: list[NDArray[np.uint8]]) -> ND
     cut_images, cut_masks = ([detail.UMat(np.ascontiguousarray(a[part])) for a in both] for both in (images, masks))
     won[part] = finder.find(cut_images, [(0, 0), (0, 0)], cut_masks)[1].get() > 0
     return won
-
-
-def _halved(image: Float32Array) -> Float32Array:
-    """Half the size, rounded up."""
-    return np.asarray(block_mean(image, 2), dtype=np.float32)
 
 
 def _near_cut(won: NDArray[np.bool_], masks: list[NDArray[np.uint8]]) -> list[NDArray[np.uint8]]:

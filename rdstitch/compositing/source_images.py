@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -92,7 +93,6 @@ def prepare_picture(picture: Picture, shrink: float, reduction: int = 1) -> Load
 
     Parameters
     ----------
-    picture : Picture
     shrink : float
         Original pixels per output pixel. From 4 on, whole blocks are averaged first; a Gaussian does the rest.
     reduction : int
@@ -152,7 +152,8 @@ class PictureReader:
 
     def __init__(self, pictures: Sequence[PlacedPicture]) -> None:
         self._pictures = pictures
-        self._samples: tuple[tuple[int, ...], np.dtype[Any]] | None = None
+        # Channels, sample type and name of the picture that was read first.
+        self._samples: tuple[tuple[int, ...], np.dtype[Any], str] | None = None
         self._masked: dict[int, bool] = {}
 
     def part(self, pictures: Sequence[int]) -> "PictureReader":
@@ -193,19 +194,18 @@ class PictureReader:
         if (width, height) != wanted:
             expected = "{} x {}".format(*wanted)
             raise InputError(f"picture {index + 1} has {width} x {height} pixels, but its camera has {expected}")
+        called = placed.path or f"picture {index + 1}"
         if self._samples is None:
-            self._samples = picture.pixels.shape[2:], picture.pixels.dtype
-        channels, dtype = self._samples
+            self._samples = picture.pixels.shape[2:], picture.pixels.dtype, Path(called).name
+        channels, dtype, first = self._samples
         pixels = picture.pixels
         if pixels.ndim == 2 and channels == (3,):
             pixels = np.repeat(pixels[..., None], 3, axis=2)
         elif pixels.shape[2:] == (3,) and channels == ():
             pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
         if (pixels.shape[2:], pixels.dtype) != (channels, dtype):
-            raise InputError(
-                f"picture {index + 1} has {_kind(pixels.shape[2:], pixels.dtype)}, but the first that was read has "
-                f"{_kind(channels, dtype)}; convert them to one kind"
-            )
+            own, other = _kind(pixels.shape[2:], pixels.dtype), _kind(channels, dtype)
+            raise InputError(f"{called}: has {own}, but {first} has {other}; convert them to one kind")
         self._masked[index] = picture.alpha is not None
         return replace(picture, pixels=pixels)
 
@@ -224,10 +224,10 @@ class PictureReader:
         if self._samples is None:
             self._read_small(0)
         assert self._samples is not None
-        channels, dtype = self._samples
+        channels, dtype, _ = self._samples
         return (channels[0] if channels else 1), dtype
 
 
 def _kind(channels: tuple[int, ...], dtype: np.dtype[Any]) -> str:
-    """Samples in words."""
-    return f"{channels[0] if channels else 1} channel(s) of {dtype}"
+    """Samples in words; grey becomes colour where it must."""
+    return f"{dtype} samples" + ("" if channels in ((), (3,)) else f" in {channels[0]} bands")

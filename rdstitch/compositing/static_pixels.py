@@ -15,23 +15,12 @@ from rdstitch.arrays import BoolArray, FloatArray
 MIN_PICTURES = 4
 """Fewer may show the same by chance."""
 
-_BLACK = 0.02
-"""Of the brightest sample, up to which a pixel is black."""
-
-_MIN_AREA = 0.005
-"""Of the picture, for a region to count."""
-
-_MAX_AREA = 0.6
-"""Of the picture: where more than this seems to stay, the pictures differ too little to say."""
-
-_STAYS = 0.5
-"""Agreement of the corners of the pictures: 1 for what stays, about 0 for what moves."""
-
-_MIN_TEXTURE = 0.1
-"""Of what is usual in the pictures, for corners to count."""
-
-_WINDOW = 0.05
-"""Of the longer side, over which corners are compared."""
+_BLACK = 0.02  # of the brightest sample, up to which a pixel is black
+_MIN_AREA = 0.005  # of the picture, for a region to count
+_MAX_AREA = 0.6  # of the picture: where more than this seems to stay, the pictures differ too little to say
+_STAYS = 0.5  # agreement of the corners of the pictures: 1 for what stays, about 0 for what moves
+_MIN_TEXTURE = 0.1  # of what is usual in the pictures, for corners to count
+_WINDOW = 0.05  # of the longer side, over which corners are compared
 
 
 def static_pixels(pictures: Sequence[NDArray[np.generic]]) -> BoolArray | None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.compositing.boxes import Box, Float32Array
+from rdstitch.compositing.boxes import Box, Float32Array, cut, intersection, overlapping_pairs
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.sampling import border_weight, sample, sample_opacity
@@ -69,6 +69,19 @@ class Survey:
     canvas: Canvas
     warps: tuple[Warp, ...]
     tiles: tuple[SurveyTile | None, ...]
+
+    def pairs(self) -> NDArray[np.intp]:
+        """Pairs (P, 2) of pictures that lie over each other; see :func:`overlapping_pairs`."""
+        return overlapping_pairs([None if tile is None else tile.box for tile in self.tiles])
+
+    def overlap(self, i: int, j: int) -> tuple[SurveyTile, SurveyTile, Box, NDArray[np.bool_]]:
+        """The tiles of one of the pairs, the box that they have in common, and where both pictures show in it."""
+        a, b = self.tiles[i], self.tiles[j]
+        assert a is not None
+        assert b is not None
+        box = intersection(a.box, b.box)
+        assert box is not None
+        return a, b, box, cut(a.inside, a.box, box) & cut(b.inside, b.box, box)
 
 
 def survey_factor(canvas: Canvas) -> int:

@@ -31,6 +31,8 @@ OutputStrip = tuple[NDArray[Any], NDArray[np.uint8]]
 ShareProgress = Callable[[float], None]
 """Called with the share of the work done, 0 to 1."""
 
+_MIN_TILES = 4  # tiles of a block, a side, at the least: pictures across the edges of blocks are read for each of them
+
 
 @dataclass(frozen=True)
 class TiledOutput:
@@ -125,10 +127,6 @@ class TiledOutput:
             return box
 
         return (samples, alpha), run(fill, boxes[::-1] if backwards else boxes)
-
-
-_MIN_TILES = 4
-"""Tiles of a block, a side, at the least: pictures across the edges of blocks are read for each of them."""
 
 
 @dataclass(frozen=True, eq=False)

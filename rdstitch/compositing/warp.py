@@ -24,11 +24,16 @@ LATTICE_STEPS = (32, 16, 8, 4, 2, 1)
 """Spacings of lattices, canvas pixels; all have the nodes of the first."""
 
 _NOWHERE = np.float32(-1e6)
+# Coordinates are computed on a lattice of the canvas and interpolated linearly, to this many pixels of the picture.
+# OpenCV rounds them to 1/32 pixel afterwards.
+_LATTICE_ERROR = 0.01
+
+_PROBES = 16
 
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Px of a picture at the nodes of a lattice around a box of the canvas.
+    """Pixels of a picture at the nodes of a lattice around a box of the canvas.
 
     It is anchored to the canvas: every node, and every pixel between them, is the same bit for bit in every box.
 
@@ -56,7 +61,7 @@ class Lattice:
         return cls(box, step, points)
 
     def nodes(self, box: Box, step: int) -> Float32Array:
-        """Px at the nodes that enclose a box within this one's, (m, n, 2), at this spacing or a wider one."""
+        """Pixels at the nodes that enclose a box within this one's, (m, n, 2), at this spacing or a wider one."""
         (x0, x1), (y0, y1) = _enclosing(box, step)
         (left, _), (top, _) = _enclosing(self.box, LATTICE_STEPS[0])
         rows, columns = (
@@ -91,12 +96,6 @@ def _enclosing(box: Box, step: int) -> tuple[tuple[int, int], tuple[int, int]]:
     x0, y0, x1, y1 = box
     across, down = ((start // step * step, ((stop - 1) // step + 1) * step) for start, stop in ((x0, x1), (y0, y1)))
     return across, down
-
-
-# Coordinates are computed on a lattice of the canvas and interpolated linearly, to this many pixels of the picture.
-# OpenCV rounds them to 1/32 pixel afterwards.
-_LATTICE_ERROR = 0.01
-_PROBES = 16
 
 
 @dataclass(frozen=True)
@@ -243,8 +242,7 @@ def plan_warp(
         to_canvas, from_canvas = -to_canvas, -from_canvas
     box = canvas.boxes()[index]
     draft = Warp(camera, from_canvas, box, 1, 1.0, None, displacement)
-    probes = _probes(camera, to_canvas, outline)
-    return _measured(draft, probes, canvas)
+    return _measured(draft, np.concatenate([to_plane(camera, to_canvas, _grid(camera)), outline]), canvas)
 
 
 def _measured(draft: Warp, probes: FloatArray, canvas: Canvas) -> Warp:
@@ -269,11 +267,6 @@ def plan_warps(pictures: Sequence[PlacedPicture], canvas: Canvas) -> list[Warp]:
 def locate(warp: Warp, box: Box) -> Geometry:
     """Where the pixels of a box come from, and which of them lie in the picture."""
     return Geometry(warp, box, Lattice.over(box, warp.step, warp.source_points))
-
-
-def _probes(camera: Camera, to_canvas: FloatArray, outline: FloatArray) -> FloatArray:
-    """Canvas pixels (K, 2) spread over the picture, its outline included."""
-    return np.concatenate([to_plane(camera, to_canvas, _grid(camera)), outline])
 
 
 def _grid(camera: Camera) -> FloatArray:

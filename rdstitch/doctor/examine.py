@@ -5,7 +5,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,23 @@ from rdstitch.inputs.find import found_pictures
 from rdstitch.inputs.frame import ChannelOrder, Images, as_inputs
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.matching.match_graph import connected_components
+from rdstitch.messages import bytes_in_words, seconds_in_words, shortened
 from rdstitch.progress import Progress, silent
+
+_GLANCE = FeatureOptions(max_features=500, work_megapixels=None)
+_MEGAPIXELS = 0.3  # of the versions that are examined
+_EXHAUSTIVE_UP_TO = 24  # pictures of which every pair is compared; of more, those up to three apart
+_MAX_SEQUENCE_GAP = 3
+_BLURRED = 0.6  # of the median sharpness
+_DARK, _BURNT = 0.06, 0.05  # mean brightness; share of burnt-out pixels
+_MIN_OVERLAP = 0.3
+_ZOOMED = 1.03  # ratio of focal lengths by EXIF
+# Bytes, fitted to the sets of python -m tests.benchmarks.doctor: interpreter and libraries, detection in each thread,
+# features and matches of a picture, and of the compositor for each byte of the mosaic.
+_BASE_MEMORY, _DETECTION_MEMORY, _FEATURES_MEMORY, _COMPOSITE_SHARE = 130 * 2**20, 75 * 2**20, 3 * 2**19, 1.5
+# Of processor time, s: per pair matched and estimated, and per megapixel composited.
+_SECONDS_PAIR, _SECONDS_MEGAPIXEL = 0.1, 0.2
+_PAIRS_PER_PICTURE = 4
 
 
 @dataclass(frozen=True)
@@ -88,7 +104,8 @@ class Examination:
             f"{_few(self.burnt, 'burnt out', 'nothing burnt out')}",
             f"overlap:    {overlap}; {_few(self.alone, 'without a partner', 'every picture has a partner')}; "
             f"{self.groups} group" + "s" * (self.groups != 1),
-            f"effort:     about {_amount(self.memory_bytes)} of memory, {_duration(self.seconds)} for a mosaic",
+            f"effort:     about {bytes_in_words(self.memory_bytes)} of memory, "
+            f"{seconds_in_words(self.seconds)} for a mosaic",
         ]
         return "\n".join([*lines, *(f"advice:     {item}" for item in self.advice or ["none: go ahead"])]) + "\n"
 
@@ -101,31 +118,7 @@ def _few(names: tuple[str, ...], what: str, none: str) -> str:
     """The first names of a list, and how many there are."""
     if not names:
         return none
-    return f"{len(names)} {what}: {', '.join(names[:3])}" + ", …" * (len(names) > 3)
-
-
-def _amount(size: int) -> str:
-    return f"{size / 2**30:.1f} GB" if size >= 2**30 else f"{max(1, round(size / 2**20))} MB"
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds / 60:.0f} min" if seconds >= 120 else f"{max(1, round(seconds))} s"
-
-
-_GLANCE = FeatureOptions(max_features=500, work_megapixels=None)
-_MEGAPIXELS = 0.3  # of the versions that are examined
-_EXHAUSTIVE_UP_TO = 24  # pictures of which every pair is compared; of more, those up to three apart
-_MAX_SEQUENCE_GAP = 3
-_BLURRED = 0.6  # of the median sharpness
-_DARK, _BURNT = 0.06, 0.05  # mean brightness; share of burnt-out pixels
-_MIN_OVERLAP = 0.3
-_ZOOMED = 1.03  # ratio of focal lengths by EXIF
-# Bytes, fitted to the sets of python -m tests.benchmarks.doctor: interpreter and libraries, detection in each thread,
-# features and matches of a picture, and of the compositor for each byte of the mosaic.
-_BASE_MEMORY, _DETECTION_MEMORY, _FEATURES_MEMORY, _COMPOSITE_SHARE = 130 * 2**20, 75 * 2**20, 3 * 2**19, 1.5
-# Of processor time, s: per pair matched and estimated, and per megapixel composited.
-_SECONDS_PAIR, _SECONDS_MEGAPIXEL = 0.1, 0.2
-_PAIRS_PER_PICTURE = 4
+    return f"{len(names)} {what}: {shortened(names)}"
 
 
 @dataclass(frozen=True)
@@ -158,7 +151,7 @@ def examine(
         When an input names nothing, or nothing can be read.
     """
     with found_pictures(as_inputs(inputs, channel_order), every=every) as pictures:
-        sources, unread = read_sources(pictures.frames, camera=None, focal=None, distortion=None, skip_bad=True)
+        sources, unread = read_sources(pictures.frames, skip_bad=True)
         unreadable = [f"{message.images[0]}: {message.text}" for message in unread]
         found: dict[int, _Examined] = {}
         workers = os.cpu_count() or 1
@@ -205,7 +198,7 @@ def _conclude(
     cameras = _common(_camera(source) for source in sources)
     focal, zoomed = _focal(sources)
     megapixels = sum(np.prod(source.metadata.size) for source in sources) / 1e6
-    return Examination(
+    found = Examination(
         count,
         unreadable,
         sizes,
@@ -220,8 +213,9 @@ def _conclude(
         float(megapixels),
         _memory(sources, overlap or 0.5, workers),
         _seconds(sources, examined, overlap or 0.5, workers),
-        tuple(_advice(count, unreadable, cameras, zoomed, blurred, dark, burnt, alone, groups, overlap)),
+        (),
     )
+    return replace(found, advice=tuple(_advice(found, zoomed)))
 
 
 def _overlaps(features: Sequence[Features]) -> dict[tuple[int, int], float]:
@@ -280,41 +274,33 @@ def _seconds(sources: Sequence[Source], examined: Sequence[_Examined], overlap: 
     return float(total / workers)
 
 
-def _advice(
-    count: int,
-    unreadable: Sequence[str],
-    cameras: Sequence[tuple[str, int]],
-    zoomed: bool,
-    blurred: Sequence[str],
-    dark: Sequence[str],
-    burnt: Sequence[str],
-    alone: Sequence[str],
-    groups: Sequence[Sequence[int]],
-    overlap: float | None,
-) -> list[str]:
+def _advice(found: Examination, zoomed: bool) -> list[str]:
     """What to change, most important first."""
     advice = []
-    if count < 2:
+    if found.pictures < 2:
         advice.append("stitching needs two pictures or more; name another one")
-    elif overlap is None:
+    elif found.overlap is None:
         advice.append("no overlap was found: take pictures that overlap by a half, of something with texture")
-    if len(cameras) > 1:
-        advice.append(f"the pictures come from {len(cameras)} cameras: stitch those of each on their own")
+    if len(found.cameras) > 1:
+        advice.append(f"the pictures come from {len(found.cameras)} cameras: stitch those of each on their own")
     if zoomed:
         advice.append("the lens was zoomed between the pictures: stitch those of one zoom on their own")
-    if unreadable:
-        advice.append(f"{len(unreadable)} file{'s' * (len(unreadable) != 1)} cannot be read: {unreadable[0]}")
-    if overlap is not None and overlap < _MIN_OVERLAP:
-        advice.append(f"pictures overlap by about {overlap:.0%} only: take more pictures, a third is the least")
-    if overlap is not None and alone:
-        named = ", ".join(alone[:3]) + ", …" * (len(alone) > 3)
-        advice.append(f"no overlap with a neighbour was seen, and may lead to being left out: {named}")
-    elif len(groups) > 1:
+    if found.unreadable:
         advice.append(
-            f"at a glance the pictures fall into {len(groups)} groups: if so, only the largest becomes the mosaic"
+            f"{len(found.unreadable)} file{'s' * (len(found.unreadable) != 1)} cannot be read: {found.unreadable[0]}"
         )
-    if blurred:
-        advice.append(f"leave blurred pictures out if their neighbours overlap without them: {', '.join(blurred[:3])}")
-    if dark or burnt:
+    if found.overlap is not None and found.overlap < _MIN_OVERLAP:
+        advice.append(f"pictures overlap by about {found.overlap:.0%} only: take more pictures, a third is the least")
+    if found.overlap is not None and found.alone:
+        advice.append(f"no overlap with a neighbour was seen, and may lead to being left out: {shortened(found.alone)}")
+    elif found.groups > 1:
+        advice.append(
+            f"at a glance the pictures fall into {found.groups} groups: if so, only the largest becomes the mosaic"
+        )
+    if found.blurred:
+        advice.append(
+            f"leave blurred pictures out if their neighbours overlap without them: {', '.join(found.blurred[:3])}"
+        )
+    if found.dark or found.burnt:
         advice.append("dark or burnt-out pictures have few features: fix the exposure if you can take them again")
     return advice

@@ -51,14 +51,13 @@ def glance_at(picture: Picture) -> Glance:
     return Glance(fine / rough if rough > 1e-6 else 0.0, float(grey[seen].mean()), float(burnt[seen].mean()))
 
 
-def overlap_of(features1: Features, features2: Features, seed: int = 0) -> float:
+def overlap_of(features1: Features, features2: Features) -> float:
     """Share of the first picture that the second one shows, by the similarity that most matches support; 0 for none.
 
     Parameters
     ----------
     features1, features2 : Features
         A few hundred each.
-    seed : int
     """
     found = match(features1, features2)
     size1, size2 = features1.image_size, features2.image_size
@@ -66,7 +65,7 @@ def overlap_of(features1: Features, features2: Features, seed: int = 0) -> float
         return 0.0
     # As complex numbers, a similarity is z2 = a z1 + b.
     z1, z2 = (points @ np.array([1.0, 1.0j]) for points in (found.points1, found.points2))
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     i, j = rng.integers(0, len(z1), (2, _SAMPLES))
     apart = np.abs(z1[i] - z1[j]) > _THRESHOLD * np.hypot(*size1)
     i, j = i[apart], j[apart]

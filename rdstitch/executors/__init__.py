@@ -21,6 +21,8 @@ _PROCESSES_FROM = 60
 one, so that the start is at most a twentieth of the work. Threads share the interpreter, which matching and estimation
 keep busy."""
 
+_MAX_PENDING = 256  # tasks that have been submitted and whose results were not taken: enough for that many workers
+
 
 def open_executor(workers: int, pictures: int, *, scheduler: str | None = None, store: Path | None = None) -> Executor:
     """The executor for a set of so many pictures, to be used in a ``with`` block.
@@ -29,7 +31,6 @@ def open_executor(workers: int, pictures: int, *, scheduler: str | None = None, 
     ----------
     workers : int
         Tasks at the same time on this machine.
-    pictures : int
     scheduler : str, optional
         Address of a Dask scheduler, or "local"; see :class:`rdstitch.executors.dask_cluster.DaskExecutor`.
     store : Path, optional
@@ -45,18 +46,14 @@ def open_executor(workers: int, pictures: int, *, scheduler: str | None = None, 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-_MAX_PENDING = 256  # tasks that have been submitted and whose results were not taken: enough for that many workers
-
 
 def in_order(executor: Executor, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Generator[Result]:
     """The result of each task, in their order; tasks are taken as they are needed.
 
     Parameters
     ----------
-    executor : concurrent.futures.Executor
     function : callable
         Of one task.
-    tasks : iterable
 
     Raises
     ------

@@ -77,7 +77,6 @@ class DaskExecutor(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """See :meth:`concurrent.futures.Executor.shutdown`."""
         self._tasks.shutdown(wait=wait and not cancel_futures)
         self._open.close()
 

@@ -29,10 +29,6 @@ class ProcessExecutor(Executor):
 
     Leaving its ``with`` block by an exception, Ctrl-C for one, ends the workers at once; and they end by themselves
     when this process is killed.
-
-    Parameters
-    ----------
-    workers : int
     """
 
     def __init__(self, workers: int) -> None:
@@ -47,7 +43,6 @@ class ProcessExecutor(Executor):
         return self._threads.submit(self._run, pickle.dumps((fn, args, kwargs), pickle.HIGHEST_PROTOCOL))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """See :meth:`concurrent.futures.Executor.shutdown`."""
         self._threads.shutdown(wait, cancel_futures=cancel_futures)
         self._stop()
 

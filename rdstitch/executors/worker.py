@@ -8,7 +8,7 @@ from queue import SimpleQueue
 from typing import IO, Any
 
 from rdstitch.opencv_state import one_opencv_thread
-from rdstitch.process_memory import release_free_heap
+from rdstitch.process_memory import return_freed_memory
 
 
 def main() -> None:
@@ -16,7 +16,7 @@ def main() -> None:
     results = os.fdopen(os.dup(1), "wb")
     # What a library prints must not come among the results.
     os.dup2(2, 1)
-    release_free_heap()
+    return_freed_memory()
     tasks: SimpleQueue[Any] = SimpleQueue()
     threading.Thread(target=_receive, args=(os.fdopen(os.dup(0), "rb"), tasks), daemon=True).start()
     with one_opencv_thread():

@@ -68,10 +68,7 @@ class Georeference:
         matrix = (a, b, 0.0, corner.real, b, -a, 0.0, corner.imag, *(0.0,) * 7, 1.0)
         # Version 1.1.0 and three keys: projected, pixels are areas, which system.
         keys = (1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, self.epsg)
-        return [
-            (_MODEL_TRANSFORMATION, _DOUBLE, len(matrix), matrix, True),
-            (_GEO_KEYS, _SHORT, len(keys), keys, True),
-        ]
+        return [(_MODEL_TRANSFORMATION, _DOUBLE, len(matrix), matrix, True), (_GEO_KEYS, _SHORT, len(keys), keys, True)]
 
     def world_file_texts(self) -> tuple[str, str]:
         """The contents of :func:`world_file_paths`."""
@@ -117,7 +114,6 @@ def georeference(
     ----------
     positions : sequence of GpsPosition or None
         Of each picture.
-    cameras : sequence of Camera
     to_output : ndarray of shape (N, 3, 3)
         Normalized undistorted coordinates of each picture to pixels of the output.
 

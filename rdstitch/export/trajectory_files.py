@@ -10,23 +10,17 @@ import io
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rdstitch.alignment.trajectory import Trajectory
-from rdstitch.errors import ArgumentError
 
 _SIDE = 800.0  # pixels of the drawing's longer side
 _MARGIN = 60.0  # pixels
 _ARROWS = 40  # at most so many headings are drawn
+_COLUMNS = ("frame", "name", "source_frame", "timestamp", "x", "y", "phi_deg", "height")
 
 
 def path_as_svg(path: Trajectory) -> str:
-    """The path seen from above, x to the right and y downwards, with arrows where the camera heads.
-
-    Parameters
-    ----------
-    path : Trajectory
-    """
+    """The path seen from above, x to the right and y downwards, with arrows where the camera heads; as SVG."""
     low, extent = path.position.min(axis=0), np.ptp(path.position, axis=0)
     unit = _SIDE / max(float(extent.max()), 1e-12)
     points = (path.position - low) * unit + _MARGIN
@@ -53,9 +47,6 @@ def path_as_svg(path: Trajectory) -> str:
 """
 
 
-_COLUMNS = ("frame", "name", "source_frame", "timestamp", "x", "y", "phi_deg", "height")
-
-
 def as_csv(path: Trajectory) -> str:
     """A table with a header; what is not known of a frame is empty."""
     count = len(path)
@@ -72,25 +63,9 @@ def as_csv(path: Trajectory) -> str:
     return text.getvalue()
 
 
-def as_tum(path: Trajectory, timestamps: ArrayLike | None = None) -> str:
-    """Lines ``timestamp tx ty tz qx qy qz qw``.
-
-    Parameters
-    ----------
-    path : Trajectory
-    timestamps : array_like of shape (F,), optional
-        s. Without them the path's own; without these, numbers of frames stand for them.
-
-    Raises
-    ------
-    ArgumentError
-        When the number of time stamps is not that of the frames.
-    """
-    if timestamps is None:
-        timestamps = path.timestamp if has_times(path) else path.frame
-    times = np.asarray(timestamps, dtype=np.float64)
-    if times.shape != path.frame.shape:
-        raise ArgumentError(f"expected {len(path)} timestamps, not an array of shape {times.shape}")
+def as_tum(path: Trajectory) -> str:
+    """Lines ``timestamp tx ty tz qx qy qz qw``; where not every frame has a time, numbers of frames stand for them."""
+    times = path.timestamp if path.timestamp is not None and has_times(path) else path.frame
     half = -path.yaw / 2
     rows = zip(times, path.position, path.height, np.sin(half), np.cos(half), strict=True)
     lines = [f"{time:.6f} {x:.9g} {y:.9g} {-height:.9g} 0 0 {qz:.9g} {qw:.9g}" for time, (x, y), height, qz, qw in rows]

@@ -1,12 +1,10 @@
 """Features of pictures, and their matches."""
 
 from rdstitch.features.detect import detect, detect_view
-from rdstitch.features.guided import match_near
-from rdstitch.features.keypoints import Features, PackedFeatures
+from rdstitch.features.keypoints import Correspondences, Features, PackedFeatures
 from rdstitch.features.learned import LightGlue
-from rdstitch.features.match import Correspondences, Matcher, match
+from rdstitch.features.match import Matcher, match, match_near, match_overlap
 from rdstitch.features.options import KINDS, FeatureOptions
-from rdstitch.features.overlap import match_overlap
 from rdstitch.features.picture import View
 
 __all__ = [

@@ -17,6 +17,8 @@ from rdstitch.features.sift_tiles import LARGE, SiftTilesDetection
 from rdstitch.features.surf.descriptor import SurfDetection
 from rdstitch.opencv_state import one_opencv_thread
 
+_MIN_KEYPOINT_SHARE = 0.5  # of the keypoints wanted: where a reduced picture shows fewer, a larger one is used
+
 
 class Detection(Protocol):
     """Keypoints of one picture, not yet described; always in the same order for the same picture."""
@@ -89,8 +91,6 @@ def spread(points: FloatArray, response: FloatArray, count: int, cell: float) ->
 ViewLoader = Callable[[float | None], View]
 """Loads one picture when it is called with the 10⁶ pixels that are needed of it; None: all. More pixels may come."""
 
-_MIN_KEYPOINT_SHARE = 0.5  # of the keypoints wanted: where a reduced picture shows fewer, a larger one is used
-
 
 def detect(image: PixelArray, options: FeatureOptions | None = None, mask: Mask | None = None) -> Features:
     """Detect and describe the features of one picture.
@@ -100,7 +100,6 @@ def detect(image: PixelArray, options: FeatureOptions | None = None, mask: Mask 
     image : ndarray of shape (height, width) or (height, width, 1 to 4)
         Grey, grey with alpha, RGB or RGB with alpha; uint8, or uint16 or float, which are stretched to 8
         bits. Nothing is detected where alpha is zero or a float is not finite.
-    options : FeatureOptions, optional
     mask : ndarray of shape (height, width), bool or uint8, optional
         Where to look: True, or not zero. A keypoint whose extent reaches into the rest is dropped.
 
@@ -125,7 +124,6 @@ def detect_view(source: ViewLoader, options: FeatureOptions) -> Features:
     ----------
     source : callable
         See :data:`ViewLoader`.
-    options : FeatureOptions
 
     Raises
     ------

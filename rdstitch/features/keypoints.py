@@ -13,6 +13,10 @@ from rdstitch.errors import ArgumentError
 Descriptors = NDArray[np.float32] | NDArray[np.uint8]
 
 
+_OF_A_KEYPOINT = ("scale", "angle", "response", "laplacian_sign")  # numbers, beside its place and descriptor
+_MAX_HALF = 60000.0  # half precision ends a little above
+
+
 @dataclass(frozen=True, eq=False)
 class Features:
     """Keypoints of one picture with their descriptors, the strongest first.
@@ -54,7 +58,6 @@ class Features:
     image_size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
-        """Check shapes and types."""
         count = len(self.points)
         if self.points.shape != (count, 2) or not np.isfinite(self.points).all():
             raise ArgumentError(f"points must be finite and of shape (N, 2), not {self.points.shape}")
@@ -62,43 +65,25 @@ class Features:
             raise ArgumentError(f"{count} points, but descriptors of shape {self.descriptors.shape}")
         if self.descriptors.dtype not in (np.float32, np.uint8):
             raise ArgumentError(f"descriptors must be float32 or uint8, not {self.descriptors.dtype}")
-        columns: dict[str, NDArray[Any] | None] = {
-            "scale": self.scale,
-            "angle": self.angle,
-            "response": self.response,
-            "laplacian_sign": self.laplacian_sign,
-        }
-        for name, values in columns.items():
-            if values is not None and values.shape != (count,):
+        for name in _OF_A_KEYPOINT:
+            if (values := getattr(self, name)) is not None and values.shape != (count,):
                 raise ArgumentError(f"{count} points, but {name} of shape {values.shape}")
 
     def __len__(self) -> int:
-        """Number of keypoints."""
         return len(self.points)
 
     def take(self, index: NDArray[np.intp]) -> Self:
         """The keypoints of the given indices, in their order."""
-        return replace(
-            self,
-            points=self.points[index],
-            descriptors=self.descriptors[index],
-            scale=self.scale[index],
-            angle=self.angle[index],
-            response=self.response[index],
-            laplacian_sign=None if self.laplacian_sign is None else self.laplacian_sign[index],
-        )
+        columns = {name: getattr(self, name) for name in ("points", "descriptors", *_OF_A_KEYPOINT)}
+        taken: dict[str, Any] = {name: values[index] for name, values in columns.items() if values is not None}
+        return replace(self, **taken)
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
         """All keypoints of at least one part; parts are of one kind, and have no signs."""
-        return replace(
-            parts[0],
-            points=np.concatenate([part.points for part in parts]),
-            descriptors=np.concatenate([part.descriptors for part in parts]),
-            scale=np.concatenate([part.scale for part in parts]),
-            angle=np.concatenate([part.angle for part in parts]),
-            response=np.concatenate([part.response for part in parts]),
-        )
+        names = ("points", "descriptors", *_OF_A_KEYPOINT[:3])
+        joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        return replace(parts[0], **joined)
 
     @property
     def binary(self) -> bool:
@@ -106,12 +91,9 @@ class Features:
         return self.descriptors.dtype == np.uint8
 
 
-_MAX_HALF = 60000.0  # half precision ends a little above
-
-
 @dataclass(frozen=True, eq=False)
 class PackedFeatures:
-    """Features of one picture.
+    """Features as they are stored: descriptors in a quarter or half of their size, which matching cannot tell apart.
 
     Attributes
     ----------
@@ -180,7 +162,6 @@ class Correspondences:
     ratio: FloatArray
 
     def __post_init__(self) -> None:
-        """Check shapes."""
         count = len(self.ratio)
         shapes = (self.indices.shape, self.points1.shape, self.points2.shape, self.ratio.shape)
         if shapes != ((count, 2), (count, 2), (count, 2), (count,)):
@@ -196,5 +177,4 @@ class Correspondences:
         return type(self)(self.indices[index], self.points1[index], self.points2[index], self.ratio[index])
 
     def __len__(self) -> int:
-        """Number of correspondences."""
         return len(self.ratio)

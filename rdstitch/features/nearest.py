@@ -19,7 +19,7 @@ from rdstitch.features.keypoints import Descriptors, Features
 _MAX_NORM = 1024.0
 
 
-class Similarity(Protocol):
+class DescriptorSimilarity(Protocol):
     """Compares descriptors of picture 1 with all descriptors of picture 2."""
 
     lowest: float
@@ -68,18 +68,15 @@ class Euclidean:
         self._block = np.empty((0, self._right.shape[1]), np.float32)
 
     def block(self, rows: NDArray[np.intp]) -> NDArray[Any]:
-        """See :class:`Similarity`."""
         # Fresh memory for every block would cost a fifth of the time.
         if len(self._block) < len(rows):
             self._block = np.empty((len(rows), self._right.shape[1]), np.float32)
         return np.matmul(self._left[rows], self._right, out=self._block[: len(rows)])
 
     def pairs(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[Any]:
-        """See :class:`Similarity`."""
         return np.einsum("ij,ij->i", self._left[rows], self._right.T[columns])  # type: ignore[no-any-return]
 
     def distance(self, similarity: NDArray[Any]) -> FloatArray:
-        """See :class:`Similarity`."""
         return np.sqrt(-2.0 * similarity.astype(np.float64))
 
 
@@ -97,7 +94,6 @@ class Hamming:
         self._right = np.ascontiguousarray(~_words(descriptors2).T)
 
     def block(self, rows: NDArray[np.intp]) -> NDArray[Any]:
-        """See :class:`Similarity`."""
         shape = (len(rows), self._right.shape[1])
         total, equal, count = np.zeros(shape, np.int16), np.empty(shape, np.uint64), np.empty(shape, np.uint8)
         for left, right in zip(self._left[rows].T, self._right, strict=True):
@@ -107,17 +103,15 @@ class Hamming:
         return total
 
     def pairs(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[Any]:
-        """See :class:`Similarity`."""
         equal = np.bitwise_count(self._left[rows] ^ self._right.T[columns])
         total: NDArray[np.int16] = equal.sum(axis=1, dtype=np.int16)
         return total
 
     def distance(self, similarity: NDArray[Any]) -> FloatArray:
-        """See :class:`Similarity`."""
         return np.where(similarity == self.lowest, np.inf, self._bits - similarity.astype(np.float64))
 
 
-def compare(descriptors1: Descriptors, descriptors2: Descriptors) -> Similarity:
+def compare(descriptors1: Descriptors, descriptors2: Descriptors) -> DescriptorSimilarity:
     """The similarity that fits the type of the descriptors."""
     if descriptors1.dtype == np.uint8:
         return Hamming(descriptors1.astype(np.uint8), descriptors2.astype(np.uint8))
@@ -161,7 +155,6 @@ class Locations:
         return cls(tuple(layers))
 
     def __len__(self) -> int:
-        """Number of locations."""
         return len(self.layers[0])
 
     def blocks(self, most: int) -> Iterator[tuple[int, int]]:
@@ -256,7 +249,7 @@ def _update_two_best(best: NDArray[Any], second: NDArray[Any], block: NDArray[An
 
 
 def _nearest_keypoints(
-    similarity: Similarity,
+    similarity: DescriptorSimilarity,
     one: Locations,
     two: Locations,
     location1: NDArray[np.intp],

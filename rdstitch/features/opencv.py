@@ -1,6 +1,6 @@
 """The detectors that OpenCV brings, in the steps that all detectors take: find, choose, describe."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self, cast
 
@@ -104,8 +104,18 @@ def create_detector(options: FeatureOptions) -> Any:
     ArgumentError
         When this OpenCV lacks it. Builds differ, and a name may be there that only raises: so it is called.
     """
+    kind = options.kind
     try:
-        return _FACTORIES[options.kind](options)
+        if kind in ("sift", "rootsift"):
+            # Without the precise upscale all points are a quarter of a pixel off.
+            return cv2.SIFT.create(nfeatures=0, contrastThreshold=options.sift_contrast, enable_precise_upscale=True)
+        if kind == "orb":
+            # Many more than wanted, because ORB keeps the strongest of the whole picture and we spread them.
+            return cv2.ORB.create(nfeatures=8 * options.limits[0], fastThreshold=options.orb_fast_threshold)
+        name = f"{kind.upper()}_create"
+        # OpenCV 5 moved these to xfeatures2d.
+        create = getattr(cv2 if hasattr(cv2, name) else cv2.xfeatures2d, name)
+        return create(thresh=options.brisk_threshold) if kind == "brisk" else create(threshold=options.kaze_threshold)
     except (AttributeError, cv2.error) as error:
         raise ArgumentError(
             f"features {options.kind!r} are not in this OpenCV ({cv2.__version__}); choose others"
@@ -130,41 +140,3 @@ def _strength(kind: str, response: FloatArray, size: FloatArray) -> FloatArray:
     of pictures the product gives a fifth to a half more inliers, among other detectors it does not help.
     """
     return response * size if kind in ("sift", "rootsift") else response
-
-
-def _sift(options: FeatureOptions) -> Any:
-    # Without the precise upscale all points are a quarter of a pixel off.
-    return cv2.SIFT.create(nfeatures=0, contrastThreshold=options.sift_contrast, enable_precise_upscale=True)
-
-
-def _orb(options: FeatureOptions) -> Any:
-    # Many more than wanted, because ORB keeps the strongest of the whole picture and we spread them.
-    return cv2.ORB.create(nfeatures=8 * options.limits[0], fastThreshold=options.orb_fast_threshold)
-
-
-def _akaze(options: FeatureOptions) -> Any:
-    return _moved("AKAZE_create")(threshold=options.kaze_threshold)
-
-
-def _kaze(options: FeatureOptions) -> Any:
-    return _moved("KAZE_create")(threshold=options.kaze_threshold)
-
-
-def _brisk(options: FeatureOptions) -> Any:
-    return _moved("BRISK_create")(thresh=options.brisk_threshold)
-
-
-def _moved(name: str) -> Callable[..., Any]:
-    """Factory of a detector that OpenCV 5 moved to ``cv2.xfeatures2d``."""
-    factory: Callable[..., Any] = getattr(cv2 if hasattr(cv2, name) else cv2.xfeatures2d, name)
-    return factory
-
-
-_FACTORIES: dict[str, Callable[[FeatureOptions], Any]] = {
-    "rootsift": _sift,
-    "sift": _sift,
-    "orb": _orb,
-    "akaze": _akaze,
-    "kaze": _kaze,
-    "brisk": _brisk,
-}

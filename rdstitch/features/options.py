@@ -14,8 +14,7 @@ MAX_FEATURES = 2000
 CLOSER = 4.0
 """Times as many pixels are used where the working size shows too little."""
 
-_BUDGET = 8
-"""Pictures of a large set whose pixels and keypoints fewer pictures may share among them."""
+_BUDGET = 8  # pictures of a large set whose pixels and keypoints fewer pictures may share among them
 _MAX_PIXELS, _MAX_FEATURES = 4.0, 2.0
 """Times as many pixels, and keypoints, that a picture of a small set gets at most: keypoints beyond the strongest 4,000
 made λ of single pairs of a flight less certain, not more."""
@@ -40,7 +39,7 @@ class FeatureOptions:
         Side of a cell of that grid, fraction of the picture's diagonal.
     stretch : (float, float), optional
         Grey levels that become 0 and 255; None: those of the set where its pictures have more than 8 bits, see
-        :mod:`rdstitch.pipeline.contrast`, else none.
+        :mod:`rdstitch.pipeline.detect_features`, else none.
     equalize : bool, optional
         Equalize local contrast before detection; None: of a set whose pictures show too little otherwise.
     sift_contrast : float
@@ -95,7 +94,6 @@ class FeatureOptions:
     aliked_size: int = 640
 
     def __post_init__(self) -> None:
-        """Check ranges."""
         if self.kind not in KINDS:
             raise ArgumentError(f"unknown kind of features {self.kind!r}; known are {', '.join(KINDS)}")
         if self.kind == "aliked" and self.aliked_model is None:

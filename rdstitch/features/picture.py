@@ -119,7 +119,10 @@ def prepare(
     if equalize:
         grey = np.asarray(cv2.createCLAHE(_CLIP_LIMIT, (_CLIP_TILES, _CLIP_TILES)).apply(grey), np.uint8)
     shrink = view.reduction * np.array([width / grey.shape[1], height / grey.shape[0]])
-    return PreparedPicture(grey, None if usable is None else _clearance(usable), shrink, view.full_size)
+    clearance = None
+    if usable is not None:
+        clearance = np.asarray(cv2.distanceTransform(usable.astype(np.uint8), cv2.DIST_L2, 5), np.float32)
+    return PreparedPicture(grey, clearance, shrink, view.full_size)
 
 
 def _usable(image: PixelArray, mask: Mask | None) -> NDArray[np.bool_] | None:
@@ -184,8 +187,3 @@ def _eight_bits(grey: PixelArray, usable: NDArray[np.bool_] | None, stretch: Str
     scaled = (finite - low) * (255.0 / max(high - low, 1e-12))
     eight: NDArray[np.uint8] = np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
     return eight
-
-
-def _clearance(usable: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Distance of each pixel to the nearest one that is not usable, pixels."""
-    return np.asarray(cv2.distanceTransform(usable.astype(np.uint8), cv2.DIST_L2, 5), np.float32)

@@ -20,6 +20,8 @@ XMP = "xmp"
 _TILT_COLUMNS = ("name", "psi", "theta")
 _MAX_NAMED = 3  # pictures in a message
 _MAX_TILT = math.radians(80.0)  # beyond, hardly a picture shows ground, and more likely angles mean something else
+_EARTH = 6_371_000.0  # m
+_TIME_COLUMNS = ("name", "timestamp")
 
 
 def with_attitudes(sources: Sequence[Source], wanted: str | Path | None) -> list[Source]:
@@ -27,7 +29,6 @@ def with_attitudes(sources: Sequence[Source], wanted: str | Path | None) -> list
 
     Parameters
     ----------
-    sources : sequence of Source
     wanted : str, path or None
         The text :data:`XMP`: what drones write into pictures, see :mod:`rdstitch.io.attitude`; the plane is then taken
         to be level. Or a CSV file with a header that names the columns ``name`` (of the picture's file), ``psi`` and
@@ -98,9 +99,6 @@ def _read_table(file: str | Path) -> dict[str, tuple[float, float]]:
     return attitudes
 
 
-_EARTH = 6_371_000.0  # m
-
-
 def positions_of(sources: Sequence[Source]) -> FloatArray:
     """Metres east and north (N, 2) of the middle of the pictures' GPS positions; NaN where unknown."""
     known = [source.metadata.gps for source in sources]
@@ -117,9 +115,6 @@ def positions_of(sources: Sequence[Source]) -> FloatArray:
     return metres
 
 
-_TIME_COLUMNS = ("name", "timestamp")
-
-
 def timestamps_of(sources: Sequence[Source], file: str | Path | None = None) -> FloatArray:
     """Time stamps (N,), s; NaN where nothing is known.
 
@@ -128,7 +123,6 @@ def timestamps_of(sources: Sequence[Source], file: str | Path | None = None) -> 
 
     Parameters
     ----------
-    sources : sequence of Source
     file : path, optional
         CSV with a header that names the columns ``name`` and ``timestamp``; or lines ``TIMESTAMP NAME`` as in the lists
         of the TUM benchmark; or one time a line, the n-th for the n-th picture or frame of the video, as KITTI's

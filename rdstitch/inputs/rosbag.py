@@ -52,7 +52,6 @@ def extract_images(
     ----------
     path : Path
         File of ROS 1, folder of ROS 2 or a file in it.
-    folder : Path
     every : int or None
         Every n-th image; None: those that show new ground.
     topic : str, optional

@@ -17,7 +17,6 @@ def selected(frames: Sequence[Frame], exclude: Sequence[str], include_only: Sequ
 
     Parameters
     ----------
-    frames : sequence of Frame
     exclude, include_only : sequence of str
         File names or whole paths, or patterns of them (``*``, ``?``, ``[...]``).
 
@@ -49,7 +48,6 @@ def with_masks(sources: Sequence[Source], mask: str | Path | None) -> list[Sourc
 
     Parameters
     ----------
-    sources : sequence of Source
     mask : path or None
         A picture: the mask of all pictures, such as of a camera that sees its own vehicle. Or a folder with a mask for
         each picture, or for some, of the picture's name; the suffix may differ.

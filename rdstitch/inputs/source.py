@@ -1,6 +1,6 @@
 """The input pictures: which files, what their headers say, and the camera each was taken with."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ from rdstitch.cache import Cache
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError, LimitError, RdstitchError
 from rdstitch.features.options import WORK_MEGAPIXELS
-from rdstitch.features.picture import halving
+from rdstitch.features.picture import View, halving
 from rdstitch.file_access import held_in_memory, is_url
 from rdstitch.inputs.decoded_image_cache import DecodedImageCache
 from rdstitch.inputs.frame import Frame, Named
@@ -96,7 +96,6 @@ class Source:
 
         Parameters
         ----------
-        reduction : int
         keep : bool
             It will be looked at again, so that the file need not be decoded once more.
 
@@ -114,6 +113,12 @@ class Source:
         if keep:
             self.decoded_images.put(key, picture)
         return reduced(picture, reduction // usual)
+
+    def view(self, megapixels: float | None) -> View:
+        """What detection at so many 10⁶ pixels needs of it; it is kept for the stages that read it again."""
+        reduction = self.reduction(megapixels)
+        picture = self.read(reduction, keep=True)
+        return View(picture.pixels, picture.alpha, reduction, self.camera.image_size)
 
     def _load(self, reduction: int) -> Picture:
         """The pixels from the file, masked."""
@@ -136,37 +141,12 @@ class Source:
         return replace(picture, alpha=alpha)
 
 
-def readers(sources: Sequence[Source]) -> list[Callable[..., Picture]]:
-    """What reads the pictures for the compositor, whole or reduced; those whose samples cannot be mixed are named.
-
-    Raises
-    ------
-    InputError
-        By a reader: see :meth:`Source.read`, and when its samples are unlike those of the picture read first.
-    """
-    first: list[tuple[str, str]] = []
-    return [partial(_read_alike, first, source) for source in sources]
-
-
-def _read_alike(first: list[tuple[str, str]], source: Source, reduction: int = 1) -> Picture:
-    """Read a picture whose samples must be as those that were read first: name and kind, noted where none were."""
-    picture = source.read(reduction)
-    bands = 1 if picture.pixels.ndim == 2 else picture.pixels.shape[2]
-    # Grey becomes colour where it must.
-    kind = f"{picture.pixels.dtype} samples" + ("" if bands in (1, 3) else f" in {bands} bands")
-    if not first:
-        first.append((source.name, kind))
-    if kind != first[0][1]:
-        raise InputError(f"{source.path}: has {kind}, but {first[0][0]} has {first[0][1]}; convert them to one kind")
-    return picture
-
-
 def read_sources(
     inputs: Iterable[Named],
     *,
-    camera: Camera | None,
-    focal: float | None,
-    distortion: float | None,
+    camera: Camera | None = None,
+    focal: float | None = None,
+    distortion: float | None = None,
     skip_bad: bool,
     guard: InputGuard | None = None,
     max_memory: int | None = None,
@@ -175,12 +155,11 @@ def read_sources(
 
     Parameters
     ----------
-    inputs : iterable of path or Frame
-    camera : Camera or None
+    camera : Camera, optional
         Known camera; adapted to the size of each picture.
-    focal : float or None
+    focal : float, optional
         Known focal length, pixels.
-    distortion : float or None
+    distortion : float, optional
         Known λ, half-diagonal frame.
     skip_bad : bool
         Leave out files that cannot be read, with the reason, instead of raising.

@@ -1,6 +1,6 @@
 """Files in and out: pictures with their metadata, sidecars, and nothing half-written."""
 
-from rdstitch.io.atomic import atomic_output, check_output, write_json_atomic, write_text_atomic
+from rdstitch.io.atomic import check_output
 from rdstitch.io.attitude import Attitude
 from rdstitch.io.layout import Layout
 from rdstitch.io.metadata import GpsPosition, Metadata, read_metadata
@@ -13,14 +13,11 @@ __all__ = [
     "Layout",
     "Metadata",
     "Picture",
-    "atomic_output",
     "check_format",
     "check_output",
     "check_size",
     "read_image",
     "read_metadata",
     "write_image",
-    "write_json_atomic",
     "write_strips",
-    "write_text_atomic",
 ]

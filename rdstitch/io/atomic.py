@@ -2,8 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -108,19 +107,6 @@ def _same_file(first: Path, second: Path) -> bool:
         return False
 
 
-@contextmanager
-def atomic_output(path: str | Path, overwrite: bool = True) -> Iterator[Path]:
-    """A staged file that takes the place of ``path`` when the block ends without an error; see :class:`Outputs`.
-
-    Raises
-    ------
-    OutputError
-        For any failure of the file system, a full disk among them; the staged file is removed.
-    """
-    with Outputs(overwrite) as outputs, outputs.writing(path) as staged:
-        yield staged
-
-
 def write_bytes_atomic(path: str | Path, data: bytes, overwrite: bool = True) -> None:
     """Write a file, whole or not at all.
 
@@ -131,16 +117,6 @@ def write_bytes_atomic(path: str | Path, data: bytes, overwrite: bool = True) ->
     """
     with Outputs(overwrite) as outputs:
         outputs.write(path, data)
-
-
-def write_text_atomic(path: str | Path, text: str) -> None:
-    """Write a UTF-8 text file, whole or not at all; see :func:`write_bytes_atomic`."""
-    write_bytes_atomic(path, text_bytes(text))
-
-
-def write_json_atomic(path: str | Path, data: Any) -> None:
-    """Write JSON, whole or not at all; see :func:`json_bytes` and :func:`write_bytes_atomic`."""
-    write_bytes_atomic(path, json_bytes(data))
 
 
 def text_bytes(text: str) -> bytes:

@@ -24,6 +24,11 @@ from PIL import Image
 
 _MAX_LENGTH = 2**20  # characters; drones write 2,000 to 20,000
 _MAX_NUMBER_LENGTH = 64  # characters of a number, and of the space around it
+_PROPERTIES = {
+    "dji-gimbal": ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"),
+    "parrot-camera": ("CameraYawDegree", "CameraPitchDegree", "CameraRollDegree"),
+    "pix4d-camera": ("Camera:Yaw", "Camera:Pitch", "Camera:Roll"),
+}
 
 
 def xmp_text(image: Image.Image) -> str:
@@ -37,7 +42,6 @@ def xmp_number(xmp: str, name: str) -> float | None:
 
     Parameters
     ----------
-    xmp : str
     name : str
         With the customary prefix of its namespace, or without for any.
     """
@@ -55,13 +59,6 @@ def finite(value: Any) -> float | None:
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
     return number if math.isfinite(number) else None
-
-
-_PROPERTIES = {
-    "dji-gimbal": ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"),
-    "parrot-camera": ("CameraYawDegree", "CameraPitchDegree", "CameraRollDegree"),
-    "pix4d-camera": ("Camera:Yaw", "Camera:Pitch", "Camera:Roll"),
-}
 
 
 @dataclass(frozen=True)

@@ -77,8 +77,6 @@ def write_deep_zoom(description: Path, folder: Path, layout: Layout, strips: Ite
         The ``.dzi`` file.
     folder : Path
         Empty folder for the tiles.
-    layout : Layout
-    strips : iterable of (samples, alpha)
     """
     width, height = layout.size
     # The profile belongs to the pixels, and so into every tile; EXIF does not.
@@ -138,8 +136,6 @@ class _Level:
 
     Parameters
     ----------
-    folder : Path
-    layout : Layout
     smaller : _Level or None
         The level of half the size.
     """

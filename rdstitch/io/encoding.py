@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rdstitch.errors import LimitError
 from rdstitch.io.layout import Layout, Strip, as_eight_bit, with_alpha
 from rdstitch.io.metadata import Metadata
+from rdstitch.io.opening import PNG_MAGIC
 
 _EXIF_HEADER = b"Exif\0\0"
 _XMP_HEADER = b"http://ns.adobe.com/xap/1.0/\0"
@@ -22,69 +23,16 @@ _ICC_HEADER = b"ICC_PROFILE\0"
 _MAX_SEGMENT = 65533
 _JFIF = 0xE0
 _METRES_PER_INCH = 0.0254
-
-
-def embed_in_jpeg(head: bytes, metadata: Metadata) -> list[bytes]:
-    """A JPEG file's beginning with EXIF and XMP (APP1) and ICC profile (APP2) after the JFIF header (APP0).
-
-    EXIF of more than 64 kB does not fit into a JPEG segment and is left out.
-    """
-    after_header = 2
-    jfif = b""
-    if head[3] == _JFIF:
-        after_header = 4 + struct.unpack_from(">H", head, 4)[0]
-        jfif = head[2:after_header]
-        if metadata.dpi is not None and all(0 < d < 65535 for d in metadata.dpi):
-            jfif = jfif[:11] + struct.pack(">BHH", 1, *(round(d) for d in metadata.dpi)) + jfif[16:]
-    exif = bare_exif(metadata)
-    segments = [_segment(0xE1, _EXIF_HEADER + exif)] if exif else []
-    if metadata.xmp and len(metadata.xmp) + len(_XMP_HEADER) <= _MAX_SEGMENT:
-        segments.append(_segment(0xE1, _XMP_HEADER + metadata.xmp))
-    return [head[:2], jfif, *segments, *_icc_segments(metadata.icc_profile), head[after_header:]]
-
-
-def png_metadata_chunks(metadata: Metadata) -> Iterator[bytes]:
-    """ICCP, pHYs, eXIf and iTXt chunks, which stand between header and pixels."""
-    if metadata.icc_profile:
-        yield png_chunk(b"iCCP", b"ICC profile\0\0" + zlib.compress(metadata.icc_profile, 9))
-    if metadata.dpi is not None and all(0 < d < 1e6 for d in metadata.dpi):
-        yield png_chunk(b"pHYs", struct.pack(">IIB", *(round(d / _METRES_PER_INCH) for d in metadata.dpi), 1))
-    if exif := bare_exif(metadata):
-        yield png_chunk(b"eXIf", exif)
-    if metadata.xmp:
-        yield png_chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + metadata.xmp)
-
-
-def png_chunk(kind: bytes, body: bytes) -> bytes:
-    """One PNG chunk."""
-    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(body, zlib.crc32(kind)))
-
-
-def bare_exif(metadata: Metadata) -> bytes:
-    """EXIF as a TIFF structure, without the header that JPEG puts before it; empty when too large."""
-    exif = metadata.exif.removeprefix(_EXIF_HEADER)
-    return exif if len(exif) + len(_EXIF_HEADER) + 2 <= _MAX_SEGMENT else b""
-
-
-def _segment(marker: int, body: bytes) -> bytes:
-    """One JPEG marker segment."""
-    return struct.pack(">BBH", 0xFF, marker, len(body) + 2) + body
-
-
-def _icc_segments(profile: bytes) -> Iterator[bytes]:
-    """A profile in numbered APP2 segments, since a segment holds 64 kB."""
-    room = _MAX_SEGMENT - len(_ICC_HEADER) - 4
-    pieces = [profile[k : k + room] for k in range(0, len(profile), room)]
-    if len(pieces) <= 255:
-        for number, piece in enumerate(pieces, start=1):
-            yield _segment(0xE2, _ICC_HEADER + bytes([number, len(pieces)]) + piece)
-
-
 _END_OF_IMAGE = b"\xff\xd9"
 # Markers RST0 to RST7 take turns; a strip of a multiple of 8 rows of blocks ends where RST7 is due.
 _RESTART_7 = b"\xff\xd7"
+
 _START_OF_FRAME, _START_OF_SCAN = 0xC0, 0xDA
 _BLOCK_GREY, _BLOCK_COLOUR = 8, 16
+_COLOUR_TYPES = {(1, False): 0, (3, False): 2, (1, True): 4, (3, True): 6}
+_FILTER_UP = 2
+# Higher levels take several times as long for a few per cent.
+_PNG_LEVEL = 3
 
 
 def jpeg_pieces(layout: Layout, strips: Iterable[Strip]) -> Iterator[bytes | memoryview]:
@@ -93,7 +41,7 @@ def jpeg_pieces(layout: Layout, strips: Iterable[Strip]) -> Iterator[bytes | mem
     for samples, alpha in strips:
         head, scan = _header_and_scan(_jpeg(layout, samples, alpha))
         if first:
-            yield from embed_in_jpeg(_with_height(head, layout.size[1]), layout.metadata)
+            yield from _embedded(_with_height(head, layout.size[1]), layout.metadata)
         else:
             yield _RESTART_7
         yield scan
@@ -147,20 +95,13 @@ def _with_height(head: bytes, height: int) -> bytes:
     return head[: position + 5] + struct.pack(">H", height) + head[position + 7 :]
 
 
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_COLOUR_TYPES = {(1, False): 0, (3, False): 2, (1, True): 4, (3, True): 6}
-_FILTER_UP = 2
-# Higher levels take several times as long for a few per cent.
-_LEVEL = 3
-
-
 def png_pieces(layout: Layout, strips: Iterable[Strip]) -> Iterator[bytes]:
     """The pieces of a PNG file, one strip in memory at a time."""
     kind = _COLOUR_TYPES[layout.channels, layout.transparent]
-    yield _SIGNATURE
+    yield PNG_MAGIC
     yield png_chunk(b"IHDR", struct.pack(">IIBBBBB", *layout.size, 8 * layout.dtype.itemsize, kind, 0, 0, 0))
-    yield from png_metadata_chunks(layout.metadata)
-    packer = zlib.compressobj(_LEVEL)
+    yield from _metadata_chunks(layout.metadata)
+    packer = zlib.compressobj(_PNG_LEVEL)
     above = np.zeros(layout.size[0] * layout.samples_per_pixel * layout.dtype.itemsize, dtype=np.uint8)
     for samples, alpha in strips:
         rows = _bytes_of_rows(with_alpha(samples, alpha) if layout.transparent else samples)
@@ -179,3 +120,59 @@ def _bytes_of_rows(samples: NDArray[Any]) -> NDArray[np.uint8]:
     """Rows as bytes, big-endian."""
     ordered = np.ascontiguousarray(samples.astype(samples.dtype.newbyteorder(">"), copy=False))
     return ordered.view(np.uint8).reshape(len(samples), -1)
+
+
+def _embedded(head: bytes, metadata: Metadata) -> list[bytes]:
+    """A JPEG file's beginning with EXIF and XMP (APP1) and ICC profile (APP2) after the JFIF header (APP0).
+
+    EXIF of more than 64 kB does not fit into a JPEG segment and is left out.
+    """
+    after_header = 2
+    jfif = b""
+    if head[3] == _JFIF:
+        after_header = 4 + struct.unpack_from(">H", head, 4)[0]
+        jfif = head[2:after_header]
+        if metadata.dpi is not None and all(0 < d < 65535 for d in metadata.dpi):
+            jfif = jfif[:11] + struct.pack(">BHH", 1, *(round(d) for d in metadata.dpi)) + jfif[16:]
+    exif = _bare_exif(metadata)
+    segments = [_segment(0xE1, _EXIF_HEADER + exif)] if exif else []
+    if metadata.xmp and len(metadata.xmp) + len(_XMP_HEADER) <= _MAX_SEGMENT:
+        segments.append(_segment(0xE1, _XMP_HEADER + metadata.xmp))
+    return [head[:2], jfif, *segments, *_icc_segments(metadata.icc_profile), head[after_header:]]
+
+
+def _metadata_chunks(metadata: Metadata) -> Iterator[bytes]:
+    """ICCP, pHYs, eXIf and iTXt chunks, which stand between header and pixels."""
+    if metadata.icc_profile:
+        yield png_chunk(b"iCCP", b"ICC profile\0\0" + zlib.compress(metadata.icc_profile, 9))
+    if metadata.dpi is not None and all(0 < d < 1e6 for d in metadata.dpi):
+        yield png_chunk(b"pHYs", struct.pack(">IIB", *(round(d / _METRES_PER_INCH) for d in metadata.dpi), 1))
+    if exif := _bare_exif(metadata):
+        yield png_chunk(b"eXIf", exif)
+    if metadata.xmp:
+        yield png_chunk(b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + metadata.xmp)
+
+
+def png_chunk(kind: bytes, body: bytes) -> bytes:
+    """One PNG chunk."""
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(body, zlib.crc32(kind)))
+
+
+def _bare_exif(metadata: Metadata) -> bytes:
+    """EXIF as a TIFF structure, without the header that JPEG puts before it; empty when too large."""
+    exif = metadata.exif.removeprefix(_EXIF_HEADER)
+    return exif if len(exif) + len(_EXIF_HEADER) + 2 <= _MAX_SEGMENT else b""
+
+
+def _segment(marker: int, body: bytes) -> bytes:
+    """One JPEG marker segment."""
+    return struct.pack(">BBH", 0xFF, marker, len(body) + 2) + body
+
+
+def _icc_segments(profile: bytes) -> Iterator[bytes]:
+    """A profile in numbered APP2 segments, since a segment holds 64 kB."""
+    room = _MAX_SEGMENT - len(_ICC_HEADER) - 4
+    pieces = [profile[k : k + room] for k in range(0, len(profile), room)]
+    if len(pieces) <= 255:
+        for number, piece in enumerate(pieces, start=1):
+            yield _segment(0xE2, _ICC_HEADER + bytes([number, len(pieces)]) + piece)

@@ -40,14 +40,10 @@ def fingerprint(picture: Path, tiles: Path | None = None) -> Fingerprint:
     """
     if tiles is None:
         return Fingerprint(picture.stat().st_size, _sha256(picture))
-    files = [(".dzi", picture), *_named(tiles)]
+    found = sorted(path for path in tiles.rglob("*") if path.is_file())
+    files = [(".dzi", picture), *((file.relative_to(tiles).as_posix(), file) for file in found)]
     listing = "".join(f"{_sha256(file)}  {name}\n" for name, file in files)
     return Fingerprint(sum(file.stat().st_size for _, file in files), hashlib.sha256(listing.encode()).hexdigest())
-
-
-def _named(tiles: Path) -> Iterator[tuple[str, Path]]:
-    for file in sorted(path for path in tiles.rglob("*") if path.is_file()):
-        yield file.relative_to(tiles).as_posix(), file
 
 
 def _sha256(file: Path) -> str:
@@ -56,7 +52,10 @@ def _sha256(file: Path) -> str:
 
 
 def interrupted_outputs(folder: Path) -> frozenset[str]:
-    """Names of the pictures in a folder that a staged sidecar describes by size and digest: rdstitch wrote them."""
+    """Names of the pictures in a folder that a staged sidecar describes by size and digest: rdstitch wrote them.
+
+    Their run was killed while it published: the picture is in its place, its sidecar still in the hidden folder.
+    """
     with suppress(OSError, ValueError):
         return frozenset(
             picture.name for staging in folder.glob(".rdstitch-*.part") for picture, _ in _staged_sidecars(staging)

@@ -54,7 +54,6 @@ class Layout:
     background: int = 0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if min(self.size) < 1 or self.channels < 1:
             raise ArgumentError(
                 f"a picture of {self.size[0]} x {self.size[1]} pixels and {self.channels} channels is empty"

@@ -44,7 +44,6 @@ def read_mask(path: str | Path, size: tuple[int, int]) -> NDArray[np.uint8]:
 
     Parameters
     ----------
-    path : path
     size : (int, int)
         Width and height, pixels, that the mask is brought to; nearest pixels.
 

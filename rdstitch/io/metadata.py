@@ -17,14 +17,26 @@ from PIL import ExifTags, Image
 from rdstitch.camera import is_focal_length
 from rdstitch.file_access import open_regular
 from rdstitch.io.attitude import Attitude, finite, read_attitude, xmp_number, xmp_text
-from rdstitch.io.decoding import check_readable, decoding
-from rdstitch.io.opening import check_megapixels, has_late_metadata, opened_picture
+from rdstitch.io.opening import check_megapixels, check_readable, decoding, has_late_metadata, opened_picture
 from rdstitch.io.optional_readers import is_raw, raw_exif, raw_size
 
 SIDEWAYS = (5, 6, 7, 8)
 """Orientations that exchange the axes; what runs backwards, runs so after that."""
 
 _X_BACKWARDS, _Y_BACKWARDS = (2, 3, 6, 7), (3, 4, 7, 8)
+_DIAGONAL_35MM = math.hypot(36.0, 24.0)
+_MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_BIT_DEPTHS = {"1": 1, "I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
+_EXPOSURE_TAGS = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings)
+
+MAX_PROFILE = 2**20 - 2**10
+"""Bytes of a colour profile: PNG readers, such as Pillow's, refuse pictures whose profile takes a megabyte."""
+
+_EXIF_OF_PNG = {"exif", "Raw profile type exif"}
+_COLOUR_SPACE = slice(16, 20)  # of a profile's header
+_UNWRITABLE = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, struct.error)
+_HEADER = 16
+_ORIENTATION, _PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE = 0x0112, 0xA002, 0xA003, 0x927C
 
 
 def turned(samples: NDArray[Any], orientation: int) -> NDArray[Any]:
@@ -43,20 +55,6 @@ def turned_direction(x: float, y: float, orientation: int) -> tuple[float, float
     if orientation in SIDEWAYS:
         x, y = y, x
     return (-x if orientation in _X_BACKWARDS else x), (-y if orientation in _Y_BACKWARDS else y)
-
-
-_DIAGONAL_35MM = math.hypot(36.0, 24.0)
-_MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-_BIT_DEPTHS = {"1": 1, "I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
-_EXPOSURE_TAGS = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings)
-MAX_PROFILE = 2**20 - 2**10
-"""Bytes of a colour profile: PNG readers, such as Pillow's, refuse pictures whose profile takes a megabyte."""
-
-_EXIF_OF_PNG = {"exif", "Raw profile type exif"}
-_COLOUR_SPACE = slice(16, 20)  # of a profile's header
-_UNWRITABLE = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, struct.error)
-_HEADER = 16
-_ORIENTATION, _PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE = 0x0112, 0xA002, 0xA003, 0x927C
 
 
 @dataclass(frozen=True)

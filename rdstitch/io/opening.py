@@ -1,14 +1,24 @@
-"""Opening picture files: only the formats below, only regular files, and nothing of them decoded yet."""
+"""Opening picture files: only the formats below, only regular files, and nothing of them decoded yet.
 
+Failures of the decoders end as one InputError. Their warnings and log messages go where those of any library go: the
+process that this runs in decides what becomes of them, since Python's filters and handlers belong to all its threads.
+"""
+
+import os
+import stat
 import struct
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, BinaryIO
 
+import cv2
+import tifffile
 from PIL import (
     BmpImagePlugin,
     GifImagePlugin,
+    Image,
     ImageFile,
     Jpeg2KImagePlugin,
     JpegImagePlugin,
@@ -20,8 +30,28 @@ from PIL import (
 )
 
 from rdstitch.errors import InputError
-from rdstitch.file_access import open_regular
-from rdstitch.io.optional_readers import avif_factory, heif_factory
+from rdstitch.file_access import is_url, open_regular, remote_status
+from rdstitch.io.optional_readers import avif_factory, check_reader, heif_factory, is_raw
+
+# What Pillow, tifffile and OpenCV have been seen to raise on damaged files; warnings, where filters make them errors.
+_DAMAGE = (
+    Warning,
+    OSError,
+    SyntaxError,
+    ValueError,
+    TypeError,
+    LookupError,
+    ArithmeticError,
+    AttributeError,
+    RuntimeError,
+    AssertionError,
+    EOFError,
+    struct.error,
+    zlib.error,
+    tifffile.TiffFileError,  # no ValueError in older versions
+    Image.DecompressionBombError,
+    cv2.error,
+)
 
 TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
@@ -38,10 +68,74 @@ _FORMATS: dict[bytes, Callable[[IO[bytes], str], ImageFile.ImageFile]] = {
     b"\0\0\0\x0cjP  \r\n\x87\n": Jpeg2KImagePlugin.Jpeg2KImageFile,
     **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6"), PpmImagePlugin.PpmImageFile),
 }
+
 _MAX_MAGIC = max(map(len, _FORMATS))
 _NAMES = "JPEG, PNG, TIFF, WebP, AVIF, HEIC, BMP, TGA, GIF, JPEG 2000, PBM, PGM, PPM"
 _MAX_MEGAPIXELS = 178
 _PNG_METADATA = (b"eXIf", b"tEXt", b"zTXt", b"iTXt")
+
+
+def check_readable(path: Path) -> None:
+    """Refuse what cannot be a picture file, before a decoder blocks or stumbles on it.
+
+    Raises
+    ------
+    InputError
+        When the path is missing, no regular file, empty, or not readable.
+    """
+    if is_url(path):
+        _check_remote(path)
+        return
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        hint = "a link to nothing" if path.is_symlink() else "no such file"
+        raise InputError(f"{path}: {hint}; check the name") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}; check the name") from error
+    if stat.S_ISDIR(status.st_mode):
+        raise InputError(f"{path}: is a folder, not a picture; name the pictures in it")
+    if not stat.S_ISREG(status.st_mode):
+        raise InputError(f"{path}: is not a regular file; copy it to one first")
+    if status.st_size == 0:
+        raise InputError(f"{path}: is empty (0 bytes); copy it again from its source")
+    check_reader(path)
+    if not os.access(path, os.R_OK):
+        raise InputError(f"{path}: permission denied; make it readable")
+
+
+def _check_remote(path: Path) -> None:
+    """The same of what a URL names."""
+    if is_raw(path):
+        raise InputError(f"{path}: raw files are read from this machine's disks only; download it first")
+    check_reader(path)
+    try:
+        is_folder, size, _ = remote_status(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; check the address") from None
+    except OSError as error:
+        raise InputError(f"{path}: {error}") from error
+    if is_folder:
+        raise InputError(f"{path}: is a folder, not a picture; name the pictures in it")
+    if size == 0:
+        raise InputError(f"{path}: is empty (0 bytes); copy it again from its source")
+
+
+@contextmanager
+def decoding(path: Path) -> Iterator[None]:
+    """Run a decoder: its failures become an InputError that names the file."""
+    try:
+        yield
+    except MemoryError as error:
+        raise InputError(f"{path}: too large to read into memory; make it smaller first") from error
+    except PermissionError as error:
+        raise InputError(f"{path}: permission denied; make it readable") from error
+    except _DAMAGE as error:
+        if isinstance(error, cv2.error) and error.code == cv2.Error.StsNoMem:
+            raise InputError(f"{path}: too large to read into memory; make it smaller first") from error
+        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = reason.replace(f"'{path}'", "the file")
+        raise InputError(f"{path}: not a picture that can be read, or damaged ({reason[:160]})") from error
 
 
 @contextmanager
@@ -53,7 +147,7 @@ def opened_picture(file: Path) -> Iterator[ImageFile.ImageFile]:
     InputError
         When it is none of these formats, or larger than any camera's.
     OSError, SyntaxError, …
-        What :func:`rdstitch.io.decoding.decoding` makes an InputError of: the file is missing, no regular one, or
+        What :func:`rdstitch.io.opening.decoding` makes an InputError of: the file is missing, no regular one, or
         damaged.
     """
     with open_regular(file) as stream, _factory(file, stream)(stream, str(file)) as image:

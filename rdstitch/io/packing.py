@@ -49,7 +49,6 @@ def unpack(data: bytes, kinds: Iterable[type] = ()) -> Any:
 
     Parameters
     ----------
-    data : bytes
     kinds : iterable of dataclass
         What may be made.
 

@@ -21,7 +21,6 @@ def read_preview(path: Path, size: tuple[int, int], side: int) -> tuple[NDArray[
 
     Parameters
     ----------
-    path : Path
     size : (int, int)
         Width and height of the picture, pixels.
     side : int

@@ -17,9 +17,8 @@ from PIL import Image
 
 from rdstitch.errors import InputError
 from rdstitch.file_access import open_regular
-from rdstitch.io.decoding import check_readable, decoding
 from rdstitch.io.metadata import Metadata, metadata_of, read_metadata, turned
-from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, opened_picture
+from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, opened_picture
 from rdstitch.io.optional_readers import is_raw, read_raw
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
 from rdstitch.opencv_state import silent_opencv
@@ -27,6 +26,15 @@ from rdstitch.opencv_state import silent_opencv
 _END_OF_IMAGE = b"\xff\xd9"
 _PADDING = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
 _MIN_JPEG_SIDE = 8  # pixels a side; below, different reductions give pictures of the same size
+_OPAQUE = 255
+# A page of a TIFF file that masks the picture, and how many pages are looked at for one.
+_MASK, _MASK_WITHIN = 4, 40
+
+_MAX_DECODED_REDUCTION = 8  # of the JPEG decoder
+_ROWS_AT_A_TIME = 128
+_PNG_PIXEL_CHUNKS = (b"IHDR", b"tRNS", b"IDAT", b"IEND")
+_JPEG = ("JPEG", "MPO")
+_GREY_16 = ("I;16", "I;16B", "I;16L", "I;16N", "I")
 
 
 def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) -> tuple[NDArray[Any] | None, str]:
@@ -37,12 +45,10 @@ def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) 
 
     Parameters
     ----------
-    file : Path
     size : (int, int)
         Width and height of the whole picture, pixels.
     factor : int
         1, 2, 4 or 8; so many pixels a side become one.
-    grey : bool
 
     Returns
     -------
@@ -74,15 +80,6 @@ def _is_padding(complaint: str, data: bytes) -> bool:
 
 
 Pixels = NDArray[Any]
-
-_OPAQUE = 255
-# A page of a TIFF file that masks the picture, and how many pages are looked at for one.
-_MASK, _MASK_WITHIN = 4, 40
-_MAX_DECODED_REDUCTION = 8  # of the JPEG decoder
-_ROWS_AT_A_TIME = 128
-_PNG_PIXEL_CHUNKS = (b"IHDR", b"tRNS", b"IDAT", b"IEND")
-_JPEG = ("JPEG", "MPO")
-_GREY_16 = ("I;16", "I;16B", "I;16L", "I;16N", "I")
 
 
 @dataclass(frozen=True)
@@ -298,7 +295,6 @@ def as_picture(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Meta
         Colour in RGB order.
     alpha : ndarray of shape (h, w), or None
         Of any sample type; full where the picture is opaque.
-    metadata : Metadata
 
     Raises
     ------

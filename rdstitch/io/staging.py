@@ -17,8 +17,7 @@ if sys.platform != "win32":
 
 _LOCK = "lock"
 _MAX_ATTEMPTS = 10
-_UNLOCKED_SECONDS = 60.0
-"""After which a file that nobody has locked is not one that somebody has just made."""
+_UNLOCKED_SECONDS = 60.0  # after which a file that nobody has locked is not one that somebody has just made
 
 
 class StagingFolder:

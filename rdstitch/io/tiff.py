@@ -47,8 +47,6 @@ def write_tiff(path: Path, layout: Layout, strips: Iterable[Strip], extra_tags: 
     ----------
     path : Path
         Temporary files for the overviews are made, and removed, in the same folder.
-    layout : Layout
-    strips : iterable of (samples, alpha)
     extra_tags
         Further tags of the first page, for example of a GeoTIFF.
     """

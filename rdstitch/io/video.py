@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.errors import InputError, OutputError
-from rdstitch.io.decoding import check_readable
+from rdstitch.io.opening import check_readable
 
 VIDEO_SUFFIXES = frozenset((".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"))
 

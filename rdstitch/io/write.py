@@ -100,7 +100,6 @@ def write_strips(
     ----------
     path
         The format follows the suffix.
-    layout : Layout
     strips : iterable of (samples, alpha)
         From top to bottom; all but the last have a multiple of 256 rows.
     extra_tags

@@ -80,16 +80,11 @@ def align_locally(
     ----------
     matches : sequence of Match
         Putative matches of all pairs, right and wrong; ``image1`` and ``image2`` count the cameras.
-    cameras : sequence of Camera
     homographies : ndarray of shape (N, 3, 3)
         Undistorted coordinates, in half diagonals, to the plane.
     choice : "auto", "off" or int
         "auto": only where matches that are held out of the fit come nearer by 15 % or more. A number: always, with so
         many cells along the longer side of a picture.
-
-    Returns
-    -------
-    LocalAlignment
     """
     if choice == "off":
         return no_local_alignment("switched off")

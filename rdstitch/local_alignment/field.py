@@ -34,7 +34,6 @@ class DisplacementField:
     values: FloatArray
 
     def __post_init__(self) -> None:
-        """Check the shape."""
         if self.values.ndim != 3 or self.values.shape[2] != 2 or min(self.values.shape[:2]) < 2:
             raise ArgumentError(
                 f"a displacement field has shape (m, n, 2), m and n at least 2, not {self.values.shape}"
@@ -86,14 +85,23 @@ def bilinear(
     points: FloatArray, image_size: tuple[int, int], shape: Sequence[int]
 ) -> tuple[NDArray[np.intp], FloatArray]:
     """Nodes (N, 4) around measured pixels (N, 2), counted row by row, and their shares (N, 4)."""
+    last = np.array([shape[1] - 1, shape[0] - 1])
+    return nodes_around(points * (last / (np.array(image_size) - 1.0)), shape)
+
+
+def nodes_around(place: FloatArray, shape: Sequence[int]) -> tuple[NDArray[np.intp], FloatArray]:
+    """Nodes (..., 4) of a grid (rows, columns) around places (..., 2) in its units, x first, and their shares (..., 4).
+
+    Outside of the grid they are those of its border.
+    """
     rows, columns = shape
     last = np.array([columns - 1, rows - 1])
-    place = np.clip(points * (last / (np.array(image_size) - 1.0)), 0.0, last)
+    place = np.clip(place, 0.0, last)
     cell = np.minimum(place.astype(np.intp), last - 1)
-    x, y = (place - cell).T
-    node = cell[:, 1] * columns + cell[:, 0]
-    nodes = np.stack([node, node + 1, node + columns, node + columns + 1], axis=1)
-    return nodes, np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=1)
+    x, y = np.moveaxis(place - cell, -1, 0)
+    node = cell[..., 1] * columns + cell[..., 0]
+    nodes = np.stack([node, node + 1, node + columns, node + columns + 1], axis=-1)
+    return nodes, np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=-1)
 
 
 def grid_shape(image_size: tuple[int, int], cells: int) -> tuple[int, int]:

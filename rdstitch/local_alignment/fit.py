@@ -125,10 +125,7 @@ def _smoothness(shape: tuple[int, int], camera: Camera, stiffness: Stiffness) ->
     total: Any = sparse.eye_array(rows * columns) * (spacing / fade) ** 2
     for order in (1, 2):
         steps = [_differences(n, order) for n in (rows, columns)]
-        for both in (
-            sparse.kron(steps[0], sparse.eye_array(columns)),
-            sparse.kron(sparse.eye_array(rows), steps[1]),
-        ):
+        for both in (sparse.kron(steps[0], sparse.eye_array(columns)), sparse.kron(sparse.eye_array(rows), steps[1])):
             total = total + both.T @ both
     return sparse.csr_array(total / (stiffness.slope * spacing) ** 2)
 

@@ -48,7 +48,6 @@ class PlaneMatches:
     residual: FloatArray
 
     def __len__(self) -> int:
-        """Number of matches."""
         return len(self.residual)
 
     def take(self, chosen: NDArray[np.bool_]) -> "PlaneMatches":

@@ -21,8 +21,7 @@ from rdstitch.verification.rival_motion import find_rival_motions, pairs_of_riva
 from rdstitch.verification.verdict import RefusedError, judge
 
 _MAX_SCALE_UNCERTAINTY = 0.05  # share that lengths may be off by, as far as the focal length is, without a word
-_MAX_ROUNDS = 20
-"""Times that something is left out; each takes one adjustment."""
+_MAX_ROUNDS = 20  # times that something is left out; each takes one adjustment
 
 _CLEARLY = 1.5
 """How many times as much of the overlaps must look alike by one motion as by another one."""
@@ -62,7 +61,6 @@ def accept(
     ----------
     registration : Registration
         In pixels of the working size; the result is in those of the pictures.
-    options : StitchOptions
     executor : concurrent.futures.Executor
         Where pictures are compared.
     lens_only : bool

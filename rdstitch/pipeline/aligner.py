@@ -25,6 +25,14 @@ from rdstitch.messages import Message, names_of
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.working_size import at_working_size
 
+_CLOSURE_ROUNDS = 2
+
+_WIDTH_PER_SIGMA, _MIN_THRESHOLD = 4.0, 0.5
+"""Up to how many standard deviations a match is an inlier, but at least up to so many pixels."""
+
+_MIN_KEPT = 0.5
+"""Share of its inliers that a pair must keep; otherwise the alignment does not fit it, and it stays as it is."""
+
 
 @contextmanager
 def impossible_estimates_fail() -> Iterator[None]:
@@ -41,9 +49,6 @@ def impossible_estimates_fail() -> Iterator[None]:
             f"no reliable result: the pictures agree best on a lens that cannot be ({error}); "
             "give the lens with --camera or --lambda, or take pictures that overlap more"
         ) from error
-
-
-_CLOSURE_ROUNDS = 2
 
 
 @dataclass(frozen=True)
@@ -203,13 +208,6 @@ def _no_overlap(paths: Sequence[str], pairs: Sequence[PairRegistration]) -> str:
     )
 
 
-_WIDTH_PER_SIGMA, _MIN_THRESHOLD = 4.0, 0.5
-"""Up to how many standard deviations a match is an inlier, but at least up to so many pixels."""
-
-_MIN_KEPT = 0.5
-"""Share of its inliers that a pair must keep; otherwise the alignment does not fit it, and it stays as it is."""
-
-
 def reselect_inliers(
     pairs: Sequence[PairRegistration], alignment: Alignment, threshold: float
 ) -> dict[int, PairRegistration]:
@@ -217,7 +215,6 @@ def reselect_inliers(
 
     Parameters
     ----------
-    pairs : sequence of PairRegistration
     alignment : Alignment
         Of these pairs.
     threshold : float

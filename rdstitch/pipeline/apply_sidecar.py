@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +18,7 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.atomic import check_output, json_bytes
-from rdstitch.io.decoding import check_readable
+from rdstitch.io.opening import check_readable
 from rdstitch.io.outputs import Outputs
 from rdstitch.local_alignment import DisplacementField
 from rdstitch.messages import Message, told_once
@@ -188,7 +189,7 @@ def _match(saved: SavedRegistration, frames: Sequence[Frame], match: MatchBy) ->
     """For each picture of the registration the frame that takes its place, and by what it was found."""
     # Arrays have no names of their own.
     if match != "order" and any(frame.picture is None for frame in frames):
-        for key in (_full_name, _stem):
+        for key in (attrgetter("name"), attrgetter("stem")):
             chosen = _by_name(saved, frames, key)
             if any(frame is not None for frame in chosen):
                 return chosen, "name"
@@ -196,14 +197,6 @@ def _match(saved: SavedRegistration, frames: Sequence[Frame], match: MatchBy) ->
         wanted = next(picture.name for picture in saved.pictures if picture.to_plane is not None)
         raise InputError(f"{saved.path}: none of the given pictures has a name that is in it, such as {wanted}")
     return list(_by_order(saved, frames)), "order"
-
-
-def _full_name(path: Path) -> str:
-    return path.name
-
-
-def _stem(path: Path) -> str:
-    return path.stem
 
 
 def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[Path], str]) -> list[Frame | None]:
@@ -245,9 +238,7 @@ def _sources(
         if frame is None:
             left_out[index] = left_out_message(picture.path, "is not among the given pictures")
             continue
-        found, unread = read_sources(
-            [frame], camera=None, focal=None, distortion=None, skip_bad=True, guard=guard, max_memory=max_memory
-        )
+        found, unread = read_sources([frame], skip_bad=True, guard=guard, max_memory=max_memory)
         if unread:
             left_out[index] = unread[0]
         else:

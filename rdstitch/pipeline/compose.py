@@ -33,7 +33,7 @@ from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
 from rdstitch.messages import Message
 from rdstitch.pipeline.placed_images import PlacedImages, plan
-from rdstitch.process_memory import release_free_heap
+from rdstitch.process_memory import return_freed_memory
 from rdstitch.progress import Progress
 from rdstitch.stitch_result import StitchResult
 from rdstitch.stored import Stored
@@ -87,13 +87,9 @@ def compose_pictures(
 
     Parameters
     ----------
-    placed : PlacedImages
     output : path or None
         File that the picture is written to, a strip at a time, with colour profile and EXIF of the first picture, and
         with its place on the Earth where three pictures have a GPS position; without it the picture is made in memory.
-    options : CompositeOptions
-    threads : int
-    progress : callable
     overwrite : bool
         Replace an existing world file.
     outputs : Outputs
@@ -108,7 +104,7 @@ def compose_pictures(
     OutputError
         When a file beside the output exists already.
     """
-    release_free_heap()
+    return_freed_memory()
     world_files = _files_beside(output, placed, overwrite)
     canvas = plan(placed, options)
     # A crop may yet make it fit.
@@ -201,7 +197,6 @@ def blocks_on(executor: Executor, sources: Sequence[Source], folder: Path | None
 
     Parameters
     ----------
-    executor : concurrent.futures.Executor
     sources : sequence of Source
         The pictures of the composite.
     folder : Path or None

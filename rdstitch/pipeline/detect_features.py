@@ -1,27 +1,35 @@
-"""Stage: the features of every picture, and which pictures turned out to be damaged."""
+"""Stage: features of all pictures by the same rendering in 8 bits, equalized where the set shows little contrast.
 
-from collections.abc import Iterator, Mapping, Sequence
+Pictures of more than 8 bits are stretched alike, so that they register as their common rendering in 8 bits does. Where
+half of the pictures show few features for their size (haze, the sea bed, concrete, snow), all are detected again, after
+a stretch and with local contrast equalized.
+"""
+
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from rdstitch.cache import Cache
 from rdstitch.errors import InputError
 from rdstitch.executors import in_order
-from rdstitch.features import FeatureOptions, Features, PackedFeatures, View, detect, detect_view
+from rdstitch.features import FeatureOptions, Features, PackedFeatures, detect, detect_view
 from rdstitch.features.options import CLOSER
-from rdstitch.features.picture import halving
+from rdstitch.features.picture import Stretch, common_stretch, halving, usual_stretch
 from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.matching.feature_store import FeatureStore, StoredFeatures
 from rdstitch.progress import Progress
 
-_MIN_BATCHES = 16
-"""Batches that pictures are at least divided into, so that a few keep several workers busy."""
+_MIN_BATCHES = 16  # batches that pictures are at least divided into, so that a few keep several workers busy
+_PICTURES_AT_ONCE = 8  # pictures of a task at the most
+_USUAL_DENSITY = 2000
+"""Features per 10⁶ pixels that pictures of usual contrast show at least; flights show 10,000 to 15,000."""
 
-_PICTURES_AT_ONCE = 8
-"""Pictures of a task at the most."""
+_LOW_SHARE = 0.5
+"""Of those, or of the features wanted if these are fewer: where half of the pictures show less, contrast is low."""
 
 
 @dataclass(frozen=True)
@@ -42,14 +50,7 @@ class DetectedFeatures:
 
 @dataclass(frozen=True)
 class DetectionTask:
-    """Pictures whose features are to be detected together.
-
-    Attributes
-    ----------
-    sources : sequence of Source
-    options : FeatureOptions
-    store : Cache
-    """
+    """Pictures whose features are to be detected together."""
 
     sources: Sequence[Source]
     options: FeatureOptions
@@ -69,14 +70,10 @@ def detect_features(
 
     Parameters
     ----------
-    sources : sequence of Source
-    options : FeatureOptions
-    executor : concurrent.futures.Executor
     store : Cache
         Where the features lie.
     skip_bad : bool
         Go on without damaged pictures instead of raising.
-    progress : callable
 
     Raises
     ------
@@ -84,7 +81,9 @@ def detect_features(
         When the pixels of a picture cannot be read, unless ``skip_bad``.
     """
     results: list[StoredFeatures | InputError] = []
-    for found, notes in in_order(executor, detect_batch, _tasks(sources, options, store)):
+    size = min(_PICTURES_AT_ONCE, -(-len(sources) // _MIN_BATCHES))
+    tasks = (DetectionTask(sources[start : start + size], options, store) for start in range(0, len(sources), size))
+    for found, notes in in_order(executor, detect_batch, tasks):
         sources[0].guard.learn(notes)
         errors = [result for result in found if isinstance(result, InputError)]
         if errors and not skip_bad:
@@ -100,11 +99,6 @@ def detect_features(
         ),
         {index: str(result) for index, result in enumerate(results) if isinstance(result, InputError)},
     )
-
-
-def _tasks(sources: Sequence[Source], options: FeatureOptions, store: Cache) -> Iterator[DetectionTask]:
-    size = min(_PICTURES_AT_ONCE, -(-len(sources) // _MIN_BATCHES))
-    return (DetectionTask(sources[start : start + size], options, store) for start in range(0, len(sources), size))
 
 
 def detect_batch(task: DetectionTask) -> tuple[list[StoredFeatures | InputError], GuardNotes]:
@@ -130,14 +124,8 @@ def _detected(source: Source, task: DetectionTask) -> StoredFeatures:
     wanted = replace(wanted, work_megapixels=None)
     inputs = (source.content(store), store.file(source.mask), size, wanted, halvings, network)
 
-    def load(megapixels: float | None) -> View:
-        # It is kept for the checks that read it again.
-        reduction = source.reduction(megapixels)
-        picture = source.read(reduction, keep=True)
-        return View(picture.pixels, picture.alpha, reduction, source.camera.image_size)
-
     def compute() -> PackedFeatures:
-        return PackedFeatures.pack(detect_view(load, options))
+        return PackedFeatures.pack(detect_view(source.view, options))
 
     stored = store.stored(
         "features", (PackedFeatures, Features), inputs, compute, lambda found: _are_of(source, found.unpack())
@@ -155,3 +143,94 @@ def _are_of(source: Source, features: Features) -> bool:
 def _no_features(options: FeatureOptions, source: Source) -> Features:
     """Features of the same kind as those of the other pictures, but none of them."""
     return replace(detect(np.zeros((1, 1), dtype=np.uint8), options), image_size=source.camera.image_size)
+
+
+@dataclass(frozen=True)
+class DetectionByContrast:
+    """Features, and how the pictures were rendered for detection.
+
+    Attributes
+    ----------
+    detected : DetectedFeatures
+    stretch : (float, float) or None
+        Grey levels that became 0 and 255 in all pictures; None where they are those of 8 bits.
+    equalized : bool
+        Whether local contrast was equalized because the pictures showed too little otherwise.
+    """
+
+    detected: DetectedFeatures
+    stretch: Stretch | None
+    equalized: bool
+
+
+def detect_by_contrast(
+    sources: Sequence[Source],
+    options: FeatureOptions,
+    executor: Executor,
+    store: Cache,
+    *,
+    skip_bad: bool,
+    progress: Progress,
+) -> DetectionByContrast:
+    """Detect the features of all pictures, if necessary once more; see :func:`detect_features`."""
+    detect = partial(detect_features, executor=executor, store=store, skip_bad=skip_bad, progress=progress)
+    depths = {source.metadata.bit_depth > 8 for source in sources}
+    stretch = options.stretch or (_stretch_of(sources, options, executor, store) if depths == {True} else None)
+    options = replace(options, stretch=stretch)
+    detected = detect(sources, options)
+    # Samples of two kinds have no grey levels in common: each picture is stretched on its own.
+    if options.equalize is not None or len(depths) > 1 or not _shows_little(sources, detected, options):
+        return DetectionByContrast(detected, stretch, bool(options.equalize))
+    stretch = stretch or _stretch_of(sources, options, executor, store)
+    again = detect(sources, replace(options, stretch=stretch, equalize=True))
+    if _typical_count(again) <= _typical_count(detected):
+        return DetectionByContrast(detected, options.stretch, False)
+    return DetectionByContrast(again, stretch, True)
+
+
+def _shows_little(sources: Sequence[Source], detected: DetectedFeatures, options: FeatureOptions) -> bool:
+    """Whether half of the pictures show few features for their size."""
+    most, megapixels = options.limits
+    shares = []
+    for index, (source, count) in enumerate(zip(sources, detected.features.counts.tolist(), strict=True)):
+        if index not in detected.damaged:
+            size = np.prod(source.metadata.size) / source.reduction(megapixels) ** 2 / 1e6
+            shares.append(count / min(most, _USUAL_DENSITY * size))
+    return bool(shares) and float(np.median(shares)) < _LOW_SHARE
+
+
+def _typical_count(detected: DetectedFeatures) -> float:
+    return float(np.median(detected.features.counts))
+
+
+def _stretch_of(sources: Sequence[Source], options: FeatureOptions, executor: Executor, store: Cache) -> Stretch | None:
+    """The stretch that suits all pictures together."""
+    tasks = (_StretchTask(source, options.limits[1], store) for source in sources)
+    found = []
+    for stretch, notes in in_order(executor, _stretch_of_one, tasks):
+        sources[0].guard.learn(notes)
+        found.append(stretch)
+    return common_stretch(found)
+
+
+@dataclass(frozen=True)
+class _StretchTask:
+    """A picture whose own stretch is wanted, at so many 10⁶ pixels."""
+
+    source: Source
+    megapixels: float | None
+    store: Cache
+
+
+def _stretch_of_one(task: _StretchTask) -> tuple[Stretch | None, GuardNotes]:
+    """The stretch of a picture, None for one that cannot be read; and what was noticed of its file."""
+    source, store = task.source, task.store
+
+    def compute() -> Stretch | None:
+        try:
+            return usual_stretch(source.view(task.megapixels))
+        except InputError:  # left out, or reported, by the detection
+            return None
+
+    inputs = (source.content(store), store.file(source.mask), task.megapixels)
+    return store.recall("stretches", (), inputs, compute), source.guard.notes_on([source.path])

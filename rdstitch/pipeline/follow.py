@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from rdstitch.errors import InputError
-from rdstitch.features import FeatureOptions, View, detect_view, match
+from rdstitch.features import FeatureOptions, detect_view, match
 from rdstitch.inputs.frame import Frame
-from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.selection import is_selected, with_masks
-from rdstitch.inputs.source import Source, read_sources
+from rdstitch.inputs.source import Source
 from rdstitch.io.write import write_image
 from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import alignment_options
+from rdstitch.pipeline.read_inputs import read_frames
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.tracking import Preview, Tracked, Tracker, TrackingOptions
 
@@ -88,7 +88,6 @@ def follow(
     ----------
     frames : iterable of Frame
         See :class:`rdstitch.inputs.arrivals.Arrivals`.
-    options : StitchOptions
     preview : path, optional
         Picture to write of what has been seen so far; JPEG or PNG.
     refresh : float
@@ -116,7 +115,7 @@ def follow(
             continue
         label = FollowedFrame(source.name, source.number(0), float(timestamps_of([source])[0]), None)
         try:
-            found = detect_view(partial(_view, source), features)
+            found = detect_view(source.view, features)
         except InputError as error:
             yield replace(label, reason=str(error))
             continue
@@ -169,24 +168,9 @@ def _live_features(options: FeatureOptions) -> FeatureOptions:
     )
 
 
-def _view(source: Source, megapixels: float | None) -> View:
-    """The frame as large as detection needs it; it is kept for the preview."""
-    reduction = source.reduction(megapixels)
-    picture = source.read(reduction, keep=True)
-    return View(picture.pixels, picture.alpha, reduction, source.camera.image_size)
-
-
 def _source(frame: Frame, options: StitchOptions) -> tuple[Source | None, str]:
     """The frame as a source, or why there is none."""
-    sources, unread = read_sources(
-        [frame],
-        camera=options.camera,
-        focal=options.focal,
-        distortion=options.distortion,
-        skip_bad=True,
-        guard=InputGuard(options.strict),
-        max_memory=options.composite.max_memory,
-    )
+    sources, unread = read_frames([frame], options, skip_bad=True)
     if not sources:
         return None, unread[0].text
     common = options.mask is not None and not Path(options.mask).is_dir()

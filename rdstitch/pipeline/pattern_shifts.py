@@ -20,12 +20,8 @@ from rdstitch.verification.unique_places import unique_shifts
 _MAX_PICTURES = 2**27 // (2 * COMPARED_SIDE**2 * np.dtype(np.float32).itemsize)
 """Pictures whose drawings and departures fit into 128 MB at once; of more, a repeated pattern is refused as before."""
 
-_PAIRS_OF_A_PICTURE = 6
-"""Pairs that are compared, by picture on average: those taken one soon after the other first."""
-
-_MIN_PLACED = 0.5
-"""Of the pictures, that must find their place; of fewer nobody is helped."""
-
+_PAIRS_OF_A_PICTURE = 6  # pairs that are compared, by picture on average: those taken one soon after the other first
+_MIN_PLACED = 0.5  # of the pictures, that must find their place; of fewer nobody is helped
 _UNDECIDED = "shows a repeated pattern, and nothing unique in it decides where it lies"
 
 
@@ -46,10 +42,6 @@ def settle_repeated_pattern(
 
     Parameters
     ----------
-    aligner : Aligner
-    pairing : Pairing
-    aligned : AlignedPairs
-    sources : sequence of Source
     stretch : (float, float) or None
         Grey levels of black and white, see :class:`rdstitch.registration.Registration`.
     workers : int

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,15 @@ from rdstitch.compositing.near_part import NearPart
 from rdstitch.compositing.placed_picture import Displacement, PlacedPicture, place_pictures
 from rdstitch.compositing.static_pixels import MIN_PICTURES, static_pixels
 from rdstitch.errors import ArgumentError
-from rdstitch.inputs.source import Source, readers
+from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import GpsPosition
 from rdstitch.io.read import Picture
 from rdstitch.io.reduction import fitting_reduction
 from rdstitch.local_alignment import LocalAlignment, LocalAlignmentMode, Match, align_locally, no_local_alignment
 from rdstitch.registration import Registration
+
+_COMPARED, _COMPARED_SIDE = 8, 400
+"""Pictures, and pixels of their longer side, that are compared to find what is static in them."""
 
 
 def align_registration_locally(registration: Registration, choice: LocalAlignmentMode) -> LocalAlignment:
@@ -50,10 +53,6 @@ def align_registration_locally(registration: Registration, choice: LocalAlignmen
     ]
     cameras = [camera for camera, used in zip(alignment.cameras, alignment.used, strict=True) if used]
     return align_locally(matches, cameras, alignment.homographies[alignment.used], choice)
-
-
-_COMPARED, _COMPARED_SIDE = 8, 400
-"""Pictures, and pixels of their longer side, that are compared to find what is static in them."""
 
 
 @dataclass(frozen=True)
@@ -116,9 +115,9 @@ class PlacedImages:
 
     def pictures(self, near: Sequence[NearPart | None]) -> list[PlacedPicture]:
         """As the compositor takes them, with only the near parts of those that are not drawn whole."""
-        read = [
-            reader if part is None else partial(_read_near, reader, part)
-            for reader, part in zip(readers(self.sources), near or [None] * len(self.sources), strict=True)
+        read: list[Callable[..., Picture]] = [
+            source.read if part is None else partial(_read_near, source.read, part)
+            for source, part in zip(self.sources, near or [None] * len(self.sources), strict=True)
         ]
         if self.static is not None:
             common = Counter(camera.image_size for camera in self.cameras).most_common(1)[0][0]
@@ -126,10 +125,14 @@ class PlacedImages:
                 partial(_read_moving, reader, self.static) if camera.image_size == common else reader
                 for reader, camera in zip(read, self.cameras, strict=True)
             ]
-        exposure = [source.metadata.exposure for source in self.sources]
-        moved = self.displacements or None
         return place_pictures(
-            read, self.cameras, self.homographies, preview=read, exposure=exposure, displacement=moved
+            read,
+            self.cameras,
+            self.homographies,
+            preview=read,
+            exposure=[source.metadata.exposure for source in self.sources],
+            displacement=self.displacements or None,
+            paths=[str(source.path) for source in self.sources],
         )
 
 
@@ -159,29 +162,18 @@ def plan(placed: PlacedImages, options: CompositeOptions) -> Canvas:
 
 def _plan(placed: PlacedImages, options: CompositeOptions, scale: float) -> Canvas:
     """The canvas on a plane, or, of pictures taken by turning on the spot, in a projection."""
-    names = [source.name for source in placed.sources]
+    how: dict[str, Any] = {
+        "scale": scale,
+        "rotate": options.rotate,
+        "reference": placed.reference,
+        "names": [source.name for source in placed.sources],
+        "max_stretch": options.max_stretch,
+    }
     if placed.turned:
-        return plan_panorama(
-            placed.cameras,
-            placed.homographies,
-            projection=options.projection,
-            scale=scale,
-            rotate=options.rotate,
-            reference=placed.reference,
-            names=names,
-            max_stretch=options.max_stretch,
-        )
+        return plan_panorama(placed.cameras, placed.homographies, projection=options.projection, **how)
     if options.projection not in ("auto", "plane"):
         raise ArgumentError(
             f"the {options.projection} projection is for pictures taken by turning on the spot; these were not, "
             "leave out --projection"
         )
-    return plan_canvas(
-        placed.cameras,
-        placed.homographies,
-        scale=scale,
-        rotate=options.rotate,
-        reference=placed.reference,
-        names=names,
-        max_stretch=options.max_stretch,
-    )
+    return plan_canvas(placed.cameras, placed.homographies, **how)

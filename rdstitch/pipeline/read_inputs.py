@@ -10,7 +10,22 @@ from rdstitch.inputs.selection import selected, with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
-from rdstitch.process_memory import release_free_heap
+from rdstitch.process_memory import return_freed_memory
+
+
+def read_frames(
+    frames: Sequence[Frame], options: StitchOptions, *, skip_bad: bool
+) -> tuple[list[Source], list[Message]]:
+    """The pictures of frames, with what options say of their camera; and why others cannot be read."""
+    return read_sources(
+        frames,
+        camera=options.camera,
+        focal=options.focal,
+        distortion=options.distortion,
+        skip_bad=skip_bad,
+        guard=InputGuard(options.strict),
+        max_memory=options.composite.max_memory,
+    )
 
 
 def read_inputs(
@@ -24,16 +39,8 @@ def read_inputs(
         See :func:`rdstitch.inputs.source.read_sources`; also when fewer than two are left.
     """
     # Before the first large picture is freed.
-    release_free_heap()
-    sources, unread = read_sources(
-        selected(frames, options.exclude, options.include_only),
-        camera=options.camera,
-        focal=options.focal,
-        distortion=options.distortion,
-        skip_bad=skip_bad,
-        guard=InputGuard(options.strict),
-        max_memory=options.composite.max_memory,
-    )
+    return_freed_memory()
+    sources, unread = read_frames(selected(frames, options.exclude, options.include_only), options, skip_bad=skip_bad)
     if len(sources) < 2:
         if unread:
             raise InputError(f"fewer than two pictures can be read; {unread[0].images[0]}: {unread[0].text}")

@@ -1,15 +1,14 @@
 """The recipes: each reads as the sequence of its stages."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.camera_files import CAMERA_SUFFIXES, camera_file_text
 from rdstitch.export.trajectory_files import WRITERS, has_times, path_as_svg
-from rdstitch.inputs.find import FoundPictures, found_pictures
+from rdstitch.inputs.find import found_pictures
 from rdstitch.inputs.frame import Images, as_inputs
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.io.atomic import check_distinct, check_output, json_bytes, text_bytes
@@ -76,16 +75,7 @@ def pano(
     >>> result.image.shape[2], result.ok
     (3, True)
     """
-    options = options or StitchOptions()
-    with found_pictures(
-        as_inputs(inputs, options.channel_order), output=output, every=every, topic=options.topic
-    ) as found:
-        _check_outputs(output, options, found.files)
-        sources, _ = read_inputs(found.frames, options, skip_bad=False)
-        with options.executor(len(sources)) as executor:
-            registration = register(sources, options, executor, skip_bad=False, progress=progress)
-            accepted = accept(registration.with_messages(found.messages), options, executor)
-            return _composite(accepted, executor, output, options, progress, beside, frontal=True)
+    return _stitch(inputs, output, options or StitchOptions(), every, progress, beside, pano=True)
 
 
 def mosaic(
@@ -128,13 +118,28 @@ def mosaic(
     >>> result.output.name, result.registration.alignment.used.all()
     ('small.tif', np.True_)
     """
-    options = options or StitchOptions()
-    with found_pictures(
-        as_inputs(inputs, options.channel_order), output=output, every=every, topic=options.topic
-    ) as found:
+    return _stitch(inputs, output, options or StitchOptions(), every, progress, beside, pano=False)
+
+
+def _stitch(
+    inputs: Images,
+    output: str | Path | None,
+    options: StitchOptions,
+    every: int | None,
+    progress: Progress,
+    beside: Callable[[Outputs, StitchResult], None] | None,
+    *,
+    pano: bool,
+) -> StitchResult:
+    """The stages of :func:`mosaic`, and, where every picture must be readable and one gives the plane, :func:`pano`."""
+    given = as_inputs(inputs, options.channel_order)
+    with found_pictures(given, output=output, every=every, topic=options.topic) as found:
         _check_outputs(output, options, found.files)
-        with _registered(found, options, progress) as (registration, executor):
-            return _composite(registration, executor, output, options, progress, beside)
+        sources, unread = read_inputs(found.frames, options, skip_bad=not pano)
+        with options.executor(len(sources)) as executor:
+            registration = register(sources, options, executor, skip_bad=not pano, progress=progress)
+            accepted = accept(registration.with_messages([*unread, *found.messages]), options, executor)
+            return _composite(accepted, executor, output, options, progress, beside, frontal=pano)
 
 
 def calibrate(
@@ -167,12 +172,13 @@ def calibrate(
     options = options or StitchOptions()
     with found_pictures(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as found:
         _check_outputs(None, options, found.files)
-        with _registered(found, options, progress, lens_only=True) as (registration, _):
-            pass
-    _release_decoded_images(registration)
-    result = _with_damage(registration)
+        sources, unread = read_inputs(found.frames, options, skip_bad=True)
+        with options.executor(len(sources)) as executor:
+            registration = register(sources, options, executor, skip_bad=True, lens_only=True, progress=progress)
+            registration = registration.with_messages([*unread, *found.messages])
+            result = _finished(accept(registration, options, executor, lens_only=True))
     with Outputs(options.overwrite) as outputs:
-        _save_camera(registration, options, outputs)
+        _save_camera(result, options, outputs)
         if beside is not None:
             beside(outputs, result)
     return result
@@ -225,8 +231,7 @@ def trajectory(
         with options.executor(len(sources)) as executor:
             registration = register(sources, options, executor, skip_bad=True, metric=True, progress=progress)
             registration = accept(registration.with_messages([*unread, *found.messages]), options, executor)
-    _release_decoded_images(registration)
-    registration = _with_damage(registration).with_messages(scale_uncertainty(registration.alignment))
+    registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     path = Trajectory.from_alignment(registration.alignment, height)
     path = path.labelled([s.name for s in sources], [s.number(k) for k, s in enumerate(sources)], times)
     if layout == "tum" and not has_times(path):
@@ -237,18 +242,6 @@ def trajectory(
         if plot is not None:
             outputs.write(plot, text_bytes(path_as_svg(path)))
     return path, registration
-
-
-@contextmanager
-def _registered(
-    found: FoundPictures, options: StitchOptions, progress: Progress, *, lens_only: bool = False
-) -> Iterator[tuple[Registration, Executor]]:
-    """A sequence registered and checked, without what cannot be read; and who computed it, until the block ends."""
-    sources, unread = read_inputs(found.frames, options, skip_bad=True)
-    with options.executor(len(sources)) as executor:
-        registration = register(sources, options, executor, skip_bad=True, lens_only=lens_only, progress=progress)
-        registration = registration.with_messages([*unread, *found.messages])
-        yield accept(registration, options, executor, lens_only=lens_only), executor
 
 
 def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Sequence[str | Path]) -> None:
@@ -270,7 +263,7 @@ def _composite(
     progress: Progress,
     beside: Callable[[Outputs, StitchResult], None] | None,
     *,
-    frontal: bool = False,
+    frontal: bool,
 ) -> StitchResult:
     """Compose into memory, or into a file that is published with all that belongs to it.
 
@@ -291,9 +284,8 @@ def _composite(
             elsewhere=blocks_on(executor, placed.sources, options.cache),
             dry_run=options.dry_run,
         )
-        _release_decoded_images(registration)
         result = StitchResult(
-            _with_damage(registration).with_messages(composed.messages),
+            _finished(registration).with_messages(composed.messages),
             composed.canvas,
             options.for_pictures(len(registration.sources)),
             None if output is None else Path(output),
@@ -313,15 +305,11 @@ def _composite(
     return result
 
 
-def _with_damage(registration: Registration) -> Registration:
-    """The registration with what the decoders have found wrong, in whichever stage; all sources have one guard."""
-    return registration.with_messages(registration.sources[0].guard.messages)
-
-
-def _release_decoded_images(registration: Registration) -> None:
-    """Let go of pictures that were kept for stages that will not come."""
+def _finished(registration: Registration) -> Registration:
+    """Pictures kept for stages that will not come are let go; what the decoders found wrong, in any stage, is added."""
     for source in registration.sources:
         source.decoded_images.clear()
+    return registration.with_messages(registration.sources[0].guard.messages)  # all have one guard
 
 
 def _save_camera(registration: Registration, options: StitchOptions, outputs: Outputs) -> None:

@@ -10,9 +10,9 @@ from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.inputs.source import Source
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.messages import Message
-from rdstitch.output_image import OutputImage
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.write import VERSION, identity_fields, lens_fields, output_geometry, plain, to_output, versions
+from rdstitch.stitch_result import OutputImage
 
 
 @dataclass(frozen=True, repr=False)
@@ -89,7 +89,12 @@ def applied_sidecar(result: Recomposition) -> dict[str, Any]:
         "version": VERSION,
         "lambda_px": camera.distortion_px,
         "lambda_focal": camera.distortion_focal,
-        "camera": {**camera.as_dict(), **_uncertainty(then)},
+        "camera": {
+            **camera.as_dict(),
+            # How far the lens was determined then.
+            "lambda_std": then.get("lambda_std"),
+            "lens_covariance": then["camera"].get("lens_covariance"),
+        },
         "focal_px": camera.focal,
         "reference": source.name,
         "output": {
@@ -103,11 +108,6 @@ def applied_sidecar(result: Recomposition) -> dict[str, Any]:
         "applied": {"sidecar": str(result.saved.path), "matched": result.matched},
     }
     return {key: plain(value) for key, value in content.items()}
-
-
-def _uncertainty(then: dict[str, Any]) -> dict[str, Any]:
-    """How far the lens was determined then."""
-    return {"lambda_std": then.get("lambda_std"), "lens_covariance": then["camera"].get("lens_covariance")}
 
 
 def _image(result: Recomposition, index: int, entry: dict[str, Any]) -> dict[str, Any]:

@@ -20,10 +20,10 @@ from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.messages import Message, left_out
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner, close_loops, impossible_estimates_fail, rematch_weak_pairs
-from rdstitch.pipeline.contrast import detect_by_contrast
+from rdstitch.pipeline.detect_features import detect_by_contrast
 from rdstitch.pipeline.pattern_shifts import settle_repeated_pattern
 from rdstitch.pipeline.working_size import at_working_size
-from rdstitch.process_memory import release_free_heap
+from rdstitch.process_memory import return_freed_memory
 from rdstitch.progress import Progress, silent
 from rdstitch.registration import Registration
 
@@ -59,8 +59,6 @@ def register(
 
     Parameters
     ----------
-    sources : sequence of Source
-    options : StitchOptions
     executor : concurrent.futures.Executor
         Where features are detected and pairs are registered; see :func:`rdstitch.executors.open_executor`.
     skip_bad : bool
@@ -69,7 +67,6 @@ def register(
         Metric poses are needed, so that the freest model is that of planar motion with small tilts.
     lens_only : bool
         Only the lens is wanted, so that pictures of a repeated pattern may be off by whole periods of it.
-    progress : callable
 
     Raises
     ------
@@ -85,7 +82,7 @@ def register(
     cameras = [at_working_size(source.camera, options.features.limits[1]) for source in sources]
     features = detected.features.at_sizes([camera.image_size for camera in cameras])
     candidates = first_pairs(features, options.seed, positions_of(sources))
-    release_free_heap()
+    return_freed_memory()
     pairing = Pairing(
         features,
         cameras,
@@ -136,8 +133,6 @@ def with_frontal_reference(registration: Registration, options: StitchOptions, *
 
     Parameters
     ----------
-    registration : Registration
-    options : StitchOptions
     always : bool
         Whether a rectified plane, that of one camera's poses, gives way too.
     """

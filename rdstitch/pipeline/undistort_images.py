@@ -103,9 +103,7 @@ def undistort(
     given = as_inputs(inputs, channel_order)
     with found_pictures(given, every=1) as found:
         guard = InputGuard()
-        sources, _ = read_sources(
-            found.frames, camera=camera, focal=None, distortion=distortion, skip_bad=False, guard=guard
-        )
+        sources, _ = read_sources(found.frames, camera=camera, distortion=distortion, skip_bad=False, guard=guard)
         for message in found.messages:
             warn(message)
         if folder is None:

@@ -12,6 +12,9 @@ from rdstitch.registration import Registration
 from rdstitch.report.geometry import middle
 from rdstitch.report.svg import BLUE, GREY, RED, drawing, element, label, path, section
 
+_WIDTH, _MARGIN = 900.0, 30.0
+_STEP = 30  # degrees between the lines of the grid
+
 
 def path_over_plane(registration: Registration) -> str:
     """The path of the camera over the plane, where the model has metric poses; where it looked, if it only turned."""
@@ -27,10 +30,6 @@ def path_over_plane(registration: Registration) -> str:
         "dot is the first, arrows point to the upper side of the picture.",
         path_as_svg(path),
     )
-
-
-_WIDTH, _MARGIN = 900.0, 30.0
-_STEP = 30  # degrees between the lines of the grid
 
 
 def view_directions(registration: Registration) -> str:

@@ -15,7 +15,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.io.preview import encode_preview, read_preview
 from rdstitch.io.reduction import fitting_reduction
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.radial_homography import to_plane
+from rdstitch.radial_homography import to_directions, to_plane
 from rdstitch.registration import Registration
 from rdstitch.stitch_result import StitchResult
 
@@ -57,8 +57,7 @@ def _on_plane(registration: Registration, index: int, points: FloatArray) -> Flo
     camera, matrix = registration.alignment.cameras[index], registration.alignment.homographies[index]
     if not registration.alignment.on_sphere:
         return to_plane(camera, matrix, points)
-    flat = camera.normalize(camera.undistort(points))
-    places = Projection("sphere").project(np.column_stack([flat, np.ones(len(flat))]) @ matrix.T)
+    places = Projection("sphere").project(to_directions(camera, matrix, points))
     # Longitudes of one picture have no jump.
     own = np.arctan2(matrix[0, 2], matrix[2, 2])
     places[:, 0] = own + np.mod(places[:, 0] - own + np.pi, 2.0 * np.pi) - np.pi

@@ -16,6 +16,14 @@ from rdstitch.report.svg import BLUE, GREY, RED, YELLOW, counted, drawing, eleme
 
 _GRID_LINES, _POINTS_OF_LINE = 13, 49
 _GRID_WIDTH = 430.0
+_WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 720.0, 320.0, 60.0, 44.0, 24.0
+_BARS = 40.0  # height of the drawing that the numbers of matches have
+_SAMPLES = 200
+_BINS = 48
+_CELLS = (16, 12)  # of the picture, to say how much of it has matches
+_BAND = 2.0  # standard deviations on either side
+_VOTES_HEIGHT, _VOTES_LEFT, _VOTES_BOTTOM, _VOTES_TOP = 280.0, 50.0, 40.0, 20.0
+_TICKS = 6
 
 
 def grid(registration: Registration) -> str:
@@ -64,14 +72,6 @@ def _after(camera: Camera) -> str:
     parts = [path((line + shift) * scale, stroke=BLUE) for line in straight]
     parts.append(path((frame + shift) * scale, closed=True, stroke=RED, stroke_width=1.5))
     return drawing(wide, high, parts, "rows and columns after undistortion")
-
-
-_WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 720.0, 320.0, 60.0, 44.0, 24.0
-_BARS = 40.0  # height of the drawing that the numbers of matches have
-_SAMPLES = 200
-_BINS = 48
-_CELLS = (16, 12)  # of the picture, to say how much of it has matches
-_BAND = 2.0  # standard deviations on either side
 
 
 def lens_curve(registration: Registration) -> str:
@@ -164,12 +164,8 @@ def _curve(camera: Camera, radii: FloatArray, counts: FloatArray) -> str:
     return drawing(_WIDTH, _HEIGHT, parts, "the lens against the one-parameter lens")
 
 
-_VOTES_HEIGHT, _VOTES_LEFT, _VOTES_BOTTOM, _VOTES_TOP = 280.0, 50.0, 40.0, 20.0
-_TICKS = 6
-
-
 def votes(registration: Registration) -> str:
-    """The histogram of the pairs' λ, each pair weighted by how well it can see λ, with the adjusted λ."""
+    """Histogram of the pairs' λ (the paper's Figure 8), each weighted by how well it sees λ, with the adjusted λ."""
     if registration.alignment.distortion_std == 0.0:
         return section("Votes on λ", "λ was given: no pair voted.")
     relations = [pair.relation for pair in registration.pairs if pair.relation]

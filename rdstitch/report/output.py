@@ -7,12 +7,16 @@ import numpy as np
 
 from rdstitch.local_alignment import DisplacementField
 from rdstitch.report.geometry import of_mosaic
-from rdstitch.report.svg import BLUE, GREY, YELLOW, drawing, element, label, path, section
+from rdstitch.report.svg import BLUE, GREY, YELLOW, drawing, element, label, line, path, section
 from rdstitch.stitch_result import StitchResult
 from rdstitch.viewer import viewer_path
 
 _MOSAIC_SIDE = 1200
 _MAX_NAMES = 12
+_WIDTH, _COLUMNS, _GAP, _TEXT = 940.0, 4, 12.0, 18.0
+_ARROWS = 9  # along the longer side of a picture
+_LONGEST = 0.8  # of the distance between arrows, for the largest displacement of all pictures
+_MAX_PICTURES = 60
 
 
 def mosaic(result: StitchResult, staged: Path | None = None) -> str:
@@ -38,12 +42,6 @@ def mosaic(result: StitchResult, staged: Path | None = None) -> str:
     page = None if result.output is None else viewer_path(result.output)
     more = "" if page is None else f" {page.name} beside it shows it with zoom."
     return section("Mosaic", f"{name}{width} x {height} pixels; outlines are those of the pictures in it.{more}", shown)
-
-
-_WIDTH, _COLUMNS, _GAP, _TEXT = 940.0, 4, 12.0, 18.0
-_ARROWS = 9  # along the longer side of a picture
-_LONGEST = 0.8  # of the distance between arrows, for the largest displacement of all pictures
-_MAX_PICTURES = 60
 
 
 def local_alignment(result: StitchResult) -> str:
@@ -85,18 +83,9 @@ def _picture(field: DisplacementField, name: str, x: float, y: float, side: floa
     moved = field(places)
     tips = moved * (_LONGEST * spacing / largest)
     frame = element("rect", x=x, y=y, width=width * scale, height=height * scale, fill="none", stroke=GREY)
-    arrows = [
-        element(
-            "line",
-            element("title", f"{np.linalg.norm(by):.2f} pixels"),
-            x1=float(x + p[0] * scale),
-            y1=float(y + p[1] * scale),
-            x2=float(x + (p[0] + tip[0]) * scale),
-            y2=float(y + (p[1] + tip[1]) * scale),
-            stroke=BLUE,
-            stroke_width=1.5,
-        )
-        + element("circle", cx=float(x + p[0] * scale), cy=float(y + p[1] * scale), r=1.2, fill=BLUE)
-        for p, tip, by in zip(places, tips, moved, strict=True)
-    ]
+    arrows = []
+    for start, end, by in zip((x, y) + places * scale, (x, y) + (places + tips) * scale, moved, strict=True):
+        title = element("title", f"{np.linalg.norm(by):.2f} pixels")
+        arrows.append(line(start, end, title, stroke=BLUE, stroke_width=1.5))
+        arrows.append(element("circle", cx=float(start[0]), cy=float(start[1]), r=1.2, fill=BLUE))
     return frame + "".join(arrows) + label(x, y + height * scale + 13.0, f"{name}: up to {field.largest:.1f} pixels")

@@ -49,7 +49,7 @@ def write_report(
     path : path
     result : StitchResult or Registration
     stages : sequence of (str, float)
-        Name and seconds of each stage; see :class:`rdstitch.pipeline.timing.StageTimer`.
+        Name and seconds of each stage; see :class:`rdstitch.progress.StageTimer`.
     command : str
         The command line that made the result, if any.
     outputs : Outputs, optional

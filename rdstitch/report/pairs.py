@@ -9,10 +9,16 @@ from rdstitch.alignment.result import LinkFit
 from rdstitch.arrays import FloatArray
 from rdstitch.registration import Registration
 from rdstitch.report.geometry import footprint, middle, of_source, pairs_of, residuals
-from rdstitch.report.svg import BLUE, GREEN, GREY, RED, counted, drawing, element, fit_into, label, path, section
+from rdstitch.report.svg import BLUE, GREEN, GREY, RED, counted, drawing, element, fit_into, label, line, path, section
 
 _GRAPH_SIDE, _GRAPH_MARGIN = 900.0, 20.0
 _LINE_HEIGHT = 11.0  # height of a name
+_PICTURE_WIDTH, _PICTURE_GAP = 440.0, 10.0
+_MAX_LINES = 150
+_FADED = 0.6  # opacity of the pictures, so that lines can be seen on them
+_MAP_WIDTH, _COLUMNS = 640.0, 16
+_MIN_MATCHES = 4  # matches in a cell that make a mean
+_ARROW = 0.9  # of a cell's width, for the largest mean
 
 
 def match_graph(registration: Registration) -> str:
@@ -28,21 +34,12 @@ def match_graph(registration: Registration) -> str:
     ]
     links = [fit for fit in alignment.links if fit.used]
     for fit in sorted(links, key=lambda fit: fit.rms):
-        (x1, y1), (x2, y2) = ((centers[k] + shift) * scale for k in (fit.image1, fit.image2))
         share = float(np.nan_to_num(np.clip(fit.rms / alignment.rms - 0.75, 0.0, 1.0)))
         names = " and ".join(registration.sources[k].name for k in (fit.image1, fit.image2))
-        parts.append(
-            element(
-                "line",
-                element("title", f"{escape(names)}: {fit.inliers} of {fit.count} matches, {fit.rms:.2f} pixels"),
-                x1=float(x1),
-                y1=float(y1),
-                x2=float(x2),
-                y2=float(y2),
-                stroke=_mixed(share),
-                stroke_width=float(np.clip(np.log10(fit.inliers + 1.0), 0.5, 4.0)),
-            )
-        )
+        title = element("title", f"{escape(names)}: {fit.inliers} of {fit.count} matches, {fit.rms:.2f} pixels")
+        start, end = ((centers[k] + shift) * scale for k in (fit.image1, fit.image2))
+        thickness = float(np.clip(np.log10(fit.inliers + 1.0), 0.5, 4.0))
+        parts.append(line(start, end, title, stroke=_mixed(share), stroke_width=thickness))
     named: list[tuple[float, float, float]] = []  # left, baseline, width
     for index, center in centers.items():
         x, y = (center + shift) * scale
@@ -73,11 +70,6 @@ def _mixed(share: float) -> str:
     """From green at 0 to red at 1."""
     low, high = ([int(colour[k : k + 2], 16) for k in (1, 3, 5)] for colour in (GREEN, RED))
     return "#" + "".join(f"{round(a + share * (b - a)):02x}" for a, b in zip(low, high, strict=True))
-
-
-_PICTURE_WIDTH, _PICTURE_GAP = 440.0, 10.0
-_MAX_LINES = 150
-_FADED = 0.6  # opacity of the pictures, so that lines can be seen on them
 
 
 def matched(registration: Registration) -> str:
@@ -131,23 +123,8 @@ def _pair(registration: Registration, title: str, fit: LinkFit) -> str:
 def _match_lines(starts: FloatArray, stops: FloatArray, colour: str, opacity: float) -> list[str]:
     """Lines between points, spread evenly over the matches where there are too many."""
     chosen = np.unique(np.linspace(0, max(len(starts) - 1, 0), min(len(starts), _MAX_LINES)).astype(int))
-    return [
-        element(
-            "line",
-            x1=float(a[0]),
-            y1=float(a[1]),
-            x2=float(b[0]),
-            y2=float(b[1]),
-            stroke=colour,
-            stroke_opacity=opacity,
-        )
-        for a, b in zip(starts[chosen], stops[chosen], strict=True)
-    ]
-
-
-_MAP_WIDTH, _COLUMNS = 640.0, 16
-_MIN_MATCHES = 4  # matches in a cell that make a mean
-_ARROW = 0.9  # of a cell's width, for the largest mean
+    ends = zip(starts[chosen], stops[chosen], strict=True)
+    return [line(start, stop, stroke=colour, stroke_opacity=opacity) for start, stop in ends]
 
 
 def residual_map(registration: Registration) -> str:
@@ -184,26 +161,11 @@ def residual_map(registration: Registration) -> str:
         box = {"x": x * side, "y": y * side, "width": side, "height": side}
         parts.append(element("rect", element("title", title), fill=f"rgb({shade},{shade},{shade})", **box))
         start = np.array([(x + 0.5) * side, (y + 0.5) * side])
-        parts.append(
-            element(
-                "line",
-                x1=float(start[0] - tip[0] / 2),
-                y1=float(start[1] - tip[1] / 2),
-                x2=float(start[0] + tip[0] / 2),
-                y2=float(start[1] + tip[1] / 2),
-                stroke=RED,
-                stroke_width=1.5,
-                marker_end="url(#residual)",
-            )
-        )
+        ends = start - tip / 2, start + tip / 2
+        parts.append(line(*ends, stroke=RED, stroke_width=1.5, marker_end="url(#residual)"))
     tall = rows * side
-    parts.append(
-        label(
-            0.0,
-            tall + 16,
-            f"darkest cell: rms {darkest:.2f} pixels; longest arrow: mean of {longest:.2f} pixels in that direction",
-        )
-    )
+    text = f"darkest cell: rms {darkest:.2f} pixels; longest arrow: mean of {longest:.2f} pixels in that direction"
+    parts.append(label(0.0, tall + 16, text))
     return section(
         "Residuals",
         f"{len(off)} inliers of all pairs over the area of the picture. Arrows that follow a pattern tell of something "

@@ -17,6 +17,7 @@ from rdstitch.report.svg import BLUE, drawing, element, label, section, table
 from rdstitch.stitch_result import StitchResult
 
 _THUMBNAIL = 200  # pixels of the longer side
+_WIDTH, _ROW, _LEFT = 640.0, 22.0, 190.0
 
 
 def summary(registration: Registration, result: StitchResult | None) -> str:
@@ -120,9 +121,6 @@ def _changed(options: Any, defaults: Any, prefix: str = "") -> list[str]:
         elif value != default:
             found.append(f"{prefix}{field.name} = {value}")
     return found
-
-
-_WIDTH, _ROW, _LEFT = 640.0, 22.0, 190.0
 
 
 def timings(stages: Sequence[tuple[str, float]]) -> str:

@@ -31,6 +31,12 @@ def drawing(width: float, height: float, parts: Iterable[str], title: str) -> st
     )
 
 
+def line(start: Iterable[float], end: Iterable[float], content: str = "", **attributes: Any) -> str:
+    """A straight line between two points."""
+    (x1, y1), (x2, y2) = map(float, start), map(float, end)
+    return element("line", content, x1=x1, y1=y1, x2=x2, y2=y2, **attributes)
+
+
 def label(x: float, y: float, text: str, **attributes: Any) -> str:
     """A text at a place."""
     return element("text", escape(text), x=x, y=y, **{"font_size": 12, **attributes})
@@ -55,9 +61,9 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return element("table", (element("tr", top) if head else "") + body)
 
 
-def counted(count: int, one: str, many: str = "") -> str:
+def counted(count: int, one: str) -> str:
     """A number with its noun: "1 pair", "2 pairs"."""
-    return f"{count} {one if count == 1 else many or one + 's'}"
+    return f"{count} {one if count == 1 else one + 's'}"
 
 
 def section(title: str, explanation: str, *content: str) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import FOCAL_LOG_STD, Camera
-from rdstitch.camera_record import read_coefficients
+from rdstitch.camera_record import read_lens
 from rdstitch.compositing import CompositeOptions
 from rdstitch.compositing.options import PROJECTIONS
 from rdstitch.errors import ArgumentError
@@ -132,7 +132,10 @@ def _check_output(record: Record) -> None:
 
 def _picture(record: Record) -> SavedPicture:
     name, path, used = record["name"].text(), record["path"].text(), record["used"].flag()
-    camera = None if record.get("size") is None else _camera(record)
+    camera = None
+    if record.get("size") is not None:
+        source = record.get("focal_source")
+        camera = read_lens(record, record["size"].size(), None if source is None else source.choice(FOCAL_LOG_STD))
     if used and camera is None:
         record["size"].expected("width and height of a picture that was used")
     to_plane = record["to_plane"].matrix() if used else None
@@ -154,23 +157,6 @@ def _two(record: Record) -> list[Record]:
     if len(items) != 2:
         record.expected("two numbers")
     return items
-
-
-def _camera(record: Record) -> Camera:
-    focal, source = record.get("focal_px"), record.get("focal_source")
-    try:
-        distortion, second, third = read_coefficients(record)
-        return Camera(
-            image_size=record["size"].size(),
-            distortion=distortion,
-            distortion2=second,
-            distortion3=third,
-            center=record["center_px"].pair(),
-            focal=None if focal is None else focal.number(),
-            focal_source=None if source is None else source.choice(FOCAL_LOG_STD),
-        )
-    except ArgumentError as error:
-        record.fail(str(error))
 
 
 def _reference(record: Record, pictures: Sequence[SavedPicture]) -> int:

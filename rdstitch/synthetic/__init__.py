@@ -1,7 +1,15 @@
 """Ground truth: problem instances, matches and rendered image sequences, for tests, examples and benchmarks."""
 
 from rdstitch.synthetic.correspondences import SyntheticMatches, correspondences
-from rdstitch.synthetic.instances import HALF_SIZE, Instances, PlanarInstances, general_instances, planar_instances
+from rdstitch.synthetic.instances import (
+    HALF_SIZE,
+    Instances,
+    PlanarInstances,
+    RotationInstances,
+    general_instances,
+    planar_instances,
+    rotation_instances,
+)
 from rdstitch.synthetic.layouts import (
     drive_poses,
     grid_poses,
@@ -18,7 +26,6 @@ from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, panor
 from rdstitch.synthetic.poses import Poses, fit_to_plane
 from rdstitch.synthetic.relief import RELIEFS, Relief, boxes, hills, ridges
 from rdstitch.synthetic.rendering import Photometry, Sequence, sequence_over
-from rdstitch.synthetic.rotation_instances import RotationInstances, rotation_instances
 from rdstitch.synthetic.textures import (
     EndlessTexture,
     LinedTexture,

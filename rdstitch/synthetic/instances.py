@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.division_model import distort
 from rdstitch.errors import ArgumentError
-from rdstitch.planar_motion import PlanarMotion, rotation_from_tilt
+from rdstitch.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
 from rdstitch.radial_homography import lift, project
 from rdstitch.solvers.solutions import Solutions
 
@@ -45,7 +45,6 @@ class Instances:
     distortion: FloatArray
 
     def __len__(self) -> int:
-        """Number of instances."""
         return len(self.distortion)
 
     def best_errors(self, solutions: Solutions) -> tuple[FloatArray, FloatArray]:
@@ -156,7 +155,7 @@ def planar_instances(
         motion[which, 1] = length * np.cos(direction)
         motion[which, 2] = length * np.sin(direction)
         motion[which, 3] = rng.uniform(*height, len(which))
-        middle = _rigid_in_plane(motion[which])
+        middle = rigid_in_plane(motion[which, 0], motion[which, 1:3], motion[which, 3])
         return rotation2[which] @ middle @ np.swapaxes(rotation[which], 1, 2)
 
     x1, x2, h = visible_points(rng, lam, rotation[:, :, 2], points, half_size, overlap, draw)
@@ -198,7 +197,7 @@ def general_instances(
     def draw(which: IndexArray) -> FloatArray:
         attitude = rotation_from_tilt(rng.uniform(-max_angle, max_angle, (len(which), 2)))
         yaw = rng.uniform(-np.pi, np.pi, len(which))
-        turn = _rigid_in_plane(np.column_stack([yaw, np.zeros((len(which), 2)), np.ones(len(which))]))
+        turn = rigid_in_plane(yaw, np.zeros((len(which), 2)))
         t = rng.standard_normal((len(which), 3))
         t *= (rng.uniform(*translation, len(which)) / np.linalg.norm(t, axis=1))[:, None]
         return attitude @ turn @ (np.eye(3) - t[:, :, None] * normal[which][:, None, :])
@@ -261,21 +260,86 @@ def _batch_transfer(homography: FloatArray, distortion: FloatArray, points: Floa
     return distort(project(lifted @ np.swapaxes(homography, 1, 2)), distortion[:, None])
 
 
-def _rigid_in_plane(motion: FloatArray) -> FloatArray:
-    """``Rz(φ) diag(1, 1, height) T`` of rows (φ, tx, ty, height); shape (B, 3, 3)."""
-    yaw, translation, height = motion[:, 0], motion[:, 1:3], motion[:, 3]
-    matrix = np.zeros((len(motion), 3, 3))
-    matrix[:, 0, 0] = matrix[:, 1, 1] = np.cos(yaw)
-    matrix[:, 1, 0] = np.sin(yaw)
-    matrix[:, 0, 1] = -matrix[:, 1, 0]
-    matrix[:, :2, 2] = -np.einsum("bij,bj->bi", matrix[:, :2, :2], translation)
-    matrix[:, 2, 2] = height
-    return matrix
-
-
 def _distance(a: FloatArray, b: FloatArray) -> FloatArray:
     """Frobenius distance of batches of homographies, scaled to unit norm, for the better sign."""
     a = a / np.linalg.norm(a, axis=(1, 2), keepdims=True)
     b = b / np.linalg.norm(b, axis=(1, 2), keepdims=True)
     distance: FloatArray = np.minimum(np.linalg.norm(a - b, axis=(1, 2)), np.linalg.norm(a + b, axis=(1, 2)))
     return distance
+
+
+@dataclass(frozen=True)
+class RotationInstances(Instances):
+    """Instances of rotation: ``H = K R K⁻¹``, ``K = diag(g, g, 1)``.
+
+    Attributes
+    ----------
+    rotation : ndarray of shape (B, 3, 3)
+    focal : ndarray of shape (B,)
+        g, in the unit of the points.
+    """
+
+    rotation: FloatArray
+    focal: FloatArray
+
+
+def rotation_instances(
+    count: int,
+    points: int,
+    *,
+    seed: int,
+    distortion: Range = (-0.7, 0.0),
+    angle: Range = (0.1, 0.7),
+    roll: float = np.pi,
+    focal: Range = (1.0, 1.0),
+    half_size: Range = HALF_SIZE,
+    overlap: float = 0.1,
+    noise: float = 0.0,
+) -> RotationInstances:
+    """Random rotations of a camera with radial distortion about its centre.
+
+    Parameters
+    ----------
+    count, points, seed, distortion, overlap, noise
+        As for :func:`rdstitch.synthetic.planar_instances`, in the frame and the unit of the points.
+    angle : (float, float)
+        Range of the angle between the optical axes, radians; their direction is uniform.
+    roll : float
+        The camera is turned about its axis by up to ± this, radians.
+    focal : (float, float)
+        Range of g, in the unit of the points.
+    half_size : (float, float)
+        Half width and half height of the pictures, in the unit of the points.
+    """
+    rng = np.random.default_rng(seed)
+    lam = rng.uniform(*distortion, count)
+    length = rng.uniform(*focal, count)
+    k = np.stack([length, length, np.ones(count)], axis=-1)
+
+    def draw(which: np.ndarray) -> FloatArray:
+        direction, by = rng.uniform(-np.pi, np.pi, len(which)), rng.uniform(*angle, len(which))
+        turned = rng.uniform(-roll, roll, len(which))
+        about = np.stack([np.cos(direction), np.sin(direction), np.zeros(len(which))], axis=-1)
+        rotation = _about(about, by) @ _about(np.tile([0.0, 0.0, 1.0], (len(which), 1)), turned)
+        return np.asarray(rotation * (k[which][:, :, None] / k[which][:, None, :]))
+
+    # In front of picture 1 every ray counts, however oblique: there is no plane that it should meet.
+    ahead = np.tile([0.0, 0.0, 1.0], (count, 1))
+    x1, x2, h = visible_points(rng, lam, ahead, points, half_size, overlap, draw)
+    return RotationInstances(
+        x1=x1 + noise * rng.standard_normal(x1.shape),
+        x2=x2 + noise * rng.standard_normal(x2.shape),
+        homography=h,
+        distortion=lam,
+        rotation=h * (k[:, None, :] / k[:, :, None]),
+        focal=length,
+    )
+
+
+def _about(axes: FloatArray, angles: FloatArray) -> FloatArray:
+    """Rotations (B, 3, 3) about unit axes (B, 3) by angles (B,) (Rodrigues)."""
+    x, y, z = axes.T
+    zero = np.zeros_like(x)
+    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+    sine, versine = np.sin(angles)[:, None, None], (1.0 - np.cos(angles))[:, None, None]
+    return np.asarray(np.eye(3) + sine * cross + versine * (cross @ cross))

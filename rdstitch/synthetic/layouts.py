@@ -73,7 +73,6 @@ def grid_poses(
 
     Parameters
     ----------
-    columns, rows : int
     overlap : float
         Of neighbours, along both axes.
     yaw : float

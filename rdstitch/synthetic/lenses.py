@@ -13,6 +13,16 @@ from rdstitch.camera_files.lens_fit import fit_lens
 from rdstitch.camera_files.lens_models import Brown
 from rdstitch.errors import ArgumentError
 
+_FISHEYES: dict[str, tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], FloatArray]]] = {
+    "equidistant": (lambda angle: angle, lambda r: r),
+    "equisolid": (
+        lambda angle: 2.0 * np.sin(angle / 2.0),
+        lambda radius: 2.0 * np.arcsin(np.minimum(radius / 2.0, 1.0)),
+    ),
+    "stereographic": (lambda angle: 2.0 * np.tan(angle / 2.0), lambda r: 2.0 * np.arctan(r / 2.0)),
+}
+"""Measured radius of the angle to the axis, in focal lengths, and the inverse, of each kind of fisheye."""
+
 
 class Lens(Protocol):
     """What rendering needs of a lens; :class:`Camera` with a focal length fulfils it."""
@@ -66,17 +76,6 @@ class _FixedFocalLens:
         return points * self.focal + self.center
 
 
-_FISHEYES: dict[str, tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], FloatArray]]] = {
-    "equidistant": (lambda angle: angle, lambda r: r),
-    "equisolid": (
-        lambda angle: 2.0 * np.sin(angle / 2.0),
-        lambda radius: 2.0 * np.arcsin(np.minimum(radius / 2.0, 1.0)),
-    ),
-    "stereographic": (lambda angle: 2.0 * np.tan(angle / 2.0), lambda r: 2.0 * np.arctan(r / 2.0)),
-}
-"""Measured radius of the angle to the axis, in focal lengths, and the inverse, of each kind of fisheye."""
-
-
 @dataclass(frozen=True)
 class FisheyeLens(_FixedFocalLens):
     """A fisheye: the angle θ of a ray to the axis alone says how far from the centre it is measured.
@@ -90,7 +89,6 @@ class FisheyeLens(_FixedFocalLens):
     kind: str = field(default="equidistant", kw_only=True)
 
     def __post_init__(self) -> None:
-        """Check the kind."""
         if self.kind not in _FISHEYES:
             raise ArgumentError(f"a fisheye is {', '.join(_FISHEYES)}, not {self.kind}")
 

@@ -51,7 +51,6 @@ def panorama_rotations(
         Rows, whose pitches are ``row_pitch`` radians apart, around the horizon.
     jitter : float
         Headings, pitches and rolls are uniform in ± this, radians, around what is aimed at.
-    seed : int
     """
     rng = np.random.default_rng(seed)
     row, column = np.divmod(np.arange(rows * count), count)
@@ -78,7 +77,6 @@ class _Around:
         return self.texture.channels
 
     def region(self, left: int, top: int, right: int, bottom: int) -> LinearPixels:
-        """See :class:`Texture`."""
         width = self.texture.size[0]
         rows = self.texture.region(0, top, width, bottom)
         return rows.take(np.arange(left, right) % width, axis=1)
@@ -142,12 +140,10 @@ def turning_sequence(
 
     Parameters
     ----------
-    lens : Lens
     rotations : ndarray of shape (N, 3, 3)
         From the scene to each camera, as :func:`camera_rotations` gives them.
     seed : int
         Of the texture and the noise.
-    photometry : Photometry, optional
     texels_per_pixel : float
         Texels at the horizon for each pixel at the picture's centre.
     channels : int

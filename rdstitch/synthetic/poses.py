@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
+from rdstitch.camera import border_of
 from rdstitch.errors import ArgumentError
 from rdstitch.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
 from rdstitch.radial_homography import project
@@ -52,7 +53,6 @@ class Poses:
             raise ArgumentError("the camera must stay above the plane")
 
     def __len__(self) -> int:
-        """Number of pictures."""
         return len(self.position)
 
     @classmethod
@@ -91,13 +91,7 @@ class Poses:
         return PlanarMotion((float(psi), float(theta)), float(yaw), (float(tx), float(ty)), scale)
 
     def shaken(
-        self,
-        *,
-        seed: int,
-        position: float = 0.0,
-        height: float = 0.0,
-        yaw: float = 0.0,
-        tilt: float = 0.0,
+        self, *, seed: int, position: float = 0.0, height: float = 0.0, yaw: float = 0.0, tilt: float = 0.0
     ) -> Self:
         """The same poses with independent uniform jitter on each picture.
 
@@ -135,11 +129,7 @@ def plane_outline(lens: Lens, from_plane: FloatArray, points_per_side: int = 32)
     from_plane : ndarray of shape (..., 3, 3)
         See :meth:`Poses.from_plane`; leading axes are kept.
     """
-    width, height = lens.image_size
-    corners = np.array([(0, 0), (width, 0), (width, height), (0, height)], dtype=np.float64) - 0.5
-    steps = np.arange(points_per_side)[:, None] / points_per_side
-    border = np.concatenate([a + steps * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
-    return texels_of_pixels(lens, from_plane, border)
+    return texels_of_pixels(lens, from_plane, border_of(lens.image_size, points_per_side))
 
 
 def texels_of_pixels(lens: Lens, from_plane: FloatArray, points: ArrayLike) -> FloatArray:

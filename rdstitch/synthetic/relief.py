@@ -38,7 +38,6 @@ class Relief:
     height: HeightMap
 
     def __post_init__(self) -> None:
-        """Check the shape and the values."""
         if self.height.ndim != 2 or not self.height.size or max(self.height.shape) >= _TOO_LONG:
             raise ArgumentError(f"a height map has shape (h, w), up to {_TOO_LONG - 1}, not {self.height.shape}")
         if self.height.dtype != np.float32 or not np.isfinite(self.height).all():

@@ -59,7 +59,6 @@ class Photometry:
     bits: int = 8
 
     def __post_init__(self) -> None:
-        """Check the bit depth."""
         if self.bits not in (8, 16):
             raise ArgumentError(f"pictures have 8 or 16 bits, not {self.bits}")
 
@@ -94,7 +93,6 @@ class Sequence:
     samples: int | None = None
 
     def __len__(self) -> int:
-        """Number of pictures."""
         return len(self.poses)
 
     @cached_property

@@ -51,7 +51,6 @@ class PictureTexture:
     pixels: NDArray[Any]
 
     def __post_init__(self) -> None:
-        """Check the shape and the type."""
         if self.pixels.ndim not in (2, 3) or self.pixels.size == 0:
             raise ArgumentError(f"a texture has shape (h, w) or (h, w, 3), not {self.pixels.shape}")
         if self.pixels.dtype not in (np.uint8, np.uint16, np.float32):
@@ -68,7 +67,6 @@ class PictureTexture:
         return 1 if self.pixels.ndim == 2 else self.pixels.shape[2]
 
     def region(self, left: int, top: int, right: int, bottom: int) -> LinearPixels:
-        """See :class:`Texture`."""
         part = self.pixels[top:bottom, left:right]
         full = 1.0 if part.dtype == np.float32 else float(np.iinfo(part.dtype).max)
         scaled: LinearPixels = part.astype(np.float32) / np.float32(full)
@@ -94,7 +92,6 @@ class EndlessTexture:
     channels: int = 3
 
     def region(self, left: int, top: int, right: int, bottom: int) -> LinearPixels:
-        """See :class:`Texture`."""
         x, y = np.arange(left, right), np.arange(top, bottom)
         layers = [_periodic_ground(period, (self.seed, period), self.channels) for period in _PERIODS]
         first, second = (
@@ -137,7 +134,6 @@ class LinedTexture:
         return self.texture.channels
 
     def region(self, left: int, top: int, right: int, bottom: int) -> LinearPixels:
-        """See :class:`Texture`."""
         painted = self.texture.region(left, top, right, bottom).copy()
         x, y = np.arange(left, right), np.arange(top, bottom)[:, None]
         for start, end in self.lines:

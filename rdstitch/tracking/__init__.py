@@ -4,8 +4,8 @@ Memory is bounded: descriptors and matches are kept of the last keyframes only. 
 steering; loops are closed and every pair is used when the whole sequence is registered at the end.
 """
 
-from rdstitch.tracking.placement import CameraPose, Placement, Similarity2
+from rdstitch.tracking.placement import CameraPose, Placement, PlaneSimilarity
 from rdstitch.tracking.preview import Preview
 from rdstitch.tracking.tracker import Tracked, Tracker, TrackingOptions
 
-__all__ = ["CameraPose", "Placement", "Preview", "Similarity2", "Tracked", "Tracker", "TrackingOptions"]
+__all__ = ["CameraPose", "Placement", "PlaneSimilarity", "Preview", "Tracked", "Tracker", "TrackingOptions"]

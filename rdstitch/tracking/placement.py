@@ -75,7 +75,7 @@ class Placement:
 
 
 @dataclass(frozen=True)
-class Similarity2:
+class PlaneSimilarity:
     """Similarity of the plane, ``X -> a X + b`` with complex a and b."""
 
     turn: complex

@@ -47,7 +47,6 @@ class Preview:
         ----------
         image : ndarray of shape (H, W) or (H, W, C)
             RGB or grey, of the whole frame at any size.
-        placement : Placement
         """
         outline = placement.to_plane(placement.camera.outline(_OUTLINE))
         if not np.isfinite(outline).all():

@@ -14,7 +14,7 @@ from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
 from rdstitch.matching.options import PairOptions
 from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
-from rdstitch.tracking.placement import CameraPose, Placement, Similarity2
+from rdstitch.tracking.placement import CameraPose, Placement, PlaneSimilarity
 
 _WINDOW = 48  # keyframes that are kept
 _PARTNERS = 2  # last keyframes that a frame is matched with
@@ -97,13 +97,7 @@ class _Keyframe:
 
 
 class Tracker:
-    """Registers frames of one camera one after the other.
-
-    Parameters
-    ----------
-    options : TrackingOptions
-    matcher : callable
-    """
+    """Registers frames of one camera one after the other."""
 
     def __init__(self, options: TrackingOptions, matcher: Matcher) -> None:
         self._options, self._match = options, matcher
@@ -135,7 +129,6 @@ class Tracker:
 
         Parameters
         ----------
-        features : Features
         camera : Camera
             Of the size that the features' points are measured at.
         """
@@ -216,7 +209,7 @@ class Tracker:
         here = np.concatenate([stay.to_plane(link.points2) for _, link in placed])
         there = np.concatenate([placement.to_plane(link.points1) for placement, link in placed])
         seen = np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
-        return Similarity2.fitted(here[seen], there[seen], keep_size=self._planar_model == "rigid").applied(stay)
+        return PlaneSimilarity.fitted(here[seen], there[seen], keep_size=self._planar_model == "rigid").applied(stay)
 
     def _shown_by_last(self, frame: _Keyframe, links: Sequence[Link]) -> float:
         """Share of the frame that the newest of its partners shows."""
@@ -305,16 +298,16 @@ class Tracker:
             )
             self._model, self._focal = alignment.model, alignment.focal
 
-    def _to_map(self, placements: Sequence[Placement | None]) -> Similarity2 | None:
+    def _to_map(self, placements: Sequence[Placement | None]) -> PlaneSimilarity | None:
         """From the plane of an alignment to that of the map; the first alignment defines it."""
         both = [(new, keyframe.placement) for new, keyframe in zip(placements, self._keyframes, strict=True)]
         shared = [(new, old) for new, old in both if new is not None and old is not None]
         if shared:
-            return Similarity2.between(*zip(*shared, strict=True))
+            return PlaneSimilarity.between(*zip(*shared, strict=True))
         first = next((placement for placement in placements if placement is not None), None)
         if first is None:
             return None
-        return Similarity2(1.0, 0.0) if first.pose is None else Similarity2.to_origin(first.pose)
+        return PlaneSimilarity(1.0, 0.0) if first.pose is None else PlaneSimilarity.to_origin(first.pose)
 
     def _tracked(self, frame: _Keyframe, *, keyframe: bool, inliers: int) -> Tracked:
         distortion = math.nan if self._distortion is None else self._distortion

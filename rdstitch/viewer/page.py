@@ -19,6 +19,7 @@ from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.io.deepzoom import OVERLAP, TILE, tiles_folder
 
 _COLOUR = (0, 229, 255)
+_CORNERS = 64  # of an outline, at most
 
 
 def seam_picture(
@@ -28,7 +29,6 @@ def seam_picture(
 
     Parameters
     ----------
-    seams : SeamMap
     origin, size : (int, int)
         Where the mosaic begins in the canvas of the seams, and how large it is, pixels.
     """
@@ -48,9 +48,6 @@ def seam_picture(
     Image.fromarray(samples).save(stream, "PNG", optimize=True)
     x, y = float(left * factor - origin[0]), float(top * factor - origin[1])
     return stream.getvalue(), (x, y, float(labels.shape[1] * factor), float(labels.shape[0] * factor))
-
-
-_CORNERS = 64  # of an outline, at most
 
 
 @dataclass(frozen=True)
@@ -92,8 +89,6 @@ def viewer_page(
         The ``.dzi`` file.
     size : (int, int)
         Width and height of the mosaic, pixels.
-    pictures : sequence of ViewedPicture
-    seams : SeamMap, optional
     origin : (int, int)
         Where the mosaic begins in the canvas of the seams, pixels.
     """

@@ -29,7 +29,7 @@ from rdstitch.compositing.seam_finder import NO_OWNER, SeamMap
 from rdstitch.compositing.source_images import PictureReader
 from rdstitch.compositing.survey import Survey, survey_pictures
 from rdstitch.compositing.warp import locate
-from rdstitch.inputs.source import read_sources, readers
+from rdstitch.inputs.source import read_sources
 from rdstitch.sidecar.read import read_sidecar
 
 CHOICES = ("none", "gain", "blocks", "balanced")
@@ -79,7 +79,7 @@ def main() -> None:
     )
     cameras = [picture.camera for picture in used if picture.camera is not None]
     matrices = np.array([picture.to_plane for picture in used])
-    canvas, read = plan_canvas(cameras, matrices), readers(sources)
+    canvas, read = plan_canvas(cameras, matrices), [source.read for source in sources]
     pictures = place_pictures(read, cameras, matrices, preview=read)
     survey = survey_pictures(PictureReader(pictures), pictures, canvas, 2)
     tiles = [tile for tile in survey.tiles if tile is not None]

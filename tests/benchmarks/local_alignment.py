@@ -42,7 +42,7 @@ from rdstitch.compositing.source_images import PictureReader
 from rdstitch.compositing.survey import survey_pictures
 from rdstitch.errors import RdstitchError
 from rdstitch.executors import open_executor
-from rdstitch.inputs.source import read_sources, readers
+from rdstitch.inputs.source import read_sources
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.accept import accept
@@ -106,7 +106,7 @@ def across_seams(truth: Sequence, registration: Registration, local: LocalAlignm
     sources, _ = read_sources([registration.sources[k].path for k in used], camera=None, focal=None, distortion=None,
                               skip_bad=False)  # fmt: skip
     cameras, matrices = [alignment.cameras[k] for k in used], alignment.homographies[used]
-    canvas, read = plan_canvas(cameras, matrices), readers(sources)
+    canvas, read = plan_canvas(cameras, matrices), [source.read for source in sources]
     fields = list(local.fields) or None
     placed = place_pictures(read, cameras, matrices, preview=read, displacement=fields)
     with prepare_composite(placed, canvas, CompositeOptions()) as ready:

@@ -25,7 +25,7 @@ from rdstitch.features import match
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.matching.candidate_pairs import first_pairs
 from rdstitch.matching.two_view_rounds import Pairing
-from rdstitch.pipeline.contrast import detect_by_contrast
+from rdstitch.pipeline.detect_features import detect_by_contrast
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.progress import silent
 from tests.benchmarks.scale import survey, write_frames

@@ -19,7 +19,7 @@ from rdstitch.io import preview, read_image
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline import accept, calibrate, pano
-from rdstitch.pipeline.timing import StageTimer
+from rdstitch.progress import StageTimer
 from rdstitch.report import geometry as thumbnails
 from rdstitch.report import report_page, write_report
 from rdstitch.report.pairs import matched

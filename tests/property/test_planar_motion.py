@@ -4,7 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rdstitch.planar_motion import PlanarMotion, constraint_residuals, rotation_from_tilt, tilt_from_normal
+from rdstitch.planar_motion import PlanarMotion, rotation_from_tilt, tilt_from_normal
+from tests.planar_constraints import constraint_residuals
 
 tilts = st.tuples(st.floats(-0.6, 0.6), st.floats(-0.6, 0.6))
 translations = st.tuples(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0)).filter(lambda t: np.hypot(*t) > 0.05)

@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
-from rdstitch.planar_motion import constraint_residuals, rotation_from_tilt, tilt_from_normal
+from rdstitch.planar_motion import rotation_from_tilt, tilt_from_normal
 from rdstitch.solvers import Solutions
 from rdstitch.synthetic import planar_instances
+from tests.planar_constraints import constraint_residuals
 
 seeds = st.integers(0, 10**6)
 angles = st.floats(-np.pi, np.pi)

@@ -12,24 +12,24 @@ import numpy as np
 import pytest
 
 from rdstitch import process_memory
-from rdstitch.process_memory import memory_left, release_free_heap, scratch_memory
+from rdstitch.process_memory import memory_left, return_freed_memory, scratch_memory
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system does not say what a process holds")
 def test_what_the_process_holds_counts() -> None:
-    release_free_heap()
+    return_freed_memory()
     before = memory_left(0)
     held = np.ones(50_000_000, dtype=np.uint8)
     assert before - memory_left(0) == pytest.approx(held.nbytes, rel=0.1)
     del held
-    release_free_heap()
+    return_freed_memory()
     assert memory_left(0) == pytest.approx(before, abs=10e6)
 
 
 _LARGE_AND_SMALL = """
 import numpy as np
-from rdstitch.process_memory import memory_left, release_free_heap
-release_free_heap()
+from rdstitch.process_memory import memory_left, return_freed_memory
+return_freed_memory()
 # After this the C library would put all up to this size onto its heap.
 np.ones(28_000_000, dtype=np.uint8)
 before, arrays, between = memory_left(0), [], []

@@ -56,8 +56,7 @@ def apply(
     workers: int,
     strict: bool,
     dry_run: bool,
-    quiet: bool,
-    verbose: bool,
+    reporter: Reporter,
     **compositing: Any,
 ) -> None:
     """Compose pictures by the registration in a sidecar, without estimating anything.
@@ -71,29 +70,28 @@ def apply(
     from rdstitch.sidecar.read import read_sidecar
 
     given = {name: value for name, value in compositing.items() if options.is_given(name)}
-    with Reporter(-quiet + verbose) as reporter:
-        result = recipe(
-            sidecar,
-            options.resolve(images),
-            output,
-            replace(read_sidecar(sidecar).composite, **given),
-            match=match,
-            mask=mask,
-            every=every,
-            workers=workers,
-            overwrite=overwrite,
-            strict=strict,
-            dry_run=dry_run,
-            progress=reporter,
-        )
-        reporter.finish()
-        for missing in told_once(result.left_out.values()):
-            reporter.warn(str(missing))
-        if result.matched == "order" and match == "auto":
-            reporter.warn("no picture has a name of the sidecar; they were taken in order")
-        for message in result.messages:
-            reporter.warn(str(message))
-        if result.plan is not None:
-            show_plan(result.plan)
-        else:
-            reporter.made(result.summary)
+    result = recipe(
+        sidecar,
+        options.resolve(images),
+        output,
+        replace(read_sidecar(sidecar).composite, **given),
+        match=match,
+        mask=mask,
+        every=every,
+        workers=workers,
+        overwrite=overwrite,
+        strict=strict,
+        dry_run=dry_run,
+        progress=reporter,
+    )
+    reporter.finish()
+    for missing in told_once(result.left_out.values()):
+        reporter.warn(str(missing))
+    if result.matched == "order" and match == "auto":
+        reporter.warn("no picture has a name of the sidecar; they were taken in order")
+    for message in result.messages:
+        reporter.warn(str(message))
+    if result.plan is not None:
+        show_plan(result.plan)
+    else:
+        reporter.made(result.summary)

@@ -39,8 +39,7 @@ def calibrate(
     every: int | None,
     report: Path | None,
     as_json: bool,
-    quiet: bool,
-    verbose: bool,
+    reporter: Reporter,
     **given: Any,
 ) -> None:
     """Find λ, and where they can be seen the tilt and the focal length, from pictures of a plane.
@@ -53,13 +52,12 @@ def calibrate(
     from rdstitch.camera_files import export_note
     from rdstitch.pipeline import calibrate as recipe
 
-    with Reporter(-quiet + verbose) as reporter:
-        wanted = stitch_options(reporter, save_camera=output, **given)
-        paths = options.resolve(inputs)
-        report_page = Report(report, reporter, paths, given["overwrite"])
-        with report_page.explaining():
-            registration = recipe(paths, wanted, every=every, progress=report_page.progress, beside=report_page.stage)
-        report_registration(registration, reporter, as_json=as_json)
-        for line in (*describe_lens(registration.alignment), *export_note(registration.camera, output)):
-            reporter.note(line)
-        reporter.made(f"{output}: {registration.summary}")
+    wanted = stitch_options(reporter, save_camera=output, **given)
+    paths = options.resolve(inputs)
+    report_page = Report(report, reporter, paths, given["overwrite"])
+    with report_page.explaining():
+        registration = recipe(paths, wanted, every=every, progress=report_page.progress, beside=report_page.stage)
+    report_registration(registration, reporter, as_json=as_json)
+    for line in (*describe_lens(registration.alignment), *export_note(registration.camera, output)):
+        reporter.note(line)
+    reporter.made(f"{output}: {registration.summary}")

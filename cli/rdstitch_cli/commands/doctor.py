@@ -21,7 +21,7 @@ Examples:
 @options.every
 @options.as_json
 @options.verbosity
-def doctor(inputs: tuple[Path, ...], every: int | None, as_json: bool, quiet: bool, verbose: bool) -> None:
+def doctor(inputs: tuple[Path, ...], every: int | None, as_json: bool, reporter: Reporter) -> None:
     """Find out at a glance what a run will meet, and what to change before it.
 
     INPUT is what 'rdstitch mosaic' takes. Shown are sizes, cameras and zooms by EXIF, blur, exposure, overlap, and the
@@ -30,10 +30,9 @@ def doctor(inputs: tuple[Path, ...], every: int | None, as_json: bool, quiet: bo
     from rdstitch.doctor import examine
     from rdstitch.io.atomic import json_bytes
 
-    with Reporter(-quiet + verbose) as reporter:
-        found = examine(options.resolve(inputs), every=every, progress=reporter)
-        reporter.finish()
-        if as_json:
-            click.echo(json_bytes(found.as_dict()), nl=False)
-        else:
-            click.echo(found.as_text(), nl=False)
+    found = examine(options.resolve(inputs), every=every, progress=reporter)
+    reporter.finish()
+    if as_json:
+        click.echo(json_bytes(found.as_dict()), nl=False)
+    else:
+        click.echo(found.as_text(), nl=False)

@@ -43,8 +43,7 @@ def mosaic(
     refresh: float,
     report: Path | None,
     as_json: bool,
-    quiet: bool,
-    verbose: bool,
+    reporter: Reporter,
     **given: Any,
 ) -> None:
     """Stitch a whole sequence over one plane, seen straight from above.
@@ -55,7 +54,7 @@ def mosaic(
     """
     from rdstitch.pipeline import mosaic as recipe
 
-    with Reporter(-quiet + verbose) as reporter, ExitStack() as stack:
+    with ExitStack() as stack:
         stitch = stitch_options(reporter, **given)
         named: list[Path] = [] if following else options.resolve(inputs)
         paths: Sequence[Named] = named

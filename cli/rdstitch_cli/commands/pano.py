@@ -30,8 +30,7 @@ def pano(
     every: int | None,
     report: Path | None,
     as_json: bool,
-    quiet: bool,
-    verbose: bool,
+    reporter: Reporter,
     **given: Any,
 ) -> None:
     """Stitch two or more pictures that overlap, in any order.
@@ -41,18 +40,17 @@ def pano(
     """
     from rdstitch.pipeline import pano as recipe
 
-    with Reporter(-quiet + verbose) as reporter:
-        paths = options.resolve(inputs)
-        report_page = Report(report, reporter, paths, given["overwrite"], output)
-        with report_page.explaining():
-            result = recipe(
-                paths,
-                output,
-                stitch_options(reporter, **given),
-                every=every,
-                progress=report_page.progress,
-                beside=report_page.stage,
-            )
-        summarize(result, reporter, as_json=as_json)
-        if result.plan is None:
-            reporter.made(result.summary)
+    paths = options.resolve(inputs)
+    report_page = Report(report, reporter, paths, given["overwrite"], output)
+    with report_page.explaining():
+        result = recipe(
+            paths,
+            output,
+            stitch_options(reporter, **given),
+            every=every,
+            progress=report_page.progress,
+            beside=report_page.stage,
+        )
+    summarize(result, reporter, as_json=as_json)
+    if result.plan is None:
+        reporter.made(result.summary)

@@ -71,8 +71,7 @@ def trajectory(
     every: int | None,
     following: bool,
     idle: float | None,
-    quiet: bool,
-    verbose: bool,
+    reporter: Reporter,
     **given: Any,
 ) -> None:
     """Find where the camera was for each picture: x, y and yaw over the plane.
@@ -83,7 +82,7 @@ def trajectory(
     """
     from rdstitch.pipeline import trajectory as recipe
 
-    with Reporter(-quiet + verbose) as reporter, ExitStack() as stack:
+    with ExitStack() as stack:
         stitch = stitch_options(reporter, **given)
         if following:
             arrived = live.followed(inputs, stitch, reporter, output=output, plot=plot, every=every, idle=idle)

@@ -40,8 +40,7 @@ def undistort(
     output: Path,
     overwrite: bool,
     view: Literal["same", "all", "valid"],
-    quiet: bool,
-    verbose: bool,
+    reporter: Reporter,
 ) -> None:
     """Undistort pictures with a known lens, each into a file of the same name in a folder.
 
@@ -52,18 +51,17 @@ def undistort(
 
     if (camera is None) == (distortion is None):
         raise click.UsageError("give either --camera FILE or --lambda L")
-    with Reporter(-quiet + verbose) as reporter:
-        lens = read_lens(camera, reporter)
-        written = recipe(
-            options.resolve(inputs),
-            output,
-            camera=lens,
-            distortion=distortion,
-            view=view,
-            overwrite=overwrite,
-            warn=lambda message: reporter.warn(str(message)),
-            progress=reporter,
-        )
-        reporter.finish()
-        noun = "picture" if len(written) == 1 else "pictures"
-        reporter.made(f"{output}: {len(written)} {noun} undistorted")
+    lens = read_lens(camera, reporter)
+    written = recipe(
+        options.resolve(inputs),
+        output,
+        camera=lens,
+        distortion=distortion,
+        view=view,
+        overwrite=overwrite,
+        warn=lambda message: reporter.warn(str(message)),
+        progress=reporter,
+    )
+    reporter.finish()
+    noun = "picture" if len(written) == 1 else "pictures"
+    reporter.made(f"{output}: {len(written)} {noun} undistorted")

@@ -16,8 +16,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.features.keypoints import Features
 from rdstitch.features.options import FeatureOptions
 from rdstitch.features.surf.hessian import Blobs, Grey, find_blobs, pyramid
-from rdstitch.features.surf.patches import apply_kernels, integer_kernels, sample_patches
-from rdstitch.features.surf.refinement import refine
+from rdstitch.features.surf.refinement import apply_kernels, integer_kernels, refine, sample_patches
 
 _RADIUS = 6  # of the disc of gradients, units of s
 _GRADIENT_SIGMA = 1.5  # of the derivatives, units of s; about as wide as the paper's wavelets of 4s
@@ -26,6 +25,12 @@ _PATCH = 2 * (_RADIUS + 3)
 _BINS = 72  # directions in which the window is tried
 _WINDOW_WIDTH = np.pi / 3  # width of the window at half its height, radians
 _ORIENTED_AT_ONCE = 4096  # worked on at a time
+_CELLS = 4  # along each side
+_SAMPLES = 5  # along each side of a cell
+_SIDE = _CELLS * _SAMPLES  # of the region, in units of s
+_RESPONSE_SIGMA = 3.3  # of the Gaussian weight, in units of s
+_SUPERSAMPLING = 2  # samples along each side of a square of s
+_DESCRIBED_AT_ONCE = 512  # worked on at a time
 
 
 def orientations(levels: list[Grey], points: FloatArray, scale: FloatArray) -> FloatArray:
@@ -85,14 +90,6 @@ def _window_spectrum() -> NDArray[np.complex128]:
 
 _ALONG_U, _ALONG_V, _GRADIENT_WEIGHTS = _gradients()
 _WINDOW_SPECTRUM = _window_spectrum()
-
-
-_CELLS = 4  # along each side
-_SAMPLES = 5  # along each side of a cell
-_SIDE = _CELLS * _SAMPLES  # of the region, in units of s
-_RESPONSE_SIGMA = 3.3  # of the Gaussian weight, in units of s
-_SUPERSAMPLING = 2  # samples along each side of a square of s
-_DESCRIBED_AT_ONCE = 512  # worked on at a time
 
 
 def describe_patches(

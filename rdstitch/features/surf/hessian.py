@@ -15,6 +15,15 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 
 Grey = NDArray[np.uint8]
+# The box filter of 9 pixels stands for a Gaussian of σ = 1.2 pixels; larger ones in proportion (§3.3).
+SIGMA_PER_SIZE = 1.2 / 9
+
+_MIN_LOBE = 3
+# Weight of the mixed derivative, which the box filters get relatively wrong (§3.2).
+_MIXED_WEIGHT = 0.9
+
+# Rows worked on at a time, few enough that the intermediate results stay in the cache.
+_STRIP_ROWS = 48
 
 
 def pyramid(grey: Grey, levels: int) -> list[Grey]:
@@ -38,7 +47,7 @@ def from_level(points: FloatArray, level: int) -> FloatArray:
 
 
 def vertex(values: NDArray[np.floating]) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Where the quadric through each neighbourhood is largest.
+    """Where the quadric through each neighbourhood is largest (Brown and Lowe, BMVC 2002).
 
     Parameters
     ----------
@@ -73,15 +82,6 @@ def vertex(values: NDArray[np.floating]) -> tuple[FloatArray, NDArray[np.bool_]]
     return np.where(is_maximum[:, None], offset, 0.0), is_maximum
 
 
-# The box filter of 9 pixels stands for a Gaussian of σ = 1.2 pixels; larger ones in proportion (§3.3).
-SIGMA_PER_SIZE = 1.2 / 9
-_MIN_LOBE = 3
-# Weight of the mixed derivative, which the box filters get relatively wrong (§3.2).
-_MIXED_WEIGHT = 0.9
-# Rows worked on at a time, few enough that the intermediate results stay in the cache.
-_STRIP_ROWS = 48
-
-
 @dataclass(frozen=True, eq=False)
 class Blobs:
     """Blobs of one picture.
@@ -104,7 +104,6 @@ class Blobs:
     laplacian_sign: NDArray[np.int8]
 
     def __len__(self) -> int:
-        """Number of blobs."""
         return len(self.points)
 
     @property
@@ -141,12 +140,7 @@ def find_blobs(grey: Grey, threshold: float, octaves: int, layers: int) -> Blobs
         for start in range(0, height, _STRIP_ROWS):
             blobs = _blobs_of_rows(level, start, min(start + _STRIP_ROWS, height), threshold, layers)
             parts.append(
-                Blobs(
-                    from_level(blobs.points, octave),
-                    blobs.size * 2**octave,
-                    blobs.response,
-                    blobs.laplacian_sign,
-                )
+                Blobs(from_level(blobs.points, octave), blobs.size * 2**octave, blobs.response, blobs.laplacian_sign)
             )
     return Blobs.concatenate(parts)
 

@@ -1,5 +1,7 @@
 """Paths: frames, units, files and errors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -35,15 +37,15 @@ def test_files() -> None:
     numbers = np.array([[float(value or "nan") for value in row.split(",")] for row in rows])
     np.testing.assert_allclose(numbers[:, 4:6], path.position, atol=1e-8)
     np.testing.assert_allclose(numbers[:, 6], np.degrees(path.yaw), atol=1e-6)
-    tum = np.array([[float(value) for value in row.split()] for row in as_tum(path, [0.0, 0.1, 0.3, 0.4]).splitlines()])
+    timed = replace(path, timestamp=np.array([0.0, 0.1, 0.3, 0.4]))
+    tum = np.array([[float(value) for value in row.split()] for row in as_tum(timed).splitlines()])
     assert tum.shape == (4, 8)
     np.testing.assert_allclose(tum[:, 0], [0.0, 0.1, 0.3, 0.4])
     np.testing.assert_allclose(tum[:, 3], -path.height, atol=1e-8)
     np.testing.assert_allclose(
         np.remainder(2 * np.arctan2(tum[:, 6], tum[:, 7]) + path.yaw, 2 * np.pi) % 6.28318, 0, atol=1e-4
     )
-    with pytest.raises(ArgumentError, match="timestamps"):
-        as_tum(path, [1.0])
+    assert [row.split()[0] for row in as_tum(path).splitlines()] == ["0.000000", "1.000000", "3.000000", "4.000000"]
 
 
 def test_neither_frame_nor_unit_matter_to_the_error() -> None:

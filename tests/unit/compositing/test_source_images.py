@@ -1,9 +1,17 @@
 """Pictures as the tiles need them."""
 
+from functools import partial
+from typing import Any
+
 import numpy as np
+import pytest
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from rdstitch.compositing.source_images import prepare_picture
+from rdstitch.camera import Camera
+from rdstitch.compositing.placed_picture import place_pictures
+from rdstitch.compositing.source_images import PictureReader, prepare_picture
+from rdstitch.errors import InputError
 from tests.compositing_scenes import as_picture
 
 
@@ -21,3 +29,18 @@ def test_what_is_transparent_has_the_samples_of_the_nearest_opaque_pixel() -> No
     assert opaque[tuple(source.T)].all()
     nearest = KDTree(np.argwhere(opaque)).query(hidden)[0]
     assert (np.linalg.norm(source - hidden, axis=1) <= 1.05 * nearest).all()  # distances of 5 x 5 chamfers
+
+
+def test_a_picture_unlike_the_first_is_named_also_in_blocks() -> None:
+    frames: list[NDArray[Any]] = [
+        np.zeros((60, 80, 3), np.uint8),
+        np.zeros((60, 80), np.uint8),
+        np.zeros((60, 80, 3), np.uint16),
+    ]
+    read = [partial(as_picture, frame) for frame in frames]
+    pictures = place_pictures(read, [Camera((80, 60))] * 3, [np.eye(3)] * 3, paths=["in/a.png", "in/b.png", "in/c.png"])
+    reader = PictureReader(pictures)
+    assert reader(0).pixels.shape == reader(1).pixels.shape == (60, 80, 3)
+    for whole, index in ((reader, 2), (reader.part([1, 2]), 1)):
+        with pytest.raises(InputError, match=r"^in/c\.png: has uint16 samples, but a\.png has uint8 samples; convert"):
+            whole(index)

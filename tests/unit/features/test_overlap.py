@@ -7,7 +7,7 @@ import pytest
 
 from rdstitch.arrays import FloatArray
 from rdstitch.features import Correspondences, Features, match, match_overlap
-from rdstitch.features.overlap import overlapping
+from rdstitch.features.match import overlapping
 
 SIZE = (800, 600)
 SHIFT = np.array([560.0, 0.0])  # three tenths of the first picture are in the second

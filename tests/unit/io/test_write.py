@@ -24,10 +24,10 @@ from rdstitch.io import (
     check_output,
     read_image,
     write_image,
-    write_json_atomic,
     write_strips,
 )
-from rdstitch.io.atomic import atomic_output
+from rdstitch.io.atomic import write_bytes_atomic
+from rdstitch.io.outputs import Outputs
 
 Pixels = NDArray[Any]
 
@@ -201,7 +201,7 @@ class TestAtomic:
         target.write_text("old")
 
         def interrupted() -> None:
-            with atomic_output(target) as temporary:
+            with Outputs(overwrite=True) as outputs, outputs.writing(target) as temporary:
                 temporary.write_text("new, half-writ")
                 raise RuntimeError
 
@@ -216,19 +216,19 @@ class TestAtomic:
 
         monkeypatch.setattr(os, "fsync", full)
         with pytest.raises(OutputError, match="No space left"):
-            write_json_atomic(tmp_path / "a.json", {"x": 1})
+            write_bytes_atomic(tmp_path / "a.json", b"{}")
         assert list(tmp_path.iterdir()) == []
 
     def test_mode_is_kept(self, tmp_path: Path) -> None:
         target = tmp_path / "a.json"
         target.write_text("{}")
         target.chmod(0o640)
-        write_json_atomic(target, {"x": 1})
+        write_bytes_atomic(target, b"{}")
         assert stat.S_IMODE(target.stat().st_mode) == 0o640
 
     def test_missing_folder(self, tmp_path: Path) -> None:
         with pytest.raises(OutputError):
-            write_json_atomic(tmp_path / "none" / "a.json", {})
+            write_bytes_atomic(tmp_path / "none" / "a.json", b"{}")
 
 
 class TestCheckOutput:

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from rdstitch.errors import ArgumentError
-from rdstitch.planar_motion import constraint_residuals
 from rdstitch.radial_homography import transfer
 from rdstitch.solvers.solutions import Solutions
 from rdstitch.synthetic import HALF_SIZE, correspondences, general_instances, planar_instances
+from tests.planar_constraints import constraint_residuals
 
 
 def test_points_of_planar_instances_obey_homography_and_motion() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from rdstitch.camera import Camera
 from rdstitch.planar_motion import rotation_from_tilt
-from rdstitch.tracking import CameraPose, Placement, Similarity2
+from rdstitch.tracking import CameraPose, Placement, PlaneSimilarity
 
 
 def _placed(x: float, y: float, yaw: float, height: float, tilt: tuple[float, float] = (0.1, -0.2)) -> Placement:
@@ -35,7 +35,7 @@ def test_without_focal_length_or_homography_there_is_no_pose() -> None:
 def test_a_similarity_moves_a_placement_and_its_pose_alike() -> None:
     first, second = _placed(1.0, 2.0, 0.3, 0.9), _placed(2.0, 1.0, 1.1, 1.2)
     assert first.pose is not None
-    move = Similarity2.to_origin(first.pose)
+    move = PlaneSimilarity.to_origin(first.pose)
     origin, other = move.applied(first).pose, move.applied(second).pose
     assert origin is not None
     assert other is not None
@@ -46,15 +46,15 @@ def test_a_similarity_moves_a_placement_and_its_pose_alike() -> None:
 
 def test_planes_are_brought_together_by_the_pictures_that_both_have() -> None:
     placed = [_placed(0.0, 0.0, 0.2, 1.0), _placed(1.0, 0.5, -0.4, 1.1)]
-    move = Similarity2(0.7 * complex(math.cos(1.0), math.sin(1.0)), 2.0 - 3.0j)
-    found = Similarity2.between(placed, [move.applied(one) for one in placed])
+    move = PlaneSimilarity(0.7 * complex(math.cos(1.0), math.sin(1.0)), 2.0 - 3.0j)
+    found = PlaneSimilarity.between(placed, [move.applied(one) for one in placed])
     assert found.turn == pytest.approx(move.turn)
     assert found.shift == pytest.approx(move.shift)
 
 
 def test_a_fit_may_keep_the_size() -> None:
     points = np.random.default_rng(0).normal(size=(20, 2))
-    kept = Similarity2.fitted(points, 2.0 * points + 1.0, keep_size=True)
+    kept = PlaneSimilarity.fitted(points, 2.0 * points + 1.0, keep_size=True)
     assert abs(kept.turn) == pytest.approx(1.0)
-    assert Similarity2.fitted(points, 2.0 * points + 1.0).turn == pytest.approx(2.0)
+    assert PlaneSimilarity.fitted(points, 2.0 * points + 1.0).turn == pytest.approx(2.0)
     assert CameraPose(0.0, 0.0, 0.0, 1.0) == CameraPose(0.0, 0.0, 0.0, 1.0)

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from rdstitch.features import FeatureOptions, detect, match
 from rdstitch.features.surf.descriptor import describe_patches, orientations
 from rdstitch.features.surf.hessian import find_blobs, from_level, pyramid, to_level, vertex
-from rdstitch.features.surf.patches import apply_kernels, integer_kernels
-from rdstitch.features.surf.refinement import refine
+from rdstitch.features.surf.refinement import apply_kernels, integer_kernels, refine
 from rdstitch.synthetic import ground
 
 Grey = NDArray[np.uint8]
