@@ -32,3 +32,10 @@ def test_a_picture_that_fails_its_checks_is_left_out_by_name(
     assert f"left out {spoiled[4]}" in done.err
     assert not any(f"left out {path}" in done.err for path in spoiled[:4])
     assert strict or abs(float(done.out) - DISTORTION) < 0.005
+
+
+def test_pictures_of_another_block_are_named_in_one_line(rdstitch: Run, tmp_path: Path) -> None:
+    own, others = flight(3, 3).write(tmp_path, "a{}.png"), flight(29, 2).write(tmp_path, "b{}.png")
+    done = rdstitch("mosaic", *own, *others, "-o", tmp_path / "out.png", *FAST)
+    (line,) = [line for line in done.err.splitlines() if "left out" in line]
+    assert f"left out {others[0]}, {others[1].name}: in block 2 of 2, whose 2 pictures overlap with none" in line
