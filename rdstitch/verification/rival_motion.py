@@ -30,6 +30,9 @@ _CELLS = 16
 _MIN_DISAGREEMENT = 0.02
 """Of a picture's diagonal: relief moves what stands on the plane by less."""
 
+_MIN_APART = 0.05
+"""Of a picture's diagonal: the tops of trees and houses reach 0.02 to 0.03, vehicles 0.25 to 0.5."""
+
 _MIN_SHARE = 0.1
 """Of the area that has either motion. Flights over trees and houses reach 0.08, vehicles over a tenth 0.09 to 0.5
 (``python -m tests.benchmarks.trust --kind vehicle``)."""
@@ -131,9 +134,12 @@ def pairs_of_rivals(pairs: Sequence[PairRegistration], rivals: Sequence[RivalMot
     return result
 
 
-def is_rival(rivals: Sequence[RivalMotion]) -> bool:
-    """Whether something that covers a good part of the pictures moves otherwise."""
-    return rival_share(rivals) >= _MIN_SHARE
+def is_apart(rivals: Sequence[RivalMotion]) -> bool:
+    """Whether what moves otherwise covers a good part of the pictures, and moves by more than tree tops do."""
+    if rival_share(rivals) < _MIN_SHARE:
+        return False
+    worst = max(rivals, key=lambda rival: rival.area)
+    return worst.relation is None or worst.disagreement > _MIN_APART * 2.0 * worst.relation.camera.half_diagonal
 
 
 def rival_messages(
@@ -158,9 +164,9 @@ def rival_messages(
     larger : bool
         Whether the rival was registered, too, and found to be the smaller one.
     """
-    if not is_rival(rivals):
-        return []
     share = rival_share(rivals)
+    if share < _MIN_SHARE:
+        return []
     worst = max(rivals, key=lambda rival: rival.area)
     images = (paths[worst.image1], paths[worst.image2])
     first, second = names_of(images)

@@ -18,7 +18,7 @@ from rdstitch.verification.input_doubts import doubtful_inputs
 from rdstitch.verification.misfits import agreement_of_all, disagreeing_pairs, misfitting_pictures
 from rdstitch.verification.overlap_check import CheckedLink, check_overlaps, share_alike
 from rdstitch.verification.parallax import find_parallax, parallax_messages
-from rdstitch.verification.rival_motion import MIN_AGREEMENT, find_rival_motions, is_rival, rival_messages
+from rdstitch.verification.rival_motion import MIN_AGREEMENT, find_rival_motions, is_apart, rival_messages
 
 Pair = tuple[int, int]
 
@@ -101,7 +101,7 @@ def judge(
     rivals = find_rival_motions(alignment, registration.pairs, threshold)
     parallax = find_parallax(alignment, registration.pairs) if alignment.on_sphere else []
     # What two pictures share of a plane looks alike; where something else moves, it may be that which holds them.
-    least = MIN_AGREEMENT if is_rival(rivals) else _MIN_AGREEMENT
+    least = MIN_AGREEMENT if is_apart(rivals) else _MIN_AGREEMENT
     suspicions = {**disagreeing, **_unlike(paths, checked, least), **ambiguous}
     decisive = [] if lens_only or resting else _decisive(suspicions, used, len(paths))
     return (

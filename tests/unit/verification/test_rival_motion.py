@@ -15,6 +15,7 @@ from rdstitch.radial_homography import RadialHomography
 from rdstitch.verification.rival_motion import (
     RivalMotion,
     find_rival_motions,
+    is_apart,
     pairs_of_rivals,
     rival_messages,
     rival_share,
@@ -51,6 +52,14 @@ def test_the_place_is_named() -> None:
     assert message.images == PATHS
     for part in ("20%", "(30, 40) of a.png", "b.png", "120 pixels"):
         assert part in message.text
+
+
+@pytest.mark.parametrize(("area", "off", "apart"), [(9, 90.0, False), (20, 51.0, True), (20, 49.0, False)])
+def test_tree_tops_are_not_apart(area: int, off: float, apart: bool) -> None:
+    """A twentieth of the diagonal of a picture."""
+    relation = RadialHomography(np.eye(3), LENS, LENS, np.ones(20, dtype=np.bool_))
+    rival = replace(_rival(area, 100 - area), disagreement=off, relation=relation)
+    assert is_apart([rival, _rival(1, 0)]) is apart
 
 
 def test_a_rival_does_not_spoil_the_lens() -> None:
