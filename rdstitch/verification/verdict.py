@@ -101,7 +101,7 @@ def judge(
     rivals = find_rival_motions(alignment, registration.pairs, threshold)
     parallax = find_parallax(alignment, registration.pairs) if alignment.on_sphere else []
     # What two pictures share of a plane looks alike; where something else moves, it may be that which holds them.
-    least = MIN_AGREEMENT if is_apart(rivals) else _MIN_AGREEMENT
+    least = MIN_AGREEMENT if is_apart(rivals) and not larger else _MIN_AGREEMENT
     suspicions = {**disagreeing, **_unlike(paths, checked, least), **ambiguous}
     decisive = [] if lens_only or resting else _decisive(suspicions, used, len(paths))
     return (

@@ -169,6 +169,8 @@ def test_where_something_moves_otherwise_two_fifths_must_look_alike(
     monkeypatch.setattr(verdict, "find_rival_motions", lambda *_: [rival])
     found = _checked_by(monkeypatch, good, _checked(100, int(100 * share)), _checked(100, 90, pair=(1, 2)))
     assert [message.severity for message in found] == severities
+    compared = judge(good, THRESHOLD, larger=True)  # what moves otherwise was registered as well, and was smaller
+    assert [message.severity for message in compared] == ["warning"]
 
 
 @pytest.mark.parametrize(("ambiguous", "of_all"), [(1, False), (2, True)])
