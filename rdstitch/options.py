@@ -136,6 +136,10 @@ class StitchOptions:
     dry_run: bool = False
 
     def __post_init__(self) -> None:
+        for name in ("cache", "save_camera"):
+            # Text is as good as a path, as it is for pictures.
+            if isinstance(given := getattr(self, name), str):
+                object.__setattr__(self, name, Path(given))
         if self.solver not in SOLVERS:
             raise ArgumentError(f"unknown solver {self.solver!r}; choose one of {', '.join(SOLVERS)}")
         if self.model not in ("auto", *MODELS):
