@@ -8,7 +8,6 @@ on the spot, G maps them to directions, and the canvas is what a projection make
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -175,7 +174,7 @@ def plan_canvas(
     high = np.max([outline.max(axis=0) for outline in placed], axis=0)
     _refuse_absurd(cameras, placed, high - low, scale, called)
     refuse_scale(cameras, high - low)
-    return canvas_between(low, high, linear, placed, near=tuple(near))
+    return replace(canvas_between(low, high, linear, placed), near=tuple(near))
 
 
 def turned_and_scaled(rotate: float, resolution: float) -> FloatArray:
@@ -185,15 +184,13 @@ def turned_and_scaled(rotate: float, resolution: float) -> FloatArray:
     return np.array([[cos, -sin], [sin, cos]])
 
 
-def canvas_between(
-    low: FloatArray, high: FloatArray, linear: FloatArray, outlines: Sequence[FloatArray], **more: Any
-) -> Canvas:
+def canvas_between(low: FloatArray, high: FloatArray, linear: FloatArray, outlines: Sequence[FloatArray]) -> Canvas:
     """The canvas from ``low`` to ``high``, which outlines are counted in after the linear part was applied to them."""
     # The outermost edge is the canvas' edge, half a pixel before the centre of the first pixel.
     size = np.maximum(np.ceil(high - low - 1e-6), 1).astype(int)
     matrix = np.eye(3)
     matrix[:2, :2], matrix[:2, 2] = linear, -low - 0.5
-    return Canvas((int(size[0]), int(size[1])), matrix, tuple(outline - low - 0.5 for outline in outlines), **more)
+    return Canvas((int(size[0]), int(size[1])), matrix, tuple(outline - low - 0.5 for outline in outlines))
 
 
 def _check(cameras: Sequence[Camera], matrices: FloatArray, scale: float, rotate: float, names: Sequence[str]) -> None:

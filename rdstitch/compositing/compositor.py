@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rdstitch.compositing.blocks import BlockRunner
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.panorama_canvas import photo_sphere_xmp
@@ -16,7 +17,7 @@ from rdstitch.compositing.photometric import Exposure
 from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.seam_finder import SeamMap
-from rdstitch.compositing.tiles import BlockRunner, OutputStrip, ShareProgress
+from rdstitch.compositing.tiles import OutputStrip, ShareProgress
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.io.layout import Layout
 from rdstitch.io.metadata import Metadata
@@ -123,7 +124,7 @@ def compose(
     progress : callable, optional
         Called with the share of the work done, 0 to 1.
     elsewhere : callable, optional
-        Computes the pixels, in blocks, in other processes; see :mod:`rdstitch.compositing.tiles`.
+        Computes the pixels, in blocks, in other processes; see :mod:`rdstitch.compositing.blocks`.
 
     Raises
     ------

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -188,7 +188,7 @@ def _lay_out(
     low, high = everything.min(axis=0), everything.max(axis=0)
     if period is not None:
         low[0], high[0] = -period / 2.0, period / 2.0
-    return canvas_between(low, high, linear, placed, projection=projection, period=period)
+    return replace(canvas_between(low, high, linear, placed), projection=projection, period=period)
 
 
 def _outline(camera: Camera, matrix: FloatArray) -> FloatArray:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from rdstitch.compositing.blender import margin
+from rdstitch.compositing.blocks import BlockRunner, strips_of_blocks
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.brightness import estimate_exposure
 from rdstitch.compositing.canvas import Canvas
@@ -19,7 +20,7 @@ from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seam_finder import find_seams
 from rdstitch.compositing.source_images import PictureReader
 from rdstitch.compositing.survey import survey_factor, survey_pictures
-from rdstitch.compositing.tiles import BlockRunner, OutputStrip, ShareProgress, TiledOutput, strips_of_blocks
+from rdstitch.compositing.tiles import OutputStrip, ShareProgress, TiledOutput
 from rdstitch.compositing.warp import LATTICE_STEPS, plan_warps
 from rdstitch.errors import ArgumentError
 from rdstitch.messages import Message

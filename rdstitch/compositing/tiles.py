@@ -1,37 +1,28 @@
-"""A part of a canvas, computed tile by tile, as strips from top to bottom; or in blocks of tiles by workers elsewhere.
-
-A block is composed as a whole output is, of the pictures that reach it, which the worker reads. Its strips go to a
-store that both see, so that neither they nor the pictures travel with tasks and results.
-"""
+"""A part of a canvas, computed tile by tile, as strips from top to bottom."""
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import islice
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.cache import Cache
 from rdstitch.compositing.blender import margin
 from rdstitch.compositing.boxes import Box
-from rdstitch.compositing.image_cache import ShownPart, shown_parts
+from rdstitch.compositing.image_parts import ShownPart, shown_parts
 from rdstitch.compositing.render import Renderer
 from rdstitch.io.layout import STRIP_ROWS
 from rdstitch.opencv_state import one_opencv_thread
-from rdstitch.stored import Stored
 
 OutputStrip = tuple[NDArray[Any], NDArray[np.uint8]]
 """Samples (h, W, C) and alpha (h, W)."""
 
 ShareProgress = Callable[[float], None]
 """Called with the share of the work done, 0 to 1."""
-
-_MIN_TILES = 4  # tiles of a block, a side, at the least: pictures across the edges of blocks are read for each of them
 
 
 @dataclass(frozen=True)
@@ -127,82 +118,3 @@ class TiledOutput:
             return box
 
         return (samples, alpha), run(fill, boxes[::-1] if backwards else boxes)
-
-
-@dataclass(frozen=True, eq=False)
-class BlockStrip:
-    """Some rows of a block.
-
-    Attributes
-    ----------
-    samples : ndarray of shape (h, w, C)
-    alpha : ndarray of shape (h, w), uint8
-    """
-
-    samples: NDArray[Any]
-    alpha: NDArray[np.uint8]
-
-
-@dataclass(frozen=True, eq=False)
-class Block:
-    """A part of an output as a task.
-
-    Attributes
-    ----------
-    tiles : TiledOutput
-        With the pictures that reach it alone.
-    pictures : tuple of int
-        Which of the composite's pictures these are.
-    """
-
-    tiles: TiledOutput
-    pictures: tuple[int, ...]
-
-    def compute(self, store: Cache) -> list[Stored[BlockStrip]]:
-        """Its strips from top to bottom, in the store, which must be this run's own."""
-        kinds, box = (BlockStrip,), self.tiles.box
-        with one_opencv_thread():
-            return [
-                store.stored("blocks", kinds, (box, number), partial(BlockStrip, *strip))
-                for number, strip in enumerate(self.tiles.strips())
-            ]
-
-
-BlockRunner = Callable[[Iterable[Block]], Generator[list[Stored[BlockStrip]]]]
-"""Computes blocks elsewhere: their strips, in the order of the blocks, which are taken as they are needed."""
-
-
-def strips_of_blocks(
-    whole: TiledOutput, run: BlockRunner, progress: ShareProgress | None = None
-) -> Generator[OutputStrip]:
-    """The strips of an output (h, W, ...) that is computed in blocks; the same, bit for bit, as here."""
-    (x0, y0, x1, y1), side = whole.box, _side(whole)
-    lefts = range(x0, x1, side)
-
-    def blocks() -> Iterator[Block]:
-        for top in range(y0, y1, side):
-            for left in lefts:
-                yield Block(*whole.part((left, top, min(left + side, x1), min(top + side, y1))))
-
-    with closing(run(blocks())) as done:
-        for top in range(y0, y1, side):
-            row = []
-            for left in lefts:
-                row.append(next(done))
-                if progress is not None:
-                    below = (min(top + side, y1) - top) * (min(left + side, x1) - x0)
-                    progress(((top - y0) * (x1 - x0) + below) / ((x1 - x0) * (y1 - y0)))
-            for parts in zip(*row, strict=True):
-                strips = [part.load() for part in parts]
-                for part in parts:
-                    part.remove()
-                yield (
-                    np.concatenate([strip.samples for strip in strips], axis=1),
-                    np.concatenate([strip.alpha for strip in strips], axis=1),
-                )
-
-
-def _side(whole: TiledOutput) -> int:
-    """Side of a block, canvas pixels: about that of a picture, so that few blocks need the same one."""
-    sides = [max(warp.box[2] - warp.box[0], warp.box[3] - warp.box[1]) for warp in whole.renderer.warps]
-    return whole.tile_size * max(_MIN_TILES, round(float(np.median(sides)) / whole.tile_size))

@@ -20,7 +20,7 @@ from rdstitch.compositing import (
     compose_to_file,
     plan_composite,
 )
-from rdstitch.compositing.tiles import Block, BlockRunner, BlockStrip
+from rdstitch.compositing.blocks import Block, BlockRunner, BlockStrip
 from rdstitch.executors import in_order
 from rdstitch.export.georeference import Georeference, georeference, has_place, world_file_paths
 from rdstitch.inputs.input_guard import GuardNotes

@@ -10,8 +10,8 @@ import pytest
 
 from rdstitch.cache import Cache
 from rdstitch.compositing import CompositeOptions
+from rdstitch.compositing.blocks import Block, BlockStrip
 from rdstitch.compositing.compositor import compose
-from rdstitch.compositing.tiles import Block, BlockStrip
 from rdstitch.stored import Stored
 from rdstitch.synthetic.rendering import Photometry
 from tests.compositing_scenes import Scene, render

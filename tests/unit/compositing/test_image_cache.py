@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from rdstitch.camera import Camera
-from rdstitch.compositing.image_cache import PictureCache, shown_parts
+from rdstitch.compositing.image_cache import PictureCache
+from rdstitch.compositing.image_parts import shown_parts
 from rdstitch.compositing.placed_picture import PlacedPicture, place_pictures
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.compositing.source_images import NOTHING, PictureReader, prepare_picture
