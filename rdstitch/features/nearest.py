@@ -6,7 +6,7 @@ to be exact, so there is nothing to depend on.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -40,6 +40,10 @@ class DescriptorSimilarity(Protocol):
         """Similarities of single pairs of descriptors, shape (len(rows),)."""
         ...
 
+    def swapped(self) -> Self:
+        """The same with the pictures exchanged."""
+        ...
+
     def distance(self, similarity: NDArray[Any]) -> FloatArray:
         """The distance that a similarity stands for; infinite for ``lowest``."""
         ...
@@ -56,25 +60,38 @@ class Euclidean:
     dtype = np.dtype(np.float32)
     bytes_each = 4
 
-    def __init__(self, descriptors1: NDArray[np.float32], descriptors2: NDArray[np.float32]) -> None:
-        norms = (float(np.linalg.norm(d, axis=1).max(initial=0.0)) for d in (descriptors1, descriptors2))
-        largest = max(norms)
+    def __init__(self, left: NDArray[np.float32], right: NDArray[np.float32]) -> None:
+        self._left, self._right = left, right
+        self._block = np.empty((0, len(right)), np.float32)
+
+    @classmethod
+    def of(cls, descriptors1: NDArray[np.float32], descriptors2: NDArray[np.float32]) -> Self:
+        """Of the descriptors of two pictures."""
+        both = descriptors1, descriptors2
+        largest = float(np.sqrt(max(np.einsum("ij,ij->i", v, v).max(initial=0.0) for v in both)))
         # A power of two, so that integers stay integers.
         scale = np.float32(2.0 ** np.floor(np.log2(_MAX_NORM / largest)) if largest > 0 else 1.0)
-        a, b = np.rint(descriptors1 * scale), np.rint(descriptors2 * scale)
-        half_a, half_b = (np.einsum("ij,ij->i", v, v)[:, None] / np.float32(2.0) for v in (a, b))
-        self._left = np.hstack([a, np.ones_like(half_a), -half_a])
-        self._right = np.ascontiguousarray(np.hstack([b, -half_b, np.ones_like(half_b)]).T)
-        self._block = np.empty((0, self._right.shape[1]), np.float32)
+        sides = []
+        for descriptors, (one, half) in zip(both, ((-2, -1), (-1, -2)), strict=True):
+            side = np.empty((len(descriptors), descriptors.shape[1] + 2), np.float32)
+            values = side[:, :-2]
+            np.rint(np.multiply(descriptors, scale, out=values), out=values)
+            side[:, one] = 1.0
+            side[:, half] = np.einsum("ij,ij->i", values, values) / np.float32(-2.0)
+            sides.append(side)
+        return cls(*sides)
 
     def block(self, rows: NDArray[np.intp]) -> NDArray[Any]:
         # Fresh memory for every block would cost a fifth of the time.
         if len(self._block) < len(rows):
-            self._block = np.empty((len(rows), self._right.shape[1]), np.float32)
-        return np.matmul(self._left[rows], self._right, out=self._block[: len(rows)])
+            self._block = np.empty((len(rows), len(self._right)), np.float32)
+        return np.matmul(self._left[rows], self._right.T, out=self._block[: len(rows)])
 
     def pairs(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[Any]:
-        return np.einsum("ij,ij->i", self._left[rows], self._right.T[columns])  # type: ignore[no-any-return]
+        return np.einsum("ij,ij->i", self._left[rows], self._right[columns])  # type: ignore[no-any-return]
+
+    def swapped(self) -> Self:
+        return type(self)(self._right, self._left)
 
     def distance(self, similarity: NDArray[Any]) -> FloatArray:
         return np.sqrt(-2.0 * similarity.astype(np.float64))
@@ -87,25 +104,32 @@ class Hamming:
     dtype = np.dtype(np.int16)
     bytes_each = 8 + 1 + 2
 
-    def __init__(self, descriptors1: NDArray[np.uint8], descriptors2: NDArray[np.uint8]) -> None:
-        self._bits = 64 * -(-descriptors1.shape[1] // 8)
-        # Equal bits of a and b are the ones of a ^ ~b.
-        self._left = _words(descriptors1)
-        self._right = np.ascontiguousarray(~_words(descriptors2).T)
+    def __init__(self, left: NDArray[np.uint64], right: NDArray[np.uint64]) -> None:
+        self._left, self._right = left, right
+        self._bits = 64 * left.shape[1]
+
+    @classmethod
+    def of(cls, descriptors1: NDArray[np.uint8], descriptors2: NDArray[np.uint8]) -> Self:
+        """Of the descriptors of two pictures."""
+        # Equal bits of a and b are the ones of a ^ ~b, and of ~a ^ b.
+        return cls(_words(descriptors1), ~_words(descriptors2))
 
     def block(self, rows: NDArray[np.intp]) -> NDArray[Any]:
-        shape = (len(rows), self._right.shape[1])
+        shape = (len(rows), len(self._right))
         total, equal, count = np.zeros(shape, np.int16), np.empty(shape, np.uint64), np.empty(shape, np.uint8)
-        for left, right in zip(self._left[rows].T, self._right, strict=True):
+        for left, right in zip(self._left[rows].T, np.ascontiguousarray(self._right.T), strict=True):
             np.bitwise_xor(left[:, None], right, out=equal)
             np.bitwise_count(equal, out=count)
             np.add(total, count, out=total)
         return total
 
     def pairs(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[Any]:
-        equal = np.bitwise_count(self._left[rows] ^ self._right.T[columns])
+        equal = np.bitwise_count(self._left[rows] ^ self._right[columns])
         total: NDArray[np.int16] = equal.sum(axis=1, dtype=np.int16)
         return total
+
+    def swapped(self) -> Self:
+        return type(self)(self._right, self._left)
 
     def distance(self, similarity: NDArray[Any]) -> FloatArray:
         return np.where(similarity == self.lowest, np.inf, self._bits - similarity.astype(np.float64))
@@ -114,8 +138,8 @@ class Hamming:
 def compare(descriptors1: Descriptors, descriptors2: Descriptors) -> DescriptorSimilarity:
     """The similarity that fits the type of the descriptors."""
     if descriptors1.dtype == np.uint8:
-        return Hamming(descriptors1.astype(np.uint8), descriptors2.astype(np.uint8))
-    return Euclidean(descriptors1.astype(np.float32), descriptors2.astype(np.float32))
+        return Hamming.of(descriptors1.astype(np.uint8), descriptors2.astype(np.uint8))
+    return Euclidean.of(*(found.astype(np.float32, copy=False) for found in (descriptors1, descriptors2)))
 
 
 def _words(descriptors: NDArray[np.uint8]) -> NDArray[np.uint64]:
@@ -157,25 +181,37 @@ class Locations:
     def __len__(self) -> int:
         return len(self.layers[0])
 
-    def blocks(self, most: int) -> Iterator[tuple[int, int]]:
-        """Ranges of locations with at most so many keypoints together, or with one location."""
+    @property
+    def order(self) -> NDArray[np.intp]:
+        """The keypoints, layer after layer."""
+        return np.concatenate(self.layers)
+
+    def places(self, chosen: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+        """Where in that order the keypoints of some locations are, ascending ones, a layer each."""
+        places, offset = [], 0
+        for layer in self.layers:
+            own = chosen[: np.searchsorted(chosen, len(layer))]
+            if len(own):
+                places.append(offset + own)
+            offset += len(layer)
+        return places
+
+    def blocks(self, chosen: NDArray[np.intp], most: int) -> Iterator[slice]:
+        """Ranges of some locations, ascending ones, with at most so many keypoints together, or with one location."""
         counts = np.zeros(len(self), dtype=np.intp)
         for layer in self.layers:
             counts[: len(layer)] += 1
-        until = np.cumsum(counts)
+        until = np.append(0, np.cumsum(counts[chosen]))
         start = 0
-        while start < len(self):
-            before = until[start] - counts[start]
-            stop = max(start + 1, int(np.searchsorted(until, before + most, side="right")))
-            yield start, stop
+        while start < len(chosen):
+            stop = max(start + 1, int(np.searchsorted(until, until[start] + most, side="right")) - 1)
+            yield slice(start, stop)
             start = stop
 
-    def rows(self, start: int, stop: int) -> list[NDArray[np.intp]]:
-        """The layers of locations ``start`` to ``stop``."""
-        return [layer[start:stop] for layer in self.layers if len(layer) > start]
 
-
-def mutual_nearest(features1: Features, features2: Features, block_bytes: int) -> tuple[NDArray[np.intp], FloatArray]:
+def mutual_nearest(
+    features1: Features, features2: Features, block_bytes: int, limit: float = np.inf
+) -> tuple[NDArray[np.intp], FloatArray]:
     """Pairs of keypoints that are each other's nearest in descriptor space, and how distinct they are.
 
     Parameters
@@ -184,6 +220,8 @@ def mutual_nearest(features1: Features, features2: Features, block_bytes: int) -
         Of one kind.
     block_bytes : int
         Size of the blocks in which the matrix of similarities is made, bytes; at least one row of it.
+    limit : float
+        Pairs with this ratio or a larger one are left out.
 
     Returns
     -------
@@ -195,30 +233,55 @@ def mutual_nearest(features1: Features, features2: Features, block_bytes: int) -
     if len(features1) == 0 or len(features2) == 0:
         return np.zeros((0, 2), dtype=np.intp), np.zeros(0)
     one, two = Locations.group(features1.points), Locations.group(features2.points)
-    columns = np.concatenate(two.layers)
-    similarity = compare(features1.descriptors, features2.descriptors[columns])
+    similarity = compare(features1.descriptors[one.order], features2.descriptors[two.order])
 
-    nearest = np.empty(len(one), dtype=np.intp)
-    best, second = np.empty((2, len(one)), similarity.dtype)
-    best_of_column, second_of_column = np.full((2, len(two)), similarity.lowest, similarity.dtype)
-    for start, stop in one.blocks(block_bytes // (similarity.bytes_each * len(columns))):
-        layers = one.rows(start, stop)
+    found = _two_best(similarity, one, two, np.arange(len(one)), block_bytes)
+    distinct = np.flatnonzero(found.ratio(similarity) < limit)
+    # Back again only from those that somebody is near to.
+    chosen, place = np.unique(found.nearest[distinct], return_inverse=True)
+    back = _two_best(similarity.swapped(), two, one, chosen, block_bytes).take(place)
+    found = replace(found.take(distinct), second=np.maximum(found.second[distinct], back.second))
+    ratio = found.ratio(similarity)
+    mutual = (back.nearest == distinct) & (ratio < limit)
+    return _nearest_keypoints(similarity, one, two, distinct[mutual], found.nearest[mutual]), ratio[mutual]
+
+
+@dataclass(frozen=True)
+class _TwoBest:
+    """Of each location the nearest one in the other picture, its similarity, and that of the next one; shapes (L,)."""
+
+    nearest: NDArray[np.intp]
+    best: NDArray[Any]
+    second: NDArray[Any]
+
+    def take(self, index: NDArray[np.intp]) -> "_TwoBest":
+        """Of some locations."""
+        return _TwoBest(self.nearest[index], self.best[index], self.second[index])
+
+    def ratio(self, similarity: DescriptorSimilarity) -> FloatArray:
+        """Distance to the nearest over distance to the second nearest; infinite where both are as near."""
+        ratio = np.full(len(self.best), np.inf)
+        distinct = np.flatnonzero(self.best > self.second)
+        nearest, second = (similarity.distance(each[distinct]) for each in (self.best, self.second))
+        ratio[distinct] = nearest / second
+        return ratio
+
+
+def _two_best(
+    similarity: DescriptorSimilarity, one: Locations, two: Locations, chosen: NDArray[np.intp], block_bytes: int
+) -> _TwoBest:
+    """For some locations of picture 1, ascending; the descriptors are in the orders of the locations."""
+    nearest = np.empty(len(chosen), dtype=np.intp)
+    best, second = np.empty((2, len(chosen)), similarity.dtype)
+    for here in one.blocks(chosen, block_bytes // (similarity.bytes_each * len(two.order))):
+        layers = one.places(chosen[here])
         block = _merge(similarity.block(np.concatenate(layers)), layers, two)
-        here = slice(start, stop)
-        _update_two_best(best_of_column, second_of_column, block)
         index = np.arange(len(block))
         nearest[here] = block.argmax(axis=1)
         best[here] = block[index, nearest[here]]
         block[index, nearest[here]] = similarity.lowest
         second[here] = block.max(axis=1)
-
-    # Where several are nearest, the second best equals the best in one direction or in the other.
-    mutual = (best == best_of_column[nearest]) & (best > second) & (best > second_of_column[nearest])
-    location1 = np.flatnonzero(mutual)
-    location2 = nearest[location1]
-    runner_up = np.maximum(second[location1], second_of_column[location2])
-    ratio = similarity.distance(best[location1]) / similarity.distance(runner_up)
-    return _nearest_keypoints(similarity, one, two, location1, location2), ratio
+    return _TwoBest(nearest, best, second)
 
 
 def _merge(block: NDArray[Any], layers: list[NDArray[np.intp]], two: Locations) -> NDArray[Any]:
@@ -236,18 +299,6 @@ def _merge(block: NDArray[Any], layers: list[NDArray[np.intp]], two: Locations) 
     return left
 
 
-def _update_two_best(best: NDArray[Any], second: NDArray[Any], block: NDArray[Any]) -> None:
-    """Let the rows of a block compete for the largest and second largest of each column, in place.
-
-    Row by row, because a row stays in the cache, where NumPy's minimum and maximum are fastest.
-    """
-    loser = np.empty_like(best)
-    for row in block:
-        np.minimum(best, row, out=loser)
-        np.maximum(second, loser, out=second)
-        np.maximum(best, row, out=best)
-
-
 def _nearest_keypoints(
     similarity: DescriptorSimilarity,
     one: Locations,
@@ -258,15 +309,17 @@ def _nearest_keypoints(
     """Of each pair of locations the most alike pair of keypoints, as indices into the features, shape (M, 2)."""
     pairs = np.column_stack([one.layers[0][location1], two.layers[0][location2]])
     best = np.full(len(pairs), similarity.lowest, similarity.dtype)
+    row = 0
     for layer1 in one.layers:
-        offset = 0
+        column = 0
         for layer2 in two.layers:
             both = np.flatnonzero((location1 < len(layer1)) & (location2 < len(layer2)))
-            keypoint1, location = layer1[location1[both]], location2[both]
-            value = similarity.pairs(keypoint1, offset + location)
+            own, other = location1[both], location2[both]
+            value = similarity.pairs(row + own, column + other)
             better = value > best[both]
             chosen = both[better]
             best[chosen] = value[better]
-            pairs[chosen] = np.column_stack([keypoint1[better], layer2[location[better]]])
-            offset += len(layer2)
+            pairs[chosen] = np.column_stack([layer1[own[better]], layer2[other[better]]])
+            column += len(layer2)
+        row += len(layer1)
     return pairs

@@ -4,8 +4,9 @@ The tasks of both stages are batches of pairs, for any :class:`concurrent.future
 and matches, which lie in the cache of the run, and give names back.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from threading import Lock
 from typing import TypeVar
 
@@ -13,7 +14,7 @@ import numpy as np
 
 from rdstitch.cache import Cache
 from rdstitch.camera import Camera
-from rdstitch.features import Correspondences, Matcher, match_overlap
+from rdstitch.features import Correspondences, Features, Matcher, match_overlap
 from rdstitch.matching.feature_store import StoredFeatures, StoredMatches
 from rdstitch.matching.links import Link
 from rdstitch.matching.options import PairOptions
@@ -101,19 +102,26 @@ class MatchingTask:
 
 def match_pairs(task: MatchingTask) -> list[StoredMatches]:
     """Match the features of every pair of a task."""
-    return [_match_pair(one, two, known, task) for (one, two), known in zip(task.features, task.known, strict=True)]
+    # Pairs that follow one another have a picture in common.
+    load = lru_cache(maxsize=2)(StoredFeatures.load)
+    pairs = zip(task.features, task.known, strict=True)
+    return [_match_pair(one, two, known, task, load) for (one, two), known in pairs]
 
 
 def _match_pair(
-    one: StoredFeatures, two: StoredFeatures, known: StoredMatches | None, task: MatchingTask
+    one: StoredFeatures,
+    two: StoredFeatures,
+    known: StoredMatches | None,
+    task: MatchingTask,
+    load: Callable[[StoredFeatures], Features],
 ) -> StoredMatches:
     def compute() -> Correspondences:
         if known is None:
-            return task.matcher(one.load(), two.load())
-        return match_overlap(task.matcher, one.load(), two.load(), known.load())
+            return task.matcher(load(one), load(two))
+        return match_overlap(task.matcher, load(one), load(two), known.load())
 
     def valid(found: Correspondences) -> bool:
-        features1, features2 = one.load(), two.load()
+        features1, features2 = load(one), load(two)
         own = found.of(features1, features2, found.indices, found.ratio)
         return np.array_equal(own.points1, found.points1) and np.array_equal(own.points2, found.points2)
 

@@ -1,6 +1,7 @@
 """Matching gives what the definition says, whatever the blocks."""
 
 from dataclasses import replace
+from itertools import product
 
 import cv2
 import numpy as np
@@ -181,14 +182,17 @@ def test_blocks_hold_as_many_keypoints_as_they_may() -> None:
     rng = np.random.default_rng(4)
     points = np.repeat(rng.uniform(0, 100, (40, 2)), rng.integers(1, 6, 40), axis=0)
     locations = Locations.group(points)
-    for most in (0, 1, 7, 30, 1000):
-        blocks = list(locations.blocks(most))
-        assert [start for start, _ in blocks] == [0, *(stop for _, stop in blocks[:-1])]
-        assert blocks[-1][1] == len(locations) == 40
-        sizes = [sum(map(len, locations.rows(start, stop))) for start, stop in blocks]
-        assert sum(sizes) == len(points)
-        assert all(size <= most or stop == start + 1 for size, (start, stop) in zip(sizes, blocks, strict=True))
+    for chosen, most in product((np.arange(40), np.arange(3, 40, 4)), (0, 1, 7, 30, 1000)):
+        blocks = list(locations.blocks(chosen, most))
+        assert [here.start for here in blocks] == [0, *(here.stop for here in blocks[:-1])]
+        assert blocks[-1].stop == len(chosen)
+        held = [np.concatenate(locations.places(chosen[here])) for here in blocks]
+        places = np.concatenate(held)
+        of_chosen = (points[locations.order][:, None] == points[locations.layers[0][chosen]]).all(axis=2).any(axis=1)
+        assert sorted(places.tolist()) == np.flatnonzero(of_chosen).tolist()
+        assert all(len(own) <= most or here.stop == here.start + 1 for own, here in zip(held, blocks, strict=True))
         # No block could take the next location, too.
-        for (start, stop), size in zip(blocks[:-1], sizes[:-1], strict=True):
-            assert size + len(locations.rows(stop, stop + 1)) > most
-            assert stop > start
+        for own, here in zip(held[:-1], blocks[:-1], strict=True):
+            following = locations.places(chosen[here.stop : here.stop + 1])
+            assert len(own) + len(following) > most
+            assert here.stop > here.start
