@@ -7,13 +7,12 @@ adjustment are both built on.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import Camera
 from rdstitch.division_model import distort, divisor, divisor_slope
 from rdstitch.planar_motion import PlanarMotion
@@ -99,8 +98,10 @@ class TransferJacobian:
     ----------
     points : ndarray of shape (N, 2)
         Where the points of picture 1 are measured in picture 2.
-    by_homography : ndarray of shape (N, 2, 9)
-        By the entries of H, row by row.
+    by_image : ndarray of shape (2, 3, N)
+        By ``z = H p``.
+    lifted : ndarray of shape (3, N)
+        ``p``.
     by_point : ndarray of shape (N, 2, 2)
         By the point in picture 1.
     by_divisor, by_own_divisor : ndarray of shape (N, 2)
@@ -110,23 +111,32 @@ class TransferJacobian:
     """
 
     points: FloatArray
-    by_homography: FloatArray
+    by_image: FloatArray
+    lifted: FloatArray
     by_point: FloatArray
     by_divisor: FloatArray
     by_own_divisor: FloatArray
     radius2: FloatArray
     own_radius2: FloatArray
 
-    @cached_property
-    def by_lens(self) -> FloatArray:
-        """By :data:`rdstitch.camera.LENS_PARAMETERS`, shape (N, 2, 5); the centre shifts in both pictures."""
-        coefficients = [self._by_coefficient(power) for power in (1, 2, 3)]
-        return side_by_side(*coefficients, np.eye(2) - self.by_point)
+    @property
+    def by_homography(self) -> FloatArray:
+        """By the entries of H, row by row, shape (N, 2, 9)."""
+        entries: FloatArray = self.by_image[:, :, None] * self.lifted
+        return entries.reshape(2, 9, -1).transpose(2, 0, 1)
 
-    def _by_coefficient(self, power: int) -> FloatArray:
-        """By the coefficient of that power of the squared radius, shape (N, 2, 1)."""
-        own = self.by_own_divisor.T * self.own_radius2**power
-        return (self.by_divisor.T * self.radius2**power + own).T[:, :, None]
+    def by_lens(self, free: BoolArray) -> FloatArray:
+        """By those of :data:`rdstitch.camera.LENS_PARAMETERS` that are ``free`` (5,), shape (2, K, N).
+
+        The centre shifts in both pictures.
+        """
+        columns = [
+            self.by_divisor.T * self.radius2**power + self.by_own_divisor.T * self.own_radius2**power
+            for power in (1, 2, 3)
+            if free[power - 1]
+        ]
+        columns += [np.eye(2)[axis][:, None] - self.by_point[:, :, axis].T for axis in (0, 1) if free[3 + axis]]
+        return np.stack(columns, axis=1) if columns else np.empty((2, 0, len(self.points)))
 
 
 def transfer_jacobian(
@@ -169,24 +179,12 @@ def transfer_jacobian(
     d_by_z[0, 0] += scale
     d_by_z[1, 1] += scale
     np.multiply(d, -1.0 / (stretch * w), out=d_by_z[:, 2])
-    by_homography = (d_by_z[:, :, None] * lifted).reshape(2, 9, -1)
 
     by_lifted = np.einsum(f"ikn,kj{each}->ijn", d_by_z, h)
     along_third = by_lifted[:, 2]
     slope = lifted[:2] * (2.0 * divisor_slope(r2, distortion, higher))
-    by_point = by_lifted[:, :2] + along_third[:, None] * slope
-    by_homography, by_point = (found.transpose(2, 0, 1) for found in (by_homography, by_point))
-    return TransferJacobian(d.T, by_homography, by_point, along_third.T, (d / (g * stretch)).T, r2, rho2)
-
-
-def side_by_side(*derivatives: FloatArray) -> FloatArray:
-    """Derivatives (N, 2, K) by several things as those by all of them, with the points last in memory."""
-    return np.concatenate([part.transpose(1, 2, 0) for part in derivatives], axis=1).transpose(2, 0, 1)
-
-
-def points_last(values: FloatArray) -> FloatArray:
-    """Values (N, 2, K) as contiguous (2, K, N): no copy of what was made in that order."""
-    return np.ascontiguousarray(values.transpose(1, 2, 0))
+    by_point = (by_lifted[:, :2] + along_third[:, None] * slope).transpose(2, 0, 1)
+    return TransferJacobian(d.T, d_by_z, lifted, by_point, along_third.T, (d / (g * stretch)).T, r2, rho2)
 
 
 def measurement_whitening(by_point: FloatArray) -> FloatArray:
@@ -218,11 +216,11 @@ def measurement_whitening(by_point: FloatArray) -> FloatArray:
 
 
 def whiten(whitening: FloatArray, values: FloatArray) -> FloatArray:
-    """``W v`` of values (N, 2, K), W upper triangular (N, 2, 2); written out, several times faster than matmul."""
+    """``W v`` of values (2, ..., N), W upper triangular (N, 2, 2); written out, several times faster than matmul."""
     result = np.empty_like(values)
-    np.multiply(whitening[:, 0, :1], values[:, 0], out=result[:, 0])
-    result[:, 0] += whitening[:, 0, 1:] * values[:, 1]
-    np.multiply(whitening[:, 1, 1:], values[:, 1], out=result[:, 1])
+    np.multiply(whitening[:, 0, 0], values[0], out=result[0])
+    result[0] += whitening[:, 0, 1] * values[1]
+    np.multiply(whitening[:, 1, 1], values[1], out=result[1])
     return result
 
 

@@ -10,9 +10,9 @@ from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.lens_description import radius_std
 from rdstitch.alignment.lens_selection import CENTER, ENOUGH_PICTURES, WORTH_SAYING, LensChoice
+from rdstitch.alignment.link_equations import whitened_errors
 from rdstitch.alignment.model_selection import ModelChoice
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
-from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.planarity import coherence, judge_relief
 from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPoses, ShapeTest
 from rdstitch.alignment.rotation_frame import levelled
@@ -84,7 +84,11 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
     names = (*fit.model.shared_names, *(n for n, free in zip(LENS_PARAMETERS, problem.free_lens, strict=True) if free))
     focal = float(np.exp(shared[-1])) if fit.model.shared_names else None
     lens_covariance = _lens_covariance(names, covariance)
-    cameras = tuple(_adjusted_camera(found, camera, lens, lens_covariance, focal) for camera in found.cameras)
+    # Most pictures are of one camera.
+    adjusted_cameras = {
+        c: _adjusted_camera(found, c, lens, lens_covariance, focal) for c in dict.fromkeys(found.cameras)
+    }
+    cameras = tuple(adjusted_cameras[camera] for camera in found.cameras)
     own = cameras[int(found.pictures[problem.reference])]
     groups = _groups(found)
     observations = problem.observations

@@ -10,14 +10,9 @@ from typing import Self
 
 import numpy as np
 
+from rdstitch.alignment.link_equations import LinkEquations, folds, link_equations, squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import ModelMatrices, MotionModel, inverses
-from rdstitch.alignment.normal_equations import (
-    LinkEquations,
-    SparseNormalEquations,
-    chain,
-    folds,
-    link_equations,
-)
+from rdstitch.alignment.normal_equations import SparseNormalEquations, chain
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.pose_blocks import PoseBlocks
 from rdstitch.arrays import BoolArray, FloatArray
@@ -187,14 +182,14 @@ class BundleAdjuster:
             Of the robust loss at the start, pixels; the scatter of the first errors decides if not given. It narrows to
             what the scatter of the errors calls for.
         """
-        sigma = self._sigma(self._evaluate(start, 1.0, 1.0))
+        sigma = self._sigma(self.squared(start))
         wide = max(width or 0.0, ALIGNMENT_WIDTH * sigma)
         parameters, used, converged = start, 0, False
         while used < self.max_iterations:
             last = wide <= ALIGNMENT_WIDTH * sigma * 1.05
             state, iterations, converged = self._descend(parameters, sigma, wide, 12 if last else 4)
             parameters, used = state.parameters, used + iterations
-            sigma, previous = self._sigma(state), sigma
+            sigma, previous = self._sigma(state.equations.squared), sigma
             wide = max(wide / 3.0, ALIGNMENT_WIDTH * sigma)
             if last and converged and abs(sigma - previous) <= 0.02 * previous:
                 break
@@ -203,8 +198,8 @@ class BundleAdjuster:
 
     def squared(self, parameters: Parameters) -> FloatArray:
         """``|r|²`` of each correspondence (M,), px², whitened; inf where it cannot be transferred."""
-        squared: FloatArray = self._evaluate(parameters, 1.0, 1.0).equations.squared
-        return squared
+        homographies = self._of_links(self.model.matrices(parameters.poses, parameters.shared))
+        return squared_lengths(whitened_errors(self.observations, homographies, parameters.lens))
 
     def normal_equations(self, adjusted: BundleAdjustmentResult, width: float | None = None) -> SparseNormalEquations:
         """At a solution, priors included; the ``width`` of the loss, pixels, follows the errors if not given."""
@@ -243,7 +238,7 @@ class BundleAdjuster:
         """Errors, cost and linearization at some parameters."""
         matrices = self.model.matrices(parameters.poses, parameters.shared)
         homographies = self._of_links(matrices)
-        equations = link_equations(self.observations, homographies, parameters.lens, width)
+        equations = link_equations(self.observations, homographies, parameters.lens, width, self.free.lens)
         cost = float(robust_cost(equations.squared, width).sum()) * self.weight(sigma)
         return _State(parameters, matrices, homographies, equations, cost + self._prior_cost(parameters))
 
@@ -264,8 +259,8 @@ class BundleAdjuster:
         """The pattern of the normal matrix."""
         return PoseBlocks.of(self.observations, self.free.poses)
 
-    def _sigma(self, state: _State) -> float:
-        return sigma_of(state.equations.squared[self.observations.scale_inliers_mask])
+    def _sigma(self, squared: FloatArray) -> float:
+        return sigma_of(squared[self.observations.scale_inliers_mask])
 
     def weight(self, sigma: float) -> float:
         """Of squared errors of this scatter: one over their variance, as far as they are independent."""
@@ -289,7 +284,6 @@ class BundleAdjuster:
             state.matrices,
             state.homographies,
             self._blocks,
-            self.free.lens,
             self.weight(sigma),
         )
         p, free, lens = self.priors, self.free.poses, self.free.lens

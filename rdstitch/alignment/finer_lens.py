@@ -14,7 +14,7 @@ from rdstitch.alignment.lens_selection import (
     free_parameters,
     has_plausible_center,
 )
-from rdstitch.alignment.normal_equations import whitened_errors
+from rdstitch.alignment.link_equations import whitened_errors
 from rdstitch.alignment.planarity import coherence
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 

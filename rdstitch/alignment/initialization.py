@@ -15,8 +15,8 @@ from rdstitch.alignment.bundle_adjustment import (
     Parameters,
     Priors,
 )
+from rdstitch.alignment.link_equations import split_lens
 from rdstitch.alignment.motion_models import MotionModel
-from rdstitch.alignment.normal_equations import split_lens
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.division_model import undistort

@@ -17,8 +17,8 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import homography_apart
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.camera_priors import CameraPriors
+from rdstitch.alignment.link_equations import whitened_errors
 from rdstitch.alignment.noise_model import NoiseModel
-from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.planarity import coherence
 from rdstitch.arrays import BoolArray, FloatArray, IntArray

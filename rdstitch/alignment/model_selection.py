@@ -18,6 +18,7 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.lens_selection import has_plausible_center
+from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import (
     HOMOGRAPHY,
     LOG_HEIGHT,
@@ -28,8 +29,7 @@ from rdstitch.alignment.motion_models import (
     MotionModel,
     PlanarModel,
 )
-from rdstitch.alignment.noise_model import EXACTNESS, NoiseModel, squared_lengths
-from rdstitch.alignment.normal_equations import whitened_errors
+from rdstitch.alignment.noise_model import EXACTNESS, NoiseModel
 from rdstitch.alignment.planarity import LARGE_RELIEF
 from rdstitch.arrays import BoolArray
 

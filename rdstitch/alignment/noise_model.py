@@ -11,6 +11,7 @@ import numpy as np
 
 from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.cycle_consistency import misfitting_links
+from rdstitch.alignment.link_equations import squared_lengths
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.planarity import coherence
 from rdstitch.arrays import BoolArray, FloatArray
@@ -73,9 +74,3 @@ class NoiseModel:
         ratio = np.minimum(squared[self.counted], _MAX_ERROR2) / self.noise**2
         misfit: FloatArray = ALIGNMENT_WIDTH**2 * np.log1p(ratio / ALIGNMENT_WIDTH**2) / self.overdispersion
         return misfit
-
-
-def squared_lengths(errors: FloatArray) -> FloatArray:
-    """``|r|²`` (M,) of errors (M, 2); inf where there is no transfer."""
-    squared: FloatArray = np.nan_to_num(np.einsum("mi,mi->m", errors, errors), nan=np.inf)
-    return squared

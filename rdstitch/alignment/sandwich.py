@@ -15,8 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult
+from rdstitch.alignment.link_equations import whitened_errors
 from rdstitch.alignment.motion_models import inverses
-from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.planarity import coherence
 from rdstitch.arrays import FloatArray, IntArray

@@ -23,9 +23,9 @@ from scipy.linalg import block_diag
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, Parameters
 from rdstitch.alignment.lens_selection import CENTER
+from rdstitch.alignment.link_equations import whitened_errors
 from rdstitch.alignment.motion_models import inverses
 from rdstitch.alignment.noise_model import EXACTNESS
-from rdstitch.alignment.normal_equations import whitened_errors
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import ShapeTest
 from rdstitch.alignment.unmodelled import CROPPED, Effect, cropping_effects, mapped, unmodelled_effects

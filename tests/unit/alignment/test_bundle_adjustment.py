@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters, Priors, sigma_of
+from rdstitch.alignment.link_equations import link_equations
 from rdstitch.alignment.motion_models import HOMOGRAPHY, PLANAR_MODELS, RIGID, TILTING, MotionModel
-from rdstitch.alignment.normal_equations import chain, link_equations
+from rdstitch.alignment.normal_equations import chain
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.pose_blocks import PoseBlocks
+from rdstitch.radial_homography import transfer_jacobian
 from rdstitch.robust.loss import robust_cost, robust_weight
 from tests.alignment_scenes import Scene, grid, jittered, scene
 
@@ -46,19 +48,17 @@ def test_gradient_and_curvature_of_the_whole_cost(model: MotionModel, width: flo
         matrices = model.matrices(parameters.poses, parameters.shared).matrices
         return np.asarray(matrices[observations.image2] @ np.linalg.inv(matrices)[observations.image1])
 
-    equations = link_equations(observations, homographies(start), start.lens, width)
+    equations = link_equations(observations, homographies(start), start.lens, width, FREE_LENS)
     free = np.ones((count, model.pose_size), dtype=np.bool_)
     free[0] = False
     matrices = model.matrices(start.poses, start.shared)
-    normal = chain(
-        equations, observations, matrices, homographies(start), PoseBlocks.of(observations, free), FREE_LENS, 2.0
-    )
+    normal = chain(equations, observations, matrices, homographies(start), PoseBlocks.of(observations, free), 2.0)
 
     def cost(poses_step: np.ndarray, shared_step: np.ndarray) -> float:
         step = np.zeros((count, model.pose_size))
         step[free] = poses_step
         moved = start.retract(model, step, shared_step, FREE_LENS)
-        there = link_equations(observations, homographies(moved), moved.lens, width)
+        there = link_equations(observations, homographies(moved), moved.lens, width, FREE_LENS)
         squared = there.squared_with(equations.whitening)
         return 2.0 * float(robust_cost(squared, width).sum())
 
@@ -77,6 +77,24 @@ def test_gradient_and_curvature_of_the_whole_cost(model: MotionModel, width: flo
     np.testing.assert_allclose(np.concatenate(normal.solve(1e-3)), np.linalg.solve(damped, right), rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("free", [ONE_LENS, FREE_LENS, np.zeros(5, dtype=np.bool_)], ids=["one", "all", "none"])
+def test_sums_of_a_link_are_those_of_its_jacobian(free: np.ndarray) -> None:
+    truth = _scene()
+    seen, lens, width = Observations.from_links(truth.links[:1], truth.cameras), np.array([-0.2, 0.05, 0, 0.01, 0]), 9.0
+    behind = np.array([[1.0, 0.0, 0.1], [0.0, 1.0, 0.0], [-2.0, 0.0, 1.0]])  # some of the correspondences
+    found = link_equations(seen, behind[None], lens, width, free)
+    by = transfer_jacobian(behind, lens[0], seen.points1 - lens[3:], (0.05, 0.0))
+    jacobian = np.concatenate([by.by_homography, by.by_lens(free).transpose(2, 0, 1)], axis=2)
+    there = np.isfinite(found.squared)
+    assert 0 < there.sum() < len(there)
+    jacobian, error = (found.whitening @ jacobian)[there], (found.whitening @ found.error[:, :, None])[there, :, 0]
+    weight = robust_weight(found.squared[there], width)
+    expected = np.einsum("m,mik,mil->kl", weight, jacobian, jacobian)
+    np.testing.assert_allclose(found.gram[0], expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+    expected = np.einsum("m,mik,mi->k", weight, jacobian, error)
+    np.testing.assert_allclose(found.gradient[0], expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+
+
 def test_information_on_shared_parameters_is_what_elimination_leaves() -> None:
     truth = _scene()
     observations = Observations.from_links(truth.links, truth.cameras)
@@ -86,12 +104,11 @@ def test_information_on_shared_parameters_is_what_elimination_leaves() -> None:
     free = np.ones((len(truth.cameras), 6), dtype=np.bool_)
     free[0] = ~TILTING.gauge
     normal = chain(
-        link_equations(observations, h, start.lens, 5.0),
+        link_equations(observations, h, start.lens, 5.0, ONE_LENS),
         observations,
         matrices,
         h,
         PoseBlocks.of(observations, free),
-        ONE_LENS,
         1.0,
     )
     normal = normal.with_priors(np.full(int(free.sum()), 1e4), np.zeros(int(free.sum())), np.eye(4), np.zeros(4))

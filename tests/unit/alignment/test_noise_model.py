@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from rdstitch.alignment.noise_model import EXACTNESS, NoiseModel, squared_lengths
+from rdstitch.alignment.link_equations import squared_lengths
+from rdstitch.alignment.noise_model import EXACTNESS, NoiseModel
 from tests.alignment_stubs import independent_errors, observations
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rdstitch.alignment.normal_equations import link_equations
+from rdstitch.alignment.link_equations import link_equations
 from rdstitch.alignment.observations import Observations
 from tests.alignment_scenes import ring, robot_path, scene
 
@@ -38,10 +38,10 @@ def test_sums_of_a_link_do_not_depend_on_the_other_links() -> None:
     """Whether these have as many correspondences or not."""
     observations = _observations([30, 12, 30, 0, 7])
     homographies = np.eye(3) + np.random.default_rng(2).normal(0.0, 0.01, (5, 3, 3))
-    lens = np.array([-0.2, 0.0, 0.0, 0.0, 0.0])
-    together = link_equations(observations, homographies, lens, 20.0)
+    lens, free = np.array([-0.2, 0.0, 0.0, 0.0, 0.0]), np.array([True, False, False, True, True])
+    together = link_equations(observations, homographies, lens, 20.0, free)
     for link in range(5):
-        alone = link_equations(observations.subset(np.array([link])), homographies[[link]], lens, 20.0)
+        alone = link_equations(observations.subset(np.array([link])), homographies[[link]], lens, 20.0, free)
         np.testing.assert_allclose(together.gram[link], alone.gram[0], rtol=1e-12, atol=1e-9)
         np.testing.assert_allclose(together.gradient[link], alone.gradient[0], rtol=1e-12, atol=1e-9)
     assert (together.gram[3] == 0.0).all()

@@ -1,0 +1,209 @@
+"""Transfer errors of the adjustment, linearized: one small Gram matrix per link.
+
+A correspondence depends on the homography of its link (9 entries) and the lens (up to 5 parameters) only. So all it
+contributes is summed up in a small matrix per link, whatever the motion model.
+
+With ``z = H p`` the derivative by H is ``(∂d/∂z) ⊗ p``. So products of the derivatives by z and by the lens, times
+products of the coordinates of p, are all that is summed: no Jacobian is formed.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.alignment.observations import Observations
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.division_model import is_one_to_one
+from rdstitch.radial_homography import TransferJacobian, measurement_whitening, transfer_jacobian, whiten
+from rdstitch.robust.loss import robust_weight
+
+_CHUNK = 4096
+"""Correspondences linearized at a time: what stays in cache."""
+
+
+@dataclass(frozen=True)
+class LinkEquations:
+    """Weighted, linearized transfer errors of all correspondences, summed per link.
+
+    Attributes
+    ----------
+    gram : ndarray of shape (L, 9 + K, 9 + K)
+        ``Σ w J'J`` by the entries of H and the K free parameters of the lens.
+    gradient : ndarray of shape (L, 9 + K)
+        ``Σ w J'r``.
+    squared : ndarray of shape (M,)
+        ``|r|²`` of each correspondence, px², whitened; inf where it cannot be transferred.
+    whitening : ndarray of shape (M, 2, 2)
+        What makes r of an error in normalized coordinates.
+    error : ndarray of shape (M, 2)
+        That error; not finite where it cannot be transferred.
+    """
+
+    gram: FloatArray
+    gradient: FloatArray
+    squared: FloatArray
+    whitening: FloatArray
+    error: FloatArray
+
+    @np.errstate(all="ignore")
+    def squared_with(self, whitening: FloatArray) -> FloatArray:
+        """``|r|²`` (M,) with a whitening that was computed elsewhere, px²; inf where there is no transfer.
+
+        Between one linearization and the next the whitening must stay what it is: otherwise the errors could be made
+        smaller by a larger derivative, against the gradient, which takes the whitening for constant.
+        """
+        return squared_lengths(whiten(whitening, self.error.T).T)
+
+
+def split_lens(lens: FloatArray) -> tuple[float, tuple[float, ...], FloatArray]:
+    """λ; μ and ν, nothing where both are 0; and the distortion centre (2,), of :data:`LENS_PARAMETERS` (5,)."""
+    distortion, *higher = lens[:3].tolist()
+    return distortion, tuple(higher) if any(higher) else (), lens[3:]
+
+
+def folds(lens: FloatArray, reach: float = 1.0) -> bool:
+    """Whether a lens with more than λ would show a place twice, out to a radius in half diagonals."""
+    distortion, higher, center = split_lens(lens)
+    return bool(higher) and not is_one_to_one(reach + float(np.linalg.norm(center)), (distortion, *higher))
+
+
+@np.errstate(all="ignore")  # a long step may give homographies that are not finite
+def link_equations(
+    observations: Observations, homographies: FloatArray, lens: FloatArray, width: float, free_lens: BoolArray
+) -> LinkEquations:
+    """Linearize all transfer errors.
+
+    Parameters
+    ----------
+    observations : Observations
+    homographies : ndarray of shape (L, 3, 3)
+        Of each link, from its first to its second picture.
+    lens : ndarray of shape (5,)
+        λ, μ, ν and the shift of the distortion centre, in the half-diagonal frame.
+    width : float
+        Of :func:`robust_weight`, pixels.
+    free_lens : ndarray of shape (5,), bool
+        Parameters of the lens to differentiate by.
+    """
+    count, total = len(observations.points1), 10 + int(free_lens.sum())
+    sums = np.zeros((len(observations), total, total))
+    squared, error, whitening = np.empty(count), np.empty((2, count)), np.empty((2, 2, count))
+    for first, last in _chunks(observations.start):
+        rows = slice(observations.start[first], observations.start[last])
+        there = _transferred(observations, homographies, lens, first, last)
+        squared[rows], error[:, rows] = squared_lengths(there.whitened.T), there.error
+        whitening[:, :, rows] = there.whitening.transpose(1, 2, 0)
+        edges = observations.start[first : last + 1] - observations.start[first]
+        sums[first:last] = _link_sums(there, np.sqrt(robust_weight(squared[rows], width)), free_lens, edges)
+    return LinkEquations(sums[:, :-1, :-1], sums[:, :-1, -1], squared, whitening.transpose(2, 0, 1), error.T)
+
+
+def whitened_errors(observations: Observations, homographies: FloatArray, lens: FloatArray) -> FloatArray:
+    """Whitened transfer errors of all correspondences, pixels, shape (M, 2); NaN where there is none."""
+    chunks = _chunks(observations.start)
+    errors = [_transferred(observations, homographies, lens, *chunk).whitened for chunk in chunks]
+    return np.concatenate([np.empty((2, 0)), *errors], axis=1).T
+
+
+def squared_lengths(errors: FloatArray) -> FloatArray:
+    """``|r|²`` (M,) of errors (M, 2); inf where there is no transfer."""
+    squared: FloatArray = errors[:, 0] ** 2 + errors[:, 1] ** 2
+    squared[np.isnan(squared)] = np.inf
+    return squared
+
+
+def _chunks(start: NDArray[np.intp]) -> list[tuple[int, int]]:
+    """Ranges of links with about :data:`_CHUNK` correspondences each."""
+    edges = np.unique(np.searchsorted(start, np.arange(0, start[-1] + _CHUNK, _CHUNK)).clip(max=len(start) - 1))
+    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+
+
+@dataclass(frozen=True)
+class _Transferred:
+    """Correspondences of some links.
+
+    Attributes
+    ----------
+    derivatives : TransferJacobian
+    whitening : ndarray of shape (m, 2, 2)
+    error : ndarray of shape (2, m)
+        Half diagonals.
+    whitened : ndarray of shape (2, m)
+        Pixels.
+    """
+
+    derivatives: TransferJacobian
+    whitening: FloatArray
+    error: FloatArray
+    whitened: FloatArray
+
+
+@np.errstate(all="ignore")
+def _transferred(
+    observations: Observations, homographies: FloatArray, lens: FloatArray, first: int, last: int
+) -> _Transferred:
+    """The correspondences of links ``first`` to ``last``, transferred."""
+    rows = slice(observations.start[first], observations.start[last])
+    counts = np.diff(observations.start[first : last + 1])
+    scale1 = np.repeat(observations.scale1[first:last], counts)[:, None, None]
+    scale2 = np.repeat(observations.scale2[first:last], counts)[:, None, None]
+    homography = np.repeat(homographies[first:last], counts, axis=0)
+    distortion, higher, center = split_lens(lens)
+    found = transfer_jacobian(homography, distortion, observations.points1[rows] - center, higher)
+    whitening = measurement_whitening(found.by_point * (scale2 / scale1)) * scale2
+    error = (found.points - (observations.points2[rows] - center)).T
+    return _Transferred(found, whitening, error, whiten(whitening, error))
+
+
+def _link_sums(there: _Transferred, root: FloatArray, free_lens: BoolArray, edges: NDArray[np.intp]) -> FloatArray:
+    """``[J r]'[J r]`` (l, 10 + K, 10 + K) of links, whose correspondences lie between the edges (l + 1,).
+
+    ``root`` (m,) is what a correspondence is multiplied by.
+    """
+    found = there.derivatives
+    own = np.concatenate([found.by_image, found.by_lens(free_lens), there.error[:, None]], axis=1)
+    own = whiten(there.whitening * root[:, None, None], own)
+    products = _products(own)
+    monomials = _products(np.concatenate([found.lifted, np.ones((1, len(root)))])[None])
+    if len(lost := np.flatnonzero(root == 0.0)):
+        products[:, lost], monomials[:, lost] = 0.0, 0.0
+    sums = np.empty((len(edges) - 1, len(products), len(monomials)))
+    for link, (start, stop) in enumerate(pairwise(edges.tolist())):
+        np.matmul(products[:, start:stop], monomials[:, start:stop].T, out=sums[link])
+    return sums[:, *_entries(own.shape[1] - 3)]
+
+
+def _products(values: FloatArray) -> FloatArray:
+    """Products (P, m) of values (axes, V, m), each with itself and those after it, summed over the axes."""
+    _, count, length = values.shape
+    products = np.empty((count * (count + 1) // 2, length))
+    start = 0
+    for k in range(count):
+        own = products[start : start + count - k]
+        np.multiply(values[0, k], values[0, k:], out=own)
+        for others in values[1:]:
+            own += others[k] * others[k:]
+        start += count - k
+    return products
+
+
+@cache
+def _entries(others: int) -> tuple[IntArray, IntArray]:
+    """Where the products of any two columns of ``[J r]`` are, two arrays (9 + others, 9 + others).
+
+    A column is the derivative by one of z times one coordinate of p; of the others, the lens and the error, times 1.
+    """
+    own, lifted = np.divmod(np.arange(9), 3)
+    own, lifted = np.append(own, 3 + np.arange(others)), np.append(lifted, np.full(others, 3))
+    return _number(3 + others)[np.ix_(own, own)], _number(4)[np.ix_(lifted, lifted)]
+
+
+def _number(count: int) -> IntArray:
+    """Which of :func:`_products` is that of two of so many values, (count, count)."""
+    number = np.empty((count, count), dtype=np.intp)
+    upper = np.triu_indices(count)
+    number[upper] = number.T[upper] = np.arange(len(upper[0]))
+    return number
