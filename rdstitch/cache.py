@@ -187,8 +187,13 @@ class Cache:
             return os.urandom(16).hex()
 
     def digest(self, value: Any) -> str:
-        """What stands for a large value in the inputs of several results; empty without a cache."""
-        return "" if self.folder is None else digest(value)
+        """What stands for a large value in the inputs of several results; empty without a cache.
+
+        Items of a tuple are packed one after the other, so that they are not all in memory twice.
+        """
+        if self.folder is None:
+            return ""
+        return digest(tuple(map(digest, value)) if isinstance(value, tuple) else value)
 
 
 @cache

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 _BLOCK = 2**18  # bytes of a file that are fetched at a time where only its header is wanted
+_READ_AT_ONCE = 2**22  # bytes
 # Two letters or more: one is a drive.
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 _LOCAL = ("file", "local")  # schemes of what is on this machine
@@ -163,8 +164,12 @@ def read_limited(path: str | Path, most: int, *, regular: bool = True) -> bytes:
     OSError
         When it cannot be opened, is no regular file, or is larger.
     """
+    left, blocks = most + 1, []
     with open_regular(path) if regular else Path(path).open("rb") as stream:
-        data = stream.read(most + 1)
-    if len(data) > most:
+        # What a stream is asked for is allocated, however small the file.
+        while left > 0 and (block := stream.read(min(left, _READ_AT_ONCE))):
+            left -= len(block)
+            blocks.append(block)
+    if left <= 0:
         raise OSError(errno.EFBIG, "too large to be such a file", str(path))
-    return data
+    return b"".join(blocks)

@@ -24,6 +24,7 @@ from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.messages import Message, names_of
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.working_size import at_working_size
+from rdstitch.process_memory import return_freed_memory
 
 _CLOSURE_ROUNDS = 2
 
@@ -109,6 +110,7 @@ class Aligner:
         RegistrationError
             When no pair was registered.
         """
+        return_freed_memory()
         links = tuple(pair.link() for pair in pairs if pair.relation)
         if not links:
             raise RegistrationError(_no_overlap(self.paths, pairs))

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -160,3 +161,12 @@ def test_the_store_of_a_killed_run_is_removed_by_the_next(tmp_path: Path, monkey
     assert not left.exists()
     assert kept.folder is not None
     assert kept.folder.exists()
+
+
+def test_the_digest_of_many_values_takes_the_memory_of_one(tmp_path: Path) -> None:
+    values = tuple(np.full(2**17, k) for k in range(40))
+    tracemalloc.start()
+    name = Cache(tmp_path / "cache").digest(values)
+    assert tracemalloc.get_traced_memory()[1] < 8 * values[0].nbytes
+    tracemalloc.stop()
+    assert name != Cache(tmp_path / "cache").digest(values[:-1])

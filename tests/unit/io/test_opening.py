@@ -3,6 +3,7 @@
 import os
 import struct
 import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -123,6 +124,22 @@ def test_only_regular_files_are_opened(tmp_path: Path) -> None:
     assert read_limited(tmp_path / "file", 3) == b"abc"
     with pytest.raises(OSError, match="too large"):
         read_limited(tmp_path / "file", 2)
+
+
+def test_a_small_file_takes_little_memory_whatever_the_limit(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"abc")
+    tracemalloc.start()
+    assert read_limited(tmp_path / "file", 2**31) == b"abc"
+    assert tracemalloc.get_traced_memory()[1] < 2**23
+    tracemalloc.stop()
+
+
+def test_a_file_of_several_blocks_is_read_whole(tmp_path: Path) -> None:
+    content = bytes(range(256)) * 2**15
+    (tmp_path / "file").write_bytes(content)
+    assert read_limited(tmp_path / "file", len(content)) == content
+    with pytest.raises(OSError, match="too large"):
+        read_limited(tmp_path / "file", len(content) - 1)
 
 
 def test_deep_pictures_keep_their_channels(tmp_path: Path) -> None:
