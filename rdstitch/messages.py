@@ -57,11 +57,12 @@ def left_out(path: str | Path, reason: str) -> Message:
 
 
 def told_once(messages: Iterable[Message]) -> list[Message]:
-    """The same; pictures that were left out for the same reason are named in one, which stands where the first did."""
+    """The same; pictures left out for the same reason are named in one, each once, which stands where the first did."""
     told: dict[object, Message] = {}
     for number, message in enumerate(messages):
         key = message.text if message.severity == "left out" else number
-        told[key] = replace(message, images=told[key].images + message.images) if key in told else message
+        images = (*told[key].images, *message.images) if key in told else message.images
+        told[key] = replace(message, images=tuple(dict.fromkeys(images)))
     return list(told.values())
 
 
