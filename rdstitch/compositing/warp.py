@@ -24,9 +24,9 @@ LATTICE_STEPS = (32, 16, 8, 4, 2, 1)
 """Spacings of lattices, canvas pixels; all have the nodes of the first."""
 
 _NOWHERE = np.float32(-1e6)
-# Coordinates are computed on a lattice of the canvas and interpolated linearly, to this many pixels of the picture.
-# OpenCV rounds them to 1/32 pixel afterwards.
-_LATTICE_ERROR = 0.01
+# Coordinates are computed on a lattice of the canvas and interpolated linearly, to this many pixels of the picture or,
+# where that gets smaller, of the canvas. OpenCV rounds them to as many afterwards.
+_LATTICE_ERROR = 1.0 / 32.0
 
 _PROBES = 16
 
@@ -278,6 +278,7 @@ def _grid(camera: Camera) -> FloatArray:
 
 def _lattice_step(warp: Warp, probes: FloatArray) -> int:
     """Widest spacing of the lattice whose interpolation error stays below the limit."""
+    limit = _LATTICE_ERROR * max(1.0, warp.shrink)
     corners = np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
     truth = warp.source_points(probes[:, 0], probes[:, 1])
     known = np.isfinite(truth).all(axis=1)
@@ -287,7 +288,7 @@ def _lattice_step(warp: Warp, probes: FloatArray) -> int:
         around = probes[:, None] + corners * (step / 2)
         near = warp.source_points(around[..., 0], around[..., 1])
         error = np.linalg.norm(near.mean(axis=1) - truth, axis=1)[known]
-        if np.isfinite(reach[known]).all() and (error < _LATTICE_ERROR).all():
+        if np.isfinite(reach[known]).all() and (error < limit).all():
             return step
     return 1
 
