@@ -7,19 +7,23 @@ between two motions is the area that they cover, not the number of their matches
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from rdstitch.alignment import Alignment
-from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.messages import Message, names_of
 from rdstitch.radial_homography import RadialHomography
-from rdstitch.robust import estimate_radial_homography
+from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
 
 _MIN_MATCHES = 12
 """Inliers of a rival: four define its homography, and eight more by chance have not been seen."""
+
+_PAIRS_AT_ONCE = 128
+"""Whose matches are in memory."""
 
 _FAR = 3.0
 """Thresholds beyond which a match disagrees with the alignment: nearer, relief and the lens may be to blame."""
@@ -101,11 +105,18 @@ def find_rival_motions(
     list of RivalMotion
         One for every pair of overlapping, aligned pictures; its area is 0 where there is no rival.
     """
-    return [
-        _rival(alignment, pair, threshold, seed)
-        for pair in pairs
-        if alignment.used[pair.image1] and alignment.used[pair.image2] and _agreeing(alignment, pair, threshold).any()
-    ]
+    aligned = [pair for pair in pairs if alignment.used[pair.image1] and alignment.used[pair.image2]]
+    rivals, limits = list[RivalMotion](), RansacOptions(threshold, seed=seed)
+    for start in range(0, len(aligned), _PAIRS_AT_ONCE):
+        rests = [_Rest(alignment, pair, threshold) for pair in aligned[start : start + _PAIRS_AT_ONCE]]
+        rests = [rest for rest in rests if rest.agreeing.any()]
+        tried = [rest for rest in rests if len(rest.unexplained) >= _MIN_MATCHES]
+        # All pictures have one lens.
+        how = EstimationOptions("auto", alignment.cameras[aligned[0].image1].distortion, limits)
+        relations = estimate_radial_homographies([rest.matches for rest in tried], how)
+        found = {rest.images: rest.rival(relation) for rest, relation in zip(tried, relations, strict=True)}
+        rivals += [found.get(rest.images, rest.nothing) for rest in rests]
+    return rivals
 
 
 def rival_share(rivals: Sequence[RivalMotion]) -> float:
@@ -186,50 +197,58 @@ def rival_messages(
     return [Message(text, tuple(paths[k] for k in shown), "failure", "rival-motion")]
 
 
-def _rival(alignment: Alignment, pair: PairRegistration, threshold: float, seed: int) -> RivalMotion:
-    matched, camera = pair.correspondences, alignment.cameras[pair.image1]
-    error = _error(alignment, pair)
-    plane = _cells(matched.points1[error < threshold], camera)
-    nothing = RivalMotion(pair.image1, pair.image2, 0, len(plane), (0.0, 0.0), 0.0)
-    # A point that the alignment puts nowhere has an infinite error.
-    unexplained = np.flatnonzero(~(error < _FAR * threshold))
-    if len(unexplained) < _MIN_MATCHES:
-        return nothing
-    found = estimate_radial_homography(
-        matched.points1[unexplained],
-        matched.points2[unexplained],
-        camera.image_size,
-        image_size2=alignment.cameras[pair.image2].image_size,
-        center=camera.center,
-        solver="auto",
-        distortion=camera.distortion,
-        quality=-matched.ratio[unexplained],
-        threshold=threshold,
-        seed=seed,
-    )
-    if not found or int(found.inliers.sum()) < _MIN_MATCHES:
-        return nothing
-    inliers = unexplained[found.inliers]
-    disagreement = float(np.median(error[inliers]))
-    if disagreement < _MIN_DISAGREEMENT * 2.0 * camera.half_diagonal:
-        return nothing
-    area = _cells(matched.points1[inliers], camera) - plane
-    u, v = np.median(matched.points1[inliers], axis=0).tolist()
-    relation = replace(found, inliers=np.isin(np.arange(len(error)), inliers))
-    return RivalMotion(pair.image1, pair.image2, len(area), len(plane), (u, v), disagreement, relation)
+class _Rest:
+    """Matches of a pair that an alignment does not explain.
 
+    Attributes
+    ----------
+    images : (int, int)
+    error : ndarray of shape (M,)
+        Of all matches, pixels; infinite where the alignment puts a point nowhere.
+    agreeing : ndarray of shape (M,), bool
+    unexplained : ndarray of shape (U,), intp
+        Matches far from where the alignment puts them.
+    """
 
-def _agreeing(alignment: Alignment, pair: PairRegistration, threshold: float) -> BoolArray:
-    agrees: BoolArray = _error(alignment, pair) < threshold
-    return agrees
+    def __init__(self, alignment: Alignment, pair: PairRegistration, threshold: float) -> None:
+        self.images = pair.image1, pair.image2
+        self._camera, self._other = (alignment.cameras[k] for k in self.images)
+        self._matched = pair.correspondences
+        expected = alignment.transfer(*self.images, self._matched.points1)
+        self.error = np.nan_to_num(np.linalg.norm(expected - self._matched.points2, axis=1), nan=np.inf)
+        self.agreeing = self.error < threshold
+        self.unexplained = np.flatnonzero(~(self.error < _FAR * threshold))
 
+    @property
+    def matches(self) -> PairMatches:
+        """As pairs are estimated from."""
+        camera = Camera(self._camera.image_size, center=self._camera.center).with_focal()
+        rest, matched = self.unexplained, self._matched
+        other = camera.resized(self._other.image_size)
+        return PairMatches(matched.points1[rest], matched.points2[rest], camera, other, -matched.ratio[rest])
 
-def _error(alignment: Alignment, pair: PairRegistration) -> FloatArray:
-    """Transfer error (M,) of every match, pixels; infinite where the alignment puts a point nowhere."""
-    matched = pair.correspondences
-    expected = alignment.transfer(pair.image1, pair.image2, matched.points1)
-    error: FloatArray = np.nan_to_num(np.linalg.norm(expected - matched.points2, axis=1), nan=np.inf)
-    return error
+    @cached_property
+    def _plane(self) -> set[tuple[int, int]]:
+        return _cells(self._matched.points1[self.agreeing], self._camera)
+
+    @property
+    def nothing(self) -> RivalMotion:
+        """No rival."""
+        return RivalMotion(*self.images, 0, len(self._plane), (0.0, 0.0), 0.0)
+
+    def rival(self, found: RadialHomography) -> RivalMotion:
+        """What the motion of these matches comes to."""
+        if not found or int(found.inliers.sum()) < _MIN_MATCHES:
+            return self.nothing
+        inliers = self.unexplained[found.inliers]
+        disagreement = float(np.median(self.error[inliers]))
+        if disagreement < _MIN_DISAGREEMENT * 2.0 * self._camera.half_diagonal:
+            return self.nothing
+        points = self._matched.points1[inliers]
+        area = _cells(points, self._camera) - self._plane
+        u, v = np.median(points, axis=0).tolist()
+        relation = replace(found, inliers=np.isin(np.arange(len(self.error)), inliers))
+        return RivalMotion(*self.images, len(area), len(self._plane), (u, v), disagreement, relation)
 
 
 def _cells(points: FloatArray, camera: Camera) -> set[tuple[int, int]]:
