@@ -5,13 +5,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.local_alignment.field import DisplacementField
-from rdstitch.local_alignment.fit import Stiffness, fit_fields, picture_fields
-from rdstitch.local_alignment.matches import Match, PlaneMatches, place_matches, plane_scale
+from rdstitch.local_alignment.fit import PlaneFields, Stiffness, fit_fields
+from rdstitch.local_alignment.matches import Match, PicturesOnPlane, PlaneMatches, place_matches
 
 LocalAlignmentMode = Literal["auto", "off"] | int
 
@@ -88,45 +87,41 @@ def align_locally(
     """
     if choice == "off":
         return no_local_alignment("switched off")
-    scale = plane_scale(cameras, homographies)
-    placed = place_matches(matches, cameras, homographies, scale)
+    pictures = PicturesOnPlane.of(cameras, homographies)
+    placed = place_matches(matches, pictures)
     if placed is None or len(placed) < _MIN_MATCHES:
         return no_local_alignment("there are too few matches")
     if choice == "auto" and (agreement := _agreement_of_neighbours(placed)) < _MIN_AGREEMENT:
         return no_local_alignment(f"not worth while; residuals of neighbouring matches agree by {agreement:.0%} only")
     cells = _CELLS if choice == "auto" else choice
     held_out = np.arange(len(placed)) % _HELD_OUT == 0
-    stiffness, before, after = _choose(placed.take(~held_out), placed.take(held_out), cameras, cells)
+    start, before, after = _choose(placed.take(~held_out), placed.take(held_out), pictures, cells)
     text = f"matches held out of the fit: {before.median:.2f} pixels apart without, {after.median:.2f} pixels with it"
     if choice == "auto" and after.median > (1.0 - _WORTHWHILE) * before.median:
         return LocalAlignment((), f"not worth while; {text}", 0, before, after)
-    fields = picture_fields(fit_fields(placed, cameras, stiffness), cameras, homographies, scale)
+    fields = fit_fields(placed, pictures, start.stiffness, start).of_pictures()
     return LocalAlignment(fields, text, cells, before, after)
 
 
 def _agreement_of_neighbours(matches: PlaneMatches) -> float:
     """Correlation of the residuals of each match and the nearest one of the same pair of pictures, in [-1, 1]."""
-    # Pairs are so far apart along a third axis that no neighbour is of another pair.
-    pair = np.unique(matches.images, axis=0, return_inverse=True)[1].reshape(-1)
-    places = np.column_stack([matches.points[:, 0], pair * 2.0 * np.ptp(matches.points[:, 0])])
-    nearest = np.asarray(cKDTree(places).query(places, k=2)[1], dtype=np.intp)[:, 1]
     length = np.linalg.norm(matches.residual, axis=1)
     most = _OUTLYING * float(np.median(length))
     residual = matches.residual * np.minimum(1.0, most / np.maximum(length, 1e-12))[:, None]
-    return float((residual * residual[nearest]).sum() / max((residual**2).sum(), 1e-300))
+    return float((residual * residual[matches.neighbours]).sum() / max((residual**2).sum(), 1e-300))
 
 
 def _choose(
-    fitted: PlaneMatches, held_out: PlaneMatches, cameras: Sequence[Camera], cells: int
-) -> tuple[Stiffness, HeldOut, HeldOut]:
-    """The stiffness that held-out matches like best, and their residuals without and with it."""
-    before = HeldOut.of(held_out.residual)
-    best, after = Stiffness(cells, _SLOPES[0]), before
-    for k, slope in enumerate(_SLOPES):
-        stiffness = Stiffness(cells, slope)
-        found = HeldOut.of(fit_fields(fitted, cameras, stiffness).residual(cameras, held_out))
-        if k == 0 or found.median < (1.0 - _BETTER) * after.median:
-            best, after = stiffness, found
-        else:
-            break
-    return best, before, after
+    fitted: PlaneMatches, held_out: PlaneMatches, pictures: PicturesOnPlane, cells: int
+) -> tuple[PlaneFields, HeldOut, HeldOut]:
+    """The fields that held-out matches like best, and the residuals of these without and with them."""
+    tried: list[PlaneFields] = []
+    for slope in reversed(_SLOPES):
+        # What is far from the plane is found by the freest; the stiffer ones start from there.
+        tried.append(fit_fields(fitted, pictures, Stiffness(cells, slope), tried[-1] if tried else None))
+    stiffest, *freer = [(fields, HeldOut.of(fields.explain(held_out)[0])) for fields in reversed(tried)]
+    best, after = stiffest
+    for fields, found in freer:
+        if found.median < (1.0 - _BETTER) * after.median:
+            best, after = fields, found
+    return best, HeldOut.of(held_out.residual), after

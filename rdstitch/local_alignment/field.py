@@ -13,6 +13,9 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 
 _DECIMALS = 3  # pixels; what a sidecar stores is what was used
+# Nodes by which a field goes on as it does at the border, so that a spline, which is level at its end, is so beyond it.
+_APRON = 8
+_PROBES = 4  # of the steepness, along a side of a cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +51,7 @@ class DisplacementField:
 
     def __call__(self, points: FloatArray) -> FloatArray:
         """Displacement (..., 2) at measured pixels (..., 2); outside the picture that of its border, 0 at NaN."""
-        place = np.moveaxis(self._grid_coordinates(points), -1, 0)[::-1]
+        place = np.moveaxis(self._grid_coordinates(points), -1, 0)[::-1] + _APRON
         return np.stack([ndimage.map_coordinates(c, place, order=3, mode="mirror", prefilter=False)
                          for c in self._coefficients], axis=-1)  # fmt: skip
 
@@ -64,15 +67,18 @@ class DisplacementField:
 
     @cached_property
     def steepest(self) -> float:
-        """Largest change of the displacement per pixel, between nodes; from 1 on a picture may fold."""
-        spacing = (np.array(self.image_size) - 1.0) / (self.values.shape[1] - 1, self.values.shape[0] - 1)
-        across = np.linalg.norm(np.diff(self.values, axis=1), axis=-1) / spacing[0]
-        down = np.linalg.norm(np.diff(self.values, axis=0), axis=-1) / spacing[1]
-        return float(max(across.max(), down.max()))
+        """Largest change of the displacement per pixel in any direction; below 1 the picture does not fold."""
+        rows, columns = (_PROBES * (n - 1) + 1 for n in self.values.shape[:2])
+        moved = self(node_points(self.image_size, (rows, columns))).reshape(rows, columns, 2)
+        spacing = (np.array(self.image_size) - 1.0) / (columns - 1, rows - 1)
+        across, down = np.diff(moved, axis=1)[:-1] / spacing[0], np.diff(moved, axis=0)[:, :-1] / spacing[1]
+        return float(np.linalg.norm(np.stack([across, down], axis=-1), ord=2, axis=(-2, -1)).max())
 
     @cached_property
     def _coefficients(self) -> list[FloatArray]:
-        return [ndimage.spline_filter(self.values[..., k], order=3, mode="mirror") for k in (0, 1)]
+        around = [(_APRON, _APRON)] * 2
+        padded = [np.pad(self.values[..., k], around, mode="reflect", reflect_type="odd") for k in (0, 1)]
+        return [ndimage.spline_filter(values, order=3, mode="mirror") for values in padded]
 
     def _grid_coordinates(self, points: FloatArray) -> FloatArray:
         """Column and row (..., 2) in units of the grid, within it."""

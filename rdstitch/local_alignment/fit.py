@@ -1,32 +1,45 @@
 """Displacements on the plane, one regularised field per picture, by robust sparse least squares over all pictures.
 
 A match of the pictures i and j that the alignment puts ``r`` apart on the plane is explained by
-``d_i(p_i) - d_j(p_j)``. Fields rise and bend little, and vanish where nothing supports them; that alone fixes what the
-matches leave open, a displacement of all pictures together, at zero. Both coordinates have the same normal equations.
+``d_i(e_i) - d_j(e_j)``, where ``e`` is the pixel at which the alignment expects what is at the measured one: fields say
+for each place of the output where its content is, so ``e`` is found anew from round to round. Fields rise and bend
+little, and vanish where nothing supports them; that alone fixes what the matches leave open, a displacement of all
+pictures together, at zero. Both coordinates have the same normal equations.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import LinearOperator, cg
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.local_alignment.field import DisplacementField, bilinear, grid_shape, node_points
-from rdstitch.local_alignment.matches import PlaneMatches, jacobians
+from rdstitch.local_alignment.matches import PicturesOnPlane, PlaneMatches
 
-# Residuals are trusted up to about this many times their median, but at least so many pixels; at first, up to this
-# percentile of them, then by this factor less from round to round, and as many rounds at the end.
+# Residuals are trusted up to about this many times their median, or their noise where relief makes them larger, but at
+# least so many pixels; at first, up to this percentile of them, then by this factor less from round to round, and as
+# many rounds at the end.
 _ROBUST, _MIN_SCALE = 2.0, 0.3
-_WIDEST, _SHARPENED, _SHARP_ROUNDS = 95.0, 0.5, 3
+_WIDEST, _SHARPENED, _SHARP_ROUNDS = 95.0, 0.5, 2
+# Of the residual of the normal equations, and the most iterations, of which a tenth is usual.
+_TOLERANCE, _MAX_ITERATIONS = 1e-4, 2000
 # A field vanishes over about this share of a picture where nothing supports it.
 _FADE = 0.2
-# Limit of the displacement's change per pixel: far from 1, where a picture would fold.
-_MAX_GRADIENT = 0.25
+# Fixed-point iterations from where a picture shows something to where the alignment expects it; each leaves the
+# gradient's share of the error.
+_STEPS = 6
+# Limit of the displacement's change per pixel: half of what would fold a picture.
+_MAX_GRADIENT = 0.5
+
+
+Shapes = tuple[tuple[int, int], ...]
+"""Rows and columns of the grid of each picture."""
 
 
 @dataclass(frozen=True)
@@ -51,77 +64,126 @@ class PlaneFields:
 
     Attributes
     ----------
+    pictures : PicturesOnPlane
+    stiffness : Stiffness
     shapes : tuple of (int, int)
         Rows and columns of nodes of each picture.
     values : tuple of ndarray of shape (m n, 2)
         Pixels of the median picture.
     """
 
-    shapes: tuple[tuple[int, int], ...]
+    pictures: PicturesOnPlane
+    stiffness: Stiffness
+    shapes: Shapes
     values: tuple[FloatArray, ...]
 
-    def at(self, cameras: Sequence[Camera], images: NDArray[np.intp], points: FloatArray) -> FloatArray:
-        """Displacements (M, 2) of one picture each at its measured pixels (M, 2)."""
-        found = np.empty((len(points), 2))
-        for k in np.unique(images):
-            chosen = images == k
-            nodes, shares = bilinear(points[chosen], cameras[k].image_size, self.shapes[k])
-            found[chosen] = (self.values[k][nodes] * shares[..., None]).sum(axis=1)
-        return found
+    def explain(self, matches: PlaneMatches) -> tuple[FloatArray, FloatArray]:
+        """What they leave over at matches, (M, 2), and pixels (2 M, 2) where the alignment expects these."""
+        values, expected = np.concatenate(self.values), matches.points.reshape(-1, 2)
+        for _ in range(_STEPS):
+            moved = _shares(matches, expected, self.pictures.cameras, self.shapes) @ values
+            expected = _expected(matches, self.pictures, moved)
+        return matches.residual - moved[0::2] + moved[1::2], expected
 
-    def residual(self, cameras: Sequence[Camera], matches: PlaneMatches) -> FloatArray:
-        """What they leave over at matches, (M, 2)."""
-        first, second = (self.at(cameras, matches.images[:, k], matches.points[:, k]) for k in (0, 1))
-        return np.asarray(matches.residual - first + second)
+    def of_pictures(self) -> tuple[DisplacementField, ...]:
+        """The displacements in measured pixels of each picture, limited so that nothing folds."""
+        done = []
+        for k, (shape, values) in enumerate(zip(self.shapes, self.values, strict=True)):
+            size = self.pictures.cameras[k].image_size
+            points = node_points(size, shape)
+            with np.errstate(invalid="ignore"):
+                shown = self.pictures.from_plane(k, self.pictures.to_plane(k, points) + values)
+            found = np.where(np.isfinite(shown), shown - points, 0.0).reshape(*shape, 2)
+            field = DisplacementField.of(size, found)
+            if field.steepest > _MAX_GRADIENT:
+                field = DisplacementField.of(size, field.values * (_MAX_GRADIENT / field.steepest))
+            done.append(field)
+        return tuple(done)
 
 
-def fit_fields(matches: PlaneMatches, cameras: Sequence[Camera], stiffness: Stiffness) -> PlaneFields:
-    """Fields of all pictures, by reweighted least squares with graduated non-convexity (Blake and Zisserman, 1987)."""
+def fit_fields(
+    matches: PlaneMatches, pictures: PicturesOnPlane, stiffness: Stiffness, start: PlaneFields | None = None
+) -> PlaneFields:
+    """Fields of all pictures, by reweighted least squares.
+
+    They start from fields that were fitted to much the same matches, or, without these, by graduated non-convexity
+    (Blake and Zisserman, 1987): the first rounds trust all that may be right, so that the fields reach what is far from
+    the plane.
+    """
+    cameras = pictures.cameras
     shapes = tuple(grid_shape(camera.image_size, stiffness.cells) for camera in cameras)
-    start = np.concatenate([[0], np.cumsum([rows * columns for rows, columns in shapes])])
-    design = _design(matches, cameras, shapes, start)
-    prior = sparse.block_diag(
-        [_smoothness(shape, camera, stiffness) for shape, camera in zip(shapes, cameras, strict=True)], format="csr"
-    )
-    left, sharp = matches.residual, 0
-    # Graduated: the first rounds trust all that may be right, so that the fields reach what is far from the plane.
-    scale = float(np.percentile(np.linalg.norm(left, axis=1), _WIDEST))
+    priors = [_smoothness(shape, camera.image_size, stiffness) for shape, camera in zip(shapes, cameras, strict=True)]
+    prior = sparse.block_diag(priors, format="csr")
+    if start is None:
+        left, expected = matches.residual, matches.points.reshape(-1, 2)
+        scale = float(np.percentile(np.linalg.norm(left, axis=1), _WIDEST))
+    else:
+        left, expected, scale = *start.explain(matches), 0.0
+    sharp = 0 if start is None else 1
+    solution = np.zeros((prior.shape[0], 2)) if start is None else np.concatenate(start.values)
     while sharp < _SHARP_ROUNDS:
         length = np.linalg.norm(left, axis=1)
-        sharpest = max(_MIN_SCALE, _ROBUST * float(np.median(length)))
+        sharpest = max(_MIN_SCALE, _ROBUST * min(float(np.median(length)), matches.noise))
         sharp += scale <= sharpest
         scale = max(scale, sharpest)
-        weight = (1.0 / (1.0 + (length / scale) ** 2)) ** 2 / scale**2
-        weighted: Any = (sparse.diags_array(weight) @ design).T
-        normal = sparse.csc_array(weighted @ design + prior)
-        # Symmetric and positive: an ordering of A + A' and no pivoting leave a third of the fill-in.
-        factor = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        solution = factor.solve(weighted @ matches.residual)
+        weight = (1.0 / (1.0 + (length / scale) ** 2)) ** 2 / sharpest**2
+        shares = _shares(matches, expected, cameras, shapes)
+        design = shares[0::2] - shares[1::2]
+        solution = _solve(design, weight, prior, matches.residual, solution)
         left = matches.residual - design @ solution
+        expected = _expected(matches, pictures, shares @ solution)
         scale *= _SHARPENED
-    return PlaneFields(shapes, tuple(np.split(solution, start[1:-1])))
+    return PlaneFields(pictures, stiffness, shapes, tuple(np.split(solution, _first_nodes(shapes)[1:-1])))
 
 
-def _design(
-    matches: PlaneMatches, cameras: Sequence[Camera], shapes: Sequence[tuple[int, int]], start: NDArray[np.intp]
-) -> sparse.csr_array:
-    """Shares of all nodes in the difference of displacements at every match."""
-    columns, entries = np.empty((len(matches), 8), dtype=np.intp), np.empty((len(matches), 8))
-    for part, sign in enumerate((1.0, -1.0)):
-        images, place = matches.images[:, part], np.s_[4 * part : 4 * part + 4]
-        for k in np.unique(images):
-            chosen = images == k
-            nodes, shares = bilinear(matches.points[chosen, part], cameras[k].image_size, shapes[k])
-            columns[chosen, place], entries[chosen, place] = start[k] + nodes, sign * shares
-    rows = np.repeat(np.arange(len(matches)), 8)
-    return sparse.csr_array((entries.ravel(), (rows, columns.ravel())), shape=(len(matches), int(start[-1])))
+def _solve(
+    design: Any, weight: FloatArray, prior: sparse.csr_array, residual: FloatArray, start: FloatArray
+) -> FloatArray:
+    """Both coordinates (nodes, 2) of the fields, from near ones, by conjugate gradients, whose memory grows evenly."""
+    weighted = design.T @ sparse.diags_array(weight)
+    diagonal = np.repeat(design.power(2).T @ weight + prior.diagonal(), 2)
+
+    def product(values: FloatArray) -> FloatArray:
+        fields = values.reshape(-1, 2)
+        return np.asarray(weighted @ (design @ fields) + prior @ fields).ravel()
+
+    normal = LinearOperator((diagonal.size, diagonal.size), product, dtype=np.float64)
+    wanted = (weighted @ residual).ravel()
+    solution, _ = cg(normal, wanted, start.ravel(), rtol=_TOLERANCE, maxiter=_MAX_ITERATIONS,
+                     M=sparse.diags_array(1.0 / diagonal))  # fmt: skip
+    return np.asarray(solution).reshape(-1, 2)
 
 
-def _smoothness(shape: tuple[int, int], camera: Camera, stiffness: Stiffness) -> sparse.csr_array:
+def _expected(matches: PlaneMatches, pictures: PicturesOnPlane, moved: FloatArray) -> FloatArray:
+    """Pixels (2 M, 2) at which the alignment expects matches that are displaced by (2 M, 2) on the plane."""
+    places, expected = matches.places.reshape(-1, 2) - moved, matches.points.reshape(-1, 2).copy()
+    for k, chosen in matches.of_picture:
+        found = pictures.from_plane(k, places[chosen])
+        expected[chosen] = np.where(np.isfinite(found), found, expected[chosen])
+    return expected
+
+
+def _shares(matches: PlaneMatches, pixels: FloatArray, cameras: Sequence[Camera], shapes: Shapes) -> Any:
+    """Shares (2 M, nodes of all pictures) of the nodes in the displacements of matches at pixels (2 M, 2)."""
+    first = _first_nodes(shapes)
+    columns, entries = np.empty((len(pixels), 4), dtype=np.intp), np.empty((len(pixels), 4))
+    for k, chosen in matches.of_picture:
+        nodes, entries[chosen] = bilinear(pixels[chosen], cameras[k].image_size, shapes[k])
+        columns[chosen] = first[k] + nodes
+    rows = np.arange(0, columns.size + 1, 4)
+    return sparse.csr_array((entries.ravel(), columns.ravel(), rows), shape=(len(pixels), int(first[-1])))
+
+
+def _first_nodes(shapes: Shapes) -> NDArray[np.intp]:
+    """Number of the first node of each picture, and of all nodes."""
+    return np.concatenate([[0], np.cumsum([rows * columns for rows, columns in shapes])])
+
+
+@lru_cache(maxsize=8)
+def _smoothness(shape: tuple[int, int], image_size: tuple[int, int], stiffness: Stiffness) -> sparse.csr_array:
     """Precision of one picture's nodes, for residuals in units of their robust scale: a membrane and a thin plate."""
     rows, columns = shape
-    spacing = max(camera.image_size) / stiffness.cells
-    fade = _FADE * max(camera.image_size)
+    spacing, fade = max(image_size) / stiffness.cells, _FADE * max(image_size)
     total: Any = sparse.eye_array(rows * columns) * (spacing / fade) ** 2
     for order in (1, 2):
         steps = [_differences(n, order) for n in (rows, columns)]
@@ -134,22 +196,3 @@ def _differences(count: int, order: int) -> Any:
     """First or second differences of ``count`` values."""
     weights = {1: [-1.0, 1.0], 2: [1.0, -2.0, 1.0]}[order]
     return sparse.diags_array(weights, offsets=list(range(order + 1)), shape=(count - order, count))
-
-
-def picture_fields(
-    fields: PlaneFields, cameras: Sequence[Camera], homographies: FloatArray, scale: float
-) -> tuple[DisplacementField, ...]:
-    """The displacements in measured pixels of each picture, limited so that nothing folds."""
-    done = []
-    for shape, values, camera, matrix in zip(fields.shapes, fields.values, cameras, homographies, strict=True):
-        points = node_points(camera.image_size, shape)
-        with np.errstate(invalid="ignore"):
-            jacobian = scale * jacobians(camera, matrix, points)
-        usable = np.isfinite(jacobian).all(axis=(1, 2))
-        found = np.zeros_like(values)
-        found[usable] = np.linalg.solve(jacobian[usable], values[usable, :, None])[..., 0]
-        field = DisplacementField.of(camera.image_size, found.reshape(*shape, 2))
-        if field.steepest > _MAX_GRADIENT:
-            field = DisplacementField.of(camera.image_size, field.values * (_MAX_GRADIENT / field.steepest))
-        done.append(field)
-    return tuple(done)

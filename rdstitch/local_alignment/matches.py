@@ -1,19 +1,22 @@
 """Matches of all overlapping pictures on the common plane, and what the alignment leaves over at each of them."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.radial_homography import to_plane
+from rdstitch.radial_homography import from_plane, to_plane
 
 # Matches that the alignment expects farther away than this share of the picture's diagonal are taken to be wrong; where
-# the ground rises by a tenth of the camera's height, right ones are up to half as far apart.
-_SEARCH_RADIUS = 0.08
+# the ground rises by a tenth of the camera's height, and the alignment is that of the valleys, right ones are nearly as
+# far apart.
+_SEARCH_RADIUS = 0.15
 _MIN_MATCHES = 8
 
 
@@ -27,11 +30,46 @@ class Match:
     points2: FloatArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class PicturesOnPlane:
+    """Where the alignment puts the pictures; places on the plane are in pixels of the median picture.
+
+    Attributes
+    ----------
+    cameras : sequence of Camera
+    homographies : ndarray of shape (N, 3, 3)
+        Normalized undistorted coordinates of each picture to the plane.
+    scale : float
+        Pixels of the median picture per unit of the plane, at the pictures' centres; NaN if it shows none of them.
+    """
+
+    cameras: Sequence[Camera]
+    homographies: FloatArray
+    scale: float
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera], homographies: FloatArray) -> Self:
+        """With the scale of the median picture."""
+        steps = np.array([(0.5, 0.0), (0.0, 0.5), (-0.5, 0.0), (0.0, -0.5)])
+        areas = []
+        for camera, matrix in zip(cameras, homographies, strict=True):
+            around = to_plane(camera, matrix, (np.array(camera.image_size) - 1.0) / 2.0 + steps)
+            if np.isfinite(around).all():  # a centre beyond the horizon is nowhere on the plane
+                areas.append(abs(np.linalg.det(around[:2] - around[2:])))
+        return cls(cameras, homographies, float(np.median(areas) ** -0.5) if areas else np.nan)
+
+    def to_plane(self, image: int, points: FloatArray) -> FloatArray:
+        """Places (M, 2) of measured pixels (M, 2); NaN beyond the horizon."""
+        return self.scale * to_plane(self.cameras[image], self.homographies[image], points)
+
+    def from_plane(self, image: int, places: FloatArray) -> FloatArray:
+        """Measured pixels (M, 2) of places (M, 2); NaN where the picture cannot show them."""
+        return from_plane(self.cameras[image], self.homographies[image], places / self.scale)
+
+
+@dataclass(frozen=True, eq=False)
 class PlaneMatches:
     """Matches of all pairs, one after the other.
-
-    Lengths on the plane are in pixels of the median picture.
 
     Attributes
     ----------
@@ -39,59 +77,63 @@ class PlaneMatches:
         The two pictures of each match.
     points : ndarray of shape (M, 2, 2)
         Measured pixels in either.
-    residual : ndarray of shape (M, 2)
-        From where the second picture puts it to where the first does, on the plane.
+    places : ndarray of shape (M, 2, 2)
+        Where the alignment puts either on the plane, pixels of the median picture.
     """
 
     images: NDArray[np.intp]
     points: FloatArray
-    residual: FloatArray
+    places: FloatArray
 
     def __len__(self) -> int:
-        return len(self.residual)
+        return len(self.images)
+
+    @cached_property
+    def residual(self) -> FloatArray:
+        """From where the second picture puts them to where the first does, (M, 2)."""
+        return np.asarray(self.places[:, 0] - self.places[:, 1])
+
+    @cached_property
+    def of_picture(self) -> tuple[tuple[int, NDArray[np.intp]], ...]:
+        """Every picture with matches, and which of the 2 M places are in it."""
+        order = np.argsort(self.images.ravel(), kind="stable")
+        pictures, first = np.unique(self.images.ravel()[order], return_index=True)
+        return tuple(zip(pictures.tolist(), np.split(order, first[1:]), strict=True))
+
+    @cached_property
+    def neighbours(self) -> NDArray[np.intp]:
+        """For each match the nearest one of the same pair of pictures, or of another where there is none."""
+        # Pairs are so far apart along a third axis that no neighbour is of another pair.
+        pair = np.unique(self.images, axis=0, return_inverse=True)[1].reshape(-1)
+        where = np.column_stack([self.points[:, 0], pair * 2.0 * np.ptp(self.points[:, 0])])
+        return np.asarray(cKDTree(where).query(where, k=2)[1], dtype=np.intp)[:, 1]
+
+    @cached_property
+    def noise(self) -> float:
+        """Median length of what a residual does not have in common with its neighbour's, and no smooth field mends."""
+        apart = self.residual - self.residual[self.neighbours]
+        return float(np.median(np.linalg.norm(apart, axis=1)) / np.sqrt(2.0))
 
     def take(self, chosen: NDArray[np.bool_]) -> "PlaneMatches":
         """A part of them."""
-        return PlaneMatches(self.images[chosen], self.points[chosen], self.residual[chosen])
+        return PlaneMatches(self.images[chosen], self.points[chosen], self.places[chosen])
 
 
-def plane_scale(cameras: Sequence[Camera], homographies: FloatArray) -> float:
-    """Pixels of the median picture per unit of the plane, at the pictures' centres; NaN if it shows none of them."""
-    middles = [(np.array(camera.image_size) - 1.0) / 2.0 for camera in cameras]
-    found = [jacobians(c, g, m[None])[0] for c, g, m in zip(cameras, homographies, middles, strict=True)]
-    # A centre beyond the horizon is nowhere on the plane.
-    areas = [abs(np.linalg.det(jacobian)) for jacobian in found if np.isfinite(jacobian).all()]
-    return float(np.median(areas) ** -0.5) if areas else math.nan
-
-
-def jacobians(camera: Camera, homography: FloatArray, points: FloatArray) -> FloatArray:
-    """Derivative of the plane coordinates by the measured pixels, (N, 2, 2), by central differences."""
-    steps = np.array([(0.5, 0.0), (0.0, 0.5)])
-    ahead, behind = (to_plane(camera, homography, points[:, None] + sign * steps) for sign in (1.0, -1.0))
-    return np.asarray(np.swapaxes(ahead - behind, -1, -2), dtype=np.float64)
-
-
-def place_matches(
-    matches: Sequence[Match], cameras: Sequence[Camera], homographies: FloatArray, scale: float
-) -> PlaneMatches | None:
+def place_matches(matches: Sequence[Match], pictures: PicturesOnPlane) -> PlaneMatches | None:
     """Matches that lie near each other on the plane, the inliers of the alignment and those a little farther off.
 
     None where there are hardly any.
     """
-    images, points, residuals = [], [], []
+    images, points, places = [], [], []
     for match in matches:
-        pair = (match.image1, match.image2)
-        placed = [
-            scale * to_plane(cameras[k], homographies[k], p)
-            for k, p in zip(pair, (match.points1, match.points2), strict=True)
-        ]
-        residual = placed[0] - placed[1]
-        radius = _SEARCH_RADIUS * min(2.0 * cameras[k].half_diagonal for k in pair)
-        near = np.linalg.norm(residual, axis=1) < radius
+        pair, measured = (match.image1, match.image2), np.stack([match.points1, match.points2], axis=1)
+        placed = np.stack([pictures.to_plane(k, measured[:, part]) for part, k in enumerate(pair)], axis=1)
+        radius = _SEARCH_RADIUS * min(2.0 * pictures.cameras[k].half_diagonal for k in pair)
+        near = np.linalg.norm(placed[:, 0] - placed[:, 1], axis=1) < radius
         if near.sum() >= _MIN_MATCHES:
             images.append(np.broadcast_to(np.array(pair), (int(near.sum()), 2)))
-            points.append(np.stack([match.points1[near], match.points2[near]], axis=1))
-            residuals.append(residual[near])
+            points.append(measured[near])
+            places.append(placed[near])
     if not images:
         return None
-    return PlaneMatches(np.concatenate(images), np.concatenate(points), np.concatenate(residuals))
+    return PlaneMatches(np.concatenate(images), np.concatenate(points), np.concatenate(places))

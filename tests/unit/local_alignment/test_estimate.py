@@ -9,8 +9,8 @@ import pytest
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.local_alignment import LocalAlignment, Match, align_locally
-from rdstitch.local_alignment.fit import Stiffness, fit_fields, picture_fields
-from rdstitch.local_alignment.matches import place_matches, plane_scale
+from rdstitch.local_alignment.fit import Stiffness, fit_fields
+from rdstitch.local_alignment.matches import PicturesOnPlane, place_matches
 from rdstitch.radial_homography import from_plane, to_plane
 from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
 
@@ -25,10 +25,11 @@ def scene(kind: str | None, height: float = 0.05, seed: int = 1) -> Sequence:
     return sequence_over(lambda size: blank(size), LENS, poses, relief=relief)
 
 
-def homographies(sequence: Sequence) -> FloatArray:
-    """Of the pictures to the plane at the mean height of the ground."""
+def homographies(sequence: Sequence, level: float | None = None) -> FloatArray:
+    """Of the pictures to the plane at a level, texels, or at the mean height of the ground."""
     poses, relief = sequence.poses, sequence.relief
-    level = 0.0 if relief is None else float(relief.height.mean())
+    if level is None:
+        level = 0.0 if relief is None else float(relief.height.mean())
     share = (poses.height - level) / poses.height
     # A plane parallel to that of the texture: similar to it from each camera's foot.
     lowered = np.stack([np.array([[s, 0, (1 - s) * x], [0, s, (1 - s) * y], [0, 0, 1.0]])
@@ -83,8 +84,19 @@ def test_what_relief_moves_apart_comes_together(kind: str, height: float, wrong:
     assert local.after.median < 0.5 * local.before.median
     off, on = (displacements(sequence, matrices, which) for which in (replace(local, fields=()), local))
     assert np.median(on) < 0.3 * np.median(off)
-    assert np.percentile(on, 95) < 0.25 * np.percentile(off, 95)
-    assert max(field.steepest for field in local.fields) <= 0.25
+    assert np.percentile(on, 95) < 0.15 * np.percentile(off, 95)
+    assert max(field.steepest for field in local.fields) <= 0.5
+
+
+@pytest.mark.parametrize("level", [0.0, -20.0])
+def test_what_lies_far_off_the_plane_is_reached(level: float) -> None:
+    # The alignment is that of the valleys, or lower: most residuals are many times their noise.
+    sequence = scene("slopes", 0.1)
+    matrices = homographies(sequence, level)
+    local = align_locally(matches(sequence, wrong=0.1), CAMERAS, matrices)
+    off, on = (displacements(sequence, matrices, which) for which in (replace(local, fields=()), local))
+    assert np.percentile(off, 95) > 30.0
+    assert np.percentile(on, 95) < 3.0
 
 
 @pytest.mark.parametrize("noise", [0.1, 1.0])
@@ -117,10 +129,10 @@ def test_a_number_of_cells_is_used_in_any_case_and_off_in_none() -> None:
 def test_the_whole_does_not_move_and_fields_fade_where_nothing_supports_them() -> None:
     sequence = scene("bumps", 0.1)
     matrices = homographies(sequence)
-    scale = plane_scale(CAMERAS, matrices)
-    placed = place_matches(matches(sequence), CAMERAS, matrices, scale)
+    pictures = PicturesOnPlane.of(CAMERAS, matrices)
+    placed = place_matches(matches(sequence), pictures)
     assert placed is not None
-    fields = fit_fields(placed, CAMERAS, Stiffness(12, 0.02))
+    fields = fit_fields(placed, pictures, Stiffness(12, 0.02))
     values = np.concatenate(fields.values)
     assert np.abs(values.mean(axis=0)).max() < 0.02 * np.abs(values).max()
     # The first picture alone shows its outer corner.
@@ -135,12 +147,11 @@ def test_nothing_folds_even_where_matches_say_so() -> None:
         Match(m.image1, m.image2, m.points1, m.points2 + 14.0 * np.sign(np.sin(m.points2[:, ::-1] / 15.0)))
         for m in matches(sequence, count=3000)
     ]
-    matrices = homographies(sequence)
-    scale = plane_scale(CAMERAS, matrices)
-    placed = place_matches(torn, CAMERAS, matrices, scale)
+    pictures = PicturesOnPlane.of(CAMERAS, homographies(sequence))
+    placed = place_matches(torn, pictures)
     assert placed is not None
-    fields = picture_fields(fit_fields(placed, CAMERAS, Stiffness(60, 5.0)), CAMERAS, matrices, scale)
-    assert 0.2 < max(field.steepest for field in fields) <= 0.2501
+    fields = fit_fields(placed, pictures, Stiffness(60, 5.0)).of_pictures()
+    assert 0.45 < max(field.steepest for field in fields) <= 0.501
 
 
 def test_equal_matches_give_equal_fields() -> None:
@@ -160,5 +171,5 @@ def test_too_few_matches_are_said() -> None:
 def test_pictures_beyond_the_horizon_are_nowhere() -> None:
     nowhere = -np.broadcast_to(np.eye(3), (6, 3, 3))
     some = np.concatenate([nowhere[:3], homographies(scene(None))[3:]])
-    assert np.isfinite(plane_scale(CAMERAS, some))
+    assert np.isfinite(PicturesOnPlane.of(CAMERAS, some).scale)
     assert align_locally(matches(scene(None)), CAMERAS, nowhere).reason == "there are too few matches"

@@ -43,10 +43,19 @@ def test_a_plane_of_nodes_is_interpolated_exactly() -> None:
     np.testing.assert_allclose((node_points(SIZE, SHAPE)[nodes] * shares[..., None]).sum(axis=1), points, atol=1e-9)
 
 
-def test_steepness_is_the_change_per_px() -> None:
+def test_what_changes_evenly_does_so_up_to_the_border() -> None:
+    matrix = np.array([[0.05, -0.02], [0.01, 0.1]])
+    field = DisplacementField(SIZE, (node_points(SIZE, SHAPE) @ matrix).reshape(*SHAPE, 2))
+    points = np.random.default_rng(2).uniform((0, 0), (639, 479), (500, 2))
+    np.testing.assert_allclose(field(points), points @ matrix, atol=0.005)
+
+
+def test_steepness_is_the_change_per_px_in_any_direction() -> None:
     x, y = node_points(SIZE, SHAPE).T
     values = np.stack([0.1 * x, np.zeros_like(y)], axis=-1).reshape(*SHAPE, 2)
-    assert DisplacementField(SIZE, values).steepest == pytest.approx(0.1)
+    assert DisplacementField(SIZE, values).steepest == pytest.approx(0.1, abs=1e-4)
+    oblique = np.stack([0.1 * (x + y), 0.1 * (x + y)], axis=-1).reshape(*SHAPE, 2)
+    assert DisplacementField(SIZE, oblique).steepest == pytest.approx(0.2, abs=1e-4)
     assert DisplacementField(SIZE, values).largest == pytest.approx(63.9)
 
 
