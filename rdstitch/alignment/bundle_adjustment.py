@@ -17,7 +17,7 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.pose_blocks import PoseBlocks
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import LENS_PARAMETERS
-from rdstitch.robust.levenberg_marquardt import FIRST_DAMPING, MAX_DAMPING, MIN_GAIN, next_damping
+from rdstitch.robust.levenberg_marquardt import FIRST_DAMPING, MAX_DAMPING, MIN_GAIN, damping_by_gain
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, RAYLEIGH_MEDIAN, robust_cost
 
 _MIN_SIGMA = 1e-3
@@ -209,11 +209,11 @@ class BundleAdjuster:
     def _descend(self, parameters: Parameters, sigma: float, width: float, most: int) -> tuple[_State, int, bool]:
         """Levenberg-Marquardt at one width of the loss; the state reached, linearizations, whether converged."""
         state = self._evaluate(parameters, sigma, width)
-        damping, used = np.asarray(FIRST_DAMPING), 1
+        damping, failures, used = FIRST_DAMPING, 0, 1
         while used < most:
             normal = self._normal_equations(state, sigma)
             try:
-                flat, step_shared = normal.solve(float(damping))
+                flat, step_shared = normal.solve(damping)
             except RuntimeError:  # singular: no correspondence of some pictures can be transferred
                 return state, used, False
             step_poses = np.zeros(self.free.poses.shape)
@@ -226,9 +226,9 @@ class BundleAdjuster:
             moved = state.parameters.retract(self.model, step_poses, step_shared, self.free.lens)
             used += 1
             there = None if folds(moved.lens, self.observations.reach) else self._evaluate(moved, sigma, width)
-            better = there is not None and self._cost(there, state.equations.whitening, sigma, width) < state.cost
-            damping = next_damping(damping, np.asarray(better))
-            if better and there is not None:
+            after = np.inf if there is None else self._cost(there, state.equations.whitening, sigma, width)
+            damping, failures = damping_by_gain(damping, failures, float((state.cost - after) / predicted))
+            if there is not None and after < state.cost:
                 state = there
             elif damping > MAX_DAMPING:
                 return state, used, True

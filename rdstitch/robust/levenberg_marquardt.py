@@ -127,6 +127,22 @@ def next_damping(damping: FloatArray, better: BoolArray) -> FloatArray:
     return np.where(better, np.maximum(damping / 10.0, _MIN_DAMPING), damping * 20.0)
 
 
+def damping_by_gain(damping: float, failures: int, gain: float) -> tuple[float, int]:
+    """Damping of the next step, and how many steps have failed since one was taken (Nielsen 1999).
+
+    Where the loss has a curved valley, as focal length, tilts and lens together have, tenfold changes go to and fro
+    between steps that are too short and steps that fail.
+
+    Parameters
+    ----------
+    gain : float
+        By how much the last step made the loss smaller, in units of what was predicted.
+    """
+    if gain > 0.0:
+        return max(damping * max(1.0 / 3.0, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3), _MIN_DAMPING), 0
+    return damping * 2.0 ** (failures + 1), failures + 1
+
+
 def _damped_step(equations: BatchedNormalEquations, damping: FloatArray) -> FloatArray:
     """Steps (B, P); NaN where the equations are singular or not finite."""
     diagonal = np.einsum("bpp->bp", equations.information)

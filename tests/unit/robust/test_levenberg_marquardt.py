@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations, descend
+from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations, damping_by_gain, descend
 
 
 @dataclass(frozen=True)
@@ -49,3 +50,14 @@ def test_what_is_only_a_start_takes_fewer_steps() -> None:
     start = np.full((1, 1), 1.01)
     assert descend(valley, _retract, start, 30, rough=True)[0] == start
     assert abs(descend(valley, _retract, start, 30)[0] - 1.0) < 1e-3
+
+
+def test_damping_follows_what_steps_gain() -> None:
+    for gain, factor in ((1.0, 1.0 / 3.0), (1.7, 1.0 / 3.0), (0.5, 1.0)):
+        assert damping_by_gain(3e-4, 2, gain) == (3e-4 * factor, 0)
+    assert damping_by_gain(3e-4, 0, 0.01)[0] > 5e-4
+    damping, failures = 1e-4, 0
+    for factor in (2.0, 8.0, 64.0):
+        damping, failures = damping_by_gain(damping, failures, -np.inf)
+        assert damping == pytest.approx(1e-4 * factor)
+    assert damping_by_gain(damping, failures, 0.5) == (damping, 0)
