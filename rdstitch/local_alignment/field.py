@@ -15,6 +15,9 @@ from rdstitch.errors import ArgumentError
 _DECIMALS = 3  # pixels; what a sidecar stores is what was used
 # Nodes by which a field goes on as it does at the border, so that a spline, which is level at its end, is so beyond it.
 _APRON = 8
+# Nodes beyond the border up to which it is evaluated: who interpolates across the border would find a kink there, and
+# take many times as many places for it.
+_BEYOND = 4
 _PROBES = 4  # of the steepness, along a side of a cell
 
 
@@ -50,7 +53,7 @@ class DisplacementField:
         return cls(image_size, np.round(values, _DECIMALS) + 0.0)
 
     def __call__(self, points: FloatArray) -> FloatArray:
-        """Displacement (..., 2) at measured pixels (..., 2); outside the picture that of its border, 0 at NaN."""
+        """Displacement (..., 2) at measured pixels (..., 2), also beside the picture; far out as there, 0 at NaN."""
         place = np.moveaxis(self._grid_coordinates(points), -1, 0)[::-1] + _APRON
         return np.stack([ndimage.map_coordinates(c, place, order=3, mode="mirror", prefilter=False)
                          for c in self._coefficients], axis=-1)  # fmt: skip
@@ -81,10 +84,10 @@ class DisplacementField:
         return [ndimage.spline_filter(values, order=3, mode="mirror") for values in padded]
 
     def _grid_coordinates(self, points: FloatArray) -> FloatArray:
-        """Column and row (..., 2) in units of the grid, within it."""
+        """Column and row (..., 2) in units of the grid, within it or not far from it."""
         last = np.array([self.values.shape[1] - 1, self.values.shape[0] - 1])
         place = np.asarray(points, dtype=np.float64) * (last / (np.array(self.image_size) - 1.0))
-        return np.clip(np.nan_to_num(place), 0.0, last)
+        return np.clip(np.nan_to_num(place), -_BEYOND, last + _BEYOND)
 
 
 def bilinear(

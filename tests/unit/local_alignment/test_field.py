@@ -23,11 +23,17 @@ def test_it_passes_through_its_nodes_and_is_smooth_between() -> None:
     assert np.abs(np.diff(bend, axis=0)).max() < 0.05 * np.abs(bend).max()
 
 
-def test_outside_it_stays_as_it_is_at_the_border() -> None:
+def test_beside_the_picture_it_goes_on_as_at_the_border() -> None:
     field = DisplacementField.of(SIZE, VALUES)
-    inside, outside = np.array([[0.0, 100.0], [639.0, 479.0]]), np.array([[-50.0, 100.0], [900.0, 700.0]])
-    np.testing.assert_allclose(field(outside), field(inside))
-    assert np.isfinite(field(np.array([[np.nan, 3.0]]))).all()
+    for border, step in (((0.0, 100.0), (-1.0, 0.0)), ((639.0, 300.0), (1.0, 0.0)), ((200.0, 479.0), (0.0, 1.0))):
+        before, here, beyond = field(np.array(border) + np.outer((-1.0, 0.0, 1.0), step))
+        np.testing.assert_allclose(beyond - here, here - before, atol=0.02)
+
+
+def test_far_outside_it_stays_as_it_is() -> None:
+    field = DisplacementField.of(SIZE, VALUES)
+    np.testing.assert_array_equal(field(np.array([[-500.0, 100.0]])), field(np.array([[-900.0, 100.0]])))
+    assert np.isfinite(field(np.array([[1e9, 1e9], [np.nan, 3.0]]))).all()
 
 
 def test_of_another_size_it_moves_the_same_content() -> None:
