@@ -141,15 +141,13 @@ def _solve(
 ) -> FloatArray:
     """Both coordinates (nodes, 2) of the fields, from near ones, by conjugate gradients, whose memory grows evenly."""
     weighted = design.T @ sparse.diags_array(weight)
-    diagonal = np.repeat(design.power(2).T @ weight + prior.diagonal(), 2)
-
-    def product(values: FloatArray) -> FloatArray:
-        fields = values.reshape(-1, 2)
-        return np.asarray(weighted @ (design @ fields) + prior @ fields).ravel()
-
-    normal = LinearOperator((diagonal.size, diagonal.size), product, dtype=np.float64)
+    normal = sparse.csr_array(weighted @ design + prior)
+    diagonal = np.repeat(normal.diagonal(), 2)
+    both = LinearOperator(
+        (diagonal.size, diagonal.size), lambda v: (normal @ v.reshape(-1, 2)).ravel(), dtype=np.float64
+    )
     wanted = (weighted @ residual).ravel()
-    solution, _ = cg(normal, wanted, start.ravel(), rtol=_TOLERANCE, maxiter=_MAX_ITERATIONS,
+    solution, _ = cg(both, wanted, start.ravel(), rtol=_TOLERANCE, maxiter=_MAX_ITERATIONS,
                      M=sparse.diags_array(1.0 / diagonal))  # fmt: skip
     return np.asarray(solution).reshape(-1, 2)
 
