@@ -32,8 +32,8 @@ _OBSERVATIONS_PER_LINK = 0.5
 flights, where ``python -m tests.benchmarks.coverage`` prints a median error of 0.7 σ; over rendered relief, where
 ``python -m tests.benchmarks.relief`` prints about 0.4 σ, it is on the safe side."""
 
-_CELLS_PER_PICTURE = 3
-"""Blocks of ground along a side of a picture."""
+_CELLS_PER_PICTURE, _MOST_CELLS = 3, 10_000
+"""Blocks of ground along a side of a picture; and on each side of the middle, beyond which all are one."""
 
 
 def sandwich_std(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> float:
@@ -98,14 +98,15 @@ def _ground_blocks(observations: Observations, adjusted: BundleAdjustmentResult)
     """The block of ground of each correspondence, shape (M,)."""
     lens, link = adjusted.parameters.lens, observations.link
     flat = undistort(observations.points1 - lens[-2:], float(lens[0]), tuple(lens[1:-2].tolist()))
-    back = inverses(adjusted.matrices.matrices)[observations.image1][link]
-    plane = project(np.einsum("mij,mj->mi", back, np.column_stack([flat, np.ones(len(flat))])))
-    first = np.nan_to_num(plane)
+    # One coordinate after the other: a matrix for each correspondence would be most of the memory of an alignment.
+    back = np.moveaxis(inverses(adjusted.matrices.matrices)[observations.image1], 0, -1)
+    plane = [row[0][link] * flat[:, 0] + row[1][link] * flat[:, 1] + row[2][link] for row in back]
+    first = np.nan_to_num(project(np.column_stack(plane)))
     starts = observations.start[:-1][np.diff(observations.start) > 0]
     sizes = np.maximum.reduceat(first, starts) - np.minimum.reduceat(first, starts)
     side = max(float(np.median(sizes.max(axis=1))), 1e-12) / _CELLS_PER_PICTURE
-    cells = np.floor((first - np.median(first, axis=0)) / side).astype(np.int64)
-    number: IntArray = np.unique(np.clip(cells, -10_000, 10_000), axis=0, return_inverse=True)[1].reshape(-1)
+    column, row = np.clip(np.floor((first - np.median(first, axis=0)) / side), -_MOST_CELLS, _MOST_CELLS).T
+    number: IntArray = np.unique(column * (2 * _MOST_CELLS + 1) + row, return_inverse=True)[1]
     return number
 
 
