@@ -218,9 +218,8 @@ class BundleAdjuster:
                 return state, used, False
             step_poses = np.zeros(self.free.poses.shape)
             step_poses[self.free.poses] = flat
-            predicted = -(
-                normal.gradient_poses @ flat + normal.gradient_shared @ step_shared
-            )  # of the quadratic model, to first order twice the decrease
+            # The decrease of the quadratic model, less what the damping adds to it.
+            predicted = -(normal.gradient_poses @ flat + normal.gradient_shared @ step_shared)
             if not np.isfinite(predicted) or predicted <= MIN_GAIN * max(state.cost, 1e-12):
                 return state, used, True
             moved = state.parameters.retract(self.model, step_poses, step_shared, self.free.lens)
