@@ -213,6 +213,6 @@ def matching_batches(items: Sequence[Item]) -> Iterator[Sequence[Item]]:
 
 
 def estimation_batches(items: Sequence[Item]) -> Iterator[Sequence[Item]]:
-    """Pairs by the tasks of :func:`estimate_pairs`."""
+    """Pairs that are estimated together, as by a task of :func:`estimate_pairs`."""
     size = _PAIRS_ESTIMATED_AT_ONCE
     return (items[start : start + size] for start in range(0, len(items), size))

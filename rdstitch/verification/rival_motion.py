@@ -14,16 +14,13 @@ import numpy as np
 from rdstitch.alignment import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.matching.two_view import PairRegistration
+from rdstitch.matching.two_view import PairRegistration, estimation_batches
 from rdstitch.messages import Message, names_of
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
 
 _MIN_MATCHES = 12
 """Inliers of a rival: four define its homography, and eight more by chance have not been seen."""
-
-_PAIRS_AT_ONCE = 128
-"""Whose matches are in memory."""
 
 _FAR = 3.0
 """Thresholds beyond which a match disagrees with the alignment: nearer, relief and the lens may be to blame."""
@@ -107,8 +104,8 @@ def find_rival_motions(
     """
     aligned = [pair for pair in pairs if alignment.used[pair.image1] and alignment.used[pair.image2]]
     rivals, limits = list[RivalMotion](), RansacOptions(threshold, seed=seed)
-    for start in range(0, len(aligned), _PAIRS_AT_ONCE):
-        rests = [_Rest(alignment, pair, threshold) for pair in aligned[start : start + _PAIRS_AT_ONCE]]
+    for batch in estimation_batches(aligned):
+        rests = [_Rest(alignment, pair, threshold) for pair in batch]
         rests = [rest for rest in rests if rest.agreeing.any()]
         tried = [rest for rest in rests if len(rest.unexplained) >= _MIN_MATCHES]
         # All pictures have one lens.
