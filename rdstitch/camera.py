@@ -137,7 +137,7 @@ class Camera:
             raise ArgumentError(f"unknown source of a focal length: {self.focal_source!r}")
         with np.errstate(all="ignore"):  # absurd values, from a damaged file, overflow
             corner = self._corner_radius
-            if not (math.isfinite(corner) and not folds(corner, self.coefficients)):
+            if not (math.isfinite(corner * corner) and not folds(corner, self.coefficients)):
                 raise ImpossibleCameraError(
                     f"distortion {', '.join(f'{value:g}' for value in self.coefficients if value)} folds the picture"
                 )
@@ -201,7 +201,8 @@ class Camera:
     @property
     def _corner_radius(self) -> float:
         """Distance of the farthest corner from the centre, half diagonals."""
-        return float(np.linalg.norm(self.normalize(border_of(self.image_size, 1)), axis=1).max())
+        farthest = (max(c, n - 1 - c) + 0.5 for c, n in zip(self.center, self.image_size, strict=True))
+        return math.hypot(*farthest) / self.half_diagonal
 
     def _radii2(self) -> FloatArray:
         """Squared radii, half diagonals, of points evenly over the picture, as far as it can be undistorted."""

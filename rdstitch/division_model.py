@@ -32,6 +32,7 @@ OBSERVABLE_STD = 0.1
 """Standard deviation of λ from which on it counts as not observable: a tenth of the radius at the corner."""
 
 _NEWTON_STEPS, _NEWTON_TOLERANCE = 40, 1e-14
+_QUICK_STEPS = 8  # of Newton's method alone, which doubles the digits with each
 _RATIO_STEPS = 12
 _FARTHEST = 4.0
 """Half diagonals: with more coefficients than λ the model is not used beyond, where only the highest power counts."""
@@ -227,13 +228,38 @@ def _first_zero(coefficients: FloatArray) -> float:
 
 
 def _distorted_radius(radius: FloatArray, distortion: float, higher: tuple[float, ...]) -> FloatArray:
-    """Solve ``r = r_u g(r²)`` for the measured radius within the domain; NaN where there is none."""
+    """Solve ``r = r_u g(r²)`` for the measured radius within the domain; NaN where there is none.
+
+    The domain has one root at most, so that whatever Newton's method reaches there is it; where it leaves the domain or
+    takes its time, bisection guards it.
+    """
+    limit = valid_radius(distortion, higher)
+    with np.errstate(all="ignore"):
+        solvable = limit - radius * float(divisor(np.asarray(limit**2), distortion, higher)) > 0.0
+        discriminant = np.maximum(1.0 - 4.0 * distortion * radius**2, 0.0)
+        found = np.minimum(2.0 * radius / (1.0 + np.sqrt(discriminant)), limit)
+        settled = np.zeros_like(solvable)
+        for _ in range(_QUICK_STEPS):
+            q = found**2
+            slope = 1.0 - 2.0 * radius * found * divisor_slope(q, distortion, higher)
+            step = (found - radius * divisor(q, distortion, higher)) / slope
+            found = found - step
+            settled = np.abs(step) <= _NEWTON_TOLERANCE * limit
+            if settled.all():
+                break
+    left = solvable & ~(settled & (slope > 0.0) & (found >= 0.0) & (found <= limit))
+    if left.any():
+        found = np.array(found)
+        found[left] = _guarded_radius(radius[left], distortion, higher)
+    return np.where(solvable, found, np.nan)
+
+
+def _guarded_radius(radius: FloatArray, distortion: float, higher: tuple[float, ...]) -> FloatArray:
+    """The same (N,) where there is a solution, by Newton's method with bisection."""
     limit = valid_radius(distortion, higher)
     with np.errstate(over="ignore", invalid="ignore"):
         low, high = np.zeros_like(radius), np.full_like(radius, limit)
-        solvable = limit - radius * divisor(high**2, distortion, higher) > 0.0
-        discriminant = np.maximum(1.0 - 4.0 * distortion * radius**2, 0.0)
-        found = np.minimum(2.0 * radius / (1.0 + np.sqrt(discriminant)), limit)
+        found = (low + high) / 2.0
         for _ in range(_NEWTON_STEPS):
             q = found**2
             value = found - radius * divisor(q, distortion, higher)
@@ -243,9 +269,9 @@ def _distorted_radius(radius: FloatArray, distortion: float, higher: tuple[float
             following = np.where((following >= low) & (following <= high), following, (low + high) / 2.0)
             step = np.abs(following - found)
             found = following
-            if not (step[solvable] > _NEWTON_TOLERANCE * limit).any():
+            if not (step > _NEWTON_TOLERANCE * limit).any():
                 break
-    return np.where(solvable, found, np.nan)
+    return found
 
 
 def is_one_to_one(radius: float, coefficients: Sequence[float]) -> bool:

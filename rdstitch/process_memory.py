@@ -9,7 +9,7 @@ from threading import Condition
 
 _USUAL = 180 * 2**20  # bytes; where the system does not say it: the libraries, and a few hundred registered pictures
 _BOUND, _BOUND_OF_A_PICTURE = 400 * 10**6, 150 * 10**3  # bytes; of the whole process, see docs/scale.md
-_MMAP_THRESHOLD = -3  # of mallopt
+_MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # of mallopt
 _LARGE = 8 * 2**20  # bytes: more than any array of a tile, which are made again and again; less than a picture
 _SCRATCH = 280 * 10**6  # bytes that the threads of this process may take at once for what they give back soon
 
@@ -19,12 +19,25 @@ def return_freed_memory() -> None:
 
     What the threads of one stage have freed is of little use to those of the next, and would count twice. From the
     first call on, large arrays go back as soon as they are freed; otherwise the library would soon put them onto its
-    heaps, where small ones between them keep what is freed.
+    heaps, where small ones between them keep what is freed. What is free at the end of a heap goes back once it is
+    twice as much, as the library has it while it chooses itself: its first threshold would have every array of a few
+    hundred kilobytes come from the system anew, page by page.
     """
     with suppress(AttributeError, OSError, TypeError):
         library = ctypes.CDLL(None)
         library.mallopt(_MMAP_THRESHOLD, _LARGE)
+        library.mallopt(_TRIM_THRESHOLD, 2 * _LARGE)
         library.malloc_trim(0)
+
+
+def reuse_freed_memory() -> None:
+    """Keep what is freed until :func:`return_freed_memory` is called next (glibc).
+
+    For a stage that takes as much for one picture after the other as :func:`scratch_memory` allows, such as the
+    pyramids of SIFT: the system would clear every page of it anew.
+    """
+    with suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).mallopt(_TRIM_THRESHOLD, _SCRATCH)
 
 
 def memory_left(pictures: int) -> int:

@@ -7,7 +7,11 @@ import numpy as np
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.features import Correspondences
+from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.links import Link
+from rdstitch.matching.rough_ground import over_rough_ground
+from rdstitch.matching.two_view import PairRegistration
 from rdstitch.radial_homography import to_plane
 from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
 from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
@@ -64,12 +68,19 @@ def strip(kind: str, height: float, seed: int, pictures: int) -> Strip:
                 own = Camera(lens.image_size).with_focal()
                 matched.append(PairMatches(points1, points2, own, own, np.zeros(len(points1)), None))
     relations = estimate_radial_homographies(matched, _OPTIONS)
-    links = [
-        Link(i, j, found.points1[relation.inliers], found.points2[relation.inliers], relation)
+    registered = [
+        PairRegistration(i, j, _stored(found), relation)
         for (i, j), found, relation in zip(pairs, matched, relations, strict=True)
         if relation
     ]
+    links = [pair.link() for pair in over_rough_ground(registered, _OPTIONS.ransac.threshold)]
     return Strip(truth, lens.distortion, [Camera(lens.image_size).with_focal() for _ in range(pictures)], links)
+
+
+def _stored(found: PairMatches) -> StoredMatches:
+    count = len(found)
+    index = np.column_stack([np.arange(count)] * 2)
+    return StoredMatches.of(Correspondences(index, found.points1, found.points2, np.zeros(count)))
 
 
 def _matches(truth: Sequence, i: int, j: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:

@@ -37,7 +37,7 @@ from rdstitch.matching.match_graph import connected_components, spanning_tree
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
 
 _UNCONFIRMED = 0.1
-"""Weight in the spanning tree of a link without a consistent triangle, relative to one with."""
+"""What the matches count in the spanning tree of a link without a consistent triangle, relative to one with."""
 
 _MATCHES_OF_A_TURN = 5000
 """Correspondences of all links together that the final adjustment of a turn on the spot uses at least, if there are."""
@@ -107,7 +107,7 @@ def align(
 
     report("choice of the model")
     wrong, confirmed = cycle_consistency(apart, few, len(cameras))
-    trust = few.matches.astype(np.float64) * np.where(confirmed > 0, 1.0, _UNCONFIRMED)
+    trust = _trust(few, confirmed)
     graph = _Graph(len(cameras), few, relations, trust, lens, free_lens, known, options)
     problem, pictures = graph.problem(~wrong)
     choice = None
@@ -151,6 +151,15 @@ def _check(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentO
         raise ArgumentError("two links are between the same pictures")
     if options.reference is not None and not 0 <= options.reference < len(cameras):
         raise ArgumentError(f"the reference picture {options.reference} is none of the {len(cameras)}")
+
+
+def _trust(observations: Observations, confirmed: IntArray) -> FloatArray:
+    """Ranks of the links for the spanning tree: by their matches, and by the area of these where they are as many.
+
+    Where all are as many, a tree of the first links may pass over neighbours, and join them a whole path away.
+    """
+    matches = observations.matches * np.where(confirmed > 0, 1.0, _UNCONFIRMED)
+    return np.argsort(np.lexsort((observations.areas, matches))).astype(np.float64)
 
 
 def _lens_start(cameras: Sequence[Camera], options: AlignmentOptions, votes: Consensus) -> tuple[FloatArray, BoolArray]:

@@ -21,6 +21,7 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.division_model import undistort
 from rdstitch.radial_homography import RadialHomography, transfer
+from rdstitch.solvers.direct_linear import direct_linear
 
 MAX_ITERATIONS = 24
 """A start need not be the minimum."""
@@ -43,18 +44,8 @@ def relations_at(observations: Observations, relations: Sequence[RadialHomograph
         x1, x2 = (undistort(points - center, distortion, higher) for points in (points1, own))
         valid = np.isfinite(x1).all(axis=1) & np.isfinite(x2).all(axis=1)
         if valid.sum() >= 4:
-            result[link] = _direct_linear(x1[valid], x2[valid])
+            result[link] = direct_linear(x1[valid], x2[valid])
     return result
-
-
-def _direct_linear(x1: FloatArray, x2: FloatArray) -> FloatArray:
-    """Homography (3, 3) between undistorted points without outliers, positive in front of the camera."""
-    lifted = np.column_stack([x1, np.ones(len(x1))])
-    zero = np.zeros_like(lifted)
-    first = np.concatenate([lifted, zero, -x2[:, :1] * lifted], axis=1)
-    second = np.concatenate([zero, lifted, -x2[:, 1:] * lifted], axis=1)
-    h: FloatArray = np.linalg.svd(np.concatenate([first, second]), full_matrices=False)[2][-1].reshape(3, 3)
-    return h * float(np.copysign(1.0 / np.linalg.norm(h), np.median(lifted @ h[2])))
 
 
 def adjust_pairs_independently(

@@ -64,6 +64,10 @@ _RADII, _SCALE_STEPS, _SCALE_STEP = 64, 6, 1e-6
 _SUFFICIENT_LINKS = 8
 """Links from which on each is a part."""
 
+_ENOUGH_LINKS = 2000
+"""Of more links, evenly chosen ones say which lens it is: all of them determine it many times over, and each of the
+lenses takes memory and time for each of them."""
+
 
 @dataclass(frozen=True)
 class LensChoice:
@@ -123,6 +127,8 @@ def choose_lens(
     """
     if not names:
         return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), apart, "given")
+    if len(names) > 1 and len(observations) > _ENOUGH_LINKS:
+        return _choose_by_some(observations, apart, names, known)
     pictures = _pictures(observations)
     few = len(names) > 1 and pictures < ENOUGH_PICTURES
     if few:
@@ -152,6 +158,19 @@ def choose_lens(
             )
     refinements = (CENTER,) if best == 0 and pictures >= _ENOUGH_PICTURES_OF_A_MOTION else ()
     return LensChoice(names[best], free[best], fits[best], reason, refinements, shift)
+
+
+def _choose_by_some(
+    observations: Observations, apart: BundleAdjustmentResult, names: Sequence[str], known: CameraPriors
+) -> LensChoice:
+    """The lens that evenly chosen links show, and every link on its own with it."""
+    start, simplest = apart.parameters.lens, free_parameters("division")
+    some = np.arange(0, len(observations), -(-len(observations) // _ENOUGH_LINKS))
+    few = observations.subset(some)
+    choice = choose_lens(few, homography_apart(few, apart.homographies[some], start, simplest, known), names, known)
+    if (choice.free != simplest).any():
+        apart = homography_apart(observations, apart.homographies, start, choice.free, known)
+    return replace(choice, apart=apart)
 
 
 def _distance(simple: BundleAdjustmentResult, rich: BundleAdjustmentResult, half_diagonal: float) -> float:

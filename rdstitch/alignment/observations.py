@@ -95,6 +95,15 @@ class Observations:
         moving = np.repeat(self.medians(distance) > _STATIC, np.diff(self.start))
         return moving if moving.any() else np.ones_like(moving)
 
+    @property
+    def areas(self) -> FloatArray:
+        """Product of the principal standard deviations of ``points1`` of each link, shape (L,); half diagonals²."""
+        counts = np.diff(self.start)
+        means = np.stack([np.bincount(self.link, x, len(self)) for x in self.points1.T], axis=1)
+        x, y = (self.points1 - (means / np.maximum(counts, 1)[:, None])[self.link]).T
+        xx, yy, xy = (np.bincount(self.link, z, len(self)) / np.maximum(counts, 1) for z in (x * x, y * y, x * y))
+        return np.sqrt(np.maximum(xx * yy - xy * xy, 0.0))
+
     def medians(self, values: FloatArray) -> FloatArray:
         """Median of one value (M,) per correspondence over each link, shape (L,); inf where a link has none."""
         counts = np.diff(self.start)

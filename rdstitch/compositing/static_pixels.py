@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.io.reduction import mean_of_channels
 
 MIN_PICTURES = 4
 """Fewer may show the same by chance."""
@@ -49,8 +50,7 @@ def static_pixels(pictures: Sequence[NDArray[np.generic]]) -> BoolArray | None:
 
 
 def _grey(picture: NDArray[np.generic]) -> NDArray[np.float32]:
-    samples = picture.astype(np.float32)
-    return samples if samples.ndim == 2 else samples.mean(axis=2)
+    return mean_of_channels(picture.astype(np.float32))
 
 
 def _agreement(grey: NDArray[np.float32], window: int) -> FloatArray:

@@ -9,6 +9,7 @@ import hashlib
 import json
 import struct
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -105,6 +106,10 @@ def _describe_array(array: NDArray[Any], blocks: list[bytes]) -> Any:
     return {"array": array.dtype.str, "shape": list(array.shape), "order": order}
 
 
+_hints_of = cache(get_type_hints)
+"""Of a dataclass; to read them takes longer than to build it."""
+
+
 def _is_of(value: Any, hint: Any) -> bool:
     """Whether a value is what a field of a dataclass is declared as, as far as that can be seen."""
     origin, arguments = get_origin(hint), get_args(hint)
@@ -148,7 +153,7 @@ def _build(described: Any, blocks: memoryview, kinds: dict[str, type]) -> Any:
             kind = kinds[part["object"]]
             given = part["fields"]
             values = {f.name: build(given[f.name]) for f in dataclasses.fields(kind)}
-            for name, hint in get_type_hints(kind).items():
+            for name, hint in _hints_of(kind).items():
                 if name in values and not _is_of(values[name], hint):
                     raise TypeError(f"{kind.__name__}.{name} is a {type(values[name]).__name__}")
             return kind(**values)

@@ -1,6 +1,6 @@
 """Whether pictures are aligned locally, and how: decided by matches that are held out of the fit."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,6 +22,8 @@ _HELD_OUT = 5  # every fifth match
 # Share by which held-out residuals must get smaller for local alignment to be worth while, and for freer fields.
 _WORTHWHILE, _BETTER = 0.15, 0.03
 _MIN_MATCHES = 100
+# Of thousands of pictures, fields are fitted to a part: each match takes about 600 bytes meanwhile.
+_MAX_MATCHES = 250_000
 # Correlation of the residuals of neighbouring matches below which no smooth field is worth while: one that brings the
 # median down by 15 % takes away a quarter of the variance, and that quarter neighbours would have in common.
 _MIN_AGREEMENT = 0.1
@@ -88,11 +90,19 @@ def align_locally(
     if choice == "off":
         return no_local_alignment("switched off")
     pictures = PicturesOnPlane.of(cameras, homographies)
-    placed = place_matches(matches, pictures)
-    if placed is None or len(placed) < _MIN_MATCHES:
+    # Pair by pair, again and again: together, the matches of thousands of pictures are what takes memory.
+    lengths = [np.linalg.norm(pair.residual, axis=1) for pair in place_matches(matches, pictures)]
+    count = sum(map(len, lengths))
+    if count < _MIN_MATCHES:
         return no_local_alignment("there are too few matches")
-    if choice == "auto" and (agreement := _agreement_of_neighbours(placed)) < _MIN_AGREEMENT:
-        return no_local_alignment(f"not worth while; residuals of neighbouring matches agree by {agreement:.0%} only")
+    if choice == "auto":
+        most = _OUTLYING * float(np.median(np.concatenate(lengths)))
+        if (agreement := _agreement_of_neighbours(place_matches(matches, pictures), most)) < _MIN_AGREEMENT:
+            return no_local_alignment(
+                f"not worth while; residuals of neighbouring matches agree by {agreement:.0%} only"
+            )
+    share = min(1.0, _MAX_MATCHES / count)
+    placed = PlaneMatches.join(pair.thinned(share) for pair in place_matches(matches, pictures))
     cells = _CELLS if choice == "auto" else choice
     held_out = np.arange(len(placed)) % _HELD_OUT == 0
     start, before, after = _choose(placed.take(~held_out), placed.take(held_out), pictures, cells)
@@ -103,12 +113,18 @@ def align_locally(
     return LocalAlignment(fields, text, cells, before, after)
 
 
-def _agreement_of_neighbours(matches: PlaneMatches) -> float:
-    """Correlation of the residuals of each match and the nearest one of the same pair of pictures, in [-1, 1]."""
-    length = np.linalg.norm(matches.residual, axis=1)
-    most = _OUTLYING * float(np.median(length))
-    residual = matches.residual * np.minimum(1.0, most / np.maximum(length, 1e-12))[:, None]
-    return float((residual * residual[matches.neighbours]).sum() / max((residual**2).sum(), 1e-300))
+def _agreement_of_neighbours(pairs: Iterable[PlaneMatches], most: float) -> float:
+    """Correlation of the residuals of each match and the nearest one of the same pair of pictures, in [-1, 1].
+
+    Residuals that are longer than ``most`` count as if they were so long.
+    """
+    common = total = 0.0
+    for pair in pairs:
+        length = np.linalg.norm(pair.residual, axis=1)
+        residual = pair.residual * np.minimum(1.0, most / np.maximum(length, 1e-12))[:, None]
+        common += float((residual * residual[pair.neighbours]).sum())
+        total += float((residual**2).sum())
+    return common / max(total, 1e-300)
 
 
 def _choose(

@@ -36,7 +36,8 @@ _FADE = 0.2
 _STEPS = 6
 # Limit of the displacement's change per pixel: half of what would fold a picture.
 _MAX_GRADIENT = 0.5
-
+# A residual leads from the second picture to the first.
+_SIGNS = np.array([1.0, -1.0])
 
 Shapes = tuple[tuple[int, int], ...]
 """Rows and columns of the grid of each picture."""
@@ -81,9 +82,9 @@ class PlaneFields:
         """What they leave over at matches, (M, 2), and pixels (2 M, 2) where the alignment expects these."""
         values, expected = np.concatenate(self.values), matches.points.reshape(-1, 2)
         for _ in range(_STEPS):
-            moved = _shares(matches, expected, self.pictures.cameras, self.shapes) @ values
-            expected = _expected(matches, self.pictures, moved)
-        return matches.residual - moved[0::2] + moved[1::2], expected
+            design = _design(matches, expected, self.pictures.cameras, self.shapes)
+            expected = _expected(matches, self.pictures, design, values)
+        return matches.residual - design @ values, expected
 
     def of_pictures(self) -> tuple[DisplacementField, ...]:
         """The displacements in measured pixels of each picture, limited so that nothing folds."""
@@ -127,49 +128,60 @@ def fit_fields(
         sharp += scale <= sharpest
         scale = max(scale, sharpest)
         weight = (1.0 / (1.0 + (length / scale) ** 2)) ** 2 / sharpest**2
-        shares = _shares(matches, expected, cameras, shapes)
-        design = shares[0::2] - shares[1::2]
+        design = _design(matches, expected, cameras, shapes)
         solution = _solve(design, weight, prior, matches.residual, solution)
         left = matches.residual - design @ solution
-        expected = _expected(matches, pictures, shares @ solution)
+        expected = _expected(matches, pictures, design, solution)
         scale *= _SHARPENED
     return PlaneFields(pictures, stiffness, shapes, tuple(np.split(solution, _first_nodes(shapes)[1:-1])))
 
 
 def _solve(
-    design: Any, weight: FloatArray, prior: sparse.csr_array, residual: FloatArray, start: FloatArray
+    design: sparse.csr_array, weight: FloatArray, prior: sparse.csr_array, residual: FloatArray, start: FloatArray
 ) -> FloatArray:
-    """Both coordinates (nodes, 2) of the fields, from near ones, by conjugate gradients, whose memory grows evenly."""
-    weighted = design.T @ sparse.diags_array(weight)
-    normal = sparse.csr_array(weighted @ design + prior)
-    diagonal = np.repeat(normal.diagonal(), 2)
-    both = LinearOperator(
-        (diagonal.size, diagonal.size), lambda v: (normal @ v.reshape(-1, 2)).ravel(), dtype=np.float64
-    )
-    wanted = (weighted @ residual).ravel()
-    solution, _ = cg(both, wanted, start.ravel(), rtol=_TOLERANCE, maxiter=_MAX_ITERATIONS,
+    """Both coordinates (nodes, 2) of the fields, from near ones, by conjugate gradients.
+
+    The matrix of the normal equations, by far the largest array, is never made.
+    """
+    weighted, across = weight[:, None], design.T
+
+    def normal(values: FloatArray) -> FloatArray:
+        both = values.reshape(-1, 2)
+        return np.asarray(across @ (weighted * (design @ both)) + prior @ both).ravel()
+
+    diagonal = np.repeat(design.power(2).T @ weight + prior.diagonal(), 2)
+    solution, _ = cg(LinearOperator((diagonal.size, diagonal.size), normal, dtype=np.float64),
+                     (across @ (weighted * residual)).ravel(), start.ravel(), rtol=_TOLERANCE, maxiter=_MAX_ITERATIONS,
                      M=sparse.diags_array(1.0 / diagonal))  # fmt: skip
     return np.asarray(solution).reshape(-1, 2)
 
 
-def _expected(matches: PlaneMatches, pictures: PicturesOnPlane, moved: FloatArray) -> FloatArray:
-    """Pixels (2 M, 2) at which the alignment expects matches that are displaced by (2 M, 2) on the plane."""
-    places, expected = matches.places.reshape(-1, 2) - moved, matches.points.reshape(-1, 2).copy()
+def _expected(
+    matches: PlaneMatches, pictures: PicturesOnPlane, design: sparse.csr_array, values: FloatArray
+) -> FloatArray:
+    """Pixels (2 M, 2) at which the alignment expects matches, in pictures that are displaced by ``values`` at nodes."""
+    sides = sparse.csr_array(
+        (design.data, design.indices, np.arange(0, design.nnz + 1, 4, dtype=np.int32)),
+        shape=(2 * len(matches), len(values)),
+    )
+    moved = (sides @ values).reshape(-1, 2, 2) * _SIGNS[:, None]
+    places, expected = (matches.places - moved).reshape(-1, 2), matches.points.reshape(-1, 2).copy()
     for k, chosen in matches.of_picture:
         found = pictures.from_plane(k, places[chosen])
         expected[chosen] = np.where(np.isfinite(found), found, expected[chosen])
     return expected
 
 
-def _shares(matches: PlaneMatches, pixels: FloatArray, cameras: Sequence[Camera], shapes: Shapes) -> Any:
-    """Shares (2 M, nodes of all pictures) of the nodes in the displacements of matches at pixels (2 M, 2)."""
+def _design(matches: PlaneMatches, pixels: FloatArray, cameras: Sequence[Camera], shapes: Shapes) -> sparse.csr_array:
+    """What all nodes do to the residuals of matches at pixels (2 M, 2): four in either picture, shape (M, nodes)."""
     first = _first_nodes(shapes)
-    columns, entries = np.empty((len(pixels), 4), dtype=np.intp), np.empty((len(pixels), 4))
+    columns, entries = np.empty((len(pixels), 4), dtype=np.int32), np.empty((len(pixels), 4))
     for k, chosen in matches.of_picture:
         nodes, entries[chosen] = bilinear(pixels[chosen], cameras[k].image_size, shapes[k])
         columns[chosen] = first[k] + nodes
-    rows = np.arange(0, columns.size + 1, 4)
-    return sparse.csr_array((entries.ravel(), columns.ravel(), rows), shape=(len(pixels), int(first[-1])))
+    entries *= np.tile(_SIGNS, len(matches))[:, None]
+    rows = np.arange(0, columns.size + 1, 8, dtype=np.int32)
+    return sparse.csr_array((entries.ravel(), columns.ravel(), rows), shape=(len(matches), int(first[-1])))
 
 
 def _first_nodes(shapes: Shapes) -> NDArray[np.intp]:

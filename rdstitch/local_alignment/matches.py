@@ -1,8 +1,9 @@
-"""Matches of all overlapping pictures on the common plane, and what the alignment leaves over at each of them."""
+"""Matches of overlapping pictures on the common plane, and what the alignment leaves over at each of them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -69,7 +70,7 @@ class PicturesOnPlane:
 
 @dataclass(frozen=True, eq=False)
 class PlaneMatches:
-    """Matches of all pairs, one after the other.
+    """Matches of one pair of pictures, or of many, one pair after the other.
 
     Attributes
     ----------
@@ -88,6 +89,12 @@ class PlaneMatches:
     def __len__(self) -> int:
         return len(self.images)
 
+    @classmethod
+    def join(cls, parts: Iterable["PlaneMatches"]) -> Self:
+        """All of them, one after the other."""
+        every = list(parts)
+        return cls(*(np.concatenate([getattr(p, name) for p in every]) for name in ("images", "points", "places")))
+
     @cached_property
     def residual(self) -> FloatArray:
         """From where the second picture puts them to where the first does, (M, 2)."""
@@ -102,11 +109,15 @@ class PlaneMatches:
 
     @cached_property
     def neighbours(self) -> NDArray[np.intp]:
-        """For each match the nearest one of the same pair of pictures, or of another where there is none."""
-        # Pairs are so far apart along a third axis that no neighbour is of another pair.
-        pair = np.unique(self.images, axis=0, return_inverse=True)[1].reshape(-1)
-        where = np.column_stack([self.points[:, 0], pair * 2.0 * np.ptp(self.points[:, 0])])
-        return np.asarray(cKDTree(where).query(where, k=2)[1], dtype=np.intp)[:, 1]
+        """For each match the nearest other one of the same pair of pictures; itself where there is none."""
+        new_pair = (self.images[1:] != self.images[:-1]).any(axis=1)
+        first = np.concatenate([[0], np.flatnonzero(new_pair) + 1, [len(self)]])
+        found = np.empty(len(self), dtype=np.intp)
+        for start, stop in pairwise(first.tolist()):
+            points = self.points[start:stop, 0]
+            nearest = np.asarray(cKDTree(points).query(points, k=2)[1])[:, 1]
+            found[start:stop] = start + np.minimum(nearest, len(points) - 1)
+        return found
 
     @cached_property
     def noise(self) -> float:
@@ -114,26 +125,24 @@ class PlaneMatches:
         apart = self.residual - self.residual[self.neighbours]
         return float(np.median(np.linalg.norm(apart, axis=1)) / np.sqrt(2.0))
 
-    def take(self, chosen: NDArray[np.bool_]) -> "PlaneMatches":
+    def thinned(self, share: float) -> "PlaneMatches":
+        """About such a share of them, evenly."""
+        return self.take(np.linspace(0, len(self) - 1, round(share * len(self))).astype(np.intp))
+
+    def take(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> "PlaneMatches":
         """A part of them."""
         return PlaneMatches(self.images[chosen], self.points[chosen], self.places[chosen])
 
 
-def place_matches(matches: Sequence[Match], pictures: PicturesOnPlane) -> PlaneMatches | None:
-    """Matches that lie near each other on the plane, the inliers of the alignment and those a little farther off.
+def place_matches(matches: Iterable[Match], pictures: PicturesOnPlane) -> Iterator[PlaneMatches]:
+    """For each pair, matches that lie near each other on the plane: inliers of the alignment, and a little farther off.
 
-    None where there are hardly any.
+    Pairs that have hardly any are left out.
     """
-    images, points, places = [], [], []
     for match in matches:
         pair, measured = (match.image1, match.image2), np.stack([match.points1, match.points2], axis=1)
         placed = np.stack([pictures.to_plane(k, measured[:, part]) for part, k in enumerate(pair)], axis=1)
         radius = _SEARCH_RADIUS * min(2.0 * pictures.cameras[k].half_diagonal for k in pair)
         near = np.linalg.norm(placed[:, 0] - placed[:, 1], axis=1) < radius
-        if near.sum() >= _MIN_MATCHES:
-            images.append(np.broadcast_to(np.array(pair), (int(near.sum()), 2)))
-            points.append(measured[near])
-            places.append(placed[near])
-    if not images:
-        return None
-    return PlaneMatches(np.concatenate(images), np.concatenate(points), np.concatenate(places))
+        if (count := int(near.sum())) >= _MIN_MATCHES:
+            yield PlaneMatches(np.tile(np.array(pair), (count, 1)), measured[near], placed[near])

@@ -35,12 +35,12 @@ def repetition(features: Features) -> float:
     strongest = features.take(np.arange(min(len(features), _MAX_KEYPOINTS)))
     if features.binary or len(strongest) <= _MIN_REPETITIONS:
         return 0.0
-    distance = np.sqrt(_squared_distances(strongest, strongest))
-    apart = np.linalg.norm(strongest.points[:, None] - strongest.points, axis=2)
-    elsewhere = apart > 2.0 * np.maximum(strongest.scale[:, None], strongest.scale)
-    others = np.where(elsewhere, distance, np.inf)
-    nearest = np.partition(others, _MIN_REPETITIONS - 1, axis=1)[:, _MIN_REPETITIONS - 1]
-    return float(np.mean(nearest < _SIMILAR_DISTANCE * np.median(distance)))
+    squared = _squared_distances(strongest, strongest)
+    one, other = np.nonzero(squared < _SIMILAR_DISTANCE**2 * np.median(squared))
+    apart = np.linalg.norm(strongest.points[one] - strongest.points[other], axis=1)
+    elsewhere = apart > 2.0 * np.maximum(strongest.scale[one], strongest.scale[other])
+    alike = np.bincount(one[elsewhere], minlength=len(strongest))
+    return float(np.mean(alike >= _MIN_REPETITIONS))
 
 
 def match_pattern(features1: Features, features2: Features) -> Correspondences:
@@ -81,18 +81,18 @@ def match_pattern(features1: Features, features2: Features) -> Correspondences:
     return Correspondences.of(features1, features2, indices, error[chosen] / _TOLERANCES[-1])
 
 
-def _squared_distances(features1: Features, features2: Features) -> FloatArray:
+def _squared_distances(features1: Features, features2: Features) -> NDArray[np.float32]:
     """Between all descriptors, (N, M)."""
     a, b = (f.descriptors.astype(np.float32) for f in (features1, features2))
-    squared = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2.0 * a @ b.T
-    return np.asarray(np.maximum(squared, 0.0), dtype=np.float64)
+    squared: NDArray[np.float32] = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2.0 * a @ b.T
+    return np.maximum(squared, 0.0, out=squared)
 
 
 def _partners(features1: Features, features2: Features) -> tuple[IntArray, IntArray, FloatArray]:
     """Keypoints of the first picture, each with its likely partners in the second, and how unlike they are."""
     squared = _squared_distances(features1, features2)
     nearest = np.argpartition(squared, _PARTNERS, axis=1)[:, :_PARTNERS]
-    distance = np.sqrt(np.take_along_axis(squared, nearest, axis=1)).ravel()
+    distance = np.sqrt(np.take_along_axis(squared, nearest, axis=1).astype(np.float64)).ravel()
     own, partner = np.repeat(np.arange(len(features1)), _PARTNERS), nearest.ravel()
     scale = np.abs(np.log(features2.scale[partner] / features1.scale[own]))
     kept = scale < np.log(_MAX_SCALE)

@@ -9,7 +9,6 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
-from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.result import LinkFit, PlanarPoses, ReliefTest, ShapeTest
 from rdstitch.arrays import FloatArray
 from rdstitch.cache import Cache
@@ -18,21 +17,25 @@ from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationEr
 from rdstitch.inputs.measurements import positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import neighbours
+from rdstitch.matching.eccentricity import blob_radii
 from rdstitch.matching.neighbours_around import neighbours_around
+from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.messages import Message, names_of
 from rdstitch.options import StitchOptions
+from rdstitch.pipeline.inlier_selection import reselect_inliers
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.process_memory import return_freed_memory
 
 _CLOSURE_ROUNDS = 2
 
-_WIDTH_PER_SIGMA, _MIN_THRESHOLD = 4.0, 0.5
-"""Up to how many standard deviations a match is an inlier, but at least up to so many pixels."""
+_SELECTION_ROUNDS = 2
+"""Of selecting inliers by the whole lens at most, each with what the one before has found."""
 
-_MIN_KEPT = 0.5
-"""Share of its inliers that a pair must keep; otherwise the alignment does not fit it, and it stays as it is."""
+_EXPLAINED = 0.5
+"""Share of the matches off the planes of their pairs that are where the alignment expects them: more than half, and it
+was the lens that moved them, not the ground."""
 
 
 @contextmanager
@@ -61,10 +64,13 @@ class AlignedPairs:
     pairs : tuple of PairRegistration
         Every pair that was compared, in the order of the pictures.
     alignment : Alignment
+    rough : bool
+        Whether the inliers that it was made from are those over rough ground.
     """
 
     pairs: tuple[PairRegistration, ...]
     alignment: Alignment
+    rough: bool = False
 
 
 @dataclass(frozen=True)
@@ -79,12 +85,15 @@ class Aligner:
         Of the size that features are detected at.
     options : AlignmentOptions
     cache : Cache
+    threshold : float
+        Largest transfer error of an inlier, pixels.
     """
 
     paths: tuple[str, ...]
     cameras: tuple[Camera, ...]
     options: AlignmentOptions
     cache: Cache
+    threshold: float
 
     @classmethod
     def of(cls, sources: Sequence[Source], options: StitchOptions, cache: Cache) -> Self:
@@ -98,7 +107,7 @@ class Aligner:
         paths = tuple(str(source.path) for source in sources)
         megapixels = options.features.for_pictures(len(sources)).limits[1]
         cameras = tuple(at_working_size(source.camera.with_focal(), megapixels) for source in sources)
-        return cls(paths, cameras, alignment_options(sources, options), cache)
+        return cls(paths, cameras, alignment_options(sources, options), cache, options.threshold)
 
     def align(self, pairs: Sequence[PairRegistration], former: Alignment | None = None) -> AlignedPairs:
         """Align the pictures by the pairs that were registered; from an earlier run where the cache has it.
@@ -111,6 +120,33 @@ class Aligner:
             When no pair was registered.
         """
         return_freed_memory()
+        alignment = self._aligned(pairs, former)
+        ground = over_rough_ground(pairs, self.threshold)
+        rough = ground is not pairs and not self._explains(alignment, pairs, ground)
+        return AlignedPairs(tuple(pairs), self._aligned(ground, None) if rough else alignment, rough)
+
+    def used(self, aligned: AlignedPairs) -> Sequence[PairRegistration]:
+        """The pairs with the inliers that the alignment was made from."""
+        return over_rough_ground(aligned.pairs, self.threshold) if aligned.rough else aligned.pairs
+
+    def _explains(
+        self, alignment: Alignment, pairs: Sequence[PairRegistration], ground: Sequence[PairRegistration]
+    ) -> bool:
+        """Whether most matches that pairs on their own do not explain are where an alignment without them expects them.
+
+        It knows more of the lens than a pair does; and near a camera that turns is no ground.
+        """
+        errors = [np.zeros(0)]
+        for pair, more in zip(pairs, ground, strict=True):
+            new = more.relation.inliers & ~pair.relation.inliers
+            if (pair.image1, pair.image2) in alignment.support and new.any():
+                matched = pair.correspondences.take(np.flatnonzero(new))
+                expected = alignment.transfer(pair.image1, pair.image2, matched.points1)
+                errors.append(np.linalg.norm(expected - matched.points2, axis=1))
+        every = np.concatenate(errors)
+        return alignment.on_sphere or not len(every) or bool(np.mean(every < self.threshold) > _EXPLAINED)
+
+    def _aligned(self, pairs: Sequence[PairRegistration], former: Alignment | None) -> Alignment:
         links = tuple(pair.link() for pair in pairs if pair.relation)
         if not links:
             raise RegistrationError(_no_overlap(self.paths, pairs))
@@ -123,7 +159,7 @@ class Aligner:
             found, given = ([camera.image_size for camera in cameras] for cameras in (alignment.cameras, self.cameras))
             return found == given and alignment.used.shape == (count,) and alignment.homographies.shape == (count, 3, 3)
 
-        return AlignedPairs(tuple(pairs), self.cache.recall("alignment", kinds, inputs, compute, valid=valid))
+        return self.cache.recall("alignment", kinds, inputs, compute, valid=valid)
 
     def metric(self, aligned: AlignedPairs) -> AlignedPairs:
         """The same pairs with a model that has metric poses, where the user left the choice of the model open."""
@@ -143,7 +179,7 @@ def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candi
         found = pairing.estimate(sorted(unaligned.union(loop_closures)), distortion=alignment.distortion)
         pairs = tuple(sorted([*pairs, *found], key=lambda pair: (pair.image1, pair.image2)))
         if not any(pair.relation for pair in found):
-            return AlignedPairs(pairs, alignment)
+            return replace(aligned, pairs=pairs)
         aligned = aligner.align(pairs, alignment)
     return aligned
 
@@ -152,16 +188,29 @@ def rematch_weak_pairs(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs
     """Match pairs of weakly supported pictures again, only near where the alignment expects the matches.
 
     Where the lens has more than λ, the inliers of all pairs, these among them, are selected again with it: pairs on
-    their own have one λ, with which matches at the corners of such a lens are outliers, and relief is not.
+    their own have one λ, with which matches at the corners of such a lens are outliers, and relief is not. They are
+    taken for the middles of blobs then, see :mod:`rdstitch.matching.eccentricity`.
     """
     alignment = aligned.alignment
     changed = pairing.guided_rematch(list(aligned.pairs), alignment.support, alignment.transfer)
-    if alignment.lens != "division" or alignment.cameras[alignment.reference].higher:
-        pairs = [changed.get(k, pair) for k, pair in enumerate(aligned.pairs)]
-        changed = {**changed, **reselect_inliers(pairs, alignment, pairing.options.pair.threshold)}
-    if not changed:
-        return aligned
-    return aligner.align([changed.get(k, pair) for k, pair in enumerate(aligned.pairs)], alignment)
+    pairs = [changed.get(k, pair) for k, pair in enumerate(aligned.pairs)]
+    if alignment.lens == "division" and not alignment.cameras[alignment.reference].higher:
+        return aligner.align(pairs, alignment) if changed else aligned
+    radii = [blob_radii(pairing.features[k]) for k in range(len(aligner.cameras))]
+    for _ in range(_SELECTION_ROUNDS):
+        former = aligned.alignment
+        selected = reselect_inliers(pairs, former, pairing.options.pair.threshold, radii, pairing.store)
+        aligned = aligner.align([selected.get(k, pair) for k, pair in enumerate(pairs)], former)
+        if _same_lens(*(found.cameras[found.reference] for found in (former, aligned.alignment))):
+            break
+    return aligned
+
+
+def _same_lens(former: Camera, found: Camera) -> bool:
+    """Whether no parameter of a lens has changed by more than its standard deviation."""
+    before, after = (np.array([*c.coefficients, *np.array(c.center) / c.half_diagonal]) for c in (former, found))
+    variance = 0.0 if found.lens_covariance is None else np.diag(found.lens_covariance)
+    return bool(((after - before) ** 2 <= variance).all())
 
 
 def alignment_options(sources: Sequence[Source], options: StitchOptions) -> AlignmentOptions:
@@ -208,41 +257,3 @@ def _no_overlap(paths: Sequence[str], pairs: Sequence[PairRegistration]) -> str:
         f"no two pictures overlap: of the likeliest pair, {first} and {second}, {best.relation.reason}; "
         "take pictures that overlap by a third or more"
     )
-
-
-def reselect_inliers(
-    pairs: Sequence[PairRegistration], alignment: Alignment, threshold: float
-) -> dict[int, PairRegistration]:
-    """Select the inliers of the pairs again, by what an alignment expects of their putative matches.
-
-    Parameters
-    ----------
-    alignment : Alignment
-        Of these pairs.
-    threshold : float
-        Distance up to which a match can be an inlier, pixels; it is less where the inliers scatter less.
-
-    Returns
-    -------
-    dict of int to PairRegistration
-        The pairs that the alignment uses with their inliers, by their position in ``pairs``.
-    """
-    used = [k for k, pair in enumerate(pairs) if (pair.image1, pair.image2) in alignment.support]
-    errors = {k: _errors(pairs[k], alignment) for k in used}
-    known = [errors[k][pairs[k].relation.inliers] for k in used]
-    sigma = sigma_of(np.concatenate([np.zeros(0), *known]) ** 2)
-    farthest = min(max(_WIDTH_PER_SIGMA * sigma, _MIN_THRESHOLD), threshold)
-    selected = {k: replace(pairs[k].relation, inliers=errors[k] < farthest) for k in used}
-    return {
-        k: replace(pairs[k], relation=relation)
-        for k, relation in selected.items()
-        if relation.inliers.sum() >= _MIN_KEPT * pairs[k].relation.inliers.sum()
-    }
-
-
-def _errors(pair: PairRegistration, alignment: Alignment) -> FloatArray:
-    """Distances (M,) of the putative matches of a pair from where the alignment expects them, pixels; inf for none."""
-    matches = pair.correspondences
-    expected = alignment.transfer(pair.image1, pair.image2, matches.points1)
-    distance: FloatArray = np.nan_to_num(np.linalg.norm(expected - matches.points2, axis=1), nan=np.inf)
-    return distance

@@ -21,6 +21,7 @@ from rdstitch.features.picture import Stretch, common_stretch, halving, usual_st
 from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.matching.feature_store import FeatureStore, StoredFeatures
+from rdstitch.process_memory import reuse_freed_memory
 from rdstitch.progress import Progress
 
 _MIN_BATCHES = 16  # batches that pictures are at least divided into, so that a few keep several workers busy
@@ -173,6 +174,7 @@ def detect_by_contrast(
     progress: Progress,
 ) -> DetectionByContrast:
     """Detect the features of all pictures, if necessary once more; see :func:`detect_features`."""
+    reuse_freed_memory()
     detect = partial(detect_features, executor=executor, store=store, skip_bad=skip_bad, progress=progress)
     depths = {source.metadata.bit_depth > 8 for source in sources}
     stretch = options.stretch or (_stretch_of(sources, options, executor, store) if depths == {True} else None)

@@ -111,7 +111,7 @@ def register(
     return Registration(
         tuple(sources),
         tuple(features.counts.tolist()),
-        aligned.pairs,
+        tuple(aligner.used(aligned)),
         aligned.alignment,
         (
             *aligned.alignment.messages,

@@ -21,6 +21,7 @@ from rdstitch.registration import Registration
 from rdstitch.verification.photometric_agreement import (
     COMPARED_SIDE,
     Agreement,
+    Parallax,
     PlacedPicture,
     as_compared,
     overlap_agreement,
@@ -79,6 +80,8 @@ class OverlapTask:
         Whether the homographies lead to directions.
     metric : bool
         Whether they lead to a plane on which a period of a pattern is the same everywhere.
+    parallax : mapping of (int, int) to Parallax
+        Of the links over rough ground, pixels of the size that features are detected at.
     """
 
     links: Sequence[tuple[LinkFit, float]]
@@ -88,6 +91,7 @@ class OverlapTask:
     stretch: tuple[float, float] | None
     on_sphere: bool
     metric: bool
+    parallax: Mapping[tuple[int, int], Parallax]
 
 
 def check_overlaps(registration: Registration, executor: Executor, cache: Cache = NO_CACHE) -> list[CheckedLink]:
@@ -113,9 +117,11 @@ def check_overlaps(registration: Registration, executor: Executor, cache: Cache 
         for k, source in ((k, registration.sources[k]) for k in pictures)
     ]
 
+    parallax = _parallax(registration, chosen)
+
     def compute() -> list[CheckedLink]:
         checked: list[CheckedLink] = []
-        for found, notes in in_order(executor, compare_overlaps, _tasks(registration, chosen)):
+        for found, notes in in_order(executor, compare_overlaps, _tasks(registration, chosen, parallax)):
             registration.sources[0].guard.learn(notes)
             checked += found
         return checked
@@ -124,7 +130,8 @@ def check_overlaps(registration: Registration, executor: Executor, cache: Cache 
         return [link.pair for link in checked] == [(fit.image1, fit.image2) for fit in chosen]
 
     kinds = (CheckedLink, LinkFit, Agreement, Ambiguity)
-    return cache.recall("overlaps", kinds, (placed, chosen, registration.stretch), compute, valid=valid)
+    inputs = (placed, chosen, registration.stretch, list(parallax.values()))
+    return cache.recall("overlaps", kinds, inputs, compute, valid=valid)
 
 
 def share_alike(checked: Sequence[CheckedLink]) -> float:
@@ -133,7 +140,25 @@ def share_alike(checked: Sequence[CheckedLink]) -> float:
     return sum(link.agreement.confirming for link in checked) / cells if cells else float("nan")
 
 
-def _tasks(registration: Registration, chosen: Sequence[LinkFit]) -> list[OverlapTask]:
+def _parallax(registration: Registration, chosen: Sequence[LinkFit]) -> dict[tuple[int, int], Parallax]:
+    """Of links over rough ground, as their inliers show it; nothing where the ground is flat."""
+    alignment = registration.alignment
+    if alignment.on_sphere or not alignment.relief.found:
+        return {}
+    pairs = {(pair.image1, pair.image2): pair for pair in registration.pairs}
+    result = {}
+    for images in ((fit.image1, fit.image2) for fit in chosen):
+        link = pairs[images].link()
+        expected = alignment.transfer(*images, link.points1)
+        seen = np.isfinite(expected).all(axis=1)
+        if seen.any():
+            result[images] = Parallax(expected[seen], (link.points2 - expected)[seen])
+    return result
+
+
+def _tasks(
+    registration: Registration, chosen: Sequence[LinkFit], parallax: Mapping[tuple[int, int], Parallax]
+) -> list[OverlapTask]:
     """Batches of links that follow one another, which have pictures in common."""
     alignment = registration.alignment
     scales = [1.0] * len(chosen)
@@ -150,10 +175,10 @@ def _tasks(registration: Registration, chosen: Sequence[LinkFit]) -> list[Overla
         own = sorted({k for fit, _ in links for k in (fit.image1, fit.image2)})
         sources = {k: registration.sources[k] for k in own}
         cameras, places = {k: alignment.cameras[k] for k in own}, {k: alignment.homographies[k] for k in own}
+        metric = alignment.poses is not None
+        known = {pair: parallax[pair] for pair in ((fit.image1, fit.image2) for fit, _ in links) if pair in parallax}
         tasks.append(
-            OverlapTask(
-                links, sources, cameras, places, registration.stretch, alignment.on_sphere, alignment.poses is not None
-            )
+            OverlapTask(links, sources, cameras, places, registration.stretch, alignment.on_sphere, metric, known)
         )
     return tasks
 
@@ -174,7 +199,10 @@ def compare_overlaps(task: OverlapTask) -> tuple[list[CheckedLink], GuardNotes]:
             return _compare_around(fit, placed[fit.image1], placed[fit.image2])
         i, j = fit.image1, fit.image2
         ambiguity = placement_ambiguity(drawing(i, scale), drawing(j, scale))
-        return CheckedLink(fit, overlap_agreement(placed[i], placed[j]), ambiguity)
+        moved = task.parallax.get((i, j))
+        if moved is not None:
+            moved = moved.resized(task.cameras[j], placed[j].camera)
+        return CheckedLink(fit, overlap_agreement(placed[i], placed[j], moved), ambiguity)
 
     checked = [compare(*link) for link in task.links]
     if task.metric:

@@ -2,24 +2,26 @@
 
 One picture is resampled as the other's lens would have seen it. In each small cell of the overlap that has texture,
 the place where the two correlate best is searched around where the registration says it is. Where the registration is
-right nearly all cells find it there; elsewhere they find it anywhere.
+right nearly all cells find it there; elsewhere they find it anywhere. Over rough ground that place is moved by the
+parallax of the matches around it.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.warp import Lattice
 from rdstitch.io.read import Picture
-from rdstitch.io.reduction import fitting_reduction, reduced_size
+from rdstitch.io.reduction import fitting_reduction, mean_of_channels, reduced_size
 from rdstitch.radial_homography import from_plane, to_plane
 
 Grey = NDArray[np.float32]
@@ -32,6 +34,7 @@ _MIN_CORRELATION = 0.5  # correlation from which on two cells show the same
 _MAX_OFFSET = 2.5  # pixels
 _MAX_CELLS = 120
 _OPAQUE = 250
+_NEAREST = 3  # matches that show the parallax of a cell; one of them may be wrong
 _LATTICE = 8  # pixels between the places that are computed; those between are interpolated
 
 
@@ -54,6 +57,33 @@ class Agreement:
     def share(self) -> float:
         """Share of the cells that confirm the registration; 1 without cells."""
         return self.confirming / self.cells if self.cells else 1.0
+
+
+@dataclass(frozen=True)
+class Parallax:
+    """By how much matches are off the places where the registration expects them.
+
+    Attributes
+    ----------
+    places : ndarray of shape (M, 2)
+        Expected, pixels of the second picture.
+    shifts : ndarray of shape (M, 2)
+        From there to where they were found, pixels.
+    """
+
+    places: FloatArray
+    shifts: FloatArray
+
+    def resized(self, camera: Camera, other: Camera) -> Self:
+        """The same in pixels of another size of the second picture."""
+        scale = other.half_diagonal / camera.half_diagonal
+        return replace(self, places=other.denormalize(camera.normalize(self.places)), shifts=scale * self.shifts)
+
+    def at(self, points: FloatArray) -> NDArray[np.intp]:
+        """Of points (N, 2): the median of that of the nearest matches, whole pixels (N, 2)."""
+        nearest = cKDTree(self.places).query(points, k=min(_NEAREST, len(self.places)))[1]
+        around = self.shifts[np.asarray(nearest).reshape(len(points), -1)]
+        return np.rint(np.median(around, axis=1)).astype(np.intp)
 
 
 @dataclass(frozen=True)
@@ -116,14 +146,14 @@ def _reduced_grey(picture: Picture, stretch: tuple[float, float] | None) -> Grey
     height, width = pixels.shape[:2]
     size = _compared_size((width, height))
     small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.float32) / np.float32(full)
-    grey: Grey = small if small.ndim == 2 else small.mean(axis=2, dtype=np.float32)
+    grey = mean_of_channels(small)
     if picture.alpha is not None:
         grey[cv2.resize(picture.alpha, size, interpolation=cv2.INTER_AREA) < _OPAQUE] = np.nan
     return grey
 
 
-def overlap_agreement(first: PlacedPicture, second: PlacedPicture) -> Agreement:
-    """Compare two registered pictures where they overlap."""
+def overlap_agreement(first: PlacedPicture, second: PlacedPicture, parallax: Parallax | None = None) -> Agreement:
+    """Compare two registered pictures where they overlap, where the ground is rough by what moves its places."""
     height, width = second.grey.shape
     # The first picture as the second one's lens would have seen it.
     seen = first.sampled(partial(to_plane, second.camera, second.homography), (0, 0, width, height))
@@ -132,7 +162,12 @@ def overlap_agreement(first: PlacedPicture, second: PlacedPicture) -> Agreement:
     corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2) - _CELL // 2
     textured = corners[_have_texture(_cells(seen, corners))]
     looked_at = textured[:: max(1, -(-len(textured) // _MAX_CELLS))]
-    windows = _cells(second.grey, looked_at, _SEARCH_RADIUS)
+    there = looked_at
+    if parallax is not None and len(looked_at):
+        there = looked_at + parallax.at(looked_at[:, ::-1] + (_CELL - 1) / 2.0)[:, ::-1]
+        inside = ((there >= _SEARCH_RADIUS) & (there + _CELL + _SEARCH_RADIUS <= (height, width))).all(axis=1)
+        looked_at, there = looked_at[inside], there[inside]
+    windows = _cells(second.grey, there, _SEARCH_RADIUS)
     inner = windows[:, _SEARCH_RADIUS:-_SEARCH_RADIUS, _SEARCH_RADIUS:-_SEARCH_RADIUS]
     known = np.isfinite(windows).all(axis=(1, 2)) & _have_texture(inner)
     cells = _cells(seen, looked_at[known])

@@ -24,11 +24,12 @@ Pair = tuple[int, int]
 
 _MAX_RMS = 1.0  # of the whole, in thresholds
 _MAX_RMS_OF_RELIEF = 3.0  # the same where neighbours' errors agree and the pictures look alike
+_MAX_RELIEF = 0.02  # of a picture's diagonal: the same where relief explains them, and most of the overlaps look alike
 _MAX_AMBIGUITY = 0.4  # share of the pairs that may fit elsewhere: more is a pattern all over
 # Of the cells of an overlap that agree: chance lets up to 7 % do so, and right registrations of difficult pictures
 # (low sun, parallax, blur) have been seen to have 20 %.
 _MIN_AGREEMENT, _DOUBTFUL_AGREEMENT = 0.10, 0.15
-_USUAL_AGREEMENT = 0.25
+_USUAL_AGREEMENT, _CLEAR_AGREEMENT = 0.25, 0.5
 _MIN_CELLS = 8  # below, the overlap has too little texture to say anything
 
 
@@ -128,7 +129,14 @@ def _error_of_the_whole(alignment: Alignment, threshold: float, checked: Sequenc
     if rms <= _MAX_RMS * threshold:
         return []
     text = f"the pictures disagree by {rms:.1f} pixels, more than the threshold of {threshold:g} pixels"
-    rough = alignment.relief.found and rms <= _MAX_RMS_OF_RELIEF * threshold and _look_alike(checked)
+    relief, alike = alignment.relief, _usual_agreement(checked)
+    largest = _MAX_RELIEF * 2.0 * max(camera.half_diagonal for camera in alignment.cameras)
+    # Without what neighbours have in common, errors are those of a plane.
+    explained = rms <= largest and rms**2 - relief.size**2 <= (_MAX_RMS * threshold) ** 2
+    rough = relief.found and (
+        (rms <= _MAX_RMS_OF_RELIEF * threshold and alike >= _USUAL_AGREEMENT)
+        or (explained and alike >= _CLEAR_AGREEMENT)
+    )
     return [Message(f"{text}: the ground is rough", code="relief") if rough else _failure(text)]
 
 
@@ -168,10 +176,10 @@ def _shape(paths: Sequence[str], alignment: Alignment) -> list[Message]:
     return [Message(text, (image,), code="shape")]
 
 
-def _look_alike(checked: Sequence[CheckedLink]) -> bool:
-    """Whether pictures look alike where most pairs put them, as far as there is something to see."""
+def _usual_agreement(checked: Sequence[CheckedLink]) -> float:
+    """How much alike pictures look where most pairs put them, [0, 1]; 0 where there is nothing to see."""
     shares = [link.agreement.share for link in checked if link.agreement.cells >= _MIN_CELLS]
-    return bool(shares) and float(np.median(shares)) >= _USUAL_AGREEMENT
+    return float(np.median(shares)) if shares else 0.0
 
 
 def _pattern(ambiguous: Mapping[Pair, Message], checked: Sequence[CheckedLink]) -> list[Message]:

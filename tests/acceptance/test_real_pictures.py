@@ -4,15 +4,12 @@ from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 import rdstitch
-from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
 from rdstitch.errors import RdstitchError
-from rdstitch.io.read import read_image
+from tests.benchmarks.real_lenses import BOARDS, corners_of, files_of, off_lines, rational_undistort
 
 Locate = Callable[[str], Path]
 
@@ -49,39 +46,11 @@ def test_sequences(name: str, least: int, distortion: float, tolerance: float, s
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "board"),
-    [("opencv_chess_left", (9, 6)), ("opencv_chess_right", (9, 6)), ("carnd_wide_gopro_chess", (8, 6))],
-)
-def test_chessboards_are_straight(name: str, board: tuple[int, int], shared_data: Locate) -> None:
-    """Rows and columns of corners, undistorted, against the best that one λ about the image centre can do."""
-    folder = shared_data(name)
-    registration = rdstitch.calibrate([folder])
-    lines = _lines(folder, board)
-    size = registration.camera.image_size
-    best = min(_bend(lines, Camera(size, float(value))) for value in np.arange(-0.7, 0.0, 0.005))
-    assert _bend(lines, registration.camera) <= 1.3 * best
-
-
-def _lines(folder: Path, board: tuple[int, int]) -> list[FloatArray]:
-    """Rows and columns of the corners of all boards that are found whole, px."""
-    lines: list[FloatArray] = []
-    for file in sorted(folder.glob("*.jpg")):
-        grey = read_image(file).pixels
-        grey = grey if grey.ndim == 2 else cv2.cvtColor(grey, cv2.COLOR_RGB2GRAY)
-        found, corners = cv2.findChessboardCorners(grey, board)
-        if found:
-            corners = cv2.cornerSubPix(grey, corners, (5, 5), (-1, -1), (3, 50, 1e-4))
-            grid = corners.reshape(board[1], board[0], 2).astype(np.float64)
-            lines += [*grid, *grid.transpose(1, 0, 2)]
-    assert len(lines) > 100
-    return lines
-
-
-def _bend(lines: list[FloatArray], camera: Camera) -> float:
-    """Root mean square distance of undistorted corners from straight lines, px."""
-    squared = []
-    for line in lines:
-        flat = camera.undistort(line)
-        squared.append(np.linalg.svd(flat - flat.mean(axis=0), compute_uv=False)[-1] ** 2 / len(flat))
-    return float(np.sqrt(np.mean(squared)))
+@pytest.mark.parametrize("name", list(BOARDS))
+def test_chessboards_are_straight(name: str, shared_data: Locate) -> None:
+    """Rows and columns of corners, undistorted, against a lens of eight coefficients fitted to these corners."""
+    files = files_of(shared_data(name))
+    camera = rdstitch.calibrate(files).camera
+    corners = corners_of(files, BOARDS[name])
+    best = off_lines(corners, rational_undistort(corners, camera.image_size))
+    assert off_lines(corners, camera.undistort) <= 1.3 * best

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from rdstitch import division_model
 from rdstitch.camera import Camera
 from rdstitch.division_model import distort, horizon_radius, nearest_one_parameter, undistort, valid_radius
 from rdstitch.errors import ArgumentError
@@ -18,6 +19,19 @@ def test_no_distortion_reaches_as_far_as_the_model_is_used() -> None:
     assert valid_radius(0.0) == np.inf
     assert valid_radius(-0.25) == pytest.approx(2.0)
     assert valid_radius(0.25) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("higher", [(0.02, 0.01), (0.3, 0.2), (-0.9, 0.3), (-0.2,)])
+def test_the_root_is_the_same_where_newtons_method_has_to_be_guarded(
+    higher: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    straight = np.random.default_rng(0).uniform(-3.0, 3.0, size=(500, 2))
+    quick = distort(straight, -0.2, higher)
+    monkeypatch.setattr(division_model, "_QUICK_STEPS", 1)
+    guarded = distort(straight, -0.2, higher)
+    assert np.isfinite(quick).any()
+    np.testing.assert_allclose(guarded, quick, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(distort(straight[0], -0.2, higher), guarded[0])
 
 
 @pytest.mark.parametrize("coefficients", [(0.3, -0.9, 0.2), (-0.4, 0.5, -0.6), (0.1, 0.1, 0.1), (-0.6, -0.1, 0.8)])

@@ -48,6 +48,34 @@ def test_large_arrays_go_back_though_small_ones_were_made_between_them() -> None
     assert int(done.stdout) == pytest.approx(0, abs=10e6)
 
 
+_AGAIN_AND_AGAIN = """
+import resource, sys
+import numpy as np
+from rdstitch.process_memory import return_freed_memory, reuse_freed_memory
+return_freed_memory()
+if len(sys.argv) > 1:
+    reuse_freed_memory()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(50):
+    arrays = [np.ones(1_000_000, dtype=np.uint8) for _ in range(40 if len(sys.argv) > 1 else 1)]
+    del arrays
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="pages of another system and C library")
+def test_arrays_that_are_made_again_and_again_do_not_come_from_the_system_each_time() -> None:
+    done = subprocess.run([sys.executable, "-c", _AGAIN_AND_AGAIN], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 2_000  # pages; one array has 245
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="pages of another system and C library")
+def test_what_each_picture_takes_is_reused_for_the_next() -> None:
+    command = [sys.executable, "-c", _AGAIN_AND_AGAIN, "many"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 20_000  # pages; the arrays of a round have 9,800
+
+
 def test_the_bound_is_400_mb_and_150_kb_a_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process_memory, "_resident", lambda: 100_000_000)
     assert memory_left(0) == 300_000_000

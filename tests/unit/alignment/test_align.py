@@ -16,6 +16,7 @@ from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, RegistrationError
 from rdstitch.matching.links import Link
+from rdstitch.matching.match_graph import SpanningTree, spanning_tree
 from rdstitch.planar_motion import PlanarMotion
 from rdstitch.radial_homography import RadialHomography, transfer
 from tests.alignment_scenes import Scene, grid, jittered, robot_path, scene
@@ -240,6 +241,23 @@ def test_any_picture_can_become_the_frame_after_the_adjustment(monkeypatch: pyte
         assert found.poses.yaw[reference] == 0.0
         # Where pictures lie to one another stays as it is.
         assert float(np.quantile(_pair_errors(found, given), 0.95)) < 0.3
+
+
+def test_of_links_with_as_many_matches_those_that_overlap_most_are_chained(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By every fifth picture, neighbours would be joined far away only, after all that the chains have drifted."""
+    module, trees = import_module("rdstitch.alignment.adjustment_problem"), []
+
+    def noted(*given: object) -> SpanningTree:
+        trees.append(spanning_tree(*given))  # type: ignore[arg-type]
+        return trees[-1]
+
+    monkeypatch.setattr(module, "spanning_tree", noted)
+    rng = np.random.default_rng(5)
+    path = robot_path(40, 0.15)
+    made = scene(path, tilt=(-0.1, 0.087), noise=0.4, overlap=0.3, reach=5, per_link=150, rng=rng)
+    assert _run(made, model="rigid").used.all()
+    assert trees
+    assert max(np.abs(tree.parent - tree.child).mean() for tree in trees) < 1.5
 
 
 def test_the_order_of_links_does_not_matter() -> None:

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rdstitch.alignment import LENSES, Alignment, AlignmentOptions, align, lens_selection
+from rdstitch.alignment import LENSES, AlignmentOptions, lens_selection
+from rdstitch.alignment.adjustment_problem import homography_apart
 from rdstitch.alignment.lens_description import describe_lens, radius_std
 from rdstitch.alignment.lens_selection import LensChoice, _Judge, _parts, free_parameters, has_plausible_center
 from rdstitch.alignment.noise_model import NoiseModel
@@ -16,38 +17,17 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import LENS_PARAMETERS, Camera
 from rdstitch.errors import ArgumentError
-from tests.alignment_scenes import Scene, grid, scene
+from tests.alignment_scenes import grid, scene
 from tests.alignment_stubs import adjusted, independent_errors, observations
+from tests.lens_scenes import FISHEYE, SIZE, aligned, lens_distance, lens_scene
 
-SIZE = (640, 480)
 align_module = importlib.import_module("rdstitch.alignment.align")
-FISHEYE = Camera(SIZE, -0.49, -0.055, (335.0, 226.0), distortion3=-0.008)
 OFF_CENTRE = Camera(SIZE, -0.25, 0.0, (339.0, 229.0))
-
-
-def _scene(lens: Camera, seed: int, *, relief: float = 0.0, columns: int = 4, rows: int = 3) -> Scene:
-    rng = np.random.default_rng(seed)
-    poses = grid(columns, rows, (0.4, 0.35), np.pi, rng)
-    return scene(poses, lens=lens, rng=rng, noise=0.25, relief=relief, focal=420.0)
-
-
-def _align(given: Scene, **options: object) -> Alignment:
-    return align(given.cameras, given.links, AlignmentOptions(**options))  # type: ignore[arg-type]
-
-
-def _apart(found: Camera, truth: Camera) -> float:
-    """Largest distance of the two lenses, pixels, after the best similarity of the undistorted pictures."""
-    u, v = np.meshgrid(np.linspace(0, SIZE[0] - 1, 15), np.linspace(0, SIZE[1] - 1, 11))
-    points = np.column_stack([u.ravel(), v.ravel()])
-    ours, theirs = (camera.normalize(camera.undistort(points)) for camera in (found, truth))
-    design = np.column_stack([ours, np.ones(len(ours))])
-    mapped = design @ np.linalg.lstsq(design, theirs, rcond=None)[0]
-    return float(np.linalg.norm(truth.distort(truth.denormalize(mapped)) - points, axis=1).max())
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_one_parameter_stays_one_parameter(seed: int) -> None:
-    found = _align(_scene(Camera(SIZE, -0.25), seed))
+    found = aligned(lens_scene(Camera(SIZE, -0.25), seed))
     assert found.lens == "division"
     assert found.cameras[0].coefficients[1:] == (0.0, 0.0)
     assert found.cameras[0].center == (319.5, 239.5)
@@ -55,10 +35,10 @@ def test_one_parameter_stays_one_parameter(seed: int) -> None:
 
 
 def test_a_fisheye_off_centre_is_found() -> None:
-    given = _scene(FISHEYE, 0)
-    found, plain = _align(given), _align(given, lens="division")
+    given = lens_scene(FISHEYE, 0)
+    found, plain = aligned(given), aligned(given, lens="division")
     assert found.lens in ("division2", "division3")
-    assert _apart(found.cameras[0], FISHEYE) < 0.3 < 1.5 < _apart(plain.cameras[0], FISHEYE)
+    assert lens_distance(found.cameras[0], FISHEYE) < 0.3 < 1.5 < lens_distance(plain.cameras[0], FISHEYE)
     assert found.distortion == found.cameras[0].nearest_distortion
     assert abs(found.distortion - FISHEYE.nearest_distortion) < 0.003
     covariance = np.array(found.cameras[0].lens_covariance)
@@ -68,52 +48,27 @@ def test_a_fisheye_off_centre_is_found() -> None:
     assert "simpler lenses more" in found.lens_reason
 
 
-def test_all_pictures_together_show_a_third_coefficient_that_pairs_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    given = _scene(replace(FISHEYE, distortion2=-0.03, distortion3=-0.03), 0)
-    chosen = []
+@pytest.mark.parametrize("lens", [Camera(SIZE, -0.25), FISHEYE])
+def test_some_of_very_many_links_show_the_lens(monkeypatch: pytest.MonkeyPatch, lens: Camera) -> None:
+    given = lens_scene(lens, 0)
+    every = aligned(given)
+    sizes = []
 
-    def choose(seen: Observations, apart: Any, names: object, known: Any) -> LensChoice:
-        chosen.append(lens_selection.choose_lens(seen, apart, ["division", "division2"], known))
-        return chosen[-1]
+    def noted(seen: Observations, *others: Any) -> Any:
+        sizes.append(len(seen))
+        return homography_apart(seen, *others)
 
-    monkeypatch.setattr(align_module, "choose_lens", choose)
-    found, simpler = _align(given), _align(given, lens="division2")
-    assert chosen[0].name == "division2"
-    assert found.lens == "division3"
-    assert "distortion3" in found.parameters
-    truth = replace(FISHEYE, distortion2=-0.03, distortion3=-0.03)
-    assert _apart(found.cameras[0], truth) < _apart(simpler.cameras[0], truth)
-
-
-def test_a_third_coefficient_that_is_smaller_than_its_deviation_does_no_harm() -> None:
-    truth = replace(FISHEYE, distortion3=0.0)
-    given = _scene(truth, 0)
-    found, simpler = _align(given), _align(given, lens="division2")
-    assert found.lens == "division3"
-    assert abs(found.cameras[0].distortion3) < 2.0 * np.sqrt(np.array(found.cameras[0].lens_covariance)[2, 2]) < 0.01
-    assert _apart(found.cameras[0], truth) < _apart(simpler.cameras[0], truth) + 0.03
-
-
-def test_a_third_coefficient_is_small_where_no_matches_show_it() -> None:
-    """An equidistant fisheye of 120 degrees; matches in the middle alone leave ν to its prior."""
-    truth = Camera(SIZE, -0.366, -0.026, (335.0, 226.0), distortion3=-0.0036)
-    given = _scene(truth, 3)
-    links = []
-    for link in given.links:
-        near = [np.linalg.norm(truth.normalize(points), axis=1) < 0.6 for points in (link.points1, link.points2)]
-        kept = near[0] & near[1]
-        links.append(replace(link, points1=link.points1[kept], points2=link.points2[kept]))
-    found = _align(replace(given, links=[link for link in links if len(link) >= 30]), lens="division3")
-    assert _apart(found.cameras[0], truth) < 1.0
-
-
-def test_a_third_coefficient_is_not_taken_from_relief() -> None:
-    given = _scene(replace(FISHEYE, distortion3=0.0), 0, relief=0.01)
-    assert _align(given).lens == "division2"
+    monkeypatch.setattr(lens_selection, "homography_apart", noted)
+    monkeypatch.setattr(lens_selection, "_ENOUGH_LINKS", len(given.links) // 2)
+    found = aligned(given)
+    assert found.lens == every.lens
+    assert lens_distance(found.cameras[0], every.cameras[0]) < 0.1
+    assert len(found.links) == len(given.links)
+    assert sorted(sizes)[-2] <= len(given.links) // 2  # all of them once at most
 
 
 def test_a_centre_off_the_middle_is_found_alone() -> None:
-    found = _align(_scene(OFF_CENTRE, 1))
+    found = aligned(lens_scene(OFF_CENTRE, 1))
     assert found.lens == "division-center"
     np.testing.assert_allclose(found.cameras[0].center, OFF_CENTRE.center, atol=1.5)
     assert found.cameras[0].higher == ()
@@ -126,7 +81,7 @@ def test_a_pair_says_whether_it_shows_the_lens() -> None:
         poses = grid(2, 1, (0.5, 0.35), 0.5, rng)
         lens = Camera(SIZE, -0.25)
         given = scene(poses, lens=lens, rng=rng, noise=noise, focal=420.0, per_link=per_link, outliers=0.0)
-        found = _align(given)
+        found = aligned(given)
         assert found.lens == "division"
         reasons.append(found.lens_reason)
         messages.append([message for message in found.messages if message.code == "few-pictures"])
@@ -143,7 +98,7 @@ def test_four_pictures_are_not_few() -> None:
     rng = np.random.default_rng(0)
     poses = grid(2, 2, (0.5, 0.35), 0.5, rng)
     given = scene(poses, lens=Camera(SIZE, -0.25), rng=rng, noise=1.0, focal=420.0, per_link=40)
-    found = _align(given, lens="division3")
+    found = aligned(given, lens="division3")
     assert radius_std(found.cameras[0], np.linspace(0.05, 1.0, 20))[-1] > 0.5
     assert "few-pictures" not in [message.code for message in found.messages]
 
@@ -153,18 +108,18 @@ def test_a_given_lens_is_not_doubted() -> None:
     lens = Camera(SIZE, -0.25)
     given = scene(grid(2, 1, (0.5, 0.35), 0.5, rng), lens=lens, rng=rng, noise=1.0, focal=420.0, per_link=60)
     cameras = [camera.with_coefficients(*lens.coefficients) for camera in given.cameras]
-    assert not _align(replace(given, cameras=cameras), lens_known=True).messages
+    assert not aligned(replace(given, cameras=cameras), lens_known=True).messages
 
 
 @pytest.mark.parametrize("relief", [0.01, 0.04])
 def test_relief_is_not_taken_for_lens(relief: float) -> None:
-    found = _align(_scene(Camera(SIZE, -0.05), 2, relief=relief))
+    found = aligned(lens_scene(Camera(SIZE, -0.05), 2, relief=relief))
     assert found.lens in ("division", "division-center")
     assert found.cameras[0].higher == ()
 
 
 def test_nothing_runs_away_where_there_are_no_matches() -> None:
-    given = _scene(Camera(SIZE, -0.25), 3)
+    given = lens_scene(Camera(SIZE, -0.25), 3)
     middle = np.array([319.5, 239.5])
     links = []
     for link in given.links:
@@ -172,17 +127,19 @@ def test_nothing_runs_away_where_there_are_no_matches() -> None:
         kept = near[0] & near[1]
         if kept.sum() >= 30:
             links.append(replace(link, points1=link.points1[kept], points2=link.points2[kept]))
-    found = _align(replace(given, links=links), lens="division3")
+    found = aligned(replace(given, links=links), lens="division3")
     camera = found.cameras[0]  # which could not be made if the lens folded the picture
     assert found.lens == "division3"
     assert np.abs(np.array(camera.coefficients) - (-0.25, 0.0, 0.0)).max() < 0.3
     # The stated uncertainty covers what is not seen: the error at the corner is within it.
-    assert radius_std(camera, np.linspace(0.05, 1.0, 20))[-1] > max(5.0, 0.3 * _apart(camera, Camera(SIZE, -0.25)))
+    assert radius_std(camera, np.linspace(0.05, 1.0, 20))[-1] > max(
+        5.0, 0.3 * lens_distance(camera, Camera(SIZE, -0.25))
+    )
 
 
 @pytest.mark.parametrize("name", LENSES)
 def test_a_lens_that_is_requested_is_estimated(name: str) -> None:
-    found = _align(_scene(FISHEYE, 4, columns=3, rows=2), lens=name)
+    found = aligned(lens_scene(FISHEYE, 4, columns=3, rows=2), lens=name)
     assert found.lens == name
     assert set(LENSES[name]) <= set(found.parameters)
     assert not (set(LENS_PARAMETERS) - set(LENSES[name])) & set(found.parameters)
@@ -192,7 +149,7 @@ def test_a_pair_keeps_the_centre_in_the_middle_and_says_so() -> None:
     lens = replace(FISHEYE, center=(319.5, 239.5))
     rng = np.random.default_rng(6)
     given = scene(grid(2, 1, (0.35, 0.35), 0.5, rng), lens=lens, rng=rng, noise=0.1, per_link=400, focal=420.0)
-    found = _align(given)
+    found = aligned(given)
     assert found.lens in ("division2", "division3")
     assert found.cameras[0].center == (319.5, 239.5)
     assert "too few pictures to find the distortion centre" in found.lens_reason
@@ -200,11 +157,11 @@ def test_a_pair_keeps_the_centre_in_the_middle_and_says_so() -> None:
 
 
 def test_a_known_lens_is_kept_whole() -> None:
-    given = _scene(FISHEYE, 5, columns=3, rows=2)
+    given = lens_scene(FISHEYE, 5, columns=3, rows=2)
     cameras = [
         replace(camera, center=FISHEYE.center).with_coefficients(*FISHEYE.coefficients) for camera in given.cameras
     ]
-    found = _align(replace(given, cameras=cameras), lens_known=True)
+    found = aligned(replace(given, cameras=cameras), lens_known=True)
     assert found.cameras[0].coefficients == FISHEYE.coefficients
     assert found.cameras[0].center == pytest.approx(FISHEYE.center)
     assert found.distortion_std == 0.0
@@ -218,10 +175,10 @@ def test_an_unknown_lens_is_refused() -> None:
 
 
 def test_the_description_says_what_is_needed() -> None:
-    plain = describe_lens(_align(_scene(Camera(SIZE, -0.25), 0, columns=3, rows=2)))
+    plain = describe_lens(aligned(lens_scene(Camera(SIZE, -0.25), 0, columns=3, rows=2)))
     assert "±" in plain[0]
     assert "second coefficient not needed" in plain
-    strong = describe_lens(_align(_scene(FISHEYE, 0)))
+    strong = describe_lens(aligned(lens_scene(FISHEYE, 0)))
     assert "nearest one-parameter lens" in strong[0]
     assert any(line.startswith("second coefficient μ = -0.0") for line in strong)
     assert any(line.startswith("centre 33") for line in strong)

@@ -34,6 +34,15 @@ def test_medians_of_links_of_any_length() -> None:
     assert _observations([0, 0]).medians(np.empty(0)).tolist() == [np.inf, np.inf]
 
 
+def test_areas_of_links_with_few_correspondences_or_many() -> None:
+    corners = np.array([(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)])
+    points = np.concatenate([corners, 0.5 * corners + 0.2, corners * (1.0, 0.0), corners[:1]])
+    start = np.array([0, 4, 8, 12, 13, 13])
+    sizes = np.full(5, 400.0)
+    made = Observations(np.arange(5), np.arange(5) + 1, start, points, points, sizes, sizes, np.diff(start))
+    np.testing.assert_allclose(made.areas, [1.0, 0.25, 0.0, 0.0, 0.0], atol=1e-12)
+
+
 def test_sums_of_a_link_do_not_depend_on_the_other_links() -> None:
     """Whether these have as many correspondences or not."""
     observations = _observations([30, 12, 30, 0, 7])

@@ -12,7 +12,7 @@ from PIL import Image
 from rdstitch.features import FeatureOptions, View, detect, detect_view
 from rdstitch.features.options import CLOSER
 from rdstitch.io import Metadata, read_image, write_image
-from rdstitch.io.reduction import block_mean, block_minimum, fitting_reduction, halved
+from rdstitch.io.reduction import block_mean, block_minimum, fitting_reduction, halved, mean_of_channels
 from rdstitch.synthetic import ground
 
 WIDTH, HEIGHT = 203, 150
@@ -106,3 +106,11 @@ def test_features_of_a_reduced_picture_lie_where_they_are_in_the_whole(pixels: N
     assert asked == [options.work_megapixels, CLOSER * WIDTH * HEIGHT / 1e6]  # for a closer look
     distance = np.linalg.norm(whole.points[:50, None] - small.points[None], axis=2).min(axis=1)
     assert np.median(distance) < 0.2
+
+
+@pytest.mark.parametrize("shape", [(5, 7), (5, 7, 1), (5, 7, 3), (5, 7, 4)])
+def test_the_mean_of_the_channels_keeps_what_is_not_known(shape: tuple[int, ...]) -> None:
+    samples = np.random.default_rng(0).uniform(size=shape).astype(np.float32)
+    samples[2, 3] = np.nan
+    expected = samples if samples.ndim == 2 else samples.mean(axis=2)
+    np.testing.assert_allclose(mean_of_channels(samples), expected, rtol=1e-6)

@@ -1,5 +1,6 @@
 """Local alignment mends what relief leaves over, and nothing else."""
 
+import tracemalloc
 from dataclasses import replace
 from functools import lru_cache
 
@@ -10,7 +11,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.local_alignment import LocalAlignment, Match, align_locally
 from rdstitch.local_alignment.fit import Stiffness, fit_fields
-from rdstitch.local_alignment.matches import PicturesOnPlane, place_matches
+from rdstitch.local_alignment.matches import PicturesOnPlane, PlaneMatches, place_matches
 from rdstitch.radial_homography import from_plane, to_plane
 from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
 
@@ -130,8 +131,7 @@ def test_the_whole_does_not_move_and_fields_fade_where_nothing_supports_them() -
     sequence = scene("bumps", 0.1)
     matrices = homographies(sequence)
     pictures = PicturesOnPlane.of(CAMERAS, matrices)
-    placed = place_matches(matches(sequence), pictures)
-    assert placed is not None
+    placed = PlaneMatches.join(place_matches(matches(sequence), pictures))
     fields = fit_fields(placed, pictures, Stiffness(12, 0.02))
     values = np.concatenate(fields.values)
     assert np.abs(values.mean(axis=0)).max() < 0.02 * np.abs(values).max()
@@ -148,8 +148,7 @@ def test_nothing_folds_even_where_matches_say_so() -> None:
         for m in matches(sequence, count=3000)
     ]
     pictures = PicturesOnPlane.of(CAMERAS, homographies(sequence))
-    placed = place_matches(torn, pictures)
-    assert placed is not None
+    placed = PlaneMatches.join(place_matches(torn, pictures))
     fields = fit_fields(placed, pictures, Stiffness(60, 5.0)).of_pictures()
     assert 0.45 < max(field.steepest for field in fields) <= 0.501
 
@@ -160,6 +159,30 @@ def test_equal_matches_give_equal_fields() -> None:
     first, again = (align_locally(matches(sequence), CAMERAS, matrices) for _ in range(2))
     for a, b in zip(first.fields, again.fields, strict=True):
         np.testing.assert_array_equal(a.values, b.values)
+
+
+def test_that_ground_is_flat_is_found_pair_by_pair() -> None:
+    """Of thousands of pictures, the matches of all pairs together would be what takes memory."""
+    sequence = scene(None)
+    found = 40 * matches(sequence)
+    tracemalloc.start()
+    try:
+        assert align_locally(found, CAMERAS, homographies(sequence)).fields == ()
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < sum(m.points1.nbytes + m.points2.nbytes for m in found)
+
+
+def test_of_very_many_matches_an_even_part_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    sequence = scene("bumps")
+    matrices, found = homographies(sequence), matches(sequence)
+    every = align_locally(found, CAMERAS, matrices)
+    monkeypatch.setattr("rdstitch.local_alignment.estimate._MAX_MATCHES", sum(len(m.points1) for m in found) // 4)
+    part = align_locally(found, CAMERAS, matrices)
+    assert not np.array_equal(part.fields[0].values, every.fields[0].values)
+    off, on = (displacements(sequence, matrices, which) for which in (replace(part, fields=()), part))
+    assert np.percentile(on, 95) < 0.5 * np.percentile(off, 95)
 
 
 def test_too_few_matches_are_said() -> None:

@@ -84,7 +84,7 @@ def test_a_turn_is_compared_between_the_two_pictures(monkeypatch: pytest.MonkeyP
     )
     source = SimpleNamespace(read=lambda *_, **__: None, camera=lens, guard=InputGuard(), path=Path("a.png"))
     registration: Any = SimpleNamespace(alignment=alignment, sources=[source] * 2, stretch=None)
-    (task,) = overlap_check._tasks(registration, [_fit(0, 1)])
+    (task,) = overlap_check._tasks(registration, [_fit(0, 1)], {})
     overlap_check.compare_overlaps(task)
     np.testing.assert_allclose(seen[0].homography, half.T @ focal, atol=1e-9)
     np.testing.assert_allclose(seen[1].homography, half @ focal, atol=1e-9)
@@ -104,9 +104,28 @@ def test_cached_overlaps_are_those_of_the_same_links(monkeypatch: pytest.MonkeyP
             verdicts.extend([valid(checked), valid(checked[::-1]), valid(checked[:1])])
             return checked
 
-    alignment = SimpleNamespace(links=links, cameras=[None] * 3, homographies=[None] * 3)
+    alignment = SimpleNamespace(links=links, cameras=[None] * 3, homographies=[None] * 3, on_sphere=True)
     source = SimpleNamespace(content=lambda cache: "", mask=None)
     registration: Any = SimpleNamespace(alignment=alignment, sources=[source] * 3, stretch=None)
     cache: Any = Recorded()
     assert overlap_check.check_overlaps(registration, ThreadPoolExecutor(1), cache) == checked
     assert verdicts == [True, False, False]
+
+
+def test_over_rough_ground_pictures_look_alike_where_their_matches_are() -> None:
+    """Two pixels to the right of where the alignment expects them; of a link that is not used nothing is asked."""
+    points = np.array([[10.0, 20.0], [30.0, 5.0]])
+    link = SimpleNamespace(points1=points, points2=points + np.array([2.0, 0.0]))
+    pairs = [SimpleNamespace(image1=i, image2=j, link=lambda: link) for i, j in ((0, 1), (1, 2))]
+
+    def transfer(i: int, j: int, points: FloatArray) -> FloatArray:
+        return np.where(points[:, :1] > 20.0, np.nan, points)
+
+    alignment = SimpleNamespace(on_sphere=False, relief=SimpleNamespace(found=True), transfer=transfer)
+    registration: Any = SimpleNamespace(alignment=alignment, pairs=pairs)
+    found = overlap_check._parallax(registration, [_fit(0, 1)])
+    assert list(found) == [(0, 1)]
+    np.testing.assert_allclose(found[0, 1].places, points[:1])
+    np.testing.assert_allclose(found[0, 1].shifts, [[2.0, 0.0]])
+    alignment.relief.found = False
+    assert overlap_check._parallax(registration, [_fit(0, 1)]) == {}

@@ -201,6 +201,25 @@ def test_errors_of_rough_ground_are_a_warning_where_pictures_look_alike(
     assert message.severity == severity
 
 
+@pytest.mark.parametrize(
+    ("size", "share", "rms", "severity"),
+    [
+        (9.4, 0.51, 9.5, "warning"),
+        (9.4, 0.49, 9.5, "failure"),
+        (8.9, 0.9, 9.5, "failure"),
+        (99.9, 0.9, 100.0, "failure"),
+    ],
+)
+def test_larger_errors_are_a_warning_where_relief_explains_them(
+    good: Registration, monkeypatch: pytest.MonkeyPatch, size: float, share: float, rms: float, severity: str
+) -> None:
+    """What neighbours do not have in common stays below the threshold, and the pictures clearly look alike."""
+    alignment = replace(good.alignment, rms=rms, relief=replace(good.alignment.relief, found=True, size=size))
+    found = _checked_by(monkeypatch, replace(good, alignment=alignment), _checked(100, int(100 * share)))
+    (message,) = [m for m in found if "the pictures disagree by" in m.text]
+    assert message.severity == severity
+
+
 def test_only_pairs_without_which_the_pictures_fall_apart_decide() -> None:
     message = Message("doubtful", (), "failure")
     used = [LinkFit(i, j, 100, 90, 0.5, True) for i, j in ((0, 1), (1, 2), (0, 2), (2, 3))]

