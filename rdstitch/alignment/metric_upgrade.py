@@ -22,6 +22,9 @@ _TILT_STEPS = 31
 _FOCAL_RANGE = np.linspace(-1.5, 1.5, 7)
 """Standard deviations of the prior on log f."""
 
+_AT_ONCE = 2**15
+"""Pictures times tilts whose conditions are looked at together: more of them take memory, and no less time."""
+
 _OUTLYING = 0.3
 """Error of the two conditions, relative, beyond which all errors count alike."""
 
@@ -73,6 +76,11 @@ def metric_upgrade(homographies: FloatArray, reference: int, log_focal: float, l
 
 def _cost(relative: FloatArray, tilts: FloatArray, log_focal: float) -> FloatArray:
     """Mean truncated squared error of the conditions (T,) of the N pictures for each of T tilts of the reference."""
+    blocks = np.array_split(tilts, math.ceil(len(tilts) * len(relative) / _AT_ONCE))
+    return np.concatenate([_cost_of_block(relative, block, log_focal) for block in blocks if len(block)])
+
+
+def _cost_of_block(relative: FloatArray, tilts: FloatArray, log_focal: float) -> FloatArray:
     metric = _metric(relative, tilts, log_focal)
     a, b = metric[..., 0], metric[..., 1]
     aa, bb, ab = ((p * q).sum(axis=-1) for p, q in ((a, a), (b, b), (a, b)))
