@@ -62,6 +62,11 @@ def even_errors(noise: NoiseModel, misfit: float) -> FloatArray:
     return np.full(len(noise.counted), squared)
 
 
+def _focal_cost(parameters: Any) -> float:
+    """The last shared parameter is log f, known to be 0.2 ± 0.3 where a model has one."""
+    return float(((parameters.shared[-1:] - 0.2) ** 2).sum() / 0.3**2)
+
+
 def problem(seen: Observations, fits: Callable[[MotionModel], Fit], pictures: int = 6, **more: Any) -> Problem:
     """A problem whose fits are given; ``problem.fitted`` lists the models that were fitted."""
     fitted: list[str] = []
@@ -79,7 +84,7 @@ def problem(seen: Observations, fits: Callable[[MotionModel], Fit], pictures: in
         fit=fit,
         fitted=fitted,
         extend=lambda fit, lens: fit,
-        camera_priors=SimpleNamespace(log_focal=0.2, log_focal_std=0.3),
+        adjuster_of=lambda fit: SimpleNamespace(camera_prior_cost=_focal_cost),
         **more,
     )
     found: Problem = made

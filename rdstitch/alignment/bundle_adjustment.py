@@ -265,15 +265,18 @@ class BundleAdjuster:
         """Of squared errors of this scatter: one over their variance, as far as they are independent."""
         return 1.0 / (sigma**2 * self.overdispersion)
 
-    def _prior_cost(self, parameters: Parameters) -> float:
+    def camera_prior_cost(self, parameters: Parameters) -> float:
+        """Sum of the squares of the camera's deviations from its priors, in their standard deviations.
+
+        With a focal length that grows without limit a turn becomes a shift over a plane, and ground a tilt.
+        """
         p = self.priors
-        offsets = self.model.prior_coordinates(parameters.poses)
-        parts = (
-            p.shared_precision * (self.model.physical_parameters(parameters.shared)[0] - p.shared) ** 2,
-            p.lens_precision * (parameters.lens - p.lens) ** 2,
-            p.poses_precision * (offsets - p.poses) ** 2,
-        )
-        return float(sum(part.sum() for part in parts))
+        shared = p.shared_precision * (self.model.physical_parameters(parameters.shared)[0] - p.shared) ** 2
+        return float(shared.sum() + (p.lens_precision * (parameters.lens - p.lens) ** 2).sum())
+
+    def _prior_cost(self, parameters: Parameters) -> float:
+        offsets = self.model.prior_coordinates(parameters.poses) - self.priors.poses
+        return self.camera_prior_cost(parameters) + float((self.priors.poses_precision * offsets**2).sum())
 
     def _normal_equations(self, state: _State, sigma: float) -> SparseNormalEquations:
         """Of the data at ``state``, and of the priors."""

@@ -10,13 +10,10 @@ from dataclasses import replace
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.lens_selection import (
     ENOUGH_PICTURES,
-    NO_COHERENCE,
     free_parameters,
     has_plausible_center,
+    leaves_noise,
 )
-from rdstitch.alignment.link_equations import whitened_errors
-from rdstitch.alignment.planarity import coherence
-from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 
 def with_third_coefficient(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
@@ -24,9 +21,7 @@ def with_third_coefficient(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     adjusted, observations, finer = fit.adjusted, problem.observations, free_parameters("division3")
     if problem.count < ENOUGH_PICTURES or (fit.free_lens != free_parameters("division2")).any():
         return problem, fit
-    errors = whitened_errors(observations, adjusted.homographies, adjusted.parameters.lens)
-    inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
-    if coherence(observations, errors, inliers).correlation > NO_COHERENCE:
+    if not leaves_noise(adjusted, observations):
         return problem, fit
     wider = problem.extend(fit, finer)
     if not has_plausible_center(wider.adjusted, observations):

@@ -197,10 +197,23 @@ def has_plausible_center(adjusted: BundleAdjustmentResult, observations: Observa
     farthest = float(np.abs(adjusted.parameters.lens[CENTER]).max())
     if farthest < _FARTHEST_CENTER:
         return True
+    return farthest < _FARTHEST_CENTER_OF_CROPS and leaves_noise(adjusted, observations)
+
+
+def shows_center(adjusted: BundleAdjustmentResult, observations: Observations) -> bool:
+    """Whether one camera shows its distortion centre: the errors are noise, so that nothing else moved it.
+
+    Over rough ground a centre that is off, with an odd focal length, bends the whole as the ground bends the pictures.
+    """
+    off = float(np.abs(adjusted.parameters.lens[CENTER]).max())
+    return off < _FARTHEST_CENTER_OF_CROPS and leaves_noise(adjusted, observations)
+
+
+def leaves_noise(adjusted: BundleAdjustmentResult, observations: Observations) -> bool:
+    """Whether the errors of neighbours hardly agree, so that they are noise."""
     errors = whitened_errors(observations, adjusted.homographies, adjusted.parameters.lens)
     inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
-    agree = coherence(observations, errors, inliers).correlation
-    return farthest < _FARTHEST_CENTER_OF_CROPS and agree < NO_COHERENCE
+    return coherence(observations, errors, inliers).correlation < NO_COHERENCE
 
 
 @dataclass(frozen=True)

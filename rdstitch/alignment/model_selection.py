@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.lens_selection import has_plausible_center
+from rdstitch.alignment.lens_selection import shows_center
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import (
     HOMOGRAPHY,
@@ -93,7 +93,7 @@ def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolAr
         for index in sorted({0, *np.argsort(costs, kind="stable")[:2].tolist()}):
             wider = problem.extend(fits[index], lens | fits[index].free_lens)
             cost = fit_cost(noise, problem, wider)
-            plausible = has_plausible_focal(wider) and has_plausible_center(wider.adjusted, problem.observations)
+            plausible = has_plausible_focal(wider) and shows_center(wider.adjusted, problem.observations)
             if cost < costs[index] and plausible:
                 fits[index], costs[index] = wider, cost
     best = int(np.argmin(costs[: max(len(cameras), 1)]))
@@ -146,12 +146,16 @@ def price(noise: NoiseModel, problem: Problem, model: MotionModel, free_lens: Bo
 
 
 def fit_cost(noise: NoiseModel, problem: Problem, fit: Fit) -> float:
-    """Misfit and price of a fit; tilts that might be anything cost more than those that hardly differ."""
+    """Misfit and price of a fit, and what its camera is off from what is known of it.
+
+    Tilts that might be anything cost more than those that hardly differ.
+    """
     wide = 0.0
     if fit.tilt_spread > 0.0:
         wide = 4.0 * problem.count * math.log(max(fit.tilt_spread / _TYPICAL_TILT_SPREAD, 1.0))
     misfit = float(noise.misfit(fit.adjusted.squared).sum())
-    return misfit + price(noise, problem, fit.model, fit.free_lens) + wide
+    priors = problem.adjuster_of(fit).camera_prior_cost(fit.adjusted.parameters)
+    return misfit + price(noise, problem, fit.model, fit.free_lens) + wide + priors
 
 
 def noise_of_links(problem: Problem) -> tuple[NoiseModel, float]:

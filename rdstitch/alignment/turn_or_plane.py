@@ -59,10 +59,10 @@ def choose_motion(problem: Problem, names: Sequence[str], lenses: Sequence[BoolA
         return _choice(problem, bound, turned, lenses, explained)
     if not possible:
         return choose_model(problem, planar, lenses)
-    if _cost(bound, problem, turned) <= least + price(bound, problem, RIGID, problem.free_lens):
+    if fit_cost(bound, problem, turned) <= least + price(bound, problem, RIGID, problem.free_lens):
         return _choice(problem, bound, turned, lenses, f"{explained}, and nothing is left for more freedom to gain")
     over_plane = choose_model(problem, planar, lenses)
-    if fit_cost(bound, problem, over_plane.fit) < _cost(bound, problem, turned):
+    if fit_cost(bound, problem, over_plane.fit) < fit_cost(bound, problem, turned):
         return over_plane
     other = over_plane.fit
     gains = f"{explained}, more freedom gains too little ({other.model.name} {other.adjusted.sigma:.2f} pixels)"
@@ -92,13 +92,3 @@ def _choice(problem: Problem, noise: NoiseModel, turned: Fit, lenses: Sequence[B
         if plausible and fit_cost(noise, problem, wider) < fit_cost(noise, problem, turned):
             turned = wider
     return ModelChoice(turned, f"{ROTATION.name}: {reason}", noise.overdispersion)
-
-
-def _cost(noise: NoiseModel, problem: Problem, turned: Fit) -> float:
-    """Misfit and price of a turn, and of the focal length that it takes.
-
-    With a focal length that grows without limit a turn becomes a shift over a plane: what is known of the focal length
-    counts.
-    """
-    log_focal, known = float(turned.adjusted.parameters.shared[0]), problem.camera_priors
-    return fit_cost(noise, problem, turned) + ((log_focal - known.log_focal) / known.log_focal_std) ** 2

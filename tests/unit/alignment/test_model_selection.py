@@ -66,6 +66,14 @@ def test_tilts_that_might_be_anything_cost_more() -> None:
     assert cost(6.0) == pytest.approx(plain + 4.0 * 6 * math.log(2.0))
 
 
+def test_a_focal_length_costs_what_it_is_off_from_what_is_known() -> None:
+    def cost(log_focal: float) -> float:
+        own = adjusted(SEEN, np.ones(540), shared=(0.0, 0.0, log_focal))
+        return fit_cost(NOISE, BARE, Fit(SIMILARITY, own, ONLY_DISTORTION))
+
+    assert cost(0.2 + 3.0 * 0.3) - cost(0.2) == pytest.approx(9.0)
+
+
 @pytest.mark.parametrize(("share", "chosen"), [(0.9, "rigid"), (1.1, "similarity")])
 def test_freedom_must_pay_for_itself(share: float, chosen: str) -> None:
     """Five heights more cost five times the logarithm of the number of independent observations."""
