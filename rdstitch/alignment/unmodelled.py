@@ -41,12 +41,15 @@ class Effect:
         Which kind of thing it is.
     correct : callable
     std : float
-        How large it may be where nothing is known of it.
+        How large it usually is, where nothing is known of it.
+    largest : float, optional
+        How large it is in an extreme case; no larger if not given.
     """
 
     cause: str
     correct: Correction
     std: float
+    largest: float | None = None
 
 
 def unmodelled_effects(fit: Fit) -> list[Effect]:
@@ -57,10 +60,12 @@ def unmodelled_effects(fit: Fit) -> list[Effect]:
         effects += [Effect(OFF_CENTER, _shifted(axis), 0.03) for axis in (0, 1)]
     if not free[1]:
         effects.append(Effect(OTHER_LENS, _bent(lens), 0.03))
-    # The camera's motion shears and stretches what its rows see, and so do pixels that are no squares.
-    effects += [Effect(ROLLING_SHUTTER, _sheared(np.array(matrix)), 0.01) for matrix in _SHEARS]
+    # The camera's motion shears and stretches what its rows see, and so do pixels that are no squares: by a tenth where
+    # a picture passes in ten read-outs.
+    effects += [Effect(ROLLING_SHUTTER, _sheared(np.array(matrix)), 0.01, 0.1) for matrix in _SHEARS]
     if isinstance(fit.model, PlanarModel):
-        effects += [Effect(CURVED, _curved(fit, fit.model, axes), 0.05) for axes in ((0, 0), (0, 1), (1, 1))]
+        # At the most, the camera is as far from the surface as the centre of its curvature.
+        effects += [Effect(CURVED, _curved(fit, fit.model, axes), 0.05, 1.0) for axes in ((0, 0), (0, 1), (1, 1))]
     return effects
 
 
