@@ -110,6 +110,8 @@ def align(
     trust = _trust(few, confirmed)
     graph = _Graph(len(cameras), few, relations, trust, lens, free_lens, known, options)
     problem, pictures = graph.problem(~wrong)
+    # Data weigh against priors as they will in the final adjustment.
+    problem = replace(problem, overdispersion=noise_of_links(problem)[0].overdispersion)
     choice = None
     if former is not None:
         choice = _choose_from(former, cameras, problem, pictures, options, chosen.refinements)
