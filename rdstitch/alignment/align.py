@@ -112,9 +112,7 @@ def align(
     problem, pictures = graph.problem(~wrong)
     # Data weigh against priors as they will in the final adjustment.
     problem = replace(problem, overdispersion=noise_of_links(problem)[0].overdispersion)
-    choice = None
-    if former is not None:
-        choice = _choose_from(former, cameras, problem, pictures, options, chosen.refinements)
+    choice = None if former is None else _choose_from(former, cameras, problem, pictures, options, chosen.refinements)
     choice = choice or choose_motion(problem, options.models, chosen.refinements)
     graph = replace(graph, free_lens=choice.fit.free_lens)
     choice, pictures, wrong = _drop_wrong_pairs(graph, problem, pictures, choice, wrong)
