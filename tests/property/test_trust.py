@@ -45,7 +45,7 @@ def test_what_moves_otherwise_is_never_stitched_without_a_word(kind: str, seed: 
         assert judged.status == 0, judged.text
 
 
-@pytest.mark.parametrize(("seed", "kind"), [(9801, "cylinder"), (9807, "cylinder"), (9800, "rolling shutter")])
+@pytest.mark.parametrize(("seed", "kind"), [(9801, "cylinder"), (9800, "rolling shutter")])
 def test_what_tilts_took_up_is_warned_of(seed: int, kind: str, tmp_path: Path) -> None:
     """A curve or a shear so large that it is rare bends the whole by pixels, and free tilts fit every overlap."""
     judged = judge_set(trust_set(seed, kind), tmp_path)
