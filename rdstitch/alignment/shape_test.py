@@ -11,8 +11,8 @@ where that would make the errors smaller by more than noise does, the model is w
 deviations that suppose it right are too small by as much: they are multiplied by the Birge ratio (R. T. Birge, The
 calculation of errors by the method of least squares, 1932).
 
-Effects are as large as they usually are. Where the camera's own parameters take up one that is larger, such as tilts
-that follow a wall of half a camera's distance in radius, little is left to show it: so extreme cases are tried, too.
+Effects are tried as large as they usually are. Of a much larger one, such as a wall whose radius is a few times the
+camera's distance, that prior would allow little: so extreme cases are tried, too.
 """
 
 from collections.abc import Sequence
@@ -56,21 +56,21 @@ def judge_shape(problem: Problem, fit: Fit, cameras: Sequence[Camera]) -> ShapeT
     usual = _Prediction.of(effects, information, gradient, *at, max(1.0, probed))
     extreme = _Prediction.of(effects, _with_extremes(information, effects), gradient, *at, max(1.0, probed))
     diagonals = np.array([2.0 * camera.half_diagonal for camera in cameras])
-    off = np.hypot(usual.shifts, usual.stds)
+    judged, off = usual, np.hypot(usual.shifts, usual.stds)
     # Extreme cases count where the errors show them. Where the pictures only fail to exclude them, as along any row, no
     # picture would be good enough.
     doubtful = bool(off.max() > _LARGE * diagonals[off.argmax()])
     if not doubtful and extreme.shown and (extreme.shifts > _LARGE * diagonals).any():
-        doubtful, usual, off = True, extreme, extreme.shifts
+        doubtful, judged, off = True, extreme, extreme.shifts
     image = int(off.argmax())
     return ShapeTest(
         doubtful=doubtful,
-        gain=usual.gain,
-        shown=usual.shown or probed > _SHOWN_PER_EFFECT,
+        gain=judged.gain,
+        shown=judged.shown or probed > _SHOWN_PER_EFFECT,
         image=image,
-        shift=float(usual.shifts[image]),
-        shift_std=float(usual.stds[image]),
-        cause=CROPPED if probed > max(usual.by_effect, _SHOWN_PER_EFFECT) else usual.cause,
+        shift=float(judged.shifts[image]),
+        shift_std=float(judged.stds[image]),
+        cause=CROPPED if probed > max(judged.by_effect, _SHOWN_PER_EFFECT) else judged.cause,
     )
 
 
