@@ -85,9 +85,7 @@ def align(
     report, options = progress or (lambda stage: None), options or AlignmentOptions()
     _check(cameras, links, options)
     known = options.camera_priors(cameras)
-    # Thousands of links determine the lens and the poses many times over: memory and time grow with the links alone.
-    most = min(options.most, max(_MATCHES_OF_ALL // len(links), _MATCHES_OF_A_LINK))
-    everything = Observations.from_links(links, cameras, most)
+    everything = Observations.from_links(links, cameras, _matches_of_a_link(len(links), options))
 
     report("consensus of the pairs")
     votes = vote([k.relation.distortion for k in links], [k.relation.distortion_std for k in links])
@@ -118,7 +116,7 @@ def align(
     choice, pictures, wrong = _drop_wrong_pairs(graph, problem, pictures, choice, wrong)
 
     report("adjustment")
-    if choice.fit.model is ROTATION and len(links) * options.most < _MATCHES_OF_A_TURN:
+    if choice.fit.model is ROTATION and most_matches_read(len(links), options) is None:
         # Few pictures of a turn hardly determine the focal length; all their matches are used.
         everything = Observations.from_links(links, cameras, _MATCHES_OF_A_TURN // len(links))
     full = replace(graph, observations=everything)
@@ -139,6 +137,16 @@ def align(
         disagreement,
     )
     return build_alignment(found)
+
+
+def most_matches_read(links: int, options: AlignmentOptions) -> int | None:
+    """Correspondences of each of so many links that :func:`align` reads at the most; None for all of them."""
+    return None if links * options.most < _MATCHES_OF_A_TURN else _matches_of_a_link(links, options)
+
+
+def _matches_of_a_link(links: int, options: AlignmentOptions) -> int:
+    """Thousands of links determine lens and poses many times over: memory and time are to grow with the links alone."""
+    return min(options.most, max(_MATCHES_OF_ALL // max(links, 1), _MATCHES_OF_A_LINK))
 
 
 def _check(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions) -> None:

@@ -51,23 +51,16 @@ class Observations:
     @classmethod
     def from_links(cls, links: Sequence[Link], cameras: Sequence[Camera], most: int | None = None) -> Self:
         """Of each link at most about ``most`` correspondences, well spread over its overlap."""
-        kept = [spread_choice(link.points1, most) for link in links]
+        thinned = [link.thinned(most) for link in links]
         sizes = [camera.half_diagonal for camera in cameras]
-        pairs = [(link.image1, link.image2) for link in links]
-        index1, index2 = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
+        index1, index2 = np.array([(link.image1, link.image2) for link in links], dtype=np.intp).reshape(-1, 2).T
         empty = [np.empty((0, 2))]
         return cls(
             index1,
             index2,
-            np.concatenate([[0], np.cumsum([len(k) for k in kept])]).astype(np.intp),
-            np.concatenate(
-                empty
-                + [cameras[i].normalize(link.points1[k]) for (i, _), link, k in zip(pairs, links, kept, strict=True)]
-            ),
-            np.concatenate(
-                empty
-                + [cameras[j].normalize(link.points2[k]) for (_, j), link, k in zip(pairs, links, kept, strict=True)]
-            ),
+            np.concatenate([[0], np.cumsum([len(link.points1) for link in thinned])]).astype(np.intp),
+            np.concatenate(empty + [cameras[link.image1].normalize(link.points1) for link in thinned]),
+            np.concatenate(empty + [cameras[link.image2].normalize(link.points2) for link in thinned]),
             np.array([sizes[i] for i in index1]),
             np.array([sizes[j] for j in index2]),
             np.array([len(link) for link in links], dtype=np.intp),

@@ -1,9 +1,11 @@
 """What the adjustment is given: a link, the correspondences of two pictures that agree with one relation."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
+from rdstitch.matching.thinning import spread_choice
 from rdstitch.radial_homography import RadialHomography
 
 
@@ -19,6 +21,8 @@ class Link:
         Where the inliers of the pair were measured, pixels of the one and of the other picture.
     relation : RadialHomography
         The pair's own estimate, from ``image1`` to ``image2``.
+    count : int, optional
+        Number of the inliers, where these points are only some of them.
     """
 
     image1: int
@@ -26,6 +30,7 @@ class Link:
     points1: FloatArray
     points2: FloatArray
     relation: RadialHomography
+    count: int | None = None
 
     def __post_init__(self) -> None:
         """Check that the parts fit together."""
@@ -37,5 +42,10 @@ class Link:
             raise ArgumentError(f"pictures {self.image1} and {self.image2}: a failed fit makes no link")
 
     def __len__(self) -> int:
-        """Number of correspondences."""
-        return len(self.points1)
+        """Number of inliers."""
+        return len(self.points1) if self.count is None else self.count
+
+    def thinned(self, most: int | None) -> Self:
+        """About ``most`` of the correspondences at the most, well spread over the overlap; the number stays."""
+        kept = spread_choice(self.points1, most)
+        return replace(self, points1=self.points1[kept], points2=self.points2[kept], count=len(self))

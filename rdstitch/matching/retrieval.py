@@ -26,7 +26,7 @@ _TRAINING_PER_BRANCH = 50
 _ROUNDS = 3  # of Lloyd's algorithm
 _SHORTLIST = 40  # most similar pictures of each that are considered further
 _SHARED_NEIGHBOURS = 10  # most similar pictures of each that two pictures may have in common
-_SHARED_NEIGHBOUR_WEIGHT = 0.3  # weight of having all neighbours in common, in units of the usual best similarity
+_SHARED_NEIGHBOUR_WEIGHT = 1.0  # weight of having all neighbours in common, in units of the usual best similarity
 _SEQUENCE_RANK = (
     0.75  # share of the other pictures that are less alike than the next one where the order means something
 )

@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment import Alignment, AlignmentOptions, align
+from rdstitch.alignment import Alignment, AlignmentOptions, align, most_matches_read
 from rdstitch.alignment.result import LinkFit, PlanarPoses, ReliefTest, ShapeTest
 from rdstitch.arrays import FloatArray
 from rdstitch.cache import Cache
@@ -147,7 +147,9 @@ class Aligner:
         return alignment.on_sphere or not len(every) or bool(np.mean(every < self.threshold) > _EXPLAINED)
 
     def _aligned(self, pairs: Sequence[PairRegistration], former: Alignment | None) -> Alignment:
-        links = tuple(pair.link() for pair in pairs if pair.relation)
+        found = [pair for pair in pairs if pair.relation]
+        most = most_matches_read(len(found), self.options)
+        links = tuple(pair.link().thinned(most) for pair in found)
         if not links:
             raise RegistrationError(_no_overlap(self.paths, pairs))
         inputs = (self.cameras, self.cache.digest(links), self.options, self.cache.digest(former))

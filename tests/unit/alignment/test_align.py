@@ -7,7 +7,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from rdstitch.alignment import AlignmentOptions, align
+from rdstitch.alignment import AlignmentOptions, align, most_matches_read
 from rdstitch.alignment.build_result import AdjustedPictures, build_alignment
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import CONTRADICTS, Alignment, PlanarPoses
@@ -266,6 +266,23 @@ def test_the_order_of_links_does_not_matter() -> None:
     there, back = align(given.cameras, given.links), align(given.cameras, given.links[::-1])
     assert there.distortion == pytest.approx(back.distortion, abs=1e-5)
     assert there.model == back.model
+
+
+@pytest.mark.parametrize(("most", "read"), [(40, None), (200, 200)])
+def test_links_need_no_more_matches_than_are_read(most: int, read: int | None) -> None:
+    rng = np.random.default_rng(5)
+    given = scene(grid(5, 4, (0.4, 0.3), 0.1, rng), per_link=220, rng=rng)
+    options = AlignmentOptions(most=most)
+    assert most_matches_read(len(given.links), options) == read
+    few = align(given.cameras, [link.thinned(read) for link in given.links], options)
+    every = align(given.cameras, given.links, options)
+    assert np.array_equal(few.homographies, every.homographies)
+    assert few.links == every.links
+
+
+def test_many_links_are_read_in_part_and_those_of_a_short_turn_whole() -> None:
+    options = AlignmentOptions(most=100)
+    assert [most_matches_read(links, options) for links in (10, 100, 6000, 50_000)] == [None, 100, 83, 60]
 
 
 def test_mistakes_of_the_caller() -> None:
