@@ -16,15 +16,11 @@ from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner, impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.registration import Registration
-from rdstitch.verification.overlap_check import check_overlaps, share_alike
-from rdstitch.verification.rival_motion import find_rival_motions, pairs_of_rivals
+from rdstitch.verification.competing_motions import planes_of_pairs
 from rdstitch.verification.verdict import RefusedError, judge
 
 _MAX_SCALE_UNCERTAINTY = 0.05  # share that lengths may be off by, as far as the focal length is, without a word
 _MAX_ROUNDS = 20  # times that something is left out; each takes one adjustment
-
-_CLEARLY = 1.5
-"""How many times as much of the overlaps must look alike by one motion as by another one."""
 
 
 @dataclass(frozen=True)
@@ -80,12 +76,10 @@ def accept(
     if not first.ok and not options.force:
         aligner = Aligner.of(registration.sources, options, cache)
         left = _Offenders({}, {})
-        if any(message.severity == "failure" and message.code == "rival-motion" for message in found):
-            larger = _larger_motion(registration, options.threshold, aligner, executor)
-            if larger is not None:
-                checked = partial(checked, larger=True)
-                registration = current = larger
-                found = checked(larger)
+        plane = None if lens_only else _plane_of_most(registration, options.threshold, aligner)
+        judged = () if plane is None else checked(plane)
+        if plane is not None and not _concerns_all(judged):
+            registration, current, found = plane, plane, judged
         for _ in range(_MAX_ROUNDS):
             if current.with_messages(found).ok:
                 break
@@ -106,24 +100,19 @@ def accept(
     return accepted
 
 
-def _larger_motion(
-    registration: Registration, threshold: float, aligner: Aligner, executor: Executor
-) -> Registration | None:
-    """Of two motions in the pictures that which fills clearly more of the overlaps; None where neither does."""
+def _plane_of_most(registration: Registration, threshold: float, aligner: Aligner) -> Registration | None:
+    """Of two motions in the pictures that which may fill most of them; None where that is not to be seen."""
     if registration.static_background:
         return None
-    rivals = find_rival_motions(registration.alignment, registration.pairs, threshold)
+    pairs = planes_of_pairs(registration, threshold)
+    if pairs is None:
+        return None
     try:
-        aligned = aligner.align(pairs_of_rivals(registration.pairs, rivals))
+        aligned = aligner.align(pairs)
     except RegistrationError:
         return None
-    other = _aligned_anew(replace(registration, pairs=aligned.pairs), aligned, aligner.paths, {})
-    both = (registration, other)
-    own, others = (share_alike(check_overlaps(motion, executor, aligner.cache)) for motion in both)
-    most = 2 * aligned.alignment.used.sum() > len(registration.sources)
-    if others >= _CLEARLY * own and most:
-        return other
-    return registration if own >= _CLEARLY * others else None
+    plane = _aligned_anew(replace(registration, pairs=tuple(aligner.used(aligned))), aligned, aligner.paths, {})
+    return plane if 2 * plane.alignment.used.sum() > len(registration.sources) else None
 
 
 def _concerns_all(found: Iterable[Message]) -> bool:

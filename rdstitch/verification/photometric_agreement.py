@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.warp import Lattice
@@ -57,6 +57,30 @@ class Agreement:
     def share(self) -> float:
         """Share of the cells that confirm the registration; 1 without cells."""
         return self.confirming / self.cells if self.cells else 1.0
+
+
+@dataclass(frozen=True)
+class ComparedCells:
+    """Cells with texture in both pictures of an overlap, and what each of them says.
+
+    Attributes
+    ----------
+    centers : ndarray of shape (N, 2)
+        Where the registration puts them, pixels of the second picture as it is compared.
+    confirming : ndarray of shape (N,), bool
+        Which correlate best, and well, where the registration says.
+    in_all : int
+        Cells with texture in the whole of the second picture.
+    """
+
+    centers: FloatArray
+    confirming: BoolArray
+    in_all: int
+
+    @property
+    def agreement(self) -> Agreement:
+        """How many there are, and how many confirm the registration."""
+        return Agreement(len(self.confirming), int(self.confirming.sum()))
 
 
 @dataclass(frozen=True)
@@ -154,6 +178,13 @@ def _reduced_grey(picture: Picture, stretch: tuple[float, float] | None) -> Grey
 
 def overlap_agreement(first: PlacedPicture, second: PlacedPicture, parallax: Parallax | None = None) -> Agreement:
     """Compare two registered pictures where they overlap, where the ground is rough by what moves its places."""
+    return compare_cells(first, second, parallax, _MAX_CELLS).agreement
+
+
+def compare_cells(
+    first: PlacedPicture, second: PlacedPicture, parallax: Parallax | None = None, most: int | None = None
+) -> ComparedCells:
+    """The cells of an overlap one by one, or about ``most`` of them; see :func:`overlap_agreement`."""
     height, width = second.grey.shape
     # The first picture as the second one's lens would have seen it.
     seen = first.sampled(partial(to_plane, second.camera, second.homography), (0, 0, width, height))
@@ -161,7 +192,7 @@ def overlap_agreement(first: PlacedPicture, second: PlacedPicture, parallax: Par
     rows, columns = (np.arange(margin, n - margin + 1, _CELL) for n in (height, width))
     corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2) - _CELL // 2
     textured = corners[_have_texture(_cells(seen, corners))]
-    looked_at = textured[:: max(1, -(-len(textured) // _MAX_CELLS))]
+    looked_at = textured if most is None else textured[:: max(1, -(-len(textured) // most))]
     there = looked_at
     if parallax is not None and len(looked_at):
         there = looked_at + parallax.at(looked_at[:, ::-1] + (_CELL - 1) / 2.0)[:, ::-1]
@@ -171,7 +202,10 @@ def overlap_agreement(first: PlacedPicture, second: PlacedPicture, parallax: Par
     inner = windows[:, _SEARCH_RADIUS:-_SEARCH_RADIUS, _SEARCH_RADIUS:-_SEARCH_RADIUS]
     known = np.isfinite(windows).all(axis=(1, 2)) & _have_texture(inner)
     cells = _cells(seen, looked_at[known])
-    return Agreement(len(cells), sum(_confirms(*both) for both in zip(cells, windows[known], strict=True)))
+    confirming = [_confirms(*both) for both in zip(cells, windows[known], strict=True)]
+    centers = looked_at[known][:, ::-1] + (_CELL - 1) / 2.0
+    in_all = int(_have_texture(_cells(second.grey, corners)).sum())
+    return ComparedCells(centers, np.array(confirming, dtype=np.bool_), in_all)
 
 
 def _cells(picture: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:

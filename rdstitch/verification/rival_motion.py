@@ -18,6 +18,7 @@ from rdstitch.matching.two_view import PairRegistration, estimation_batches
 from rdstitch.messages import Message, names_of
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
+from rdstitch.verification.competing_motions import Contest
 
 _MIN_MATCHES = 12
 """Inliers of a rival: four define its homography, and eight more by chance have not been seen."""
@@ -45,8 +46,9 @@ _CLEAR_AGREEMENT = 0.55
 """Share of the overlaps from which on what looks alike there is the larger part: matches are where texture is."""
 
 MIN_AGREEMENT = 0.4
-"""Share of the overlaps that must look alike where there is a rival. The plane fills what two pictures share of it, but
-for the rival: 0.5 to 0.9 in the same sets, where a vehicle was registered instead 0.15 to 0.29."""
+"""Share of the overlaps that must look alike where there is a rival, unless that is seen to be the smaller one. The
+plane fills what two pictures share of it, but for the rival: 0.2 to 0.9 in the same sets; a vehicle, where it was
+registered instead, 0.15 to 0.36."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,11 @@ class RivalMotion:
     def share(self) -> float:
         """Of the area that has either motion, in [0, 1]."""
         return self.area / max(self.area + self.plane_area, 1)
+
+    @property
+    def is_far(self) -> bool:
+        """Whether it moves by more than tree tops do, as far as its pictures are known."""
+        return self.relation is None or self.disagreement > _MIN_APART * 2.0 * self.relation.camera.half_diagonal
 
 
 def find_rival_motions(
@@ -122,41 +129,20 @@ def rival_share(rivals: Sequence[RivalMotion]) -> float:
     return sum(rival.area for rival in rivals) / max(total, 1)
 
 
-def pairs_of_rivals(pairs: Sequence[PairRegistration], rivals: Sequence[RivalMotion]) -> list[PairRegistration]:
-    """The pairs as the rivals move; those that contradicted the alignment stay, and those without a rival say nothing.
-
-    Parameters
-    ----------
-    pairs : sequence of PairRegistration
-    rivals : sequence of RivalMotion
-        What :func:`find_rival_motions` found in them.
-    """
-    found = {(rival.image1, rival.image2): rival.relation for rival in rivals}
-    result = []
-    for pair in pairs:
-        own = pair.relation
-        relation = found.get((pair.image1, pair.image2), own)
-        if relation is None:
-            relation = RadialHomography.failed("nothing moves otherwise", own.camera, own.camera2, len(own.inliers))
-        result.append(replace(pair, relation=relation))
-    return result
-
-
 def is_apart(rivals: Sequence[RivalMotion]) -> bool:
     """Whether what moves otherwise covers a good part of the pictures, and moves by more than tree tops do."""
     if rival_share(rivals) < _MIN_SHARE:
         return False
-    worst = max(rivals, key=lambda rival: rival.area)
-    return worst.relation is None or worst.disagreement > _MIN_APART * 2.0 * worst.relation.camera.half_diagonal
+    return max(rivals, key=lambda rival: rival.area).is_far
 
 
 def rival_messages(
     paths: Sequence[str],
     rivals: Sequence[RivalMotion],
     agreement: float,
+    compared: Contest | None = None,
     *,
     lens_only: bool = False,
-    larger: bool = False,
 ) -> list[Message]:
     """What to say of the rivals: nothing where they cover little, a failure where they may be the plane.
 
@@ -167,13 +153,13 @@ def rival_messages(
     rivals : sequence of RivalMotion
     agreement : float
         Share of the overlaps, [0, 1], that looks alike where the alignment puts the pictures; NaN where unknown.
+    compared : Contest, optional
+        What the pixels say of both motions, where they were compared.
     lens_only : bool
         Only the lens is wanted, which both motions show.
-    larger : bool
-        Whether the rival was registered, too, and found to be the smaller one.
     """
     share = rival_share(rivals)
-    if share < _MIN_SHARE:
+    if share < _MIN_SHARE and compared is None:
         return []
     worst = max(rivals, key=lambda rival: rival.area)
     images = (paths[worst.image1], paths[worst.image2])
@@ -183,8 +169,9 @@ def rival_messages(
         f"{share:.0%} of what the pictures have in common moves otherwise than the rest, most of it around "
         f"({u:.0f}, {v:.0f}) of {first} when compared with {second}, by {worst.disagreement:.0f} pixels"
     )
-    decided = larger or share < _CONTESTED_SHARE
-    clear = agreement >= _CLEAR_AGREEMENT or (decided and not agreement < MIN_AGREEMENT)
+    clear = agreement >= _CLEAR_AGREEMENT or (share < _CONTESTED_SHARE and not agreement < MIN_AGREEMENT)
+    if compared is not None:
+        clear = compared.won or (clear and not compared.lost)
     if lens_only or clear:
         more = f"; what was stitched fills {agreement:.0%} of the overlaps" if share >= _CONTESTED_SHARE else ""
         return [Message(f"{what} (a vehicle, a second plane?){more}; a mask keeps it out", images, code="rival-motion")]

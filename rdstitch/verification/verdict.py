@@ -14,10 +14,12 @@ from rdstitch.errors import RegistrationError
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.messages import Message, Severity, names_of, shortened
 from rdstitch.registration import Registration
+from rdstitch.verification.competing_motions import Contest
 from rdstitch.verification.input_doubts import doubtful_inputs
 from rdstitch.verification.misfits import agreement_of_all, disagreeing_pairs, misfitting_pictures
 from rdstitch.verification.overlap_check import CheckedLink, check_overlaps, share_alike
 from rdstitch.verification.parallax import find_parallax, parallax_messages
+from rdstitch.verification.rival_check import compare_with_rivals, outside_rivals
 from rdstitch.verification.rival_motion import MIN_AGREEMENT, find_rival_motions, is_apart, rival_messages
 
 Pair = tuple[int, int]
@@ -56,7 +58,6 @@ def judge(
     cache: Cache = NO_CACHE,
     *,
     lens_only: bool = False,
-    larger: bool = False,
 ) -> tuple[Message, ...]:
     """Check an alignment against the pairs that it was made from, and against the pixels.
 
@@ -74,8 +75,6 @@ def judge(
     cache : Cache
     lens_only : bool
         Only the lens is wanted, so that doubts about the places of pictures do not make the result fail.
-    larger : bool
-        Whether what moves otherwise was registered, too, and found to be the smaller one.
 
     Returns
     -------
@@ -98,12 +97,15 @@ def judge(
         return tuple(geometric)
     with nullcontext(executor) if executor is not None else ThreadPoolExecutor(1) as where:
         checked = [] if resting else check_overlaps(registration, where, cache)
-    ambiguous = _ambiguous(paths, checked)
     rivals = find_rival_motions(alignment, registration.pairs, threshold)
     parallax = find_parallax(alignment, registration.pairs) if alignment.on_sphere else []
+    compared = compare_with_rivals(registration, rivals, checked)
+    seen = outside_rivals(checked, rivals, compared)
+    ambiguous = _ambiguous(paths, seen)
     # What two pictures share of a plane looks alike; where something else moves, it may be that which holds them.
-    least = MIN_AGREEMENT if is_apart(rivals) and not larger else _MIN_AGREEMENT
-    suspicions = {**disagreeing, **_unlike(paths, checked, least), **ambiguous}
+    undecided = is_apart(rivals) and not (compared and (compared.won or compared.lost))
+    least = MIN_AGREEMENT if undecided else _MIN_AGREEMENT
+    suspicions = {**disagreeing, **_unlike(paths, seen, least), **_of_the_rival(paths, checked, compared), **ambiguous}
     decisive = [] if lens_only or resting else _decisive(suspicions, used, len(paths))
     return (
         *_error_of_the_whole(alignment, threshold, checked),
@@ -112,9 +114,9 @@ def judge(
         *([] if lens_only else _pattern(ambiguous, checked)),
         *(suspicions[pair] for pair in decisive),
         *_outvoted(paths, [pair for pair in suspicions if pair not in decisive], ambiguous),
-        *([] if parallax else rival_messages(paths, rivals, share_alike(checked), lens_only=lens_only, larger=larger)),
-        *_little_alike(paths, [link for link in checked if link.pair not in suspicions]),
-        *([] if lens_only else _settled(paths, checked)),
+        *([] if parallax else rival_messages(paths, rivals, share_alike(checked), compared, lens_only=lens_only)),
+        *_little_alike(paths, [link for link in seen if link.pair not in suspicions]),
+        *([] if lens_only else _settled(paths, seen)),
         *doubtful_inputs(registration.sources),
     )
 
@@ -242,6 +244,20 @@ def _unlike(paths: Sequence[str], checked: Sequence[CheckedLink], least: float) 
         )
         for link in checked
         if link.agreement.cells >= _MIN_CELLS and link.agreement.share < least
+    }
+
+
+def _of_the_rival(
+    paths: Sequence[str], checked: Sequence[CheckedLink], compared: Contest | None
+) -> dict[Pair, Message]:
+    """Pictures that may be held together by what moves otherwise than the plane; none where that holds all of them."""
+    doubtful = frozenset[Pair]() if compared is None or compared.lost else compared.doubtful
+    return {
+        link.pair: _of_pair(
+            paths, link.fit, " may be held together by what moves otherwise than the plane (a vehicle?)"
+        )
+        for link in checked
+        if link.pair in doubtful
     }
 
 

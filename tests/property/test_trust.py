@@ -45,6 +45,16 @@ def test_what_moves_otherwise_is_never_stitched_without_a_word(kind: str, seed: 
         assert judged.status == 0, judged.text
 
 
+@pytest.mark.parametrize("seed", [9803, 9806, 20022, 30008])
+def test_a_vehicle_with_more_matches_than_the_plane_is_not_taken_for_it(seed: int, tmp_path: Path) -> None:
+    """Some pairs show it and some the plane; it looks like rough ground; it may be all that most of the pairs show."""
+    judged = judge_set(trust_set(seed, "vehicle"), tmp_path)
+    assert judged.status == 0, judged.text
+    assert judged.right, judged
+    assert judged.warned
+    assert "moves otherwise" in judged.text
+
+
 @pytest.mark.parametrize(("seed", "kind"), [(9801, "cylinder"), (9800, "rolling shutter")])
 def test_what_tilts_took_up_is_warned_of(seed: int, kind: str, tmp_path: Path) -> None:
     """A curve or a shear so large that it is rare bends the whole by pixels, and free tilts fit every overlap."""

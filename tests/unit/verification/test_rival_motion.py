@@ -3,20 +3,20 @@
 import math
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.matching.two_view import PairRegistration
 from rdstitch.radial_homography import RadialHomography
+from rdstitch.verification.competing_motions import Contest
+from rdstitch.verification.photometric_agreement import Agreement
 from rdstitch.verification.rival_motion import (
     RivalMotion,
     find_rival_motions,
     is_apart,
-    pairs_of_rivals,
     rival_messages,
     rival_share,
 )
@@ -45,6 +45,24 @@ def _rival(area: int, plane: int) -> RivalMotion:
 def test_area_and_agreement_decide(area: int, agreement: float, severity: str | None) -> None:
     messages = rival_messages(PATHS, [_rival(area, 100 - area)], agreement)
     assert [message.severity for message in messages] == ([] if severity is None else [severity])
+
+
+@pytest.mark.parametrize(
+    ("area", "agreement", "fills", "rival", "severity"),
+    [
+        (46, 0.2, 0.7, 0.3, "warning"),  # it holds wherever the rival does not, which is the smaller one
+        (46, 0.2, 0.7, 0.6, "failure"),
+        (46, 0.6, 0.7, 0.6, "warning"),
+        (20, 0.6, 0.4, 0.3, "failure"),  # most of the pictures contradict it, however much of the overlaps looks alike
+        (5, 0.45, 0.4, 1.0, "failure"),
+    ],
+)
+def test_what_fills_less_than_half_of_the_pictures_fails(
+    area: int, agreement: float, fills: float, rival: float, severity: str
+) -> None:
+    compared = Contest(fills, rival, {(0, 1): Agreement(100, 90)}, frozenset())
+    (message,) = rival_messages(PATHS, [_rival(area, 100 - area)], agreement, compared)
+    assert message.severity == severity
 
 
 def test_the_place_is_named() -> None:
@@ -105,16 +123,6 @@ def test_a_second_motion_is_found_with_its_place_and_area() -> None:
     assert found.share == pytest.approx(20 / 116)
     assert found.center == pytest.approx((325.0, 450.0))
     assert found.disagreement == pytest.approx(50.0, abs=0.1)
-
-
-def test_pairs_move_as_their_rivals_do() -> None:
-    relation = RadialHomography(np.eye(3), LENS, LENS, np.array([True, False]))
-    rival = replace(relation, inliers=np.array([False, True]))
-    pairs: Any = [PairRegistration(0, second, cast(Any, None), relation) for second in (1, 2, 3)]
-    found = pairs_of_rivals(pairs, [replace(_rival(9, 9), relation=rival), replace(_rival(0, 9), image2=2)])
-    assert found[0].relation is rival
-    assert not found[1].relation  # it shows the plane alone
-    assert found[2].relation is relation  # it contradicts the alignment, so that it is none of its rivals
 
 
 def test_area_that_the_plane_covers_too_does_not_count() -> None:

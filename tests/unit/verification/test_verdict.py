@@ -15,8 +15,10 @@ from rdstitch.io import write_image
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.register import register
+from rdstitch.radial_homography import RadialHomography
 from rdstitch.registration import Registration
-from rdstitch.verification import verdict
+from rdstitch.verification import rival_check, verdict
+from rdstitch.verification.competing_motions import Contest
 from rdstitch.verification.overlap_check import CheckedLink
 from rdstitch.verification.photometric_agreement import Agreement
 from rdstitch.verification.rival_motion import RivalMotion
@@ -169,8 +171,32 @@ def test_where_something_moves_otherwise_two_fifths_must_look_alike(
     monkeypatch.setattr(verdict, "find_rival_motions", lambda *_: [rival])
     found = _checked_by(monkeypatch, good, _checked(100, int(100 * share)), _checked(100, 90, pair=(1, 2)))
     assert [message.severity for message in found] == severities
-    compared = judge(good, THRESHOLD, larger=True)  # what moves otherwise was registered as well, and was smaller
+    outside = {(0, 1): Agreement(50, 39), (1, 2): Agreement(100, 90)}
+    monkeypatch.setattr(rival_check, "contest", lambda *_: Contest(0.8, 0.3, outside, frozenset()))
+    compared = judge(good, THRESHOLD)  # what moves otherwise was seen to be smaller
     assert [message.severity for message in compared] == ["warning"]
+
+
+def test_pairs_that_the_rival_may_hold_together_do_not_count(
+    good: Registration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However much alike they look: what drives ahead does."""
+    first, second = good.alignment.cameras[:2]
+    relation = RadialHomography(np.eye(3), first, second, np.ones(20, dtype=np.bool_))
+    checked = [_checked(100, 48), _checked(100, 45, pair=(1, 2))]
+    for area, fills, doubtful, texts in (
+        (5, 0.8, frozenset({(0, 1)}), []),  # a rival of a twentieth, and a plane that may be one
+        (5, 0.45, frozenset({(0, 1)}), ["not clear which"]),  # of all pictures together
+        (20, 0.8, frozenset({(0, 1)}), ["held together by what moves otherwise"]),
+        (20, 0.8, frozenset(), []),
+    ):
+        rival = RivalMotion(0, 1, area, 100 - area, (30.0, 40.0), 120.0, relation)
+        monkeypatch.setattr(verdict, "find_rival_motions", lambda *_, rival=rival: [rival])
+        found = Contest(fills, 0.3, {}, doubtful)
+        monkeypatch.setattr(rival_check, "contest", lambda *_, found=found: found)
+        failures = [m.text for m in _checked_by(monkeypatch, good, *checked) if m.severity == "failure"]
+        assert len(failures) == len(texts)
+        assert all(part in text for part, text in zip(texts, failures, strict=True))
 
 
 @pytest.mark.parametrize(("ambiguous", "of_all"), [(1, False), (2, True)])
