@@ -17,7 +17,7 @@ from rdstitch.alignment.planarity import coherence, judge_relief
 from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPoses, ShapeTest
 from rdstitch.alignment.rotation_frame import levelled
 from rdstitch.alignment.rotation_model import ROTATION
-from rdstitch.alignment.sandwich import sandwich_std
+from rdstitch.alignment.sandwich import sandwich_covariance
 from rdstitch.alignment.shape_test import judge_shape
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS, Camera
@@ -79,7 +79,7 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
     problem, fit = found.problem, found.choice.fit
     adjusted, planar = fit.adjusted, isinstance(fit.model, PlanarModel)
     shared, lens = fit.model.physical_parameters(adjusted.parameters.shared)[0], adjusted.parameters.lens
-    covariance = adjusted.covariance * _inflation(found)
+    covariance = _covariance(found)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     names = (*fit.model.shared_names, *(n for n, free in zip(LENS_PARAMETERS, problem.free_lens, strict=True) if free))
     focal = float(np.exp(shared[-1])) if fit.model.shared_names else None
@@ -135,15 +135,12 @@ def _shape(found: AdjustedPictures) -> ShapeTest | None:
     return replace(judged, image=int(pictures[judged.image]))
 
 
-def _inflation(found: AdjustedPictures) -> float:
-    """Ratio of the variances to those of the normal equations, since errors are not independent."""
-    fit, adjusted = found.choice.fit, found.choice.fit.adjusted
+def _covariance(found: AdjustedPictures) -> FloatArray:
+    """Covariance of the named parameters, where λ was estimated for errors that are not independent."""
+    fit = found.choice.fit
     if not (found.observable and found.problem.free_lens[0]):
-        return 1.0
-    distortion = len(fit.model.shared_names)
-    stated = float(adjusted.covariance[distortion, distortion])
-    adjuster = found.problem.adjuster_of(fit)
-    return max(1.0, sandwich_std(adjuster, adjusted) ** 2 / max(stated, 1e-300))
+        return fit.adjusted.covariance
+    return sandwich_covariance(found.problem.adjuster_of(fit), fit.adjusted)
 
 
 def _lens_covariance(names: Sequence[str], covariance: FloatArray) -> FloatArray:

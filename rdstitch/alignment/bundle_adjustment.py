@@ -206,6 +206,13 @@ class BundleAdjuster:
         state = self._evaluate(adjusted.parameters, adjusted.sigma, width or ALIGNMENT_WIDTH * adjusted.sigma)
         return self._normal_equations(state, adjusted.sigma)
 
+    def covariance(self, adjusted: BundleAdjustmentResult) -> FloatArray:
+        """Of the named parameters and the free ones of the lens (S', S'), as far as the overdispersion is right."""
+        derivative = self.named_parameters(adjusted.parameters.shared)[1]
+        covariance = _covariance(self.normal_equations(adjusted).shared_information())
+        named: FloatArray = derivative @ covariance @ derivative.T
+        return named
+
     def _descend(self, parameters: Parameters, sigma: float, width: float, most: int) -> tuple[_State, int, bool]:
         """Levenberg-Marquardt at one width of the loss; the state reached, linearizations, whether converged."""
         state = self._evaluate(parameters, sigma, width)
@@ -290,7 +297,7 @@ class BundleAdjuster:
         )
         p, free, lens = self.priors, self.free.poses, self.free.lens
         precision = np.concatenate([p.shared_precision, p.lens_precision[lens]])
-        physical, derivative = self._physical_parameters(state.parameters.shared)
+        physical, derivative = self.named_parameters(state.parameters.shared)
         error = np.concatenate([physical - p.shared, (state.parameters.lens - p.lens)[lens]])
         poses = self.model.prior_coordinates(state.parameters.poses) - p.poses
         return normal.with_priors(
@@ -300,7 +307,7 @@ class BundleAdjuster:
             derivative.T @ (precision * error),
         )
 
-    def _physical_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def named_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The named parameters (S,), and their derivatives by the shared ones and by the lens (S', S')."""
         physical, derivative = self.model.physical_parameters(shared)
         size, lens = len(physical), int(self.free.lens.sum())
@@ -311,7 +318,7 @@ class BundleAdjuster:
     def _finished(self, parameters: Parameters, sigma: float, used: int, converged: bool) -> BundleAdjustmentResult:
         """The result with its covariance."""
         state = self._evaluate(parameters, sigma, ALIGNMENT_WIDTH * sigma)
-        derivative = self._physical_parameters(parameters.shared)[1]
+        derivative = self.named_parameters(parameters.shared)[1]
         covariance = _covariance(self._normal_equations(state, sigma).shared_information())
         return BundleAdjustmentResult(
             parameters,

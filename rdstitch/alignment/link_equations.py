@@ -7,6 +7,7 @@ With ``z = H p`` the derivative by H is ``(∂d/∂z) ⊗ p``. So products of th
 products of the coordinates of p, are all that is summed: no Jacobian is formed.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -106,6 +107,58 @@ def whitened_errors(observations: Observations, homographies: FloatArray, lens: 
     chunks = _chunks(observations.start)
     errors = [_transferred(observations, homographies, lens, *chunk).whitened for chunk in chunks]
     return np.concatenate([np.empty((2, 0)), *errors], axis=1).T
+
+
+@dataclass(frozen=True)
+class LinearizedErrors:
+    """Whitened transfer errors of some links with their derivatives, all in pixels; 0 where there is no transfer.
+
+    Attributes
+    ----------
+    first, last : int
+        The links ``first`` to ``last - 1``, whose correspondences are ``rows``.
+    rows : slice
+    errors : ndarray of shape (m, 2)
+    jacobian : ndarray of shape (m, 2, 9 + K)
+        By the entries of H and the K free parameters of the lens.
+    by_point1, by_point2 : ndarray of shape (m, 2, 2)
+        By the measured points, half diagonals.
+    """
+
+    first: int
+    last: int
+    rows: slice
+    errors: FloatArray
+    jacobian: FloatArray
+    by_point1: FloatArray
+    by_point2: FloatArray
+
+
+@np.errstate(all="ignore")
+def linearized_errors(
+    observations: Observations, homographies: FloatArray, lens: FloatArray, free_lens: BoolArray
+) -> Iterator[LinearizedErrors]:
+    """All links, some at a time: derivatives of all correspondences at once would be most of an alignment's memory."""
+    for first, last in _chunks(observations.start):
+        there = _transferred(observations, homographies, lens, first, last)
+        found = there.derivatives
+        by_homography = found.by_image[:, :, None] * found.lifted
+        columns = np.concatenate([by_homography.reshape(2, 9, -1), found.by_lens(free_lens)], axis=1)
+        yield LinearizedErrors(
+            first,
+            last,
+            slice(int(observations.start[first]), int(observations.start[last])),
+            _finite(there.whitened.T),
+            _finite(whiten(there.whitening, columns).transpose(2, 0, 1)),
+            _finite(there.whitening @ found.by_point),
+            _finite(-there.whitening),
+        )
+
+
+def _finite(values: FloatArray) -> FloatArray:
+    """The values, and 0 where they are not finite."""
+    finite: FloatArray = np.where(np.isfinite(values), values, 0.0)
+    return finite
 
 
 def squared_lengths(errors: FloatArray) -> FloatArray:

@@ -17,6 +17,9 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.pose_blocks import PoseBlocks
 from rdstitch.arrays import FloatArray
 
+_LEAST_DAMPING = 1e-12
+"""Relative to the diagonal: what makes poses solvable that nothing holds."""
+
 
 @dataclass(frozen=True)
 class SparseNormalEquations:
@@ -50,6 +53,13 @@ class SparseNormalEquations:
         step_shared = _solve_scaled(reduced + diagonal, right)
         return -solved[:, -1] - solved[:, :-1] @ step_shared, step_shared
 
+    def responses(self, gradient_poses: FloatArray, gradient_shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The steps, (F, C) and (S, C), for C gradients (F, C) and (S, C) in place of the equations' own."""
+        kept = self.coupling.shape[1]
+        reduced, solved = replace(self, gradient_poses=gradient_poses)._eliminate(_LEAST_DAMPING)
+        step_shared = _solve_scaled(reduced, self.coupling.T @ solved[:, kept:] - gradient_shared)
+        return -solved[:, kept:] - solved[:, :kept] @ step_shared, step_shared
+
     def with_priors(
         self,
         precision_poses: FloatArray,
@@ -82,7 +92,7 @@ class SparseNormalEquations:
 
     def pose_response(self) -> FloatArray:
         """How the poses follow a unit step of each shared parameter, shape (F, S): ``-A⁻¹ B``."""
-        response: FloatArray = -self._eliminate(1e-12)[1][:, : self.coupling.shape[1]]
+        response: FloatArray = -self._eliminate(_LEAST_DAMPING)[1][:, : self.coupling.shape[1]]
         return response
 
     def _eliminate(self, damping: float) -> tuple[FloatArray, FloatArray]:
@@ -95,17 +105,18 @@ class SparseNormalEquations:
         damped = self.blocks.with_diagonal(self.poses, damping * diagonal + floor)
         factor = splu(damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         solved = factor.solve(right)
-        return self.shared - self.coupling.T @ solved[:, :-1], solved
+        return self.shared - self.coupling.T @ solved[:, : self.coupling.shape[1]], solved
 
 
 def _solve_scaled(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Least-norm solution of a small symmetric system, in units in which its diagonal is one."""
+    """Least-norm solution of a small symmetric system, in units in which its diagonal is one; of one or several."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
     kept = values > 1e-12
     inverse = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
-    solution: FloatArray = scale * (vectors @ (inverse * (vectors.T @ (scale * right))))
-    return solution
+    # The last axis of what is scaled is that of the system.
+    solution: FloatArray = scale * (vectors @ (inverse * (vectors.T @ (scale * right.T).T).T).T).T
+    return solution.T
 
 
 def chain(
@@ -131,20 +142,8 @@ def chain(
     weight : float
         Of all equations: one over the variance of the errors.
     """
-    i, j = observations.image1, observations.image2
-    size, count = model.by_pose.shape[1], len(observations)
-    inverse = inverses(model.matrices)[i][:, None]
-    along = homographies[:, None]
-    by_parts = [
-        -along @ model.by_pose[i] @ inverse,
-        model.by_pose[j] @ inverse,
-        model.by_shared[j] @ inverse - along @ model.by_shared[i] @ inverse,
-    ]
-    by_homography = np.concatenate(by_parts, axis=1).reshape(count, -1, 9)
-    width, lens = by_homography.shape[1], np.arange(equations.gram.shape[1] - 9)
-    derivative = np.zeros((count, 9 + len(lens), width + len(lens)))
-    derivative[:, :9, :width] = np.swapaxes(by_homography, 1, 2)
-    derivative[:, 9 + lens, width + lens] = 1.0
+    derivative = link_derivatives(observations, model, homographies, equations.gram.shape[1] - 9)
+    size = model.by_pose.shape[1]
     local = np.swapaxes(derivative, 1, 2) @ equations.gram @ derivative * weight
     gradient = np.einsum("lpk,lp->lk", derivative, equations.gradient) * weight
 
@@ -157,3 +156,27 @@ def chain(
         blocks.sums(gradient[:, :pair]),
         gradient[:, pair:].sum(axis=0),
     )
+
+
+def link_derivatives(
+    observations: Observations, model: ModelMatrices, homographies: FloatArray, lens_count: int
+) -> FloatArray:
+    """Derivatives of each link's homography and K parameters of the lens, shape (L, 9 + K, 2 D + S + K).
+
+    By the poses of its two pictures, the shared parameters of the model, and those of the lens.
+    """
+    i, j = observations.image1, observations.image2
+    count = len(observations)
+    inverse = inverses(model.matrices)[i][:, None]
+    along = homographies[:, None]
+    by_parts = [
+        -along @ model.by_pose[i] @ inverse,
+        model.by_pose[j] @ inverse,
+        model.by_shared[j] @ inverse - along @ model.by_shared[i] @ inverse,
+    ]
+    by_homography = np.concatenate(by_parts, axis=1).reshape(count, -1, 9)
+    width, lens = by_homography.shape[1], np.arange(lens_count)
+    derivative = np.zeros((count, 9 + len(lens), width + len(lens)))
+    derivative[:, :9, :width] = np.swapaxes(by_homography, 1, 2)
+    derivative[:, 9 + lens, width + lens] = 1.0
+    return derivative

@@ -26,8 +26,8 @@ LARGE_RELIEF = 0.00075
 _MAX_SAMPLES = 200_000
 """Correspondences of which the agreement is measured."""
 
-_MIN_DISTANCE = 0.005
-"""Half diagonals; nearer points are the same feature found twice."""
+_MIN_DISTANCE, _MAX_DISTANCE = 0.005, 0.25
+"""Half diagonals between neighbours; nearer points are the same feature found twice."""
 
 
 @dataclass(frozen=True)
@@ -56,20 +56,13 @@ class Coherence:
 
 def coherence(observations: Observations, errors: FloatArray, inliers: BoolArray) -> Coherence:
     """Agreement of the residuals (M, 2) of neighbouring inliers of the same link; of very many links, every n-th."""
-    every = max(1, -(-len(inliers) // _MAX_SAMPLES))
-    inliers = inliers & (observations.link % every == 0)
-    link, points, residual = observations.link[inliers], observations.points1[inliers], errors[inliers]
+    chosen = _sample(observations, inliers)
+    link, points, residual = observations.link[chosen], observations.points1[chosen], errors[chosen]
     pictures = len(np.unique(np.concatenate([observations.image1, observations.image2])))
     if len(points) < 2:
         return Coherence(0.0, 0.0, 0.0, 1.0)
-    apart = np.column_stack([points, link * 10.0])
-    nearby = cKDTree(apart).query(apart, k=min(4, len(apart)))
-    distance, neighbour = np.asarray(nearby[0]), np.asarray(nearby[1])
-    pairs = (distance[:, 1:] > _MIN_DISTANCE) & (distance[:, 1:] < 0.25)
-    nearest = np.argmax(pairs, axis=1)
-    found = pairs.any(axis=1)
-    other = neighbour[np.arange(len(apart)), nearest + 1]
-    products = np.einsum("mi,mi->m", residual, residual[other])[found]
+    first, second = neighbours(observations, inliers)
+    products = np.einsum("mi,mi->m", errors[first], errors[second])
     power = float(np.einsum("mi,mi->", residual, residual) / len(residual))
     common = float(products.mean()) if len(products) else 0.0
     size = float(np.sqrt(max(common, 0.0)))
@@ -80,6 +73,26 @@ def coherence(observations: Observations, errors: FloatArray, inliers: BoolArray
         max(_overdispersion(link, points, residual, len(observations), cells) for cells in _CELLS)
         * max(1.0, len(observations) / max(pictures - 1, 1)),
     )
+
+
+def neighbours(observations: Observations, inliers: BoolArray) -> tuple[IntArray, IntArray]:
+    """Inliers, of very many links every n-th, and the nearest neighbour in the same link of each that has one."""
+    chosen = _sample(observations, inliers)
+    apart = np.column_stack([observations.points1[chosen], observations.link[chosen] * 10.0])
+    if len(apart) < 2:
+        return chosen[:0], chosen[:0]
+    nearby = cKDTree(apart).query(apart, k=min(4, len(apart)))
+    distance, neighbour = np.asarray(nearby[0]), np.asarray(nearby[1])
+    pairs = (distance[:, 1:] > _MIN_DISTANCE) & (distance[:, 1:] < _MAX_DISTANCE)
+    found = pairs.any(axis=1)
+    nearest = neighbour[np.arange(len(apart)), np.argmax(pairs, axis=1) + 1]
+    return chosen[found], chosen[nearest[found]]
+
+
+def _sample(observations: Observations, inliers: BoolArray) -> IntArray:
+    """Indices of the inliers; of very many links, of every n-th."""
+    every = max(1, -(-len(inliers) // _MAX_SAMPLES))
+    return np.flatnonzero(inliers & (observations.link % every == 0))
 
 
 def _overdispersion(link: IntArray, points: FloatArray, residual: FloatArray, count: int, cells: int) -> float:

@@ -1,13 +1,11 @@
-"""How well λ is known where errors are no independent noise: a sandwich estimate over blocks (Liang and Zeger 1986).
+"""How well the lens is known where errors are no independent noise: a sandwich estimate (Huber 1981; Cameron and Miller
+2015).
 
-Relief moves all points of a place on the ground together, in every pair of pictures that shows it; a lens that one
-model does not quite describe, or a rolling shutter, moves all points of a picture. The inverse of the normal equations
-takes errors for independent and is too small then. Here the influence of each correspondence on λ is added up per
-block, within which errors may do what they like, and the sums are squared.
-
-Blocks cannot see what the parameters have absorbed: hills as wide as an overlap are fitted by its homography and by λ.
-What neighbours have in common is therefore taken to be as large where nothing shows it, and counts as half an
-independent observation of λ for each pair of pictures.
+The inverse of the normal equations takes errors for independent. They are not, in three ways. A keypoint that several
+pairs share brings its error into all of them. Relief moves all points of a place together, in every pair of pictures
+that shows it; see :mod:`rdstitch.alignment.relief_field`. A rolling shutter, or a lens that changes, moves all points
+of a picture. The influence of each correspondence on λ is added up per keypoint, or per picture, and the sums are
+squared.
 """
 
 from dataclasses import replace
@@ -15,104 +13,95 @@ from dataclasses import replace
 import numpy as np
 
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult
-from rdstitch.alignment.link_equations import whitened_errors
-from rdstitch.alignment.motion_models import inverses
+from rdstitch.alignment.linear_response import LinearResponse
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.planarity import coherence
-from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.division_model import undistort
-from rdstitch.radial_homography import project
-from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_weight
+from rdstitch.alignment.relief_field import ReliefField
+from rdstitch.arrays import FloatArray
 
-_STEP = 1e-3
-"""Of the direction along which the errors are differentiated, in standard deviations of λ."""
-
-_OBSERVATIONS_PER_LINK = 0.5
-"""Independent observations of λ by one link, of errors that neighbours have in common. Chosen on windows of real
-flights, where ``python -m tests.benchmarks.coverage`` prints a median error of 0.7 σ; over rendered relief, where
-``python -m tests.benchmarks.relief`` prints about 0.4 σ, it is on the safe side."""
-
-_CELLS_PER_PICTURE, _MOST_CELLS = 3, 10_000
-"""Blocks of ground along a side of a picture; and on each side of the middle, beyond which all are one."""
+_SINGULAR = 1e-12
+"""Least eigenvalue of a correlation matrix of parameters."""
 
 
-def sandwich_std(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> float:
-    """Standard deviation of λ when errors agree within blocks of ground, or within pictures, whichever is larger.
+def sandwich_covariance(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> FloatArray:
+    """Covariance (S', S') of the model's named parameters and the free parameters of the lens.
+
+    In no direction less than that of independent errors, nor than where errors agree within pictures.
 
     Parameters
     ----------
     adjuster : BundleAdjuster
-        With λ free.
     adjusted : BundleAdjustmentResult
         Of this adjuster.
     """
-    influence = _influence(adjuster, adjusted)
-    ground = _ground_blocks(adjuster.observations, adjusted)
-    by_ground = float((np.bincount(ground, influence) ** 2).sum())
-    blocks = len(np.unique(ground[influence != 0.0]))
-    free = int(adjuster.free.poses.sum()) + len(adjusted.parameters.shared) + int(adjuster.free.lens.sum())
-    few = 2.0 * blocks / max(2.0 * blocks - free, 0.25 * blocks)  # what the parameters have absorbed
-    blockwise = max(by_ground * few, _by_pictures(adjuster.observations, influence))
-    return float(np.sqrt(blockwise + _absorbed(adjuster, adjusted, influence)))
+    response, observations = LinearResponse.of(adjuster, adjusted), adjuster.observations
+    influence, priors = _influence(response)
+    by_pictures = priors + _by_pictures(observations, influence)
+    count = int(adjuster.free.poses.sum()) + influence.shape[1]
+    errors = 2 * int((response.weight > 0.0).sum())
+    absorbed = errors / max(errors - count, 0.25 * errors)
+    noise = absorbed * _by_keypoints(observations, influence)
+    found = _at_least(priors + noise + ReliefField(response).covariance(), by_pictures)
+    derivative = adjuster.named_parameters(adjusted.parameters.shared)[1]
+    independent = replace(adjuster, overdispersion=1.0).covariance(adjusted)
+    return _at_least(independent, derivative @ found @ derivative.T)
 
 
-def _influence(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> FloatArray:
-    """By how much each correspondence moves λ, shape (M,)."""
-    normal, observations = adjuster.normal_equations(adjusted), adjuster.observations
-    unit = np.zeros(len(normal.gradient_shared))
-    unit[len(adjusted.parameters.shared)] = -1.0
-    poses, shared = replace(normal, gradient_poses=np.zeros_like(normal.gradient_poses), gradient_shared=unit).solve(
-        1e-12
-    )
-    step = np.zeros(adjuster.free.poses.shape)
-    step[adjuster.free.poses] = poses
-    size = _STEP / max(float(np.sqrt(abs(shared[len(adjusted.parameters.shared)]))), 1e-12)
-    ahead, behind = (_errors(adjuster, adjusted, sign * size * step, sign * size * shared) for sign in (1.0, -1.0))
-    errors = whitened_errors(observations, adjusted.homographies, adjusted.parameters.lens)
-    weight = robust_weight(adjusted.squared, ALIGNMENT_WIDTH * adjusted.sigma) * adjuster.weight(adjusted.sigma)
-    change = (ahead - behind) / (2.0 * size)
-    influence: FloatArray = np.nan_to_num(weight * np.einsum("mi,mi->m", errors, change))
-    return influence
+def _influence(response: LinearResponse) -> tuple[FloatArray, FloatArray]:
+    """By how much each correspondence moves the shared parameters (M, S'), and their covariance by the priors alone."""
+    normal = response.normal
+    count = len(normal.gradient_shared)
+    poses, shared = normal.responses(np.zeros((len(normal.gradient_poses), count)), -np.eye(count))
+    influence, information = np.empty((len(response.weight), count)), np.zeros((count, count))
+    for part in response.parts():
+        change, weight = response.changes(part, poses, shared), response.weight[part.rows]
+        influence[part.rows] = weight[:, None] * np.einsum("mi,mic->mc", part.errors, change)
+        rows = change.reshape(-1, count)
+        information += response.curvature * (rows.T * np.repeat(weight, 2)) @ rows
+    return influence, shared - information
 
 
-def _errors(
-    adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult, poses: FloatArray, shared: FloatArray
-) -> FloatArray:
-    """Whitened errors (M, 2) after a step."""
-    moved = adjusted.parameters.retract(adjuster.model, poses, shared, adjuster.free.lens)
-    matrices = adjuster.model.matrices(moved.poses, moved.shared).matrices
-    i, j = adjuster.observations.image1, adjuster.observations.image2
-    return whitened_errors(adjuster.observations, matrices[j] @ inverses(matrices)[i], moved.lens)
+def _at_least(covariance: FloatArray, least: FloatArray) -> FloatArray:
+    """The covariance (S, S), in no direction less than another, which may be singular."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    values = np.maximum(values, _SINGULAR)
+    # In the basis where the first is the identity, the larger of the two is a matter of eigenvalues.
+    root, inverse = vectors * np.sqrt(values) * scale[:, None], vectors / np.sqrt(values) / scale[:, None]
+    spread, directions = np.linalg.eigh(inverse.T @ least @ inverse)
+    root = root @ (directions * np.sqrt(np.maximum(spread, 1.0)))
+    larger: FloatArray = root @ root.T
+    return larger
 
 
-def _absorbed(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult, influence: FloatArray) -> float:
-    """Variance of λ by what neighbours have in common, as far as the parameters can have absorbed it."""
-    errors = whitened_errors(adjuster.observations, adjusted.homographies, adjusted.parameters.lens)
-    inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
-    common = max(coherence(adjuster.observations, errors, inliers).correlation, 0.0)
-    independent = _OBSERVATIONS_PER_LINK * len(adjuster.observations)
-    return common * float((influence**2).sum()) * max(2.0 * float(inliers.sum()) / independent, 1.0)
+def _by_keypoints(observations: Observations, influence: FloatArray) -> FloatArray:
+    """Covariance (S, S) when errors of correspondences that share a keypoint agree, by the influence (M, S) of each."""
+    pictures = np.concatenate([observations.image1, observations.image2])
+    own = influence.T @ influence
+    shared = -own  # each correspondence is among those of two keypoints
+    # One picture after the other: all keypoints at once would be most of the memory of an alignment.
+    for ends in np.split(np.argsort(pictures, kind="stable"), np.cumsum(np.bincount(pictures))[:-1]):
+        sides, links = np.divmod(ends, len(observations))
+        rows = [np.arange(observations.start[link], observations.start[link + 1]) for link in links.tolist()]
+        points = [
+            (observations.points2 if side else observations.points1)[own_rows]
+            for side, own_rows in zip(sides.tolist(), rows, strict=True)
+        ]
+        if not points:
+            continue
+        x, y = np.concatenate(points).T
+        keypoint = np.unique(x + 1j * y, return_inverse=True)[1].reshape(-1)
+        sums = np.zeros((len(keypoint), influence.shape[1]))
+        np.add.at(sums, keypoint, influence[np.concatenate(rows)])
+        shared = shared + sums.T @ sums
+    return _at_least(own, shared)
 
 
-def _ground_blocks(observations: Observations, adjusted: BundleAdjustmentResult) -> IntArray:
-    """The block of ground of each correspondence, shape (M,)."""
-    lens, link = adjusted.parameters.lens, observations.link
-    flat = undistort(observations.points1 - lens[-2:], float(lens[0]), tuple(lens[1:-2].tolist()))
-    # One coordinate after the other: a matrix for each correspondence would be most of the memory of an alignment.
-    back = np.moveaxis(inverses(adjusted.matrices.matrices)[observations.image1], 0, -1)
-    plane = [row[0][link] * flat[:, 0] + row[1][link] * flat[:, 1] + row[2][link] for row in back]
-    first = np.nan_to_num(project(np.column_stack(plane)))
-    starts = observations.start[:-1][np.diff(observations.start) > 0]
-    sizes = np.maximum.reduceat(first, starts) - np.minimum.reduceat(first, starts)
-    side = max(float(np.median(sizes.max(axis=1))), 1e-12) / _CELLS_PER_PICTURE
-    column, row = np.clip(np.floor((first - np.median(first, axis=0)) / side), -_MOST_CELLS, _MOST_CELLS).T
-    number: IntArray = np.unique(column * (2 * _MOST_CELLS + 1) + row, return_inverse=True)[1]
-    return number
-
-
-def _by_pictures(observations: Observations, influence: FloatArray) -> float:
-    """Variance when errors of links that share a picture agree (dyadic clusters; Aronow, Samii, Assenova 2015)."""
-    link = np.bincount(observations.link, influence, len(observations))
+def _by_pictures(observations: Observations, influence: FloatArray) -> FloatArray:
+    """Covariance (S, S) when errors of links that share a picture agree: dyadic clusters (Aronow et al. 2015)."""
     count = 1 + int(max(observations.image1.max(), observations.image2.max()))
-    picture = np.bincount(observations.image1, link, count) + np.bincount(observations.image2, link, count)
-    return max(float((picture**2).sum() - (link**2).sum()), 0.0)
+    link, picture = np.zeros((len(observations), influence.shape[1])), np.zeros((count, influence.shape[1]))
+    np.add.at(link, observations.link, influence)
+    for pictures in (observations.image1, observations.image2):
+        np.add.at(picture, pictures, link)
+    covariance: FloatArray = picture.T @ picture - link.T @ link
+    return covariance

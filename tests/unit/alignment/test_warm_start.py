@@ -54,7 +54,7 @@ def test_more_links_give_what_they_give_without_the_earlier_alignment(
     assert "similarity" not in links_apart
     assert warm.model == cold.model == model
     assert warm.lens == cold.lens
-    assert abs(warm.distortion - cold.distortion) < 0.05 * cold.distortion_std
+    assert abs(warm.distortion - cold.distortion) < 0.1 * cold.distortion_std
     assert warm.rms == pytest.approx(cold.rms, rel=1e-3)
     corners = np.array([(0.0, 0.0), (639.0, 0.0), (639.0, 479.0), (0.0, 479.0)])
     for link in given.links:

@@ -1,0 +1,100 @@
+"""How an adjustment answers small changes of its errors: the linearized M-estimator (Huber 1981, section 6.3).
+
+The estimate is where ``Σ w(r) J'r`` vanishes. When an error changes by a little, w r changes with the derivative of w r
+by r, not with w: far errors count less the farther they are. In the normal equations w stands in its place, which is
+as good for finding the minimum; for how far the minimum moves, it is too large by what this module calls the curvature.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult
+from rdstitch.alignment.link_equations import LinearizedErrors, linearized_errors
+from rdstitch.alignment.normal_equations import SparseNormalEquations, link_derivatives
+from rdstitch.arrays import FloatArray
+from rdstitch.robust.loss import ALIGNMENT_WIDTH, loss_ratio, robust_weight
+
+Fields = Callable[[LinearizedErrors], FloatArray]
+"""Changes (m, 2, C) of the errors of some links, pixels."""
+
+
+@dataclass(frozen=True)
+class LinearResponse:
+    """An adjustment, linearized at its solution.
+
+    Attributes
+    ----------
+    adjuster : BundleAdjuster
+    adjusted : BundleAdjustmentResult
+        Of this adjuster.
+    weight : ndarray of shape (M,)
+        What the square of each error counts in the normal equations.
+    curvature : float
+        Mean derivative of ``w r`` by r, in units of the mean of w: between 0 and 1.
+    normal : SparseNormalEquations
+        With the curvature in them.
+    """
+
+    adjuster: BundleAdjuster
+    adjusted: BundleAdjustmentResult
+    weight: FloatArray
+    curvature: float
+    normal: SparseNormalEquations
+
+    @classmethod
+    def of(cls, adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> Self:
+        """At the solution."""
+        width = ALIGNMENT_WIDTH * adjusted.sigma
+        weight = robust_weight(adjusted.squared, width)
+        # In two dimensions w r changes by w + r² dw/dr², the mean over all directions; w is the square of the ratio.
+        slope = weight * (2.0 * loss_ratio(adjusted.squared, width) - 1.0)
+        curvature = float(np.clip(slope.sum() / max(weight.sum(), 1e-300), 0.1, 1.0))
+        normal = replace(adjuster, overdispersion=adjuster.overdispersion / curvature).normal_equations(adjusted)
+        return cls(adjuster, adjusted, weight * adjuster.weight(adjusted.sigma), curvature, normal)
+
+    def parts(self) -> Iterator[LinearizedErrors]:
+        """The errors with their derivatives, some links at a time."""
+        adjusted = self.adjusted
+        return linearized_errors(
+            self.adjuster.observations, adjusted.homographies, adjusted.parameters.lens, self.adjuster.free.lens
+        )
+
+    def steps_of(self, fields: Fields, columns: int) -> tuple[FloatArray, FloatArray]:
+        """By how much poses (F, C) and shared parameters (S, C) move when the errors change by so many ``fields``."""
+        derivative = self._derivative
+        links = np.empty((*derivative.shape[:2], columns))
+        start = self.adjuster.observations.start
+        for part in self.parts():
+            weighted = fields(part) * (self.curvature * self.weight[part.rows])[:, None, None]
+            for link in range(part.first, part.last):
+                own = slice(start[link] - part.rows.start, start[link + 1] - part.rows.start)
+                jacobian = part.jacobian[own].reshape(-1, derivative.shape[1])
+                links[link] = jacobian.T @ weighted[own].reshape(-1, columns)
+        local = np.swapaxes(derivative, 1, 2) @ links
+        blocks = self.normal.blocks
+        pair = blocks.column.shape[1]
+        return self.normal.responses(blocks.sums(local[:, :pair]), local[:, pair:].sum(axis=0))
+
+    def changes(self, part: LinearizedErrors, poses: FloatArray, shared: FloatArray) -> FloatArray:
+        """By how much the errors change, (m, 2, C), with steps of the poses (F, C) and the shared parameters (S, C)."""
+        start, column = self.adjuster.observations.start, self.normal.blocks.column
+        columns = shared.shape[1]
+        padded = np.concatenate([poses, np.zeros((1, columns))])
+        change = np.empty((*part.errors.shape, columns))
+        for link in range(part.first, part.last):
+            own = slice(start[link] - part.rows.start, start[link + 1] - part.rows.start)
+            step = self._derivative[link] @ np.concatenate([padded[column[link]], shared])
+            change[own] = part.jacobian[own] @ step
+        return change
+
+    @cached_property
+    def _derivative(self) -> FloatArray:
+        """Of each link's homography and the free lens by its own parameters, see :func:`link_derivatives`."""
+        lens_count = int(self.adjuster.free.lens.sum())
+        return link_derivatives(
+            self.adjuster.observations, self.adjusted.matrices, self.adjusted.homographies, lens_count
+        )
