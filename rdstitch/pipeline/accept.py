@@ -22,6 +22,10 @@ from rdstitch.verification.verdict import RefusedError, judge
 _MAX_SCALE_UNCERTAINTY = 0.05  # share that lengths may be off by, as far as the focal length is, without a word
 _MAX_ROUNDS = 20  # times that something is left out; each takes one adjustment
 
+_FEW_PAIRS = 500
+"""Pairs up to which every failure is reason enough to look for a second motion in each: that takes 20 seconds then. In
+larger sets something has been seen to move otherwise, or the failure is one of the whole."""
+
 
 @dataclass(frozen=True)
 class _Offenders:
@@ -76,7 +80,9 @@ def accept(
     if not first.ok and not options.force:
         aligner = Aligner.of(registration.sources, options, cache)
         left = _Offenders({}, {})
-        plane = None if lens_only else _plane_of_most(registration, options.threshold, aligner)
+        plane = None
+        if not lens_only and (len(registration.pairs) <= _FEW_PAIRS or _may_be_another_plane(found)):
+            plane = _plane_of_most(registration, options.threshold, aligner)
         judged = () if plane is None else checked(plane)
         if plane is not None and not _concerns_all(judged):
             registration, current, found = plane, plane, judged
@@ -113,6 +119,13 @@ def _plane_of_most(registration: Registration, threshold: float, aligner: Aligne
         return None
     plane = _aligned_anew(replace(registration, pairs=tuple(aligner.used(aligned))), aligned, aligner.paths, {})
     return plane if 2 * plane.alignment.used.sum() > len(registration.sources) else None
+
+
+def _may_be_another_plane(found: Iterable[Message]) -> bool:
+    """Whether something moves otherwise than what was registered, or the whole fails."""
+    return any(
+        message.code == "rival-motion" or (message.severity == "failure" and not message.images) for message in found
+    )
 
 
 def _concerns_all(found: Iterable[Message]) -> bool:

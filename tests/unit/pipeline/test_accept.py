@@ -13,7 +13,7 @@ from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import write_image
 from rdstitch.messages import Message, Severity, left_out
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.accept import _concerns_all, _Offenders, _without, accept
+from rdstitch.pipeline.accept import _concerns_all, _may_be_another_plane, _Offenders, _without, accept
 from rdstitch.pipeline.aligner import Aligner
 from rdstitch.pipeline.register import register
 from tests.cli.running import flight
@@ -39,6 +39,22 @@ def test_only_failures_of_many_pictures_concern_all(
     images: tuple[str, ...], severity: Severity, expected: bool
 ) -> None:
     assert _concerns_all([Message("wrong", ("x.png",), "failure"), Message("wrong", images, severity)]) is expected
+
+
+@pytest.mark.parametrize(
+    ("images", "severity", "code", "expected"),
+    [
+        (("a.png",), "failure", "", False),
+        (("a.png", "b.png"), "failure", "", False),
+        ((), "warning", "", False),
+        ((), "failure", "", True),
+        (("a.png", "b.png"), "warning", "rival-motion", True),
+    ],
+)
+def test_in_large_sets_a_second_motion_is_looked_for_where_it_may_be(
+    images: tuple[str, ...], severity: Severity, code: str, expected: bool
+) -> None:
+    assert _may_be_another_plane([Message("wrong", images, severity, code)]) is expected
 
 
 def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Path) -> None:
