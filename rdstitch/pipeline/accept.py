@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from rdstitch.alignment.motion_models import PLANAR_MODELS
 from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.cache import Cache
@@ -74,6 +75,8 @@ def accept(
         When a picture is left out, under ``options.strict``.
     """
     cache = Cache(options.cache)
+    if not options.force and registration.sources[0].guard.messages:
+        registration = _without_damage(registration, Aligner.of(registration.sources, options, cache))
     checked = partial(judge, threshold=options.threshold, executor=executor, cache=cache, lens_only=lens_only)
     current, found = registration, checked(registration)
     first = registration.with_messages(found)
@@ -104,6 +107,26 @@ def accept(
     if options.strict and accepted.left_out:
         raise PartialResultError("; ".join(map(str, told_once(accepted.left_out))))
     return accepted
+
+
+def _without_damage(registration: Registration, aligner: Aligner) -> Registration:
+    """Without pictures of damaged files, where they alone ask for a freer motion than all the others together.
+
+    Flipped bits shift a part of a picture, and by a few pixels that looks as if the camera had tilted: all tilt then.
+    """
+    former, used = registration.alignment, registration.alignment.used
+    index = {str(source.path): k for k, source in enumerate(registration.sources)}
+    reported = (message.images[0] for message in registration.sources[0].guard.messages)
+    damaged = [index[path] for path in reported if path in index and used[index[path]]]
+    if not damaged:
+        return registration
+    reason = Message("is damaged, and all others fit a simpler motion without it; copy it again from its source")
+    rest = _without(registration, _Offenders(dict.fromkeys(damaged, reason), {}), aligner)
+    if rest is None or not {former.model, rest.alignment.model} <= PLANAR_MODELS.keys():
+        return registration
+    by_freedom = list(PLANAR_MODELS)
+    simpler = by_freedom.index(rest.alignment.model) < by_freedom.index(former.model)
+    return rest if simpler and 2 * rest.alignment.used.sum() > used.sum() else registration
 
 
 def _plane_of_most(registration: Registration, threshold: float, aligner: Aligner) -> Registration | None:

@@ -55,6 +55,14 @@ def test_a_vehicle_with_more_matches_than_the_plane_is_not_taken_for_it(seed: in
     assert "moves otherwise" in judged.text
 
 
+@pytest.mark.parametrize(("seed", "rotten"), [(13079, "frame_0005.jpg"), (12095, "frame_0003.jpg")])
+def test_a_damaged_picture_does_not_bend_the_others(seed: int, rotten: str, tmp_path: Path) -> None:
+    judged = judge_set(trust_set(seed, "bit rot"), tmp_path)
+    assert judged.status == 0, judged.text
+    assert judged.right, judged
+    assert f"{rotten}: is damaged" in judged.text
+
+
 @pytest.mark.parametrize(("seed", "kind"), [(9801, "cylinder"), (9800, "rolling shutter")])
 def test_what_tilts_took_up_is_warned_of(seed: int, kind: str, tmp_path: Path) -> None:
     """A curve or a shear so large that it is rare bends the whole by pixels, and free tilts fit every overlap."""

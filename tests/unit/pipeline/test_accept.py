@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import write_image
 from rdstitch.messages import Message, Severity, left_out
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.accept import _concerns_all, _may_be_another_plane, _Offenders, _without, accept
+from rdstitch.pipeline.accept import _concerns_all, _may_be_another_plane, _Offenders, _without, _without_damage, accept
 from rdstitch.pipeline.aligner import Aligner
 from rdstitch.pipeline.register import register
 from tests.cli.running import flight
@@ -55,6 +57,42 @@ def test_in_large_sets_a_second_motion_is_looked_for_where_it_may_be(
     images: tuple[str, ...], severity: Severity, code: str, expected: bool
 ) -> None:
     assert _may_be_another_plane([Message("wrong", images, severity, code)]) is expected
+
+
+@pytest.mark.parametrize(
+    ("former", "rest", "remaining", "left_out"),
+    [
+        ("tilting", "rigid", 3, True),
+        ("homography", "tilting", 3, True),
+        ("rigid", "rigid", 3, False),
+        ("rigid", "tilting", 3, False),
+        ("tilting", "rigid", 2, False),  # most of the pictures would be missing
+        ("tilting", "rotation", 3, False),
+    ],
+)
+def test_what_is_damaged_is_left_out_where_the_others_fit_a_simpler_motion(
+    monkeypatch: pytest.MonkeyPatch, former: str, rest: str, remaining: int, left_out: bool
+) -> None:
+    def registration(model: str, used: int) -> Any:
+        guard = SimpleNamespace(messages=[Message("is damaged", ("2.jpg",), code="damaged")])
+        alignment = SimpleNamespace(model=model, used=np.arange(4) < used)
+        return SimpleNamespace(
+            alignment=alignment, sources=[SimpleNamespace(path=f"{k}.jpg", guard=guard) for k in range(4)]
+        )
+
+    whole, smaller = registration(former, 4), registration(rest, remaining)
+    asked: list[_Offenders] = []
+
+    def without(_: object, offenders: _Offenders, aligner: object) -> Any:
+        asked.append(offenders)
+        return smaller
+
+    monkeypatch.setattr("rdstitch.pipeline.accept._without", without)
+    aligner: Any = None
+    assert _without_damage(whole, aligner) is (smaller if left_out else whole)
+    assert [list(offenders.reasons) for offenders in asked] == [[2]]
+    unused = registration(former, 2)  # the damaged one is not in it anyway
+    assert _without_damage(unused, aligner) is unused
 
 
 def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Path) -> None:
