@@ -23,7 +23,7 @@ ADVERSE = (
 )  # fmt: skip
 """Kinds of sets. A right result, a warning that names the place, or a refusal: each is honest."""
 
-SOLVABLE_ADVERSE = ("round border", "curved border", "blurred")
+SOLVABLE_ADVERSE = ("body", "vehicle", "banner", "round border", "curved border", "blurred")
 """Kinds of which a person would make a picture."""
 
 Surface = Callable[[FloatArray], FloatArray]

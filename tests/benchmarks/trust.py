@@ -57,8 +57,10 @@ def main() -> None:
         print(f"{kind:16}" + "".join(f"{counts[kind, name]:16}" for name in columns))
     solvable = sum(count for (kind, _), count in counts.items() if kind in _SOLVABLE)
     share = sum(counts[kind, "solved"] for kind in _SOLVABLE) / max(solvable, 1)
+    refused = sum(counts[kind, "refused"] for kind in _SOLVABLE) / max(solvable, 1)
     wrong = sum(counts[kind, "silently wrong"] for kind in (*_SOLVABLE, *_OTHERS))
-    print(f"\n{share:.1%} of {solvable} solvable sets solved; {wrong} of {wanted.sets} sets silently wrong; ", end="")
+    print(f"\n{share:.1%} of {solvable} solvable sets solved, {refused:.1%} refused; ", end="")
+    print(f"{wrong} of {wanted.sets} sets silently wrong; ", end="")
     print(f"{(time.process_time() - start) / max(done, 1):.1f} s of processor time a set")
 
 
