@@ -32,7 +32,7 @@ from rdstitch.camera import LENS_STD, Camera
 from rdstitch.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTION
 from rdstitch.errors import ArgumentError, RegistrationError
 from rdstitch.matching.distortion_consensus import Consensus, vote
-from rdstitch.matching.links import Link
+from rdstitch.matching.links import Link, in_alternate_directions
 from rdstitch.matching.match_graph import connected_components, spanning_tree
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
 
@@ -85,13 +85,14 @@ def align(
     report, options = progress or (lambda stage: None), options or AlignmentOptions()
     _check(cameras, links, options)
     known = options.camera_priors(cameras)
-    everything = Observations.from_links(links, cameras, _matches_of_a_link(len(links), options))
+    everything = _observations(links, cameras, _matches_of_a_link(len(links), options))
 
     report("consensus of the pairs")
     votes = vote([k.relation.distortion for k in links], [k.relation.distortion_std for k in links])
     lens, free_lens = _lens_start(cameras, options, votes)
     few = everything.thinned(thin_for_selection(len(links)))
-    relations = relations_at(few, [link.relation for link in links], lens)
+    own = [link.relation for link in in_alternate_directions(links)]
+    relations = relations_at(few, own, lens)
     apart = homography_apart(few, relations, lens, free_lens, known)
     observable = options.lens_known or _observable(apart)
     chosen = choose_lens(few, apart, options.lenses if observable else (), known)
@@ -100,7 +101,7 @@ def align(
         lens, relations = apart.parameters.lens, apart.homographies
     else:
         lens, free_lens = _lens_of(cameras[0]), np.zeros(len(LENS_STD), dtype=np.bool_)
-        apart = homography_apart(few, relations_at(few, [k.relation for k in links], lens), lens, free_lens, known)
+        apart = homography_apart(few, relations_at(few, own, lens), lens, free_lens, known)
         relations = apart.homographies
 
     report("choice of the model")
@@ -118,7 +119,7 @@ def align(
     report("adjustment")
     if choice.fit.model is ROTATION and most_matches_read(len(links), options) is None:
         # Few pictures of a turn hardly determine the focal length; all their matches are used.
-        everything = Observations.from_links(links, cameras, _MATCHES_OF_A_TURN // len(links))
+        everything = _observations(links, cameras, _MATCHES_OF_A_TURN // len(links))
     full = replace(graph, observations=everything)
     problem, _ = full.problem(~wrong, pictures, choice.overdispersion)
     fit = problem.refine(choice.fit.model, choice.fit.adjusted.parameters, choice.fit.tilt_spread)
@@ -147,6 +148,11 @@ def most_matches_read(links: int, options: AlignmentOptions) -> int | None:
 def _matches_of_a_link(links: int, options: AlignmentOptions) -> int:
     """Thousands of links determine lens and poses many times over: memory and time are to grow with the links alone."""
     return min(options.most, max(_MATCHES_OF_ALL // max(links, 1), _MATCHES_OF_A_LINK))
+
+
+def _observations(links: Sequence[Link], cameras: Sequence[Camera], most: int) -> Observations:
+    """Of each link at most so many correspondences, chosen before any is turned round."""
+    return Observations.from_links(in_alternate_directions([link.thinned(most) for link in links]), cameras)
 
 
 def _check(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions) -> None:

@@ -232,12 +232,12 @@ def _link_fits(found: AdjustedPictures, inliers: BoolArray) -> tuple[LinkFit, ..
     medians = link_medians(squared, observations)
     pictures = found.pictures
     rows = {
-        (int(pictures[i]), int(pictures[j])): row
+        frozenset((int(pictures[i]), int(pictures[j]))): row
         for row, (i, j) in enumerate(zip(observations.image1, observations.image2, strict=True))
     }
     result = []
     for link, right in zip(found.links, found.right, strict=True):
-        row = rows.get((link.image1, link.image2))
+        row = rows.get(frozenset((link.image1, link.image2)))
         if row is None or not right:
             why = "belongs to another group of pictures" if right else CONTRADICTS
             result.append(LinkFit(link.image1, link.image2, len(link), 0, math.nan, False, why))

@@ -45,8 +45,8 @@ def _bend(found: Alignment, given: Scene) -> float:
 
 
 def test_positions_hold_a_strip_over_hills_in_shape() -> None:
-    given = _strip(0.15)
-    without, held = _without(0.15), _aligned(given, _positions(given, 2.0))
+    given = _strip(0.3)
+    without, held = _without(0.3), _aligned(given, _positions(given, 2.0))
     assert _bend(without, given) > 0.008
     assert _bend(held, given) < 0.6 * _bend(without, given)
     assert held.messages == ()
