@@ -222,6 +222,8 @@ def _horner(coefficients: Sequence[float], q: FloatArray) -> FloatArray | float:
 
 def _first_zero(coefficients: FloatArray) -> float:
     """The smallest radius at which ``1 + c1 q + c2 q² + …`` of its square is zero; inf if there is none."""
+    if not np.isfinite(coefficients).all():  # beyond what can be computed with: at the centre
+        return 0.0
     inverse = np.roots([1.0, *coefficients])  # roots in 1 / q, which exist whatever coefficients are zero
     largest = inverse.real[np.abs(inverse.imag) <= 1e-9 * np.abs(inverse)].max(initial=0.0)
     return float(1.0 / np.sqrt(largest)) if largest > 0.0 else np.inf

@@ -22,6 +22,7 @@ from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames, grey_frames
 from rdstitch.messages import Message, names_of, shortened
 from rdstitch.records import MAX_FILE, read_text
 
+_MAX_PATTERN = 4096  # characters: longer names no file has, and compiling a pattern takes the square of its length
 PICTURE_SUFFIXES = frozenset(
     [".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".bmp", ".tga", ".jp2", ".ppm", ".pgm", ".pnm", ".gif"]
 )
@@ -267,6 +268,8 @@ def _in_folder(folder: Path) -> list[Path]:
 
 
 def _matching(pattern: str) -> list[Path]:
+    if len(pattern) > _MAX_PATTERN:
+        raise InputError(f"{pattern[:40]}…: a pattern of {len(pattern)} characters is none")
     matching = map(Path, glob.glob(pattern))  # noqa: PTH207 - a pattern may be absolute
     found = [path for path in matching if path.is_file()]
     if not found:

@@ -80,6 +80,13 @@ def _of_table(sources: Sequence[Source], file: str | Path) -> list[tuple[float, 
 
 def _read_table(file: str | Path) -> dict[str, tuple[float, float]]:
     """(ψ, θ), radians, of each name."""
+    try:
+        return _read_rows(file)
+    except csv.Error as error:
+        raise InputError(f"{file}: is no table with commas: {error}") from error
+
+
+def _read_rows(file: str | Path) -> dict[str, tuple[float, float]]:
     rows = csv.DictReader(read_text(file).splitlines(), skipinitialspace=True)
     missing = [name for name in _TILT_COLUMNS if name not in (rows.fieldnames or ())]
     if missing:

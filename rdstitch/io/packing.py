@@ -22,6 +22,11 @@ from rdstitch.errors import ArgumentError, InputError
 _MAGIC = b"rdstitch pack 1\n"
 _DIGEST = hashlib.sha256().digest_size
 _HEAD = len(_MAGIC) + _DIGEST + 8
+# What building a value from damaged bytes raises; NumPy parses the names of dtypes as Python, hence the first.
+_DAMAGED = (
+    *(SyntaxError, ValueError, TypeError, LookupError, AttributeError, RecursionError, OverflowError),
+    struct.error,
+)
 _ARRAY_KINDS = "biuf"
 
 
@@ -65,7 +70,7 @@ def unpack(data: bytes, kinds: Iterable[type] = ()) -> Any:
         (length,) = struct.unpack_from("<Q", body)
         arrays = memoryview(body)[8 + length :]
         return _build(json.loads(body[8 : 8 + length]), arrays, {kind.__name__: kind for kind in kinds})
-    except (ValueError, TypeError, LookupError, AttributeError, RecursionError, OverflowError, struct.error) as error:
+    except _DAMAGED as error:
         raise InputError(f"not what was expected: {error}") from error
 
 

@@ -107,3 +107,10 @@ def test_three_coefficients_describe_an_equidistant_fisheye() -> None:
     lens = Camera((640, 480), -(half**2) / 3, -(half**4) / 45, distortion3=-2.0 * half**6 / 945)
     points = np.random.default_rng(0).uniform((0, 0), (639, 479), (300, 2))
     assert np.linalg.norm(lens.distort(fisheye.undistort(points)) - points, axis=1).max() < 0.1
+
+
+def test_coefficients_beyond_what_can_be_computed_with_fold() -> None:
+    """A damaged camera file holds them; what they are multiplied by would be infinite."""
+    for coefficients in ((0.0, 1e308), (0.0, 0.0, 1e308), (-1e308, 1e308)):
+        with pytest.raises(ArgumentError):
+            Camera((640, 480), distortion=coefficients[0], distortion2=coefficients[1], distortion3=coefficients[-1])
