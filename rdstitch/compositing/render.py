@@ -233,7 +233,9 @@ class Renderer:
                 share[~geometry.inside] = 0.0
             if (opacity := self._opacity(index, geometry)) is not None:
                 share[opacity == 0] = 0.0
-            yield Layer(index, part, share, geometry)
+            if (layer := Layer(index, part, share, geometry).weighted_part(part)) is not None:
+                # Of many pictures that overlap each owns little of a tile; a view would hold the whole.
+                yield replace(layer, weight=layer.weight.copy())
 
 
 def _claim(owner: NDArray[np.int32], best: Float32Array, box: Box, layer: Layer) -> None:
