@@ -54,7 +54,12 @@ class _Offenders:
 
 @impossible_estimates_fail()
 def accept(
-    registration: Registration, options: StitchOptions, executor: Executor, *, lens_only: bool = False
+    registration: Registration,
+    options: StitchOptions,
+    executor: Executor,
+    *,
+    metric: bool = False,
+    lens_only: bool = False,
 ) -> Registration:
     """The registration of what passes all checks, with everything that the user should know of it.
 
@@ -64,6 +69,8 @@ def accept(
         In pixels of the working size; the result is in those of the pictures.
     executor : concurrent.futures.Executor
         Where pictures are compared.
+    metric : bool
+        Metric poses are needed, also of what remains.
     lens_only : bool
         Only the lens is wanted, so that doubts about the places of pictures do not matter.
 
@@ -75,13 +82,13 @@ def accept(
         When a picture is left out, under ``options.strict``.
     """
     cache = Cache(options.cache)
+    aligner = replace(Aligner.of(registration.sources, options, cache), needs_poses=metric)
     if not options.force and registration.sources[0].guard.messages:
-        registration = _without_damage(registration, Aligner.of(registration.sources, options, cache))
+        registration = _without_damage(registration, aligner)
     checked = partial(judge, threshold=options.threshold, executor=executor, cache=cache, lens_only=lens_only)
     current, found = registration, checked(registration)
     first = registration.with_messages(found)
     if not first.ok and not options.force:
-        aligner = Aligner.of(registration.sources, options, cache)
         left = _Offenders({}, {})
         plane = None
         if not lens_only and (len(registration.pairs) <= _FEW_PAIRS or _may_be_another_plane(found)):

@@ -87,6 +87,8 @@ class Aligner:
     cache : Cache
     threshold : float
         Largest transfer error of an inlier, pixels.
+    needs_poses : bool
+        Whether every alignment must have metric poses, see :meth:`metric`.
     """
 
     paths: tuple[str, ...]
@@ -94,6 +96,7 @@ class Aligner:
     options: AlignmentOptions
     cache: Cache
     threshold: float
+    needs_poses: bool = False
 
     @classmethod
     def of(cls, sources: Sequence[Source], options: StitchOptions, cache: Cache) -> Self:
@@ -123,7 +126,8 @@ class Aligner:
         alignment = self._aligned(pairs, former)
         ground = over_rough_ground(pairs, self.threshold)
         rough = ground is not pairs and not self._explains(alignment, pairs, ground)
-        return AlignedPairs(tuple(pairs), self._aligned(ground, None) if rough else alignment, rough)
+        aligned = AlignedPairs(tuple(pairs), self._aligned(ground, None) if rough else alignment, rough)
+        return self.metric(aligned) if self.needs_poses else aligned
 
     def used(self, aligned: AlignedPairs) -> Sequence[PairRegistration]:
         """The pairs with the inliers that the alignment was made from."""

@@ -230,7 +230,8 @@ def trajectory(
         times = timestamps_of(sources, timestamps)
         with options.executor(len(sources)) as executor:
             registration = register(sources, options, executor, skip_bad=True, metric=True, progress=progress)
-            registration = accept(registration.with_messages([*unread, *found.messages]), options, executor)
+            registration = registration.with_messages([*unread, *found.messages])
+            registration = accept(registration, options, executor, metric=True)
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     path = Trajectory.from_alignment(registration.alignment, height)
     path = path.labelled([s.name for s in sources], [s.number(k) for k, s in enumerate(sources)], times)

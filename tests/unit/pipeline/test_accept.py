@@ -115,6 +115,21 @@ def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Pat
     assert [str(message) for message in rest.left_out] == [f"left out {frames[2]}: shows something else [left-out]"]
 
 
+def test_what_remains_has_metric_poses_where_they_are_needed(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def aligned(aligner: Aligner, pairs: object, former: object) -> Any:
+        asked.append(aligner.options.model)
+        return SimpleNamespace(poses=None if aligner.options.model == "auto" else "poses", on_sphere=False)
+
+    monkeypatch.setattr(Aligner, "_aligned", aligned)
+    monkeypatch.setattr("rdstitch.pipeline.aligner.over_rough_ground", lambda pairs, threshold: pairs)
+    free = Aligner.of([], OPTIONS, NO_CACHE)
+    assert free.align(()).alignment.poses is None
+    assert replace(free, needs_poses=True).align(()).alignment.poses is not None
+    assert asked == ["auto", "auto", "pose"]
+
+
 def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path: Path) -> None:
     """What drives ahead fills a good third of every picture, and has more matches where pictures overlap little."""
     plane, ahead = flight(3, 3, overlap=0.4), flight(5, 3, overlap=0.4)
