@@ -26,6 +26,8 @@ _SRGB_OFFSET = 0.055
 _DARKEST, _BRIGHTEST = 0.02, 0.97
 _SAMPLES_PER_PAIR, _MAX_SAMPLES = 800, 200_000
 _MIN_SAMPLES = 30
+# Of thousands of overlaps, each needs fewer.
+_FEWEST_SAMPLES = 10
 # How well two pictures' brightness can agree, and how far gains stray (log units): keeps long chains from drifting.
 _PAIR_SIGMA, _GAIN_SIGMA = 0.02, 0.5
 # The same where the camera has written its exposure down: tone curves and apertures are not exact.
@@ -79,7 +81,7 @@ def _gain_prior(exposures: Sequence[float | None], offset: float) -> tuple[Float
 
 @dataclass(frozen=True)
 class _Samples:
-    """Points that two pictures see: picture, weight, value (share of full), pixels and r² of either; S of each.
+    """Points that two pictures see: picture, weight, value (share of full) and r² of either; S of each.
 
     They are sorted by pair; ``start`` is where those of each begin.
     """
@@ -90,8 +92,6 @@ class _Samples:
     share: FloatArray
     value1: FloatArray
     value2: FloatArray
-    point1: FloatArray
-    point2: FloatArray
     radius1: FloatArray
     radius2: FloatArray
 
@@ -99,7 +99,7 @@ class _Samples:
 def _collect(survey: Survey, cameras: Sequence[Camera]) -> _Samples | None:
     """Samples from every pair of overlapping pictures, evenly spread."""
     pairs = survey.pairs().tolist()
-    limit = max(_MIN_SAMPLES, min(_SAMPLES_PER_PAIR, _MAX_SAMPLES // max(1, len(pairs))))
+    limit = max(_FEWEST_SAMPLES, min(_SAMPLES_PER_PAIR, _MAX_SAMPLES // max(1, len(pairs))))
     found: list[tuple[Any, ...]] = []
     for i, j in pairs:
         a, b, box, inside = survey.overlap(i, j)
@@ -112,11 +112,11 @@ def _collect(survey: Survey, cameras: Sequence[Camera]) -> _Samples | None:
         if a.pixels.dtype.kind != "u":
             usable = ((va > 0) & (vb > 0)).all(axis=1)
         where, va, vb = where[usable], va[usable], vb[usable]
-        if len(where) < _MIN_SAMPLES:
+        if len(where) < min(_MIN_SAMPLES, limit):
             continue
         y, x = (index.astype(np.float64) for index in np.unravel_index(where, inside.shape))
         pa, pb = (survey.warps[k].source_points(x + box[0], y + box[1]) for k in (i, j))
-        found.append((i, j, va, vb, pa, pb, squared_radius(cameras[i], pa), squared_radius(cameras[j], pb)))
+        found.append((i, j, va, vb, squared_radius(cameras[i], pa), squared_radius(cameras[j], pb)))
     if not found:
         return None
     counts = [len(f[2]) for f in found]
@@ -124,7 +124,7 @@ def _collect(survey: Survey, cameras: Sequence[Camera]) -> _Samples | None:
     # A pair counts as one measurement however many samples it has.
     share = np.repeat([1.0 / n for n in counts], counts)
     start = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    return _Samples(start, first, second, share, *(np.concatenate([f[k] for f in found]) for k in range(2, 8)))
+    return _Samples(start, first, second, share, *(np.concatenate([f[k] for f in found]) for k in range(2, 6)))
 
 
 def _values(tile: SurveyTile, box: Box, where: NDArray[np.intp]) -> FloatArray:
