@@ -2,8 +2,8 @@
 
 A direct factorization couples the nodes of every picture with those of all that overlap it, and fills in between.
 Conjugate gradients need only the products with the design matrix. Their preconditioner has two levels: what each
-picture's own measurements say of its nodes, and polynomials over each picture, solved for all together (additive
-Schwarz with a coarse space; Nicolaides 1987), which carries what is common to many pictures across the set.
+picture's own measurements say of its nodes, and one level of each picture, solved for all together (additive Schwarz
+with a coarse space; Nicolaides 1987), which carries what is common to many pictures across the set.
 """
 
 from collections.abc import Callable
@@ -16,8 +16,8 @@ from rdstitch.arrays import FloatArray
 
 # Energy norm of the error, as a share of that of the solution: far below a grey level.
 _TOLERANCE, _MAX_STEPS = 1e-8, 3000
-_DEGREE = 2
 _ROWS = 10_000  # of the design that are taken at a time
+_PICTURES = 256  # whose own nodes are solved for at a time
 
 
 def solve_fields(
@@ -46,9 +46,9 @@ def solve_fields(
     """
     precision, expected = prior
     count, side, _, channels = start.shape
-    design, scale = sparse.csr_array(parts[0] + parts[1]), sparse.diags_array(weight)
-    own = splu(sparse.csc_array(precision + parts[0].T @ scale @ parts[0] + parts[1].T @ scale @ parts[1]))
-    spread = sparse.csr_array(sparse.kron(sparse.eye_array(count), _polynomials(side)))
+    design = sparse.csr_array(parts[0] + parts[1])
+    own = _inverse_blocks(parts, weight, precision, side**2)
+    spread = sparse.csr_array(sparse.kron(sparse.eye_array(count), np.ones((side**2, 1))))
     coarse = spread.T @ precision @ spread
     for rows in (slice(k, k + _ROWS) for k in range(0, len(weight), _ROWS)):
         there = design[rows] @ spread
@@ -59,17 +59,27 @@ def solve_fields(
         return np.asarray(design.T @ (weight[:, None] * np.asarray(design @ x)) + precision @ x)
 
     def precondition(x: FloatArray) -> FloatArray:
-        return np.asarray(own.solve(x) + spread @ common.solve(np.asarray(spread.T @ x)))
+        of_each = (own @ x.reshape(count, side**2, channels)).reshape(x.shape)
+        return np.asarray(of_each + spread @ common.solve(np.asarray(spread.T @ x)))
 
     right = np.asarray(design.T @ (weight[:, None] * values) + expected)
     return _conjugate_gradients(product, precondition, right, start.reshape(-1, channels)).reshape(start.shape)
 
 
-def _polynomials(side: int) -> FloatArray:
-    """Products of powers of both coordinates up to a degree, at the nodes of a picture, (B², Q)."""
-    v, u = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-1.0, 1.0, side)] * 2, indexing="ij"))
-    powers = [(m, n) for m in range(_DEGREE + 1) for n in range(_DEGREE + 1 - m)]
-    return np.stack([u**m * v**n for m, n in powers], axis=1)
+def _inverse_blocks(
+    parts: tuple[sparse.csr_array, sparse.csr_array], weight: FloatArray, precision: sparse.csr_array, nodes: int
+) -> FloatArray:
+    """Inverses (N, nodes, nodes) of what prior and measurements say of each picture's nodes, the others given."""
+    blocks: FloatArray = sparse.bsr_array(precision, blocksize=(nodes, nodes)).data.copy()
+    scale = sparse.diags_array(weight)
+    for part in map(sparse.csc_array, parts):
+        for first in range(0, len(blocks), _PICTURES):
+            some = part[:, first * nodes : (first + _PICTURES) * nodes]
+            found = sparse.bsr_array(some.T @ scale @ some, blocksize=(nodes, nodes))
+            blocks[first + found.indices] += found.data
+    for first in range(0, len(blocks), _PICTURES):
+        blocks[first : first + _PICTURES] = np.linalg.inv(blocks[first : first + _PICTURES])
+    return blocks
 
 
 def _conjugate_gradients(

@@ -52,7 +52,7 @@ def _row(count: int) -> tuple[Survey, list[PlacedPicture]]:
 
 
 def test_what_is_held_is_linear_in_the_number_of_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two neighbours a picture in a row, and of factorizations less than a picture's nodes by its neighbours' take."""
+    """Two neighbours a picture in a row, and a few entries of factorizations."""
     entries: list[int] = []
 
     def counted(matrix: Any, **options: Any) -> Any:
@@ -67,7 +67,7 @@ def test_what_is_held_is_linear_in_the_number_of_pictures(monkeypatch: pytest.Mo
     cells = brightness._compare(survey, exposure)
     assert cells is not None
     assert cells.overlap.nnz == 2 * (count - 1)
-    assert max(entries) < 3000 * count
+    assert 0 < max(entries) < 10 * count
     means = np.exp(exposure.log_gain + exposure.fields.mean(axis=(1, 2))).mean(axis=1)
     assert (means[1::2] > means[::2]).all()
 
