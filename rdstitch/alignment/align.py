@@ -34,6 +34,7 @@ from rdstitch.errors import ArgumentError, RegistrationError
 from rdstitch.matching.distortion_consensus import Consensus, vote
 from rdstitch.matching.links import Link, in_alternate_directions
 from rdstitch.matching.match_graph import connected_components, spanning_tree
+from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
 
 _UNCONFIRMED = 0.1
@@ -85,13 +86,12 @@ def align(
     report, options = progress or (lambda stage: None), options or AlignmentOptions()
     _check(cameras, links, options)
     known = options.camera_priors(cameras)
-    everything = _observations(links, cameras, _matches_of_a_link(len(links), options))
+    everything, own = _observations(links, cameras, _matches_of_a_link(len(links), options))
 
     report("consensus of the pairs")
     votes = vote([k.relation.distortion for k in links], [k.relation.distortion_std for k in links])
     lens, free_lens = _lens_start(cameras, options, votes)
     few = everything.thinned(thin_for_selection(len(links)))
-    own = [link.relation for link in in_alternate_directions(links)]
     relations = relations_at(few, own, lens)
     apart = homography_apart(few, relations, lens, free_lens, known)
     observable = options.lens_known or _observable(apart)
@@ -119,7 +119,7 @@ def align(
     report("adjustment")
     if choice.fit.model is ROTATION and most_matches_read(len(links), options) is None:
         # Few pictures of a turn hardly determine the focal length; all their matches are used.
-        everything = _observations(links, cameras, _MATCHES_OF_A_TURN // len(links))
+        everything, _ = _observations(links, cameras, _MATCHES_OF_A_TURN // len(links))
     full = replace(graph, observations=everything)
     problem, _ = full.problem(~wrong, pictures, choice.overdispersion)
     fit = problem.refine(choice.fit.model, choice.fit.adjusted.parameters, choice.fit.tilt_spread)
@@ -150,9 +150,12 @@ def _matches_of_a_link(links: int, options: AlignmentOptions) -> int:
     return min(options.most, max(_MATCHES_OF_ALL // max(links, 1), _MATCHES_OF_A_LINK))
 
 
-def _observations(links: Sequence[Link], cameras: Sequence[Camera], most: int) -> Observations:
-    """Of each link at most so many correspondences, chosen before any is turned round."""
-    return Observations.from_links(in_alternate_directions([link.thinned(most) for link in links]), cameras)
+def _observations(
+    links: Sequence[Link], cameras: Sequence[Camera], most: int
+) -> tuple[Observations, list[RadialHomography]]:
+    """Of each link at most so many correspondences, chosen before any is turned round; and how each maps them."""
+    read = in_alternate_directions([link.thinned(most) for link in links])
+    return Observations.from_links(read, cameras), [link.relation for link in read]
 
 
 def _check(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions) -> None:

@@ -22,7 +22,7 @@ from rdstitch.radial_homography import RadialHomography, from_plane, to_plane
 from rdstitch.registration import Registration
 from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
 from rdstitch.verification.overlap_check import placed_picture
-from rdstitch.verification.photometric_agreement import Agreement, PlacedPicture, compare_cells
+from rdstitch.verification.photometric_agreement import CELL, Agreement, ComparedCells, PlacedPicture, compare_cells
 
 Pair = tuple[int, int]
 
@@ -39,34 +39,27 @@ _MIN_CELLS = 8
 _NEIGHBOURS, _MIN_NEIGHBOURS = 5, 2
 """Cells around a place, and how many of them look alike at least where a motion holds, or may hold."""
 
-_REACH = 48.0
-"""Pixels of the compared pictures that these may be away: two cells."""
+_REACH = 2.0 * CELL
+"""Pixels of the compared pictures that these may be away."""
 
-_MIN_MATCHES = 12
-"""Inliers of a motion; see :mod:`rdstitch.verification.rival_motion`."""
+MIN_INLIERS = 12
+"""Inliers of a motion: four define its homography, and eight more by chance have not been seen."""
 
 _PICTURES_AT_ONCE = 64
 """Pictures that are kept while pairs are compared, 1 MB each."""
 
 
 @dataclass(frozen=True)
-class Cells:
+class Cells(ComparedCells):
     """What the pixels of a pair say of a motion.
 
     Attributes
     ----------
-    first, second : ndarray of shape (N, 2)
-        Where the motion puts the cells that were compared, pixels of the two pictures as they are compared.
-    confirming : ndarray of shape (N,), bool
-        Which of them look alike.
-    in_all : int
-        Cells with texture in the whole of the second picture.
+    centers_in_first : ndarray of shape (N, 2)
+        Where the motion puts the cells that were compared, pixels of the first picture as it is compared.
     """
 
-    first: FloatArray
-    second: FloatArray
-    confirming: BoolArray
-    in_all: int
+    centers_in_first: FloatArray
 
     @classmethod
     def of(cls, first: PlacedPicture, second: PlacedPicture) -> Self:
@@ -74,7 +67,7 @@ class Cells:
         cells = compare_cells(first, second)
         there = from_plane(first.camera, first.homography, to_plane(second.camera, second.homography, cells.centers))
         seen = np.isfinite(there).all(axis=1)
-        return cls(there[seen], cells.centers[seen], cells.confirming[seen], cells.in_all)
+        return cls(cells.centers[seen], cells.confirming[seen], cells.in_all, there[seen])
 
     @property
     def contradicting(self) -> int:
@@ -86,11 +79,6 @@ class Cells:
         """Whether nothing shows that the motion fills less than half of the pictures."""
         return fills_at_most([self]) >= FILLED_BY_A_PLANE
 
-    @property
-    def agreement(self) -> Agreement:
-        """How many there are, and how many look alike."""
-        return Agreement(len(self.confirming), int(self.confirming.sum()))
-
 
 class _Held:
     """Where in each picture a motion holds, by what was compared in any pair."""
@@ -98,8 +86,8 @@ class _Held:
     def __init__(self, compared: Iterable[tuple[Pair, Cells]]) -> None:
         found: dict[int, list[tuple[FloatArray, BoolArray]]] = {}
         for (i, j), cells in compared:
-            found.setdefault(i, []).append((cells.first, cells.confirming))
-            found.setdefault(j, []).append((cells.second, cells.confirming))
+            found.setdefault(i, []).append((cells.centers_in_first, cells.confirming))
+            found.setdefault(j, []).append((cells.centers, cells.confirming))
         self._places = {k: cKDTree(np.concatenate([places for places, _ in own])) for k, own in found.items()}
         # One more, for places that have fewer neighbours.
         self._held = {k: np.concatenate([*(held for _, held in own), [False]]) for k, own in found.items()}
@@ -114,7 +102,7 @@ class _Held:
 
     def outside(self, pair: Pair, cells: Cells) -> Agreement:
         """How much of a pair looks alike by another motion, where this one holds in neither of its pictures."""
-        explained = self._around(pair[0], cells.first) | self._around(pair[1], cells.second)
+        explained = self._around(pair[0], cells.centers_in_first) | self._around(pair[1], cells.centers)
         return Agreement(int((~explained).sum()), int((cells.confirming & ~explained).sum()))
 
 
@@ -297,10 +285,10 @@ def _strongest_motions(
             np.flatnonzero(~former[place].relation.inliers) if place in former else np.arange(len(pair.matches))
             for place, pair in zip(places, batch, strict=True)
         ]
-        tried = [k for k, rest in enumerate(rests) if len(rest) >= _MIN_MATCHES]
+        tried = [k for k, rest in enumerate(rests) if len(rest) >= MIN_INLIERS]
         found = estimate_radial_homographies([_matches(batch[k], rests[k]) for k in tried], how)
         for k, motion in zip(tried, found, strict=True):
-            if motion and int(motion.inliers.sum()) >= _MIN_MATCHES:
+            if motion and int(motion.inliers.sum()) >= MIN_INLIERS:
                 inliers = np.isin(np.arange(len(batch[k].matches)), rests[k][motion.inliers])
                 result[places[k]] = _Motion(replace(motion, inliers=inliers), pictures.moved(places[k], motion))
     return result

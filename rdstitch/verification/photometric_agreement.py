@@ -27,7 +27,7 @@ from rdstitch.radial_homography import from_plane, to_plane
 Grey = NDArray[np.float32]
 
 COMPARED_SIDE = 512  # pixels of the longer side of the pictures that are compared
-_CELL = 24  # pixels
+CELL = 24  # pixels
 _SEARCH_RADIUS = 8  # pixels
 _MIN_TEXTURE = 0.012  # standard deviation in a cell, of full range
 _MIN_CORRELATION = 0.5  # correlation from which on two cells show the same
@@ -188,29 +188,29 @@ def compare_cells(
     height, width = second.grey.shape
     # The first picture as the second one's lens would have seen it.
     seen = first.sampled(partial(to_plane, second.camera, second.homography), (0, 0, width, height))
-    margin = _CELL // 2 + _SEARCH_RADIUS
-    rows, columns = (np.arange(margin, n - margin + 1, _CELL) for n in (height, width))
-    corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2) - _CELL // 2
+    margin = CELL // 2 + _SEARCH_RADIUS
+    rows, columns = (np.arange(margin, n - margin + 1, CELL) for n in (height, width))
+    corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2) - CELL // 2
     textured = corners[_have_texture(_cells(seen, corners))]
     looked_at = textured if most is None else textured[:: max(1, -(-len(textured) // most))]
     there = looked_at
     if parallax is not None and len(looked_at):
-        there = looked_at + parallax.at(looked_at[:, ::-1] + (_CELL - 1) / 2.0)[:, ::-1]
-        inside = ((there >= _SEARCH_RADIUS) & (there + _CELL + _SEARCH_RADIUS <= (height, width))).all(axis=1)
+        there = looked_at + parallax.at(looked_at[:, ::-1] + (CELL - 1) / 2.0)[:, ::-1]
+        inside = ((there >= _SEARCH_RADIUS) & (there + CELL + _SEARCH_RADIUS <= (height, width))).all(axis=1)
         looked_at, there = looked_at[inside], there[inside]
     windows = _cells(second.grey, there, _SEARCH_RADIUS)
     inner = windows[:, _SEARCH_RADIUS:-_SEARCH_RADIUS, _SEARCH_RADIUS:-_SEARCH_RADIUS]
     known = np.isfinite(windows).all(axis=(1, 2)) & _have_texture(inner)
     cells = _cells(seen, looked_at[known])
     confirming = [_confirms(*both) for both in zip(cells, windows[known], strict=True)]
-    centers = looked_at[known][:, ::-1] + (_CELL - 1) / 2.0
+    centers = looked_at[known][:, ::-1] + (CELL - 1) / 2.0
     in_all = int(_have_texture(_cells(second.grey, corners)).sum())
     return ComparedCells(centers, np.array(confirming, dtype=np.bool_), in_all)
 
 
 def _cells(picture: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:
     """Cells (N, side, side) with these top-left pixels (N, 2), row and column, and so much around them."""
-    side = _CELL + 2 * margin
+    side = CELL + 2 * margin
     if not len(corners):
         return np.zeros((0, side, side), dtype=np.float32)
     top, left = (corners - margin).T

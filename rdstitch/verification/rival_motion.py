@@ -18,10 +18,7 @@ from rdstitch.matching.two_view import PairRegistration, estimation_batches
 from rdstitch.messages import Message, names_of
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
-from rdstitch.verification.competing_motions import Contest
-
-_MIN_MATCHES = 12
-"""Inliers of a rival: four define its homography, and eight more by chance have not been seen."""
+from rdstitch.verification.competing_motions import MIN_INLIERS, Contest
 
 _FAR = 3.0
 """Thresholds beyond which a match disagrees with the alignment: nearer, relief and the lens may be to blame."""
@@ -114,7 +111,7 @@ def find_rival_motions(
     for batch in estimation_batches(aligned):
         rests = [_Rest(alignment, pair, threshold) for pair in batch]
         rests = [rest for rest in rests if rest.agreeing.any()]
-        tried = [rest for rest in rests if len(rest.unexplained) >= _MIN_MATCHES]
+        tried = [rest for rest in rests if len(rest.unexplained) >= MIN_INLIERS]
         # All pictures have one lens.
         how = EstimationOptions("auto", alignment.cameras[aligned[0].image1].distortion, limits)
         relations = estimate_radial_homographies([rest.matches for rest in tried], how)
@@ -222,7 +219,7 @@ class _Rest:
 
     def rival(self, found: RadialHomography) -> RivalMotion:
         """What the motion of these matches comes to."""
-        if not found or int(found.inliers.sum()) < _MIN_MATCHES:
+        if not found or int(found.inliers.sum()) < MIN_INLIERS:
             return self.nothing
         inliers = self.unexplained[found.inliers]
         disagreement = float(np.median(self.error[inliers]))

@@ -10,7 +10,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from rdstitch.camera import Camera
-from rdstitch.compositing import brightness, field_solver, place_pictures, plan_canvas
+from rdstitch.compositing import brightness, field_solver, gain_compensation, place_pictures, plan_canvas
 from rdstitch.compositing.boxes import intersection, overlapping_pairs
 from rdstitch.compositing.field_solver import solve_fields
 from rdstitch.compositing.placed_picture import PlacedPicture
@@ -70,6 +70,16 @@ def test_what_is_held_is_linear_in_the_number_of_pictures(monkeypatch: pytest.Mo
     assert 0 < max(entries) < 10 * count
     means = np.exp(exposure.log_gain + exposure.fields.mean(axis=(1, 2))).mean(axis=1)
     assert (means[1::2] > means[::2]).all()
+
+
+def test_gains_of_thousands_of_overlaps_take_a_few_samples_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    survey, pictures = _row(60)
+    of_all = gain_compensation.estimate_gains(survey, pictures).log_gain
+    monkeypatch.setattr(gain_compensation, "_MAX_SAMPLES", 60)
+    samples = gain_compensation._collect(survey, [picture.camera for picture in pictures])
+    assert samples is not None
+    assert 59 <= len(samples.value1) <= 20 * 59
+    np.testing.assert_allclose(gain_compensation.estimate_gains(survey, pictures).log_gain, of_all, atol=1e-3)
 
 
 def test_fields_are_those_of_a_direct_solution() -> None:

@@ -144,7 +144,7 @@ def test_where_all_pairs_show_a_plane_there_is_nothing_to_choose(monkeypatch: py
 
 
 def test_what_is_not_seen_speaks_against_nothing() -> None:
-    cells = Cells(np.zeros((10, 2)), np.zeros((10, 2)), np.arange(10) < 4, 40)
+    cells = Cells(np.zeros((10, 2)), np.arange(10) < 4, 40, np.zeros((10, 2)))
     assert fills_at_most([cells]) == pytest.approx(1.0 - 6 / 40)
     assert fills_at_most([cells, cells]) == fills_at_most([cells])
     assert fills_at_most([]) == 1.0
@@ -155,11 +155,11 @@ def test_two_of_the_five_cells_around_a_place_hold_it() -> None:
     away = places + 1000.0
     tried = np.array([[10.0, 10.0]])
     for holding, outside in ((2, 0), (1, 1)):
-        held = _Held([((0, 1), Cells(places, away, np.arange(6) < holding, 6))])
-        cells = Cells(tried, tried, np.array([True]), 1)
+        held = _Held([((0, 1), Cells(away, np.arange(6) < holding, 6, places))])
+        cells = Cells(tried, np.array([True]), 1, tried)
         assert held.outside((0, 2), cells) == Agreement(outside, outside)
         assert held.outside((3, 2), cells) == Agreement(1, 1)  # pictures that nothing is known of
-    far = Cells(tried + 300.0, tried + 300.0, np.array([True]), 1)
+    far = Cells(tried + 300.0, np.array([True]), 1, tried + 300.0)
     assert held.outside((0, 1), far) == Agreement(1, 1)
 
 
