@@ -83,12 +83,15 @@ def accept(
     """
     cache = Cache(options.cache)
     aligner = replace(Aligner.of(registration.sources, options, cache), needs_poses=metric)
-    if not options.force and registration.sources[0].guard.messages:
-        registration = _without_damage(registration, aligner)
+    undamaged = None if options.force else _without_damage(registration, aligner)
+    if undamaged is not None and _is_simpler(undamaged.alignment.model, registration.alignment.model):
+        registration, undamaged = undamaged, None
     checked = partial(judge, threshold=options.threshold, executor=executor, cache=cache, lens_only=lens_only)
     current, found = registration, checked(registration)
     first = registration.with_messages(found)
-    if not first.ok and not options.force:
+    if not first.ok and undamaged is not None and undamaged.with_messages(judged := checked(undamaged)).ok:
+        current, found = undamaged, judged
+    elif not first.ok and not options.force:
         left = _Offenders({}, {})
         plane = None
         if not lens_only and (len(registration.pairs) <= _FEW_PAIRS or _may_be_another_plane(found)):
@@ -116,24 +119,27 @@ def accept(
     return accepted
 
 
-def _without_damage(registration: Registration, aligner: Aligner) -> Registration:
-    """Without pictures of damaged files, where they alone ask for a freer motion than all the others together.
+def _without_damage(registration: Registration, aligner: Aligner) -> Registration | None:
+    """Without pictures of damaged files; None where none is used, or too few others are left.
 
-    Flipped bits shift a part of a picture, and by a few pixels that looks as if the camera had tilted: all tilt then.
+    Flipped bits shift a part of a picture: by a few pixels, that looks as if the camera had tilted, and all tilt then;
+    by more, as if something moved.
     """
-    former, used = registration.alignment, registration.alignment.used
+    used = registration.alignment.used
     index = {str(source.path): k for k, source in enumerate(registration.sources)}
     reported = (message.images[0] for message in registration.sources[0].guard.messages)
     damaged = [index[path] for path in reported if path in index and used[index[path]]]
     if not damaged:
-        return registration
-    reason = Message("is damaged, and all others fit a simpler motion without it; copy it again from its source")
+        return None
+    reason = Message("is damaged, and all others fit better without it; copy it again from its source")
     rest = _without(registration, _Offenders(dict.fromkeys(damaged, reason), {}), aligner)
-    if rest is None or not {former.model, rest.alignment.model} <= PLANAR_MODELS.keys():
-        return registration
+    return rest if rest is not None and 2 * rest.alignment.used.sum() > used.sum() else None
+
+
+def _is_simpler(model: str, former: str) -> bool:
+    """Whether a motion in the plane has less freedom than a former one."""
     by_freedom = list(PLANAR_MODELS)
-    simpler = by_freedom.index(rest.alignment.model) < by_freedom.index(former.model)
-    return rest if simpler and 2 * rest.alignment.used.sum() > used.sum() else registration
+    return {model, former} <= PLANAR_MODELS.keys() and by_freedom.index(model) < by_freedom.index(former)
 
 
 def _plane_of_most(registration: Registration, threshold: float, aligner: Aligner) -> Registration | None:

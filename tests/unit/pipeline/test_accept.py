@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from rdstitch.cache import NO_CACHE
+from rdstitch.errors import RegistrationError
 from rdstitch.executors import open_executor
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import write_image
 from rdstitch.messages import Message, Severity, left_out
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.accept import _concerns_all, _may_be_another_plane, _Offenders, _without, _without_damage, accept
+from rdstitch.pipeline.accept import _concerns_all, _is_simpler, _may_be_another_plane, _Offenders, _without, accept
 from rdstitch.pipeline.aligner import Aligner
 from rdstitch.pipeline.register import register
 from tests.cli.running import flight
@@ -60,39 +61,76 @@ def test_in_large_sets_a_second_motion_is_looked_for_where_it_may_be(
 
 
 @pytest.mark.parametrize(
-    ("former", "rest", "remaining", "left_out"),
+    ("former", "model", "simpler"),
     [
-        ("tilting", "rigid", 3, True),
-        ("homography", "tilting", 3, True),
-        ("rigid", "rigid", 3, False),
-        ("rigid", "tilting", 3, False),
-        ("tilting", "rigid", 2, False),  # most of the pictures would be missing
-        ("tilting", "rotation", 3, False),
+        ("tilting", "rigid", True),
+        ("homography", "tilting", True),
+        ("rigid", "rigid", False),
+        ("rigid", "tilting", False),
+        ("tilting", "rotation", False),
     ],
 )
-def test_what_is_damaged_is_left_out_where_the_others_fit_a_simpler_motion(
-    monkeypatch: pytest.MonkeyPatch, former: str, rest: str, remaining: int, left_out: bool
-) -> None:
-    def registration(model: str, used: int) -> Any:
-        guard = SimpleNamespace(messages=[Message("is damaged", ("2.jpg",), code="damaged")])
-        alignment = SimpleNamespace(model=model, used=np.arange(4) < used)
-        return SimpleNamespace(
-            alignment=alignment, sources=[SimpleNamespace(path=f"{k}.jpg", guard=guard) for k in range(4)]
-        )
+def test_motions_in_the_plane_are_compared_by_their_freedom(former: str, model: str, simpler: bool) -> None:
+    assert _is_simpler(model, former) is simpler
 
-    whole, smaller = registration(former, 4), registration(rest, remaining)
+
+class _Stub(SimpleNamespace):
+    """As much of a registration of four pictures, the third of which is damaged, as ``accept`` asks for."""
+
+    def with_messages(self, messages: object) -> Any:
+        return _Stub(**{**vars(self), "found": messages})
+
+    @property
+    def ok(self) -> bool:
+        return not self.found
+
+
+def _stub(model: str, used: int) -> Any:
+    guard = SimpleNamespace(messages=[Message("is damaged", ("2.jpg",), code="damaged")])
+    sources = [SimpleNamespace(path=f"{k}.jpg", guard=guard) for k in range(4)]
+    alignment = SimpleNamespace(model=model, used=np.arange(4) < used)
+    return _Stub(alignment=alignment, sources=sources, pairs=(), left_out=(), found=())
+
+
+@pytest.mark.parametrize(
+    ("rest", "remaining", "fails", "left_out"),
+    [
+        ("rigid", 3, (), True),  # the damaged one alone asked for tilts
+        ("tilting", 3, (), False),
+        ("tilting", 3, (4,), True),  # the whole fails, the rest does not
+        ("tilting", 3, (3, 4), None),
+        ("rigid", 2, (), False),  # most of the pictures would be missing
+    ],
+)
+def test_what_is_damaged_is_left_out_where_the_others_fit_better(
+    monkeypatch: pytest.MonkeyPatch, rest: str, remaining: int, fails: tuple[int, ...], left_out: bool | None
+) -> None:
+    whole, smaller = _stub("tilting", 4), _stub(rest, remaining)
     asked: list[_Offenders] = []
 
     def without(_: object, offenders: _Offenders, aligner: object) -> Any:
         asked.append(offenders)
         return smaller
 
-    monkeypatch.setattr("rdstitch.pipeline.accept._without", without)
-    aligner: Any = None
-    assert _without_damage(whole, aligner) is (smaller if left_out else whole)
-    assert [list(offenders.reasons) for offenders in asked] == [[2]]
-    unused = registration(former, 2)  # the damaged one is not in it anyway
-    assert _without_damage(unused, aligner) is unused
+    def judge(registration: Any, **_: object) -> tuple[Message, ...]:
+        return (Message("moves otherwise", (), "failure"),) if registration.alignment.used.sum() in fails else ()
+
+    stage = "rdstitch.pipeline.accept"
+    monkeypatch.setattr(f"{stage}._without", without)
+    monkeypatch.setattr(f"{stage}.judge", judge)
+    monkeypatch.setattr(f"{stage}._plane_of_most", lambda *_: None)
+    monkeypatch.setattr(f"{stage}.at_full_size", lambda registration: registration)
+    aligner = Aligner.of([], OPTIONS, NO_CACHE)
+    monkeypatch.setattr(f"{stage}.Aligner.of", lambda *_: aligner)
+    monkeypatch.setattr(f"{stage}.RefusedError", RegistrationError)
+    nowhere: Any = None
+    if left_out is None:
+        with pytest.raises(RegistrationError):
+            accept(whole, OPTIONS, nowhere)
+    else:
+        accepted = accept(whole, OPTIONS, nowhere)
+        assert accepted.alignment is (smaller if left_out else whole).alignment
+    assert [list(offenders.reasons) for offenders in asked[:1]] == [[2]]
 
 
 def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Path) -> None:
