@@ -13,7 +13,7 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.lens_selection import has_plausible_center
 from rdstitch.alignment.model_selection import ModelChoice, choose_model, fit_cost, noise_of_links, price
-from rdstitch.alignment.motion_models import RIGID, SIMILARITY
+from rdstitch.alignment.motion_models import RIGID, SIMILARITY, TILTING
 from rdstitch.alignment.noise_model import EXACTNESS, NoiseModel
 from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.arrays import BoolArray
@@ -26,6 +26,10 @@ _PARALLAX = 0.0015
 """Of a picture's diagonal: errors up to which a camera that turned far, held by hand, still counts as having turned on
 the spot. More freedom would explain them, and stretch the pictures over a plane that is not there. A centre that moves
 by 8 % of the scene's distance leaves 0.0012; over a plane, a turn as far leaves 0.003 to 0.007."""
+
+_STEADY = math.radians(6.0)
+"""Spread of the tilts of a camera over a plane, up to which it did not turn as far instead: tilts that stand for such a
+turn spread over 11 degrees and more, those of a drone over 1 to 3."""
 
 _POSSIBLE = 4.0
 """Times the noise that pairs may be off from a turn on the spot for it to be tried on all of them."""
@@ -70,12 +74,16 @@ def choose_motion(problem: Problem, names: Sequence[str], lenses: Sequence[BoolA
 
 
 def _is_over_plane(problem: Problem, noise: NoiseModel) -> bool:
-    """Whether a camera that keeps its tilt over a plane explains the pictures as well as pairs on their own do.
+    """Whether a camera that hardly tilts over a plane explains the pictures as well as pairs on their own do.
 
     A row of pictures over a plane can be bent into a turn with an odd lens; parallax does not make a plane of a turn.
     """
-    fits = (problem.fit(model) for model in (RIGID, SIMILARITY))
-    return any(math.hypot(fit.adjusted.sigma, EXACTNESS) < _AS_GOOD * noise.noise for fit in fits)
+    fits: list[Fit] = []
+    for model in (RIGID, SIMILARITY, TILTING):
+        fits.append(problem.fit(model, fits[-1:]))
+        if math.hypot(fits[-1].adjusted.sigma, EXACTNESS) < _AS_GOOD * noise.noise:
+            return fits[-1].tilt_spread < _STEADY
+    return False
 
 
 def _turns_far(turned: Fit) -> bool:

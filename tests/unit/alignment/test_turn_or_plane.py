@@ -1,6 +1,7 @@
 """Turn on the spot or motion over a plane: what is tried, and what is taken."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,7 +10,7 @@ import pytest
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.model_selection import noise_of_links, price
-from rdstitch.alignment.motion_models import RIGID, MotionModel
+from rdstitch.alignment.motion_models import RIGID, TILTING, MotionModel
 from rdstitch.alignment.noise_model import EXACTNESS
 from rdstitch.alignment.rotation_model import ROTATION, rotation_from_vector
 from rdstitch.alignment.turn_or_plane import choose_motion
@@ -99,6 +100,26 @@ def test_a_hand_held_turn_may_have_some_parallax() -> None:
     ):
         given = _problem(_of_sigma(sigma), _of_sigma(plane), degrees=60, trial=1.0)
         assert _chosen(given) == name, (sigma, plane)
+
+
+@pytest.mark.parametrize(
+    ("spread", "name"), [(1.0, "tilting"), (5.0, "tilting"), (7.0, "rotation"), (14.0, "rotation")]
+)
+def test_a_row_over_a_plane_by_a_camera_that_sways_is_no_hand_held_turn(spread: float, name: str) -> None:
+    """Nine pictures of a drone before rough ground fitted a turn by 50 degrees to 0.0013 of the diagonal."""
+    turn, level, swaying = 0.0013 * 2.0 * SCALE, 3.0, 0.5
+
+    def spread_fit(model: MotionModel) -> Fit:
+        fit = given.fit(model)
+        if model is not TILTING:
+            return fit
+        return replace(
+            fit, adjusted=adjusted(SEEN, _of_sigma(swaying), shared=(0.0,) * 3), tilt_spread=math.radians(spread)
+        )
+
+    given = _problem(_of_sigma(turn), _of_sigma(level), degrees=60, trial=1.0)
+    found = choose_motion(problem(SEEN, spread_fit, trial=given.trial), ["rigid", "tilting", "rotation"])
+    assert found.fit.model.name == name
 
 
 @pytest.mark.parametrize(("beyond", "plane_tried"), [(-1.0, False), (1.0, True)])
