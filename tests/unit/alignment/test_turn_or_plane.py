@@ -113,7 +113,7 @@ def test_a_hand_held_turn_may_have_some_parallax() -> None:
     ("degrees", "name"), [(1.0, "tilting"), (5.0, "tilting"), (7.0, "rotation"), (14.0, "rotation")]
 )
 def test_a_camera_that_sways_over_a_plane_did_not_turn_by_hand(degrees: float, name: str) -> None:
-    """Nine pictures of a drone fitted a turn by 50 degrees to 0.0013 of the diagonal; tilts of one degree were better."""
+    """Pictures of a drone fitted a turn by 50 degrees to 0.0013 of the diagonal; tilts of one degree were better."""
     sways = Fit(TILTING, adjusted(SEEN, _of_sigma(0.5), shared=(0.0,) * 3), ONLY_DISTORTION, math.radians(degrees))
     given = _problem(_of_sigma(0.0013 * 2.0 * SCALE), _of_sigma(3.0), degrees=60, trial=1.0, sways=sways)
     assert _chosen(given, "rigid", "tilting", "rotation") == name
