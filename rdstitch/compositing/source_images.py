@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, encloses, intersection
+from rdstitch.compositing.masked_pixels import filled, opacity
 from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.errors import InputError
 from rdstitch.io.read import Picture
@@ -21,8 +22,6 @@ NOTHING: Box = (0, 0, 0, 0)
 _OPAQUE_FROM = 128
 # A picture that gets smaller by less than this keeps its pixels as they are.
 _NEGLIGIBLE_SHRINK = 1.05
-# Share of the shorter side over which the weight rises from the border of a mask.
-_MASK_FEATHER = 0.125
 # Room around a part of a picture for the kernel of the resampling, pixels.
 KERNEL_MARGIN = 8
 # Pixels read for one of the output, at least: a Gaussian needs nearly two to smooth them.
@@ -101,7 +100,7 @@ def prepare_picture(picture: Picture, shrink: float, reduction: int = 1) -> Load
     pixels, opaque = picture.pixels, None
     if picture.alpha is not None:
         opaque = picture.alpha >= _OPAQUE_FROM
-        pixels = _filled(pixels, opaque)
+        pixels = filled(pixels, opaque)
     # Blocks alone alias; a Gaussian on at least two pixels per output pixel does not.
     further = max(1, int(shrink / reduction / 2))
     if further > 1:
@@ -114,31 +113,7 @@ def prepare_picture(picture: Picture, shrink: float, reduction: int = 1) -> Load
         pixels = cv2.GaussianBlur(pixels, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
     if opaque is None:
         return LoadedPicture(pixels, reduction=reduction)
-    opacity, step = _opacity(opaque)
-    return LoadedPicture(pixels, opacity, step, reduction)
-
-
-def _filled(pixels: NDArray[Any], opaque: NDArray[np.bool_]) -> NDArray[Any]:
-    """Every transparent pixel gets the value of the nearest opaque one, so that no kernel mixes in its colour."""
-    hidden = (~opaque).astype(np.uint8)
-    # The nearest opaque pixel of a transparent one touches a transparent one itself.
-    border = np.flatnonzero(cv2.dilate(hidden, np.ones((3, 3), np.uint8)).view(np.bool_) & opaque)
-    if not len(border):
-        return pixels
-    _, labels = cv2.distanceTransformWithLabels(hidden, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    label, unseen = labels.ravel(), np.flatnonzero(hidden)
-    position = np.zeros(int(label.max()) + 1, dtype=np.intp)
-    position[label[border]] = border
-    filled = pixels.copy()
-    filled.reshape(-1, *pixels.shape[2:])[unseen] = pixels.reshape(-1, *pixels.shape[2:])[position[label[unseen]]]
-    return filled
-
-
-def _opacity(opaque: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float]:
-    """Weight that rises from a mask's border, and its value at the first opaque pixel."""
-    reach = max(2.0, _MASK_FEATHER * min(opaque.shape))
-    distance = cv2.distanceTransform(opaque.astype(np.uint8), cv2.DIST_L2, 5)
-    return np.minimum(np.asarray(distance, dtype=np.float32) / np.float32(reach), np.float32(1.0)), 1.0 / reach
+    return LoadedPicture(pixels, *opacity(opaque), reduction)
 
 
 class PictureReader:
