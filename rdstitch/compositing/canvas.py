@@ -54,25 +54,22 @@ class Canvas:
     period: float | None = None
     near: tuple[NearPart | None, ...] = ()
 
-    def boxes(self) -> list[Box]:
-        """Bounds (x0, y0, x1, y1) of every picture, whole pixels inside the canvas, end exclusive.
+    def box(self, index: int) -> Box:
+        """Bounds (x0, y0, x1, y1) of a picture, whole pixels inside the canvas, end exclusive.
 
         A picture that lies across the edge of a canvas that goes all the way round has the whole width.
         """
-        width, height = self.size
-        boxes = []
-        for outline in self.footprints:
-            low, high = np.floor(outline.min(axis=0)), np.ceil(outline.max(axis=0)) + 1
-            shifts = self._shifts(float(low[0]), float(high[0]))
-            low[0], high[0] = low[0] + min(shifts), high[0] + max(shifts)
-            x0, y0 = (max(0, int(v)) for v in low)
-            boxes.append((x0, y0, min(width, int(high[0])), min(height, int(high[1]))))
-        return boxes
+        outline, (width, height) = self.footprints[index], self.size
+        low, high = np.floor(outline.min(axis=0)), np.ceil(outline.max(axis=0)) + 1
+        shifts = self._shifts(float(low[0]), float(high[0]))
+        low[0], high[0] = low[0] + min(shifts), high[0] + max(shifts)
+        x0, y0 = (max(0, int(v)) for v in low)
+        return x0, y0, min(width, int(high[0])), min(height, int(high[1]))
 
     def areas(self) -> list[int]:
         """Of the bounds of every picture, as if it had only one place on the canvas, square pixels."""
         if self.period is None:
-            return [(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in self.boxes()]
+            return [(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in map(self.box, range(len(self.footprints)))]
         sizes = [np.minimum(np.ptp(outline, axis=0) + 1, self.size) for outline in self.footprints]
         return [int(width * height) for width, height in sizes]
 

@@ -231,7 +231,7 @@ def plan_warp(
     if canvas.projection != PLANE:
         surface = Surface(canvas.projection, np.asarray(np.linalg.inv(canvas.matrix), dtype=np.float64))
         from_directions = np.asarray(np.linalg.inv(homography), dtype=np.float64)
-        draft = Warp(camera, from_directions, canvas.boxes()[index], 1, 1.0, surface, displacement)
+        draft = Warp(camera, from_directions, canvas.box(index), 1, 1.0, surface, displacement)
         probes = canvas.place(camera, homography, np.concatenate([_grid(camera), camera.outline(_PROBES)]))
         return _measured(draft, probes, canvas)
     to_canvas = canvas.matrix @ homography
@@ -240,8 +240,7 @@ def plan_warp(
     # The sign of a homography is free; its inverse must put the footprint in front of the camera.
     if from_canvas[2] @ np.array([*outline.mean(axis=0), 1.0]) < 0:
         to_canvas, from_canvas = -to_canvas, -from_canvas
-    box = canvas.boxes()[index]
-    draft = Warp(camera, from_canvas, box, 1, 1.0, None, displacement)
+    draft = Warp(camera, from_canvas, canvas.box(index), 1, 1.0, None, displacement)
     return _measured(draft, np.concatenate([to_plane(camera, to_canvas, _grid(camera)), outline]), canvas)
 
 

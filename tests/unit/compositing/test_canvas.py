@@ -20,14 +20,14 @@ def test_one_flat_picture_is_its_own_canvas() -> None:
     # Plane coordinates of the top-left px go to (0, 0).
     point = canvas.matrix @ np.append(FLAT.normalize((0.0, 0.0)), 1.0)
     np.testing.assert_allclose(point, [0, 0, 1], atol=1e-9)
-    assert canvas.boxes() == [(0, 0, 400, 300)]
+    assert canvas.box(0) == (0, 0, 400, 300)
 
 
 def test_neighbours_side_by_side() -> None:
     step = 100 / FLAT.half_diagonal
     canvas = plan_canvas([FLAT, FLAT], np.stack([np.eye(3), _shift(step, 0.0)]))
     assert canvas.size == (500, 300)
-    assert canvas.boxes()[1][0] == 99 or canvas.boxes()[1][0] == 100
+    assert canvas.box(1)[0] == 99 or canvas.box(1)[0] == 100
 
 
 def test_scale_and_rotation() -> None:
