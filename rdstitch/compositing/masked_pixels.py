@@ -9,6 +9,12 @@ from numpy.typing import NDArray
 
 BoolImage = NDArray[np.bool_]
 
+OPAQUE = 65535
+"""Opacity of what is far from all transparent pixels."""
+
+OPACITY_BYTES = 2
+"""Bytes of a pixel's opacity."""
+
 _ROWS = 256
 # How far, pixels, samples are at least those of the nearest opaque pixel of all: blending reaches so far.
 _REACH = 64
@@ -43,15 +49,16 @@ def filled(pixels: NDArray[Any], opaque: BoolImage) -> NDArray[Any]:
     return result
 
 
-def opacity(opaque: BoolImage) -> tuple[NDArray[np.float32], float]:
-    """Weight that rises from a mask's border, and its value at the first opaque pixel."""
+def opacity(opaque: BoolImage) -> tuple[NDArray[np.uint16], float]:
+    """Weight that rises from a mask's border to OPAQUE, and its value at the first opaque pixel, as a share of that."""
     reach = max(2.0, _FEATHER * min(opaque.shape))
-    weight = np.empty(opaque.shape, dtype=np.float32)
+    weight = np.empty(opaque.shape, dtype=np.uint16)
     for rows, window in _windows(len(opaque), int(reach) + 1):
         distance = cv2.distanceTransform(opaque[window].view(np.uint8), cv2.DIST_L2, 5)
-        weight[rows] = distance[rows.start - window.start : rows.stop - window.start]
-    weight /= np.float32(reach)
-    return np.minimum(weight, np.float32(1.0), out=weight), 1.0 / reach
+        own = distance[rows.start - window.start : rows.stop - window.start]
+        # Where nothing is transparent distances are beyond all numbers.
+        weight[rows] = np.rint(np.minimum(own, np.float32(reach)) * np.float32(OPAQUE / reach))
+    return weight, 1.0 / reach
 
 
 def _windows(height: int, reach: int) -> Iterator[tuple[slice, slice]]:

@@ -9,6 +9,7 @@ import numpy as np
 from rdstitch.camera import Camera
 from rdstitch.compositing.blender import margin
 from rdstitch.compositing.canvas import Canvas
+from rdstitch.compositing.masked_pixels import OPACITY_BYTES
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.errors import LimitError
 from rdstitch.process_memory import memory_left
@@ -61,7 +62,13 @@ class CompositePlan:
 
 
 def plan_composite(
-    cameras: Sequence[Camera], canvas: Canvas, options: CompositeOptions, channels: int = 3, itemsize: int = 1
+    cameras: Sequence[Camera],
+    canvas: Canvas,
+    options: CompositeOptions,
+    channels: int = 3,
+    itemsize: int = 1,
+    *,
+    masked: bool = False,
 ) -> CompositePlan:
     """Tile size and cache that keep within the memory limit, with estimates for a dry run.
 
@@ -69,6 +76,8 @@ def plan_composite(
     ----------
     channels, itemsize : int
         Channels and bytes per sample of the pictures.
+    masked : bool
+        Whether some have transparent parts, or else only those of which the canvas has the near part.
 
     Raises
     ------
@@ -77,7 +86,8 @@ def plan_composite(
     """
     bands = options.bands or usual_bands(cameras)
     limit = options.max_memory or min(DEFAULT_MEMORY, memory_left(len(cameras)))
-    picture = max(c.image_size[0] * c.image_size[1] for c in cameras) * channels * itemsize
+    opacity = OPACITY_BYTES if masked or any(part is not None for part in canvas.near) else 0
+    picture = max(c.image_size[0] * c.image_size[1] for c in cameras) * (channels * itemsize + opacity)
     # While a picture is decoded it is there twice, beside those in the cache.
     workers = options.workers or min(_MAX_WORKERS, os.cpu_count() or 1)
     sides = _TILE_SIZES if options.tile_size is None else (options.tile_size,)

@@ -79,7 +79,8 @@ def prepare_composite(
         raise ArgumentError(f"the canvas is for {len(canvas.footprints)} pictures, not for {len(pictures)}")
     reader = PictureReader(pictures)
     channels, dtype = reader.samples
-    plan = plan_composite([picture.camera for picture in pictures], canvas, options, channels, dtype.itemsize)
+    cameras = [picture.camera for picture in pictures]
+    plan = plan_composite(cameras, canvas, options, channels, dtype.itemsize, masked=reader.masked(0))
     if canvas.period is not None:
         canvas = canvas.widened(_wrap_margin(canvas, plan.bands))
     warps = plan_warps(pictures, canvas)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, Float32Array
+from rdstitch.compositing.masked_pixels import OPAQUE
 from rdstitch.compositing.source_images import KERNEL_MARGIN, LoadedPicture
 from rdstitch.compositing.warp import Geometry
 
@@ -65,9 +66,9 @@ def sample_opacity(picture: LoadedPicture, geometry: Geometry) -> Float32Array |
     if picture.opacity is None:
         return None
     map_x, map_y = _mirrored(picture, geometry)
-    opacity = _remap_from(picture.opacity, picture.origin, map_x, map_y, cv2.INTER_LINEAR)
+    opacity = _remap_from(picture.opacity, picture.origin, map_x, map_y, cv2.INTER_LINEAR) * np.float32(1.0 / OPAQUE)
     # The outer half of the last opaque pixel is outside.
-    return np.where(opacity >= 0.5 * picture.opacity_step, opacity, 0.0).astype(np.float32)
+    return np.where(opacity >= np.float32(0.5 * picture.opacity_step), opacity, np.float32(0.0))
 
 
 def _mirrored(picture: LoadedPicture, geometry: Geometry) -> tuple[Float32Array, Float32Array]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, encloses, intersection
-from rdstitch.compositing.masked_pixels import filled, opacity
+from rdstitch.compositing.masked_pixels import OPACITY_BYTES, filled, opacity
 from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.errors import InputError
 from rdstitch.io.read import Picture
@@ -40,10 +40,10 @@ class LoadedPicture:
     ----------
     pixels : ndarray of shape (h, w) or (h, w, C)
         uint8, uint16 or float32; transparent pixels are filled from their nearest neighbours.
-    opacity : ndarray of shape (h, w), float32, or None
-        0 where the picture is masked out, else rising to 1 with the distance from the mask.
+    opacity : ndarray of shape (h, w), uint16, or None
+        0 where the picture is masked out, else rising to OPAQUE with the distance from the mask.
     opacity_step : float
-        Opacity of the last opaque pixel beside a transparent one.
+        Opacity of the last opaque pixel beside a transparent one, as a share of OPAQUE.
     reduction : int
         The picture is smaller than the original by this factor.
     part : (int, int, int, int) or None
@@ -53,7 +53,7 @@ class LoadedPicture:
     """
 
     pixels: NDArray[Any]
-    opacity: NDArray[np.float32] | None = None
+    opacity: NDArray[np.uint16] | None = None
     opacity_step: float = 1.0
     reduction: int = 1
     part: Box | None = None
@@ -101,6 +101,7 @@ def prepare_picture(picture: Picture, shrink: float, reduction: int = 1) -> Load
     if picture.alpha is not None:
         opaque = picture.alpha >= _OPAQUE_FROM
         pixels = filled(pixels, opaque)
+    del picture  # as large as all that is left of it
     # Blocks alone alias; a Gaussian on at least two pixels per output pixel does not.
     further = max(1, int(shrink / reduction / 2))
     if further > 1:
@@ -147,7 +148,7 @@ class PictureReader:
         """Memory that picture ``index`` takes at most when it is prepared for such an output, if it was read before."""
         channels, dtype = self.samples
         width, height = reduced_size(self._pictures[index].camera.image_size, self._reduction(index, shrink))
-        opacity = np.dtype(np.float32).itemsize if self._masked.get(index, False) else 0
+        opacity = OPACITY_BYTES if self._masked.get(index, False) else 0
         return width * height * (channels * dtype.itemsize + opacity)
 
     def _reduction(self, index: int, shrink: float) -> int:

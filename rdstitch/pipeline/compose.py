@@ -116,9 +116,11 @@ def compose_pictures(
     if dry_run:
         preview = pictures[0].preview
         assert preview is not None
-        pixels = preview(_PROBE_REDUCTION).pixels
-        channels = 1 if pixels.ndim == 2 else pixels.shape[2]
-        return Composed(canvas, plan=plan_composite(placed.cameras, canvas, options, channels, pixels.dtype.itemsize))
+        probe = preview(_PROBE_REDUCTION)
+        channels = 1 if probe.pixels.ndim == 2 else probe.pixels.shape[2]
+        size = probe.pixels.dtype.itemsize
+        masked = probe.alpha is not None
+        return Composed(canvas, plan=plan_composite(placed.cameras, canvas, options, channels, size, masked=masked))
 
     def report(share: float) -> None:
         progress("compositing", round(100 * share), 100)

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from rdstitch.compositing.masked_pixels import filled, opacity
+from rdstitch.compositing.masked_pixels import OPAQUE, filled, opacity
 
 
 def test_what_is_transparent_has_the_samples_of_the_nearest_opaque_pixel() -> None:
@@ -52,7 +52,7 @@ def test_rows_apart_give_what_the_whole_does_near_the_mask_and_opaque_samples_el
     assert np.isin(made, pixels[opaque]).all()
     reach = 0.125 * min(opaque.shape)
     whole = np.asarray(cv2.distanceTransform(opaque.astype(np.uint8), cv2.DIST_L2, 5)) / np.float32(reach)
-    np.testing.assert_array_equal(opacity(opaque)[0], np.minimum(whole, np.float32(1.0)))
+    np.testing.assert_allclose(opacity(opaque)[0] / OPAQUE, np.minimum(whole, np.float32(1.0)), atol=1e-5)
 
 
 def test_where_nothing_is_opaque_there_is_nothing_to_fill_with() -> None:

@@ -22,3 +22,12 @@ def test_it_takes_what_the_process_has_left(monkeypatch: pytest.MonkeyPatch) -> 
     assert tight.memory_bytes <= 80 * 2**20 < plenty.memory_bytes + plenty.cache_bytes
     assert (none.tile_size, none.workers) == (256, 1)
     assert none.memory_bytes < tight.memory_bytes
+
+
+def test_a_picture_with_transparent_parts_takes_more() -> None:
+    scene = render(3, 1)
+    plain, masked = (
+        plan_composite(scene.cameras, scene.canvas, CompositeOptions(workers=2), masked=some) for some in (False, True)
+    )
+    width, height = scene.cameras[0].image_size
+    assert masked.memory_bytes - plain.memory_bytes == (2 + 3) * 2 * width * height
