@@ -2,7 +2,7 @@
 
 Pictures of more than 8 bits are stretched alike, so that they register as their common rendering in 8 bits does. Where
 half of the pictures show few features for their size (haze, the sea bed, concrete, snow), all are detected again, after
-a stretch and with local contrast equalized.
+a stretch and with local contrast equalized. Where fewer do, or show few for the set (a cloud), they alone are.
 """
 
 from collections.abc import Mapping, Sequence
@@ -155,13 +155,13 @@ class DetectionByContrast:
     detected : DetectedFeatures
     stretch : (float, float) or None
         Grey levels that became 0 and 255 in all pictures; None where they are those of 8 bits.
-    equalized : bool
-        Whether local contrast was equalized because the pictures showed too little otherwise.
+    equalized : tuple of int
+        The pictures whose local contrast was equalized because they showed too little otherwise.
     """
 
     detected: DetectedFeatures
     stretch: Stretch | None
-    equalized: bool
+    equalized: tuple[int, ...]
 
 
 def detect_by_contrast(
@@ -181,28 +181,32 @@ def detect_by_contrast(
     options = replace(options, stretch=stretch)
     detected = detect(sources, options)
     # Samples of two kinds have no grey levels in common: each picture is stretched on its own.
-    if options.equalize is not None or len(depths) > 1 or not _shows_little(sources, detected, options):
-        return DetectionByContrast(detected, stretch, bool(options.equalize))
-    stretch = stretch or _stretch_of(sources, options, executor, store)
-    again = detect(sources, replace(options, stretch=stretch, equalize=True))
-    if _typical_count(again) <= _typical_count(detected):
-        return DetectionByContrast(detected, options.stretch, False)
-    return DetectionByContrast(again, stretch, True)
+    poor = [] if options.equalize is not None or len(depths) > 1 else _show_little(sources, detected, options)
+    all_of_them = tuple(range(len(sources)))
+    if not poor:
+        return DetectionByContrast(detected, stretch, all_of_them if options.equalize else ())
+    most = 2 * len(poor) >= len(sources) - len(detected.damaged)
+    chosen = all_of_them if most else tuple(poor)
+    wanted = [sources[k] for k in chosen]
+    own = options.stretch or _stretch_of(wanted, options, executor, store)
+    again = detect(wanted, replace(options, stretch=own, equalize=True))
+    if np.median(again.features.counts) <= np.median(detected.features.counts[list(chosen)]):
+        return DetectionByContrast(detected, stretch, ())
+    items = dict(enumerate(detected.features.items)) | dict(zip(chosen, again.features.items, strict=True))
+    merged = replace(detected, features=FeatureStore(tuple(items.values())))
+    return DetectionByContrast(merged, own if most else stretch, chosen)
 
 
-def _shows_little(sources: Sequence[Source], detected: DetectedFeatures, options: FeatureOptions) -> bool:
-    """Whether half of the pictures show few features for their size."""
+def _show_little(sources: Sequence[Source], detected: DetectedFeatures, options: FeatureOptions) -> list[int]:
+    """The pictures that show few features for their size, or for what the set shows."""
     most, megapixels = options.limits
-    shares = []
-    for index, (source, count) in enumerate(zip(sources, detected.features.counts.tolist(), strict=True)):
-        if index not in detected.damaged:
-            size = np.prod(source.metadata.size) / source.reduction(megapixels) ** 2 / 1e6
-            shares.append(count / min(most, _USUAL_DENSITY * size))
-    return bool(shares) and float(np.median(shares)) < _LOW_SHARE
-
-
-def _typical_count(detected: DetectedFeatures) -> float:
-    return float(np.median(detected.features.counts))
+    counts, found = detected.features.counts, []
+    usual = float(np.median(np.delete(counts, list(detected.damaged)))) if len(detected.damaged) < len(counts) else 0.0
+    for index, (source, count) in enumerate(zip(sources, counts.tolist(), strict=True)):
+        size = np.prod(source.metadata.size) / source.reduction(megapixels) ** 2 / 1e6
+        if index not in detected.damaged and count < _LOW_SHARE * min(most, max(_USUAL_DENSITY * size, usual)):
+            found.append(index)
+    return found
 
 
 def _stretch_of(sources: Sequence[Source], options: FeatureOptions, executor: Executor, store: Cache) -> Stretch | None:

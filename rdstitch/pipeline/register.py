@@ -17,7 +17,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import first_pairs
 from rdstitch.matching.mixed_lenses import separate_lenses
 from rdstitch.matching.two_view_rounds import Pairing
-from rdstitch.messages import Message, left_out
+from rdstitch.messages import Message, left_out, names_of, shortened
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner, close_loops, impossible_estimates_fail, rematch_weak_pairs
 from rdstitch.pipeline.detect_features import detect_by_contrast
@@ -31,11 +31,6 @@ _STATIC_BACKGROUND = Message(
     "a part of what the pictures show stays where it is in them (a vehicle's body, a background, dirt, a date); "
     "only what moves was registered",
     code="static-background",
-)
-
-
-_LOW_CONTRAST = Message(
-    "the pictures show little contrast: features were found after equalizing it locally", code="low-contrast"
 )
 
 
@@ -116,7 +111,7 @@ def register(
         (
             *aligned.alignment.messages,
             *([_STATIC_BACKGROUND] if moving.found else []),
-            *([_LOW_CONTRAST] if rendered.equalized else []),
+            *_low_contrast(rendered.equalized, aligned.alignment, aligner.paths),
             *_left_out(aligned.alignment, aligner.paths, {**lenses.left_out, **detected.damaged, **undecided}),
         ),
         static_background=moving.found,
@@ -150,6 +145,18 @@ def _matcher(options: StitchOptions) -> Matcher:
     if options.lightglue_model is not None:
         return LightGlue(options.lightglue_model).match
     return partial(match, ratio=options.ratio)
+
+
+def _low_contrast(equalized: Sequence[int], alignment: Alignment, paths: Sequence[str]) -> list[Message]:
+    """That local contrast was equalized, and in which of the pictures aligned, unless in all pictures."""
+    everywhere = len(equalized) == len(paths)
+    images = () if everywhere else tuple(paths[k] for k in equalized if alignment.used[k])
+    if not (everywhere or images):
+        return []
+    several = f"{len(images)} of the pictures ({shortened(names_of(images))})" if images else "the pictures"
+    who = "shows" if len(images) == 1 else f"{several} show"
+    text = f"{who} little contrast: features were found after equalizing it locally"
+    return [Message(text, images, code="low-contrast")]
 
 
 def _left_out(alignment: Alignment, paths: Sequence[str], reasons: Mapping[int, str]) -> list[Message]:

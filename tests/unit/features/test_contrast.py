@@ -20,12 +20,16 @@ def frames() -> list[NDArray[np.uint8]]:
     return [sequence.frame(index) for index in range(3)]
 
 
-def test_a_tenth_of_the_contrast_with_noise_is_seen_and_said(frames: list[NDArray[np.uint8]]) -> None:
+def _hazy(frames: list[NDArray[np.uint8]]) -> list[NDArray[np.uint8]]:
     rng = np.random.default_rng(0)
-    hazy = [
+    return [
         np.clip(np.rint(150 + (frame - 128.0) / 10 + rng.normal(0.0, 0.7, frame.shape)), 0, 255).astype(np.uint8)
         for frame in frames
     ]
+
+
+def test_a_tenth_of_the_contrast_with_noise_is_seen_and_said(frames: list[NDArray[np.uint8]]) -> None:
+    hazy = _hazy(frames)
     clear, found = (rdstitch.calibrate(pictures, _OPTIONS) for pictures in (frames, hazy))
     assert found.alignment.used.all()
     assert any(message.code == "low-contrast" for message in found.warnings)
@@ -40,6 +44,16 @@ def test_a_tenth_of_the_contrast_with_noise_is_seen_and_said(frames: list[NDArra
     except rdstitch.RdstitchError:
         return
     assert sum(as_it_is.keypoints) < sum(found.keypoints) / 2
+
+
+def test_a_single_picture_of_little_contrast_is_seen_and_named(frames: list[NDArray[np.uint8]]) -> None:
+    clear, found = (rdstitch.calibrate(k, _OPTIONS) for k in (frames, [frames[0], _hazy(frames)[1], frames[2]]))
+    assert found.alignment.used.all()
+    assert found.keypoints[::2] == clear.keypoints[::2]
+    assert found.keypoints[1] > clear.keypoints[1] / 2
+    (message,) = [message for message in found.warnings if message.code == "low-contrast"]
+    assert message.images == (str(found.sources[1].path),)
+    assert message.text.startswith("shows little contrast")
 
 
 def test_deep_pictures_register_as_their_common_rendering_does(frames: list[NDArray[np.uint8]]) -> None:
