@@ -8,7 +8,7 @@ from pathlib import Path
 from threading import Condition
 
 _USUAL = 180 * 2**20  # bytes; where the system does not say it: the libraries, and a few hundred registered pictures
-_BOUND, _BOUND_OF_A_PICTURE = 400 * 10**6, 150 * 10**3  # bytes; of the whole process, see docs/scale.md
+_BOUND, _BOUND_OF_A_PICTURE = 400 * 10**6, 150 * 10**3  # bytes; of the whole process
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # of mallopt
 _LARGE = 8 * 2**20  # bytes: more than any array of a tile, which are made again and again; less than a picture
 _SCRATCH = 280 * 10**6  # bytes that the threads of this process may take at once for what they give back soon
@@ -40,9 +40,14 @@ def reuse_freed_memory() -> None:
         ctypes.CDLL(None).mallopt(_TRIM_THRESHOLD, _SCRATCH)
 
 
+def usual_bound(pictures: int) -> int:
+    """Bytes that a process is to take at most for so many pictures, see docs/scale.md."""
+    return _BOUND + _BOUND_OF_A_PICTURE * pictures
+
+
 def memory_left(pictures: int) -> int:
     """Bytes that a process may still take for so many pictures within its usual bound; negative beyond it."""
-    return _BOUND + _BOUND_OF_A_PICTURE * pictures - _resident()
+    return usual_bound(pictures) - _resident()
 
 
 class _Scratch:

@@ -19,6 +19,7 @@ from rdstitch.inputs.frame import ChannelOrder, Images, as_inputs
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.messages import bytes_in_words, seconds_in_words, shortened
+from rdstitch.process_memory import usual_bound
 from rdstitch.progress import Progress, silent
 
 _GLANCE = FeatureOptions(max_features=500, work_megapixels=None)
@@ -250,10 +251,11 @@ def _focal(sources: Sequence[Source]) -> tuple[str, bool]:
 
 
 def _memory(sources: Sequence[Source], overlap: float, workers: int) -> int:
-    """Libraries, features, and the part of the mosaic that the compositor holds at a time."""
+    """Libraries, features, and what detection or the compositor hold at a time; runs keep to the usual bound."""
     shown = sum(np.prod(m.size) * m.channels * m.bit_depth / 8 for m in (source.metadata for source in sources))
     composite = min(_COMPOSITE_SHARE * _mosaic_share(overlap) * float(shown), DEFAULT_MEMORY)
-    return int(_BASE_MEMORY + _DETECTION_MEMORY * workers + _FEATURES_MEMORY * len(sources) + composite)
+    needed = _BASE_MEMORY + _FEATURES_MEMORY * len(sources) + max(_DETECTION_MEMORY * workers, composite)
+    return int(min(needed, usual_bound(len(sources))))
 
 
 def _mosaic_share(overlap: float) -> float:
