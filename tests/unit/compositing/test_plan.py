@@ -3,16 +3,17 @@
 import pytest
 
 from rdstitch.compositing import plan as planning
+from rdstitch.compositing.masked_pixels import OPACITY_BYTES
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.plan import DEFAULT_MEMORY, CompositePlan, plan_composite
 from tests.compositing_scenes import render
 
 
-def _planned(monkeypatch: pytest.MonkeyPatch, left: int) -> CompositePlan:
+def _planned(monkeypatch: pytest.MonkeyPatch, left: int, *, masked: bool = False) -> CompositePlan:
     """The plan of a process that has so much left."""
     scene = render(3, 1)
     monkeypatch.setattr(planning, "memory_left", lambda pictures: left)
-    return plan_composite(scene.cameras, scene.canvas, CompositeOptions(workers=2))
+    return plan_composite(scene.cameras, scene.canvas, CompositeOptions(workers=2), masked=masked)
 
 
 def test_it_takes_what_the_process_has_left(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -24,10 +25,8 @@ def test_it_takes_what_the_process_has_left(monkeypatch: pytest.MonkeyPatch) -> 
     assert none.memory_bytes < tight.memory_bytes
 
 
-def test_a_picture_with_transparent_parts_takes_more() -> None:
-    scene = render(3, 1)
-    plain, masked = (
-        plan_composite(scene.cameras, scene.canvas, CompositeOptions(workers=2), masked=some) for some in (False, True)
-    )
-    width, height = scene.cameras[0].image_size
-    assert masked.memory_bytes - plain.memory_bytes == (2 + 3) * 2 * width * height
+def test_pictures_with_transparent_parts_take_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain, masked = (_planned(monkeypatch, 2**30, masked=some) for some in (False, True))
+    width, height = render(3, 1).cameras[0].image_size
+    # Two while one is prepared, and all three in the cache.
+    assert masked.memory_bytes - plain.memory_bytes == (2 + 3) * OPACITY_BYTES * width * height
