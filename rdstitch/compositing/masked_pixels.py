@@ -16,7 +16,8 @@ OPACITY_BYTES = 2
 """Bytes of a pixel's opacity."""
 
 _ROWS = 256
-# How far, pixels, samples are at least those of the nearest opaque pixel of all: blending reaches so far.
+# How far, pixels, samples are certainly those of the nearest opaque pixel: blending reaches so far at a picture's own
+# scale. Where it reaches farther, these weigh next to nothing, and are of an opaque pixel all the same.
 _REACH = 64
 # Share of the shorter side over which the weight rises from the border of a mask.
 _FEATHER = 0.125

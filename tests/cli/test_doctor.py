@@ -3,6 +3,8 @@
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,6 +12,8 @@ import pytest
 from PIL import ExifTags, Image
 
 from rdstitch.doctor import examine
+from rdstitch.doctor.examine import _memory
+from rdstitch.process_memory import usual_bound
 from tests.cli.running import Run
 
 
@@ -84,3 +88,10 @@ def test_what_cannot_be_read_is_named_once(rdstitch: Run, tmp_path: Path) -> Non
     missing = tmp_path / "nofolder"
     done = rdstitch("doctor", missing)
     assert (done.status, done.line.count(str(missing))) == (3, 1)
+
+
+def test_expected_memory_is_that_of_the_work_and_at_most_what_runs_keep_to() -> None:
+    source: Any = SimpleNamespace(metadata=SimpleNamespace(size=(480, 360), channels=3, bit_depth=8))
+    few, many = _memory([source] * 12, 0.5, 2), _memory([source] * 1000, 0.5, 2)
+    assert few < usual_bound(12)
+    assert many == usual_bound(1000)
