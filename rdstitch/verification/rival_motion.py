@@ -156,7 +156,7 @@ def rival_messages(
         Only the lens is wanted, which both motions show.
     """
     share = rival_share(rivals)
-    if share < _MIN_SHARE and compared is None:
+    if not rivals or (share < _MIN_SHARE and compared is None):
         return []
     worst = max(rivals, key=lambda rival: rival.area)
     images = (paths[worst.image1], paths[worst.image2])

@@ -74,7 +74,8 @@ def judge(
         Where pictures are compared; None: in one thread.
     cache : Cache
     lens_only : bool
-        Only the lens is wanted, so that doubts about the places of pictures do not make the result fail.
+        Only the lens is wanted, so that doubts about the places of pictures do not make the result fail, and are
+        not reported where a repeated pattern explains them.
 
     Returns
     -------
@@ -102,20 +103,23 @@ def judge(
     compared = compare_with_rivals(registration, rivals, checked)
     seen = outside_rivals(checked, rivals, compared)
     ambiguous = _ambiguous(paths, seen)
+    if lens_only:  # it is the same a period of the pattern further on, and what rests has a message of its own
+        rivals = [] if resting else [rival for rival in rivals if (rival.image1, rival.image2) not in ambiguous]
     # What two pictures share of a plane looks alike; where something else moves, it may be that which holds them.
     undecided = is_apart(rivals) and not (compared and (compared.won or compared.lost))
     least = MIN_AGREEMENT if undecided else _MIN_AGREEMENT
     suspicions = {**disagreeing, **_unlike(paths, seen, least), **_of_the_rival(paths, checked, compared), **ambiguous}
     decisive = [] if lens_only or resting else _decisive(suspicions, used, len(paths))
+    doubtful = [pair for pair in suspicions if pair not in decisive and not (lens_only and pair in ambiguous)]
     return (
         *_error_of_the_whole(alignment, threshold, checked),
         *(parallax_messages(paths, parallax) or _relief(paths, alignment)),
         *([] if lens_only else _shape(paths, alignment)),
         *([] if lens_only else _pattern(ambiguous, checked)),
         *(suspicions[pair] for pair in decisive),
-        *_outvoted(paths, [pair for pair in suspicions if pair not in decisive], ambiguous),
+        *_outvoted(paths, doubtful, ambiguous),
         *([] if parallax else rival_messages(paths, rivals, share_alike(checked), compared, lens_only=lens_only)),
-        *_little_alike(paths, [link for link in seen if link.pair not in suspicions]),
+        *([] if lens_only else _little_alike(paths, [link for link in seen if link.pair not in suspicions])),
         *([] if lens_only else _settled(paths, seen)),
         *doubtful_inputs(registration.sources),
     )

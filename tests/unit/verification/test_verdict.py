@@ -213,6 +213,19 @@ def test_a_pattern_all_over_is_one_failure(
     )
 
 
+@pytest.mark.parametrize(("shown", "resting", "count"), [((0, 1), False, 0), ((1, 2), False, 1), ((1, 2), True, 0)])
+def test_what_only_the_places_suffer_from_is_not_said_of_a_lens(
+    good: Registration, monkeypatch: pytest.MonkeyPatch, shown: tuple[int, int], resting: bool, count: int
+) -> None:
+    """A pair of a repeated pattern moves by periods too, and there are no seams to look at."""
+    monkeypatch.setattr(verdict, "find_rival_motions", lambda *_: [RivalMotion(*shown, 20, 80, (30.0, 40.0), 120.0)])
+    checked = [_checked(100, 90, elsewhere=0.9), _checked(100, 12, pair=(1, 2))]
+    monkeypatch.setattr(verdict, "check_overlaps", lambda *_: checked)
+    found = judge(replace(good, static_background=resting), THRESHOLD, lens_only=True)
+    assert sum("moves otherwise" in message.text for message in found) == count
+    assert not any("elsewhere" in message.text or "look alike;" in message.text for message in found)
+
+
 @pytest.mark.parametrize(
     ("rms", "share", "severity"), [(8.9, 0.26, "warning"), (8.9, 0.24, "failure"), (9.1, 0.9, "failure")]
 )
