@@ -79,14 +79,15 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
     problem, fit = found.problem, found.choice.fit
     adjusted, planar = fit.adjusted, isinstance(fit.model, PlanarModel)
     shared, lens = fit.model.physical_parameters(adjusted.parameters.shared)[0], adjusted.parameters.lens
-    covariance = _covariance(found)
+    covariance = _covariance(found, problem.free_lens)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    names = (*fit.model.shared_names, *(n for n, free in zip(LENS_PARAMETERS, problem.free_lens, strict=True) if free))
+    names = (*fit.model.shared_names, *_names_of(problem.free_lens))
     focal = float(np.exp(shared[-1])) if fit.model.shared_names else None
     lens_covariance = _lens_covariance(names, covariance)
+    considered = _considered(found, lens_covariance)
     # Most pictures are of one camera.
     adjusted_cameras = {
-        c: _adjusted_camera(found, c, lens, lens_covariance, focal) for c in dict.fromkeys(found.cameras)
+        c: _adjusted_camera(found, c, lens, (lens_covariance, considered), focal) for c in dict.fromkeys(found.cameras)
     }
     cameras = tuple(adjusted_cameras[camera] for camera in found.cameras)
     own = cameras[int(found.pictures[problem.reference])]
@@ -135,12 +136,29 @@ def _shape(found: AdjustedPictures) -> ShapeTest | None:
     return replace(judged, image=int(pictures[judged.image]))
 
 
-def _covariance(found: AdjustedPictures) -> FloatArray:
+def _covariance(found: AdjustedPictures, free_lens: BoolArray) -> FloatArray:
     """Covariance of the named parameters, where λ was estimated for errors that are not independent."""
     fit = found.choice.fit
     if not (found.observable and found.problem.free_lens[0]):
         return fit.adjusted.covariance
-    return sandwich_covariance(found.problem.adjuster_of(fit), fit.adjusted)
+    return sandwich_covariance(replace(found.problem, free_lens=free_lens).adjuster_of(fit), fit.adjusted)
+
+
+def _considered(found: AdjustedPictures, covariance: FloatArray) -> FloatArray:
+    """Covariance (5, 5) of all parameters of a lens, also of those that were not freed: consider parameters (Schmidt
+    1966).
+
+    That a lens of fewer parameters explains the pictures does not make it the lens. What they leave open of the others,
+    within what lenses usually have, moves λ where these pictures show nothing.
+    """
+    if found.problem.free_lens.all() or not (found.observable and found.problem.free_lens[0]):
+        return covariance
+    every = np.ones_like(found.problem.free_lens)
+    return _covariance(found, every)[-len(every) :, -len(every) :]
+
+
+def _names_of(lens: BoolArray) -> list[str]:
+    return [name for name, free in zip(LENS_PARAMETERS, lens, strict=True) if free]
 
 
 def _lens_covariance(names: Sequence[str], covariance: FloatArray) -> FloatArray:
@@ -153,9 +171,14 @@ def _lens_covariance(names: Sequence[str], covariance: FloatArray) -> FloatArray
 
 
 def _adjusted_camera(
-    found: AdjustedPictures, camera: Camera, lens: FloatArray, covariance: FloatArray, focal: float | None
+    found: AdjustedPictures,
+    camera: Camera,
+    lens: FloatArray,
+    covariances: tuple[FloatArray, FloatArray],
+    focal: float | None,
 ) -> Camera:
-    """The camera of a picture with the lens that was found."""
+    """The camera of a picture with the lens that was found; covariances of what was estimated, and of all of a lens."""
+    covariance, considered = covariances
     center = np.asarray(camera.center) + lens[CENTER] * camera.half_diagonal
     estimated = bool(covariance.any())
     result = replace(
@@ -168,15 +191,13 @@ def _adjusted_camera(
     )
     if estimated and result.sees_beyond_horizon:
         raise ImpossibleCameraError(f"with λ = {result.distortion:.3g} the corners would see behind the camera")
-    std = _nearest_distortion_std(result, covariance) if found.observable else math.inf
+    std = _nearest_distortion_std(result, considered) if found.observable else math.inf
     result = replace(result, distortion_std=std)
     return result if focal is None else replace(result, focal=focal * camera.half_diagonal, focal_source="estimate")
 
 
 def _nearest_distortion_std(camera: Camera, covariance: FloatArray) -> float:
     """Standard deviation of the λ of the nearest one-parameter lens."""
-    if not camera.higher:
-        return math.sqrt(max(float(covariance[0, 0]), 0.0))
     gradient = np.zeros(len(covariance))
     for index, name in enumerate(LENS_PARAMETERS[:3]):
         value = getattr(camera, name)
