@@ -175,7 +175,8 @@ def _by_name(lines: Sequence[str], file: str | Path) -> dict[str, float]:
     times: dict[str, float] = {}
     for time, name in rows:
         if not name or not _is_number(time):
-            raise InputError(f"{file}: expected a time and a name in each line, found {time!r} and {name!r}")
+            wanted = f"a table with the columns {','.join(_TIME_COLUMNS)}, lines TIMESTAMP NAME, or one time a line"
+            raise InputError(f"{file}: found the time {time!r} for the name {name!r}; give {wanted}")
         times[Path(name).name] = float(time)
     return times
 
