@@ -32,7 +32,7 @@ OBSERVABLE_STD = 0.1
 """Standard deviation of λ from which on it counts as not observable: a tenth of the radius at the corner."""
 
 _NEWTON_STEPS, _NEWTON_TOLERANCE = 40, 1e-14
-_QUICK_STEPS = 8  # of Newton's method alone, which doubles the digits with each
+_QUICK_STEPS, _QUICK_TOLERANCE = 8, 1e-9  # of Newton's method alone: the error left is the square of the last step
 _RATIO_STEPS = 12
 _FARTHEST = 4.0
 """Half diagonals: with more coefficients than λ the model is not used beyond, where only the highest power counts."""
@@ -246,7 +246,7 @@ def _distorted_radius(radius: FloatArray, distortion: float, higher: tuple[float
             slope = 1.0 - 2.0 * radius * found * divisor_slope(q, distortion, higher)
             step = (found - radius * divisor(q, distortion, higher)) / slope
             found = found - step
-            settled = np.abs(step) <= _NEWTON_TOLERANCE * limit
+            settled = np.abs(step) <= _QUICK_TOLERANCE * limit
             if settled.all():
                 break
     left = solvable & ~(settled & (slope > 0.0) & (found >= 0.0) & (found <= limit))
