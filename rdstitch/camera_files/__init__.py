@@ -34,7 +34,15 @@ from rdstitch.camera_files.opencv import (
 )
 from rdstitch.camera_files.opendronemap import is_opendronemap, opendronemap_json, read_opendronemap
 from rdstitch.camera_files.own_camera import CameraFile, read_comments
-from rdstitch.camera_files.text_formats import camera_chain_yaml, camera_info_yaml, colmap_text
+from rdstitch.camera_files.text_formats import (
+    camera_chain_yaml,
+    camera_info_yaml,
+    colmap_text,
+    is_colmap,
+    is_kalibr,
+    read_colmap,
+    read_kalibr,
+)
 from rdstitch.camera_record import camera_from_record
 from rdstitch.errors import OutputError
 from rdstitch.io.atomic import text_bytes, write_bytes_atomic
@@ -90,6 +98,10 @@ def read_camera_file(path: str | Path) -> CameraFile:
         return read_hugin(text, file)
     if (own := read_comments(text, file, "rdstitch")) is not None:
         return own
+    if is_colmap(text):
+        return read_colmap(text, file)
+    if is_kalibr(text):
+        return read_kalibr(text, file)
     return read_opencv(parse_yaml(text, file))
 
 

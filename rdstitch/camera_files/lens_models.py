@@ -1,6 +1,8 @@
 """Lens models of others that several formats share: Brown's polynomial, and Kannala and Brandt's fisheye."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -53,6 +55,12 @@ class Brown(_ForeignLens):
     radial: tuple[float, ...]
     tangential: tuple[float, float] = (0.0, 0.0)
     denominator: tuple[float, ...] = ()
+
+    @classmethod
+    def of_opencv(cls, focal: tuple[float, float], center: tuple[float, float], coefficients: Sequence[float]) -> Self:
+        """From up to 8 coefficients in OpenCV's order: k1, k2, p1, p2, k3, k4, k5, k6."""
+        k1, k2, p1, p2, k3, *denominator = (*coefficients, *[0.0] * (8 - len(coefficients)))
+        return cls(focal, center, (k1, k2, k3), (p1, p2), tuple(denominator))
 
     def distort(self, points: FloatArray) -> FloatArray:
         """Pixels (..., 2) of a lens without distortion and with square pixels to measured pixels.

@@ -140,8 +140,7 @@ def _brown(given: Record, k: list[float], focal: tuple[float, float], center: tu
     """Brown's model of OpenCV's coefficients."""
     if len(k) not in (0, 4, 5, 8, 12, 14) or any(k[8:]):
         given.fail("expected 4, 5 or 8 coefficients; thin prisms and tilted sensors are not known here")
-    k += [0.0] * (8 - len(k))
-    return Brown(focal, center, (k[0], k[1], k[4]), (k[2], k[3]), (k[5], k[6], k[7]))
+    return Brown.of_opencv(focal, center, k[:8])
 
 
 def opencv_yaml(camera: Camera) -> str:

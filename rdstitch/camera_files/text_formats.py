@@ -1,10 +1,109 @@
-"""COLMAP, Kalibr and ROS: camera files of text, which are written; what comes back is rdstitch's own camera in them."""
+"""Camera files of text: COLMAP's, Kalibr's and those of ROS, which are read as OpenCV's are."""
 
+import re
 from collections.abc import Sequence
 
 from rdstitch.camera import Camera
-from rdstitch.camera_files.lens_models import brown_of, closer_fisheye, least_brown_of, rational_of
-from rdstitch.camera_files.own_camera import comments
+from rdstitch.camera_files.lens_models import Brown, Fisheye, brown_of, closer_fisheye, least_brown_of, rational_of
+from rdstitch.camera_files.opencv import parse_yaml
+from rdstitch.camera_files.own_camera import CameraFile, comments, fitted_camera
+from rdstitch.records import Record, parse_json
+
+_COLMAP = {
+    "SIMPLE_PINHOLE": (1, 0),
+    "PINHOLE": (2, 0),
+    "SIMPLE_RADIAL": (1, 1),
+    "RADIAL": (1, 2),
+    "OPENCV": (2, 4),
+    "FULL_OPENCV": (2, 8),
+    "SIMPLE_RADIAL_FISHEYE": (1, 1),
+    "RADIAL_FISHEYE": (1, 2),
+    "OPENCV_FISHEYE": (2, 4),
+}
+"""COLMAP's models: how many focal lengths, and how many of OpenCV's coefficients, in its order."""
+
+_KALIBR = {"none": 0, "radtan": 4, "equi": 4}
+"""Kalibr's models of distortion: how many of OpenCV's coefficients."""
+
+_COLMAP_LINE = re.compile(r"\s*\d+\s+([A-Z_]+)\s+(\d+)\s+(\d+)\s+(\S.*)")
+_KALIBR_CAMERA = re.compile(r"^cam\d+:", re.MULTILINE)
+
+
+def is_colmap(text: str) -> bool:
+    """Whether the first line that is no comment is a camera of COLMAP."""
+    return any(_COLMAP_LINE.fullmatch(line) for line in _colmap_lines(text)[:1])
+
+
+def _colmap_lines(text: str) -> list[str]:
+    return [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+
+
+def read_colmap(text: str, file: str) -> CameraFile:
+    """The camera of a ``cameras.txt``, to which λ is fitted.
+
+    Raises
+    ------
+    InputError
+        When there are several, or the model is one that λ cannot describe.
+    """
+    cameras = [found for line in _colmap_lines(text) if (found := _COLMAP_LINE.fullmatch(line))]
+    model, width, height, values = cameras[0].groups()
+    numbers = parse_json(f"[{', '.join(values.split())}]", file).value
+    record = Record(file, "", {"MODEL": model, "SIZE": [int(width), int(height)], "PARAMS": numbers})
+    if len(cameras) > 1:
+        record.fail(f"holds {len(cameras)} cameras; keep the line of the one that took the pictures")
+    focals, coefficients = _COLMAP[record["MODEL"].choice(_COLMAP)]
+    given = record["PARAMS"]
+    values = given.numbers(focals + 2 + coefficients)
+    # COLMAP's pixels have their centres at halves.
+    intrinsics = (values[0], values[focals - 1], values[focals] - 0.5, values[focals + 1] - 0.5)
+    return _fitted(record, "COLMAP", record["SIZE"], intrinsics, values[focals + 2 :], fisheye="FISHEYE" in model)
+
+
+def is_kalibr(text: str) -> bool:
+    """Whether the text is a chain of cameras."""
+    return _KALIBR_CAMERA.search(text) is not None
+
+
+def read_kalibr(text: str, file: str) -> CameraFile:
+    """The camera of a chain of one, to which λ is fitted.
+
+    Raises
+    ------
+    InputError
+        When there are several, or the model is one that λ cannot describe.
+    """
+    # Rows of matrices say where the camera is.
+    lines = ("" if line.lstrip().startswith("- ") else line for line in text.splitlines())
+    chain = parse_yaml("\n".join(lines), file)
+    cameras = [camera for name, camera in chain.fields().items() if _KALIBR_CAMERA.match(f"{name}:")]
+    if len(cameras) > 1:
+        chain.fail(f"holds {len(cameras)} cameras; keep the one that took the pictures")
+    camera = cameras[0]
+    camera["camera_model"].choice(("pinhole",))
+    model = camera["distortion_model"].choice(_KALIBR)
+    fx, fy, cx, cy = camera["intrinsics"].numbers(4)
+    coefficients = camera["distortion_coeffs"].numbers(_KALIBR[model]) if _KALIBR[model] else ()
+    return _fitted(camera, "Kalibr", camera["resolution"], (fx, fy, cx, cy), coefficients, fisheye=model == "equi")
+
+
+def _fitted(
+    record: Record,
+    kind: str,
+    size: Record,
+    intrinsics: tuple[float, float, float, float],
+    coefficients: Sequence[float],
+    *,
+    fisheye: bool,
+) -> CameraFile:
+    """The camera of a focal length and centre along x and y, and OpenCV's coefficients."""
+    fx, fy, cx, cy = intrinsics
+    if not min(fx, fy) > 0.0:
+        record.fail("expected positive focal lengths")
+    lens: Brown | Fisheye = Brown.of_opencv((fx, fy), (cx, cy), coefficients)
+    if fisheye:
+        lens = Fisheye((fx, fy), (cx, cy), tuple(coefficients))
+    return fitted_camera(record, kind, lens.distort, size.size(), lens.center, lens.mean_focal)
 
 
 def colmap_text(camera: Camera) -> str:

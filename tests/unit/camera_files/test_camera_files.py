@@ -18,8 +18,8 @@ from rdstitch.camera_files.opencv import parse_yaml
 from rdstitch.errors import InputError, OutputError
 
 OPENCV = ["c.yml", "c.yaml", "opencv.json", "left.opencv.json", "a.fisheye.yml"]
-FOREIGN = [*OPENCV, "cameras.json", "c.pto", "camera_info.yaml"]
-NAMES = ["own.json", *FOREIGN, "camchain.yaml", "cameras.txt"]
+FOREIGN = [*OPENCV, "cameras.json", "c.pto", "camera_info.yaml", "camchain.yaml", "cameras.txt"]
+NAMES = ["own.json", *FOREIGN]
 CAMERAS = [
     Camera((4000, 3000), -0.21, 0.0, (2013.25, 1490.5), 3300.0, "file", 0.0012),
     Camera((640, 480), 0.08, 0.01),
@@ -285,6 +285,69 @@ def test_opendronemap_of_others(tmp_path: Path) -> None:
     file.write_text(json.dumps({"one": entry, "two": entry}), encoding="utf-8")
     with pytest.raises(InputError, match="2 cameras"):
         load_camera(file)
+
+
+@pytest.mark.parametrize(
+    ("model", "values"),
+    [
+        ("SIMPLE_PINHOLE", [1500.0]),
+        ("SIMPLE_RADIAL", [1500.0, -0.08]),
+        ("RADIAL", [1500.0, -0.08, 0.01]),
+        ("OPENCV", [1500.0, 1500.1, -0.08, 0.01, 1e-05, -1e-05]),
+        ("FULL_OPENCV", [1500.0, 1500.1, 0.5, 0.02, 0.0, 0.0, 0.001, 0.6, 0.08, 0.002]),
+        ("RADIAL_FISHEYE", [1500.0, -0.02, 0.004]),
+        ("OPENCV_FISHEYE", [1500.0, 1500.1, -0.02, 0.004, -1e-3, 1e-4]),
+    ],
+)
+def test_cameras_of_colmap_and_kalibr_mean_what_opencv_says(tmp_path: Path, model: str, values: list[float]) -> None:
+    size, fisheye = (1600, 1200), "FISHEYE" in model
+    focals = values[: 2 if model in ("OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE") else 1]
+    k = values[len(focals) :]
+    written = [*focals, 810.5, 590.5, *k]
+    (tmp_path / "cameras.txt").write_text(
+        f"# Camera list\n#   CAMERA_ID, MODEL, …\n7 {model} 1600 1200 {' '.join(map(repr, written))}\n",
+        encoding="utf-8",
+    )
+    found = [read_camera_file(tmp_path / "cameras.txt")]
+    padded = [*k, *[0.0] * (4 - len(k))]
+    if len(padded) == 4:
+        (tmp_path / "rig-camchain.yaml").write_text(
+            "cam0:\n  T_cam_imu:\n  - [1.0, 0.0, 0.0, 0.0]\n  - [0.0, 1.0, 0.0, 0.0]\n  cam_overlaps: []\n"
+            f"  camera_model: pinhole\n  distortion_coeffs: {padded}\n"
+            f"  distortion_model: {'equi' if fisheye else 'radtan'}\n"
+            f"  intrinsics: [{focals[0]}, {focals[-1]}, 810.0, 590.0]\n  resolution: [1600, 1200]\n"
+            "  rostopic: /cam0/image_raw\n",
+            encoding="utf-8",
+        )
+        found.append(read_camera_file(tmp_path / "rig-camchain.yaml"))
+    matrix = np.array([[focals[0], 0.0, 810.0], [0.0, focals[-1], 590.0], [0.0, 0.0, 1.0]])
+    for file, kind in zip(found, ("COLMAP", "Kalibr"), strict=False):
+        assert file.kind == kind
+        assert file.camera.image_size == size
+        points = _points(file.camera)
+        focal = np.sqrt(focals[0] * focals[-1])
+        assert file.camera.focal == pytest.approx(focal)
+        rays = np.column_stack([(file.camera.undistort(points) - (810.0, 590.0)) / focal, np.ones(len(points))])
+        apart = np.linalg.norm(_projected(matrix, padded, rays, fisheye=fisheye) - points, axis=1)
+        assert apart.max() < 0.15
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("1 THIN_PRISM_FISHEYE 640 480 500 500 320 240\n", "MODEL"),
+        ("1 RADIAL 640 480 500 320 240 0.1\n", "PARAMS"),
+        ("1 RADIAL 640 480 -500 320 240 0.1 0\n", "positive"),
+        ("1 PINHOLE 640 480 500 500 320 240\n2 PINHOLE 640 480 500 500 320 240\n", "2 cameras"),
+        ("cam0:\n  camera_model: omni\n", "cam0.camera_model"),
+        ("cam0:\n  camera_model: pinhole\n  distortion_model: fov\n", "cam0.distortion_model"),
+        ("cam0:\n  camera_model: pinhole\ncam1:\n  camera_model: pinhole\n", "2 cameras"),
+    ],
+)
+def test_what_colmap_and_kalibr_know_and_rdstitch_does_not_is_named(tmp_path: Path, text: str, named: str) -> None:
+    (tmp_path / "file").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=named):
+        load_camera(tmp_path / "file")
 
 
 @pytest.mark.parametrize(
