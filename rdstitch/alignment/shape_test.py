@@ -12,11 +12,12 @@ deviations that suppose it right are too small by as much: they are multiplied b
 calculation of errors by the method of least squares, 1932).
 
 Effects are tried as large as they usually are. Of a much larger one, such as a wall whose radius is a few times the
-camera's distance, that prior would allow little: so extreme cases are tried, too.
+camera's distance, that prior would allow little: so extreme cases are tried, too. And a row of few pictures fits a
+curved wall by a strong tilt and a focal length that next to no lens has: then the usual focal length is tried.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -24,7 +25,7 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.result import ShapeTest
 from rdstitch.alignment.shape_directions import Directions, places
-from rdstitch.alignment.unmodelled import CROPPED, Effect, cropping_effects, unmodelled_effects
+from rdstitch.alignment.unmodelled import CROPPED, USUAL_FOCAL, Effect, cropping_effects, unmodelled_effects
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
 
@@ -33,6 +34,9 @@ _LARGE = 0.004
 
 _SHOWN_PER_EFFECT = 4.0
 """Gain of each effect, in squared standard deviations, from which on the pictures show that something is left out."""
+
+_UNLIKELY_FOCAL = 4.0
+"""Standard deviations of what is known of a focal length beyond which it may stand for something else."""
 
 
 def judge_shape(problem: Problem, fit: Fit, cameras: Sequence[Camera]) -> ShapeTest:
@@ -62,6 +66,11 @@ def judge_shape(problem: Problem, fit: Fit, cameras: Sequence[Camera]) -> ShapeT
     doubtful = bool(off.max() > _LARGE * diagonals[off.argmax()])
     if not doubtful and extreme.shown and (extreme.shifts > _LARGE * diagonals).any():
         doubtful, judged, off = True, extreme, extreme.shifts
+    beside = _beside_usual_focal(problem, fit)
+    if not doubtful and abs(beside) > _UNLIKELY_FOCAL * problem.camera_priors.log_focal_std:
+        elsewhere = usual.moved_along(len(fit.adjusted.parameters.shared) - 1, -beside, information, *at)
+        if (elsewhere.shifts > _LARGE * diagonals).any():
+            doubtful, judged, off = True, elsewhere, elsewhere.shifts
     image = int(off.argmax())
     return ShapeTest(
         doubtful=doubtful,
@@ -120,12 +129,34 @@ class _Prediction:
         step = -covariance @ gradient
         step[:kept] += np.linalg.solve(alone, gradient[:kept])  # what the fit lacks without any effect
         covariance *= inflation
-        points = np.maximum(np.bincount(pictures, minlength=count), 1)
         squared = ((moved @ step) ** 2).sum(axis=1), np.einsum("pas,st,pat->p", moved, covariance, moved)
-        shifts, stds = (np.sqrt(np.maximum(np.bincount(pictures, own, count), 0.0) / points) for own in squared)
+        shifts, stds = (_per_picture(own, pictures, count) for own in squared)
         gain = _gain(information, gradient) - _gain(alone, gradient[:kept])
         cause = _cause(effects, step[kept:], np.asarray(covariance[kept:, kept:], dtype=np.float64))
         return cls(gain, gain / len(effects), shifts, stds, cause)
+
+    def moved_along(
+        self, index: int, size: float, information: FloatArray, moved: FloatArray, pictures: IntArray, count: int
+    ) -> Self:
+        """What a step of one shared parameter, the logarithm of the focal length, changes when all others follow it."""
+        response = np.linalg.inv(information)[:, index]
+        shifts = _per_picture(((moved @ response * (size / response[index])) ** 2).sum(axis=1), pictures, count)
+        return replace(self, by_effect=0.0, shifts=shifts, stds=np.zeros(count), cause=USUAL_FOCAL)
+
+
+def _per_picture(squared: FloatArray, pictures: IntArray, count: int) -> FloatArray:
+    """Root mean square (N,) of the points (P,) of each picture."""
+    points = np.maximum(np.bincount(pictures, minlength=count), 1)
+    result: FloatArray = np.sqrt(np.maximum(np.bincount(pictures, squared, count), 0.0) / points)
+    return result
+
+
+def _beside_usual_focal(problem: Problem, fit: Fit) -> float:
+    """By how much the logarithm of a fit's focal length exceeds what was known of it; 0 where it has none."""
+    if not fit.model.shared_names:
+        return 0.0
+    log_focal = float(fit.model.physical_parameters(fit.adjusted.parameters.shared)[0][-1])
+    return log_focal - problem.camera_priors.log_focal
 
 
 def _with_extremes(information: FloatArray, effects: Sequence[Effect]) -> FloatArray:

@@ -26,6 +26,7 @@ OTHER_LENS = "a lens of another kind"
 ROLLING_SHUTTER = "rows that were read while the camera moved (a rolling shutter)"
 CURVED = "a curved surface"
 CROPPED = "pictures that were cropped, or stabilised, each differently"
+USUAL_FOCAL = "a usual focal length, far from the one that fits best"
 
 _PATTERNS = 8
 """Random ways in which pictures are tried to be cropped: as many for few pictures as for many."""
