@@ -2,11 +2,17 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from rdstitch.alignment.result import CONTRADICTS, Alignment
 from rdstitch.messages import Message, left_out, names_of
 
+_FEW_FEATURES = 1.0 / 3.0
+"""Of what most pictures have: a blur of several pixels leaves a quarter and less, even where all have as many as are
+looked for at the most."""
 
-def explain_unaligned(alignment: Alignment, paths: Sequence[str]) -> list[Message]:
+
+def explain_unaligned(alignment: Alignment, paths: Sequence[str], keypoints: Sequence[int]) -> list[Message]:
     """One message for each picture that the alignment does not use.
 
     Parameters
@@ -14,6 +20,8 @@ def explain_unaligned(alignment: Alignment, paths: Sequence[str]) -> list[Messag
     alignment : Alignment
     paths : sequence of str
         Of all its pictures.
+    keypoints : sequence of int
+        Number of features of each.
     """
     contradicting: dict[int, list[int]] = {}
     for fit in alignment.links:
@@ -39,6 +47,16 @@ def explain_unaligned(alignment: Alignment, paths: Sequence[str]) -> list[Messag
                 "add pictures with more overlap"
             )
         else:
-            reason = "no reliable overlap with any other picture; add pictures with more overlap"
+            found = few_features(keypoints, picture)
+            remedy = f"it has {found}" if found else "add pictures with more overlap"
+            reason = f"no reliable overlap with any other picture; {remedy}"
         messages.append(left_out(path, reason))
     return messages
+
+
+def few_features(keypoints: Sequence[int], picture: int) -> str:
+    """How few features a picture has, and why that may be; empty where it has about as many as the others."""
+    usual = float(np.median(keypoints))
+    if keypoints[picture] >= _FEW_FEATURES * usual:
+        return ""
+    return f"{keypoints[picture]} features, others {usual:.0f} (blurred?)"

@@ -237,7 +237,7 @@ def _aligned_anew(
     """The registration with another alignment, and why pictures are not in it."""
     known = {message.images: message for message in registration.left_out}
     unaligned = np.flatnonzero(~aligned.alignment.used).tolist()
-    explained = zip(unaligned, explain_unaligned(aligned.alignment, paths), strict=True)
+    explained = zip(unaligned, explain_unaligned(aligned.alignment, paths, registration.keypoints), strict=True)
     unused = [
         known.get(message.images, left_out(paths[k], reasons[k].text) if k in reasons else message)
         for k, message in explained

@@ -105,14 +105,14 @@ def register(
         aligned = aligner.metric(aligned)
     return Registration(
         tuple(sources),
-        tuple(features.counts.tolist()),
+        counts := tuple(features.counts.tolist()),
         tuple(aligner.used(aligned)),
         aligned.alignment,
         (
             *aligned.alignment.messages,
             *([_STATIC_BACKGROUND] if moving.found else []),
             *_low_contrast(rendered.equalized, aligned.alignment, aligner.paths),
-            *_left_out(aligned.alignment, aligner.paths, {**lenses.left_out, **detected.damaged, **undecided}),
+            *_left_out(aligned.alignment, aligner.paths, counts, {**lenses.left_out, **detected.damaged, **undecided}),
         ),
         static_background=moving.found,
         stretch=rendered.stretch,
@@ -159,11 +159,13 @@ def _low_contrast(equalized: Sequence[int], alignment: Alignment, paths: Sequenc
     return [Message(text, images, code="low-contrast")]
 
 
-def _left_out(alignment: Alignment, paths: Sequence[str], reasons: Mapping[int, str]) -> list[Message]:
+def _left_out(
+    alignment: Alignment, paths: Sequence[str], keypoints: Sequence[int], reasons: Mapping[int, str]
+) -> list[Message]:
     """Why pictures are not in the alignment, which is known beforehand of those that never reached it."""
     return [
         message if index not in reasons else left_out(paths[index], reasons[index])
         for index, message in zip(
-            np.flatnonzero(~alignment.used).tolist(), explain_unaligned(alignment, paths), strict=True
+            np.flatnonzero(~alignment.used).tolist(), explain_unaligned(alignment, paths, keypoints), strict=True
         )
     ]

@@ -6,6 +6,7 @@ import numpy as np
 
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.result import LinkFit
+from rdstitch.alignment.unaligned import few_features
 from rdstitch.messages import Message, names_of
 from rdstitch.radial_homography import RadialHomography, lift
 from rdstitch.registration import Registration
@@ -33,9 +34,10 @@ def disagreeing_pairs(registration: Registration) -> dict[Pair, Message]:
     result = {}
     for fit in used:
         both = paths[fit.image1], paths[fit.image2]
+        remedy = f"{_reason(registration, [fit])} stitch them on their own"
         text = (
             f"{' and '.join(names_of(both))}: only {fit.inliers} of {fit.count} matches agree with the whole; "
-            f"{_reason(registration, [fit])} stitch them on their own"
+            f"{_few_features(registration, (fit.image1, fit.image2)) or remedy}"
         )
         result[fit.image1, fit.image2] = Message(text, both, "failure")
     return result
@@ -48,7 +50,8 @@ def misfitting_pictures(registration: Registration, links: Sequence[LinkFit]) ->
         own = [fit for fit in links if k in (fit.image1, fit.image2)]
         given, kept = sum(fit.count for fit in own), sum(fit.inliers for fit in own)
         if kept < _MIN_MATCHES_PER_PICTURE * given:
-            text = f"only {kept} of {given} of its matches agree with the whole; {_reason(registration, own)}"
+            reason = _few_features(registration, (k,)) or _reason(registration, own)
+            text = f"only {kept} of {given} of its matches agree with the whole; {reason}"
             result.append(Message(text, (str(source.path),), "failure"))
     return result
 
@@ -59,6 +62,12 @@ def agreement_of_all(used: Sequence[LinkFit]) -> list[Message]:
     if kept >= _MIN_INLIERS * given:
         return []
     return [Message(f"only {kept} of {given} matches of the pairs agree with the whole", (), "failure")]
+
+
+def _few_features(registration: Registration, pictures: Sequence[int]) -> str:
+    """Which of some pictures have few features to be matched by; empty for none."""
+    found = [(k, few_features(registration.keypoints, k)) for k in pictures]
+    return ", ".join(f"{registration.sources[k].name} has {few}" for k, few in found if few)
 
 
 def _reason(registration: Registration, links: Sequence[LinkFit]) -> str:

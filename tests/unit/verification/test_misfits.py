@@ -16,7 +16,13 @@ OBLIQUE = np.array([[1.0, 0.0, 0.3], [0.0, 0.4, 0.9], [0.0, 0.9, 0.6]])
 
 
 def _registration(
-    count: int, homography: np.ndarray, distortion: float = -0.2, *, on_sphere: bool = False, agree: float = 0.2
+    count: int,
+    homography: np.ndarray,
+    distortion: float = -0.2,
+    *,
+    on_sphere: bool = False,
+    agree: float = 0.2,
+    keypoints: tuple[int, ...] = (900, 900, 900),
 ) -> Any:
     """Two pictures of which so many matches were given to the alignment, and a share agrees with it."""
     camera = Camera((400, 300), distortion=distortion)
@@ -24,8 +30,8 @@ def _registration(
     fit = LinkFit(0, 1, count, int(agree * count), 0.5, True)
     alignment = SimpleNamespace(links=(fit,), distortion=-0.2, on_sphere=on_sphere)
     pair = SimpleNamespace(image1=0, image2=1, relation=relation)
-    sources = [SimpleNamespace(path=f"folder/{name}.jpg") for name in "ab"]
-    return SimpleNamespace(alignment=alignment, pairs=(pair,), sources=sources)
+    sources = [SimpleNamespace(path=f"folder/{name}.jpg", name=f"{name}.jpg") for name in "ab"]
+    return SimpleNamespace(alignment=alignment, pairs=(pair,), sources=sources, keypoints=keypoints)
 
 
 @pytest.mark.parametrize(
@@ -47,6 +53,15 @@ def test_the_reason_is_what_the_pair_shows(registration: Any, reason: str) -> No
     first, second = misfitting_pictures(registration, registration.alignment.links)
     assert reason in first.text
     assert second.images == ("folder/b.jpg",)
+
+
+def test_a_picture_of_few_features_is_said_to_be_blurred() -> None:
+    registration = _registration(100, AHEAD, keypoints=(900, 200, 900))
+    (message,) = disagreeing_pairs(registration).values()
+    assert message.text.endswith("; b.jpg has 200 features, others 900 (blurred?)")
+    first, second = misfitting_pictures(registration, registration.alignment.links)
+    assert "(trees, walls)?" in first.text
+    assert "b.jpg has 200 features, others 900 (blurred?)" in second.text
 
 
 def test_what_agrees_is_not_named() -> None:
