@@ -125,13 +125,13 @@ class Source:
         array = None if self.frame is None else self.frame.picture
         if array is None:
             with held_in_memory(self.path), self.guard.reading(self.path):
-                picture = read_image(self.path, reduction)
+                picture = read_image(self.path, reduction, self.metadata)
         else:
             picture = reduced(array, reduction)
         self.guard.check(self.path, picture)
         expected = self.camera.image_size
         if picture.pixels.shape[1::-1] != reduced_size(expected, reduction):
-            now, before = ("{} x {}".format(*size) for size in (picture.metadata.size, expected))
+            now, before = ("{} x {}".format(*size) for size in (read_metadata(self.path).size, expected))
             raise InputError(f"{self.path}: has {now} pixels now, but had {before} before; run again")
         if self.mask is None:
             return picture

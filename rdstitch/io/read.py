@@ -108,7 +108,7 @@ class Picture:
         return self.pixels.nbytes + (0 if self.alpha is None else self.alpha.nbytes)
 
 
-def read_image(path: str | Path, reduction: int = 1) -> Picture:
+def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None = None) -> Picture:
     """Read a picture file.
 
     JPEG, PNG, TIFF, WebP and whatever else Pillow reads, with 8 or 16 bit or floating-point samples; with optional
@@ -122,6 +122,9 @@ def read_image(path: str | Path, reduction: int = 1) -> Picture:
     reduction : int
         Blocks of so many pixels a side become one pixel, the last ones of what is there of them. The metadata stay
         those of the whole picture. JPEG files are decoded at 1/2, 1/4 or 1/8 of the size, in a fraction of the time.
+    metadata : Metadata, optional
+        What :func:`read_metadata` has found in the file, which is not looked for again: of a small JPEG file that takes
+        as long as its pixels.
 
     Raises
     ------
@@ -134,11 +137,11 @@ def read_image(path: str | Path, reduction: int = 1) -> Picture:
         with open_regular(file) as stream:
             magic = stream.read(len(PNG_MAGIC))
         if is_raw(file):
-            return reduced(as_picture(file, read_raw(file), None, read_metadata(file)), reduction)
+            return reduced(as_picture(file, read_raw(file), None, metadata or read_metadata(file)), reduction)
         if magic[:4] in TIFF_MAGIC:
-            return reduced(as_picture(file, *_read_tiff(file), read_metadata(file)), reduction)
+            return reduced(as_picture(file, *_read_tiff(file), metadata or read_metadata(file)), reduction)
         with opened_picture(file) as image:
-            metadata = metadata_of(image)
+            metadata = metadata or metadata_of(image)
             if magic == PNG_MAGIC and metadata.bit_depth == 16 and image.mode not in _GREY_16:
                 samples, alpha = _split(_read_16_bit_png(file))
             else:

@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import ExifTags, Image
 
 from rdstitch.camera import Camera
 from rdstitch.inputs import source as sources
 from rdstitch.inputs.decoded_image_cache import DecodedImageCache
-from rdstitch.inputs.source import Source
+from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import Metadata, write_image
+from rdstitch.io import read as reading
 from rdstitch.io.read import Picture, read_image
 
 SIZE = (1500, 1000)  # halved once for a look at it
@@ -39,9 +41,9 @@ def read(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The reductions at which files are decoded."""
     seen: list[int] = []
 
-    def noted(path: Path, reduction: int = 1) -> Picture:
+    def noted(path: Path, reduction: int, metadata: Metadata) -> Picture:
         seen.append(reduction)
-        return read_image(path, reduction)
+        return read_image(path, reduction, metadata)
 
     monkeypatch.setattr(sources, "read_image", noted)
     return seen
@@ -67,6 +69,19 @@ def test_what_is_on_the_shelf_changes_no_px(source: Source) -> None:
     for reduction in (1, 2, 4, 8):
         with_shelf, without = (s.read(reduction, keep=True).pixels for s in (shelved, source))
         np.testing.assert_array_equal(with_shelf, without)
+
+
+def test_tags_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    pixels = np.random.default_rng(0).integers(0, 256, (9, 16, 3)).astype(np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.jpg", exif=exif)
+    source = read_sources([tmp_path / "a.jpg"], skip_bad=False)[0][0]
+    expected = read_image(tmp_path / "a.jpg")
+    monkeypatch.setattr(reading, "metadata_of", None)
+    picture = source.read()
+    assert picture.metadata is source.metadata
+    np.testing.assert_array_equal(picture.pixels, expected.pixels)
 
 
 def test_a_larger_size_is_read_from_the_file(source: Source, read: list[int]) -> None:
