@@ -18,7 +18,7 @@ from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPos
 from rdstitch.alignment.rotation_frame import levelled
 from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.alignment.sandwich import sandwich_covariance
-from rdstitch.alignment.shape_test import judge_shape
+from rdstitch.alignment.shape_test import UNLIKELY_FOCAL, beside_usual_focal, judge_shape
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS, Camera
 from rdstitch.errors import ImpossibleCameraError
@@ -84,7 +84,11 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
     names = (*fit.model.shared_names, *_names_of(problem.free_lens))
     focal = float(np.exp(shared[-1])) if fit.model.shared_names else None
     lens_covariance = _lens_covariance(names, covariance)
-    considered = _considered(found, lens_covariance)
+    observations = problem.observations
+    errors = whitened_errors(observations, adjusted.homographies, lens)
+    inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
+    relief = judge_relief(coherence(observations, errors, inliers), fit.model.name, len(observations))
+    considered = _considered(found, lens_covariance, rough=relief.found)
     # Most pictures are of one camera.
     adjusted_cameras = {
         c: _adjusted_camera(found, c, lens, (lens_covariance, considered), focal) for c in dict.fromkeys(found.cameras)
@@ -92,10 +96,6 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
     cameras = tuple(adjusted_cameras[camera] for camera in found.cameras)
     own = cameras[int(found.pictures[problem.reference])]
     groups = _groups(found)
-    observations = problem.observations
-    errors = whitened_errors(observations, adjusted.homographies, lens)
-    inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
-    relief = judge_relief(coherence(observations, errors, inliers), fit.model.name, len(observations))
     used = np.zeros(len(found.cameras), dtype=np.bool_)
     used[found.pictures] = True
     homographies, poses = _in_frame_of_reference(found)
@@ -144,17 +144,28 @@ def _covariance(found: AdjustedPictures, free_lens: BoolArray) -> FloatArray:
     return sandwich_covariance(replace(found.problem, free_lens=free_lens).adjuster_of(fit), fit.adjusted)
 
 
-def _considered(found: AdjustedPictures, covariance: FloatArray) -> FloatArray:
+def _considered(found: AdjustedPictures, covariance: FloatArray, *, rough: bool) -> FloatArray:
     """Covariance (5, 5) of all parameters of a lens, also of those that were not freed: consider parameters (Schmidt
     1966).
 
     That a lens of fewer parameters explains the pictures does not make it the lens. What they leave open of the others,
-    within what lenses usually have, moves λ where these pictures show nothing.
+    within what lenses usually have, moves λ where these pictures show nothing. So does a focal length that next to no
+    lens has: something else bends the pictures, and λ may be what goes with the usual one. Where the ground is
+    ``rough`` that is known, and in the covariance.
     """
-    if found.problem.free_lens.all() or not (found.observable and found.problem.free_lens[0]):
+    problem, fit = found.problem, found.choice.fit
+    if not (found.observable and problem.free_lens[0]):
         return covariance
-    every = np.ones_like(found.problem.free_lens)
-    return _covariance(found, every)[-len(every) :, -len(every) :]
+    every = np.ones_like(problem.free_lens)
+    if not problem.free_lens.all():
+        covariance = _covariance(found, every)[-len(every) :, -len(every) :]
+    beside = beside_usual_focal(problem, fit)
+    if not rough and abs(beside) > UNLIKELY_FOCAL * problem.camera_priors.log_focal_std:
+        together = replace(problem, free_lens=every).adjuster_of(fit).covariance(fit.adjusted)
+        focal = len(fit.model.shared_names) - 1
+        moved = together[-len(every) :, focal] * (beside / together[focal, focal])
+        covariance = covariance + np.outer(moved, moved)
+    return covariance
 
 
 def _names_of(lens: BoolArray) -> list[str]:

@@ -23,6 +23,7 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
+from rdstitch.alignment.motion_models import PlanarModel
 from rdstitch.alignment.result import ShapeTest
 from rdstitch.alignment.shape_directions import Directions, places
 from rdstitch.alignment.unmodelled import CROPPED, USUAL_FOCAL, Effect, cropping_effects, unmodelled_effects
@@ -35,7 +36,7 @@ _LARGE = 0.004
 _SHOWN_PER_EFFECT = 4.0
 """Gain of each effect, in squared standard deviations, from which on the pictures show that something is left out."""
 
-_UNLIKELY_FOCAL = 4.0
+UNLIKELY_FOCAL = 4.0
 """Standard deviations of what is known of a focal length beyond which it may stand for something else."""
 
 
@@ -66,8 +67,8 @@ def judge_shape(problem: Problem, fit: Fit, cameras: Sequence[Camera]) -> ShapeT
     doubtful = bool(off.max() > _LARGE * diagonals[off.argmax()])
     if not doubtful and extreme.shown and (extreme.shifts > _LARGE * diagonals).any():
         doubtful, judged, off = True, extreme, extreme.shifts
-    beside = _beside_usual_focal(problem, fit)
-    if not doubtful and abs(beside) > _UNLIKELY_FOCAL * problem.camera_priors.log_focal_std:
+    beside = beside_usual_focal(problem, fit)
+    if not doubtful and abs(beside) > UNLIKELY_FOCAL * problem.camera_priors.log_focal_std:
         elsewhere = usual.moved_along(len(fit.adjusted.parameters.shared) - 1, -beside, information, *at)
         if (elsewhere.shifts > _LARGE * diagonals).any():
             doubtful, judged, off = True, elsewhere, elsewhere.shifts
@@ -151,9 +152,9 @@ def _per_picture(squared: FloatArray, pictures: IntArray, count: int) -> FloatAr
     return result
 
 
-def _beside_usual_focal(problem: Problem, fit: Fit) -> float:
-    """By how much the logarithm of a fit's focal length exceeds what was known of it; 0 where it has none."""
-    if not fit.model.shared_names:
+def beside_usual_focal(problem: Problem, fit: Fit) -> float:
+    """By how much the logarithm of a fit's focal length exceeds what was known of it; 0 where no tilt shows one."""
+    if not isinstance(fit.model, PlanarModel):
         return 0.0
     log_focal = float(fit.model.physical_parameters(fit.adjusted.parameters.shared)[0][-1])
     return log_focal - problem.camera_priors.log_focal

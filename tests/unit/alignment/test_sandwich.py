@@ -92,3 +92,23 @@ def test_the_stated_deviation_covers_what_two_pictures_do_not_show() -> None:
     assert {own.lens for own in found} == {"division"}
     assert misses.max() < 3.0
     assert np.median(misses) > 0.33
+
+
+def test_a_focal_length_that_no_lens_has_makes_the_lens_less_certain() -> None:
+    """Something else bends the pictures; what λ would be with a usual focal length is counted."""
+    poses = grid(3, 2, (0.06, 0.045), 0.2, np.random.default_rng(0))
+    std = {}
+    for source in ("option", "guess"):
+        given = scene(
+            poses,
+            focal=3600.0,
+            tilt=(0.5, 0.4),
+            guess=3600.0 if source == "option" else 520.0,
+            focal_source=source,
+            rng=np.random.default_rng(1),
+        )
+        found = align(given.cameras, given.links, AlignmentOptions(model="similarity"))
+        assert found.focal is not None
+        assert found.focal > 6.0
+        std[source] = found.distortion_std
+    assert std["guess"] > 2.0 * std["option"]
