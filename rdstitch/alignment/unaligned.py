@@ -7,9 +7,9 @@ import numpy as np
 from rdstitch.alignment.result import CONTRADICTS, Alignment
 from rdstitch.messages import Message, left_out, names_of
 
-_FEW_FEATURES = 1.0 / 3.0
-"""Of what most pictures have: a blur of several pixels leaves a quarter and less, even where all have as many as are
-looked for at the most."""
+_FEW = 1.0 / 3.0
+"""Of the features that most pictures have: a blur of several pixels leaves a quarter and less, even where all others
+have as many as are looked for at the most."""
 
 
 def explain_unaligned(alignment: Alignment, paths: Sequence[str], keypoints: Sequence[int]) -> list[Message]:
@@ -47,16 +47,14 @@ def explain_unaligned(alignment: Alignment, paths: Sequence[str], keypoints: Seq
                 "add pictures with more overlap"
             )
         else:
-            found = few_features(keypoints, picture)
-            remedy = f"it has {found}" if found else "add pictures with more overlap"
+            few = few_features(keypoints, picture)
+            remedy = f"it has {few}" if few else "add pictures with more overlap"
             reason = f"no reliable overlap with any other picture; {remedy}"
         messages.append(left_out(path, reason))
     return messages
 
 
 def few_features(keypoints: Sequence[int], picture: int) -> str:
-    """How few features a picture has, and why that may be; empty where it has about as many as the others."""
-    usual = float(np.median(keypoints))
-    if keypoints[picture] >= _FEW_FEATURES * usual:
-        return ""
-    return f"{keypoints[picture]} features, others {usual:.0f} (blurred?)"
+    """That a picture has few features, and why that may be; empty where it has about as many as the others."""
+    few = keypoints[picture] < _FEW * float(np.median(keypoints))
+    return "less than a third of the features that others have (blurred?)" if few else ""

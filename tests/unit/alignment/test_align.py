@@ -166,6 +166,8 @@ def test_pictures_without_connection_are_named() -> None:
     assert reasons["6.png",].startswith("in block 2 of 2, whose 2 pictures overlap with none of the others")
     assert reasons["7.png",] == reasons["6.png",]
     assert "no reliable overlap" in reasons["8.png",]
+    blurred = explain_unaligned(found, [f"{k}.png" for k in range(9)], [900] * 8 + [290])
+    assert [message.images for message in blurred if "(blurred?)" in message.text] == [("8.png",)]
     assert np.isnan(found.homographies[6:]).all()
     assert np.isfinite(found.homographies[:6]).all()
 
