@@ -21,6 +21,7 @@ from rdstitch.messages import Message, left_out, names_of, shortened
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner, close_loops, impossible_estimates_fail, rematch_weak_pairs
 from rdstitch.pipeline.detect_features import detect_by_contrast
+from rdstitch.pipeline.pattern_crossings import match_crossings
 from rdstitch.pipeline.pattern_shifts import settle_repeated_pattern
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.process_memory import return_freed_memory
@@ -96,11 +97,8 @@ def register(
     aligned = aligner.align(pairs)
     aligned = close_loops(aligner, moving.pairing, aligned, lenses.of_one_lens(candidates))
     aligned = rematch_weak_pairs(aligner, moving.pairing, aligned)
-    undecided: dict[int, str] = {}
-    if not lens_only:
-        aligned, undecided = settle_repeated_pattern(
-            aligner, moving.pairing, aligned, sources, rendered.stretch, options.threads
-        )
+    settle = match_crossings if lens_only else settle_repeated_pattern
+    aligned, undecided = settle(aligner, moving.pairing, aligned, sources, rendered.stretch, options.threads)
     if metric:
         aligned = aligner.metric(aligned)
     return Registration(
