@@ -26,8 +26,11 @@ from rdstitch.robust.loss import ALIGNMENT_WIDTH
 _SHORTEST, _LONGEST = 0.5, 6.0
 """Wavelengths, in half diagonals of a picture on the ground: what neighbours show, and what poses absorb whole."""
 
-_WAVES, _AT_ONCE = 32, 8
-"""Waves, each as a sine and a cosine; and those that are answered together."""
+_WAVES = 32
+"""Waves, each as a sine and a cosine."""
+
+_AT_ONCE, _FEW_LINKS = 8, 4000
+"""Waves that are answered together; of so few links all of them, with less than 10 kB a link."""
 
 _NOISE_FIELDS = 16
 """Fields of independent errors that show what their absorption leaves of agreement between neighbours."""
@@ -60,7 +63,8 @@ class ReliefField:
         common = self._common()
         if common == 0.0:
             return np.zeros((count, count))
-        answers = [self._answers(self._waves(start), 2 * _AT_ONCE) for start in range(0, _WAVES, _AT_ONCE)]
+        step = _WAVES if len(self.response.adjuster.observations) <= _FEW_LINKS else _AT_ONCE
+        answers = [self._answers(self._waves(start, step), 2 * step) for start in range(0, _WAVES, step)]
         agreement = float(np.mean([own for own, _ in answers]))
         moved = np.mean([own for _, own in answers], axis=0)
         covariance: FloatArray = moved * (common / agreement) if agreement > 0.0 else np.zeros((count, count))
@@ -91,9 +95,9 @@ class ReliefField:
             agreement += float(np.einsum("mic,mic->", a, b))
         return agreement / (len(first) * columns), shared @ shared.T / columns
 
-    def _waves(self, start: int) -> Fields:
+    def _waves(self, start: int, count: int) -> Fields:
         """Sines and cosines of some of the waves, from the ``start``-th."""
-        waves = _wave_vectors(self._is_turn)[start : start + _AT_ONCE] / self._size
+        waves = _wave_vectors(self._is_turn)[start : start + count] / self._size
         # Equally steep, waves are the higher the longer they are.
         height = 1.0 / np.linalg.norm(waves * self._size, axis=1)
 
