@@ -117,7 +117,7 @@ def judge(
         *([] if lens_only else _shape(paths, alignment)),
         *([] if lens_only else _pattern(ambiguous, checked)),
         *(suspicions[pair] for pair in decisive),
-        *_outvoted(paths, doubtful, ambiguous),
+        *_outvoted(paths, doubtful, ambiguous, seams=not lens_only),
         *([] if parallax else rival_messages(paths, rivals, share_alike(checked), compared, lens_only=lens_only)),
         *([] if lens_only else _little_alike(paths, [link for link in seen if link.pair not in suspicions])),
         *([] if lens_only else _settled(paths, seen)),
@@ -195,7 +195,9 @@ def _pattern(ambiguous: Mapping[Pair, Message], checked: Sequence[CheckedLink]) 
     return [_failure(f"{len(ambiguous)} of {len(checked)} pairs fit as well elsewhere (a repeated pattern?)")]
 
 
-def _outvoted(paths: Sequence[str], pairs: Sequence[Pair], ambiguous: Container[Pair] = ()) -> list[Message]:
+def _outvoted(
+    paths: Sequence[str], pairs: Sequence[Pair], ambiguous: Container[Pair] = (), *, seams: bool = True
+) -> list[Message]:
     """Suspicious pairs on which nothing depends: a warning of those that fit badly, one of those that fit twice."""
     result = []
     for twice, what in ((False, "badly"), (True, "as well elsewhere (a repeated pattern?)")):
@@ -204,7 +206,8 @@ def _outvoted(paths: Sequence[str], pairs: Sequence[Pair], ambiguous: Container[
             named = shortened([" and ".join(names_of([paths[i], paths[j]])) for i, j in own])
             text = f"{len(own)} of the pairs fit {what}, and little depends on them: {named}"
             images = tuple(paths[k] for k in sorted({k for pair in own for k in pair}))
-            result.append(Message(f"{text}; look at the seams between them", images, code="doubtful-seam"))
+            text += "; look at the seams between them" if seams else ""
+            result.append(Message(text, images, code="doubtful-seam"))
     return result
 
 
