@@ -121,6 +121,7 @@ def judge(
         *([] if parallax else rival_messages(paths, rivals, share_alike(checked), compared, lens_only=lens_only)),
         *([] if lens_only else _little_alike(paths, [link for link in seen if link.pair not in suspicions])),
         *([] if lens_only else _settled(paths, seen)),
+        *_two_left(paths, registration),
         *doubtful_inputs(registration.sources),
     )
 
@@ -223,6 +224,19 @@ def _mixed(paths: Sequence[str], registration: Registration) -> list[Message]:
             f"{shortened(names_of(others))} ({mixed.distortion[0]:.3f}); stitch those of each on their own"
         )
     ]
+
+
+def _two_left(paths: Sequence[str], registration: Registration) -> list[Message]:
+    """A warning where a third picture, taken for one of another lens, is all that told a curved wall from a plane."""
+    used = registration.alignment.used
+    if registration.mixed is None or used.sum() != 2:
+        return []
+    kept = tuple(path for path, own in zip(paths, used, strict=True) if own)
+    text = (
+        f"{' and '.join(names_of(kept))} fit without the pictures of another lens, as any two do; if all are of one "
+        "lens, the scene is no plane, and these are off in the whole; add pictures of this lens"
+    )
+    return [Message(text, kept, code="mixed-lenses")]
 
 
 def _decisive(suspicions: Mapping[Pair, Message], used: Sequence[LinkFit], count: int) -> list[Pair]:

@@ -12,6 +12,7 @@ from rdstitch.executors import open_executor
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import write_image
+from rdstitch.matching.mixed_lenses import TwoLenses
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.register import register
@@ -292,3 +293,14 @@ def test_a_doubtful_shape_names_the_picture_and_the_size(good: Registration) -> 
     free = replace(good, alignment=replace(alignment, model_reason=f"homography: {NOT_ONE_CAMERA}; it leaves 0.2 px"))
     (message,) = judge(free, THRESHOLD)
     assert "homography of its own" in message.text
+
+
+def test_two_pictures_that_are_left_of_one_lens_may_be_of_a_curved_wall(good: Registration) -> None:
+    divided = replace(good, mixed=TwoLenses(np.array([False, False, True]), (-0.1, -0.2), certain=True))
+    assert judge(divided, THRESHOLD) == ()
+    links = [fit for fit in good.alignment.links if 2 not in (fit.image1, fit.image2)]
+    used = np.array([True, True, False])
+    two = replace(divided, alignment=replace(good.alignment, used=used, links=tuple(links)))
+    (message,) = judge(two, THRESHOLD)
+    assert message.severity == "warning"
+    assert message.images == tuple(str(source.path) for source in good.sources[:2])
