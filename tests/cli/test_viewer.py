@@ -124,7 +124,7 @@ def test_the_wheel_is_small() -> None:
     assert 0 < sum(_packed_sizes().values()) <= 1_000_000
 
 
-@pytest.mark.xfail(reason="the package has grown to about 640 kB: CHANGELOG, known limits")
+@pytest.mark.xfail(reason="the package has grown to about 700 kB: CHANGELOG, known limits")
 def test_the_wheel_without_the_viewer_is_small() -> None:
     sizes = _packed_sizes()
     del sizes["openseadragon.min.js"]
