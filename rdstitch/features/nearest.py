@@ -6,7 +6,7 @@ to be exact, so there is nothing to depend on.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -38,10 +38,6 @@ class DescriptorSimilarity(Protocol):
 
     def pairs(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[Any]:
         """Similarities of single pairs of descriptors, shape (len(rows),)."""
-        ...
-
-    def swapped(self) -> Self:
-        """The same with the pictures exchanged."""
         ...
 
     def distance(self, similarity: NDArray[Any]) -> FloatArray:
@@ -90,9 +86,6 @@ class Euclidean:
     def pairs(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[Any]:
         return np.einsum("ij,ij->i", self._left[rows], self._right[columns])  # type: ignore[no-any-return]
 
-    def swapped(self) -> Self:
-        return type(self)(self._right, self._left)
-
     def distance(self, similarity: NDArray[Any]) -> FloatArray:
         return np.sqrt(-2.0 * similarity.astype(np.float64))
 
@@ -127,9 +120,6 @@ class Hamming:
         equal = np.bitwise_count(self._left[rows] ^ self._right[columns])
         total: NDArray[np.int16] = equal.sum(axis=1, dtype=np.int16)
         return total
-
-    def swapped(self) -> Self:
-        return type(self)(self._right, self._left)
 
     def distance(self, similarity: NDArray[Any]) -> FloatArray:
         return np.where(similarity == self.lowest, np.inf, self._bits - similarity.astype(np.float64))
@@ -186,24 +176,24 @@ class Locations:
         """The keypoints, layer after layer."""
         return np.concatenate(self.layers)
 
-    def places(self, chosen: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-        """Where in that order the keypoints of some locations are, ascending ones, a layer each."""
+    def places(self, chosen: slice) -> list[NDArray[np.intp]]:
+        """Where in that order the keypoints of a range of locations are, a layer each."""
         places, offset = [], 0
         for layer in self.layers:
-            own = chosen[: np.searchsorted(chosen, len(layer))]
+            own = np.arange(offset + chosen.start, offset + min(chosen.stop, len(layer)))
             if len(own):
-                places.append(offset + own)
+                places.append(own)
             offset += len(layer)
         return places
 
-    def blocks(self, chosen: NDArray[np.intp], most: int) -> Iterator[slice]:
-        """Ranges of some locations, ascending ones, with at most so many keypoints together, or with one location."""
+    def blocks(self, most: int) -> Iterator[slice]:
+        """All locations in ranges with at most so many keypoints together, or with one location."""
         counts = np.zeros(len(self), dtype=np.intp)
         for layer in self.layers:
             counts[: len(layer)] += 1
-        until = np.append(0, np.cumsum(counts[chosen]))
+        until = np.append(0, np.cumsum(counts))
         start = 0
-        while start < len(chosen):
+        while start < len(self):
             stop = max(start + 1, int(np.searchsorted(until, until[start] + most, side="right")) - 1)
             yield slice(start, stop)
             start = stop
@@ -235,31 +225,26 @@ def mutual_nearest(
     one, two = Locations.group(features1.points), Locations.group(features2.points)
     similarity = compare(features1.descriptors[one.order], features2.descriptors[two.order])
 
-    found = _two_best(similarity, one, two, np.arange(len(one)), block_bytes)
-    distinct = np.flatnonzero(found.ratio(similarity) < limit)
-    # Back again only from those that somebody is near to.
-    chosen, place = np.unique(found.nearest[distinct], return_inverse=True)
-    back = _two_best(similarity.swapped(), two, one, chosen, block_bytes).take(place)
-    found = replace(found.take(distinct), second=np.maximum(found.second[distinct], back.second))
+    found = _two_best(similarity, one, two, block_bytes)
     ratio = found.ratio(similarity)
-    mutual = (back.nearest == distinct) & (ratio < limit)
-    return _nearest_keypoints(similarity, one, two, distinct[mutual], found.nearest[mutual]), ratio[mutual]
+    chosen = np.flatnonzero(ratio < limit)
+    return _nearest_keypoints(similarity, one, two, chosen, found.nearest[chosen]), ratio[chosen]
 
 
 @dataclass(frozen=True)
 class _TwoBest:
-    """Of each location the nearest one in the other picture, its similarity, and that of the next one; shapes (L,)."""
+    """Of each location of picture 1 the nearest one in picture 2, and how alike they are; shapes (L,).
+
+    ``second`` is how alike the best other pair is that either of the two is in: where that is less than ``best``, the
+    two are each other's nearest.
+    """
 
     nearest: NDArray[np.intp]
     best: NDArray[Any]
     second: NDArray[Any]
 
-    def take(self, index: NDArray[np.intp]) -> "_TwoBest":
-        """Of some locations."""
-        return _TwoBest(self.nearest[index], self.best[index], self.second[index])
-
     def ratio(self, similarity: DescriptorSimilarity) -> FloatArray:
-        """Distance to the nearest over distance to the second nearest; infinite where both are as near."""
+        """Distance of the nearest over that of the best other pair; infinite where that is as near, or nearer."""
         ratio = np.full(len(self.best), np.inf)
         distinct = np.flatnonzero(self.best > self.second)
         nearest, second = (similarity.distance(each[distinct]) for each in (self.best, self.second))
@@ -267,21 +252,38 @@ class _TwoBest:
         return ratio
 
 
-def _two_best(
-    similarity: DescriptorSimilarity, one: Locations, two: Locations, chosen: NDArray[np.intp], block_bytes: int
-) -> _TwoBest:
-    """For some locations of picture 1, ascending; the descriptors are in the orders of the locations."""
-    nearest = np.empty(len(chosen), dtype=np.intp)
-    best, second = np.empty((2, len(chosen)), similarity.dtype)
-    for here in one.blocks(chosen, block_bytes // (similarity.bytes_each * len(two.order))):
-        layers = one.places(chosen[here])
+def _two_best(similarity: DescriptorSimilarity, one: Locations, two: Locations, block_bytes: int) -> _TwoBest:
+    """Both directions from one pass over the similarities; the descriptors are in the orders of the locations."""
+    nearest = np.empty(len(one), dtype=np.intp)
+    best, second = np.empty((2, len(one)), similarity.dtype)
+    # Of each location of picture 2, the most alike of those whose nearest it is not.
+    others = np.full(len(two), similarity.lowest, similarity.dtype)
+    for here in one.blocks(block_bytes // (similarity.bytes_each * len(two.order))):
+        layers = one.places(here)
         block = _merge(similarity.block(np.concatenate(layers)), layers, two)
         index = np.arange(len(block))
         nearest[here] = block.argmax(axis=1)
         best[here] = block[index, nearest[here]]
         block[index, nearest[here]] = similarity.lowest
         second[here] = block.max(axis=1)
-    return _TwoBest(nearest, best, second)
+        np.maximum(others, block.max(axis=0), out=others)
+    rivals = _rivals(nearest, best, similarity.lowest)
+    return _TwoBest(nearest, best, np.maximum.reduce([second, others[nearest], rivals]))
+
+
+def _rivals(nearest: NDArray[np.intp], best: NDArray[Any], lowest: float) -> NDArray[Any]:
+    """How alike another location of picture 1 is that has the same nearest, (L,).
+
+    Of the most alike of these that is the best of the others; of the rest one that is no less alike than themselves.
+    """
+    order = np.lexsort((best, nearest))
+    same = np.diff(nearest[order]) == 0
+    rival = np.full(len(order), lowest, best.dtype)
+    rival[1:][same] = best[order][:-1][same]
+    rival[:-1][same] = best[order][1:][same]
+    found = np.empty_like(rival)
+    found[order] = rival
+    return found
 
 
 def _merge(block: NDArray[Any], layers: list[NDArray[np.intp]], two: Locations) -> NDArray[Any]:

@@ -173,7 +173,7 @@ def main() -> None:
             sequence.write(place)
         for name, place, sequence in [*work, *((own.name, own, None) for own in given.folder)]:
             print_mosaic(name, place, sequence)
-            print_peers(sorted(path for path in place.iterdir() if path.suffix != ".csv"), given.peer_python)
+            print_peers(sorted(path.resolve() for path in place.iterdir() if path.suffix != ".csv"), given.peer_python)
     print(f"\nlargest memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
 
 
