@@ -112,7 +112,7 @@ class Cache:
         if kept:
             return kept[0]
         value = compute()
-        _keep(file, value)
+        self._keep(file, value)
         return value
 
     def stored(
@@ -130,7 +130,7 @@ class Cache:
         if _read(file, kinds, valid):
             return Stored(file, kinds, folder=self.temporary)
         value = compute()
-        return Stored(file, kinds, folder=self.temporary) if _keep(file, value) else Stored(value=value)
+        return Stored(file, kinds, folder=self.temporary) if self._keep(file, value) else Stored(value=value)
 
     def recall_many(
         self,
@@ -160,7 +160,7 @@ class Cache:
         missing = [index for index, kept in enumerate(found) if not kept]
         for index, value in zip(missing, compute(missing) if missing else [], strict=True):
             found[index] = [value]
-            _keep(files[index], value)
+            self._keep(files[index], value)
         return [kept[0] for kept in found]
 
     def _file(self, stage: str, inputs: tuple[Any, ...]) -> Path:
@@ -168,6 +168,21 @@ class Cache:
         assert self.folder is not None
         name = digest((_FORMAT, software(), stage, inputs))
         return self.folder / stage / name[:2] / name[2:]
+
+    def _keep(self, file: Path, value: Any) -> bool:
+        """Write a result, and whether that was possible: a full or read-only cache is no reason to stop.
+
+        What is of this run alone nobody reads before it is written.
+        """
+        with suppress(OSError):
+            data = pack((entry_name(file), value))
+            if self.temporary is None:
+                _write_at_once(file, data)
+            else:
+                file.parent.mkdir(parents=True, exist_ok=True)
+                file.write_bytes(data)
+            return True
+        return False
 
     def file(self, path: str | Path | None) -> str:
         """What stands for the content of a file in the inputs of a stage; empty without a file or a cache.
@@ -231,20 +246,12 @@ def _read(file: Path, kinds: tuple[type, ...], valid: Callable[[Value], bool]) -
     return []
 
 
-def _keep(file: Path, value: Any) -> bool:
-    """Write a result, and whether that was possible: a cache that has become full or read-only is no reason to stop."""
-    with suppress(OSError):
-        _write(file, pack((entry_name(file), value)))
-        return True
-    return False
-
-
 NO_CACHE = Cache()
 """Keeps nothing."""
 
 
-def _write(file: Path, data: bytes) -> None:
-    """Write a file at once; unlike an output it need not survive a loss of power, since damage is noticed.
+def _write_at_once(file: Path, data: bytes) -> None:
+    """Write a file, whole or not at all; unlike an output it need not survive a loss of power, since damage is noticed.
 
     Whoever may read and write in the folder of the cache may read and write the file.
     """

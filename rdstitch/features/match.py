@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
@@ -226,14 +227,12 @@ def _around(features: Features, size: tuple[int, int], points: FloatArray, reach
     """The features in the cells of a picture whose centre is within reach of one of the points."""
     middle = (np.arange(_CELLS) + 0.5) / _CELLS
     centres = np.stack(np.meshgrid(middle * size[0], middle * size[1]), axis=-1).reshape(-1, 2)
-    covered = np.logical_or.reduce(_distances(centres, points, size) < reach, axis=1)
+    covered = np.any(_distances(centres, points, size) < reach, axis=1)
     column, row = np.clip(features.points / size * _CELLS, 0, _CELLS - 1).astype(np.intp).T
     return np.flatnonzero(covered[row * _CELLS + column])
 
 
 def _distances(points: FloatArray, others: FloatArray, size: tuple[int, int]) -> FloatArray:
     """Between all points (N, 2) and all others (M, 2), diagonals of the picture, (N, M)."""
-    first, second = ((values / np.hypot(*size)).T for values in (points, others))
-    squared: FloatArray = (first[0, :, None] - second[0]) ** 2
-    squared += (first[1, :, None] - second[1]) ** 2
-    return np.sqrt(squared, out=squared)
+    diagonal = np.hypot(*size)
+    return cdist(points / diagonal, others / diagonal)
