@@ -1,13 +1,10 @@
-"""Memory of this process: what it holds, and how what earlier stages have freed goes back to the system."""
+"""Memory of this process: what it may take, and how what earlier stages have freed goes back to the system."""
 
 import ctypes
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from threading import Condition
 
-_USUAL = 180 * 2**20  # bytes; where the system does not say it: the libraries, and a few hundred registered pictures
 _BOUND, _BOUND_OF_A_PICTURE = 400 * 10**6, 150 * 10**3  # bytes; of the whole process
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # of mallopt
 _LARGE = 8 * 2**20  # bytes: more than any array of a tile, which are made again and again; less than a picture
@@ -45,11 +42,6 @@ def usual_bound(pictures: int) -> int:
     return _BOUND + _BOUND_OF_A_PICTURE * pictures
 
 
-def memory_left(pictures: int) -> int:
-    """Bytes that a process may still take for so many pictures within its usual bound; negative beyond it."""
-    return usual_bound(pictures) - _resident()
-
-
 class _Scratch:
     """Memory that the threads of this process take for a while, and give back."""
 
@@ -74,11 +66,3 @@ class _Scratch:
 
 
 scratch_memory = _Scratch().take
-
-
-def _resident() -> int:
-    """Bytes that this process holds now."""
-    with suppress(OSError, ValueError, LookupError, AttributeError):
-        pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
-        return int(pages) * os.sysconf("SC_PAGE_SIZE")
-    return _USUAL

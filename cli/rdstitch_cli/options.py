@@ -255,7 +255,7 @@ compositing = together(
     click.option(
         "--max-memory",
         type=Bytes(),
-        help="Memory that compositing may take, as 800M; otherwise up to 256M, or more for a large canvas.",
+        help="Memory that compositing may take, as 800M; otherwise 200M, or more for a large canvas.",
     ),
     _number("--scale", float, 1.0, "Factor to the size of the output; 1 keeps resolution."),
     _number(

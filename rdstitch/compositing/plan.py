@@ -12,10 +12,10 @@ from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.masked_pixels import OPACITY_BYTES
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.errors import LimitError
-from rdstitch.process_memory import memory_left
 
-# What the compositor takes at most by default; more memory means that fewer pictures are read twice.
-DEFAULT_MEMORY = 256 * 2**20
+# What the compositor takes at most by default; more memory means that fewer pictures are read twice. Beside it are the
+# libraries and the registered pictures, 190 MB for a few hundred of them: together within the usual bound of a process.
+DEFAULT_MEMORY = 200 * 2**20
 _TILE_SIZES = (512, 256)
 _MAX_WORKERS = 4
 _MAX_BANDS = 4
@@ -85,7 +85,7 @@ def plan_composite(
         When the limit is too low for the smallest tiles.
     """
     bands = options.bands or usual_bands(cameras)
-    limit = options.max_memory or min(DEFAULT_MEMORY, memory_left(len(cameras)))
+    limit = options.max_memory or DEFAULT_MEMORY
     opacity = OPACITY_BYTES if masked or any(part is not None for part in canvas.near) else 0
     picture = max(c.image_size[0] * c.image_size[1] for c in cameras) * (channels * itemsize + opacity)
     # While a picture is decoded it is there twice, beside those in the cache.

@@ -1,4 +1,4 @@
-"""What memory is left of the usual bound, and how threads share it."""
+"""How freed memory goes back or is kept, and how threads share what they take for a while."""
 
 import subprocess
 import sys
@@ -8,36 +8,29 @@ from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 
-import numpy as np
 import pytest
 
 from rdstitch import process_memory
-from rdstitch.process_memory import memory_left, return_freed_memory, scratch_memory
-
-
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system does not say what a process holds")
-def test_what_the_process_holds_counts() -> None:
-    return_freed_memory()
-    before = memory_left(0)
-    held = np.ones(50_000_000, dtype=np.uint8)
-    assert before - memory_left(0) == pytest.approx(held.nbytes, rel=0.1)
-    del held
-    return_freed_memory()
-    assert memory_left(0) == pytest.approx(before, abs=10e6)
-
+from rdstitch.process_memory import scratch_memory, usual_bound
 
 _LARGE_AND_SMALL = """
+from os import sysconf
 import numpy as np
-from rdstitch.process_memory import memory_left, return_freed_memory
+from rdstitch.process_memory import return_freed_memory
+
+def resident():
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * sysconf("SC_PAGE_SIZE")
+
 return_freed_memory()
 # After this the C library would put all up to this size onto its heap.
 np.ones(28_000_000, dtype=np.uint8)
-before, arrays, between = memory_left(0), [], []
+before, arrays, between = resident(), [], []
 for _ in range(8):
     arrays.append(np.ones(12_000_000, dtype=np.uint8))
     between.append(np.ones(3000, dtype=np.uint8))
 arrays.clear()
-print(before - memory_left(0))
+print(resident() - before)
 """
 
 
@@ -76,10 +69,9 @@ def test_what_each_picture_takes_is_reused_for_the_next() -> None:
     assert int(done.stdout) < 20_000  # pages; the arrays of a round have 9,800
 
 
-def test_the_bound_is_400_mb_and_150_kb_a_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(process_memory, "_resident", lambda: 100_000_000)
-    assert memory_left(0) == 300_000_000
-    assert memory_left(1000) == 450_000_000
+def test_the_bound_is_400_mb_and_150_kb_a_picture() -> None:
+    assert usual_bound(0) == 400_000_000
+    assert usual_bound(1000) == 550_000_000
 
 
 def test_threads_share_the_memory_that_they_give_back(monkeypatch: pytest.MonkeyPatch) -> None:
