@@ -24,6 +24,7 @@ from examples.paper.common.subprocesses import run_all
 from examples.paper.end_to_end import SETS
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.io.read import read_image
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
 from rdstitch.synthetic import Sequence, correspondences
 from tests.acceptance.rendered import geometry
@@ -118,20 +119,27 @@ class StageTimes:
 
 
 def print_mosaic(name: str, folder: Path, sequence: Sequence | None = None) -> None:
-    """One line: processor time, that of a picture, λ, pairs, errors against the truth where it is known; the stages."""
+    """A line: processor time, λ, pairs, errors against the truth where it is known; and one of the stages."""
     stages = StageTimes()
     options = rdstitch.StitchOptions(workers=1, overwrite=True, force=True)
     with TemporaryDirectory() as output:
         seconds, result = _timed(lambda: rdstitch.mosaic([folder], Path(output) / "out.jpg", options, progress=stages))
     alignment, pairs = result.registration.alignment, result.registration.pairs
     used, count = int(alignment.used.sum()), len(alignment.used)
-    line = f"{name:34s}{seconds:8.1f}{seconds / count:8.3f}  λ {alignment.distortion:+.5f}  {used}/{count} pictures"
-    line += f"  {len(pairs)} pairs"
+    line = _times(name, seconds, count, result.canvas.size)
+    line += f"  λ {alignment.distortion:+.5f}  {used}/{count} pictures  {len(pairs)} pairs"
     if sequence is not None:
         error = geometry(sequence, result, "similarity")
         line += f"  error {error.median:.3f}, 95 % {error.percentile95:.3f} px"
     print(line)
     print("    " + ", ".join(f"{stage} {taken:.1f}" for stage, taken in stages.spent.items() if taken > 0.05))
+
+
+def _times(name: str, seconds: float, pictures: int, size: tuple[int, int]) -> str:
+    """Processor time of the whole, of a picture, and of a megapixel of output; others leave pictures out."""
+    megapixels = size[0] * size[1] / 1e6
+    each = f"{seconds / megapixels:9.2f}" if megapixels else f"{'-':>9s}"
+    return f"{name:34s}{seconds:8.1f}{seconds / pictures:10.3f}{each}"
 
 
 def print_peers(files: list[Path], peer_python: str | None) -> None:
@@ -140,11 +148,11 @@ def print_peers(files: list[Path], peer_python: str | None) -> None:
     for stitcher in stitchers:
         if stitcher.name in _COMPARED:
             with TemporaryDirectory() as folder:
-                done = run_all(stitcher.commands(files, Path(folder) / "out.tif", 60.0), Path(folder), 600.0)
+                output = Path(folder) / "out.tif"
+                done = run_all(stitcher.commands(files, output, 60.0), Path(folder), 600.0)
+                height, width = read_image(output).pixels.shape[:2] if output.exists() else (0, 0)
             status = "time is up" if done.status is None else f"exit status {done.status}"
-            print(
-                f"{stitcher.name:34s}{done.processor_seconds:8.1f}{done.processor_seconds / len(files):8.3f}  {status}"
-            )
+            print(f"{_times(stitcher.name, done.processor_seconds, len(files), (width, height))}  {status}")
     print(*notes, sep="\n")
 
 
@@ -159,7 +167,7 @@ def main() -> None:
     given = parser.parse_args()
     if given.pairs:
         print_pairs(given.pairs)
-    print(f"\n{'processor time of mosaic, s':34s}{'whole':>8s}{'a picture':>10s}")
+    print(f"\n{'processor time of mosaic, s':34s}{'whole':>8s}{'a picture':>10s}{'a Mpx':>9s}")
     with TemporaryDirectory() as folder:
         work: list[tuple[str, Path, Sequence | None]] = []
         if given.views:
