@@ -71,12 +71,14 @@ def match_crossings(
         found = find_crossings(prepare(sources[k].view(_MEGAPIXELS), _MEGAPIXELS, stretch=stretch))
         return (found + 0.5) * (np.array(former.cameras[k].image_size) / sources[k].camera.image_size) - 0.5
 
-    used = np.flatnonzero(former.used).tolist()
-    with ThreadPoolExecutor(workers) as pool:
-        crossings = dict(zip(used, pool.map(crossings_of, used), strict=True))
+    crossings: dict[int, FloatArray] = {}
     by_crossings = aligned
     for _ in range(_ROUNDS):
         alignment = by_crossings.alignment
+        # Pictures that keypoints did not place may be placed by the crossings of others.
+        new = [k for k in np.flatnonzero(alignment.used).tolist() if k not in crossings]
+        with ThreadPoolExecutor(workers) as pool:
+            crossings.update(zip(new, pool.map(crossings_of, new), strict=True))
         pairs = [
             _matched(pair, alignment, crossings, aligner.threshold)
             if (pair.image1, pair.image2) in alignment.support
