@@ -13,6 +13,7 @@ from rdstitch.alignment.lens_selection import CENTER, ENOUGH_PICTURES, WORTH_SAY
 from rdstitch.alignment.link_equations import whitened_errors
 from rdstitch.alignment.model_selection import ModelChoice
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
+from rdstitch.alignment.noise_model import EXACTNESS
 from rdstitch.alignment.planarity import coherence, judge_relief
 from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPoses, ShapeTest
 from rdstitch.alignment.rotation_frame import levelled
@@ -87,6 +88,8 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
     observations = problem.observations
     errors = whitened_errors(observations, adjusted.homographies, lens)
     inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
+    # No lens or plane is exact enough for matches that are off by less to disagree.
+    agreeing = adjusted.squared <= (ALIGNMENT_WIDTH * math.hypot(adjusted.sigma, EXACTNESS)) ** 2
     relief = judge_relief(coherence(observations, errors, inliers), fit.model.name, len(observations))
     considered = _considered(found, lens_covariance, rough=relief.found)
     # Most pictures are of one camera.
@@ -118,8 +121,8 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
         lens_reason=found.lens.reason,
         parameters=names,
         covariance=covariance,
-        rms=float(np.sqrt(adjusted.squared[inliers].mean())) if inliers.any() else math.nan,
-        links=_link_fits(found, inliers),
+        rms=float(np.sqrt(adjusted.squared[agreeing].mean())) if agreeing.any() else math.nan,
+        links=_link_fits(found, agreeing),
         relief=relief,
         shape=_shape(found),
         messages=_warnings(found, own),
@@ -257,7 +260,7 @@ def _groups(found: AdjustedPictures) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(group) for group in ordered)
 
 
-def _link_fits(found: AdjustedPictures, inliers: BoolArray) -> tuple[LinkFit, ...]:
+def _link_fits(found: AdjustedPictures, agreeing: BoolArray) -> tuple[LinkFit, ...]:
     """How well each link agrees, in the order of the links given."""
     problem, squared = found.problem, found.choice.fit.adjusted.squared
     observations = problem.observations
@@ -275,8 +278,8 @@ def _link_fits(found: AdjustedPictures, inliers: BoolArray) -> tuple[LinkFit, ..
             result.append(LinkFit(link.image1, link.image2, len(link), 0, math.nan, False, why))
             continue
         own = slice(observations.start[row], observations.start[row + 1])
-        good = squared[own][inliers[own]]
-        share = len(good) / max(len(inliers[own]), 1)
+        good = squared[own][agreeing[own]]
+        share = len(good) / max(len(agreeing[own]), 1)
         rms = float(np.sqrt(good.mean())) if len(good) else float(medians[row])
         result.append(LinkFit(link.image1, link.image2, len(link), round(share * len(link)), rms, True))
     return tuple(result)

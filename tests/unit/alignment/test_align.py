@@ -327,3 +327,17 @@ def test_small_tilts_do_not_ask_for_a_short_focal_length() -> None:
     found = _run(given, model="tilting", lens="division")
     assert found.focal is not None
     assert abs(math.log(found.focal * given.cameras[0].half_diagonal / 520.0)) < 0.3
+
+
+def test_matches_off_by_less_than_a_lens_is_exact_agree() -> None:
+    """Where most links are of crossings that are exact to 0.03 px, 0.2 px are no contradiction; 2 px are one."""
+    rng = np.random.default_rng(5)
+    given = scene(grid(4, 3, (0.35, 0.3), 0.2, rng), noise=0.03, outliers=0.0, rng=rng)
+    for size, agrees in ((0.2, True), (2.0, False)):
+        first = given.links[0]
+        angle = rng.uniform(0.0, 2.0 * np.pi, len(first.points2))
+        off = first.points2 + size * np.column_stack([np.cos(angle), np.sin(angle)])
+        links = [replace(first, points2=off), *given.links[1:]]
+        fit = _run(replace(given, links=links)).links[0]
+        assert fit.used
+        assert (fit.inliers > 0.9 * fit.count) == agrees
