@@ -12,12 +12,13 @@ from rdstitch.features.keypoints import Features
 from rdstitch.features.learned import AlikedDetection
 from rdstitch.features.opencv import OpenCVDetection
 from rdstitch.features.options import CLOSER, FeatureOptions
-from rdstitch.features.picture import Mask, PixelArray, PreparedPicture, View, prepare
+from rdstitch.features.picture import CLIP_LIMIT, Mask, PixelArray, PreparedPicture, View, prepare
 from rdstitch.features.sift_tiles import LARGE, SiftTilesDetection
 from rdstitch.features.surf.descriptor import SurfDetection
 from rdstitch.opencv_state import one_opencv_thread
 
 _MIN_KEYPOINT_SHARE = 0.5  # of the keypoints wanted: where a reduced picture shows fewer, a larger one is used
+_LASTING = 0.5  # share of the keypoints that must be seen at less contrast, too; of fewer, contrast is what is missing
 
 
 class Detection(Protocol):
@@ -140,7 +141,9 @@ def _detect(source: ViewLoader, options: FeatureOptions) -> Features:
     """The same for a picture that is loaded as large as it is needed."""
     most, megapixels = options.limits
     picture, detection, usable = _look(source, options, megapixels)
-    if megapixels is not None and picture.reduced and len(usable) < _MIN_KEYPOINT_SHARE * most:
+    shown, few = len(usable), len(usable) < _MIN_KEYPOINT_SHARE * most
+    faint = few and len(_usable(picture, _find_at_less_contrast(picture, options))) <= _LASTING * shown
+    if megapixels is not None and picture.reduced and few:
         picture, detection, usable = _look(source, options, CLOSER * megapixels)
     points, response = detection.points[usable], detection.response[usable]
     if options.spread:
@@ -152,7 +155,8 @@ def _detect(source: ViewLoader, options: FeatureOptions) -> Features:
     # Some detectors return them in an order of their own.
     features = features.take(strongest(features.response, len(features)))
     scale = features.scale * float(np.sqrt(picture.factor.prod()))
-    return replace(features, points=picture.to_full_size(features.points), scale=scale, image_size=picture.full_size)
+    points = picture.to_full_size(features.points)
+    return replace(features, points=points, scale=scale, image_size=picture.full_size, shown=shown, faint=faint)
 
 
 def _look(
@@ -161,5 +165,14 @@ def _look(
     """The picture at most so large, what is found in it, and which of that may count."""
     picture = prepare(source(megapixels), megapixels, stretch=options.stretch, equalize=bool(options.equalize))
     detection = find(picture.grey, options)
-    usable = np.flatnonzero(picture.covers(detection.points, detection.scale / 2))
-    return picture, detection, usable
+    return picture, detection, _usable(picture, detection)
+
+
+def _usable(picture: PreparedPicture, detection: Detection) -> NDArray[np.intp]:
+    """Which keypoints keep clear of the mask."""
+    return np.flatnonzero(picture.covers(detection.points, detection.scale / 2))
+
+
+def _find_at_less_contrast(picture: PreparedPicture, options: FeatureOptions) -> Detection:
+    """What is found where differences of grey levels are divided by what equalization multiplies them by at most."""
+    return find(np.rint(picture.grey / CLIP_LIMIT).astype(np.uint8), options)

@@ -41,6 +41,12 @@ class Features:
         What detected and described them; features of different kinds cannot be compared.
     image_size : (int, int), optional
         Width and height of the picture, pixels.
+    shown : int, optional
+        Keypoints that the picture shows at its working size, before any were chosen, or a larger picture was used for
+        want of them; None where that is not known.
+    faint : bool
+        Whether these are few, and most of them only just strong enough: they are not seen at the contrast divided by
+        what equalizing it locally multiplies it by at most.
 
     Raises
     ------
@@ -56,6 +62,8 @@ class Features:
     laplacian_sign: NDArray[np.int8] | None
     kind: str
     image_size: tuple[int, int] | None = None
+    shown: int | None = None
+    faint: bool = False
 
     def __post_init__(self) -> None:
         count = len(self.points)

@@ -18,7 +18,8 @@ Mask = NDArray[Any]
 """Of bool or uint8."""
 
 _STRETCH_PERCENTILES = (0.1, 99.9)
-_CLIP_LIMIT, _CLIP_TILES = 4.0, 8
+CLIP_LIMIT = 4.0
+_CLIP_TILES = 8
 """Of contrast-limited adaptive histogram equalization (Zuiderveld 1994): largest slope, and tiles along a side."""
 
 Stretch = tuple[float, float]
@@ -117,7 +118,7 @@ def prepare(
             usable = cv2.resize(usable.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
     grey = _eight_bits(_grey(image), usable, stretch)
     if equalize:
-        grey = np.asarray(cv2.createCLAHE(_CLIP_LIMIT, (_CLIP_TILES, _CLIP_TILES)).apply(grey), np.uint8)
+        grey = np.asarray(cv2.createCLAHE(CLIP_LIMIT, (_CLIP_TILES, _CLIP_TILES)).apply(grey), np.uint8)
     shrink = view.reduction * np.array([width / grey.shape[1], height / grey.shape[0]])
     clearance = None
     if usable is not None:

@@ -32,6 +32,10 @@ class StoredFeatures:
         Those that are wanted, in their order; None: all.
     most : int, optional
         Only so many of these, the first ones.
+    shown : int
+        Keypoints that the picture shows at its working size, see :class:`rdstitch.features.Features`.
+    faint : bool
+        Whether these are few and weak.
     """
 
     stored: Stored[PackedFeatures]
@@ -39,11 +43,20 @@ class StoredFeatures:
     image_size: Size | None = None
     chosen: NDArray[np.intp] | None = None
     most: int | None = None
+    shown: int = 0
+    faint: bool = False
 
     @classmethod
     def of(cls, features: Features) -> Self:
         """Features that stay in memory."""
-        return cls(Stored(value=PackedFeatures.pack(features)), len(features))
+        return cls.at(Stored(value=PackedFeatures.pack(features)))
+
+    @classmethod
+    def at(cls, stored: Stored[PackedFeatures]) -> Self:
+        """Features wherever they lie; they are read once."""
+        features = stored.load().features
+        shown = len(features) if features.shown is None else features.shown
+        return cls(stored, len(features), shown=shown, faint=features.faint)
 
     def __len__(self) -> int:
         """Number of features."""

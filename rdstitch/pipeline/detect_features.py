@@ -12,6 +12,7 @@ from functools import partial
 
 import numpy as np
 
+from rdstitch.arrays import IntArray
 from rdstitch.cache import Cache
 from rdstitch.errors import InputError
 from rdstitch.executors import in_order
@@ -131,7 +132,7 @@ def _detected(source: Source, task: DetectionTask) -> StoredFeatures:
     stored = store.stored(
         "features", (PackedFeatures, Features), inputs, compute, lambda found: _are_of(source, found.unpack())
     )
-    return StoredFeatures(stored, len(stored.load().features))
+    return StoredFeatures.at(stored)
 
 
 def _are_of(source: Source, features: Features) -> bool:
@@ -190,7 +191,7 @@ def detect_by_contrast(
     wanted = [sources[k] for k in chosen]
     own = options.stretch or _stretch_of(wanted, options, executor, store)
     again = detect(wanted, replace(options, stretch=own, equalize=True))
-    if np.median(again.features.counts) <= np.median(detected.features.counts[list(chosen)]):
+    if np.median(_shown(again.features.items)) <= np.median(_shown(detected.features.items)[list(chosen)]):
         return DetectionByContrast(detected, stretch, ())
     items = dict(enumerate(detected.features.items)) | dict(zip(chosen, again.features.items, strict=True))
     merged = replace(detected, features=FeatureStore(tuple(items.values())))
@@ -198,15 +199,25 @@ def detect_by_contrast(
 
 
 def _show_little(sources: Sequence[Source], detected: DetectedFeatures, options: FeatureOptions) -> list[int]:
-    """The pictures that show few features for their size, or for what the set shows."""
+    """The pictures that show few features for their size, or for what the set shows, for want of contrast.
+
+    Counted are those of the working size: that there are more pixels, in which more is found, is no contrast. A board
+    of black and white squares shows few, but strong ones; equalization would only add the noise of what is plain.
+    """
     most, megapixels = options.limits
-    counts, found = detected.features.counts, []
+    counts, found = np.minimum(_shown(detected.features.items), most), []
     usual = float(np.median(np.delete(counts, list(detected.damaged)))) if len(detected.damaged) < len(counts) else 0.0
     for index, (source, count) in enumerate(zip(sources, counts.tolist(), strict=True)):
         size = np.prod(source.metadata.size) / source.reduction(megapixels) ** 2 / 1e6
-        if index not in detected.damaged and count < _LOW_SHARE * min(most, max(_USUAL_DENSITY * size, usual)):
+        few = count < _LOW_SHARE * min(most, max(_USUAL_DENSITY * size, usual))
+        if few and detected.features.items[index].faint and index not in detected.damaged:
             found.append(index)
     return found
+
+
+def _shown(features: Sequence[StoredFeatures]) -> IntArray:
+    """Keypoints that each picture shows at its working size, (N,)."""
+    return np.array([item.shown for item in features], dtype=np.intp)
 
 
 def _stretch_of(sources: Sequence[Source], options: FeatureOptions, executor: Executor, store: Cache) -> Stretch | None:

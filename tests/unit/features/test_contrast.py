@@ -7,7 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 import rdstitch
+from rdstitch.camera import Camera
+from rdstitch.features import FeatureOptions, detect
 from rdstitch.features.picture import View, common_stretch, usual_stretch
+from rdstitch.synthetic import Photometry, PictureTexture, grid_poses, sequence_over
 from tests.cli.running import flight
 
 _OPTIONS = rdstitch.StitchOptions(workers=1, channel_order="rgb", features=rdstitch.FeatureOptions(max_features=800))
@@ -74,3 +77,30 @@ def test_a_picture_unlike_the_rest_does_not_decide() -> None:
     assert common_stretch([None, (5.0, 9.0)]) == (5.0, 9.0)
     assert common_stretch([None]) is None
     assert usual_stretch(View(np.zeros((4, 4), np.uint8), np.zeros((4, 4), np.bool_))) is None
+
+
+def test_a_board_shows_few_features_but_no_little_contrast() -> None:
+    """Equalized, the noise of its plain squares would drown them."""
+    lens = Camera((640, 480), distortion=-0.25, focal=600.0)
+    squares = np.kron(np.indices((10, 16)).sum(axis=0) % 2, np.ones((110, 110)))
+    poses = grid_poses(lens, 3, 1, overlap=0.7, yaw=0.2, shift=0.05, seed=3).shaken(seed=4, tilt=0.12)
+    plane = PictureTexture((60 + 130 * squares).astype(np.uint8))
+    frames = sequence_over(plane, lens, poses, photometry=Photometry(noise=0.012, blur=0.7)).frames() * 3
+    found = rdstitch.calibrate(frames, rdstitch.StitchOptions(workers=1))
+    assert not any(message.code == "low-contrast" for message in found.warnings)
+    assert found.alignment.used.all()
+
+
+def test_that_there_are_more_pixels_is_no_contrast(frames: list[NDArray[np.uint8]]) -> None:
+    hazy = _hazy(frames)[0]
+    options = FeatureOptions(max_features=800, work_megapixels=hazy.shape[0] * hazy.shape[1] / 1e6)
+    small, large = (detect(np.kron(hazy, np.ones((k, k, 1), np.uint8)), options) for k in (1, 2))
+    assert small.shown == large.shown
+    assert small.faint
+    assert large.faint
+    blank = detect(np.zeros((40, 40), np.uint8), options)
+    assert blank.shown == 0
+    assert blank.faint
+    clear = detect(frames[0], options)
+    assert (clear.shown or 0) > 400
+    assert not clear.faint
