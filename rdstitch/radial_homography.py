@@ -187,7 +187,7 @@ def transfer_jacobian(
     return TransferJacobian(d.T, d_by_z, lifted, by_point, along_third.T, (d / (g * stretch)).T, r2, rho2)
 
 
-def measurement_whitening(by_point: FloatArray) -> FloatArray:
+def measurement_whitening(by_point: FloatArray, common: FloatArray | None = None) -> FloatArray:
     """Whitening of a transfer error whose noise comes from both pictures (Sampson's weighting).
 
     A point measured with the same noise in both pictures is transferred with covariance ``I + J J'``,
@@ -198,6 +198,9 @@ def measurement_whitening(by_point: FloatArray) -> FloatArray:
     ----------
     by_point : ndarray of shape (N, 2, 2)
         Derivative of the transferred by the original point, both in pixels.
+    common : ndarray of shape (N, 2), optional
+        A random displacement of the transferred point besides, of one standard deviation, over that of the noise: its
+        square is added to the covariance.
 
     Returns
     -------
@@ -207,6 +210,8 @@ def measurement_whitening(by_point: FloatArray) -> FloatArray:
     xx = (1.0 + np.einsum("ni,ni->n", a, a)) / 2.0
     yy = (1.0 + np.einsum("ni,ni->n", b, b)) / 2.0
     xy = np.einsum("ni,ni->n", a, b) / 2.0
+    if common is not None:
+        xx, yy, xy = xx + common[:, 0] ** 2, yy + common[:, 1] ** 2, xy + common[:, 0] * common[:, 1]
     whitening = np.zeros_like(by_point)
     conditional = xx - xy**2 / yy
     whitening[:, 0, 0] = 1.0 / np.sqrt(conditional)

@@ -113,7 +113,7 @@ class Problem:
         """
         if not others and not model.shared_names and self.count > _LONG_CHAIN:
             others = [self.fit(SIMILARITY)]
-        starts = [self._taken_over(model, other) for other in others]
+        starts = [self.taken_over(model, other) for other in others]
         if self.warm is not None and isinstance(model, PlanarModel):
             spread = self.warm.tilt_spread if model is self.warm.model else None
             return self.refine(model, self._nearest(model, [self.warm.start_of(model), *starts]), spread)
@@ -248,7 +248,7 @@ class Problem:
             steps = steps[:1]
         return [model.shared_from_physical(physical + np.array([*step, 0.0])) for step in steps]
 
-    def _taken_over(self, model: MotionModel, other: Fit) -> Parameters:
+    def taken_over(self, model: MotionModel, other: Fit) -> Parameters:
         """Another model's solution as this model's start."""
         parameters = other.adjusted.parameters
         if isinstance(model, PlanarModel) and isinstance(other.model, PlanarModel):

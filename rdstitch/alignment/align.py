@@ -23,6 +23,7 @@ from rdstitch.alignment.noise_model import EXACTNESS
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.options import AlignmentOptions
 from rdstitch.alignment.position_priors import hold_positions
+from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.alignment.turn_or_plane import choose_motion
@@ -113,16 +114,17 @@ def align(
     problem = replace(problem, overdispersion=noise_of_links(problem)[0].overdispersion)
     choice = None if former is None else _choose_from(former, cameras, problem, pictures, options, chosen.refinements)
     choice = choice or choose_motion(problem, options.models, chosen.refinements)
-    graph = replace(graph, free_lens=choice.fit.free_lens)
-    choice, pictures, wrong = _drop_wrong_pairs(graph, problem, pictures, choice, wrong)
+    held = replace(graph, free_lens=choice.fit.free_lens)
+    choice, pictures, wrong = _drop_wrong_pairs(held, problem, pictures, choice, wrong)
+    choice = choose_over_relief(graph.problem(~wrong, pictures)[0], choice, options.models)
 
     report("adjustment")
     if choice.fit.model is ROTATION and most_matches_read(len(links), options) is None:
         # Few pictures of a turn hardly determine the focal length; all their matches are used.
         everything, _ = _observations(links, cameras, _MATCHES_OF_A_TURN // len(links))
-    full = replace(graph, observations=everything)
+    full = replace(graph, observations=everything, free_lens=choice.fit.free_lens)
     problem, _ = full.problem(~wrong, pictures, choice.overdispersion)
-    fit = problem.refine(choice.fit.model, choice.fit.adjusted.parameters, choice.fit.tilt_spread)
+    problem, fit = adjust_over_relief(problem, choice)
     problem, fit = with_third_coefficient(problem, fit) if options.lens_chosen else (problem, fit)
     problem, fit, disagreement = hold_positions(problem, fit)
     found = AdjustedPictures(

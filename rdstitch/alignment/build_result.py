@@ -7,10 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Problem
+from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.lens_description import radius_std
 from rdstitch.alignment.lens_selection import CENTER, ENOUGH_PICTURES, WORTH_SAYING, LensChoice
-from rdstitch.alignment.link_equations import whitened_errors
+from rdstitch.alignment.lens_uncertainty import considered_covariance
+from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.model_selection import ModelChoice
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
 from rdstitch.alignment.noise_model import EXACTNESS
@@ -19,7 +21,7 @@ from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPos
 from rdstitch.alignment.rotation_frame import levelled
 from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.alignment.sandwich import sandwich_covariance
-from rdstitch.alignment.shape_test import UNLIKELY_FOCAL, beside_usual_focal, judge_shape
+from rdstitch.alignment.shape_test import judge_shape
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS, Camera
 from rdstitch.errors import ImpossibleCameraError
@@ -80,18 +82,23 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
     problem, fit = found.problem, found.choice.fit
     adjusted, planar = fit.adjusted, isinstance(fit.model, PlanarModel)
     shared, lens = fit.model.physical_parameters(adjusted.parameters.shared)[0], adjusted.parameters.lens
-    covariance = _covariance(found, problem.free_lens)
+    covariance = _covariance(found)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     names = (*fit.model.shared_names, *_names_of(problem.free_lens))
     focal = float(np.exp(shared[-1])) if fit.model.shared_names else None
     lens_covariance = _lens_covariance(names, covariance)
-    observations = problem.observations
+    # What is reported is how far points are off, whatever moved them.
+    observations = replace(problem.observations, relief=None)
     errors = whitened_errors(observations, adjusted.homographies, lens)
-    inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
+    squared = squared_lengths(errors)
+    sigma = sigma_of(squared[observations.scale_inliers_mask])
+    inliers = squared <= (ALIGNMENT_WIDTH * sigma) ** 2
     # No lens or plane is exact enough for matches that are off by less to disagree.
-    agreeing = adjusted.squared <= (ALIGNMENT_WIDTH * math.hypot(adjusted.sigma, EXACTNESS)) ** 2
+    agreeing = squared <= (ALIGNMENT_WIDTH * math.hypot(sigma, EXACTNESS)) ** 2
     relief = judge_relief(coherence(observations, errors, inliers), fit.model.name, len(observations))
-    considered = _considered(found, lens_covariance, rough=relief.found)
+    considered = lens_covariance
+    if found.observable and problem.free_lens[0]:
+        considered = considered_covariance(problem, fit, rough=relief.found)
     # Most pictures are of one camera.
     adjusted_cameras = {
         c: _adjusted_camera(found, c, lens, (lens_covariance, considered), focal) for c in dict.fromkeys(found.cameras)
@@ -121,8 +128,8 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
         lens_reason=found.lens.reason,
         parameters=names,
         covariance=covariance,
-        rms=float(np.sqrt(adjusted.squared[agreeing].mean())) if agreeing.any() else math.nan,
-        links=_link_fits(found, agreeing),
+        rms=float(np.sqrt(squared[agreeing].mean())) if agreeing.any() else math.nan,
+        links=_link_fits(found, squared, agreeing),
         relief=relief,
         shape=_shape(found),
         messages=_warnings(found, own),
@@ -139,36 +146,12 @@ def _shape(found: AdjustedPictures) -> ShapeTest | None:
     return replace(judged, image=int(pictures[judged.image]))
 
 
-def _covariance(found: AdjustedPictures, free_lens: BoolArray) -> FloatArray:
+def _covariance(found: AdjustedPictures) -> FloatArray:
     """Covariance of the named parameters, where λ was estimated for errors that are not independent."""
     fit = found.choice.fit
     if not (found.observable and found.problem.free_lens[0]):
         return fit.adjusted.covariance
-    return sandwich_covariance(replace(found.problem, free_lens=free_lens).adjuster_of(fit), fit.adjusted)
-
-
-def _considered(found: AdjustedPictures, covariance: FloatArray, *, rough: bool) -> FloatArray:
-    """Covariance (5, 5) of all parameters of a lens, also of those that were not freed: consider parameters (Schmidt
-    1966).
-
-    That a lens of fewer parameters explains the pictures does not make it the lens. What they leave open of the others,
-    within what lenses usually have, moves λ where these pictures show nothing. So does a focal length that next to no
-    lens has: something else bends the pictures, and λ may be what goes with the usual one. Where the ground is
-    ``rough`` that is known, and in the covariance.
-    """
-    problem, fit = found.problem, found.choice.fit
-    if not (found.observable and problem.free_lens[0]):
-        return covariance
-    every = np.ones_like(problem.free_lens)
-    if not problem.free_lens.all():
-        covariance = _covariance(found, every)[-len(every) :, -len(every) :]
-    beside = beside_usual_focal(problem, fit)
-    if not rough and abs(beside) > UNLIKELY_FOCAL * problem.camera_priors.log_focal_std:
-        together = replace(problem, free_lens=every).adjuster_of(fit).covariance(fit.adjusted)
-        focal = len(fit.model.shared_names) - 1
-        moved = together[-len(every) :, focal] * (beside / together[focal, focal])
-        covariance = covariance + np.outer(moved, moved)
-    return covariance
+    return sandwich_covariance(found.problem.adjuster_of(fit), fit.adjusted)
 
 
 def _names_of(lens: BoolArray) -> list[str]:
@@ -260,10 +243,9 @@ def _groups(found: AdjustedPictures) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(group) for group in ordered)
 
 
-def _link_fits(found: AdjustedPictures, agreeing: BoolArray) -> tuple[LinkFit, ...]:
+def _link_fits(found: AdjustedPictures, squared: FloatArray, agreeing: BoolArray) -> tuple[LinkFit, ...]:
     """How well each link agrees, in the order of the links given."""
-    problem, squared = found.problem, found.choice.fit.adjusted.squared
-    observations = problem.observations
+    observations = found.problem.observations
     medians = link_medians(squared, observations)
     pictures = found.pictures
     rows = {

@@ -206,7 +206,8 @@ def _transferred(
     homography = np.repeat(homographies[first:last], counts, axis=0)
     distortion, higher, center = split_lens(lens)
     found = transfer_jacobian(homography, distortion, observations.points1[rows] - center, higher)
-    whitening = measurement_whitening(found.by_point * (scale2 / scale1)) * scale2
+    relief = None if observations.relief is None else observations.relief[rows]
+    whitening = measurement_whitening(found.by_point * (scale2 / scale1), relief) * scale2
     error = (found.points - (observations.points2[rows] - center)).T
     return _Transferred(found, whitening, error, whiten(whitening, error))
 

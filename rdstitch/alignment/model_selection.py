@@ -59,11 +59,14 @@ class ModelChoice:
     reason : str
     overdispersion : float
         Of the freest model's errors, see :class:`rdstitch.alignment.planarity.Coherence`.
+    over_relief : bool
+        Whether it was chosen with heights of the ground that account for errors along the parallax.
     """
 
     fit: Fit
     reason: str
     overdispersion: float
+    over_relief: bool = False
 
 
 def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolArray] = ()) -> ModelChoice:
@@ -100,6 +103,21 @@ def choose_model(problem: Problem, names: Sequence[str], lenses: Sequence[BoolAr
     if cameras and len(fits) > len(cameras) and _beyond_one_camera(problem, fits[best], fits[-1]):
         best = len(fits) - 1
     return ModelChoice(fits[best], _reason(fits, best, list(names)), noise.overdispersion)
+
+
+def least_costly(problem: Problem, fits: Sequence[Fit]) -> ModelChoice:
+    """The best of some models of one camera, which were adjusted to the problem, from the least to the most free."""
+    noise = _noise_of_fit(problem, fits[-1])
+    costs = [fit_cost(noise, problem, fit) if has_plausible_focal(fit) else math.inf for fit in fits]
+    best = int(np.argmin(costs))
+    reason = _reason(fits, best, [fit.model.name for fit in fits])
+    return ModelChoice(fits[best], reason, noise.overdispersion)
+
+
+def evidence_against(problem: Problem, free: Fit, fit: Fit) -> float:
+    """By how much the cost of the freer of two fits exceeds that of the other."""
+    noise = _noise_of_fit(problem, free)
+    return fit_cost(noise, problem, free) - fit_cost(noise, problem, fit)
 
 
 def has_plausible_focal(fit: Fit) -> bool:

@@ -36,6 +36,9 @@ class Observations:
         Correspondences that each link had before thinning.
     reach : float
         Radius in half diagonals out to which a lens must be one-to-one: the corners, unless a given one is not.
+    relief : ndarray of shape (M, 2), optional
+        By how much a standard deviation of the ground's height moves each point in the second picture, over the
+        standard deviation of the noise, see :mod:`rdstitch.alignment.relief_weights`; none over a plane.
     """
 
     image1: IntArray
@@ -47,6 +50,7 @@ class Observations:
     scale2: FloatArray
     matches: IntArray
     reach: float = 1.0
+    relief: FloatArray | None = None
 
     @classmethod
     def from_links(cls, links: Sequence[Link], cameras: Sequence[Camera], most: int | None = None) -> Self:
@@ -129,6 +133,7 @@ class Observations:
             self.scale2[chosen],
             self.matches[chosen],
             self.reach,
+            None if self.relief is None else self.relief[rows],
         )
 
     def thinned(self, most: int) -> Self:
@@ -136,7 +141,8 @@ class Observations:
         kept = [spread_choice(self.points1[a:b], most) + a for a, b in itertools.pairwise(self.start)]
         rows = np.concatenate([np.empty(0, dtype=np.intp), *kept])
         start = np.concatenate([[0], np.cumsum([len(k) for k in kept])]).astype(np.intp)
-        return replace(self, start=start, points1=self.points1[rows], points2=self.points2[rows])
+        relief = None if self.relief is None else self.relief[rows]
+        return replace(self, start=start, points1=self.points1[rows], points2=self.points2[rows], relief=relief)
 
     def as_independent_pairs(self) -> Self:
         """Every link on its own: link l is between the pictures 2l and 2l + 1."""

@@ -1,26 +1,26 @@
 """What relief does to a lens: hills are laid under the pictures, and the adjustment answers them.
 
 Relief moves all points of a place together, in every picture that shows it, and a part of that the parameters absorb:
-hills as wide as an overlap are fitted by its homography and by λ. What is left over, that the errors of neighbours
-agree, shows how high the hills are, and by how much they can have moved λ, if how wide they are is known. Here they are
-taken to be of all widths, and equally steep, as most ground roughly is (a power law; Mandelbrot 1975). The answers to
-waves of all these widths give both: the agreement that they leave, and how far they move λ.
+hills as wide as an overlap are fitted by its homography and by λ. What is left over shows how high and how wide the
+hills are, and by how much they can have moved λ: errors agree from one neighbour to the next, and over some distance.
+The answers to waves of all widths give both, the agreement that they leave at every distance, and how far they move λ.
+Hills of the widths that leave little are taken to be as steep as the others, as most ground roughly is (a power law;
+Mandelbrot 1975).
 """
 
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
+from scipy.optimize import nnls
 
 from rdstitch.alignment.linear_response import Fields, LinearResponse
-from rdstitch.alignment.link_equations import LinearizedErrors, split_lens
-from rdstitch.alignment.motion_models import inverses
-from rdstitch.alignment.planarity import neighbours
-from rdstitch.alignment.rotation_model import ROTATION
+from rdstitch.alignment.link_equations import LinearizedErrors
+from rdstitch.alignment.parallax import Parallax
+from rdstitch.alignment.planarity import apart, neighbours
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.division_model import distort, undistort
-from rdstitch.radial_homography import project
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 _SHORTEST, _LONGEST = 0.5, 6.0
@@ -29,17 +29,17 @@ _SHORTEST, _LONGEST = 0.5, 6.0
 _WAVES = 32
 """Waves, each as a sine and a cosine."""
 
-_AT_ONCE, _FEW_LINKS = 8, 4000
-"""Waves that are answered together; of so few links all of them, with less than 10 kB a link."""
+_BANDS = 4
+"""Of wavelengths, about an octave each, whose waves are answered together."""
+
+_DISTANCES = (0.25, 0.5, 1.0, 2.0)
+"""Half diagonals: beyond those of neighbours, between which the agreement of errors is measured, too."""
+
+_FEWEST = 20
+"""Pairs that say anything of a distance."""
 
 _NOISE_FIELDS = 16
 """Fields of independent errors that show what their absorption leaves of agreement between neighbours."""
-
-_STEP = 1e-4
-"""Heights, of differences."""
-
-_ASIDE = 0.3
-"""Half diagonals from the middle of a picture, where its size on the ground is measured."""
 
 
 @dataclass(frozen=True)
@@ -56,53 +56,63 @@ class ReliefField:
     def covariance(self) -> FloatArray:
         """Covariance (S, S) of the shared parameters by relief.
 
-        By relief of the height at which it leaves the agreement of neighbours that was found, beyond that of
-        independent errors. These agree less than not at all, since the parameters absorb what they have in common.
+        By relief of the heights at which it leaves the agreement of errors that was found, at every distance, beyond
+        that of independent errors. These agree less than not at all, since the parameters absorb what they have in
+        common.
         """
         count = len(self.response.normal.gradient_shared)
-        common = self._common()
-        if common == 0.0:
+        found, std = self._agreement()
+        if not len(found) or found[0] <= 0.0:
             return np.zeros((count, count))
-        step = _WAVES if len(self.response.adjuster.observations) <= _FEW_LINKS else _AT_ONCE
+        step = _WAVES // _BANDS
         answers = [self._answers(self._waves(start, step), 2 * step) for start in range(0, _WAVES, step)]
-        agreement = float(np.mean([own for own, _ in answers]))
-        moved = np.mean([own for _, own in answers], axis=0)
-        covariance: FloatArray = moved * (common / agreement) if agreement > 0.0 else np.zeros((count, count))
+        power = _spectrum(np.stack([left for left, _ in answers], axis=1), found, std)
+        covariance: FloatArray = np.einsum("b,bst->st", power, np.stack([moved for _, moved in answers]))
         return covariance
 
-    def _common(self) -> float:
-        """Mean product of the errors of neighbours, px², beyond what the absorption of independent errors leaves."""
-        first, second = self._neighbours
-        if not len(first):
-            return 0.0
+    def _agreement(self) -> tuple[FloatArray, FloatArray]:
+        """Mean products (D,) of the errors at each distance, px², beyond what the absorption of independent errors
+        leaves, and their standard deviations.
+        """
+        pairs = self._pairs
+        if not pairs:
+            return np.zeros(0), np.zeros(0)
+        o = self.response.adjuster.observations
         errors = np.concatenate([part.errors for part in self.response.parts()])
-        products = np.einsum("mi,mi->m", errors[first], errors[second])
-        power = float((errors[np.unique(np.concatenate([first, second]))] ** 2).mean())
-        return max(float(products.mean()) - power * self._answers(_independent, _NOISE_FIELDS)[0], 0.0)
+        power = float((errors[np.unique(np.concatenate(pairs[0]))] ** 2).mean())
+        independent = power * self._answers(_independent, _NOISE_FIELDS)[0]
+        found, std = np.empty(len(pairs)), np.empty(len(pairs))
+        for k, (first, second) in enumerate(pairs):
+            products = np.einsum("mi,mi->m", errors[first], errors[second])
+            mean = float(products.mean())
+            # Errors of a link depend on each other.
+            by_link = np.bincount(o.link[first], products - mean, len(o))
+            found[k], std[k] = mean - independent[k], np.sqrt((by_link**2).sum()) / len(first)
+        return found, std
 
-    def _answers(self, fields: Fields, columns: int) -> tuple[float, FloatArray]:
-        """Agreement of neighbours, px², that fields leave, and products (S, S) of the steps of the shared parameters.
-
-        Both in the mean over the fields.
+    def _answers(self, fields: Fields, columns: int) -> tuple[FloatArray, FloatArray]:
+        """Agreement (D,) at each distance, px², that fields leave, and products (S, S) of the steps of the shared
+        parameters, both in the mean over the fields.
         """
         poses, shared = self.response.steps_of(fields, columns)
-        first, second = self._neighbours
-        agreement = 0.0
+        agreement = np.zeros(len(self._pairs))
         for part in self.response.parts():
-            own = slice(*np.searchsorted(first, [part.rows.start, part.rows.stop]).tolist())
             left = fields(part) + self.response.changes(part, poses, shared)
-            a, b = (left[rows[own] - part.rows.start] for rows in (first, second))
-            agreement += float(np.einsum("mic,mic->", a, b))
-        return agreement / (len(first) * columns), shared @ shared.T / columns
+            for k, (first, second) in enumerate(self._pairs):
+                own = slice(*np.searchsorted(first, [part.rows.start, part.rows.stop]).tolist())
+                a, b = (left[rows[own] - part.rows.start] for rows in (first, second))
+                agreement[k] += float(np.einsum("mic,mic->", a, b)) / (len(first) * columns)
+        return agreement, shared @ shared.T / columns
 
     def _waves(self, start: int, count: int) -> Fields:
         """Sines and cosines of some of the waves, from the ``start``-th."""
-        waves = _wave_vectors(self._is_turn)[start : start + count] / self._size
+        size = self._parallax.size
+        waves = _wave_vectors(self._parallax.is_turn)[start : start + count] / size
         # Equally steep, waves are the higher the longer they are.
-        height = 1.0 / np.linalg.norm(waves * self._size, axis=1)
+        height = 1.0 / np.linalg.norm(waves * size, axis=1)
 
         def fields(part: LinearizedErrors) -> FloatArray:
-            place, parallax = self._parallax(part)
+            place, parallax = self._parallax.of(part)
             phase = place @ waves.T
             heights = np.concatenate([height * np.cos(phase), height * np.sin(phase)], axis=1)
             field: FloatArray = parallax[:, :, None] * heights[:, None, :]
@@ -110,84 +120,48 @@ class ReliefField:
 
         return fields
 
-    @property
-    def _is_turn(self) -> bool:
-        return self.response.adjuster.model is ROTATION
+    @cached_property
+    def _parallax(self) -> Parallax:
+        return Parallax(self.response.adjuster, self.response.adjusted)
 
     @cached_property
-    def _neighbours(self) -> tuple[IntArray, IntArray]:
-        """Pairs of neighbours, each once, by the first of each."""
-        adjusted = self.response.adjusted
+    def _pairs(self) -> list[tuple[IntArray, IntArray]]:
+        """Pairs of inliers of a link, by the first of each: neighbours, and those at each of the greater distances."""
+        adjusted, o = self.response.adjusted, self.response.adjuster.observations
         inliers: BoolArray = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
-        pairs = np.sort(np.stack(neighbours(self.response.adjuster.observations, inliers)), axis=0)
-        first, second = np.unique(pairs, axis=1)
-        return first, second
+        nearest = np.unique(np.sort(np.stack(neighbours(o, inliers)), axis=0), axis=1)
+        if not nearest.size:
+            return []
+        first, second = apart(o, inliers)
+        distance = np.linalg.norm(o.points1[first] - o.points1[second], axis=1)
+        found = [(nearest[0], nearest[1])]
+        for low, high in pairwise(_DISTANCES):
+            chosen = (low <= distance) & (distance < high)
+            if chosen.sum() >= _FEWEST:
+                found.append((first[chosen], second[chosen]))
+        return found
 
-    @cached_property
-    def _back(self) -> FloatArray:
-        """Picture-to-plane homographies, or those to directions, (N, 3, 3)."""
-        return inverses(self.response.adjusted.matrices.matrices)
 
-    def _places(self, lifted: FloatArray) -> FloatArray:
-        """Places (m, 2) on the plane, or directions (m, 3), of homogeneous ones (m, 3)."""
-        if not self._is_turn:
-            return np.nan_to_num(project(lifted))
-        unit: FloatArray = lifted / np.linalg.norm(lifted, axis=1, keepdims=True)
-        return np.nan_to_num(unit)
+def _spectrum(left: FloatArray, found: FloatArray, std: FloatArray) -> FloatArray:
+    """Mean squares (B,) of the heights of the bands of waves, in those of waves that are equally steep.
 
-    @cached_property
-    def _centres(self) -> FloatArray:
-        """What each picture's centre shows, (N, 2 or 3)."""
-        return self._places(self._back[:, :, 2])
-
-    @cached_property
-    def _sizes(self) -> FloatArray:
-        """Of half a diagonal of each picture on the plane, or between directions, (N,)."""
-        aside = [self._places(self._back @ np.array([x, y, 1.0])) for x, y in ((_ASIDE, 0.0), (0.0, _ASIDE))]
-        away = [np.linalg.norm(places - self._centres, axis=1) / _ASIDE for places in aside]
-        sizes: FloatArray = np.maximum((away[0] + away[1]) / 2.0, 1e-12)
-        return sizes
-
-    @cached_property
-    def _size(self) -> float:
-        """Of half a diagonal of most pictures."""
-        return float(np.median(self._sizes))
-
-    @cached_property
-    def _shifts(self) -> FloatArray:
-        """Of the camera away from where it turns, one a picture, (N, 2): any, since nothing is known of them."""
-        return np.random.default_rng(0).normal(size=(len(self._back), 2))
-
-    @np.errstate(all="ignore")  # what lies beyond a horizon has no place
-    def _parallax(self, part: LinearizedErrors) -> tuple[FloatArray, FloatArray]:
-        """The places (m, 2 or 3) of correspondences, and the errors (m, 2), pixels, of ground one unit higher there.
-
-        The unit does not matter, since how high the ground is shows in the errors.
-        """
-        o, lens = self.response.adjuster.observations, self.response.adjusted.parameters.lens
-        link = o.link[part.rows]
-        distortion, higher, centre = split_lens(lens)
-        flat = undistort(o.points1[part.rows] - centre, distortion, higher)
-        lifted = np.column_stack([flat, np.ones(len(flat))])
-        place = self._places(np.einsum("mij,mj->mi", self._back[o.image1[link]], lifted))
-        moved = [self._moved(place, pictures[link]) for pictures in (o.image1, o.image2)]
-        errors = np.einsum("mij,mj->mi", part.by_point1, moved[0]) + np.einsum("mij,mj->mi", part.by_point2, moved[1])
-        return place, np.nan_to_num(errors, posinf=0.0, neginf=0.0)
-
-    def _moved(self, place: FloatArray, pictures: IntArray) -> FloatArray:
-        """By how much measured points (m, 2) of places move in their pictures (m,) with the height of the ground."""
-        if self._is_turn:
-            shift: FloatArray = self._shifts[pictures]
-            return shift
-        lens, matrices = self.response.adjusted.parameters.lens, self.response.adjusted.matrices.matrices[pictures]
-        distortion, higher, _ = split_lens(lens)
-        away = (place - self._centres[pictures]) / self._sizes[pictures, None]
-        ends = []
-        for step in (_STEP, -_STEP):
-            there = np.column_stack([place + step * self._size * away, np.ones(len(place))])
-            ends.append(distort(project(np.einsum("mij,mj->mi", matrices, there)), distortion, higher))
-        moved: FloatArray = (ends[0] - ends[1]) / (2.0 * _STEP)
-        return moved
+    Parameters
+    ----------
+    left : ndarray of shape (D, B)
+        Agreement at each distance that each band leaves.
+    found, std : ndarray of shape (D,)
+        What was found, and its standard deviation.
+    """
+    steep = found[0] / float(left[0].mean()) if left[0].mean() > 0.0 else 0.0
+    if steep <= 0.0:
+        return np.zeros(left.shape[1])
+    bands = left.shape[1]
+    weight = 1.0 / np.maximum(std, 1e-12)
+    # What the errors do not show is as of equally steep waves: an octave may have next to nothing or twice as much.
+    equations = np.concatenate([left * (steep / bands) * weight[:, None], np.eye(bands)])
+    power = nnls(equations, np.concatenate([found * weight, np.ones(bands)]))[0]
+    scaled: FloatArray = power * (steep / bands)
+    return scaled
 
 
 def _independent(part: LinearizedErrors) -> FloatArray:

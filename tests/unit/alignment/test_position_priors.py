@@ -15,8 +15,9 @@ _HEIGHT = 300.0
 
 @cache
 def _strip(relief: float) -> Scene:
+    """Of 30 pictures: a shorter one keeps its shape without positions."""
     rng = np.random.default_rng(1)
-    return scene(grid(12, 1, (0.4, 0.1), 0.1, rng), per_link=50, relief=relief, rng=rng, focal_source="exif", reach=2)
+    return scene(grid(30, 1, (0.4, 0.1), 0.1, rng), per_link=50, relief=relief, rng=rng, focal_source="exif", reach=2)
 
 
 def _positions(given: Scene, std: float) -> FloatArray:

@@ -1,0 +1,141 @@
+"""Over rough ground an error along the parallax says little of the camera, one across it as much as over a plane.
+
+The height of a place moves it in one picture against the other along the line between the cameras, and along that alone
+(plane and parallax; Kumar, Anandan and Hanna 1994). So heights are taken for random: their scatter is found from how
+much larger errors are along the parallax than across it, and the covariance of an error is that of the noise and of the
+heights together. Without that, a camera bends the strip, tilts and takes an odd focal length to follow hills.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from rdstitch.alignment.adjustment_problem import Fit, Problem
+from rdstitch.alignment.lens_selection import leaves_noise
+from rdstitch.alignment.link_equations import linearized_errors
+from rdstitch.alignment.model_selection import ModelChoice, least_costly, noise_of_links
+from rdstitch.alignment.motion_models import POSE, SIMILARITY, TILTING, PlanarModel
+from rdstitch.alignment.parallax import Parallax
+from rdstitch.arrays import FloatArray
+
+_FEWEST = 3
+"""Pictures: of two, tilts do what heights do, and the errors do not show which."""
+
+_ROUNDS, _SETTLED = 4, 0.02
+"""Of finding the scatter of the heights and adjusting again, and by how much it still changes at the end: at first the
+camera has followed the hills, so that it is found too small."""
+
+_NORMAL_MEDIAN, _MEDIAN_STD = 0.4549, 2.333
+"""Median of the square of a normal variable of variance 1; the standard deviation of the median of N such squares, in
+medians and times the root of N."""
+
+_SIGNIFICANT = 3.0
+"""Standard deviations of the logarithm of their ratio by which errors along the parallax must exceed those across."""
+
+_BISECTIONS = 40
+
+
+def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[str]) -> ModelChoice:
+    """The model of one camera chosen again, with heights that account for errors, where such heights show.
+
+    Without a free distortion centre, which over rough ground bends the whole as the ground bends the pictures.
+
+    Parameters
+    ----------
+    problem : Problem
+    choice : ModelChoice
+        Of this problem.
+    names : sequence of str
+        The models to choose among.
+    """
+    # Where neighbours hardly agree, errors along the parallax are none of the ground: blobs have them, seen obliquely.
+    rough = problem.count >= _FEWEST and not leaves_noise(choice.fit.adjusted, problem.observations)
+    if not rough or weighted_by_relief(problem, choice.fit) is problem:
+        return choice
+    problem = replace(problem, overdispersion=choice.overdispersion)
+    fits: list[Fit] = []
+    # From the least free one: a camera that is free to tilt has already followed the hills.
+    for model in (SIMILARITY, TILTING):
+        if model.name in names and choice.fit.model is not POSE:
+            start = problem.refine(model, problem.taken_over(model, fits[-1])) if fits else problem.fit(model)
+            problem, fit = _settled(problem, start)
+            fits.append(fit)
+    if not fits:
+        return replace(choice, fit=_settled(problem, choice.fit)[1], over_relief=True)
+    return replace(least_costly(problem, [_refined(problem, fit) for fit in fits]), over_relief=True)
+
+
+def adjust_over_relief(problem: Problem, choice: ModelChoice) -> tuple[Problem, Fit]:
+    """The chosen fit adjusted to a problem with more observations, and the problem with what heights do to these."""
+    if choice.over_relief:
+        return _settled(problem, choice.fit)
+    return problem, _refined(problem, choice.fit)
+
+
+def weighted_by_relief(problem: Problem, fit: Fit) -> Problem:
+    """The problem with what heights add to the covariances of its errors; as it is where no heights show.
+
+    Of one camera over a plane only.
+    """
+    if not isinstance(fit.model, PlanarModel) or problem.count < _FEWEST:
+        return problem
+    plain = replace(problem, observations=replace(problem.observations, relief=None))
+    adjuster, adjusted, o = plain.adjuster_of(fit), fit.adjusted, plain.observations
+    field = Parallax(adjuster, adjusted)
+    errors, parallax, moved = (np.zeros_like(o.points1) for _ in range(3))
+    for part in linearized_errors(o, adjusted.homographies, adjusted.parameters.lens, adjuster.free.lens):
+        errors[part.rows], parallax[part.rows] = part.errors, field.of(part)[1]
+        seen = part.by_point2[:, 0, 0] != 0.0
+        # Without the whitening, in half diagonals of the second picture.
+        moved[part.rows][seen] = np.linalg.solve(-part.by_point2[seen], parallax[part.rows][seen, :, None])[:, :, 0]
+    scatter = _scatter(errors, parallax, noise_of_links(plain)[0].effective)
+    if scatter == 0.0:
+        return problem if problem.observations.relief is None else plain
+    return replace(problem, observations=replace(o, relief=scatter * moved * o.scale2[o.link, None]))
+
+
+def _settled(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
+    """A problem and a fit that go with each other."""
+    size = math.inf
+    for _ in range(_ROUNDS):
+        problem = weighted_by_relief(problem, fit)
+        fit = _refined(problem, fit)
+        relief, former = problem.observations.relief, size
+        size = 0.0 if relief is None else float(np.median(np.linalg.norm(relief, axis=1)))
+        if abs(size - former) <= _SETTLED * size:
+            break
+    return problem, fit
+
+
+def _refined(problem: Problem, fit: Fit) -> Fit:
+    return problem.refine(fit.model, fit.adjusted.parameters, fit.tilt_spread)
+
+
+def _scatter(errors: FloatArray, parallax: FloatArray, effective: float) -> float:
+    """Standard deviation of the heights over that of the noise, in units per pixel; 0 where none is significant.
+
+    Parameters
+    ----------
+    errors, parallax : ndarray of shape (M, 2)
+        Whitened errors, pixels, and those of ground one unit higher.
+    effective : float
+        Independent coordinates of the errors.
+    """
+    length = np.linalg.norm(parallax, axis=1)
+    moving = length > 0.0
+    length, errors = length[moving], errors[moving]
+    direction = parallax[moving] / length[:, None]
+    along = np.einsum("mi,mi->m", errors, direction) ** 2
+    across = (errors[:, 1] * direction[:, 0] - errors[:, 0] * direction[:, 1]) ** 2
+    noise = float(np.median(across)) / _NORMAL_MEDIAN if len(across) else 0.0
+    least = math.exp(_SIGNIFICANT * _MEDIAN_STD * math.sqrt(2.0 / (effective / 2.0)))
+    if noise <= 0.0 or float(np.median(along)) <= least * noise * _NORMAL_MEDIAN:
+        return 0.0
+    low, high = 0.0, float((np.sqrt(along) / length).max())
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2.0
+        higher = np.median(along / (noise + (middle * length) ** 2)) > _NORMAL_MEDIAN
+        low, high = (middle, high) if higher else (low, middle)
+    return high / math.sqrt(noise)

@@ -1,0 +1,96 @@
+"""Heights of the ground explain errors along the parallax, and nothing else moves with them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rdstitch.alignment import AlignmentOptions, align
+from rdstitch.alignment.adjustment_problem import Fit, Problem
+from rdstitch.alignment.model_selection import ModelChoice
+from rdstitch.alignment.motion_models import SIMILARITY
+from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.relief_weights import choose_over_relief, weighted_by_relief
+from rdstitch.radial_homography import measurement_whitening
+from tests.alignment_scenes import Scene, grid, scene
+
+
+def _scene(relief: float, seed: int = 0) -> Scene:
+    rng = np.random.default_rng(seed)
+    return scene(grid(3, 2, (0.4, 0.3), 0.2, rng), rng=rng, relief=relief)
+
+
+def _fitted(given: Scene) -> tuple[Problem, Fit]:
+    observations = Observations.from_links(given.links, given.cameras)
+    count = len(given.cameras)
+    known = AlignmentOptions().camera_priors(given.cameras)
+    homographies = np.stack([link.relation.homography for link in given.links])
+    free = np.arange(5) == 0
+    trust = np.ones(len(given.links))
+    lens = np.array([given.distortion, 0.0, 0.0, 0.0, 0.0])
+    problem = Problem(observations, homographies, trust, count, 0, lens, free, known)
+    return problem, problem.fit(SIMILARITY)
+
+
+@pytest.mark.parametrize("relief", [0.03, 0.08])
+def test_hills_hardly_move_the_lens(relief: float) -> None:
+    """By errors that all count alike λ is off by 0.005 and 0.012 in the root mean square."""
+    errors, misses = [], []
+    for seed in range(6):
+        given = _scene(relief, seed)
+        found = align(given.cameras, given.links, AlignmentOptions(model="similarity"))
+        errors.append(found.distortion - given.distortion)
+        misses.append(abs(errors[-1]) / found.distortion_std)
+        assert found.relief.found
+    assert np.sqrt(np.mean(np.square(errors))) < 0.001
+    assert max(misses) < 3.0
+
+
+def test_over_a_plane_nothing_changes() -> None:
+    problem, fit = _fitted(_scene(0.0))
+    choice = ModelChoice(fit, "", 1.0)
+    assert weighted_by_relief(problem, fit) is problem
+    assert choose_over_relief(problem, choice, ["similarity", "tilting"]) is choice
+
+
+def test_of_two_pictures_tilts_do_what_heights_do() -> None:
+    given = _scene(0.08)
+    pair = replace(given, cameras=given.cameras[:2], links=[k for k in given.links if max(k.image1, k.image2) == 1])
+    problem, fit = _fitted(pair)
+    assert weighted_by_relief(problem, fit) is problem
+
+
+def test_heights_are_found_as_they_scatter() -> None:
+    """Of ``sin sin`` hills they scatter by half of the amplitude, which moves points by that share of the parallax."""
+    problem, fit = _fitted(_scene(0.08))
+    choice = choose_over_relief(problem, ModelChoice(fit, "", 1.0), ["similarity"])
+    weighted = weighted_by_relief(problem, choice.fit)
+    relief = weighted.observations.relief
+    assert relief is not None
+    noise = choice.fit.adjusted.sigma
+    o = problem.observations
+    moved = np.linalg.norm(relief, axis=1) * noise
+    baseline = np.linalg.norm((o.points2 - o.points1) * o.scale1[o.link, None], axis=1)
+    # Of pictures that hardly turn, a place as high as the amplitude moves by that share of how far it moves anyway.
+    assert 0.02 < np.median(moved / baseline) < 0.08
+    assert 0.25 < noise < 0.6
+
+
+def test_a_common_displacement_adds_its_square_to_the_covariance() -> None:
+    rng = np.random.default_rng(0)
+    by_point, common = rng.normal(size=(5, 2, 2)), rng.normal(size=(5, 2))
+    whitening = measurement_whitening(by_point, common)
+    covariance = (np.eye(2) + by_point @ np.swapaxes(by_point, 1, 2)) / 2.0 + common[:, :, None] * common[:, None, :]
+    np.testing.assert_allclose(np.linalg.inv(np.swapaxes(whitening, 1, 2) @ whitening), covariance, rtol=1e-9)
+
+
+def test_the_displacements_go_with_their_observations() -> None:
+    problem, fit = _fitted(_scene(0.08))
+    o = weighted_by_relief(problem, fit).observations
+    assert o.relief is not None
+    few, thin = o.subset(np.array([2, 0])), o.thinned(20)
+    for own in (few, thin):
+        assert own.relief is not None
+        assert own.relief.shape == own.points1.shape
+        rows = [int(np.flatnonzero((o.points1 == point).all(axis=1))[0]) for point in own.points1]
+        np.testing.assert_array_equal(own.relief, o.relief[rows])
