@@ -13,12 +13,13 @@ from dataclasses import replace
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.lens_selection import leaves_noise
-from rdstitch.alignment.link_equations import linearized_errors
+from rdstitch.alignment.link_equations import linearized_errors, whitened_errors
 from rdstitch.alignment.model_selection import ModelChoice, least_costly, noise_of_links
 from rdstitch.alignment.motion_models import POSE, SIMILARITY, TILTING, PlanarModel
 from rdstitch.alignment.parallax import Parallax
+from rdstitch.alignment.planarity import coherence, judge_relief
 from rdstitch.arrays import FloatArray
+from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 _FEWEST = 3
 """Pictures: of two, tilts do what heights do, and the errors do not show which."""
@@ -50,9 +51,7 @@ def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[st
     names : sequence of str
         The models to choose among.
     """
-    # Where neighbours hardly agree, errors along the parallax are none of the ground: blobs have them, seen obliquely.
-    rough = problem.count >= _FEWEST and not leaves_noise(choice.fit.adjusted, problem.observations)
-    if not rough or weighted_by_relief(problem, choice.fit) is problem:
+    if not _is_rough(problem, choice.fit) or weighted_by_relief(problem, choice.fit) is problem:
         return choice
     problem = replace(problem, overdispersion=choice.overdispersion)
     fits: list[Fit] = []
@@ -94,6 +93,17 @@ def weighted_by_relief(problem: Problem, fit: Fit) -> Problem:
     if scatter == 0.0:
         return problem if problem.observations.relief is None else plain
     return replace(problem, observations=replace(o, relief=scatter * moved * o.scale2[o.link, None]))
+
+
+def _is_rough(problem: Problem, fit: Fit) -> bool:
+    """Whether the ground moves points, and not by next to nothing.
+
+    Where neighbours hardly agree, errors along the parallax are none of the ground: blobs have them, seen obliquely.
+    """
+    o, adjusted = problem.observations, fit.adjusted
+    errors = whitened_errors(o, adjusted.homographies, adjusted.parameters.lens)
+    inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
+    return judge_relief(coherence(o, errors, inliers), fit.model.name, len(o)).found
 
 
 def _settled(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
