@@ -20,7 +20,7 @@ from rdstitch.alignment.camera_priors import CameraPriors
 from rdstitch.alignment.link_equations import whitened_errors
 from rdstitch.alignment.noise_model import NoiseModel
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.planarity import coherence
+from rdstitch.alignment.planarity import Coherence, coherence
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS
 from rdstitch.division_model import distort, undistort
@@ -211,9 +211,14 @@ def shows_center(adjusted: BundleAdjustmentResult, observations: Observations) -
 
 def leaves_noise(adjusted: BundleAdjustmentResult, observations: Observations) -> bool:
     """Whether the errors of neighbours hardly agree, so that they are noise."""
+    return left_coherence(adjusted, observations).correlation < NO_COHERENCE
+
+
+def left_coherence(adjusted: BundleAdjustmentResult, observations: Observations) -> Coherence:
+    """How much the errors of neighbours agree that an adjustment leaves."""
     errors = whitened_errors(observations, adjusted.homographies, adjusted.parameters.lens)
     inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
-    return coherence(observations, errors, inliers).correlation < NO_COHERENCE
+    return coherence(observations, errors, inliers)
 
 
 @dataclass(frozen=True)

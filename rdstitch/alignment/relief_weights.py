@@ -13,13 +13,13 @@ from dataclasses import replace
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.link_equations import linearized_errors, whitened_errors
+from rdstitch.alignment.lens_selection import left_coherence
+from rdstitch.alignment.link_equations import linearized_errors
 from rdstitch.alignment.model_selection import ModelChoice, least_costly, noise_of_links
 from rdstitch.alignment.motion_models import POSE, SIMILARITY, TILTING, PlanarModel
 from rdstitch.alignment.parallax import Parallax
-from rdstitch.alignment.planarity import coherence, judge_relief
+from rdstitch.alignment.planarity import judge_relief
 from rdstitch.arrays import FloatArray
-from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 _FEWEST = 3
 """Pictures: of two, tilts do what heights do, and the errors do not show which."""
@@ -100,10 +100,8 @@ def _is_rough(problem: Problem, fit: Fit) -> bool:
 
     Where neighbours hardly agree, errors along the parallax are none of the ground: blobs have them, seen obliquely.
     """
-    o, adjusted = problem.observations, fit.adjusted
-    errors = whitened_errors(o, adjusted.homographies, adjusted.parameters.lens)
-    inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
-    return judge_relief(coherence(o, errors, inliers), fit.model.name, len(o)).found
+    left = left_coherence(fit.adjusted, problem.observations)
+    return judge_relief(left, fit.model.name, len(problem.observations)).found
 
 
 def _settled(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
