@@ -14,7 +14,6 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from scipy.optimize import nnls
 
 from rdstitch.alignment.linear_response import Fields, LinearResponse
 from rdstitch.alignment.link_equations import LinearizedErrors
@@ -155,6 +154,9 @@ def _spectrum(left: FloatArray, found: FloatArray, std: FloatArray) -> FloatArra
     steep = found[0] / float(left[0].mean()) if left[0].mean() > 0.0 else 0.0
     if steep <= 0.0:
         return np.zeros(left.shape[1])
+    # Imported late: where no relief shows, nobody should wait for SciPy's optimizers.
+    from scipy.optimize import nnls
+
     bands = left.shape[1]
     weight = 1.0 / np.maximum(std, 1e-12)
     # What the errors do not show is as of equally steep waves: an octave may have next to nothing or twice as much.
