@@ -4,7 +4,7 @@ Each solver's plain RANSAC gives a motion for every pair of consecutive frames. 
 without adjustment, and where the adjustment starts. Beside them stands what rdstitch does of its own.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from rdstitch.alignment.bundle_adjustment import (
 )
 from rdstitch.alignment.motion_models import RIGID, YAW, X, Y
 from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.priors import Prior
 from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
 from rdstitch.arrays import FloatArray
@@ -134,9 +135,8 @@ def _adjusted(d: Drive, start: Trajectory, tilt: tuple[float, float], distortion
     poses = np.zeros((count, 6))
     poses[:, YAW], poses[:, [X, Y]] = start.yaw, start.position * focal
     links = [Link(p.image1, p.image2, p.points1, p.points2, _any_relation(d)) for p in d.pairs]
-    none = Priors.none(RIGID, count)
-    focal_prior = np.array([0.0, 0.0, _FOCAL_STD**-2.0])
-    known = Priors(natural, focal_prior, none.lens, none.lens_precision, none.poses, none.poses_precision)
+    focal_prior = Prior(((1.0, float(natural[2]), _FOCAL_STD),))
+    known = replace(Priors.none(RIGID, count), shared=(Prior(), Prior(), focal_prior))
     free = FreeParameters.fixing(RIGID, count, [0], np.array([name == "distortion" for name in LENS_PARAMETERS]))
     adjuster = BundleAdjuster(RIGID, Observations.from_links(links, cameras), free, known)
     lens = np.zeros(len(LENS_PARAMETERS))

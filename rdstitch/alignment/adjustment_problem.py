@@ -15,6 +15,7 @@ from rdstitch.alignment.bundle_adjustment import (
 from rdstitch.alignment.camera_priors import CameraPriors
 from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.initialization import MAX_ITERATIONS, adjust_pairs_independently
+from rdstitch.alignment.link_equations import whitened_errors
 from rdstitch.alignment.metric_upgrade import metric_upgrade
 from rdstitch.alignment.motion_models import (
     HOMOGRAPHY,
@@ -26,7 +27,8 @@ from rdstitch.alignment.motion_models import (
     PlanarModel,
 )
 from rdstitch.alignment.observations import Observations
-from rdstitch.alignment.rotation_model import FOCAL_STARTS, ROTATION
+from rdstitch.alignment.planarity import coherence
+from rdstitch.alignment.rotation_model import FOCAL_STARTS
 from rdstitch.alignment.warm_start import WarmStart
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.matching.match_graph import spanning_tree
@@ -48,6 +50,9 @@ _TILT_SPREAD_START = math.radians(3.0)
 _MIN_TILT_SPREAD = math.radians(0.05)
 _TILT_SPREAD_ROUNDS = 3
 
+_SETTLED_OVERDISPERSION = 1.5
+"""Times by which the overdispersion of a model's errors may exceed that of the links without a second adjustment."""
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -61,12 +66,15 @@ class Fit:
         Lens parameters that were estimated.
     tilt_spread : float
         Standard deviation of the pictures' own tilts, radians; 0 where the model has none.
+    overdispersion : float
+        Of the errors that it leaves, at least that of the problem; see :class:`BundleAdjuster`.
     """
 
     model: MotionModel
     adjusted: BundleAdjustmentResult
     free_lens: BoolArray
     tilt_spread: float = 0.0
+    overdispersion: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -128,7 +136,21 @@ class Problem:
         return self.adjuster(model).squared(parameters)
 
     def refine(self, model: MotionModel, start: Parameters, tilt_spread: float | None = None) -> Fit:
-        """Adjust a model from a given start."""
+        """Adjust a model from a given start; again where its errors count for less than was thought.
+
+        What neighbours share in the errors belongs to the model: where that is large, priors count for more.
+        """
+        fit = self._refined(model, start, tilt_spread)
+        adjusted, observations = fit.adjusted, self.observations
+        errors = whitened_errors(observations, adjusted.homographies, adjusted.parameters.lens)
+        inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
+        shared = coherence(observations, errors, inliers).overdispersion
+        if shared <= _SETTLED_OVERDISPERSION * self.overdispersion:
+            return replace(fit, overdispersion=self.overdispersion)
+        again = replace(self, overdispersion=shared)._refined(model, adjusted.parameters, fit.tilt_spread or None)
+        return replace(again, overdispersion=shared)
+
+    def _refined(self, model: MotionModel, start: Parameters, tilt_spread: float | None) -> Fit:
         if model is POSE and self.camera_priors.attitudes_std is None:
             return Fit(model, self._run(model, start, POSE_TILT_SPREAD), self.free_lens, POSE_TILT_SPREAD)
         if not self._has_free_tilts(model) or self.camera_priors.attitudes_std is not None:
@@ -166,7 +188,8 @@ class Problem:
 
     def adjuster_of(self, fit: Fit) -> BundleAdjuster:
         """Of a fit, with the priors on it."""
-        return self.adjuster(fit.model, fit.tilt_spread or 1.0, fit.adjusted.parameters.shared)
+        own = replace(self, overdispersion=fit.overdispersion)
+        return own.adjuster(fit.model, fit.tilt_spread or 1.0, fit.adjusted.parameters.shared)
 
     def adjuster(
         self, model: MotionModel, tilt_spread: float = _TILT_SPREAD_START, shared: FloatArray | None = None
@@ -230,7 +253,7 @@ class Problem:
                 model, sample, own, shared, lens, self.free_lens, priors, self.camera_priors.attitudes, iterations
             )
 
-        starts = self._shared_to_try(model, priors.shared)
+        starts = self._shared_to_try(model)
         if len(starts) == 1:
             return adjusted(starts[0], self.lens, MAX_ITERATIONS)
         trials = [adjusted(shared, self.lens, _TRIAL_ITERATIONS) for shared in starts]
@@ -239,14 +262,15 @@ class Problem:
         best = trials[int(np.argmin(cost))].parameters
         return adjusted(best.shared, best.lens, MAX_ITERATIONS)
 
-    def _shared_to_try(self, model: MotionModel, physical: FloatArray) -> list[FloatArray]:
+    def _shared_to_try(self, model: MotionModel) -> list[FloatArray]:
         """Focal lengths; or shared parameters for the known or zero tilt, and for four around it, 0.2 radians away."""
-        if model is ROTATION:
-            return [np.array([log_focal]) for log_focal in (*physical, *FOCAL_STARTS)]
+        known = self.camera_priors
+        if model.on_sphere:
+            return [np.array([log_focal]) for log_focal in (known.log_focal, *FOCAL_STARTS)]
         steps = np.array([(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2)])
-        if self.camera_priors.tilt_known:
+        if known.tilt_known:
             steps = steps[:1]
-        return [model.shared_from_physical(physical + np.array([*step, 0.0])) for step in steps]
+        return [model.shared_from_physical(np.array([*(known.tilt + step), known.log_focal])) for step in steps]
 
     def taken_over(self, model: MotionModel, other: Fit) -> Parameters:
         """Another model's solution as this model's start."""

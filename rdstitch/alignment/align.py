@@ -18,15 +18,14 @@ from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_l
 from rdstitch.alignment.finer_lens import with_third_coefficient
 from rdstitch.alignment.initialization import relations_at
 from rdstitch.alignment.lens_selection import choose_lens
-from rdstitch.alignment.model_selection import ModelChoice, choose_model, noise_of_links
-from rdstitch.alignment.noise_model import EXACTNESS
+from rdstitch.alignment.noise_model import EXACTNESS, noise_of_links
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.options import AlignmentOptions
 from rdstitch.alignment.position_priors import hold_positions
 from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.rotation_model import ROTATION
-from rdstitch.alignment.turn_or_plane import choose_motion
+from rdstitch.alignment.select import ModelChoice, select_model
 from rdstitch.alignment.warm_start import WarmStart
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_STD, Camera
@@ -111,9 +110,17 @@ def align(
     graph = _Graph(len(cameras), few, relations, trust, lens, free_lens, known, options)
     problem, pictures = graph.problem(~wrong)
     # Data weigh against priors as they will in the final adjustment.
-    problem = replace(problem, overdispersion=noise_of_links(problem)[0].overdispersion)
+    problem = replace(
+        problem, overdispersion=noise_of_links(problem.observations, problem.homographies, problem.lens).overdispersion
+    )
     choice = None if former is None else _choose_from(former, cameras, problem, pictures, options, chosen.refinements)
-    choice = choice or choose_motion(problem, options.models, chosen.refinements)
+    choice = choice or select_model(
+        problem,
+        options.models,
+        chosen.refinements,
+        prefer_turn=options.prefer_turn,
+        layout_matters=options.layout_matters,
+    )
     held = replace(graph, free_lens=choice.fit.free_lens)
     choice, pictures, wrong = _drop_wrong_pairs(held, problem, pictures, choice, wrong)
     choice = choose_over_relief(graph.problem(~wrong, pictures)[0], choice, options.models)
@@ -206,12 +213,15 @@ def _choose_from(
     warm = WarmStart.of(former, cameras, pictures, problem.lens, problem.free_lens)
     if warm is None or options.attitudes is not None:
         return None
-    squared, noise = problem.squared(warm.model, warm.parameters), noise_of_links(problem)[0].noise
+    squared, noise = (
+        problem.squared(warm.model, warm.parameters),
+        noise_of_links(problem.observations, problem.homographies, problem.lens).noise,
+    )
     sigma = sigma_of(squared)
     if misfitting_links(squared, problem.observations).any() or sigma > _AS_GOOD * math.hypot(noise, EXACTNESS):
         return None
     planar = [name for name in options.models if name != ROTATION.name]  # what came before was no turn
-    choice = choose_model(replace(problem, warm=warm), planar, refinements)
+    choice = select_model(replace(problem, warm=warm), planar, refinements)
     costs = [robust_cost(errors, ALIGNMENT_WIDTH * sigma).sum() for errors in (choice.fit.adjusted.squared, squared)]
     return choice if choice.fit.model is warm.model and costs[0] <= costs[1] else None
 

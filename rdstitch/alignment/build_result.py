@@ -13,7 +13,6 @@ from rdstitch.alignment.lens_description import radius_std
 from rdstitch.alignment.lens_selection import CENTER, ENOUGH_PICTURES, WORTH_SAYING, LensChoice
 from rdstitch.alignment.lens_uncertainty import considered_covariance
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
-from rdstitch.alignment.model_selection import ModelChoice
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
 from rdstitch.alignment.noise_model import EXACTNESS
 from rdstitch.alignment.planarity import coherence, judge_relief
@@ -21,6 +20,7 @@ from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPos
 from rdstitch.alignment.rotation_frame import levelled
 from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.alignment.sandwich import sandwich_covariance
+from rdstitch.alignment.select import ModelChoice
 from rdstitch.alignment.shape_test import judge_shape
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_PARAMETERS, Camera

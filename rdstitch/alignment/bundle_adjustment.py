@@ -15,6 +15,7 @@ from rdstitch.alignment.motion_models import ModelMatrices, MotionModel, inverse
 from rdstitch.alignment.normal_equations import SparseNormalEquations, chain
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.pose_blocks import PoseBlocks
+from rdstitch.alignment.priors import Prior, costs, curvatures, slopes
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import LENS_PARAMETERS
 from rdstitch.robust.levenberg_marquardt import FIRST_DAMPING, MAX_DAMPING, MIN_GAIN, damping_by_gain
@@ -59,29 +60,28 @@ class Parameters:
 
 @dataclass(frozen=True)
 class Priors:
-    """Gaussian priors, as means and inverse variances; 0 where there is none.
+    """Priors on all that is adjusted.
 
     Attributes
     ----------
-    shared, shared_precision : ndarray of shape (S,)
+    shared : tuple of S priors
         Of the model's named parameters, see :meth:`MotionModel.physical_parameters`.
-    lens, lens_precision : ndarray of shape (5,)
+    lens : tuple of 5 priors
+        Of :data:`rdstitch.camera.LENS_PARAMETERS`.
     poses, poses_precision : ndarray of shape (N, D)
+        Means and inverse variances; 0 where there is no prior.
     """
 
-    shared: FloatArray
-    shared_precision: FloatArray
-    lens: FloatArray
-    lens_precision: FloatArray
+    shared: tuple[Prior, ...]
+    lens: tuple[Prior, ...]
     poses: FloatArray
     poses_precision: FloatArray
 
     @classmethod
     def none(cls, model: MotionModel, count: int) -> Self:
         """None, for ``count`` pictures."""
-        shared, poses = np.zeros(len(model.shared_names)), np.zeros((count, model.pose_size))
-        lens = np.zeros(len(LENS_PARAMETERS))
-        return cls(shared, shared, lens, lens, poses, poses)
+        poses = np.zeros((count, model.pose_size))
+        return cls((Prior(),) * len(model.shared_names), (Prior(),) * len(LENS_PARAMETERS), poses, poses)
 
 
 @dataclass(frozen=True)
@@ -273,13 +273,12 @@ class BundleAdjuster:
         return 1.0 / (sigma**2 * self.overdispersion)
 
     def camera_prior_cost(self, parameters: Parameters) -> float:
-        """Sum of the squares of the camera's deviations from its priors, in their standard deviations.
+        """-2 log of the prior density of the camera, relative to the largest.
 
         With a focal length that grows without limit a turn becomes a shift over a plane, and ground a tilt.
         """
-        p = self.priors
-        shared = p.shared_precision * (self.model.physical_parameters(parameters.shared)[0] - p.shared) ** 2
-        return float(shared.sum() + (p.lens_precision * (parameters.lens - p.lens) ** 2).sum())
+        physical = self.model.physical_parameters(parameters.shared)[0]
+        return costs(self.priors.shared, physical) + costs(self.priors.lens, parameters.lens)
 
     def _prior_cost(self, parameters: Parameters) -> float:
         offsets = self.model.prior_coordinates(parameters.poses) - self.priors.poses
@@ -296,16 +295,22 @@ class BundleAdjuster:
             self.weight(sigma),
         )
         p, free, lens = self.priors, self.free.poses, self.free.lens
-        precision = np.concatenate([p.shared_precision, p.lens_precision[lens]])
+        precision = self.prior_curvatures(state.parameters)
         physical, derivative = self.named_parameters(state.parameters.shared)
-        error = np.concatenate([physical - p.shared, (state.parameters.lens - p.lens)[lens]])
+        slope = np.concatenate([slopes(p.shared, physical), slopes(p.lens, state.parameters.lens)[lens]])
         poses = self.model.prior_coordinates(state.parameters.poses) - p.poses
         return normal.with_priors(
             p.poses_precision[free],
             poses[free],
             derivative.T @ (precision[:, None] * derivative),
-            derivative.T @ (precision * error),
+            derivative.T @ slope,
         )
+
+    def prior_curvatures(self, parameters: Parameters) -> FloatArray:
+        """Precisions (S',) of the priors on the named and the free lens parameters, as they count there."""
+        physical = self.model.physical_parameters(parameters.shared)[0]
+        lens = curvatures(self.priors.lens, parameters.lens)[self.free.lens]
+        return np.concatenate([curvatures(self.priors.shared, physical), lens])
 
     def named_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The named parameters (S,), and their derivatives by the shared ones and by the lens (S', S')."""

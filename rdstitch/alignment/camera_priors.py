@@ -8,11 +8,9 @@ import numpy as np
 
 from rdstitch.alignment.bundle_adjustment import Priors
 from rdstitch.alignment.motion_models import PSI, THETA, MotionModel, X, Y
-from rdstitch.alignment.rotation_model import ROTATION
+from rdstitch.alignment.priors import LENS, TILT, exact, focal_prior
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
-
-_EXACT_PRECISION = 1e12  # precision of what is known: a standard deviation of 1e-6 radians
 
 
 @dataclass(frozen=True)
@@ -23,6 +21,8 @@ class CameraPriors:
     ----------
     log_focal, log_focal_std : float
         Of the logarithm of the focal length in half diagonals.
+    focal_source : str
+        Where it comes from, a key of :data:`rdstitch.camera.FOCAL_LOG_STD`.
     tilt : (float, float)
         (ψ, θ), radians.
     tilt_known : bool
@@ -30,8 +30,6 @@ class CameraPriors:
         How the tilt of each picture differs from the shared one, radians; zeros where that is not known.
     attitudes_std : float or None
         Standard deviation of these, 0 for exact ones; None where they are not known.
-    lens, lens_std : ndarray of shape (5,)
-        λ, μ, ν and the shift of the distortion centre.
     positions : ndarray of shape (N, 2)
         Metres east and north where each picture was taken; NaN where that is not known.
     places, places_precision : ndarray of shape (N, 2) and (N,)
@@ -40,12 +38,11 @@ class CameraPriors:
 
     log_focal: float
     log_focal_std: float
+    focal_source: str
     tilt: tuple[float, float]
     tilt_known: bool
     attitudes: FloatArray
     attitudes_std: float | None
-    lens: FloatArray
-    lens_std: FloatArray
     positions: FloatArray
     places: FloatArray | None = None
     places_precision: FloatArray | None = None
@@ -56,14 +53,13 @@ class CameraPriors:
         Tilts are turned into what they do in the pictures with ``log_focal``, the prior one if not given.
         """
         none = Priors.none(model, count)
-        known = replace(none, lens=self.lens, lens_precision=self.lens_std**-2.0)
-        if not model.shared_names:
+        tilts = map(exact, self.tilt) if self.tilt_known else (TILT, TILT)
+        focal_length = focal_prior(self.log_focal, self.log_focal_std, self.focal_source)
+        of_name = dict(zip(("psi", "theta", "log_focal"), (*tilts, focal_length), strict=True))
+        shared = tuple(of_name[name] for name in model.shared_names)
+        known = replace(none, shared=shared, lens=LENS)
+        if "psi" not in model.shared_names:
             return known
-        if model is ROTATION:
-            return replace(
-                known, shared=np.array([self.log_focal]), shared_precision=np.array([self.log_focal_std**-2.0])
-            )
-        tilt_precision = _EXACT_PRECISION if self.tilt_known else 0.0
         poses, precision = np.zeros_like(none.poses), np.zeros_like(none.poses)
         free = list(getattr(model, "free", ()))
         focal = math.exp(self.log_focal if log_focal is None else log_focal)
@@ -74,21 +70,16 @@ class CameraPriors:
         if self.places is not None and self.places_precision is not None:
             columns = [free.index(column) for column in (X, Y)]
             poses[:, columns], precision[:, columns] = self.places, self.places_precision[:, None]
-        return replace(
-            known,
-            shared=np.array([*self.tilt, self.log_focal]),
-            shared_precision=np.array([tilt_precision, tilt_precision, self.log_focal_std**-2.0]),
-            poses=poses,
-            poses_precision=precision,
-        )
+        return replace(known, poses=poses, poses_precision=precision)
 
     def of(self, pictures: IntArray) -> "CameraPriors":
         """Of some of the pictures only."""
         return replace(self, attitudes=self.attitudes[pictures], positions=self.positions[pictures])
 
 
-def focal_prior(cameras: Sequence[Camera]) -> tuple[float, float]:
-    """Mean and standard deviation of the logarithm of the focal length in half diagonals."""
+def known_focal(cameras: Sequence[Camera]) -> tuple[float, float, str]:
+    """Mean and standard deviation of the logarithm of the focal length in half diagonals, and where it comes from."""
     known = [camera for camera in cameras if camera.focal is not None] or [cameras[0].with_focal()]
     ratios = [camera.focal / camera.half_diagonal for camera in known if camera.focal is not None]
-    return float(np.log(np.median(ratios))), max(camera.focal_log_std for camera in known)
+    vaguest = max(known, key=lambda camera: camera.focal_log_std)
+    return float(np.log(np.median(ratios))), vaguest.focal_log_std, vaguest.focal_source or "guess"

@@ -5,6 +5,7 @@ consensus of all pairs, robust because no wrong link can pull at another. Their 
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -82,13 +83,6 @@ def adjust_pairs_independently(
     matrices[1::2] = homographies @ matrices[0::2]
     start = Parameters(model.nearest_poses(matrices, shared, tilts), shared, lens)
     none = Priors.none(model, count)
-    known = Priors(
-        priors.shared,
-        priors.shared_precision,
-        priors.lens,
-        priors.lens_precision,
-        none.poses,
-        none.poses_precision,
-    )
+    known = replace(none, shared=priors.shared, lens=priors.lens)
     freedom = FreeParameters.fixing(model, count, list(range(0, count, 2)), free_lens)
     return BundleAdjuster(model, apart, freedom, known, max_iterations=iterations).run(start)

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.model_selection import evidence_against
 from rdstitch.alignment.motion_models import HOMOGRAPHY, PlanarModel
 from rdstitch.alignment.sandwich import sandwich_covariance
+from rdstitch.alignment.select import Posterior
 from rdstitch.alignment.shape_test import UNLIKELY_FOCAL, beside_usual_focal
 from rdstitch.arrays import FloatArray
 
@@ -44,7 +44,9 @@ def _with_free_motion(problem: Problem, fit: Fit, covariance: FloatArray, *, rou
     Each model counts as much as Schwarz's criterion makes it likely.
     """
     free = problem.fit(HOMOGRAPHY)
-    share = 1.0 / (1.0 + math.exp(float(np.clip(evidence_against(problem, free, fit) / 2.0, -50.0, 50.0))))
+    posterior = Posterior(problem)
+    against = float(np.clip((posterior.of(free).score - posterior.of(fit).score) / 2.0, -50.0, 50.0))
+    share = 1.0 / (1.0 + math.exp(against))
     off = free.adjusted.parameters.lens - fit.adjusted.parameters.lens
     other = considered_covariance(problem, free, rough=rough) + np.outer(off, off)
     mixed: FloatArray = (1.0 - share) * covariance + share * other

@@ -72,6 +72,10 @@ class MotionModel(Protocol):
         """Free parameters per picture, D."""
 
     @property
+    def on_sphere(self) -> bool:
+        """Whether pictures lie around one centre, not over a plane."""
+
+    @property
     def shared_names(self) -> tuple[str, ...]:
         """Parameters that all pictures share, S of them, without those of the lens."""
 
@@ -118,6 +122,7 @@ class PlanarModel:
     name: str
     free: tuple[int, ...]
     shared_names: tuple[str, ...] = ("psi", "theta", "log_focal")
+    on_sphere: bool = False
 
     @property
     def pose_size(self) -> int:
@@ -240,6 +245,7 @@ class HomographyModel:
     name: str = "homography"
     pose_size: int = 8
     shared_names: tuple[str, ...] = ()
+    on_sphere: bool = False
 
     @property
     def gauge(self) -> BoolArray:

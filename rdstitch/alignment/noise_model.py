@@ -11,7 +11,7 @@ import numpy as np
 
 from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.cycle_consistency import misfitting_links
-from rdstitch.alignment.link_equations import squared_lengths
+from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.planarity import coherence
 from rdstitch.arrays import BoolArray, FloatArray
@@ -74,3 +74,8 @@ class NoiseModel:
         ratio = np.minimum(squared[self.counted], _MAX_ERROR2) / self.noise**2
         misfit: FloatArray = ALIGNMENT_WIDTH**2 * np.log1p(ratio / ALIGNMENT_WIDTH**2) / self.overdispersion
         return misfit
+
+
+def noise_of_links(observations: Observations, homographies: FloatArray, lens: FloatArray) -> NoiseModel:
+    """The noise that every link leaves on its own, with its homography (L, 3, 3)."""
+    return NoiseModel.of_independent_links(observations, whitened_errors(observations, homographies, lens))

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rdstitch.alignment.camera_priors import CameraPriors, focal_prior
+from rdstitch.alignment.camera_priors import CameraPriors, known_focal
 from rdstitch.alignment.lens_selection import LENSES
 from rdstitch.alignment.model_family import MODELS
-from rdstitch.camera import LENS_STD, Camera
+from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
 
 
@@ -39,6 +39,10 @@ class AlignmentOptions:
         Metres east and north where each picture was taken; NaN where that is not known. A weak prior.
     lens : str
         One of :data:`rdstitch.alignment.lens_selection.LENSES`, or "auto": the simplest that the data allow.
+    prefer_turn : bool
+        Whether a turn on the spot is taken where a plane explains the images as well.
+    layout_matters : bool
+        Whether images are to be laid out on the plane, so that an absurd layout rules a model out.
     most : int
         Correspondences used of each link at most; fewer where there are thousands of links.
     """
@@ -52,6 +56,8 @@ class AlignmentOptions:
     gravity: ArrayLike | None = None
     positions: ArrayLike | None = None
     lens: str = "auto"
+    prefer_turn: bool = False
+    layout_matters: bool = True
     most: int = 250
 
     def __post_init__(self) -> None:
@@ -82,13 +88,11 @@ class AlignmentOptions:
         if positions.shape != (count, 2):
             raise ArgumentError(f"expected one position (east, north) for each of the {count} pictures")
         return CameraPriors(
-            *focal_prior(cameras),
+            *known_focal(cameras),
             tilt=self.tilt or (0.0, 0.0),
             tilt_known=self.tilt is not None,
             attitudes=attitudes,
             attitudes_std=None if self.attitudes is None else self.attitudes_std,
-            lens=np.zeros(len(LENS_STD)),
-            lens_std=LENS_STD,
             positions=positions,
         )
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rdstitch.alignment.layout import MAX_STRETCH
 from rdstitch.alignment.result import Alignment, PlanarPoses
 from rdstitch.arrays import FloatArray, IntArray
 
@@ -24,14 +25,11 @@ def in_frame_of(alignment: Alignment, reference: int) -> Alignment:
 
 
 def frontal_reference(alignment: Alignment) -> int:
-    """The reference picture, or, where another picture crosses its horizon, the one for which that happens least.
-
-    Of several for which no picture crosses the horizon, the one in whose frame the nearest to it keeps farthest away.
-    """
+    """The reference picture, or, where another one is absurdly stretched by its frame, the one that stretches least."""
     used = np.flatnonzero(alignment.used)
     nearness = np.array([_nearest_to_horizon(alignment, used, int(k)) for k in used])
     own = int(np.flatnonzero(used == alignment.reference)[0])
-    if nearness[own].min() > 0.0:
+    if nearness[own].min() > MAX_STRETCH ** (-1.0 / 3.0):  # areas grow with the third power
         return alignment.reference
     crossing, least = (nearness <= 0.0).sum(axis=1), nearness.min(axis=1)
     return int(used[np.lexsort((-least, crossing))[0]])

@@ -15,10 +15,11 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.lens_selection import left_coherence
 from rdstitch.alignment.link_equations import linearized_errors
-from rdstitch.alignment.model_selection import ModelChoice, least_costly, noise_of_links
 from rdstitch.alignment.motion_models import POSE, SIMILARITY, TILTING, PlanarModel
+from rdstitch.alignment.noise_model import noise_of_links
 from rdstitch.alignment.parallax import Parallax
 from rdstitch.alignment.planarity import judge_relief
+from rdstitch.alignment.select import ModelChoice, best_of
 from rdstitch.arrays import FloatArray
 
 _FEWEST = 3
@@ -63,7 +64,7 @@ def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[st
             fits.append(fit)
     if not fits:
         return replace(choice, fit=_settled(problem, choice.fit)[1], over_relief=True)
-    return replace(least_costly(problem, [_refined(problem, fit) for fit in fits]), over_relief=True)
+    return replace(best_of(problem, [_refined(problem, fit) for fit in fits]), over_relief=True)
 
 
 def adjust_over_relief(problem: Problem, choice: ModelChoice) -> tuple[Problem, Fit]:
@@ -89,7 +90,7 @@ def weighted_by_relief(problem: Problem, fit: Fit) -> Problem:
         seen = part.by_point2[:, 0, 0] != 0.0
         # Without the whitening, in half diagonals of the second picture.
         moved[part.rows][seen] = np.linalg.solve(-part.by_point2[seen], parallax[part.rows][seen, :, None])[:, :, 0]
-    scatter = _scatter(errors, parallax, noise_of_links(plain)[0].effective)
+    scatter = _scatter(errors, parallax, noise_of_links(o, plain.homographies, plain.lens).effective)
     if scatter == 0.0:
         return problem if problem.observations.relief is None else plain
     return replace(problem, observations=replace(o, relief=scatter * moved * o.scale2[o.link, None]))

@@ -35,6 +35,7 @@ class RotationModel:
     name: str = "rotation"
     pose_size: int = 3
     shared_names: tuple[str, ...] = ("log_focal",)
+    on_sphere: bool = True
 
     @property
     def gauge(self) -> BoolArray:

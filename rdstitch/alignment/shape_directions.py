@@ -125,11 +125,11 @@ class Directions:
 
     def _priors(self) -> FloatArray:
         """Information (S, S) before anything is measured."""
-        priors, lens = self.adjuster.priors, self.adjuster.free.lens
-        derivative = self.fit.model.physical_parameters(self.fit.adjusted.parameters.shared)[1]
-        shared = derivative.T @ (priors.shared_precision[:, None] * derivative)
-        others = [*priors.lens_precision[lens].tolist(), *(effect.std**-2.0 for effect in self.effects)]
-        return np.asarray(block_diag(shared, np.diag(others)), dtype=np.float64)
+        parameters = self.fit.adjusted.parameters
+        derivative = self.adjuster.named_parameters(parameters.shared)[1]
+        camera = derivative.T @ (self.adjuster.prior_curvatures(parameters)[:, None] * derivative)
+        effects = np.diag([effect.std**-2.0 for effect in self.effects])
+        return np.asarray(block_diag(camera, effects), dtype=np.float64)
 
 
 def places(found: Directions, cameras: Sequence[Camera], count: int) -> tuple[FloatArray, IntArray]:

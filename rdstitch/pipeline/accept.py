@@ -60,6 +60,7 @@ def accept(
     *,
     metric: bool = False,
     lens_only: bool = False,
+    prefer_turn: bool = False,
 ) -> Registration:
     """The registration of what passes all checks, with everything that the user should know of it.
 
@@ -73,6 +74,8 @@ def accept(
         Metric poses are needed, also of what remains.
     lens_only : bool
         Only the lens is wanted, so that doubts about the places of pictures do not matter.
+    prefer_turn : bool
+        As for :func:`rdstitch.pipeline.register.register`.
 
     Raises
     ------
@@ -82,7 +85,9 @@ def accept(
         When a picture is left out, under ``options.strict``.
     """
     cache = Cache(options.cache)
-    aligner = replace(Aligner.of(registration.sources, options, cache), needs_poses=metric)
+    layout_matters = not (lens_only or metric)
+    aligner = Aligner.of(registration.sources, options, cache, prefer_turn=prefer_turn, layout_matters=layout_matters)
+    aligner = replace(aligner, needs_poses=metric)
     undamaged = None if options.force else _without_damage(registration, aligner)
     if undamaged is not None and _is_simpler(undamaged.alignment.model, registration.alignment.model):
         registration, undamaged = undamaged, None

@@ -99,8 +99,16 @@ class Aligner:
     needs_poses: bool = False
 
     @classmethod
-    def of(cls, sources: Sequence[Source], options: StitchOptions, cache: Cache) -> Self:
-        """From what the user decided, and what the pictures and their headers say.
+    def of(
+        cls,
+        sources: Sequence[Source],
+        options: StitchOptions,
+        cache: Cache,
+        *,
+        prefer_turn: bool = False,
+        layout_matters: bool = True,
+    ) -> Self:
+        """From what the user decided, and what the pictures and their headers say; see :class:`AlignmentOptions`.
 
         Raises
         ------
@@ -110,7 +118,8 @@ class Aligner:
         paths = tuple(str(source.path) for source in sources)
         megapixels = options.features.for_pictures(len(sources)).limits[1]
         cameras = tuple(at_working_size(source.camera.with_focal(), megapixels) for source in sources)
-        return cls(paths, cameras, alignment_options(sources, options), cache, options.threshold)
+        decided = replace(alignment_options(sources, options), prefer_turn=prefer_turn, layout_matters=layout_matters)
+        return cls(paths, cameras, decided, cache, options.threshold)
 
     def align(self, pairs: Sequence[PairRegistration], former: Alignment | None = None) -> AlignedPairs:
         """Align the pictures by the pairs that were registered; from an earlier run where the cache has it.

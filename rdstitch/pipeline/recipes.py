@@ -137,8 +137,9 @@ def _stitch(
         _check_outputs(output, options, found.files)
         sources, unread = read_inputs(found.frames, options, skip_bad=not pano)
         with options.executor(len(sources)) as executor:
-            registration = register(sources, options, executor, skip_bad=not pano, progress=progress)
-            accepted = accept(registration.with_messages([*unread, *found.messages]), options, executor)
+            registration = register(sources, options, executor, skip_bad=not pano, prefer_turn=pano, progress=progress)
+            registration = registration.with_messages([*unread, *found.messages])
+            accepted = accept(registration, options, executor, prefer_turn=pano)
             return _composite(accepted, executor, output, options, progress, beside, frontal=pano)
 
 

@@ -44,6 +44,7 @@ def register(
     skip_bad: bool,
     metric: bool = False,
     lens_only: bool = False,
+    prefer_turn: bool = False,
     progress: Progress = silent,
 ) -> Registration:
     """Detect features, register pairs, and align all pictures as one.
@@ -63,6 +64,8 @@ def register(
         Metric poses are needed, so that the freest model is that of planar motion with small tilts.
     lens_only : bool
         Only the lens is wanted, so that pictures of a repeated pattern may be off by whole periods of it.
+    prefer_turn : bool
+        A turn on the spot is taken where a plane explains the images as well.
 
     Raises
     ------
@@ -71,7 +74,8 @@ def register(
     """
     options = options.for_pictures(len(sources))
     cache = Cache.at(options.cache)
-    aligner = Aligner.of(sources, options, cache)
+    layout_matters = not (lens_only or metric)
+    aligner = Aligner.of(sources, options, cache, prefer_turn=prefer_turn, layout_matters=layout_matters)
     store = cache if options.cache is not None else Cache.for_this_run()
     rendered = detect_by_contrast(sources, options.features, executor, store, skip_bad=skip_bad, progress=progress)
     detected = rendered.detected

@@ -7,8 +7,8 @@ from contextlib import nullcontext
 
 import numpy as np
 
-from rdstitch.alignment.model_selection import NOT_ONE_CAMERA
 from rdstitch.alignment.result import Alignment, LinkFit
+from rdstitch.alignment.select import NOT_ONE_CAMERA
 from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.errors import RegistrationError
 from rdstitch.matching.match_graph import connected_components

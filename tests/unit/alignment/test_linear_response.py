@@ -16,6 +16,7 @@ from rdstitch.alignment.linear_response import LinearResponse
 from rdstitch.alignment.link_equations import LinearizedErrors, whitened_errors
 from rdstitch.alignment.motion_models import PLANAR_MODELS, MotionModel, inverses
 from rdstitch.alignment.observations import Observations
+from rdstitch.alignment.priors import Prior
 from rdstitch.arrays import FloatArray
 from rdstitch.radial_homography import project
 from tests.alignment_scenes import grid, scene
@@ -30,8 +31,8 @@ def _adjusted(model: MotionModel) -> tuple[BundleAdjuster, BundleAdjustmentResul
     shared = model.shared_from_physical(np.array([0.0, 0.0, np.log(1.3)])) if model.shared_names else np.zeros(0)
     poses = model.nearest_poses(truth.truth, shared, np.zeros((len(truth.truth), 2)))
     free, priors = FreeParameters.fixing(model, 6, [0], LENS), Priors.none(model, 6)
-    precision = np.full(len(shared), 100.0)
-    priors = replace(priors, shared=model.physical_parameters(shared)[0], shared_precision=precision)
+    middle = model.physical_parameters(shared)[0].tolist()
+    priors = replace(priors, shared=tuple(Prior(((1.0, value, 0.1),)) for value in middle))
     adjuster = BundleAdjuster(model, observations, free, replace(priors, poses_precision=priors.poses_precision + 1.0))
     return adjuster, adjuster.run(Parameters(poses, shared, np.array([-0.25, 0.0, 0.0, 0.0, 0.0])))
 

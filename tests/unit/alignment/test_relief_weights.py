@@ -7,10 +7,10 @@ import pytest
 
 from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.model_selection import ModelChoice
 from rdstitch.alignment.motion_models import SIMILARITY
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.relief_weights import choose_over_relief, weighted_by_relief
+from rdstitch.alignment.select import ModelChoice
 from rdstitch.radial_homography import measurement_whitening
 from tests.alignment_scenes import Scene, grid, scene
 

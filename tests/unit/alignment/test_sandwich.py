@@ -10,6 +10,7 @@ from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters,
 from rdstitch.alignment.motion_models import SIMILARITY
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.planarity import coherence
+from rdstitch.alignment.priors import Prior
 from rdstitch.alignment.sandwich import sandwich_covariance
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import LENS_STD, Camera
@@ -18,7 +19,7 @@ from tests.alignment_scenes import grid, scene
 from tests.lens_scenes import SIZE, aligned, lens_scene
 
 LENS, NOISE = Camera((640, 480), distortion=-0.2), 0.4
-KNOWN = np.array([0.0, 0.0, 1e4])
+KNOWN = (Prior(), Prior(), Prior(((1.0, float(np.log(1.3)), 0.01),)))
 """The inverse variance of the focal length's logarithm: pictures from straight above do not show it."""
 
 PAIRS = [(i, j) for i in range(6) for j in range(i + 1, 6)]
@@ -58,7 +59,7 @@ def _miss(seed: int, shared_keypoints: bool) -> float:
         SIMILARITY,
         observations,
         FreeParameters.fixing(SIMILARITY, 6, [0], np.arange(len(LENS_STD)) == 0),
-        replace(Priors.none(SIMILARITY, 6), shared=np.array([0.0, 0.0, np.log(1.3)]), shared_precision=KNOWN),
+        replace(Priors.none(SIMILARITY, 6), shared=KNOWN),
         coherence(observations, np.zeros((int(start[-1]), 2)), np.ones(int(start[-1]), dtype=np.bool_)).overdispersion,
     )
     found = adjuster.run(Parameters(poses, shared, np.array([-0.2, 0.0, 0.0, 0.0, 0.0])))

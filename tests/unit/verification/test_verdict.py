@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rdstitch.alignment.model_selection import NOT_ONE_CAMERA
 from rdstitch.alignment.result import LinkFit
+from rdstitch.alignment.select import NOT_ONE_CAMERA
 from rdstitch.executors import open_executor
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.source import read_sources

@@ -1,0 +1,268 @@
+"""Which motion the images show: one posterior score for all hypotheses.
+
+``score = -2 log L(errors) + k log n + priors``: how likely the errors are (:mod:`rdstitch.alignment.evidence`),
+Schwarz's approximation of what ``k`` parameters cost, and what the camera is off from what cameras are
+(:mod:`rdstitch.alignment.priors`). No score makes up for errors that everybody sees, nor for a layout that nobody would
+keep (:mod:`rdstitch.alignment.layout`).
+
+A camera that stays where it is sees the same of a plane as of anything else: where a turn explains the images, models
+over a plane do so too, with more parameters, so that the turn is taken where it fits, and a plane where there is
+translation. Of the planar models the least free one is taken that the images allow.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from rdstitch.alignment.adjustment_problem import Fit, Problem
+from rdstitch.alignment.evidence import Evidence
+from rdstitch.alignment.layout import MAX_STRETCH, stretch
+from rdstitch.alignment.lens_selection import shows_center
+from rdstitch.alignment.link_equations import whitened_errors
+from rdstitch.alignment.model_family import MODELS
+from rdstitch.alignment.motion_models import HOMOGRAPHY, LOG_HEIGHT, POSE, PSI, THETA, MotionModel, PlanarModel
+from rdstitch.alignment.rotation_model import ROTATION
+from rdstitch.arrays import BoolArray, FloatArray
+
+NOT_ONE_CAMERA = "the images do not come from one camera with one focal length"
+"""Why free homographies were taken."""
+
+_MIN_RATIO = 3.0
+"""Times by which the errors of one camera must exceed those of free homographies, one an image: these fit relief better
+than any camera does, by up to 2.2 times over strips of rendered relief, and their chains drift projectively."""
+
+_FOCAL_LIMITS = 0.2, 50.0
+"""Half diagonals: focal lengths that a model may ask for; the widest fisheyes have 0.3."""
+
+_TYPICAL_TILT_SPREAD = math.radians(3.0)
+"""Spread of tilts from which on a wider one costs: Occam's factor of the hierarchical prior on the tilts."""
+
+_PREFERENCE = 6.0
+"""What the user's command says: odds of twenty to one for a turn by ``pano``, and for a plane by ``mosaic``."""
+
+_TOLERABLE = 0.25
+"""Of what an error counts at most: shared errors that local alignment and seams can hide."""
+
+_POSSIBLE, _PARALLAX = 4.0, 0.005
+"""Times the noise, and diagonals of an image, that pairs may be off from a turn for it to be tried on all of them."""
+
+
+@dataclass(frozen=True)
+class ModelChoice:
+    """The model chosen.
+
+    Attributes
+    ----------
+    fit : Fit
+    reason : str
+    overdispersion : float
+        Of the errors that it leaves, see :class:`rdstitch.alignment.planarity.Coherence`.
+    over_relief : bool
+        Whether it was chosen with heights of the ground that account for errors along the parallax.
+    """
+
+    fit: Fit
+    reason: str
+    overdispersion: float
+    over_relief: bool = False
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A fit with its posterior score.
+
+    Attributes
+    ----------
+    fit : Fit
+    score : float
+        -2 log of the posterior, up to a constant of the problem.
+    field : float
+        Size of what the errors of neighbours share, pixels of a coordinate.
+    absurd : bool
+        Whether nobody would keep its layout.
+    """
+
+    fit: Fit
+    score: float
+    field: float
+    absurd: bool
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Compares fits of one problem."""
+
+    problem: Problem
+    prefer_turn: bool = False
+    layout_matters: bool = True
+
+    @cached_property
+    def link_errors(self) -> FloatArray:
+        """Whitened errors (M, 2) of links fitted on their own, pixels."""
+        return whitened_errors(self.problem.observations, self.problem.homographies, self.problem.lens)
+
+    @cached_property
+    def evidence(self) -> Evidence:
+        """The cells that errors are compared by."""
+        return Evidence.of(self.problem.observations, self.link_errors)
+
+    @cached_property
+    def least(self) -> float:
+        """Cost of the errors of links on their own, which those of no model undercut by much."""
+        return self.evidence.cost(self.link_errors)[0]
+
+    @cached_property
+    def least_field(self) -> float:
+        """Size of what neighbours share in the errors of links on their own, pixels."""
+        return self.evidence.cost(self.link_errors)[1]
+
+    def of(self, fit: Fit) -> Hypothesis:
+        """Score a fit."""
+        errors = whitened_errors(self.problem.observations, fit.adjusted.homographies, fit.adjusted.parameters.lens)
+        cost, field = self.evidence.cost(errors)
+        wide = 0.0
+        if fit.tilt_spread > 0.0:
+            wide = 4.0 * self.problem.count * math.log(max(fit.tilt_spread / _TYPICAL_TILT_SPREAD, 1.0))
+        priors = self.problem.adjuster_of(fit).camera_prior_cost(fit.adjusted.parameters)
+        score = cost + self.price(fit.model, fit.free_lens) + wide + priors
+        if fit.model.on_sphere != self.prefer_turn:
+            score += _PREFERENCE
+        absurd = self.layout_matters and not stretch(fit) <= MAX_STRETCH
+        return Hypothesis(fit, score if has_plausible_focal(fit) else math.inf, field, absurd)
+
+    def suffices(self, best: Hypothesis, model: MotionModel) -> bool:
+        """Whether a freer model could not be taken, even if it left the errors that links leave on their own."""
+        if model is HOMOGRAPHY and not _is_beyond_one_camera(self, best, self.least_field):
+            return True
+        return not best.absurd and best.score <= self.least + self.price(model, self.problem.free_lens)
+
+    def price(self, model: MotionModel, free_lens: BoolArray) -> float:
+        """What the parameters of a model cost (Schwarz's criterion)."""
+        return parameter_count(self.problem, model, free_lens) * math.log(max(self.evidence.count, 2.0))
+
+
+def select_model(
+    problem: Problem,
+    names: Sequence[str],
+    lenses: Sequence[BoolArray] = (),
+    *,
+    prefer_turn: bool = False,
+    layout_matters: bool = True,
+) -> ModelChoice:
+    """Adjust hypotheses from the least to the most free, and take the one with the best score.
+
+    Models are no longer tried that could not pay for their freedom even with the errors that links leave on their own.
+    The best two and the least free one are then tried with more of the lens free: an off-centre lens acts like less
+    regular motion. Free homographies are a model of another kind, taken only for what one camera cannot explain.
+    """
+    posterior = Posterior(problem, prefer_turn, layout_matters)
+    tried: list[Hypothesis] = []
+    for name in [name for name in (ROTATION.name, *MODELS) if name in names]:
+        model = MODELS[name]
+        if any(one.fit.model is model for one in tried) or (model is POSE and problem.count == 2 and len(names) > 1):
+            continue
+        best = min(tried, key=lambda one: one.score, default=None)
+        if best is not None and posterior.suffices(best, model):
+            break
+        if model.on_sphere:
+            trial = problem.trial(model)
+            limit = max(
+                _POSSIBLE * posterior.evidence.noise, _PARALLAX * 2.0 * float(np.median(problem.observations.scale2))
+            )
+            if len(names) > 1 and trial.sigma > limit:
+                continue
+            tried.append(posterior.of(problem.fit(model, shared=trial.parameters.shared)))
+        else:
+            planar = [one.fit for one in tried if not one.fit.model.on_sphere]
+            tried.append(posterior.of(problem.fit(model, planar[-1:])))
+    tried = _with_wider_lenses(posterior, tried, lenses)
+    best_one = _best(posterior, tried)
+    return _choice(posterior, tried, best_one, requested=len(names) == 1)
+
+
+def best_of(problem: Problem, fits: Sequence[Fit]) -> ModelChoice:
+    """Take the best of some fits of the problem."""
+    posterior = Posterior(problem)
+    tried = [posterior.of(fit) for fit in fits]
+    return _choice(posterior, tried, min(tried, key=lambda one: one.score), requested=False)
+
+
+def _with_wider_lenses(
+    posterior: Posterior, tried: Sequence[Hypothesis], lenses: Sequence[BoolArray]
+) -> list[Hypothesis]:
+    """Free more of the lens where that pays."""
+    tried = list(tried)
+    for lens in lenses:
+        order = sorted(range(len(tried)), key=lambda index: tried[index].score)[:2]
+        for index in sorted({0, *order}):
+            fit = tried[index].fit
+            wider = posterior.of(posterior.problem.extend(fit, lens | fit.free_lens))
+            if wider.score < tried[index].score and shows_center(wider.fit.adjusted, posterior.problem.observations):
+                tried[index] = wider
+    return tried
+
+
+def _best(posterior: Posterior, tried: Sequence[Hypothesis]) -> Hypothesis:
+    """The one with the best score; where that has an absurd layout, the turn or, of the others, the best that joins."""
+    cameras = [one for one in tried if one.fit.model is not HOMOGRAPHY]
+    best = min(cameras or tried, key=lambda one: one.score)
+    if not best.absurd:
+        beyond = _is_beyond_one_camera(posterior, best, tried[-1].field)
+        return min(tried, key=lambda one: one.score) if beyond else best
+    joining = [one for one in tried if not one.absurd and one.field < _TOLERABLE * posterior.evidence.farthest]
+    return min(joining, key=lambda one: (not one.fit.model.on_sphere, one.score), default=best)
+
+
+def _is_beyond_one_camera(posterior: Posterior, best: Hypothesis, free: float) -> bool:
+    """Whether free homographies with such a field compete; two images need no more than one."""
+    return posterior.problem.count == 2 or best.absurd or best.field > _MIN_RATIO * free
+
+
+def parameter_count(problem: Problem, model: MotionModel, free_lens: BoolArray) -> int:
+    """Number of free parameters; in the pose model the shared tilt is only the mean of those of the images."""
+    poses = problem.count * model.pose_size - int(model.gauge.sum())
+    return poses + len(model.shared_names) + int(free_lens.sum()) - (2 if model is POSE else 0)
+
+
+def has_plausible_focal(fit: Fit) -> bool:
+    """Whether a lens can have the focal length of a fit: over relief, small tilts may ask for any."""
+    if not fit.model.shared_names:
+        return True
+    focal = math.exp(float(fit.model.physical_parameters(fit.adjusted.parameters.shared)[0][-1]))
+    return _FOCAL_LIMITS[0] < focal < _FOCAL_LIMITS[1]
+
+
+def _choice(posterior: Posterior, tried: Sequence[Hypothesis], best: Hypothesis, *, requested: bool) -> ModelChoice:
+    overdispersion = best.fit.overdispersion
+    what = (
+        f"{best.fit.model.name}: {_description(best.fit)}; it leaves an error of {best.fit.adjusted.sigma:.2f} pixels"
+    )
+    if requested:
+        return ModelChoice(best.fit, f"{what}; as requested", overdispersion)
+    others = [one for one in tried if one is not best]
+    listed = [
+        f"{one.fit.model.name} {one.fit.adjusted.sigma:.2f} pixels"
+        + (", an absurd layout" if one.absurd else f", {one.score - best.score:+.0f}")
+        for one in others
+    ]
+    return ModelChoice(best.fit, f"{what} (others: {'; '.join(listed)})" if listed else what, overdispersion)
+
+
+def _description(fit: Fit) -> str:
+    """What a model says of the camera."""
+    if fit.model.on_sphere:
+        return "the camera turned on the spot"
+    if not isinstance(fit.model, PlanarModel):
+        return NOT_ONE_CAMERA if len(fit.adjusted.parameters.poses) > 2 else "two images need no more"
+    parts = ["height and tilt stay the same"]
+    if LOG_HEIGHT in fit.model.free:
+        heights = float(np.std(fit.adjusted.parameters.poses[:, LOG_HEIGHT]))
+        parts = [f"heights differ by {heights:.0%}", "the tilt stays the same"]
+    if PSI in fit.model.free:
+        tilts = fit.model.metric_poses(fit.adjusted.parameters.poses, fit.adjusted.parameters.shared)[:, [PSI, THETA]]
+        largest = math.degrees(float(np.arccos(np.cos(tilts).prod(axis=1)).max()))
+        parts[1] = f"tilted by up to {largest:.0f} degrees"
+    return ", ".join(parts)
