@@ -15,12 +15,15 @@ from rdstitch.alignment.build_result import AdjustedPictures, build_alignment
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult, sigma_of
 from rdstitch.alignment.camera_priors import CameraPriors
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
+from rdstitch.alignment.evidence import Evidence
 from rdstitch.alignment.finer_lens import with_third_coefficient
 from rdstitch.alignment.initialization import relations_at
-from rdstitch.alignment.lens_selection import choose_lens
+from rdstitch.alignment.lens_selection import choose_lens, left_coherence
+from rdstitch.alignment.link_equations import whitened_errors
 from rdstitch.alignment.noise_model import EXACTNESS, noise_of_links
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.options import AlignmentOptions
+from rdstitch.alignment.planarity import COHERENT_CORRELATION, LARGE_RELIEF
 from rdstitch.alignment.position_priors import hold_positions
 from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief
 from rdstitch.alignment.result import Alignment
@@ -48,6 +51,10 @@ _MATCHES_OF_ALL, _MATCHES_OF_A_LINK = 500_000, 60
 
 _ROUNDS = 3
 """Rounds of rejecting wrong pairs and adjusting again."""
+
+_FEW_VIEWS, _LENS_OVER_DEPTH = 3, 4.0
+"""Images from more than which depth does not look like a lens; times by which a lens must make errors of depth smaller
+to be no depth itself, whose power grows with the square of the wavelength."""
 
 _AS_GOOD = 1.5
 """Errors of an earlier alignment, in units of those of pairs on their own, up to which a later one starts there."""
@@ -94,7 +101,7 @@ def align(
     few = everything.thinned(thin_for_selection(len(links)))
     relations = relations_at(few, own, lens)
     apart = homography_apart(few, relations, lens, free_lens, known)
-    observable = options.lens_known or _observable(apart)
+    observable = options.lens_known or (_observable(apart) and not _may_be_depth(few, own, apart, known))
     chosen = choose_lens(few, apart, options.lenses if observable else (), known)
     if observable:
         apart, free_lens = chosen.apart, chosen.free
@@ -224,6 +231,29 @@ def _choose_from(
     choice = select_model(replace(problem, warm=warm), planar, refinements)
     costs = [robust_cost(errors, ALIGNMENT_WIDTH * sigma).sum() for errors in (choice.fit.adjusted.squared, squared)]
     return choice if choice.fit.model is warm.model and costs[0] <= costs[1] else None
+
+
+def _may_be_depth(
+    observations: Observations, relations: Sequence[RadialHomography], bent: BundleAdjustmentResult, known: CameraPriors
+) -> bool:
+    """Whether the depth of what a few images show may look like their lens.
+
+    Depth changes most from one end of a view to the other, as the effect of a lens does: where it shows in the errors
+    that are left, λ takes the blame for more of it than that.
+    """
+    if len(np.unique([observations.image1, observations.image2])) > _FEW_VIEWS:
+        return False
+    straight = np.zeros_like(bent.parameters.lens)
+    flat = homography_apart(
+        observations, relations_at(observations, relations, straight), straight, straight != 0.0, known
+    )
+    left = left_coherence(flat, observations)
+    if left.correlation <= COHERENT_CORRELATION or left.relative_size <= LARGE_RELIEF:
+        return False
+    errors = [whitened_errors(observations, fit.homographies, fit.parameters.lens) for fit in (bent, flat)]
+    evidence = Evidence.of(observations, errors[0])
+    with_lens, without = (evidence.cost(each).field for each in errors)
+    return without < _LENS_OVER_DEPTH * with_lens
 
 
 def _observable(apart: BundleAdjustmentResult) -> bool:

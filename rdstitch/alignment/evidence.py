@@ -88,16 +88,8 @@ class Evidence:
             min(1.0, (images - 1) / max(len(observations), 1)),
         )
 
-    @property
-    def count(self) -> float:
-        """Coordinates of errors of independent links."""
-        return 2.0 * self.weight * len(self.cell)
-
-    def cost(self, errors: FloatArray) -> tuple[float, float]:
-        """Return -2 log of the likelihood of errors (M, 2), pixels, and the size of the field that they have.
-
-        The size is that of a coordinate, pixels.
-        """
+    def cost(self, errors: FloatArray) -> "ErrorCost":
+        """Return how likely errors (M, 2), pixels, are with the fields that make them most likely."""
         length = np.linalg.norm(errors, axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):
             kept = np.where(length > self.farthest, self.farthest / length, 1.0)[:, None] * errors
@@ -106,16 +98,37 @@ class Evidence:
         mean = sums / self.counts[:, None]
         squared = np.einsum("ck,ck->c", mean, mean)
         sizes = np.geomspace(EXACTNESS, max(self.farthest, 2.0 * EXACTNESS), _SIZES)
-        best = (np.inf, 0.0)
+        coarse = np.concatenate([[0.0], sizes])[:, None]
+        best = ErrorCost(np.inf, 0.0, 2.0)
         for fine in sizes:
             variance = fine**2 + self.noise**2 / self.counts
             information = np.bincount(self.block, 1.0 / variance)
             weighted = np.stack([np.bincount(self.block, axis / variance) for axis in mean.T], axis=1)
-            own = float((2.0 * np.log(variance) + squared / variance).sum())
             power = np.einsum("bk,bk->b", weighted, weighted)
-            coarse = np.concatenate([[0.0], sizes])[:, None]
             grown = 1.0 + information * coarse**2
-            costs = own + (2.0 * np.log(grown) - coarse**2 * power / grown).sum(axis=1)
+            costs = (2.0 * np.log(grown) - coarse**2 * power / grown).sum(axis=1)
             index = int(np.argmin(costs))
-            best = min(best, (float(costs[index]) * self.weight, float(np.hypot(fine, coarse[index, 0]))))
+            cost = self.weight * float((2.0 * np.log(variance) + squared / variance).sum() + costs[index])
+            if cost < best.cost:
+                count = 2.0 * self.weight * float(((fine**2 + self.noise**2) / variance).sum())
+                best = ErrorCost(cost, float(np.hypot(fine, coarse[index, 0])), max(count, 2.0))
         return best
+
+
+@dataclass(frozen=True)
+class ErrorCost:
+    """What errors say of a hypothesis.
+
+    Attributes
+    ----------
+    cost : float
+        -2 log of their likelihood, up to a constant.
+    field : float
+        Size of what neighbours share, pixels of a coordinate.
+    count : float
+        Independent coordinates: all where there is noise only, one pair of them a cell where the field is large.
+    """
+
+    cost: float
+    field: float
+    count: float

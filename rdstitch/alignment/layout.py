@@ -8,8 +8,8 @@ from rdstitch.alignment.motion_models import inverses
 from rdstitch.arrays import FloatArray
 from rdstitch.division_model import undistort
 
-_GRID = np.stack(np.meshgrid([-0.64, 0.0, 0.64], [-0.48, 0.0, 0.48]), axis=-1).reshape(-1, 2)
-"""Half diagonals: points of an image of usual proportions, out to four fifths of the way to the corners."""
+_GRID = np.stack(np.meshgrid([-0.8, 0.0, 0.8], [-0.6, 0.0, 0.6]), axis=-1).reshape(-1, 2)
+"""Half diagonals: points of an image of usual proportions, out to the corners."""
 
 _FRAMES = 12
 """Images that are tried as the frame of a plane without a metric."""

@@ -17,7 +17,7 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 _CELLS = (2, 3, 4)
 """Cells per side of a link's overlap within which errors are added up; the worst counts."""
 
-_COHERENT_CORRELATION = 0.5
+COHERENT_CORRELATION = 0.5
 """Correlation of neighbours from which on a scene does not count as flat, if what they have in common is large."""
 
 LARGE_RELIEF = 0.00075
@@ -137,7 +137,7 @@ def judge_relief(found: Coherence, model: str, links: int) -> ReliefTest:
         Pairs of pictures; what is as wide as the overlap of one pair alone, its homography and λ absorb.
     """
     agreement = f"errors of neighbours agree (correlation {found.correlation:.2f}, {found.size:.1f} pixels in common)"
-    relief = found.correlation > _COHERENT_CORRELATION and found.relative_size > LARGE_RELIEF
+    relief = found.correlation > COHERENT_CORRELATION and found.relative_size > LARGE_RELIEF
     if model == "rotation":
         moved = "the camera moved between the pictures (parallax): what is near does not fit; turn about the lens"
         text = f"{agreement}: {moved}" if relief else f"the camera hardly moved (correlation {found.correlation:.2f})"
@@ -145,7 +145,7 @@ def judge_relief(found: Coherence, model: str, links: int) -> ReliefTest:
         text = (
             f"{agreement}: the scene is not one plane, or the {model} model does not describe the camera; λ may be off"
         )
-    elif found.correlation > _COHERENT_CORRELATION:
+    elif found.correlation > COHERENT_CORRELATION:
         text = f"{agreement}, as over a scene that is nearly flat"
     else:
         seen = "the scene is flat" if links > 1 else "no relief shows, but hills as wide as one overlap would not"

@@ -18,13 +18,12 @@ from functools import cached_property
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.evidence import Evidence
+from rdstitch.alignment.evidence import ErrorCost, Evidence
 from rdstitch.alignment.layout import MAX_STRETCH, stretch
 from rdstitch.alignment.lens_selection import shows_center
 from rdstitch.alignment.link_equations import whitened_errors
 from rdstitch.alignment.model_family import MODELS
 from rdstitch.alignment.motion_models import HOMOGRAPHY, LOG_HEIGHT, POSE, PSI, THETA, MotionModel, PlanarModel
-from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.arrays import BoolArray, FloatArray
 
 NOT_ONE_CAMERA = "the images do not come from one camera with one focal length"
@@ -110,38 +109,41 @@ class Posterior:
         return Evidence.of(self.problem.observations, self.link_errors)
 
     @cached_property
-    def least(self) -> float:
-        """Cost of the errors of links on their own, which those of no model undercut by much."""
-        return self.evidence.cost(self.link_errors)[0]
+    def least(self) -> ErrorCost:
+        """What the errors of links on their own say, which those of no model undercut by much."""
+        return self.evidence.cost(self.link_errors)
 
-    @cached_property
-    def least_field(self) -> float:
-        """Size of what neighbours share in the errors of links on their own, pixels."""
-        return self.evidence.cost(self.link_errors)[1]
+    @property
+    def largest_trial(self) -> float:
+        """Error that a few pairs may have as a turn for that to be tried on all, pixels."""
+        diagonal = 2.0 * float(np.median(self.problem.observations.scale2))
+        return max(_POSSIBLE * self.evidence.noise, _PARALLAX * diagonal)
 
     def of(self, fit: Fit) -> Hypothesis:
         """Score a fit."""
         errors = whitened_errors(self.problem.observations, fit.adjusted.homographies, fit.adjusted.parameters.lens)
-        cost, field = self.evidence.cost(errors)
+        found = self.evidence.cost(errors)
         wide = 0.0
         if fit.tilt_spread > 0.0:
             wide = 4.0 * self.problem.count * math.log(max(fit.tilt_spread / _TYPICAL_TILT_SPREAD, 1.0))
         priors = self.problem.adjuster_of(fit).camera_prior_cost(fit.adjusted.parameters)
-        score = cost + self.price(fit.model, fit.free_lens) + wide + priors
+        score = found.cost + self.price(fit.model, fit.free_lens, found.count) + wide + priors
         if fit.model.on_sphere != self.prefer_turn:
             score += _PREFERENCE
         absurd = self.layout_matters and not stretch(fit) <= MAX_STRETCH
-        return Hypothesis(fit, score if has_plausible_focal(fit) else math.inf, field, absurd)
+        return Hypothesis(fit, score if has_plausible_focal(fit) else math.inf, found.field, absurd)
 
     def suffices(self, best: Hypothesis, model: MotionModel) -> bool:
         """Whether a freer model could not be taken, even if it left the errors that links leave on their own."""
-        if model is HOMOGRAPHY and not _is_beyond_one_camera(self, best, self.least_field):
+        if model is HOMOGRAPHY and not _is_beyond_one_camera(self, best, self.least.field):
             return True
-        return not best.absurd and best.score <= self.least + self.price(model, self.problem.free_lens)
+        return not best.absurd and best.score <= self.least.cost + self.price(
+            model, self.problem.free_lens, self.least.count
+        )
 
-    def price(self, model: MotionModel, free_lens: BoolArray) -> float:
-        """What the parameters of a model cost (Schwarz's criterion)."""
-        return parameter_count(self.problem, model, free_lens) * math.log(max(self.evidence.count, 2.0))
+    def price(self, model: MotionModel, free_lens: BoolArray, count: float) -> float:
+        """What the parameters of a model cost, by so many independent observations (Schwarz's criterion)."""
+        return parameter_count(self.problem, model, free_lens) * math.log(count)
 
 
 def select_model(
@@ -160,34 +162,29 @@ def select_model(
     """
     posterior = Posterior(problem, prefer_turn, layout_matters)
     tried: list[Hypothesis] = []
-    for name in [name for name in (ROTATION.name, *MODELS) if name in names]:
-        model = MODELS[name]
-        if any(one.fit.model is model for one in tried) or (model is POSE and problem.count == 2 and len(names) > 1):
+    turns = [MODELS[name] for name in names if MODELS[name].on_sphere]
+    for turn in turns:
+        trial = problem.trial(turn)
+        if len(names) == 1 or trial.sigma <= posterior.largest_trial:
+            tried.append(posterior.of(problem.fit(turn, shared=trial.parameters.shared)))
+    for model in [MODELS[name] for name in names if not MODELS[name].on_sphere]:
+        if model is POSE and problem.count == 2 and len(names) > 1:  # one camera in any pose is a homography
             continue
-        best = min(tried, key=lambda one: one.score, default=None)
-        if best is not None and posterior.suffices(best, model):
+        if tried and posterior.suffices(min(tried, key=_score), model):
             break
-        if model.on_sphere:
-            trial = problem.trial(model)
-            limit = max(
-                _POSSIBLE * posterior.evidence.noise, _PARALLAX * 2.0 * float(np.median(problem.observations.scale2))
-            )
-            if len(names) > 1 and trial.sigma > limit:
-                continue
-            tried.append(posterior.of(problem.fit(model, shared=trial.parameters.shared)))
-        else:
-            planar = [one.fit for one in tried if not one.fit.model.on_sphere]
-            tried.append(posterior.of(problem.fit(model, planar[-1:])))
+        planes = [one.fit for one in tried if not one.fit.model.on_sphere]
+        tried.append(posterior.of(problem.fit(model, planes[-1:])))
+    if min(tried, key=_score).absurd:
+        tried += [posterior.of(problem.fit(turn)) for turn in turns if all(one.fit.model is not turn for one in tried)]
     tried = _with_wider_lenses(posterior, tried, lenses)
-    best_one = _best(posterior, tried)
-    return _choice(posterior, tried, best_one, requested=len(names) == 1)
+    return _choice(posterior, tried, _best(posterior, tried), requested=len(names) == 1)
 
 
 def best_of(problem: Problem, fits: Sequence[Fit]) -> ModelChoice:
     """Take the best of some fits of the problem."""
     posterior = Posterior(problem)
     tried = [posterior.of(fit) for fit in fits]
-    return _choice(posterior, tried, min(tried, key=lambda one: one.score), requested=False)
+    return _choice(posterior, tried, min(tried, key=_score), requested=False)
 
 
 def _with_wider_lenses(
@@ -208,12 +205,17 @@ def _with_wider_lenses(
 def _best(posterior: Posterior, tried: Sequence[Hypothesis]) -> Hypothesis:
     """The one with the best score; where that has an absurd layout, the turn or, of the others, the best that joins."""
     cameras = [one for one in tried if one.fit.model is not HOMOGRAPHY]
-    best = min(cameras or tried, key=lambda one: one.score)
+    free = [one for one in tried if one.fit.model is HOMOGRAPHY]
+    best = min(cameras or free, key=_score)
     if not best.absurd:
-        beyond = _is_beyond_one_camera(posterior, best, tried[-1].field)
-        return min(tried, key=lambda one: one.score) if beyond else best
+        beyond = [one for one in free if _is_beyond_one_camera(posterior, best, one.field)]
+        return min([best, *beyond], key=_score)
     joining = [one for one in tried if not one.absurd and one.field < _TOLERABLE * posterior.evidence.farthest]
-    return min(joining, key=lambda one: (not one.fit.model.on_sphere, one.score), default=best)
+    return min(joining, key=lambda one: (not one.fit.model.on_sphere, one.score), default=min(tried, key=_score))
+
+
+def _score(one: Hypothesis) -> float:
+    return one.score
 
 
 def _is_beyond_one_camera(posterior: Posterior, best: Hypothesis, free: float) -> bool:

@@ -18,6 +18,7 @@ _MAX_MATCHES = 250  # matches of a pair that are used
 _MIN_STD = 2e-4  # λ; no pair knows it better than that the division model holds
 _MIN_INLIERS = 30  # of a pair that votes: three times the parameters of a homography and two λ
 _COMMON_STD = 0.05  # λ; by so much relief and lenses of another kind change what a pair sees, of both pictures alike
+_MAX_COHERENCE = 0.5  # correlation of neighbours' errors: more is depth, for which λ of either picture takes the blame
 _ROUNDS = 6
 _PAIRS_AT_ONCE = 64
 
@@ -51,7 +52,11 @@ class Votes:
             and int(pair.relation.inliers.sum()) >= _MIN_INLIERS
         ]
         found = list(zip(registered, _votes(registered, threshold), strict=True))
-        seen = [(pair, vote) for pair, vote in found if np.isfinite(vote.covariance).all()]
+        seen = [
+            (pair, vote)
+            for pair, vote in found
+            if np.isfinite(vote.covariance).all() and vote.coherence < _MAX_COHERENCE
+        ]
         return cls(
             np.array([pair.image1 for pair, _ in seen], dtype=np.intp),
             np.array([pair.image2 for pair, _ in seen], dtype=np.intp),

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_STD
@@ -37,10 +38,13 @@ class OwnLenses:
     ----------
     distortion : ndarray of shape (2,)
     covariance : ndarray of shape (2, 2)
+    coherence : float
+        Correlation of the errors of neighbours that are left: 0 for noise, up to 1 where depth moves them together.
     """
 
     distortion: FloatArray
     covariance: FloatArray
+    coherence: float
 
 
 def own_lenses(relations: Sequence[RadialHomography], data: Measurements, threshold: float) -> list[OwnLenses]:
@@ -68,7 +72,25 @@ def own_lenses(relations: Sequence[RadialHomography], data: Measurements, thresh
             parameters, found = descend(problems, _retract, parameters, _ITERATIONS)
         noise = noise_of(found.errors, threshold)
         covariance = covariances(found.information, problems.influence(parameters), noise, data)
-    return [OwnLenses(own[:2], known[:2, :2]) for own, known in zip(parameters, covariance, strict=True)]
+        left = differentiate(*_parts(parameters), data)
+        inliers = data.present & ~left.lost & (left.squared < loss_width(noise, threshold)[:, None] ** 2)
+    coherence = [
+        _coherence(points[:, own].T, errors[:, own].T)
+        for points, errors, own in zip(data.x1, left.error, inliers, strict=True)
+    ]
+    return [
+        OwnLenses(own[:2], known[:2, :2], shared)
+        for own, known, shared in zip(parameters, covariance, coherence, strict=True)
+    ]
+
+
+def _coherence(points: FloatArray, errors: FloatArray) -> float:
+    """Correlation of the errors (N, 2) of points (N, 2) and their nearest neighbours."""
+    if len(points) < 2:
+        return 0.0
+    nearest = np.asarray(cKDTree(points).query(points, k=2)[1])[:, 1]
+    power = float(np.einsum("ni,ni->", errors, errors))
+    return float(np.einsum("ni,ni->", errors, errors[nearest])) / power if power > 0.0 else 0.0
 
 
 def _retract(parameters: FloatArray, step: FloatArray) -> tuple[FloatArray, BoolArray]:
