@@ -150,6 +150,7 @@ def align(
         replace(choice, fit=fit),
         chosen.refined(fit.free_lens),
         observable,
+        options.layout_matters,
         None if options.gravity is None else np.asarray(options.gravity, dtype=np.float64),
         disagreement,
     )

@@ -59,6 +59,8 @@ class AdjustedPictures:
         The lens, with the distortion centre if the motion model freed it.
     observable : bool
         Whether λ is observable, or known.
+    layout_matters : bool
+        Whether a picture is wanted; the lens or the poses otherwise.
     gravity : ndarray of shape (M, 3), optional
         Direction down in the axes of every camera; NaN where it is unknown.
     positions_disagree : str
@@ -73,6 +75,7 @@ class AdjustedPictures:
     choice: ModelChoice
     lens: LensChoice
     observable: bool
+    layout_matters: bool = True
     gravity: FloatArray | None = None
     positions_disagree: str = ""
 
@@ -283,7 +286,7 @@ def _warnings(found: AdjustedPictures, camera: Camera) -> tuple[Message, ...]:
                 f"{len(found.pictures)} pictures show the lens to {off:.1f} pixels at the corners only; "
                 f"take {ENOUGH_PICTURES} or more, or give the lens"
             )
-            result.append(Message(text, code="few-pictures"))
+            result.append(Message(text, severity="note" if found.layout_matters else "warning", code="few-pictures"))
     if not found.choice.fit.adjusted.converged:
         result.append(Message("the adjustment did not converge; judge the result with care", code="not-converged"))
     if found.positions_disagree:

@@ -19,13 +19,11 @@ import numpy as np
 
 from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.link_equations import squared_lengths
+from rdstitch.alignment.noise_model import EXACTNESS
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.planarity import coherence
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
-
-EXACTNESS = 0.1
-"""Pixels: how exactly a lens and a plane can be described at all; the field of no hypothesis is smaller."""
 
 _SIDE = 4
 """Cells along each side of an overlap; blocks have half as many."""
@@ -110,8 +108,9 @@ class Evidence:
             index = int(np.argmin(costs))
             cost = self.weight * float((2.0 * np.log(variance) + squared / variance).sum() + costs[index])
             if cost < best.cost:
-                count = 2.0 * self.weight * float(((fine**2 + self.noise**2) / variance).sum())
-                best = ErrorCost(cost, float(np.hypot(fine, coarse[index, 0])), max(count, 2.0))
+                field = float(np.hypot(fine, coarse[index, 0]))
+                count = 2.0 * self.weight * (field**2 + self.noise**2) * float((information / grown[index]).sum())
+                best = ErrorCost(cost, field, max(count, 2.0))
         return best
 
 
@@ -126,7 +125,7 @@ class ErrorCost:
     field : float
         Size of what neighbours share, pixels of a coordinate.
     count : float
-        Independent coordinates: all where there is noise only, one pair of them a cell where the field is large.
+        Independent coordinates: all where there is noise only, a pair of them a cell or block where the field is large.
     """
 
     cost: float

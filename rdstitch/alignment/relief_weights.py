@@ -64,7 +64,9 @@ def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[st
             fits.append(fit)
     if not fits:
         return replace(choice, fit=_settled(problem, choice.fit)[1], over_relief=True)
-    return replace(best_of(problem, [_refined(problem, fit) for fit in fits]), over_relief=True)
+    return replace(
+        best_of(problem, [_refined(problem, fit) for fit in fits], requested=len(names) == 1), over_relief=True
+    )
 
 
 def adjust_over_relief(problem: Problem, choice: ModelChoice) -> tuple[Problem, Fit]:

@@ -180,11 +180,11 @@ def select_model(
     return _choice(posterior, tried, _best(posterior, tried), requested=len(names) == 1)
 
 
-def best_of(problem: Problem, fits: Sequence[Fit]) -> ModelChoice:
+def best_of(problem: Problem, fits: Sequence[Fit], *, requested: bool) -> ModelChoice:
     """Take the best of some fits of the problem."""
     posterior = Posterior(problem)
     tried = [posterior.of(fit) for fit in fits]
-    return _choice(posterior, tried, min(tried, key=_score), requested=False)
+    return _choice(posterior, tried, min(tried, key=_score), requested=requested)
 
 
 def _with_wider_lenses(

@@ -21,6 +21,7 @@ from rdstitch.verification.overlap_check import CheckedLink, check_overlaps, sha
 from rdstitch.verification.parallax import find_parallax, parallax_messages
 from rdstitch.verification.rival_check import compare_with_rivals, outside_rivals
 from rdstitch.verification.rival_motion import MIN_AGREEMENT, find_rival_motions, is_apart, rival_messages
+from rdstitch.verification.rules import Situation, spoken
 
 Pair = tuple[int, int]
 
@@ -111,7 +112,7 @@ def judge(
     suspicions = {**disagreeing, **_unlike(paths, seen, least), **_of_the_rival(paths, checked, compared), **ambiguous}
     decisive = [] if lens_only or resting else _decisive(suspicions, used, len(paths))
     doubtful = [pair for pair in suspicions if pair not in decisive and not (lens_only and pair in ambiguous)]
-    return (
+    messages = (
         *_error_of_the_whole(alignment, threshold, checked),
         *(parallax_messages(paths, parallax) or _relief(paths, alignment)),
         *([] if lens_only else _shape(paths, alignment)),
@@ -124,6 +125,9 @@ def judge(
         *_two_left(paths, registration),
         *doubtful_inputs(registration.sources),
     )
+    shape, size = alignment.shape, min(2.0 * camera.half_diagonal for camera in alignment.cameras)
+    shown = shape is not None and shape.shown and math.hypot(shape.shift, shape.shift_std) < size
+    return spoken(messages, Situation(_usual_agreement(checked), alignment.relief.found or bool(parallax), shown))
 
 
 def _failure(text: str, images: Sequence[str] = ()) -> Message:
@@ -208,7 +212,7 @@ def _outvoted(
             text = f"{len(own)} of the pairs fit {what}, and little depends on them: {named}"
             images = tuple(paths[k] for k in sorted({k for pair in own for k in pair}))
             text += "; look at the seams between them" if seams else ""
-            result.append(Message(text, images, code="doubtful-seam"))
+            result.append(Message(text, images, "note", code="doubtful-seam"))
     return result
 
 

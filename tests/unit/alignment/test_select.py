@@ -1,0 +1,139 @@
+"""Turn, plane or neither: what is chosen, on matches of known motions."""
+
+from dataclasses import replace
+from importlib import import_module
+
+import numpy as np
+import pytest
+
+from rdstitch.alignment import Alignment, AlignmentOptions, align
+from rdstitch.alignment.adjustment_problem import Problem
+from rdstitch.alignment.motion_models import PSI
+from rdstitch.alignment.select import ModelChoice, Posterior, select_model
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
+from rdstitch.matching.links import Link
+from rdstitch.radial_homography import RadialHomography
+from rdstitch.synthetic.panorama import camera_rotations
+from tests.alignment_scenes import grid, scene
+
+SIZE, FOCAL = (640, 480), 520.0
+
+
+def _views(
+    rotations: FloatArray,
+    positions: FloatArray,
+    depth: tuple[float, float],
+    *,
+    camera: Camera | None = None,
+    lens: Camera | None = None,
+    seed: int = 0,
+    count: int = 150,
+) -> tuple[list[Camera], list[Link]]:
+    """Links between images of a scene whose depth grows from the first to the second value, upwards in the images."""
+    lens = lens or Camera(SIZE)
+    given = camera or Camera(SIZE, focal=FOCAL, focal_source="guess")
+    rng, links = np.random.default_rng(seed), []
+    for i in range(len(rotations)):
+        for j in range(i + 1, len(rotations)):
+            first = rng.uniform((0, 0), np.array(SIZE) - 1.0, (4 * count, 2))
+            rays = np.column_stack([(lens.undistort(first) - lens.center) / FOCAL, np.ones(len(first))])
+            share = 1.0 - first[:, 1] / SIZE[1]
+            along = depth[0] * (depth[1] / depth[0]) ** share * np.where(first[:, 0] % 160 < 80, 1.0, 1.05)
+            seen = (rays * along[:, None]) @ rotations[i] + positions[i]
+            other = (seen - positions[j]) @ rotations[j].T
+            second = lens.distort(other[:, :2] / other[:, 2:] * FOCAL + lens.center)
+            inside = (other[:, 2] > 0.0) & ((second >= 0.0) & (second <= np.array(SIZE) - 1.0)).all(axis=1)
+            if inside.sum() < count:
+                continue
+            p1, p2 = (p[inside][:count] + rng.normal(0.0, 0.2, (count, 2)) for p in (first, second))
+            k = np.diag([FOCAL / lens.half_diagonal, FOCAL / lens.half_diagonal, 1.0])
+            relation = RadialHomography(
+                k @ rotations[j] @ rotations[i].T @ np.linalg.inv(k), given, given, np.ones(count, dtype=np.bool_)
+            )
+            links.append(Link(i, j, p1, p2, replace(relation, distortion_std=0.02)))
+    return [given] * len(rotations), links
+
+
+def _turn(step: float, *, pitch: float = 0.0, moved: float = 0.0, **options: object) -> tuple[list[Camera], list[Link]]:
+    """Five images of a turn by steps of so many degrees, of a scene from 5 to 50 units away."""
+    headings = np.radians(step) * np.arange(5)
+    rotations = camera_rotations(headings.tolist(), [np.radians(pitch)] * 5)
+    positions = moved * np.random.default_rng(3).normal(size=(5, 3))
+    return _views(rotations, positions, (5.0, 50.0), **options)  # type: ignore[arg-type]
+
+
+def _focal_error(found: Alignment) -> float:
+    assert found.focal is not None
+    return abs(found.focal * Camera(SIZE).half_diagonal / FOCAL - 1.0)
+
+
+@pytest.mark.parametrize("moved", [0.0, 0.03])
+@pytest.mark.parametrize("pitch", [0.0, 50.0])
+def test_a_turn_by_hand_is_a_turn(moved: float, pitch: float) -> None:
+    found = align(*_turn(20.0, moved=moved, pitch=pitch))
+    assert found.model == "rotation"
+    assert found.used.all()
+    assert abs(found.distortion) < 0.03
+    assert _focal_error(found) < 0.05
+
+
+@pytest.mark.parametrize("factor", [0.3, 8.0])
+def test_images_overrule_a_focal_length_of_exif_that_is_nonsense(factor: float) -> None:
+    wrong = Camera(SIZE, focal=factor * FOCAL, focal_source="exif")
+    found = align(*_turn(20.0, camera=wrong))
+    assert found.model == "rotation"
+    assert _focal_error(found) < 0.05
+
+
+def test_a_wide_lens_on_a_turn_is_found() -> None:
+    found = align(*_turn(20.0, lens=Camera(SIZE, distortion=-0.25)))
+    assert found.model == "rotation"
+    assert found.distortion == pytest.approx(-0.25, abs=0.02)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.6])
+def test_a_camera_that_moves_over_a_plane_does_not_turn(tilt: float) -> None:
+    rng = np.random.default_rng(4)
+    poses = grid(3, 2, (0.4, 0.35), 0.3, rng)
+    given = scene(poses, rng=rng, tilt=(tilt, 0.0), focal_source="guess", per_link=120)
+    found = align(given.cameras, given.links)
+    assert found.model == "rigid"
+    assert found.tilt is not None
+    assert found.tilt[0] == pytest.approx(tilt, abs=0.03)
+    assert found.distortion == pytest.approx(-0.25, abs=0.01)
+
+
+def test_tilts_of_their_own_are_found() -> None:
+    rng = np.random.default_rng(5)
+    poses = grid(3, 3, (0.4, 0.35), 0.3, rng)
+    poses[:, PSI] = np.radians([0, 4, -5, 6, -3, 2, -6, 5, 1])
+    given = scene(poses, rng=rng, focal_source="guess", per_link=120)
+    assert align(given.cameras, given.links).model == "tilting"
+
+
+def test_depth_in_two_images_is_not_taken_for_a_lens() -> None:
+    """Something near at the bottom and far at the top, from two places."""
+    rotations = camera_rotations([0.0, np.radians(8.0)], [0.0, 0.0])
+    found = align(*_views(rotations, np.array([[0.0, 0.0, 0.0], [0.25, 0.0, 0.1]]), (4.0, 12.0)))
+    assert abs(found.distortion) < 0.09
+
+
+def test_a_model_that_was_requested_is_taken() -> None:
+    found = align(*_turn(12.0), AlignmentOptions(model="similarity"))
+    assert found.model == "similarity"
+    assert "as requested" in found.model_reason
+
+
+def test_the_command_decides_between_what_is_as_good(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`pano` is for turns, `mosaic` for planes: odds that evidence overrules."""
+    scores = []
+
+    def spy(problem: Problem, names: list[str], *rest: object, **options: bool) -> ModelChoice:
+        choice = select_model(problem, ["rotation"])
+        scores.append([Posterior(problem, prefer_turn).of(choice.fit).score for prefer_turn in (True, False)])
+        return choice
+
+    monkeypatch.setattr(import_module("rdstitch.alignment.align"), "select_model", spy)
+    align(*_turn(20.0))
+    assert 2.0 < scores[0][1] - scores[0][0] < 10.0
