@@ -20,6 +20,7 @@ from rdstitch.pipeline.compose import blocks_on, compose_pictures, viewed_pictur
 from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally
 from rdstitch.pipeline.read_inputs import read_inputs
 from rdstitch.pipeline.register import register, with_frontal_reference
+from rdstitch.pipeline.whole_pixels import on_whole_pixels
 from rdstitch.progress import Progress, silent
 from rdstitch.registration import Registration
 from rdstitch.sidecar.write import sidecar
@@ -270,7 +271,7 @@ def _composite(
 
     ``frontal`` takes the undistorted reference picture for the plane.
     """
-    registration = with_frontal_reference(registration, options, always=frontal)
+    registration = on_whole_pixels(with_frontal_reference(registration, options, always=frontal))
     local = align_registration_locally(registration, options.local_alignment)
     placed = PlacedImages.of(registration, local.fields or None)
     with Outputs(options.overwrite) as outputs:
