@@ -1,201 +1,265 @@
-"""Gain compensation and vignetting: gain per picture and channel, and one vignetting for all.
+"""Gain compensation and vignetting correction: pictures agree where they overlap, and keep their own brightness.
 
-Two pictures of one point of the plane differ by their gains and the vignetting alone, which are linear in the
-logarithm (:mod:`rdstitch.compositing.photometric`). Which response of the camera the pictures follow is decided by the
-residuals. What is left over, and the brightness of the whole, is left to :mod:`rdstitch.compositing.brightness`.
+Two pictures of one point of the plane differ by gain, vignetting and a smooth field, which are linear in the logarithm
+(:mod:`rdstitch.compositing.photometric`): robust least squares over the cells that two pictures show, of gains and
+vignetting first, and then of the fields. What differs for other reasons (parallax, people, the header of a page) is no
+evidence of brightness, however much of it there is that agrees with itself: weights redescend to 0 (Tukey's biweight)
+around the median of each overlap, and a correction is made only where it explains the overlaps better than none.
+
+Gains alone carry the automatic exposure of one end of a flight to the other, where bright ground is then burnt out.
+With "balanced", fields tend to the brightness of each region's own pictures instead, as a photographer would leave it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import LinearOperator, cg
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import Camera
-from rdstitch.compositing.boxes import Box, cut
-from rdstitch.compositing.photometric import Exposure, full_scale, no_exposure, squared_radius
+from rdstitch.compositing.options import ExposureMethod
+from rdstitch.compositing.overlap_cells import Cells, compare_overlaps
+from rdstitch.compositing.photometric import Exposure, bilinear_weights, full_scale, no_exposure, squared_radius
 from rdstitch.compositing.placed_picture import PlacedPicture
-from rdstitch.compositing.survey import Survey, SurveyTile
+from rdstitch.compositing.survey import Survey
 
 _SRGB_OFFSET = 0.055
-# Samples outside this part of the range are clipped or mostly noise.
-_DARKEST, _BRIGHTEST = 0.02, 0.97
-_SAMPLES_PER_PAIR, _MAX_SAMPLES = 800, 200_000
-_MIN_SAMPLES = 30
-# Of thousands of overlaps, each needs fewer.
-_FEWEST_SAMPLES = 10
-# How well two pictures' brightness can agree, and how far gains stray (log units): keeps long chains from drifting.
-_PAIR_SIGMA, _GAIN_SIGMA = 0.02, 0.5
-# The same where the camera has written its exposure down: tone curves and apertures are not exact.
-_EXIF_SIGMA = 0.15
+# How well the gains of two pictures can explain their overlap, and how far gains stray (log units): keeps long chains
+# from drifting. The last where the camera has written its exposure down: tone curves and apertures are not exact.
+_PAIR_SIGMA, _GAIN_SIGMA, _EXIF_SIGMA = 0.02, 0.5, 0.15
 # Power of the light that samples follow, for the prior: sRGB above its toe, or raw light.
 _SRGB_POWER = 2.4
 _VIGNETTING_SIGMA, _VIGNETTING_RANGE = 1.0, (0.15, 1.25)
-_HUBER = 1.345
+_NODES = 7  # of a field, along each side of a picture
+_CELL_SIGMA = 0.03  # how well fields can explain the means of a cell, log units
+# How far a picture may stray from its own brightness, or, with gains that hold, from these (log units), and how much a
+# field may rise, and bend, from one side of a picture to the other. Brightness follows the pictures' own over a
+# distance of the first by the third, in pictures.
+_OWN_SIGMA, _FIELD_SIGMA = 0.02, 0.3
+_RISE_SIGMA, _BEND_SIGMA = 0.1, 0.5
+_TUKEY = 4.685  # standard deviations from which on an error counts for nothing: 95 % efficient for Gaussian ones
+_VISIBLE = 0.004  # log units, a grey level of a light sample: differences below are as good as none
 _ROUNDS = 6
 # A model with more freedom must explain the data better by this share to be taken.
-_MIN_RELATIVE_GAIN = 0.02
+_MIN_RELATIVE_GAIN = 0.05
+# From here on, as a share of the full range, brightened samples are compressed instead of clipped.
+_KNEE = 0.75
+_MEDIAN_SAMPLES = 400_000  # of all pictures together
+# Residual, as a share of the right side, and decimals that are kept: both far below a grey level.
+_TOLERANCE, _MAX_STEPS, _DECIMALS = 1e-5, 3000, 5
+
+_Prior = tuple[sparse.csr_array, FloatArray, FloatArray]
+"""Precision (K, K), its product with what is expected (K, C), and the inverse (B, B) of its blocks."""
 
 
-def estimate_gains(survey: Survey, pictures: Sequence[PlacedPicture]) -> Exposure:
-    """Least squares over all overlaps, robust against what differs for other reasons (parallax, people).
+def estimate_exposure(
+    survey: Survey, pictures: Sequence[PlacedPicture], method: ExposureMethod = "balanced"
+) -> Exposure:
+    """Estimate what makes pictures agree where they overlap, with the median brightness of the set kept.
 
     Parameters
     ----------
     pictures : sequence of PlacedPicture
         The distortion centre is the centre of the vignetting, and the exposure that the camera wrote down is a weak
         prior of the gain.
+    method : str
+        "gain": one factor per picture and channel, and one vignetting for all. "blocks": also a smooth field per
+        picture. "balanced": gains and fields that stay near the pictures' own brightness at large scale, and nothing
+        is clipped.
 
     Returns
     -------
     Exposure
-        Without any correction where no pictures overlap.
+        Without any correction where none makes pictures agree better.
     """
-    cameras, exposures = zip(*((picture.camera, picture.exposure) for picture in pictures), strict=True)
-    present = [tile for tile in survey.tiles if tile is not None]
-    channels = present[0].pixels.shape[2] if present else 1
-    samples = _collect(survey, cameras)
-    if samples is None:
-        return no_exposure(len(cameras), channels)
-    offsets = (_SRGB_OFFSET, 0.0) if present[0].pixels.dtype.kind == "u" else (0.0,)
-    priors = [_gain_prior(exposures, b) for b in offsets]
-    fits = (_fit_light(samples, b, prior) for b, prior in zip(offsets, priors, strict=True))
-    return min(fits, key=lambda fit: fit.rms_after)
-
-
-def _gain_prior(exposures: Sequence[float | None], offset: float) -> tuple[FloatArray, FloatArray]:
-    """Expected log gain of each picture, and its precision (N,): from the exposures where two or more are known."""
-    count = len(exposures)
-    mean, precision = np.zeros(count), np.full(count, _GAIN_SIGMA**-2)
-    known = np.array([k for k, value in enumerate(exposures) if value is not None and value > 0.0], dtype=np.intp)
-    if len(known) > 1:
-        light = np.log([exposures[k] or 1.0 for k in known])
-        mean[known] = (light - light.mean()) / (_SRGB_POWER if offset else 1.0)
-        precision[known] = _EXIF_SIGMA**-2
-    return mean, precision
+    present, cells = [tile for tile in survey.tiles if tile is not None], compare_overlaps(survey)
+    integer = any(tile.pixels.dtype.kind == "u" for tile in present)
+    if cells is None or not cells.clear.any():
+        return no_exposure(len(pictures), present[0].pixels.shape[2] if present else 1)
+    responses = [_Differences.of(cells, b) for b in ((_SRGB_OFFSET, 0.0) if integer else (0.0,))]
+    fits = [(*_fit(data, pictures), data) for data in responses]
+    exposure, errors, data = min(fits, key=lambda fit: fit[0].rms_after)
+    cameras = [picture.camera for picture in pictures]
+    if method != "gain":
+        fields, errors = _fit_fields(cells, errors, cameras, exposure.log_gain, balanced=method == "balanced")
+        exposure = replace(exposure, fields=fields, rms_after=data.misfit(errors))
+    if exposure.rms_after > (1.0 - _MIN_RELATIVE_GAIN) * exposure.rms_before:
+        return no_exposure(*exposure.log_gain.shape)
+    exposure = replace(exposure, knee=_KNEE if method == "balanced" and integer else 1.0)
+    return _with_median_kept(exposure, survey, cameras)
 
 
 @dataclass(frozen=True)
-class _Samples:
-    """Points that two pictures see: picture, weight, value (share of full) and r² of either; S of each.
+class _Differences:
+    """What the first picture of each cell is brighter by, log units, for one response of the camera.
 
-    They are sorted by pair; ``start`` is where those of each begin.
+    Attributes
+    ----------
+    offset : float
+    values : ndarray of shape (M, C)
+    level : ndarray of shape (M,)
+        Share of the full range that one log unit is there.
     """
 
-    start: NDArray[np.intp]
-    first: NDArray[np.intp]
-    second: NDArray[np.intp]
-    share: FloatArray
-    value1: FloatArray
-    value2: FloatArray
-    radius1: FloatArray
-    radius2: FloatArray
+    cells: Cells
+    offset: float
+    values: FloatArray
+    level: FloatArray
+
+    @classmethod
+    def of(cls, cells: Cells, offset: float) -> Self:
+        log = np.log(cells.values + offset)
+        return cls(cells, offset, log[0] - log[1], np.sqrt((cells.values.mean(axis=-1) + offset).prod(axis=0)))
+
+    def misfit(self, errors: FloatArray) -> float:
+        """Mean over the overlaps of the median difference that is left, share of the full range."""
+        floor = _VISIBLE * float(np.median(self.cells.values))
+        size = np.hypot(np.abs(errors).max(axis=1) * self.level, floor)
+        medians = _medians(size[:, None], self.cells.pair, self.cells.clear)
+        return float(medians[medians > 0.0].mean())
 
 
-def _collect(survey: Survey, cameras: Sequence[Camera]) -> _Samples | None:
-    """Samples from every pair of overlapping pictures, evenly spread."""
-    pairs = survey.pairs().tolist()
-    limit = max(_FEWEST_SAMPLES, min(_SAMPLES_PER_PAIR, _MAX_SAMPLES // max(1, len(pairs))))
-    found: list[tuple[Any, ...]] = []
-    for i, j in pairs:
-        a, b, box, inside = survey.overlap(i, j)
-        where = np.flatnonzero(inside)
-        if len(where) < _MIN_SAMPLES:
-            continue
-        where = where[:: max(1, len(where) // limit)]
-        va, vb = (_values(tile, box, where) for tile in (a, b))
-        usable = ((np.minimum(va, vb) > _DARKEST) & (np.maximum(va, vb) < _BRIGHTEST)).all(axis=1)
-        if a.pixels.dtype.kind != "u":
-            usable = ((va > 0) & (vb > 0)).all(axis=1)
-        where, va, vb = where[usable], va[usable], vb[usable]
-        if len(where) < min(_MIN_SAMPLES, limit):
-            continue
-        y, x = (index.astype(np.float64) for index in np.unravel_index(where, inside.shape))
-        pa, pb = (survey.warps[k].source_points(x + box[0], y + box[1]) for k in (i, j))
-        found.append((i, j, va, vb, squared_radius(cameras[i], pa), squared_radius(cameras[j], pb)))
-    if not found:
-        return None
-    counts = [len(f[2]) for f in found]
-    first, second = (np.repeat([f[k] for f in found], counts) for k in (0, 1))
-    # A pair counts as one measurement however many samples it has.
-    share = np.repeat([1.0 / n for n in counts], counts)
-    start = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    return _Samples(start, first, second, share, *(np.concatenate([f[k] for f in found]) for k in range(2, 6)))
+def _fit(data: _Differences, pictures: Sequence[PlacedPicture]) -> tuple[Exposure, FloatArray]:
+    """Gains, and vignetting where it explains the data better; and the errors."""
+    cells, prior = data.cells, _gain_prior(pictures, data.offset)
+    radius2 = np.empty((2, len(data.level)))
+    for end, picture, chosen in cells.by_picture():
+        radius2[end, chosen] = squared_radius(pictures[picture].camera, cells.points[end, chosen])
+    powers = np.stack([radius2[0] ** k - radius2[1] ** k for k in (1, 2, 3)], axis=1)
+    gains, errors = _fit_gains(cells, data.values, powers[:, :0], prior)
+    exposure = Exposure(data.offset, gains, rms_before=data.misfit(data.values), rms_after=data.misfit(errors))
+    coefficients = _fit_gains(cells, data.values, powers, prior)[0][len(pictures) :].mean(axis=1)
+    gains, flat = _fit_gains(cells, data.values - (powers @ coefficients)[:, None], powers[:, :0], prior)
+    profile = np.exp(np.linspace(0.0, 1.0, 20)[:, None] ** (1, 2, 3) @ coefficients)
+    possible = profile.min() > _VIGNETTING_RANGE[0] and profile.max() < _VIGNETTING_RANGE[1]
+    if possible and (better := data.misfit(flat)) < (1.0 - _MIN_RELATIVE_GAIN) * exposure.rms_after:
+        return replace(exposure, log_gain=gains, vignetting=coefficients, rms_after=better), flat
+    return exposure, errors
 
 
-def _values(tile: SurveyTile, box: Box, where: NDArray[np.intp]) -> FloatArray:
-    """Samples as share of the full range, (S, C)."""
-    pixels = cut(tile.pixels, tile.box, box).reshape(-1, tile.pixels.shape[2])
-    return pixels[where].astype(np.float64) / full_scale(tile.pixels.dtype)
+def _gain_prior(pictures: Sequence[PlacedPicture], offset: float) -> tuple[FloatArray, FloatArray]:
+    """Expected log gain of each picture, and its precision (N,): from the exposures where two or more are known."""
+    light = np.array([np.log(p.exposure) if p.exposure and p.exposure > 0.0 else np.nan for p in pictures])
+    known = np.isfinite(light)
+    if known.sum() < 2:
+        return np.zeros(len(light)), np.full(len(light), _GAIN_SIGMA**-2)
+    mean = (light - light[known].mean()) / (_SRGB_POWER if offset else 1.0)
+    return np.where(known, mean, 0.0), np.where(known, _EXIF_SIGMA, _GAIN_SIGMA) ** -2.0
 
 
-def _fit_light(samples: _Samples, offset: float, prior: tuple[FloatArray, FloatArray]) -> Exposure:
-    """Gains, and vignetting where it explains the data better."""
-    gains, vignetted = (_fit(samples, offset, prior, vignetting) for vignetting in (False, True))
-    return vignetted if vignetted.rms_after < (1.0 - _MIN_RELATIVE_GAIN) * gains.rms_after else gains
+def _fit_gains(
+    cells: Cells, values: FloatArray, radial: FloatArray, prior: tuple[FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Gains (N, C) and below them the coefficients of further columns (M, K), and the errors (M, C)."""
+    (mean, precision), (rows, extra) = prior, radial.shape
+    signed = np.tile([1.0, -1.0], rows), cells.pictures.T.ravel(), 2 * np.arange(rows + 1)
+    design = sparse.hstack([sparse.csr_array(signed, shape=(rows, len(mean))), sparse.csr_array(radial)])
+    # Clipped samples say nothing of gains, and a pair counts as one measurement however many cells it has.
+    clear = cells.clear
+    weight = clear / (np.bincount(cells.pair, clear)[cells.pair].clip(1.0) * _PAIR_SIGMA**2)
+    both = sparse.diags_array(np.concatenate([precision, np.full(extra, _VIGNETTING_SIGMA**-2)]))
+    expected = np.concatenate([precision * mean, np.zeros(extra)])[:, None].repeat(values.shape[1], axis=1)
+    return _fit_robustly(cells, sparse.csr_array(design), weight, values, (sparse.csr_array(both), expected, np.eye(1)))
 
 
-def _fit(samples: _Samples, offset: float, prior: tuple[FloatArray, FloatArray], vignetting: bool) -> Exposure:
-    """Gains and vignetting for one response of the camera, by iteratively reweighted least squares."""
-    count = len(prior[0])
-    difference = np.log(samples.value1 + offset) - np.log(samples.value2 + offset)
-    grey = difference.mean(axis=1)
-    level = np.sqrt((samples.value1.mean(axis=1) + offset) * (samples.value2.mean(axis=1) + offset))
-    powers = [samples.radius1**k - samples.radius2**k for k in (1, 2, 3)]
-    radial = np.stack(powers, axis=1) if vignetting else np.zeros((len(grey), 0))
-    robust = np.ones(len(grey))
-    before = _robust_rms(grey * level, samples.share)
+def _fit_fields(
+    cells: Cells, values: FloatArray, cameras: Sequence[Camera], log_gain: FloatArray, *, balanced: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Fields (N, B, B, C) beside gains and vignetting, and the errors (M, C)."""
+    (rows, channels), nodes = values.shape, _NODES**2
+    columns, entries = np.empty((rows, 2, 4), dtype=np.intp), np.empty((rows, 2, 4))
+    for end, picture, chosen in cells.by_picture():
+        places, shares = bilinear_weights(cameras[picture], cells.points[end, chosen], _NODES)
+        columns[chosen, end], entries[chosen, end] = picture * nodes + places, (1 - 2 * end) * shares
+    shape = (rows, len(cameras) * nodes)
+    design = sparse.csr_array((entries.ravel(), columns.ravel(), 8 * np.arange(rows + 1)), shape=shape)
+    # What one picture alone is brighter by is to vanish: neighbours count by the share that they have in common.
+    around = cells.overlap + sparse.eye_array(len(cameras))
+    wanted = -(around @ log_gain) / around.sum(axis=1)[:, None] if balanced else np.zeros_like(log_gain)
+    near = (_OWN_SIGMA if balanced else _FIELD_SIGMA) ** -2 / nodes
+    block = _evenness() + near * np.eye(nodes)
+    precision = sparse.csr_array(sparse.kron(sparse.eye_array(len(cameras)), block))
+    prior = precision, near * np.repeat(wanted, nodes, axis=0), np.asarray(np.linalg.inv(block), dtype=np.float64)
+    found, errors = _fit_robustly(cells, design, np.full(rows, _CELL_SIGMA**-2), values, prior)
+    return found.reshape(len(cameras), _NODES, _NODES, channels), errors
+
+
+def _evenness() -> FloatArray:
+    """Precision of the nodes of one picture: fields rise and bend little."""
+    total, one = np.zeros((_NODES**2, _NODES**2)), np.eye(_NODES)
+    for order, sigma in ((1, _RISE_SIGMA), (2, _BEND_SIGMA)):
+        step = np.diff(one, order, axis=0) * (_NODES - 1) ** order
+        for both in (np.kron(step, one), np.kron(one, step)):
+            total += both.T @ both / (sigma**2 * len(both))
+    return total
+
+
+def _fit_robustly(
+    cells: Cells, design: sparse.csr_array, weight: FloatArray, values: FloatArray, prior: _Prior
+) -> tuple[FloatArray, FloatArray]:
+    """Solution (K, C) of ``design x = values`` (M, C) and the errors, by iteratively reweighted least squares."""
+    clear = cells.clear
+    errors, solution = (
+        values - _medians(values, cells.pair, clear)[cells.pair],
+        np.zeros((design.shape[1], values.shape[1])),
+    )
     for _ in range(_ROUNDS):
-        weight = robust * samples.share / _PAIR_SIGMA**2
-        solution = _solve(samples, weight, grey[:, None], radial, prior)
-        residual = grey - (solution[samples.first] - solution[samples.second])[:, 0] - radial @ solution[count:, 0]
-        scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-4)
-        robust = 1.0 / np.maximum(1.0, np.abs(residual) / (_HUBER * scale))
-    coefficients = np.zeros(3)
-    if vignetting:
-        coefficients = solution[count:, 0]
-        profile = np.exp(np.stack([np.linspace(0, 1, 20) ** k for k in (1, 2, 3)], axis=1) @ coefficients)
-        if not ((profile > _VIGNETTING_RANGE[0]) & (profile < _VIGNETTING_RANGE[1])).all():
-            return Exposure(offset, np.zeros((count, difference.shape[1])), rms_before=before, rms_after=np.inf)
-    flat = difference - (radial @ solution[count:])
-    gains = _solve(samples, robust * samples.share / _PAIR_SIGMA**2, flat, np.zeros((len(grey), 0)), prior)
-    after = _robust_rms((flat - gains[samples.first] + gains[samples.second]).mean(axis=1) * level, samples.share)
-    return Exposure(offset, gains, coefficients, rms_before=before, rms_after=after)
-
-
-def _robust_rms(errors: FloatArray, share: FloatArray) -> float:
-    """Mean absolute error over pairs."""
-    return float((np.abs(errors) * share).sum() / share.sum())
+        size = np.abs(errors).max(axis=1)
+        scale = max(1.4826 * float(np.median(size[clear])), _VISIBLE)
+        robust = (1.0 - (size / (_TUKEY * scale)) ** 2).clip(0.0) ** 2
+        # A burnt-out sky is as bright as its samples or brighter, and must not end in a step either.
+        darker = np.stack([errors.mean(axis=1), -errors.mean(axis=1)]) < 0.0
+        robust[(cells.clipped & darker).any(axis=0)] = 1.0
+        solution = _solve(design, robust * weight, values, prior, solution)
+        errors = values - design @ solution
+    return np.round(solution, _DECIMALS), errors
 
 
 def _solve(
-    samples: _Samples,
-    weight: FloatArray,
-    values: FloatArray,
-    radial: FloatArray,
-    prior_gain: tuple[FloatArray, FloatArray],
+    design: sparse.csr_array, weight: FloatArray, values: FloatArray, prior: _Prior, start: FloatArray
 ) -> FloatArray:
-    """Weighted least squares of ``g_first - g_second + radial a = values``; shape (N + K, C)."""
-    (mean, precision), extra = prior_gain, radial.shape[1]
-    count = len(mean)
-    # All samples of a pair have the same gains: their normal equations are summed first.
-    ends = samples.first[samples.start], samples.second[samples.start]
-    total, gain_radial, gain_value = (
-        np.add.reduceat(weight[:, None] * v, samples.start, axis=0) for v in (np.ones((len(weight), 1)), radial, values)
-    )
-    between = sparse.csr_array(
-        (np.repeat([1.0, -1.0], len(total)), (np.concatenate(ends), np.tile(np.arange(len(total)), 2))),
-        shape=(count, len(total)),
-    )
-    border = sparse.csr_array(between @ gain_radial)
-    gains = between @ sparse.diags_array(total[:, 0]) @ between.T
-    bends = sparse.csr_array((weight[:, None] * radial).T @ radial)
-    prior = sparse.diags_array(np.concatenate([precision, np.full(extra, _VIGNETTING_SIGMA**-2)]))
-    normal = sparse.block_array([[gains, border], [border.T, bends]]) + prior
-    expected = (precision * mean)[:, None]
-    right = np.concatenate([between @ gain_value + expected, (weight[:, None] * radial).T @ values])
-    return np.asarray(spsolve(normal.tocsc(), right), dtype=np.float64).reshape(count + extra, -1)
+    """Weighted least squares with a prior, by conjugate gradients, in memory that grows with the number of pictures."""
+    precision, expected, inverse = prior
+    shape = (design.shape[1],) * 2
+
+    def normal(x: FloatArray) -> FloatArray:
+        return np.asarray(design.T @ (weight * (design @ x)) + precision @ x)
+
+    def precondition(x: FloatArray) -> FloatArray:
+        return np.asarray((x.reshape(-1, len(inverse)) @ inverse).ravel())
+
+    right = design.T @ (weight[:, None] * values) + expected
+    operator, better = (LinearOperator(shape, matvec=apply, dtype=np.float64) for apply in (normal, precondition))
+    options: dict[str, Any] = {"rtol": _TOLERANCE, "maxiter": _MAX_STEPS, "M": better}
+    return np.stack([cg(operator, b, x, **options)[0] for b, x in zip(right.T, start.T, strict=True)], axis=1)
+
+
+def _medians(values: FloatArray, pair: IntArray, which: BoolArray) -> FloatArray:
+    """Median of the values (M, C) of each pair, of those chosen (P, C); 0 where there are none."""
+    found = np.zeros((pair[-1] + 1, values.shape[1]))
+    pair, values = pair[which], values[which]
+    start = np.flatnonzero(np.diff(pair, prepend=-1))
+    middle = start + np.diff(start, append=len(pair)) // 2
+    for channel, column in enumerate(values.T):
+        found[pair[start], channel] = column[np.lexsort((column, pair))][middle]
+    return found
+
+
+def _with_median_kept(exposure: Exposure, survey: Survey, cameras: Sequence[Camera]) -> Exposure:
+    """Gains with a common factor that leaves the median of all samples where it was."""
+    before, after = [], []
+    for index, tile in enumerate(survey.tiles):
+        if tile is not None:
+            y, x = (axis[:: -(-axis.size * len(cameras) // _MEDIAN_SAMPLES)] for axis in np.nonzero(tile.inside))
+            points = survey.warps[index].source_points(
+                *np.add((x, y), np.array(tile.box[:2], dtype=np.float64)[:, None])
+            )
+            log = exposure.log_gain[index] + exposure.smooth_part(index, cameras[index], points)
+            light = tile.pixels[y, x] / full_scale(tile.pixels.dtype) + exposure.offset
+            before.append(light.mean(axis=1))
+            after.append((light * np.exp(-log)).mean(axis=1))
+    common = np.log(np.nanmedian(np.concatenate(after)) / np.median(np.concatenate(before)))
+    return replace(exposure, log_gain=exposure.log_gain + common)

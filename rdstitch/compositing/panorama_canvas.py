@@ -7,14 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.canvas import Canvas, canvas_between, plan_canvas, refuse_scale, turned_and_scaled
 from rdstitch.compositing.projection import PLANE, TURN, Projection
 from rdstitch.errors import ArgumentError, LimitError
-from rdstitch.radial_homography import to_directions
+from rdstitch.radial_homography import project, to_directions
 
 _POINTS_PER_SIDE = 64
+_PROBES = 2048  # of a turn: a sixth of a degree
 # Radians: the view up to which a plane shows it without much stretching, and the height up to which a cylinder does.
 _PLANE_VIEW = math.radians(90.0)
 _CYLINDER_HEIGHT = math.radians(70.0)
@@ -41,10 +42,13 @@ class SeenDirections:
         Longitude and latitude of each picture's border, radians; longitudes without a jump, around that of the picture.
     around : bool
         Whether they go all the way round.
+    start : float
+        Longitude at the left border of a full turn: that of the reference image's back, or where a gap is open.
     """
 
     outlines: tuple[FloatArray, ...]
     around: bool
+    start: float = -np.pi
 
     @property
     def extent(self) -> tuple[float, float]:
@@ -71,11 +75,14 @@ def seen_directions(cameras: Sequence[Camera], directions: FloatArray) -> SeenDi
     low = np.array([outline[:, 0].min() for outline in outlines])
     high = np.array([outline[:, 0].max() for outline in outlines])
     gap = _widest_gap(low, high)
-    if gap is None:
+    start = _gap_between(cameras, directions) if gap is None else gap
+    if start is None:
         return SeenDirections(tuple(outlines), True)
     # From the middle of what nobody shows on, everything is in one piece.
-    shifts = np.floor((0.5 * (low + high) - gap) / TURN) * TURN
+    shifts = np.floor((0.5 * (low + high) - start) / TURN) * TURN
     moved = [outline - (shift, 0.0) for outline, shift in zip(outlines, shifts, strict=True)]
+    if gap is None:
+        return SeenDirections(tuple(moved), True, start)
     back = np.rint(np.mean([outline[:, 0].mean() for outline in moved]) / TURN) * TURN
     return SeenDirections(tuple(outline - (back, 0.0) for outline in moved), False)
 
@@ -149,7 +156,7 @@ def _within(seen: SeenDirections, limit: float, names: Sequence[str]) -> SeenDir
                 "use --projection sphere, or raise --max-stretch"
             )
     outlines = (np.column_stack([outline[:, 0], np.clip(outline[:, 1], -limit, limit)]) for outline in seen.outlines)
-    return SeenDirections(tuple(outlines), seen.around)
+    return replace(seen, outlines=tuple(outlines))
 
 
 def _lay_out(
@@ -187,7 +194,7 @@ def _lay_out(
     everything = np.concatenate(placed)
     low, high = everything.min(axis=0), everything.max(axis=0)
     if period is not None:
-        low[0], high[0] = -period / 2.0, period / 2.0
+        low[0], high[0] = seen.start * resolution, seen.start * resolution + period
     return replace(canvas_between(low, high, linear, placed), projection=projection, period=period)
 
 
@@ -198,7 +205,7 @@ def _outline(camera: Camera, matrix: FloatArray) -> FloatArray:
     middle = math.atan2(ahead[0], ahead[2])
     longitude = middle + np.mod(np.arctan2(rays[:, 0], rays[:, 2]) - middle + np.pi, TURN) - np.pi
     latitude = np.arctan2(rays[:, 1], np.hypot(rays[:, 0], rays[:, 2]))
-    poles = [sign for sign in (-1.0, 1.0) if _shows(camera, matrix, np.array([0.0, sign, 0.0]))]
+    poles = [sign for sign in (-1.0, 1.0) if _shows(camera, matrix, np.array([[0.0, sign, 0.0]]))[0]]
     if not poles:
         return np.stack([longitude, latitude], axis=1)
     top = -np.pi / 2 if -1.0 in poles else float(latitude.min())
@@ -207,14 +214,29 @@ def _outline(camera: Camera, matrix: FloatArray) -> FloatArray:
     return np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
 
 
-def _shows(camera: Camera, matrix: FloatArray, direction: FloatArray) -> bool:
-    """Whether a picture shows a direction."""
-    x, y, z = np.linalg.solve(matrix, direction)
-    if z <= 0.0:
-        return False
-    u, v = camera.distort(camera.denormalize(np.array([[x / z, y / z]])))[0]
-    width, height = camera.image_size
-    return bool(-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5)
+def _shows(camera: Camera, matrix: FloatArray, directions: FloatArray) -> BoolArray:
+    """Which directions (K, 3) a picture shows."""
+    flat = project(directions @ np.asarray(np.linalg.inv(matrix), dtype=np.float64).T)
+    points, (width, height) = camera.distort(camera.denormalize(flat)), camera.image_size
+    return np.asarray(((points >= -0.5) & (points <= (width - 0.5, height - 0.5))).all(axis=1))
+
+
+def _gap_between(cameras: Sequence[Camera], directions: FloatArray) -> float | None:
+    """Middle of the widest range of longitudes that no picture shows at their middle latitude; None if there is none.
+
+    A full turn that is not quite closed has such a gap even where the corners of pictures meet above and below it.
+    """
+    ahead = directions[:, :, 2]
+    latitude = float(np.median(np.arctan2(ahead[:, 1], np.hypot(ahead[:, 0], ahead[:, 2]))))
+    longitude = (np.arange(_PROBES) + 0.5) * (TURN / _PROBES) - np.pi
+    level = np.stack([np.sin(longitude), np.full(_PROBES, math.tan(latitude)), np.cos(longitude)], axis=1)
+    seen = np.any([_shows(camera, matrix, level) for camera, matrix in zip(cameras, directions, strict=True)], axis=0)
+    shown = longitude[seen]
+    widths = np.diff(shown, append=shown[:1] + TURN)
+    if not len(shown) or widths.max() < 1.5 * TURN / _PROBES:
+        return None
+    widest = int(np.argmax(widths))
+    return float(np.remainder(shown[widest] + widths[widest] / 2.0 + np.pi, TURN) - np.pi)
 
 
 def _places(outline: FloatArray, projection: Projection) -> FloatArray:

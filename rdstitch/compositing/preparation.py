@@ -8,9 +8,9 @@ from functools import partial
 from rdstitch.compositing.blender import margin
 from rdstitch.compositing.blocks import BlockRunner, strips_of_blocks
 from rdstitch.compositing.boxes import Box
-from rdstitch.compositing.brightness import estimate_exposure
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.crop import coverage_map, crop_box, crop_rows
+from rdstitch.compositing.gain_compensation import estimate_exposure
 from rdstitch.compositing.image_cache import PictureCache
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photometric import no_exposure

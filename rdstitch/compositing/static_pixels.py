@@ -1,7 +1,8 @@
-"""What belongs to the camera and not to the plane: a black border, a robot's own body, a pasted banner.
+"""What belongs to the camera and not to the plane: a black border, a robot's own body, a pasted banner or caption.
 
 It is at the same place in every picture. Black is seen at once. Texture that stays has the same corners in all
 pictures, whereas those of the plane are at other places in each. Edges do not count: a rail along the motion stays too.
+Nor do even areas, but those beside them along the border belong to them: the band and the scale bar of a caption.
 """
 
 from collections.abc import Sequence
@@ -45,6 +46,7 @@ def static_pixels(pictures: Sequence[NDArray[np.generic]]) -> BoolArray | None:
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (window | 1, window | 1))
     closed = cv2.morphologyEx((_agreement(grey, window) > _STAYS).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
     static = black | _regions(cv2.morphologyEx(closed, cv2.MORPH_OPEN, kernel) > 0, at_border=False)
+    static = _with_captions(static, np.ptp(grey, axis=0) <= _BLACK * float(grey.max()), window)
     share = float(static.mean())
     return static if _MIN_AREA < share < _MAX_AREA else None
 
@@ -76,6 +78,25 @@ def _smaller_eigenvalue(tensor: FloatArray, window: int) -> FloatArray:
     xx, yy, xy = (cv2.boxFilter(part, -1, (window, window)) for part in tensor)
     smaller: FloatArray = (xx + yy) / 2.0 - np.sqrt(((xx - yy) / 2.0) ** 2 + xy**2)
     return smaller
+
+
+def _with_captions(static: BoolArray, same: BoolArray, window: int) -> BoolArray:
+    """The same with what is ``same`` in all pictures in a strip along the border that is nearest to it.
+
+    Only in pieces larger than any outside of such strips: of white paper, sameness says nothing.
+    """
+    strips, (height, width) = np.zeros_like(static), static.shape
+    for x, y, w, h in cv2.connectedComponentsWithStats(static.astype(np.uint8))[2][1:, :4].tolist():
+        if min(y, height - y - h) <= min(x, width - x - w):
+            strips[max(y - window, 0) : y + h + window] = True
+        else:
+            strips[:, max(x - window, 0) : x + w + window] = True
+    parts = (same & strips & ~static, same & ~strips)
+    pieces = [cv2.connectedComponentsWithStats(part.astype(np.uint8)) for part in parts]
+    (_, labels, inside, _), (_, _, outside, _) = pieces
+    large = np.flatnonzero(inside[:, cv2.CC_STAT_AREA] > outside[1:, cv2.CC_STAT_AREA].max(initial=0))
+    found = np.isin(labels, large[large > 0]) & (not strips.all())
+    return static | (cv2.dilate(found.astype(np.uint8), np.ones((5, 5), dtype=np.uint8)) > 0)
 
 
 def _regions(found: NDArray[np.bool_], *, at_border: bool) -> NDArray[np.bool_]:

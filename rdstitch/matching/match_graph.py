@@ -79,24 +79,27 @@ def spanning_tree(
     weight : ndarray of shape (L,)
         How much each link can be relied on.
     root : int, optional
-        The centre of the tree, from where the farthest picture is the fewest steps away, if not given.
+        The centre of the tree, from where the farthest picture is the fewest steps away, if not given; of two, the one
+        whose links weigh more, so that the numbers of the pictures do not decide.
     """
     tree = spanning_forest(count, image1, image2, weight)
     number = _graph(count, image1[tree], image2[tree], tree.astype(np.float64) + 1.0)
     number = (number + number.T).tocsr()
-    start = _centre(number) if root is None else root
-    order, predecessor = csgraph.breadth_first_order(number, start, directed=False)
+    if root is None:
+        middle = _centre(number)
+        root = max(middle, key=lambda node: float(weight[(image1 == node) | (image2 == node)].sum()))
+    order, predecessor = csgraph.breadth_first_order(number, root, directed=False)
     child = order[1:].astype(np.intp)
     parent = predecessor[child].astype(np.intp)
     step = np.array([number[p, c] - 1 for p, c in zip(parent, child, strict=True)], dtype=np.intp)
-    return SpanningTree(start, step, parent, child)
+    return SpanningTree(root, step, parent, child)
 
 
-def _centre(tree: sparse.csr_array) -> int:
-    """Middle of the longest path of a tree."""
+def _centre(tree: sparse.csr_array) -> list[int]:
+    """Middle of the longest path of a tree: one node, or two."""
     first = int(csgraph.breadth_first_order(tree, 0, directed=False)[0][-1])
     order, predecessor = csgraph.breadth_first_order(tree, first, directed=False)
     path = [int(order[-1])]
     while path[-1] != first:
         path.append(int(predecessor[path[-1]]))
-    return path[len(path) // 2]
+    return path[(len(path) - 1) // 2 : len(path) // 2 + 1]

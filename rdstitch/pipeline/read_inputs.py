@@ -3,14 +3,26 @@
 from collections.abc import Sequence
 
 from rdstitch.errors import ArgumentError, InputError
+from rdstitch.inputs.find import natural_key
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.measurements import with_attitudes
 from rdstitch.inputs.selection import selected, with_masks
 from rdstitch.inputs.source import Source, read_sources
+from rdstitch.matching.candidate_pairs import EXHAUSTIVE_UP_TO
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.process_memory import return_freed_memory
+
+
+def in_lasting_order(frames: Sequence[Frame]) -> Sequence[Frame]:
+    """Files by their names where every pair is compared, so that the order in which they were named does not show.
+
+    Of more images, and of arrays, the order says which follow which.
+    """
+    if len(frames) > EXHAUSTIVE_UP_TO or any(frame.picture is not None for frame in frames):
+        return frames
+    return sorted(frames, key=lambda frame: (natural_key(frame.path), frame.number or 0))
 
 
 def read_frames(

@@ -18,8 +18,9 @@ from rdstitch.options import StitchOptions
 from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.compose import blocks_on, compose_pictures, viewed_pictures, write_page
 from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally
-from rdstitch.pipeline.read_inputs import read_inputs
+from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs
 from rdstitch.pipeline.register import register, with_frontal_reference
+from rdstitch.pipeline.whole_pixels import on_whole_pixels
 from rdstitch.progress import Progress, silent
 from rdstitch.registration import Registration
 from rdstitch.sidecar.write import sidecar
@@ -135,7 +136,7 @@ def _stitch(
     given = as_inputs(inputs, options.channel_order)
     with found_pictures(given, output=output, every=every, topic=options.topic) as found:
         _check_outputs(output, options, found.files)
-        sources, unread = read_inputs(found.frames, options, skip_bad=not pano)
+        sources, unread = read_inputs(in_lasting_order(found.frames), options, skip_bad=not pano)
         with options.executor(len(sources)) as executor:
             registration = register(sources, options, executor, skip_bad=not pano, prefer_turn=pano, progress=progress)
             registration = registration.with_messages([*unread, *found.messages])
@@ -271,7 +272,7 @@ def _composite(
 
     ``frontal`` takes the undistorted reference picture for the plane.
     """
-    registration = with_frontal_reference(registration, options, always=frontal)
+    registration = on_whole_pixels(with_frontal_reference(registration, options, always=frontal))
     local = align_registration_locally(registration, options.local_alignment)
     placed = PlacedImages.of(registration, local.fields or None)
     with Outputs(options.overwrite) as outputs:

@@ -51,7 +51,7 @@ def test_order_does_not_matter_and_reference_keeps_its_frame(rdstitch: Run, fram
     assert done.status == 0
     record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
     assert record["reference"] == frames[0].name
-    matrix = np.array(record["images"][1]["to_output"])
+    matrix = np.array(next(i for i in record["images"] if i["name"] == frames[0].name)["to_output"])
     matrix /= matrix[2, 2]
     # An undistorted picture is only scaled and shifted into its own frame.
     np.testing.assert_allclose(

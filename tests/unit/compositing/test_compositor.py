@@ -119,10 +119,11 @@ def test_brightness_that_drifts_becomes_a_slope_without_steps() -> None:
 
 
 def test_a_clipped_sky_ends_in_no_step() -> None:
-    """One picture is burnt out where the other is not; beside the seam the two are equally bright."""
-    scene = render(2, 1, size=(320, 240), overlap=0.6, photometry=Photometry(gain=np.array([1.0, 1.0])), seed=8)
+    """The brighter picture is burnt out where the other is not; beside the seam the two are equally bright."""
+    light = Photometry(gain=np.array([1.8, 1.0]), gamma=2.2)
+    scene = render(2, 1, size=(320, 240), overlap=0.6, photometry=light, seed=8)
     sky = [frame.copy() for frame in scene.frames]
-    sky[0][:100], sky[1][:100] = 255, 215
+    sky[0][:100], sky[1][:100] = 255, 240
     sources: list[PictureLoader] = [partial(as_picture, frame) for frame in sky]
     steps = {}
     choices: tuple[ExposureMethod, ...] = ("gain", "balanced")
@@ -148,6 +149,49 @@ def test_equal_pictures_are_not_touched() -> None:
     exposure = _compose(scene).exposure
     assert np.abs(exposure.log_gain).max() < 0.01
     assert (exposure.vignetting == 0).all()
+
+
+@pytest.mark.parametrize("share", [0.06, 0.11, 0.2, 0.28, 0.4])
+@pytest.mark.parametrize("noise", [0.0, 2.0])
+def test_what_only_one_picture_shows_colours_nothing(share: float, noise: float) -> None:
+    """Two pieces of white paper with text, equally exposed, and a blue header on the second."""
+    rng, (width, height, step) = np.random.default_rng(4), (300, 360, 160)
+    paper = np.full((height + step, width, 3), 245, np.uint8)
+    for x, y, w in rng.integers((10, 10, 4), (width - 30, height + step - 10, 25), (250, 3)):
+        paper[y : y + 3, x : x + w] = 20
+    frames = [paper[:height].copy(), paper[step:].copy()]
+    header = round(share * (height - step))
+    frames[1][:header] = 0, 110, 220
+    if noise:
+        frames = [np.clip(frame + rng.normal(0, noise, frame.shape), 0, 255).astype(np.uint8) for frame in frames]
+    lens = Camera((width, height))
+    places = np.array([np.eye(3), np.eye(3)])
+    places[1, 1, 2] = step / lens.half_diagonal
+    pictures = place_pictures([partial(as_picture, frame) for frame in frames], [lens] * 2, places)
+    result = compose(pictures, plan_canvas([lens] * 2, places), CompositeOptions(blend="none"))
+    first, second = frames[0], frames[1]
+    np.testing.assert_array_equal(result.pixels[:step], first[:step])
+    np.testing.assert_array_equal(result.pixels[height : height + step], second[height - step :])
+    both = result.pixels[step:height], first[step:], second[: height - step]
+    same = [(both[0] == own).all(axis=-1) for own in both[1:]]
+    assert (same[0] | same[1]).all()
+
+
+@pytest.mark.parametrize("people", [0, 6])
+def test_gains_are_found_among_what_moved(people: int) -> None:
+    """Patches of other colours, a seventh of each picture, hardly change what is found for true gains."""
+    rng, gains = np.random.default_rng(9), np.random.default_rng(0).uniform(0.7, 1.3, 9)
+    light = Photometry(gain=gains, vignetting=0.4, noise=0.004)
+    scene = render(3, 3, size=(360, 270), photometry=light, seed=0)
+    frames = [frame.copy() for frame in scene.frames]
+    for frame in frames:
+        for x, y in rng.integers(0, (310, 210), (people, 2)):
+            frame[y : y + 60, x : x + 50] = rng.integers(0, 255, 3)
+    sources = [partial(as_picture, frame) for frame in frames]
+    placed = place_pictures(sources, scene.cameras, scene.homographies)
+    exposure = compose(placed, scene.canvas, CompositeOptions(exposure="gain")).exposure
+    assert np.std(exposure.log_gain.mean(axis=1) - np.log(gains)) < 0.01
+    np.testing.assert_allclose(np.exp(exposure.vignetting.sum()), 1 - 0.4, atol=0.05)
 
 
 @pytest.mark.parametrize("blend", ["none", "feather", "multiband"])

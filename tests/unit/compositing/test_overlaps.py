@@ -2,17 +2,15 @@
 
 from functools import partial
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from rdstitch.camera import Camera
-from rdstitch.compositing import brightness, field_solver, gain_compensation, place_pictures, plan_canvas
+from rdstitch.compositing import gain_compensation, overlap_cells, place_pictures, plan_canvas
 from rdstitch.compositing.boxes import intersection, overlapping_pairs
-from rdstitch.compositing.field_solver import solve_fields
+from rdstitch.compositing.overlap_cells import compare_overlaps
 from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.source_images import PictureReader
 from rdstitch.compositing.survey import Survey, survey_pictures
@@ -51,52 +49,42 @@ def _row(count: int) -> tuple[Survey, list[PlacedPicture]]:
     return survey_pictures(PictureReader(pictures), pictures, plan_canvas(cameras, places)), pictures
 
 
-def test_what_is_held_is_linear_in_the_number_of_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two neighbours a picture in a row, and a few entries of factorizations."""
-    entries: list[int] = []
-
-    def counted(matrix: Any, **options: Any) -> Any:
-        factors = splu(matrix, **options)
-        entries.append(factors.nnz)
-        return factors
-
-    monkeypatch.setattr(field_solver, "splu", counted)
+def test_what_is_compared_is_linear_in_the_number_of_pictures() -> None:
+    """Two neighbours a picture in a row."""
     count = 400
     survey, pictures = _row(count)
-    exposure = brightness.estimate_exposure(survey, pictures)
-    cells = brightness._compare(survey, exposure)
+    cells = compare_overlaps(survey)
     assert cells is not None
     assert cells.overlap.nnz == 2 * (count - 1)
-    assert 0 < max(entries) < 10 * count
+    exposure = gain_compensation.estimate_exposure(survey, pictures)
     means = np.exp(exposure.log_gain + exposure.fields.mean(axis=(1, 2))).mean(axis=1)
     assert (means[1::2] > means[::2]).all()
 
 
-def test_gains_of_thousands_of_overlaps_take_a_few_samples_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gains_of_thousands_of_overlaps_take_a_few_cells_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
     survey, pictures = _row(60)
-    of_all = gain_compensation.estimate_gains(survey, pictures).log_gain
-    monkeypatch.setattr(gain_compensation, "_MAX_SAMPLES", 60)
-    samples = gain_compensation._collect(survey, [picture.camera for picture in pictures])
-    assert samples is not None
-    assert 59 <= len(samples.value1) <= 20 * 59
-    np.testing.assert_allclose(gain_compensation.estimate_gains(survey, pictures).log_gain, of_all, atol=1e-3)
+    of_all = gain_compensation.estimate_exposure(survey, pictures, "gain").log_gain
+    monkeypatch.setattr(overlap_cells, "_MAX_CELLS", 600)
+    cells = compare_overlaps(survey)
+    assert cells is not None
+    assert 59 <= len(cells.pair) <= 600
+    np.testing.assert_allclose(
+        gain_compensation.estimate_exposure(survey, pictures, "gain").log_gain, of_all, atol=1e-3
+    )
 
 
-def test_fields_are_those_of_a_direct_solution() -> None:
-    rng, (count, side, rows) = np.random.default_rng(5), (6, 7, 900)
-    parts, nodes = [], side**2
+def test_the_solution_is_the_direct_one() -> None:
+    rng, (count, nodes, rows) = np.random.default_rng(5), (6, 49, 900)
+    design = np.zeros((rows, count * nodes))
     for sign, shift in ((1.0, 0), (-1.0, 1)):
-        matrix = np.zeros((rows, count * nodes))
         picture = np.arange(rows) % (count - 1) + shift
         for _ in range(4):
-            matrix[np.arange(rows), picture * nodes + rng.integers(0, nodes, rows)] += 0.25 * sign
-        parts.append(matrix)
+            design[np.arange(rows), picture * nodes + rng.integers(0, nodes, rows)] += 0.25 * sign
     weight, values, expected = rng.random(rows) * 1e3, rng.normal(size=(rows, 3)), rng.normal(size=(count * nodes, 3))
-    design, prior = parts[0] + parts[1], np.eye(count * nodes) * 0.1
+    precision = np.eye(count * nodes) * 0.1
     direct = np.linalg.solve(
-        design.T @ (weight[:, None] * design) + prior, design.T @ (weight[:, None] * values) + expected
+        design.T @ (weight[:, None] * design) + precision, design.T @ (weight[:, None] * values) + expected
     )
-    first, second = (sparse.csr_array(part) for part in parts)
-    start = np.zeros((count, side, side, 3))
-    found = solve_fields((first, second), weight, values, (sparse.csr_array(prior), expected), start)
-    np.testing.assert_allclose(found.reshape(-1, 3), direct, atol=1e-5 * np.abs(direct).max())
+    prior = sparse.csr_array(precision), expected, np.eye(nodes)
+    found = gain_compensation._solve(sparse.csr_array(design), weight, values, prior, np.zeros_like(direct))
+    np.testing.assert_allclose(found, direct, atol=1e-3 * np.abs(direct).max())

@@ -7,8 +7,9 @@ import pytest
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.compositing import gain_compensation
 from rdstitch.compositing.canvas import plan_canvas
-from rdstitch.compositing.gain_compensation import estimate_gains
+from rdstitch.compositing.overlap_cells import compare_overlaps
 from rdstitch.compositing.photometric import Exposure, full_scale, no_exposure
 from rdstitch.compositing.placed_picture import place_pictures
 from rdstitch.compositing.source_images import PictureReader
@@ -68,6 +69,9 @@ def test_a_picture_without_overlap_has_the_gain_that_its_camera_wrote_down() -> 
     canvas = plan_canvas(scene.cameras, apart)
     sets = [place_pictures(scene.sources, scene.cameras, apart, exposure=e) for e in (None, [0.5, 0.5, 1.0])]
     survey = survey_pictures(PictureReader(sets[0]), sets[0], canvas)
-    gains = [estimate_gains(survey, pictures).log_gain for pictures in sets]
+    cells = compare_overlaps(survey)
+    assert cells is not None
+    differences = gain_compensation._Differences.of(cells, 0.055)
+    gains = [gain_compensation._fit(differences, pictures)[0].log_gain for pictures in sets]
     assert np.abs(gains[0][2]).max() < 0.01
     np.testing.assert_allclose(gains[1][2] - gains[1][:2].mean(axis=0), np.log(2.0) / 2.4, atol=0.02)

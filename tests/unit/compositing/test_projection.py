@@ -93,6 +93,25 @@ def test_the_edge_lies_where_nothing_is_shown(heading: float) -> None:
         assert box[2] - box[0] < 0.3 * canvas.size[0]
 
 
+@pytest.mark.parametrize("heading", [0.0, 1.0, -2.5, np.pi])
+def test_a_gap_that_is_open_between_closed_corners_lies_at_the_border(heading: float) -> None:
+    """A turn of 358 degrees: the barrel-shaped images meet at their corners, and not between."""
+    side = LENS.undistort(np.array([[-0.5, 59.5]]))[0, 0] - 79.5
+    half = np.arctan2(-side, 110.0)
+    headings = heading + np.linspace(half, np.radians(358.0) - half, 9)
+    rotations = camera_rotations(headings)
+    sequence, directions = _panorama(rotations)
+    canvas = plan_panorama([LENS] * 9, directions)
+    assert canvas.period == canvas.size[0]
+    found = _composed(sequence, directions, canvas, CompositeOptions())
+    middle = found.alpha[found.alpha.shape[0] // 2] > 0
+    width = canvas.size[0]
+    assert not middle.all()
+    assert middle[width // 100 : -width // 100].all()
+    assert not middle[0]
+    assert not middle[-1]
+
+
 @pytest.mark.parametrize("name", ["cylinder", "sphere", "mercator"])
 @pytest.mark.parametrize("rotate", [0.0, 15.0])
 def test_points_of_a_picture_come_back_through_the_warp(name: str, rotate: float) -> None:

@@ -1,5 +1,6 @@
 """What stays at its place in all pictures: found where it is, and nowhere else."""
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -45,6 +46,36 @@ def test_a_body_and_a_black_border_are_found(shape: str) -> None:
     assert found is not None
     assert found[region].mean() > 0.95
     assert found[~region].mean() < 0.06
+
+
+@pytest.mark.parametrize("band", [0, 255, None], ids=["black", "white", "none"])
+def test_of_a_caption_nothing_is_left(band: int | None) -> None:
+    """Text at the left and a scale bar at the right, in a band or on the picture itself."""
+    pictures = (_pictures() * 255).astype(np.uint8)
+    region, ink = np.zeros((_HEIGHT, _WIDTH), dtype=np.uint8), 0 if band == 255 else 255
+    for picture in pictures:
+        if band is not None:
+            picture[128:] = band
+        cv2.putText(picture, "15 kV 2 kx SE", (6, 145), cv2.FONT_HERSHEY_SIMPLEX, 0.5, ink, 1)
+        picture[136:140, 118:190] = ink
+    cv2.putText(region, "15 kV 2 kx SE", (6, 145), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1, 1)
+    region[136:140, 118:190] = 1
+    if band is not None:
+        region[128:] = 1
+    found = static_pixels(list(pictures))
+    assert found is not None
+    assert found[region > 0].mean() > 0.95
+    assert not found[:115].any()
+
+
+def test_the_white_margins_of_a_page_with_a_header_that_stays_are_kept() -> None:
+    pictures = (_pictures() * 255).astype(np.uint8)
+    pictures[:, :, :30] = pictures[:, :, -30:] = 255
+    pictures[:, :24] = (ground((_WIDTH, 24), 9).region(0, 0, _WIDTH, 24)[:, :, 0] * 255).astype(np.uint8)
+    found = static_pixels(list(pictures))
+    assert found is not None
+    assert found[:24].mean() > 0.9
+    assert not found[40:].any()
 
 
 def test_a_camera_that_hardly_moves_masks_nothing() -> None:

@@ -68,3 +68,10 @@ def test_a_spanning_forest_of_many_links_is_that_of_kruskal() -> None:
             group[group == one] = other
             expected.append(int(link))
     assert spanning_forest(count, i, j, weight).tolist() == sorted(expected)
+
+
+def test_of_two_centres_the_one_with_more_matches_is_the_root_whatever_the_numbers() -> None:
+    weight = np.array([5.0, 4.0, 3.0])
+    for chain in ([0, 1, 2, 3], [3, 2, 1, 0], [2, 0, 3, 1]):
+        i, j = np.array(chain[:-1], dtype=np.intp), np.array(chain[1:], dtype=np.intp)
+        assert spanning_tree(4, i, j, weight).root == chain[1]

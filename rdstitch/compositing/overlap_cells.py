@@ -1,0 +1,111 @@
+"""What overlapping pictures say of their light: means of the cells that two of them show."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.compositing.boxes import Box, cut
+from rdstitch.compositing.photometric import full_scale
+from rdstitch.compositing.survey import Survey, SurveyTile
+
+# Along the longest side of a picture or an overlap, and of all overlaps together: of thousands, each needs fewer.
+_CELLS, _MAX_CELLS = 16, 150_000
+# Integer samples outside this part of the range are clipped or mostly noise.
+_DARKEST, _BRIGHTEST = 0.02, 0.97
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Cells that two pictures show.
+
+    Attributes
+    ----------
+    pair : ndarray of shape (M,)
+        Index of the overlap, ascending.
+    pictures : ndarray of shape (2, M)
+    points : ndarray of shape (2, M, 2)
+        Middle of the cell, measured pixels of either picture.
+    values : ndarray of shape (2, M, C)
+        Mean samples, share of the full range.
+    clipped : ndarray of shape (2, M), bool
+        Where a picture is burnt out: its light is what the samples say, or more. Other cells hold no clipped sample.
+    overlap : sparse array of shape (N, N)
+        What two pictures have in common, share of the smaller one.
+    """
+
+    pair: IntArray
+    pictures: IntArray
+    points: FloatArray
+    values: FloatArray
+    clipped: BoolArray
+    overlap: sparse.csr_array
+
+    @property
+    def clear(self) -> BoolArray:
+        """Cells (M,) where neither picture is burnt out."""
+        return np.asarray(~self.clipped.any(axis=0))
+
+    def by_picture(self) -> Iterator[tuple[int, int, IntArray]]:
+        """Side (0 or 1), picture, and its cells."""
+        for side, pictures in enumerate(self.pictures):
+            order = np.argsort(pictures, kind="stable")
+            for cells in np.split(order, np.flatnonzero(np.diff(pictures[order])) + 1):
+                yield side, int(pictures[cells[0]]), cells
+
+
+def compare_overlaps(survey: Survey) -> Cells | None:
+    """Compare all pictures that lie over each other; None where no two show the same."""
+    pairs, count = survey.pairs(), len(survey.tiles)
+    shares, found = np.zeros(len(pairs)), []
+    for index, (i, j) in enumerate(pairs.tolist()):
+        a, b, box, seen = survey.overlap(i, j)
+        shares[index] = seen.sum() / min(a.inside.sum(), b.inside.sum())
+        side = max(2, round(max(*seen.shape, *a.inside.shape, *b.inside.shape) / _CELLS))
+        (va, bright_a), (vb, bright_b) = (_samples(tile, box) for tile in (a, b))
+        lit = seen & (np.minimum(va, vb) > (_DARKEST if a.pixels.dtype.kind == "u" else 0.0)).all(axis=-1)
+        layers = np.concatenate([va, vb, bright_a[..., None], bright_b[..., None]], axis=-1)
+        for which in (lit & ~(bright_a | bright_b), lit & (bright_a | bright_b)):
+            means = _cell_means(which, layers, side)
+            means[:, :2] += box[:2]
+            found.append((np.full(len(means), index), means))
+    pair = np.concatenate([which for which, _ in found]) if found else np.zeros(0, dtype=np.intp)
+    if not len(pair):
+        return None
+    kept = np.s_[:: -(-len(pair) // _MAX_CELLS)]
+    pair, means = pair[kept], np.concatenate([means for _, means in found])[kept]
+    values = np.moveaxis(means[:, 2:-2].reshape(len(means), 2, -1), 1, 0)
+    overlap = sparse.csr_array((shares, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    clipped, points = means[:, -2:].T > 0.5, np.empty((2, len(pair), 2))
+    cells = Cells(pair, pairs[pair].T, points, values, clipped, sparse.csr_array(overlap + overlap.T))
+    for end, picture, chosen in cells.by_picture():
+        points[end, chosen] = survey.warps[picture].source_points(*means[chosen, :2].T)
+    known = np.isfinite(points).all(axis=(0, 2))
+    parts = (cells.pictures[:, known], points[:, known], values[:, known], clipped[:, known])
+    return Cells(pair[known], *parts, cells.overlap)
+
+
+def _samples(tile: SurveyTile, box: Box) -> tuple[FloatArray, BoolArray]:
+    """Samples of a box, share of the full range (h, w, C), and which pixels are clipped (h, w)."""
+    pixels = cut(tile.pixels, tile.box, box)
+    values = pixels.astype(np.float64) / full_scale(pixels.dtype)
+    return values, np.asarray((values > (_BRIGHTEST if pixels.dtype.kind == "u" else np.inf)).any(axis=-1))
+
+
+def _cell_means(which: BoolArray, values: NDArray[Any], side: int) -> FloatArray:
+    """Mean x, y (pixels of the box) and values (h, w, K) of every cell of which more than half counts, (M, 2 + K).
+
+    As products with matrices of ones and zeros, which are many times faster than sums along short axes.
+    """
+    height, width = which.shape
+    y, x = np.indices((height, width), dtype=np.float64)[..., None]
+    weighted = np.concatenate([np.ones_like(x), x, y, values], axis=-1) * which[..., None]
+    rows, columns = (np.arange(n) // side == np.arange(-(-n // side))[:, None] for n in (height, width))
+    summed = rows.astype(np.float64) @ weighted.reshape(height, -1)
+    sums = (columns.astype(np.float64) @ summed.reshape(-1, width, weighted.shape[-1])).reshape(-1, weighted.shape[-1])
+    sums = sums[sums[:, 0] > side**2 / 2]
+    return np.asarray(sums[:, 1:] / sums[:, :1])

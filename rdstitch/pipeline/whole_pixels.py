@@ -1,0 +1,97 @@
+"""Scans, screenshots and crops of one image: what was moved by whole pixels is put together without resampling."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from rdstitch.alignment import Alignment
+from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.matching.match_graph import spanning_tree
+from rdstitch.registration import Registration
+from rdstitch.robust.loss import ALIGNMENT_WIDTH, RAYLEIGH_MEDIAN, robust_cost
+
+_RESOLVED = 0.1
+"""Standard deviation of the shift of a pair, pixels, up to which its matches can say that it is whole."""
+
+_EXACTNESS = 1.0 / 32.0
+"""Pixels that resampling rounds to."""
+
+_FREEDOM = 4
+"""Parameters of an image that whole pixels take the place of: two of the shift, turn and scale."""
+
+_UPRIGHT = 0.01
+"""Largest turn of the reference image in the output, radians, where that can be its frame."""
+
+
+def on_whole_pixels(registration: Registration) -> Registration:
+    """The same registration, with motion by whole pixels and no lens where that explains the matches as well.
+
+    Its freedom is paid for by the Bayesian information criterion, and the shifts of pairs must agree in every loop. A
+    lens that was given, and a turn on the spot, stay.
+    """
+    alignment = registration.alignment
+    given = alignment.distortion_std == 0.0 and any(any(camera.coefficients) for camera in alignment.cameras)
+    whole = None if alignment.on_sphere or given else _whole_shifts(registration)
+    frame = alignment.homographies[alignment.reference] / alignment.homographies[alignment.reference][2, 2]
+    linear = frame[:2, :2] - np.outer(frame[:2, 2], frame[2, :2])
+    unit = math.sqrt(abs(float(np.linalg.det(linear))))
+    if whole is None or np.abs(linear / unit - np.eye(2)).max() > _UPRIGHT:
+        return registration
+    cameras = tuple(
+        replace(c, distortion=0.0, distortion2=0.0, distortion3=0.0, center=(math.nan, math.nan))
+        for c in alignment.cameras
+    )
+    own, homographies = cameras[alignment.reference], np.full_like(alignment.homographies, np.nan)
+    for index, shift in zip(np.flatnonzero(alignment.used), whole, strict=True):
+        camera = cameras[index]
+        middle = (shift + camera.center - own.center) / own.half_diagonal
+        homographies[index] = np.diag([unit * camera.half_diagonal / own.half_diagonal] * 2 + [1.0])
+        homographies[index][:2, 2] = frame[:2, 2] + unit * middle
+    return replace(
+        registration, alignment=replace(alignment, cameras=cameras, homographies=homographies, distortion=0.0)
+    )
+
+
+def _whole_shifts(registration: Registration) -> FloatArray | None:
+    """Where the images that are used begin in the reference image, (N, 2); None unless whole pixels fit."""
+    alignment, support = registration.alignment, registration.alignment.support
+    number = np.cumsum(alignment.used) - 1
+    pairs, shifts, spread, left = [], [], [], []
+    for pair in registration.pairs:
+        if (pair.image1, pair.image2) not in support:
+            continue
+        link = pair.link()
+        moved = link.points1 - link.points2
+        shift = np.rint(np.median(moved, axis=0))
+        whole, fitted = moved - shift, _errors(alignment, pair.image1, pair.image2, link.points1, link.points2)
+        # Of most sets the first pair already says no.
+        if np.median(np.linalg.norm(whole, axis=1)) > 0.5 + np.median(np.linalg.norm(fitted, axis=1)):
+            return None
+        pairs.append((number[pair.image1], number[pair.image2]))
+        shifts.append(shift)
+        spread.append(float(np.median(np.linalg.norm(fitted, axis=1))) / RAYLEIGH_MEDIAN / math.sqrt(len(moved)))
+        left.append(((whole**2).sum(axis=1), (fitted**2).sum(axis=1)))
+    if not pairs or max(spread) > _RESOLVED:
+        return None
+    first, second = np.array(pairs, dtype=np.intp).T
+    places = _chained(first, second, np.array(shifts), int(number[alignment.reference]), int(alignment.used.sum()))
+    if (places[second] - places[first] != shifts).any():
+        return None
+    squared, fit = (np.concatenate([errors[k] for errors in left]) for k in (0, 1))
+    sigma = math.hypot(math.sqrt(float(np.median(fit))) / RAYLEIGH_MEDIAN, _EXACTNESS)
+    worse = float((robust_cost(squared, ALIGNMENT_WIDTH * sigma) - robust_cost(fit, ALIGNMENT_WIDTH * sigma)).sum())
+    return places if worse <= _FREEDOM * (len(places) - 1) * math.log(len(fit)) * sigma**2 else None
+
+
+def _errors(alignment: Alignment, image1: int, image2: int, points1: FloatArray, points2: FloatArray) -> FloatArray:
+    """What the alignment leaves of matches (M, 2), pixels; 0 where a lens cannot see them."""
+    return np.nan_to_num(alignment.transfer(image1, image2, points1) - points2)
+
+
+def _chained(first: IntArray, second: IntArray, shifts: FloatArray, root: int, count: int) -> FloatArray:
+    """Sums of shifts along a spanning tree of the links."""
+    tree, places = spanning_tree(count, first, second, np.ones(len(first)), root), np.zeros((count, 2))
+    for link, parent, child in zip(tree.link, tree.parent, tree.child, strict=True):
+        places[child] = places[parent] + (shifts[link] if first[link] == parent else -shifts[link])
+    return places
