@@ -28,7 +28,7 @@ class _SharedSetting:
         with self._lock:
             if self._blocks == 0:
                 self._before = self._read()
-                self._write(self._held)
+                self._set(self._held)
             self._blocks += 1
         try:
             yield
@@ -36,10 +36,21 @@ class _SharedSetting:
             with self._lock:
                 self._blocks -= 1
                 if self._blocks == 0:
-                    self._write(self._before)
+                    self._set(self._before)
+
+    def _set(self, value: int) -> None:
+        if self._before != self._held:
+            self._write(value)
 
 
-_threads = _SharedSetting(cv2.getNumThreads, cv2.setNumThreads, 1)
+def _opencv_threads() -> int:
+    """0 for those of the caller alone: OpenCV says 1, but to set 1 would end its threads."""
+    count = cv2.getNumThreads()
+    return count if count > 1 else 0
+
+
+# 0 rather than 1: a forked process would wait for ever for the end of threads that its parent alone has.
+_threads = _SharedSetting(_opencv_threads, cv2.setNumThreads, 0)
 # OpenCV 4 has the same functions at its top level; its stubs know neither.
 _logging: Any = getattr(cv2.utils, "logging", cv2)
 _log_level = _SharedSetting(_logging.getLogLevel, _logging.setLogLevel, _SILENT)

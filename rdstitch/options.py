@@ -1,7 +1,6 @@
 """Options of the recipes: the same names and defaults as on the command line."""
 
 import math
-import os
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from rdstitch.executors import LOCAL, open_executor
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.local_alignment import MAX_CELLS, LocalAlignmentMode
+from rdstitch.machine import processor_count
 from rdstitch.matching.options import MatchingOptions, PairOptions
 from rdstitch.robust import SOLVERS
 
@@ -206,4 +206,4 @@ class StitchOptions:
     @property
     def threads(self) -> int:
         """Number of pictures or pairs to work on at the same time."""
-        return self.workers or os.cpu_count() or 1
+        return self.workers or processor_count()

@@ -1,11 +1,10 @@
-"""Memory of this process: what it may take, and how what earlier stages have freed goes back to the system."""
+"""Memory of this process: how what earlier stages have freed goes back to the system, or is kept for the next."""
 
 import ctypes
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from threading import Condition
 
-_BOUND, _BOUND_OF_A_PICTURE = 400 * 10**6, 150 * 10**3  # bytes; of the whole process
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # of mallopt
 _LARGE = 8 * 2**20  # bytes: more than any array of a tile, which are made again and again; less than a picture
 _SCRATCH = 280 * 10**6  # bytes that the threads of this process may take at once for what they give back soon
@@ -35,11 +34,6 @@ def reuse_freed_memory() -> None:
     """
     with suppress(AttributeError, OSError, TypeError):
         ctypes.CDLL(None).mallopt(_TRIM_THRESHOLD, _SCRATCH)
-
-
-def usual_bound(pictures: int) -> int:
-    """Bytes that a process is to take at most for so many pictures, see docs/scale.md."""
-    return _BOUND + _BOUND_OF_A_PICTURE * pictures
 
 
 class _Scratch:

@@ -144,7 +144,7 @@ mask = _file(
 )
 
 workers = click.option(
-    "-j", "--workers", type=click.IntRange(0), default=0, help="Threads; 0, the default, is one for each core."
+    "-j", "--workers", type=click.IntRange(0), default=0, help="Threads; 0, the default, is one for each usable core."
 )
 
 estimation = together(
@@ -255,7 +255,7 @@ compositing = together(
     click.option(
         "--max-memory",
         type=Bytes(),
-        help="Memory that compositing may take, as 800M; otherwise 200M, or more for a large canvas.",
+        help="Memory that compositing may take, as 800M; otherwise a quarter of what is available, at least 400M.",
     ),
     _number("--scale", float, 1.0, "Factor to the size of the output; 1 keeps resolution."),
     _number(

@@ -112,7 +112,7 @@ class Report:
     ) -> None:
         from rdstitch.progress import StageTimer
 
-        self._file, self.progress = file, StageTimer(reporter)
+        self._file, self._reporter, self.progress = file, reporter, StageTimer(reporter)
         if file is not None:
             from rdstitch.io.atomic import check_distinct, check_output
             from rdstitch.viewer import viewer_path
@@ -129,18 +129,24 @@ class Report:
         try:
             yield
         except RefusedError as refused:
-            if self._file is not None:
-                from rdstitch.report import write_report
+            from rdstitch.io.outputs import Outputs
 
-                write_report(self._file, refused.registration, self.progress.stages, _command_line())
+            with Outputs(overwrite=True) as outputs:
+                self.stage(outputs, refused.registration)
             raise
 
     def stage(self, outputs: "Outputs", result: "StitchResult | Registration") -> None:
         """Stage the file, if one is wanted, to be published with what else the recipe writes."""
-        if self._file is not None:
+        if (file := self._file) is None:
+            return
+
+        def write() -> None:
             from rdstitch.report import write_report
 
-            write_report(self._file, result, self.progress.stages, _command_line(), outputs=outputs)
+            write_report(file, result, self.progress.stages, _command_line(), outputs=outputs)
+
+        for message in outputs.attempt(file, write):
+            self._reporter.warn(str(message))
 
 
 def _command_line() -> str:

@@ -1,26 +1,28 @@
-"""Pictures for the tiles, prefetched, in bounded memory.
+"""Pictures for the tiles, prefetched, decoded once, in bounded memory: those for which there is no room wait on disk.
 
-Most of a picture is often hidden by its neighbours: where room is short, only the requested part is kept.
+Most of a picture is often hidden by its neighbours: where room is short, only the part that will be requested is kept.
 """
 
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from threading import Lock
 
 from rdstitch.compositing.boxes import Box, encloses
-from rdstitch.compositing.source_images import NOTHING, LoadedPicture, PictureReader
+from rdstitch.compositing.source_images import NOTHING, LoadedPicture, PictureOnDisk, PictureReader
+from rdstitch.stored import TemporaryFolder
 
 
 class PictureCache:
-    """The parts of pictures used last, prepared for resampling, in at most ``limit`` bytes (though always one).
+    """Pictures, or parts of them, prepared for resampling, in at most ``limit`` bytes (though always one in memory).
 
     Parameters
     ----------
     shrinks : sequence of float
         Picture pixels per output pixel.
     limit : int
-        Bytes.
+        Bytes of memory; those used longest ago go to a temporary file when there are more, where one can be written.
     ahead : bool
         Read pictures ahead of their use, in a thread of its own.
     """
@@ -29,18 +31,25 @@ class PictureCache:
         self._reader, self._shrinks, self._limit = reader, shrinks, limit
         self._ahead = ThreadPoolExecutor(1) if ahead else None
         self._held: OrderedDict[int, LoadedPicture] = OrderedDict()
+        self._on_disk: dict[int, PictureOnDisk] = {}
+        self._folder: TemporaryFolder | None = None
         self._expected: list[Box | None] = [None] * len(shrinks)
         self._surprising: set[int] = set()
         # One picture is read at a time; meanwhile those that are held can be had.
         self._lock, self._reading = Lock(), Lock()
 
-    def part(self, pictures: Sequence[int]) -> "PictureCache":
+    def part(self, pictures: Sequence[int], limit: int) -> "PictureCache":
         """An empty one for some of the pictures, which reads nothing ahead."""
-        return PictureCache(self._reader.part(pictures), [self._shrinks[index] for index in pictures], self._limit)
+        return PictureCache(self._reader.part(pictures), [self._shrinks[index] for index in pictures], limit)
 
     def __reduce__(self) -> tuple[type["PictureCache"], tuple[PictureReader, Sequence[float], int]]:
         """Other processes get an empty one, which reads nothing ahead."""
         return PictureCache, (self._reader, self._shrinks, self._limit)
+
+    @property
+    def limit(self) -> int:
+        """Bytes of memory."""
+        return self._limit
 
     def masked(self, index: int) -> bool:
         """Whether a picture has transparent parts."""
@@ -49,29 +58,29 @@ class PictureCache:
     def expect(self, parts: Sequence[Box]) -> None:
         """Keep no more of each picture than the part that will be requested from now on, where room is short.
 
-        It is a guess: a picture of which more is requested is read again, and from then on kept whole.
+        A picture of which more is requested after all is read again, and from then on kept whole.
         """
         with self._lock:
             for index, part in enumerate(parts):
                 if index not in self._surprising:
                     self._expected[index] = part
                     if part == NOTHING:
-                        self._held.pop(index, None)
+                        self._drop(index)
 
     def get(self, index: int, part: Box) -> LoadedPicture:
-        """A part of picture ``index``, read unless it is held; callable from several threads."""
-        if (held := self._find(index, part)) is not None:
-            return held
+        """A part of picture ``index``, read unless it is kept; callable from several threads."""
+        if (kept := self._find(index, part)) is not None:
+            return kept
         with self._reading:
             # Another thread may have read it in the meantime.
-            if (held := self._find(index, part)) is not None:
-                return held
+            if (kept := self._find(index, part)) is not None:
+                return kept
             with self._lock:
+                self._drop(index)
                 expected = self._expected[index]
                 if expected is not None and not encloses(expected, part):
                     self._surprising.add(index)
                     self._expected[index] = expected = None
-                self._held.pop(index, None)
             return self._read(index, expected)
 
     def prefetch(self, indices: Iterable[int]) -> None:
@@ -83,29 +92,31 @@ class PictureCache:
             self._ahead.submit(self._read_ahead, index)
 
     def close(self) -> None:
-        """Read nothing ahead any more."""
+        """Read nothing ahead any more, and forget what is on disk."""
         if self._ahead is not None:
             self._ahead.shutdown(cancel_futures=True)
             self._ahead = None
+        with self._lock:
+            self._on_disk, self._folder = {}, None
 
     def _read_ahead(self, index: int) -> None:
-        """Read a picture, unless it is held or others would have to go for it."""
+        """Read a picture, unless it is kept or others would have to go for it."""
         with self._reading:
             expected = self._expected[index]
-            if index in self._held or expected == NOTHING:
+            if index in self._held or index in self._on_disk or expected == NOTHING:
                 return
             if self._make_room(self._reader.nbytes(index, self._shrinks[index])):
                 self._read(index, expected)
 
     def _read(self, index: int, part: Box | None) -> LoadedPicture:
-        """Read a part of a picture and hold it; those used longest ago go where there is no room."""
+        """Read a part of a picture and hold it; those used longest ago go to disk where there is no room."""
         loaded = self._reader.prepared(index, self._shrinks[index])
         if part is not None:
             loaded = loaded.cut(part)
         self._make_room(loaded.nbytes)
         with self._lock:
             while self._held and self._nbytes() + loaded.nbytes > self._limit:
-                self._held.popitem(last=False)
+                self._move_to_disk(*self._held.popitem(last=False))
             self._held[index] = loaded
         return loaded
 
@@ -128,19 +139,33 @@ class PictureCache:
         picture = None if expected == NOTHING else picture.cut(expected)
         with self._lock:
             if picture is None:
-                self._held.pop(index, None)
+                self._drop(index)
             elif index in self._held:
                 self._held[index] = picture
+
+    def _move_to_disk(self, index: int, picture: LoadedPicture) -> None:
+        """Keep a picture in a file, unless none can be written; call with the lock held."""
+        with suppress(OSError):
+            self._folder = self._folder or TemporaryFolder()
+            self._on_disk[index] = PictureOnDisk.write(picture, self._folder.path / str(index))
+
+    def _drop(self, index: int) -> None:
+        """Forget a picture; call with the lock held."""
+        self._held.pop(index, None)
+        if (on_disk := self._on_disk.pop(index, None)) is not None:
+            on_disk.remove()
 
     def _nbytes(self) -> int:
         """Memory in use; call with the lock held."""
         return sum(picture.nbytes for picture in self._held.values())
 
     def _find(self, index: int, part: Box) -> LoadedPicture | None:
-        """A picture that is held."""
+        """A picture that is kept."""
         with self._lock:
-            held = self._held.get(index)
-            if held is None or not held.holds(part):
-                return None
-            self._held.move_to_end(index)
-            return held
+            if (held := self._held.get(index)) is not None:
+                self._held.move_to_end(index)
+                return held if held.holds(part) else None
+            on_disk = self._on_disk.get(index)
+            # What is mapped can be read when its file is gone.
+            mapped = None if on_disk is None else on_disk.mapped()
+        return mapped.cut(part, copy=True) if mapped is not None and mapped.holds(part) else None

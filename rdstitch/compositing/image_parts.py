@@ -1,79 +1,52 @@
-"""Which part of each picture shows in the output, so that no more of it need be held in memory, nor for longer."""
+"""Which part of each picture the tiles of an output request, so that no more of it need be held, nor for longer."""
 
-import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import Box
-from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.compositing.source_images import NOTHING
-from rdstitch.compositing.warp import Warp
-
-# By how much the scale may vary over a picture.
-_UNEVENNESS = 1.25
 
 
 @dataclass(frozen=True)
-class ShownPart:
-    """Where in a picture what it owns of the canvas comes from.
+class RequestedParts:
+    """What is requested of the pictures, by rows of tiles.
 
     Attributes
     ----------
-    rows : ndarray of shape (K,)
-        Rows of the canvas, pixels, ...
-    points : ndarray of shape (K, 2)
-        ... and places in the picture, pixels: both ends of every run of the seam map that the picture owns.
-    room : int
-        Pixels of the picture around them that may be requested too.
-    size : (int, int)
-        Width and height of the picture, pixels.
+    count : int
+        Pictures.
+    rows : ndarray of shape (K,), int
+        Number of a row of tiles, ...
+    pictures : ndarray of shape (K,), int
+        ... a picture that it shows, ...
+    parts : ndarray of shape (K, 4), int
+        ... and what of it one of the row's tiles takes, pixels of the picture: x0, y0, x1, y1, end exclusive.
     """
 
-    rows: FloatArray
-    points: FloatArray
-    room: int
-    size: tuple[int, int]
+    count: int
+    rows: NDArray[np.intp]
+    pictures: NDArray[np.intp]
+    parts: NDArray[np.intp]
 
-    def on_rows(self, first: float, last: float) -> bool:
-        """Whether it shows on any of these rows of the canvas."""
-        return bool(((self.rows >= first) & (self.rows <= last)).any())
+    @classmethod
+    def of(cls, count: int, rows: Iterable[Sequence[tuple[int, Box]]]) -> Self:
+        """From the pictures and parts that each row of tiles takes."""
+        found = [(row, index, *part) for row, taken in enumerate(rows) for index, part in taken]
+        table = np.array(found, dtype=np.intp).reshape(-1, 6)
+        return cls(count, table[:, 0], table[:, 1], table[:, 2:])
 
-    def from_row(self, row: float) -> Box:
-        """The part that is needed for the canvas from a row on."""
-        points = self.points[self.rows >= row]
-        if not len(points):
-            return NOTHING
-        low, high = np.floor(points.min(axis=0)) - self.room, np.ceil(points.max(axis=0)) + self.room
-        limit = np.array(self.size)
-        x0, y0, x1, y1 = (int(v) for v in (*np.clip(low, 0, limit - 1), *np.clip(high, 1, limit)))
-        return x0, y0, x1, y1
+    def on_row(self, row: int) -> set[int]:
+        """Pictures that a row of tiles shows."""
+        return set(self.pictures[self.rows == row].tolist())
 
-
-def shown_parts(warps: Sequence[Warp], seams: SeamMap, around: int) -> list[ShownPart]:
-    """Where in each picture what it owns comes from.
-
-    Parameters
-    ----------
-    around : int
-        How far from what a picture owns it is requested too, canvas pixels.
-    """
-    labels, factor, (left, top) = seams.labels, seams.factor, seams.origin
-    ends = np.ones((labels.shape[0], labels.shape[1] + 1), dtype=np.bool_)
-    ends[:, 1:-1] = labels[:, 1:] != labels[:, :-1]
-    # Runs begin after an end and stop before the next.
-    rows, columns = np.nonzero(ends[:, :-1])
-    first, last = columns, np.nonzero(ends[:, 1:])[1]
-    owners = labels[rows, first]
-    parts = []
-    for index, warp in enumerate(warps):
-        own = owners == index
-        y = np.tile((rows[own] + top + 0.5) * factor - 0.5, 2)
-        x = (np.concatenate([first[own], last[own]]) + left + 0.5) * factor - 0.5
-        points = warp.source_points(x, y)
-        known = np.isfinite(points).all(axis=1)
-        room = math.ceil(_UNEVENNESS * warp.shrink * (around + factor))
-        parts.append(ShownPart(y[known], points[known], room, warp.camera.image_size))
-    return parts
+    def from_row(self, row: int) -> list[Box]:
+        """What is needed of each picture for a row of tiles and those below."""
+        due = self.rows >= row
+        low, high = np.full((self.count, 2), np.iinfo(np.intp).max), np.zeros((self.count, 2), dtype=np.intp)
+        np.minimum.at(low, self.pictures[due], self.parts[due, :2])
+        np.maximum.at(high, self.pictures[due], self.parts[due, 2:])
+        return [(*a, *b) if b[0] else NOTHING for a, b in zip(low.tolist(), high.tolist(), strict=True)]

@@ -50,8 +50,8 @@ class CompositeOptions:
     rotate : float
         Degrees that the output is turned clockwise.
     max_memory : int, optional
-        Bytes that the compositor may hold in pictures and tiles; None: 200 MB, or more where
-        the canvas needs it.
+        Bytes that the compositor may hold in pictures and tiles; None: a quarter of the memory that is
+        available, at least 400 MB, or more where the canvas needs it.
     interpolation : str
         Kernel of the one resampling: "linear", "cubic" or "lanczos".
     background : int

@@ -1,6 +1,5 @@
 """What a composite will take: memory and time, found before the work, and the sizes that follow from a memory limit."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,10 +11,9 @@ from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.masked_pixels import OPACITY_BYTES
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.errors import LimitError
+from rdstitch.machine import available_memory, processor_count
 
-# What the compositor takes at most by default; more memory means that fewer pictures are read twice. Beside it are the
-# libraries and the registered pictures, 190 MB for a few hundred of them: together within the usual bound of a process.
-DEFAULT_MEMORY = 200 * 2**20
+_SHARE, _LEAST = 0.25, 400 * 2**20  # of the memory that is available, and bytes that are taken in any case
 _TILE_SIZES = (512, 256)
 _MAX_WORKERS = 4
 _MAX_BANDS = 4
@@ -85,11 +83,11 @@ def plan_composite(
         When the limit is too low for the smallest tiles.
     """
     bands = options.bands or usual_bands(cameras)
-    limit = options.max_memory or DEFAULT_MEMORY
+    limit = options.max_memory or default_memory()
     opacity = OPACITY_BYTES if masked or any(part is not None for part in canvas.near) else 0
     picture = max(c.image_size[0] * c.image_size[1] for c in cameras) * (channels * itemsize + opacity)
     # While a picture is decoded it is there twice, beside those in the cache.
-    workers = options.workers or min(_MAX_WORKERS, os.cpu_count() or 1)
+    workers = options.workers or min(_MAX_WORKERS, processor_count())
     sides = _TILE_SIZES if options.tile_size is None else (options.tile_size,)
     choices = [(side, count) for side in sides for count in range(workers, 0, -1)]
     needs = {
@@ -115,6 +113,11 @@ def plan_composite(
         width * height * (channels * itemsize + 1),
         _SECONDS_OUT * width * height / 1e6 + _SECONDS_IN * megapixels_in,
     )
+
+
+def default_memory() -> int:
+    """Bytes that the compositor takes at most where the user gives no limit: a share of what is available now."""
+    return max(_LEAST, int(_SHARE * available_memory()))
 
 
 def usual_bands(cameras: Sequence[Camera]) -> int:

@@ -14,8 +14,9 @@ from rdstitch.compositing.boxes import Box, Float32Array, aligned, bounds, cut, 
 from rdstitch.compositing.image_cache import PictureCache
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photometric import Exposure, full_scale
-from rdstitch.compositing.sampling import border_weight, read_part, sample, sample_opacity
+from rdstitch.compositing.sampling import border_weight, reachable_part, read_part, sample, sample_opacity
 from rdstitch.compositing.seam_finder import NO_OWNER, SeamMap
+from rdstitch.compositing.source_images import NOTHING
 from rdstitch.compositing.warp import Geometry, Warp, locate
 
 
@@ -100,14 +101,29 @@ class Renderer:
             cv2.copyTo(self._multiband(layers, zone), _as_mask(cut(covered, box, zone)), cut(pixels, box, zone))
         return pixels, covered
 
-    def part(self, box: Box) -> tuple["Renderer", tuple[int, ...]]:
-        """What the tiles of a box need, which it gives the same samples; and the pictures that are left in it."""
+    def requests(self, box: Box) -> Iterator[tuple[int, Box]]:
+        """Pictures that a tile takes samples from, and the part of each, but where the seam map misses a pixel."""
+        blended = self.options.blend == "multiband"
+        around = self._blend_support(box) if blended else box
+        owned = {} if self.seams is None else self.seams.bounds(around)
+        for index, warp in enumerate(self.warps):
+            # Where nobody owns anything, masks decide who covers it.
+            anywhere = self.seams is None or (NO_OWNER in owned and self.pictures.masked(index))
+            shown = intersection(warp.box, around if anywhere else owned.get(index, NOTHING))
+            if shown is not None and (part := intersection(shown, around)) is not None:
+                yield index, reachable_part(warp, self._support_within(part, around))
+
+    def part(self, box: Box, shares: int) -> tuple["Renderer", tuple[int, ...]]:
+        """What the tiles of a box need, which it gives the same samples; and the pictures that are left in it.
+
+        It takes one of so many shares of the memory.
+        """
         around = self._blend_support(box) if self.options.blend == "multiband" else box
         chosen = [index for index, warp in enumerate(self.warps) if intersection(warp.box, around) is not None]
         part = replace(
             self,
             warps=[self.warps[index] for index in chosen],
-            pictures=self.pictures.part(chosen),
+            pictures=self.pictures.part(chosen, self.pictures.limit // shares),
             exposure=self.exposure.part(chosen),
             seams=None if self.seams is None else self.seams.part(around, chosen),
         )
@@ -175,21 +191,29 @@ class Renderer:
             return list(self._bordered(box))
         return self._owned(box)
 
-    def _bordered(self, box: Box) -> Iterator[Layer]:
-        """Every picture that covers part of a box, with weights that fall to its border."""
+    def _bordered(self, box: Box, wanted: NDArray[np.bool_] | None = None) -> Iterator[Layer]:
+        """Every picture that covers part of a box, or of what is wanted of it, with weights that fall to its border."""
         for index, warp in enumerate(self.warps):
             if (part := intersection(warp.box, box)) is None:
                 continue
             geometry = self._placed(index, part, box)
-            if geometry.inside.any():
-                weight = border_weight(geometry)
-                opacity = self._opacity(index, geometry)
-                yield Layer(index, part, weight if opacity is None else weight * opacity, geometry)
+            inside = geometry.inside if wanted is None else geometry.inside & cut(wanted, box, part)
+            if (shown := bounds(inside, part)) is None:
+                continue
+            geometry = geometry.on(shown)
+            weight = border_weight(geometry)
+            if wanted is not None:
+                weight[~cut(wanted, box, shown)] = 0.0
+            opacity = self._opacity(index, geometry)
+            yield Layer(index, shown, weight if opacity is None else weight * opacity, geometry)
 
     def _placed(self, index: int, part: Box, box: Box) -> Geometry:
         """The geometry of a picture on its part of a box, with a lattice for all that blending can need of it there."""
-        requested = intersection(self._blend_support(part), box) if self.options.blend == "multiband" else part
-        return locate(self.warps[index], requested or part).on(part)
+        return locate(self.warps[index], self._support_within(part, box)).on(part)
+
+    def _support_within(self, part: Box, box: Box) -> Box:
+        """What blending can need around a part of a box."""
+        return (intersection(self._blend_support(part), box) or part) if self.options.blend == "multiband" else part
 
     def _opacity(self, index: int, geometry: Geometry) -> Float32Array | None:
         """Opacity of a picture that has a mask."""
@@ -214,8 +238,7 @@ class Renderer:
         missing = owner == NO_OWNER
         if (left_over := bounds(missing, box)) is not None:
             best[...] = 0.0
-            for layer in self._bordered(left_over):
-                layer.weight[~cut(missing, box, layer.box)] = 0.0
+            for layer in self._bordered(left_over, cut(missing, box, left_over)):
                 _claim(owner, best, box, layer)
                 layers.append(layer)
         if self.options.blend == "feather":
@@ -228,14 +251,17 @@ class Renderer:
             part = intersection(self.warps[index].box, box) if index != NO_OWNER else None
             if part is None or self.seams is None:
                 continue
-            share, geometry = self.seams.share(index, part), self._placed(index, part, box)
+            share = self.seams.share(index, part)
+            if (shown := bounds(share, part)) is None:
+                continue
+            # Of many pictures that overlap each owns little of a tile; a view would hold the whole.
+            share, geometry = cut(share, part, shown).copy(), self._placed(index, shown, box)
             if not geometry.filled:
                 share[~geometry.inside] = 0.0
             if (opacity := self._opacity(index, geometry)) is not None:
                 share[opacity == 0] = 0.0
-            if (layer := Layer(index, part, share, geometry).weighted_part(part)) is not None:
-                # Of many pictures that overlap each owns little of a tile; a view would hold the whole.
-                yield replace(layer, weight=layer.weight.copy())
+            if (layer := Layer(index, shown, share, geometry).weighted_part(shown)) is not None:
+                yield layer
 
 
 def _claim(owner: NDArray[np.int32], best: Float32Array, box: Box, layer: Layer) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.compositing.masked_pixels import OPAQUE
 from rdstitch.compositing.source_images import KERNEL_MARGIN, LoadedPicture
-from rdstitch.compositing.warp import Geometry
+from rdstitch.compositing.warp import Geometry, Warp, points_around
 
 INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos": cv2.INTER_LANCZOS4}
 
@@ -20,9 +20,17 @@ _MIN_WEIGHT = np.float32(1e-6)
 
 def read_part(geometry: Geometry) -> Box:
     """The part of the picture that :func:`sample` takes pixels from."""
-    (map_x, map_y), (width, height) = geometry.maps, geometry.warp.camera.image_size
-    left, right = _mirrored_extent(map_x, width)
-    top, bottom = _mirrored_extent(map_y, height)
+    return _part_of(geometry.warp, *geometry.maps)
+
+
+def reachable_part(warp: Warp, box: Box) -> Box:
+    """The part of the picture that holds what :func:`read_part` gives for a box of the canvas and all boxes within."""
+    return _part_of(warp, *np.moveaxis(points_around(warp, box), -1, 0))
+
+
+def _part_of(warp: Warp, map_x: Float32Array, map_y: Float32Array) -> Box:
+    width, height = warp.camera.image_size
+    (left, right), (top, bottom) = _mirrored_extent(map_x, width), _mirrored_extent(map_y, height)
     return left, top, right, bottom
 
 

@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -68,23 +69,75 @@ class LoadedPicture:
         """Whether a part of the original can be resampled from it."""
         return self.part is None or encloses(self.part, part)
 
-    def cut(self, part: Box) -> "LoadedPicture":
+    def cut(self, part: Box, *, copy: bool = False) -> "LoadedPicture":
         """A part of the original, with what the kernel of the resampling needs around it, in memory of its own.
 
-        The whole where the part is not much less: the copy would not be worth its time.
+        The whole where the part is not much less, unless a copy is wanted: it would not be worth its time.
         """
         unit, room = self.reduction, KERNEL_MARGIN
         height, width = self.pixels.shape[:2]
         x, y = self.origin
         left, right = (max(0, part[0] // unit - room - x), min(width, -(-part[2] // unit) + room - x))
         top, bottom = (max(0, part[1] // unit - room - y), min(height, -(-part[3] // unit) + room - y))
-        if (right - left) * (bottom - top) > _WORTH_CUTTING * width * height:
+        if not copy and (right - left) * (bottom - top) > _WORTH_CUTTING * width * height:
             return self
         rows, columns = slice(top, bottom), slice(left, right)
-        opacity = None if self.opacity is None else self.opacity[rows, columns].copy()
+        opacity = None if self.opacity is None else np.array(self.opacity[rows, columns])
         left_part = part if self.part is None else intersection(part, self.part) or NOTHING
-        pixels, origin = self.pixels[rows, columns].copy(), (left + x, top + y)
+        pixels, origin = np.array(self.pixels[rows, columns]), (left + x, top + y)
         return replace(self, pixels=pixels, opacity=opacity, part=left_part, origin=origin)
+
+
+@dataclass(frozen=True)
+class PictureOnDisk:
+    """A picture ready to be resampled, in a file.
+
+    Attributes
+    ----------
+    file : Path
+        Its pixels, then its opacity, as they are in memory.
+    arrays : sequence of (dtype, shape)
+        Of these.
+    outline : LoadedPicture
+        What else is known of it.
+    """
+
+    file: Path
+    arrays: Sequence[tuple[np.dtype[Any], tuple[int, ...]]]
+    outline: LoadedPicture
+
+    @classmethod
+    def write(cls, picture: LoadedPicture, file: Path) -> Self:
+        """Keep a picture in a file.
+
+        Raises
+        ------
+        OSError
+            When it cannot be written.
+        """
+        arrays = [picture.pixels] if picture.opacity is None else [picture.pixels, picture.opacity]
+        try:
+            with file.open("wb") as stream:
+                for array in arrays:
+                    np.ascontiguousarray(array).tofile(stream)
+        except OSError:
+            file.unlink(missing_ok=True)
+            raise
+        outline = replace(picture, pixels=picture.pixels[:0], opacity=None)
+        return cls(file, [(array.dtype, array.shape) for array in arrays], outline)
+
+    def mapped(self) -> LoadedPicture:
+        """The picture, whose pixels are read from the file when they are used."""
+        arrays, start = [], 0
+        for dtype, shape in self.arrays:
+            arrays.append(np.memmap(self.file, dtype, "r", start, shape))
+            start += arrays[-1].nbytes
+        return replace(self.outline, pixels=arrays[0], opacity=arrays[1] if len(arrays) > 1 else None)
+
+    def remove(self) -> None:
+        """Remove the file; what is mapped stays."""
+        with suppress(OSError):
+            self.file.unlink()
 
 
 def prepare_picture(picture: Picture, shrink: float, reduction: int = 1) -> LoadedPicture:

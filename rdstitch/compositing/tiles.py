@@ -1,7 +1,7 @@
 """A part of a canvas, computed tile by tile, as strips from top to bottom."""
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.compositing.blender import margin
 from rdstitch.compositing.boxes import Box
-from rdstitch.compositing.image_parts import ShownPart, shown_parts
+from rdstitch.compositing.image_parts import RequestedParts
 from rdstitch.compositing.render import Renderer
 from rdstitch.io.layout import STRIP_ROWS
 from rdstitch.opencv_state import one_opencv_thread
@@ -50,23 +49,27 @@ class TiledOutput:
         """Width and height, pixels."""
         return self.box[2] - self.box[0], self.box[3] - self.box[1]
 
-    @property
-    def _around(self) -> int:
-        """How far from where they show pictures are requested too, canvas pixels.
-
-        The support of a tile's blending is aligned to the coarsest band.
-        """
-        return margin(self.renderer.bands) + (2 << self.renderer.bands)
-
     @cached_property
-    def _shown(self) -> Sequence[ShownPart]:
-        """Which part of each picture shows, where that is known before; else empty."""
-        seams = self.renderer.seams
-        return [] if seams is None else shown_parts(self.renderer.warps, seams, self._around)
+    def _requested(self) -> RequestedParts:
+        """Which part of each picture the tiles take."""
+        rows = (
+            [request for box in self._boxes(top) for request in self.renderer.requests(box)]
+            for top in range(0, self.size[1], self.tile_size)
+        )
+        return RequestedParts.of(len(self.renderer.warps), rows)
+
+    def _boxes(self, top: int) -> list[Box]:
+        """The tiles of a row that begins so many pixels below the top."""
+        (width, height), (x, y), side = self.size, self.box[:2], self.tile_size
+        bottom = min(top + side, height)
+        return [(x + k, y + top, x + min(k + side, width), y + bottom) for k in range(0, width, side)]
 
     def part(self, box: Box) -> tuple["TiledOutput", tuple[int, ...]]:
-        """A smaller part, one tile at a time, with nothing but the pictures that reach it; and which these are."""
-        renderer, pictures = self.renderer.part(box)
+        """A smaller part, one tile at a time, with nothing but the pictures that reach it; and which these are.
+
+        As many are computed at one time as there are workers, and share the memory.
+        """
+        renderer, pictures = self.renderer.part(box, self.workers)
         return TiledOutput(renderer, box, self.tile_size, 1), pictures
 
     def strips(self, progress: ShareProgress | None = None) -> Generator[OutputStrip]:
@@ -97,19 +100,16 @@ class TiledOutput:
 
     def _start(self, top: int, run: Callable[..., Iterator[Any]]) -> tuple[OutputStrip, Iterator[Box]]:
         """Begin with a row of tiles, when all but one above are done: the strip they fill, and each once it is done."""
-        (width, height), (x, y), side = self.size, self.box[:2], self.tile_size
-        bottom = min(top + side, height)
+        row, x, boxes = top // self.tile_size, self.box[0], self._boxes(top)
         # In alternating directions, so that the pictures used last are the ones needed next.
-        backwards = top // side % 2 == 1
-        if self._shown:
-            pictures, warps = self.renderer.pictures, self.renderer.warps
-            pictures.expect([part.from_row(y + top - side - self._around) for part in self._shown])
-            rows = y + top - self._around, y + bottom + self._around
-            due = [index for index, part in enumerate(self._shown) if part.on_rows(*rows)]
-            pictures.prefetch(sorted(due, key=lambda index: warps[index].box, reverse=backwards))
-        boxes = [(x + k, y + top, x + min(k + side, width), y + bottom) for k in range(0, width, side)]
-        samples = np.zeros((bottom - top, width, self.renderer.channels), dtype=self.renderer.dtype)
-        alpha = np.zeros((bottom - top, width), dtype=np.uint8)
+        backwards = row % 2 == 1
+        pictures, warps = self.renderer.pictures, self.renderer.warps
+        # The row above is not done yet.
+        pictures.expect(self._requested.from_row(row - 1))
+        pictures.prefetch(sorted(self._requested.on_row(row), key=lambda k: warps[k].box, reverse=backwards))
+        shape = boxes[0][3] - boxes[0][1], self.size[0]
+        samples = np.zeros((*shape, self.renderer.channels), dtype=self.renderer.dtype)
+        alpha = np.zeros(shape, dtype=np.uint8)
 
         def fill(box: Box) -> Box:
             columns = slice(box[0] - x, box[2] - x)

@@ -56,9 +56,7 @@ class Lattice:
         """Nodes by what maps x (1, n) and y (m, 1), canvas pixels, to pixels (m, n, 2) of a picture."""
         (x0, x1), (y0, y1) = _enclosing(box, LATTICE_STEPS[0])
         x, y = (np.arange(start, stop + 1, step, dtype=np.float64) for start, stop in ((x0, x1), (y0, y1)))
-        points = places(x[None, :], y[:, None]).astype(np.float32)
-        points[~np.isfinite(points).all(axis=-1)] = _NOWHERE
-        return cls(box, step, points)
+        return cls(box, step, _somewhere(places(x[None, :], y[:, None])))
 
     def nodes(self, box: Box, step: int) -> Float32Array:
         """Pixels at the nodes that enclose a box within this one's, (m, n, 2), at this spacing or a wider one."""
@@ -266,6 +264,23 @@ def plan_warps(pictures: Sequence[PlacedPicture], canvas: Canvas) -> list[Warp]:
 def locate(warp: Warp, box: Box) -> Geometry:
     """Where the pixels of a box come from, and which of them lie in the picture."""
     return Geometry(warp, box, Lattice.over(box, warp.step, warp.source_points))
+
+
+def points_around(warp: Warp, box: Box) -> Float32Array:
+    """Pixels (K, 2) of the picture at the outermost nodes of the lattice over a box: no other node lies beyond."""
+    (x0, x1), (y0, y1) = _enclosing(box, LATTICE_STEPS[0])
+    x, y = (np.arange(start, stop + 1, warp.step, dtype=np.float64) for start, stop in ((x0, x1), (y0, y1)))
+    left, top = np.full_like(y, x0), np.full_like(x, y0)
+    return _somewhere(
+        warp.source_points(np.concatenate([x, x, left, left + (x1 - x0)]), np.concatenate([top, top + (y1 - y0), y, y]))
+    )
+
+
+def _somewhere(points: FloatArray) -> Float32Array:
+    """Places in a picture, far outside where there are none."""
+    there = points.astype(np.float32)
+    there[~np.isfinite(there).all(axis=-1)] = _NOWHERE
+    return there
 
 
 def _grid(camera: Camera) -> FloatArray:

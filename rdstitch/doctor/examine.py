@@ -1,6 +1,5 @@
 """The examination of a set of pictures, as data and in words; nothing is registered."""
 
-import os
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -10,16 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from rdstitch.compositing.plan import DEFAULT_MEMORY
+from rdstitch.compositing.plan import default_memory
 from rdstitch.doctor.glance import Glance, glance_at, overlap_of
 from rdstitch.errors import InputError
 from rdstitch.features import FeatureOptions, Features, detect
 from rdstitch.inputs.find import found_pictures
 from rdstitch.inputs.frame import ChannelOrder, Images, as_inputs
 from rdstitch.inputs.source import Source, read_sources
+from rdstitch.machine import processor_count
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.messages import bytes_in_words, seconds_in_words, shortened
-from rdstitch.process_memory import usual_bound
 from rdstitch.progress import Progress, silent
 
 _GLANCE = FeatureOptions(max_features=500, work_megapixels=None)
@@ -155,7 +154,7 @@ def examine(
         sources, unread = read_sources(pictures.frames, skip_bad=True)
         unreadable = [f"{message.images[0]}: {message.text}" for message in unread]
         found: dict[int, _Examined] = {}
-        workers = os.cpu_count() or 1
+        workers = processor_count()
         with ThreadPoolExecutor(workers) as pool:
             waiting = [pool.submit(_examine_one, source) for source in sources]
             for index, future in enumerate(waiting):
@@ -251,11 +250,10 @@ def _focal(sources: Sequence[Source]) -> tuple[str, bool]:
 
 
 def _memory(sources: Sequence[Source], overlap: float, workers: int) -> int:
-    """Libraries, features, and what detection or the compositor hold at a time; runs keep to the usual bound."""
+    """Libraries, features, and what detection or the compositor hold at a time."""
     shown = sum(np.prod(m.size) * m.channels * m.bit_depth / 8 for m in (source.metadata for source in sources))
-    composite = min(_COMPOSITE_SHARE * _mosaic_share(overlap) * float(shown), DEFAULT_MEMORY)
-    needed = _BASE_MEMORY + _FEATURES_MEMORY * len(sources) + max(_DETECTION_MEMORY * workers, composite)
-    return int(min(needed, usual_bound(len(sources))))
+    composite = min(_COMPOSITE_SHARE * _mosaic_share(overlap) * float(shown), default_memory())
+    return int(_BASE_MEMORY + _FEATURES_MEMORY * len(sources) + max(_DETECTION_MEMORY * workers, composite))
 
 
 def _mosaic_share(overlap: float) -> float:

@@ -10,16 +10,17 @@ import errno
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from rdstitch.errors import OutputError
+from rdstitch.errors import OutputError, RdstitchError
 from rdstitch.io.deepzoom import holds_only_tiles
 from rdstitch.io.staging import StagingFolder
+from rdstitch.messages import Message
 
 if sys.platform != "win32":
     import fcntl
@@ -97,6 +98,18 @@ class Outputs:
         """Stage a file with this content."""
         with self.writing(path) as staged:
             staged.write_bytes(data)
+
+    def attempt(self, path: str | Path, stage: Callable[[], None]) -> list[Message]:
+        """Stage what belongs beside a picture, whose failure must not cost the picture: a warning, where it fails."""
+        count = len(self._items)
+        try:
+            stage()
+        except Exception as error:  # noqa: BLE001 the work of hours is not thrown away for a page, whatever is wrong
+            del self._items[count:]
+            text = str(error) if isinstance(error, RdstitchError) else f"{type(error).__name__}: {error}"
+            older = "; the file of this name is older" if Path(path).exists() else ""
+            return [Message(f"{path}: not written, all else is: {text.removeprefix(f'{path}: ')}{older}")]
+        return []
 
     def staged(self, path: str | Path) -> Path | None:
         """Where an output lies until it is published; None where none of this name is staged."""

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, JpegImagePlugin
 
 from rdstitch.io.deepzoom import read_deep_zoom
 from rdstitch.io.read import read_image
@@ -31,6 +31,11 @@ def read_preview(path: Path, size: tuple[int, int], side: int) -> tuple[NDArray[
         return read_deep_zoom(path, size, side), None
     if size[0] * size[1] > _OVERVIEW_FROM and suffix in (".tif", ".tiff"):
         return _overview(path, side), None
+    if suffix in (".jpg", ".jpeg"):
+        # Of any size: none of it is decoded larger than needed.
+        with JpegImagePlugin.JpegImageFile(path) as image:
+            image.draft(None, (side, side))
+            return np.asarray(image), None
     picture = read_image(path)
     return picture.pixels, picture.alpha
 

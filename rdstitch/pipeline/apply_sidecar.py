@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Literal
@@ -24,7 +25,7 @@ from rdstitch.local_alignment import DisplacementField
 from rdstitch.messages import Message, told_once
 from rdstitch.messages import left_out as left_out_message
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.compose import compose_pictures, plainly_viewed, write_page
+from rdstitch.pipeline.compose import Composed, compose_pictures, plainly_viewed, write_page
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.recomposition import Recomposition, applied_sidecar
 from rdstitch.progress import Progress, silent
@@ -134,10 +135,18 @@ def apply(
             composed.fingerprint,
         )
         if output is not None and not dry_run:
-            names = [source.name for source in used.values()]
-            write_page(outputs, output, composed, plainly_viewed(composed.canvas, names))
-            outputs.write(f"{output}.json", json_bytes(applied_sidecar(result)))
+            return _written(result, output, composed, list(used.values()), outputs)
         return result
+
+
+def _written(
+    result: Recomposition, output: str | Path, composed: Composed, used: Sequence[Source], outputs: Outputs
+) -> Recomposition:
+    """The result, with the page and the sidecar written."""
+    page = partial(plainly_viewed, composed.canvas, [source.name for source in used])
+    result = replace(result, messages=(*result.messages, *write_page(outputs, output, composed, page)))
+    outputs.write(f"{output}.json", json_bytes(applied_sidecar(result)))
+    return result
 
 
 def _placed(saved: SavedRegistration, used: Mapping[int, Source]) -> PlacedImages:

@@ -1,9 +1,10 @@
 """The last stage of every picture: from registered pictures to pixels, in memory or in a file with a page beside it."""
 
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -137,14 +138,15 @@ def compose_pictures(
     file = OutputFile(output, placed.sources[0].metadata, tags, outputs)
     written = compose_to_file(file, pictures, canvas, options, report, elsewhere)
     place, note = located[0]
+    beside = []
     if place is not None and world_files:
-        for path, text in zip(world_files, place.world_file_texts(), strict=True):
-            outputs.write(path, text_bytes(text))
+        beside = outputs.attempt(world_files[0], partial(_write_world_files, outputs, world_files, place))
     messages = (
         *_masked(placed),
         *written.messages,
         *([Message(note)] if note else []),
         *_profile_lost(placed.sources[0], Path(output)),
+        *beside,
     )
     return Composed(written.canvas, messages=messages, fingerprint=written.fingerprint, written=written)
 
@@ -166,6 +168,11 @@ def _files_beside(output: str | Path | None, placed: PlacedImages, overwrite: bo
     for file in (*world_files, *([] if page is None else [page])):
         check_output(file, overwrite, suffixes=())
     return world_files
+
+
+def _write_world_files(outputs: Outputs, paths: Sequence[Path], place: Georeference) -> None:
+    for path, text in zip(paths, place.world_file_texts(), strict=True):
+        outputs.write(path, text_bytes(text))
 
 
 def _profile_lost(source: Source, output: Path) -> list[Message]:
@@ -227,13 +234,20 @@ def compose_block(task: BlockTask) -> tuple[list[Stored[BlockStrip]], GuardNotes
     return strips, task.sources[0].guard.notes_on([source.path for source in task.sources])
 
 
-def write_page(outputs: Outputs, output: str | Path, composed: Composed, pictures: Sequence[ViewedPicture]) -> None:
-    """Write the page of a ``.dzi`` output; others have none."""
+def write_page(
+    outputs: Outputs, output: str | Path, composed: Composed, pictures: Callable[[], Sequence[ViewedPicture]]
+) -> list[Message]:
+    """Write the page of a ``.dzi`` output; others have none. A warning, where it cannot be written."""
     page, written = viewer_path(output), composed.written
-    if page is not None and written is not None:
-        text = viewer_page(output, composed.canvas.size, pictures, written.seams, written.origin)
+    if page is None or written is None:
+        return []
+
+    def stage() -> None:
+        text = viewer_page(output, composed.canvas.size, pictures(), written.seams, written.origin)
         # Names of files need not be UTF-8.
         outputs.write(page, text.encode("utf-8", "backslashreplace"))
+
+    return outputs.attempt(page, stage)
 
 
 def plainly_viewed(canvas: Canvas, names: Sequence[str]) -> list[ViewedPicture]:

@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -243,7 +245,9 @@ def trajectory(
         if output is not None:
             outputs.write(output, text_bytes(WRITERS[layout](path)))
         if plot is not None:
-            outputs.write(plot, text_bytes(path_as_svg(path)))
+            file = plot
+            failed = outputs.attempt(file, lambda: outputs.write(file, text_bytes(path_as_svg(path))))
+            registration = registration.with_messages(failed)
     return path, registration
 
 
@@ -298,11 +302,13 @@ def _composite(
             local,
         )
         if not options.dry_run:
-            _save_camera(registration, options, outputs)
+            failed = outputs.attempt(options.save_camera or "", partial(_save_camera, registration, options, outputs))
+            if output is not None:
+                failed += write_page(outputs, output, composed, partial(viewed_pictures, result))
+            result = replace(result, registration=result.registration.with_messages(failed))
             if beside is not None:
                 beside(outputs, result)
             if output is not None:
-                write_page(outputs, output, composed, viewed_pictures(result))
                 # Last: whoever finds it finds what it belongs to.
                 outputs.write(f"{output}.json", json_bytes(sidecar(result)))
     return result

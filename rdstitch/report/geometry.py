@@ -74,13 +74,16 @@ def of_source(source: Source, side: int) -> str | None:
 
 
 def of_mosaic(result: StitchResult, side: int, staged: Path | None = None) -> str | None:
-    """A thumbnail of the output, or of its staged file; None where there is none, as after a dry run."""
+    """A thumbnail of the output, or of its staged file; None where there is none, as after a dry run, or it is huge."""
     if result.composite is not None:
         return data_address(result.composite.pixels, side)
     file = staged or result.output
     if file is None or not file.exists():
         return None
-    return data_address(read_preview(file, result.canvas.size, side)[0], side)
+    try:
+        return data_address(read_preview(file, result.canvas.size, side)[0], side)
+    except InputError:
+        return None
 
 
 def data_address(pixels: NDArray[Any], side: int) -> str:

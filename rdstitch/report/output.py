@@ -23,7 +23,8 @@ def mosaic(result: StitchResult, staged: Path | None = None) -> str:
     """The output, small; every outline has its picture's name as title, and a few pictures have it written."""
     picture = of_mosaic(result, _MOSAIC_SIDE, staged)
     if picture is None:
-        return section("Mosaic", "No picture was written.")
+        large = result.plan is None and result.output is not None
+        return section("Mosaic", "It is too large to be shown here." if large else "No picture was written.")
     name = "" if result.output is None else f"{result.output.name}, "
     width, height = result.canvas.size
     scale = _MOSAIC_SIDE / max(width, height)

@@ -12,8 +12,7 @@ import pytest
 from PIL import ExifTags, Image
 
 from rdstitch.doctor import examine
-from rdstitch.doctor.examine import _memory
-from rdstitch.process_memory import usual_bound
+from rdstitch.doctor.examine import _FEATURES_MEMORY, _memory
 from tests.cli.running import Run
 
 
@@ -90,8 +89,11 @@ def test_what_cannot_be_read_is_named_once(rdstitch: Run, tmp_path: Path) -> Non
     assert (done.status, done.line.count(str(missing))) == (3, 1)
 
 
-def test_expected_memory_is_that_of_the_work_and_at_most_what_runs_keep_to() -> None:
+def test_expected_memory_is_that_of_the_work_and_at_most_what_compositing_keeps_to(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("rdstitch.compositing.plan.available_memory", lambda: 0)
     source: Any = SimpleNamespace(metadata=SimpleNamespace(size=(480, 360), channels=3, bit_depth=8))
-    few, many = _memory([source] * 12, 0.5, 2), _memory([source] * 1000, 0.5, 2)
-    assert few < usual_bound(12)
-    assert many == usual_bound(1000)
+    few, many, more = (_memory([source] * count, 0.5, 2) for count in (12, 2000, 3000))
+    assert few < 400 * 2**20 < many
+    assert more - many == 1000 * _FEATURES_MEMORY

@@ -301,3 +301,41 @@ def test_what_an_option_names_to_be_read_is_never_replaced(rdstitch: Run, frames
         done = rdstitch(command, *frames[:2], "-o", file, "--overwrite", *given)
         assert (done.status, f"{file.name}: is read as input" in done.line) == (6, True)
         assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("made_by", "name"),
+    [
+        ("rdstitch.report.page.report_page", "report.html"),
+        ("rdstitch.pipeline.compose.viewer_page", "field.html"),
+        ("rdstitch.pipeline.recipes.camera_file_text", "camera.json"),
+        ("rdstitch.export.georeference.Georeference.world_file_texts", "field.jgw"),
+    ],
+)
+def test_what_belongs_beside_a_picture_never_costs_the_picture(
+    made_by: str, name: str, rdstitch: Run, located: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise ValueError("drawn wrongly")
+
+    monkeypatch.setattr(made_by, fail)
+    output = tmp_path / ("field.jpg" if name.endswith(".jgw") else "field.dzi")
+    done = rdstitch(
+        *("mosaic", located / "flight", "-o", output, *FAST, "--report", tmp_path / "report.html"),
+        *("--save-camera", tmp_path / "camera.json"),
+    )
+    assert done.status == 0
+    assert f"{name}: not written, all else is: ValueError: drawn wrongly" in done.err
+    expected = {"report.html", "camera.json", output.name, f"{output.name}.json"}
+    expected |= {"field.html", "field_files"} if output.suffix == ".dzi" else set()
+    assert {file.name for file in tmp_path.iterdir()} == expected - {name}
+    assert json.loads(Path(f"{output}.json").read_text())["images"]
+
+
+def test_a_page_of_an_earlier_run_is_called_older(
+    rdstitch: Run, located: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = ("mosaic", located / "flight", "-o", tmp_path / "field.dzi", *FAST, "--overwrite")
+    assert rdstitch(*arguments).status == 0
+    monkeypatch.setattr("rdstitch.pipeline.compose.viewer_page", lambda *_: 1 // 0)
+    assert "the file of this name is older" in rdstitch(*arguments).err

@@ -247,3 +247,16 @@ def test_the_best_pair_has_many_matches(frames: list[Path]) -> None:
     names = [frames[k].name for k in (few.image1, few.image2)]
     assert f"Best pair: {' and '.join(names)}" not in shown
     assert "Best pair: " in shown
+
+
+def test_a_picture_larger_than_any_cameras_is_shown_or_said_to_be_too_large(
+    frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = pano(frames, options=StitchOptions(composite=CompositeOptions(scale=0.5)))
+    monkeypatch.setattr("rdstitch.io.opening._MAX_MEGAPIXELS", 0.01)
+    for suffix, shown in ((".jpg", True), (".png", False)):
+        file = tmp_path / f"large{suffix}"
+        Image.new("RGB", result.canvas.size, (10, 200, 30)).save(file)
+        page = report_page(replace(result, composite=None, output=file))
+        assert ("too large to be shown here" in page) is not shown
+        assert "Match graph" in page

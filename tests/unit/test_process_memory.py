@@ -11,7 +11,7 @@ from threading import Thread
 import pytest
 
 from rdstitch import process_memory
-from rdstitch.process_memory import scratch_memory, usual_bound
+from rdstitch.process_memory import scratch_memory
 
 _LARGE_AND_SMALL = """
 from os import sysconf
@@ -67,11 +67,6 @@ def test_what_each_picture_takes_is_reused_for_the_next() -> None:
     command = [sys.executable, "-c", _AGAIN_AND_AGAIN, "many"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert int(done.stdout) < 20_000  # pages; the arrays of a round have 9,800
-
-
-def test_the_bound_is_400_mb_and_150_kb_a_picture() -> None:
-    assert usual_bound(0) == 400_000_000
-    assert usual_bound(1000) == 550_000_000
 
 
 def test_threads_share_the_memory_that_they_give_back(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,9 +1,12 @@
 """The cache of pictures: bounded, no more than is needed, and right all the same."""
 
+import tempfile
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from errno import ENOSPC
 from functools import partial
+from pathlib import Path
 from threading import Event, Timer
 from time import monotonic, sleep
 
@@ -12,15 +15,12 @@ import pytest
 
 from rdstitch.camera import Camera
 from rdstitch.compositing.image_cache import PictureCache
-from rdstitch.compositing.image_parts import shown_parts
 from rdstitch.compositing.placed_picture import PlacedPicture, place_pictures
-from rdstitch.compositing.seam_finder import SeamMap
-from rdstitch.compositing.source_images import NOTHING, PictureReader, prepare_picture
-from rdstitch.compositing.warp import plan_warp
+from rdstitch.compositing.source_images import NOTHING, PictureOnDisk, PictureReader, prepare_picture
 from rdstitch.errors import InputError
 from rdstitch.io import Picture
 from rdstitch.io.read import reduced
-from tests.compositing_scenes import as_picture, render
+from tests.compositing_scenes import as_picture
 
 WHOLE = (0, 0, 200, 100)
 
@@ -48,12 +48,52 @@ class DecodedImageCache:
         return PictureCache(reader, [1.0] * 4, limit, ahead=ahead)
 
 
-def test_those_used_last_are_held() -> None:
+@pytest.mark.parametrize("writable", [True, False])
+def test_those_used_last_are_held_and_the_others_wait_on_disk(
+    writable: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path if writable else tmp_path / "missing"))
     decoded_images = DecodedImageCache()
     cache = decoded_images.cache(limit=2 * 20_000)
     for index in (0, 1, 0, 1, 2, 1, 0):
         np.testing.assert_array_equal(cache.get(index, WHOLE).pixels, decoded_images.frames[index])
-    assert decoded_images.reads == {0: 2, 1: 1, 2: 1}
+    assert decoded_images.reads == {0: 1 if writable else 2, 1: 1, 2: 1}
+    assert sum(file.stat().st_size for file in tmp_path.rglob("*")) >= 20_000 * writable
+    cache.expect([WHOLE, WHOLE, NOTHING, NOTHING])
+    cache.close()
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["uint8", "uint16", "float32"])
+def test_what_waits_on_disk_comes_back_as_it_was(kind: str) -> None:
+    rng = np.random.default_rng(2)
+    frames = [rng.integers(0, 200, (99, 201, 3)).astype(kind) for _ in range(3)]
+    alpha = np.where(rng.random((99, 201)) < 0.1, np.uint8(0), np.uint8(255))
+    pictures = [replace(as_picture(frame), alpha=alpha) for frame in frames]
+    reader = PictureReader(
+        place_pictures([partial(lambda p: p, p) for p in pictures], [Camera((201, 99))] * 3, [np.eye(3)] * 3)
+    )
+    cache, whole = PictureCache(reader, [1.0] * 3, 1), [prepare_picture(p, 1.0) for p in pictures]
+    for _ in range(2):
+        for index in range(3):
+            kept, expected = cache.get(index, (50, 20, 90, 77)), whole[index].cut((50, 20, 90, 77))
+            x, y = (a - b for a, b in zip(expected.origin, kept.origin, strict=True))
+            for got, true in ((kept.pixels, expected.pixels), (kept.opacity, expected.opacity)):
+                assert got is not None
+                assert true is not None
+                np.testing.assert_array_equal(got[y : y + len(true), x : x + true.shape[1]], true)
+
+
+def test_a_full_disk_costs_time_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(PictureOnDisk, "write", full)
+    decoded_images = DecodedImageCache()
+    cache = decoded_images.cache(limit=20_000)
+    for index in (0, 1, 0):
+        np.testing.assert_array_equal(cache.get(index, WHOLE).pixels, decoded_images.frames[index])
+    assert decoded_images.reads == {0: 2, 1: 1}
 
 
 def test_parts_take_less_room() -> None:
@@ -172,28 +212,3 @@ def test_a_cut_holds_what_was_requested(shrink: float) -> None:
         x, y = smaller.origin
         rows, columns = smaller.pixels.shape[:2]
         np.testing.assert_array_equal(smaller.pixels, whole.pixels[y : y + rows, x : x + columns])
-
-
-def test_shown_parts_hold_all_that_a_picture_owns() -> None:
-    scene = render(2, 2, distortion=-0.3)
-    warps = [
-        plan_warp(c, g, scene.canvas, k) for k, (c, g) in enumerate(zip(scene.cameras, scene.homographies, strict=True))
-    ]
-    width, height = scene.canvas.size
-    labels = np.full((height // 4 + 1, width // 4 + 1), -1, np.int32)
-    labels[20:60, 30:70] = 0
-    labels[70:90, 100:130] = 3
-    parts = shown_parts(warps, SeamMap(labels, 4), around=10)
-    assert parts[1].from_row(0) == NOTHING
-    for index, (rows, columns) in {0: ((80, 240), (120, 280)), 3: ((280, 360), (400, 520))}.items():
-        y, x = (np.arange(*limits, dtype=float) for limits in (rows, columns))
-        for first in (0, (rows[0] + rows[1]) // 2):
-            points = warps[index].source_points(*np.meshgrid(x, y[y >= first])).reshape(-1, 2)
-            points = points[warps[index].contains(*points.T)]
-            x0, y0, x1, y1 = parts[index].from_row(first)
-            assert ((points >= (x0, y0)) & (points <= (x1, y1))).all()
-        assert parts[index].on_rows(rows[0] - 50, rows[0] + 4)
-        assert parts[index].on_rows(rows[1] - 4, rows[1] + 50)
-        assert not parts[index].on_rows(rows[0] - 50, rows[0] - 4)
-        assert not parts[index].on_rows(rows[1] + 4, rows[1] + 50)
-        assert parts[index].from_row(rows[1]) == NOTHING

@@ -1,13 +1,12 @@
 """What a composite may take when nobody says it."""
 
-import numpy as np
 import pytest
 
+from rdstitch.compositing import plan as planning
 from rdstitch.compositing.masked_pixels import OPACITY_BYTES
 from rdstitch.compositing.options import CompositeOptions
-from rdstitch.compositing.plan import DEFAULT_MEMORY, CompositePlan, plan_composite
+from rdstitch.compositing.plan import CompositePlan, default_memory, plan_composite
 from rdstitch.errors import LimitError
-from rdstitch.process_memory import usual_bound
 from tests.compositing_scenes import render
 
 
@@ -17,17 +16,17 @@ def _planned(max_memory: int | None = None, *, masked: bool = False) -> Composit
     return plan_composite(scene.cameras, scene.canvas, options, masked=masked)
 
 
-def test_the_usual_limit_leaves_room_for_the_libraries_and_the_registered_pictures() -> None:
+@pytest.mark.parametrize(("available", "taken"), [(0, 400 * 2**20), (10**9, 400 * 2**20), (8 * 10**9, 2 * 10**9)])
+def test_the_default_is_a_quarter_of_what_is_available(
+    available: int, taken: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(planning, "available_memory", lambda: available)
+    assert default_memory() == taken
     plan = _planned()
     assert (plan.tile_size, plan.workers) == (512, 2)
-    assert plan.memory_bytes <= DEFAULT_MEMORY <= usual_bound(0) - 190e6
-
-
-def test_what_else_the_process_holds_does_not_matter() -> None:
-    before = _planned()
-    held = np.ones(600_000_000, dtype=np.uint8)
-    assert _planned() == before
-    del held
+    assert plan.memory_bytes <= taken
+    assert plan.memory_bytes - len(render(3, 1).cameras) * 10**6 <= taken < plan.cache_bytes + plan.memory_bytes
+    assert _planned(40 * 2**20).cache_bytes < plan.cache_bytes
 
 
 def test_less_memory_means_smaller_tiles_on_fewer_threads() -> None:
