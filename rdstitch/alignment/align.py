@@ -11,6 +11,7 @@ from rdstitch.alignment.adjustment_problem import (
     homography_apart,
     thin_for_selection,
 )
+from rdstitch.alignment.attitude_check import check_attitudes
 from rdstitch.alignment.build_result import AdjustedPictures, build_alignment
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult, sigma_of
 from rdstitch.alignment.camera_priors import CameraPriors
@@ -112,6 +113,9 @@ def align(
     problem, pictures = graph.problem(~wrong)
     # Data weigh against priors as they will in the final adjustment.
     problem = replace(problem, overdispersion=noise_of_links(problem)[0].overdispersion)
+    if (doubt := check_attitudes(problem, options)) is not None:
+        alignment = align(cameras, links, doubt[0], former=former, progress=progress)
+        return replace(alignment, messages=(*alignment.messages, doubt[1]))
     choice = None if former is None else _choose_from(former, cameras, problem, pictures, options, chosen.refinements)
     choice = choice or choose_motion(problem, options.models, chosen.refinements)
     held = replace(graph, free_lens=choice.fit.free_lens)
