@@ -41,6 +41,8 @@ LENS_STD = np.array([0.5, 0.1, 0.03, 0.03, 0.03])
 FOCAL_LOG_STD = {"option": 0.01, "file": 0.01, "estimate": 0.05, "exif": 0.05, "guess": 0.3}
 """Standard deviation of the logarithm of a focal length, by where it comes from."""
 
+_LEAST_LOG_STD = 1e-6  # of a focal length: what is exact has no inverse variance
+
 _GRID = 33  # points along each side of the picture at which lenses are compared
 
 _FOCAL_LIMITS = 0.05, 1e3  # half diagonals; the widest fisheyes have 0.3
@@ -92,6 +94,10 @@ class Camera:
         Focal length, pixels, or None where nothing is known of it.
     focal_source : str or None
         Where the focal length comes from, a key of :data:`FOCAL_LOG_STD`.
+    focal_std : float or None
+        Standard deviation of an estimated focal length, pixels; None where :data:`FOCAL_LOG_STD` stands for it.
+    tilt, tilt_std : (float, float) or None
+        (ψ, θ) of the camera to the plane of its images, radians, and their standard deviations; None where not known.
     distortion_std : float or None
         Standard deviation of :attr:`nearest_distortion`; None where it was given and not estimated.
     lens_covariance : tuple of 5 tuples of 5 floats, or None
@@ -118,6 +124,9 @@ class Camera:
     distortion_std: float | None = None
     distortion3: float = 0.0
     lens_covariance: tuple[tuple[float, ...], ...] | None = field(default=None, repr=False)
+    focal_std: float | None = None
+    tilt: tuple[float, float] | None = None
+    tilt_std: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         """Fill in the image centre and check every value."""
@@ -236,13 +245,16 @@ class Camera:
     @property
     def focal_log_std(self) -> float:
         """Standard deviation of the logarithm of the focal length."""
+        if self.focal is not None and self.focal_std is not None:
+            return max(self.focal_std / self.focal, _LEAST_LOG_STD)
         return FOCAL_LOG_STD[self.focal_source or "guess"]
 
-    def with_focal(self) -> Self:
-        """The camera with a guessed focal length where none is known."""
-        if self.focal is not None:
+    def with_focal(self, focal: float | None = None, source: str = "guess", std: float | None = None) -> Self:
+        """The camera with a focal length; without one given, with a guessed one where none is known."""
+        if focal is None and self.focal is not None:
             return self
-        return replace(self, focal=_GUESSED_FOCAL * self.half_diagonal, focal_source="guess")
+        guessed = _GUESSED_FOCAL * self.half_diagonal if focal is None else focal
+        return replace(self, focal=guessed, focal_source=source, focal_std=std)
 
     def with_coefficients(self, distortion: float, distortion2: float = 0.0, distortion3: float = 0.0) -> Self:
         """The camera with another, given lens; the distortion centre stays."""
@@ -285,8 +297,8 @@ class Camera:
         factor = math.hypot(*image_size) / math.hypot(*self.image_size)
         offset = [(c - (n - 1) / 2) * factor for c, n in zip(self.center, self.image_size, strict=True)]
         center = ((image_size[0] - 1) / 2 + offset[0], (image_size[1] - 1) / 2 + offset[1])
-        focal = None if self.focal is None else self.focal * factor
-        return replace(self, image_size=image_size, center=center, focal=focal)
+        focal, std = (None if value is None else value * factor for value in (self.focal, self.focal_std))
+        return replace(self, image_size=image_size, center=center, focal=focal, focal_std=std)
 
     def as_dict(self) -> dict[str, Any]:
         """Everything known of the camera as plain values, the content of a camera file."""
@@ -305,7 +317,10 @@ class Camera:
             "lambda_px": self.distortion_px,
             "lambda_focal": self.distortion_focal,
             "focal_px": self.focal,
+            "focal_std_px": self.focal_std,
             "focal_source": self.focal_source,
+            "tilt_deg": None if self.tilt is None else [math.degrees(angle) for angle in self.tilt],
+            "tilt_std_deg": None if self.tilt_std is None else [math.degrees(angle) for angle in self.tilt_std],
         }
 
     def save(self, path: str | Path) -> None:

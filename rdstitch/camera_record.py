@@ -1,5 +1,6 @@
 """Cameras from what :meth:`rdstitch.camera.Camera.as_dict` gave: records of camera files and sidecars."""
 
+import math
 from dataclasses import replace
 
 from rdstitch.camera import FILE_VERSION, LENS_PARAMETERS, Camera
@@ -17,10 +18,32 @@ def camera_from_record(record: Record) -> Camera:
     """
     if record["format"].value != "rdstitch camera" or record["version"].value not in range(1, FILE_VERSION + 1):
         record.fail(f"is not an rdstitch camera of version 1 to {FILE_VERSION}")
-    std, source = record.get("lambda_std"), None if record.get("focal_px") is None else "file"
-    camera = read_lens(record, record["image_size"].size(), source)
-    deviation = None if std is None else std.number()
-    return replace(camera, distortion_std=deviation, lens_covariance=_read_covariance(record.get("lens_covariance")))
+    source = None if record.get("focal_px") is None else "file"
+    return replace(
+        read_lens(record, record["image_size"].size(), source),
+        distortion_std=_deviation(record.get("lambda_std")),
+        lens_covariance=_read_covariance(record.get("lens_covariance")),
+        focal_std=_deviation(record.get("focal_std_px")),
+        tilt=_angles(record.get("tilt_deg")),
+        tilt_std=_angles(record.get("tilt_std_deg")),
+    )
+
+
+def _deviation(record: Record | None) -> float | None:
+    """A standard deviation; None where there is none."""
+    if record is None:
+        return None
+    if not (value := record.number()) >= 0.0:
+        record.expected("a standard deviation, zero or more")
+    return value
+
+
+def _angles(record: Record | None) -> tuple[float, float] | None:
+    """Two angles of degrees, in radians; None where there are none."""
+    if record is None:
+        return None
+    psi, theta = record.pair()
+    return math.radians(psi), math.radians(theta)
 
 
 def read_lens(record: Record, size: tuple[int, int], focal_source: str | None) -> Camera:

@@ -11,6 +11,7 @@ from rdstitch.alignment.adjustment_problem import (
     homography_apart,
     thin_for_selection,
 )
+from rdstitch.alignment.attitude_check import check_attitudes
 from rdstitch.alignment.build_result import AdjustedPictures, build_alignment
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult, sigma_of
 from rdstitch.alignment.camera_priors import CameraPriors
@@ -120,6 +121,9 @@ def align(
     problem = replace(
         problem, overdispersion=noise_of_links(problem.observations, problem.homographies, problem.lens).overdispersion
     )
+    if (doubt := check_attitudes(problem, options)) is not None:
+        alignment = align(cameras, links, doubt[0], former=former, progress=progress)
+        return replace(alignment, messages=(*alignment.messages, doubt[1]))
     choice = None if former is None else _choose_from(former, cameras, problem, pictures, options, chosen.refinements)
     choice = choice or select_model(
         problem,

@@ -102,10 +102,18 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
     considered = lens_covariance
     if found.observable and problem.free_lens[0]:
         considered = considered_covariance(problem, fit, rough=relief.found)
+    tilt, tilt_std = ((float(values[0]), float(values[1])) if planar else None for values in (shared, std))
+    focal_std = None if focal is None else float(std[names.index("log_focal")]) * focal
+
+    def adjusted_camera(camera: Camera) -> Camera:
+        result = _with_lens(found, camera, lens, (lens_covariance, considered))
+        if focal is not None and focal_std is not None:
+            size = camera.half_diagonal
+            result = result.with_focal(focal * size, "estimate", focal_std * size)
+        return replace(result, tilt=tilt, tilt_std=tilt_std)
+
     # Most pictures are of one camera.
-    adjusted_cameras = {
-        c: _adjusted_camera(found, c, lens, (lens_covariance, considered), focal) for c in dict.fromkeys(found.cameras)
-    }
+    adjusted_cameras = {camera: adjusted_camera(camera) for camera in dict.fromkeys(found.cameras)}
     cameras = tuple(adjusted_cameras[camera] for camera in found.cameras)
     own = cameras[int(found.pictures[problem.reference])]
     groups = _groups(found)
@@ -121,10 +129,10 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
         model=fit.model.name,
         model_reason=found.choice.reason,
         poses=poses,
-        tilt=(float(shared[0]), float(shared[1])) if planar else None,
+        tilt=tilt,
         tilt_spread=fit.tilt_spread,
         focal=focal,
-        focal_std=None if focal is None else float(std[names.index("log_focal")]) * focal,
+        focal_std=focal_std,
         distortion=own.nearest_distortion,
         distortion_std=0.0 if own.distortion_std is None else own.distortion_std,
         lens=found.lens.name,
@@ -150,9 +158,9 @@ def _shape(found: AdjustedPictures) -> ShapeTest | None:
 
 
 def _covariance(found: AdjustedPictures) -> FloatArray:
-    """Covariance of the named parameters, where λ was estimated for errors that are not independent."""
+    """Covariance of the named parameters, for errors that are not independent."""
     fit = found.choice.fit
-    if not (found.observable and found.problem.free_lens[0]):
+    if not fit.adjusted.covariance.size:
         return fit.adjusted.covariance
     return sandwich_covariance(found.problem.adjuster_of(fit), fit.adjusted)
 
@@ -170,12 +178,8 @@ def _lens_covariance(names: Sequence[str], covariance: FloatArray) -> FloatArray
     return result
 
 
-def _adjusted_camera(
-    found: AdjustedPictures,
-    camera: Camera,
-    lens: FloatArray,
-    covariances: tuple[FloatArray, FloatArray],
-    focal: float | None,
+def _with_lens(
+    found: AdjustedPictures, camera: Camera, lens: FloatArray, covariances: tuple[FloatArray, FloatArray]
 ) -> Camera:
     """The camera of a picture with the lens that was found; covariances of what was estimated, and of all of a lens."""
     covariance, considered = covariances
@@ -192,8 +196,7 @@ def _adjusted_camera(
     if estimated and result.sees_beyond_horizon:
         raise ImpossibleCameraError(f"with λ = {result.distortion:.3g} the corners would see behind the camera")
     std = _nearest_distortion_std(result, considered) if found.observable else math.inf
-    result = replace(result, distortion_std=std)
-    return result if focal is None else replace(result, focal=focal * camera.half_diagonal, focal_source="estimate")
+    return replace(result, distortion_std=std)
 
 
 def _nearest_distortion_std(camera: Camera, covariance: FloatArray) -> float:

@@ -1,5 +1,6 @@
 """What the adjustment gives: the cameras and poses of all pictures over one plane."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -209,6 +210,11 @@ class Alignment:
     def on_sphere(self) -> bool:
         """Whether :attr:`homographies` lead to directions around one centre, not to a plane."""
         return self.model == "rotation"
+
+    @property
+    def length_std(self) -> float:
+        """Relative standard deviation that all lengths on the plane share, that of the focal length; NaN without."""
+        return math.nan if self.focal is None or self.focal_std is None else self.focal_std / self.focal
 
     @property
     def support(self) -> dict[tuple[int, int], int]:

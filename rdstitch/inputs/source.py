@@ -215,9 +215,9 @@ def _camera(metadata: Metadata, camera: Camera | None, focal: float | None, dist
     """The best that is known of one picture's camera: what the user says, then EXIF; the guess comes later."""
     found = Camera(metadata.size) if camera is None else _fitted(camera, metadata.size)
     if focal is not None:
-        found = replace(found, focal=focal, focal_source="option")
+        found = found.with_focal(focal, "option")
     elif found.focal is None and metadata.focal_px is not None:
-        found = replace(found, focal=metadata.focal_px, focal_source="exif")
+        found = found.with_focal(metadata.focal_px, "exif")
     if distortion is None:
         return found
     return found.with_coefficients(distortion)

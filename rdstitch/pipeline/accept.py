@@ -255,8 +255,8 @@ def _aligned_anew(
 
 def scale_uncertainty(alignment: Alignment) -> list[Message]:
     """A warning where the focal length, and with it the length of every step, is hardly known."""
-    unsure = 0.0 if alignment.focal is None or alignment.focal_std is None else alignment.focal_std / alignment.focal
-    if unsure <= _MAX_SCALE_UNCERTAINTY:
+    if not alignment.length_std > _MAX_SCALE_UNCERTAINTY:
         return []
-    text = f"all lengths may be off together by {unsure:.0%}: the pictures hardly show the focal length; give --focal"
+    off = f"all lengths may be off together by {alignment.length_std:.0%}"
+    text = f"{off}: the pictures hardly show the focal length; give --focal"
     return [Message(text, code="focal-unknown")]

@@ -36,7 +36,8 @@ def summary(registration: Registration, result: StitchResult | None) -> str:
     if alignment.tilt is not None:
         rows.append(("tilt ψ, θ", "{:.2f}°, {:.2f}°".format(*np.degrees(alignment.tilt))))
     if camera.focal is not None:
-        rows.append(("focal length", f"{camera.focal:.1f} pixels ({camera.focal_source})"))
+        std = "" if camera.focal_std is None else f" ± {camera.focal_std:.1f}"
+        rows.append(("focal length", f"{camera.focal:.1f}{std} pixels ({camera.focal_source})"))
     if result is not None:
         rows.append(("output", "{} x {} pixels".format(*result.canvas.size)))
     return section("Summary", "", _verdict(registration), table((), rows))

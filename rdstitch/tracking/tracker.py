@@ -257,8 +257,7 @@ class Tracker:
             # Another focal length would give other heights: those of one map must not depend on the window.
             own = (camera.half_diagonal for camera in cameras)
             cameras = [
-                replace(camera, focal=self._focal * size, focal_source="option")
-                for camera, size in zip(cameras, own, strict=True)
+                camera.with_focal(self._focal * size, "option") for camera, size in zip(cameras, own, strict=True)
             ]
         options = replace(
             self._options.alignment,

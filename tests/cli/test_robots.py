@@ -1,6 +1,8 @@
 """What robots bring and take: time stamps, formats of trajectories, ROS bags."""
 
 import csv
+import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +12,11 @@ import pytest
 from PIL import ExifTags, Image
 
 import rdstitch
-from rdstitch.synthetic import Sequence
+from rdstitch.alignment.trajectory import compare_trajectories
+from rdstitch.camera import Camera
+from rdstitch.synthetic import Photometry, Sequence, ground, parking_poses, sequence_over
 from tests.cli.running import DISTORTION, FAST, Run
+from tests.floor_drives import read_path, true_path
 
 
 def _rows(file: Path) -> list[dict[str, str]]:
@@ -206,6 +211,39 @@ def test_what_is_no_bag_is_named(rdstitch: Run, tmp_path: Path, monkeypatch: pyt
     assert "broken.bag" in done.line
     monkeypatch.setitem(__import__("sys").modules, "rosbags.highlevel", None)
     assert "rdstitch[ros]" in rdstitch("mosaic", bag, "-o", tmp_path / "out.png", *FAST).line
+
+
+def test_a_calibrated_focal_length_is_as_sure_as_it_was(rdstitch: Run, tmp_path: Path) -> None:
+    lens = Camera((400, 300), DISTORTION, focal=320.0)
+    poses = parking_poses(lens, 8, overlap=0.6, heading=0.3, tilt=(np.radians(1.5), np.radians(-1.0)))
+    drive = sequence_over(partial(ground, seed=1), lens, poses, photometry=Photometry(noise=0.01), seed=1)
+    (folder := tmp_path / "drive").mkdir()
+    drive.write(folder)
+    file = tmp_path / "camera.json"
+    done = rdstitch("calibrate", folder, "-o", file, *FAST)
+    assert done.status == 0
+    camera = Camera.load(file)
+    focal, psi, theta = (
+        re.search(rf"{name}([-.\d]+) ± ([.\d]+)", done.err) for name in ("focal length ", "ψ = ", "θ = ")
+    )
+    assert focal
+    assert psi
+    assert theta
+    assert camera.focal is not None
+    assert camera.focal_std is not None
+    assert focal.groups() == (f"{camera.focal:.1f}", f"{camera.focal_std:.1f}")
+    for found, true in ((focal, 320.0), (psi, 1.5), (theta, -1.0)):
+        assert abs(float(found[1]) - true) < 3.0 * float(found[2])
+    assert abs(float(psi[1]) - 1.5) < 0.3
+    assert camera.focal_std > 0.02 * camera.focal
+
+    path = tmp_path / "path.csv"
+    done = rdstitch("trajectory", folder, "-o", path, "--camera", file, "--height", "0.42", *FAST)
+    stated = re.search(r"lengths ± (\S+)%", done.made)
+    assert stated
+    scale = compare_trajectories(read_path(path), true_path(drive)).scale
+    assert float(stated[1]) > 1.0
+    assert abs(scale * 0.42 - 1.0) < 3.0 * float(stated[1]) / 100.0
 
 
 def test_python_gets_labels_too(frames: list[Path]) -> None:

@@ -42,13 +42,16 @@ def calibrate(
     reporter: Reporter,
     **given: Any,
 ) -> None:
-    """Find λ, and where they can be seen the tilt and the focal length, from pictures of a plane.
+    """Find λ, focal length and tilt from images of a plane, and how well each is known.
 
-    λ goes to standard output; how far the lens is determined, and whether it takes more than λ, to standard error.
+    λ goes to standard output; focal length, tilt and what else the lens takes, each with its standard deviation, to
+    standard error. All are in the camera file.
 
-    INPUT is what 'rdstitch mosaic' takes. The camera file is what 'undistort', 'pano' and 'mosaic' take as --camera.
+    INPUT is what 'rdstitch mosaic' takes. 'undistort', 'pano', 'mosaic' and 'trajectory' take the camera file as
+    --camera: the lens as given, the focal length within its standard deviation; for the tilt, which belongs to how the
+    camera was mounted, use --tilt.
     """
-    from rdstitch.alignment.lens_description import describe_lens
+    from rdstitch.alignment.lens_description import describe_camera
     from rdstitch.camera_files import export_note
     from rdstitch.pipeline import calibrate as recipe
 
@@ -58,6 +61,6 @@ def calibrate(
     with report_page.explaining():
         registration = recipe(paths, wanted, every=every, progress=report_page.progress, beside=report_page.stage)
     report_registration(registration, reporter, as_json=as_json)
-    for line in (*describe_lens(registration.alignment), *export_note(registration.camera, output)):
+    for line in (*describe_camera(registration.alignment), *export_note(registration.camera, output)):
         reporter.note(line)
     reporter.made(f"{output}: {registration.summary}")

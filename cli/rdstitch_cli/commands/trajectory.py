@@ -104,4 +104,4 @@ def trajectory(
             live.print_result(registration, reporter, output)
         else:
             report_registration(registration, reporter)
-        reporter.made(f"{output}: {registration.summary}")
+        reporter.made(f"{output}: {registration.summary}, lengths ± {registration.alignment.length_std:.2%}")

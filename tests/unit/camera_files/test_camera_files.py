@@ -48,6 +48,19 @@ def _without_own_node(text: str) -> str:
     return re.sub(r"(?m)^rdstitch:\n(?: +.*\n)*", "", text)
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_focal_length_and_tilt_keep_their_standard_deviations(tmp_path: Path, name: str) -> None:
+    camera = Camera((640, 480), -0.2, focal=512.0, focal_source="file", focal_std=13.0)
+    camera = replace(camera, tilt=(0.05, -0.03), tilt_std=(0.002, 0.001))
+    save_camera(camera.resized((1280, 960)), tmp_path / name)
+    found = load_camera(tmp_path / name)
+    assert found.focal_std == pytest.approx(26.0)
+    assert found.focal_log_std == pytest.approx(13.0 / 512.0)
+    assert found.tilt == pytest.approx(camera.tilt)
+    assert found.tilt_std == pytest.approx(camera.tilt_std)
+    assert found.with_focal(600.0, "option").focal_log_std == 0.01
+
+
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("name", NAMES)
 def test_a_camera_comes_back_as_it_was(tmp_path: Path, name: str, camera: Camera) -> None:

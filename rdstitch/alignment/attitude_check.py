@@ -1,0 +1,157 @@
+"""Whether given attitudes, or a given tilt, are those that the images show.
+
+The images are aligned without them, and show the tilt of each up to a covariance. Attitudes that need more scatter
+than they are said to have are compared with the same angles of other signs and in the other order, and with none at
+all, each with the scatter that makes it most likely.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from rdstitch.alignment.adjustment_problem import Fit, Problem
+from rdstitch.alignment.model_selection import choose_model
+from rdstitch.alignment.motion_models import POSE, PSI, THETA, PlanarModel
+from rdstitch.alignment.options import AlignmentOptions
+from rdstitch.alignment.rotation_model import ROTATION
+from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.messages import Message
+
+_MAX_IMAGES = 60
+"""That are compared: evenly chosen ones of more say as well which signs are right."""
+
+_LOG_ODDS = math.log(1000.0)
+"""By how much the images must contradict what the user says."""
+
+_SCATTERS = np.append(0.0, np.radians(np.geomspace(0.01, 45.0, 60)))
+"""Standard deviations that are tried."""
+
+_EXACT = math.radians(0.01)
+"""Nothing is mounted more exactly."""
+
+_FREE_MOUNT = 1.0
+"""Standard deviation, radians, of a tilt of the mount of which nothing is known."""
+
+_SIGNED_ORDERS = tuple(
+    np.diag(signs)[:, list(order)] for order in ((0, 1), (1, 0)) for signs in product((1.0, -1.0), repeat=2)
+)
+"""Matrices (2, 2) that change signs and order of (ψ, θ); the first changes nothing."""
+
+
+def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[AlignmentOptions, Message] | None:
+    """Options without what the images contradict, or with the scatter that they show; and what the user should know.
+
+    Parameters
+    ----------
+    problem : Problem
+        With the given attitudes and tilt among its priors.
+    options : AlignmentOptions
+
+    Returns
+    -------
+    (AlignmentOptions, Message) or None
+        None where nothing is given, or the images agree with it as well as it is said to be known, or show no tilts.
+    """
+    if options.attitudes is None and options.tilt is None:
+        return None
+    without = replace(options, attitudes=None, tilt=None)
+    known = problem.camera_priors
+    given = known.attitudes + known.tilt
+    nothing = replace(
+        known, attitudes=np.zeros_like(known.attitudes), attitudes_std=None, tilt=(0.0, 0.0), tilt_known=False
+    )
+    bare = replace(problem, camera_priors=nothing)
+    fit = choose_model(bare, [name for name in without.models if name != ROTATION.name]).fit
+    if not isinstance(fit.model, PlanarModel):
+        return None
+    if PSI in fit.model.free and fit.model is not POSE:  # whose prior draws tilts together
+        fit = bare.refine(POSE, bare.taken_over(POSE, fit))
+    shown = _ShownTilts.of(bare, fit, free_mount=options.tilt is None)
+    stated = options.attitudes_std if options.attitudes is not None else 0.0
+    scores = [shown.likelihood(given @ change.T) for change in _SIGNED_ORDERS]
+    none = shown.likelihood(np.zeros_like(given))
+    (own, scatter), best = scores[0], int(np.argmax([score for score, _ in scores]))
+    if own - shown.log_likelihood(given, stated) < _LOG_ODDS or scatter <= stated:
+        return None
+    if max(scores[best][0], none[0]) < own + _LOG_ODDS:
+        if options.attitudes is None:
+            return None
+        text = f"the attitudes agree with the images to {math.degrees(scatter):.2g} degrees, which is taken for their "
+        text += f"standard deviation instead of {math.degrees(stated):.2g}"
+        return replace(options, attitudes_std=scatter), Message(text, severity="note")
+    if options.attitudes is None:
+        text = "the images contradict the given tilt of {:.2f}, {:.2f} degrees".format(*np.degrees(given[0]))
+        text += ", which is not used: they show {:.2f}, {:.2f}".format(*np.degrees(np.median(shown.tilts, axis=0)))
+    else:
+        text = f"the images contradict the attitudes by {math.degrees(scatter):.1f} degrees; they are not used: "
+        related = scores[best][0] > none[0] + _LOG_ODDS
+        error = math.degrees(max(scores[best][1], _EXACT))
+        better = f"with {_named(_SIGNED_ORDERS[best])} they would fit to {error:.2g} degrees"
+        text += better if related else "no signs and no order of psi and theta make them fit"
+    return without, Message(text, code="attitudes-contradicted")
+
+
+def _named(change: FloatArray) -> str:
+    """What is to be changed in a table of attitudes."""
+    psi, theta = ("-psi" if row[0] < 0 else "psi" if row[0] else "-theta" if row[1] < 0 else "theta" for row in change)
+    changes = [f"{new} for {old}" for new, old in ((psi, "psi"), (theta, "theta")) if new != old]
+    return " and ".join(changes)
+
+
+@dataclass(frozen=True)
+class _ShownTilts:
+    """What the images show of their tilts.
+
+    Attributes
+    ----------
+    images : ndarray of shape (K,), intp
+        The images compared.
+    tilts : ndarray of shape (K, 2)
+        (ψ, θ), radians.
+    variances, axes : ndarray of shape (2 K,) and (2 K, 2 K)
+        Eigenvalues and eigenvectors of their covariance.
+    """
+
+    images: IntArray
+    tilts: FloatArray
+    variances: FloatArray
+    axes: FloatArray
+
+    @classmethod
+    def of(cls, problem: Problem, fit: Fit, *, free_mount: bool) -> "_ShownTilts":
+        """By a planar fit that knows nothing of the tilts; with ``free_mount`` up to what all have in common."""
+        adjuster, adjusted, model = problem.adjuster_of(fit), fit.adjusted, fit.model
+        assert isinstance(model, PlanarModel)
+        normal = adjuster.normal_equations(adjusted)
+        tilts = model.metric_poses(adjusted.parameters.poses, adjusted.parameters.shared)[:, [PSI, THETA]]
+        images = np.unique(np.linspace(0, problem.count - 1, _MAX_IMAGES).astype(np.intp))
+        focal = math.exp(adjusted.parameters.shared[-1])
+        number = np.cumsum(adjuster.free.poses.ravel()).reshape(adjuster.free.poses.shape) - 1
+        rows = np.arange(2 * len(images))
+        by_pose = np.zeros((len(normal.gradient_poses), len(rows)))
+        by_shared = np.zeros((len(normal.gradient_shared), len(rows)))
+        for axis, column in enumerate((PSI, THETA)):
+            if column in model.free:
+                by_pose[number[images, model.free.index(column)], rows[axis::2]] = focal
+            by_shared[axis, rows[axis::2]] = focal
+        by_shared[len(model.shared_names) - 1] = tilts[images].ravel()
+        moved_poses, moved_shared = normal.responses(-by_pose, -by_shared)
+        covariance = by_pose.T @ moved_poses + by_shared.T @ moved_shared
+        if free_mount:
+            covariance = covariance + _FREE_MOUNT**2 * np.tile(np.eye(2), (len(images), len(images)))
+        variances, axes = np.linalg.eigh((covariance + covariance.T) / 2.0)
+        return cls(images, tilts[images], np.maximum(variances, 0.0), axes)
+
+    def log_likelihood(self, expected: FloatArray, scatter: float) -> float:
+        """Of tilts (N, 2) that scatter by so much, radians, about those of the images."""
+        error = self.axes.T @ (self.tilts - expected[self.images]).ravel()
+        variance = self.variances + scatter**2 + _EXACT**2
+        return -0.5 * float((error**2 / variance + np.log(variance)).sum())
+
+    def likelihood(self, expected: FloatArray) -> tuple[float, float]:
+        """The largest log likelihood, and the scatter that it has."""
+        values = [self.log_likelihood(expected, scatter) for scatter in _SCATTERS.tolist()]
+        best = int(np.argmax(values))
+        return values[best], float(_SCATTERS[best])

@@ -1,0 +1,90 @@
+"""Attitudes and tilts that the images contradict are not used, and the message says which would fit."""
+
+import math
+
+import numpy as np
+import pytest
+
+from rdstitch.alignment import AlignmentOptions, align
+from rdstitch.alignment.motion_models import PSI, THETA
+from rdstitch.alignment.result import Alignment
+from rdstitch.arrays import FloatArray
+from tests.alignment_scenes import Scene, grid, jittered, scene
+
+_ONE = math.radians(1.0)
+
+
+@pytest.fixture(scope="module")
+def windy() -> tuple[Scene, FloatArray]:
+    """A drone whose tilts scatter by 3 degrees, and what an IMU measures of them to 0.2 degrees."""
+    rng = np.random.default_rng(2)
+    poses = jittered(grid(4, 3, (0.4, 0.3), 0.25, rng), 0.1, math.radians(3.0), rng)
+    given = scene(poses, focal_source="exif", rng=rng, per_link=120)
+    return given, poses[:, [PSI, THETA]] + rng.normal(scale=math.radians(0.2), size=(12, 2))
+
+
+def _aligned(given: Scene, attitudes: FloatArray | None, std: float) -> Alignment:
+    return align(given.cameras, given.links, AlignmentOptions(attitudes=attitudes, attitudes_std=std))
+
+
+@pytest.fixture(scope="module")
+def plain(windy: tuple[Scene, FloatArray]) -> Alignment:
+    """Without attitudes."""
+    return _aligned(windy[0], None, _ONE)
+
+
+def test_right_attitudes_are_used_as_well_as_they_are(windy: tuple[Scene, FloatArray]) -> None:
+    given, measured = windy
+    right = _aligned(given, measured, math.radians(0.2))
+    assert not right.messages
+    assert right.used.all()
+    assert right.tilt_spread == math.radians(0.2)
+    optimistic = _aligned(given, measured, 0.0)
+    assert 0.1 < math.degrees(optimistic.tilt_spread) < 0.4
+    (note,) = optimistic.messages
+    assert note.severity == "note"
+    assert optimistic.rms < 1.05 * right.rms
+
+
+@pytest.mark.parametrize(
+    ("change", "std", "named"),
+    [
+        ([[-1, 0], [0, -1]], _ONE, "with -psi for psi and -theta for theta they"),
+        ([[1, 0], [0, -1]], 0.0, "with -theta for theta they"),
+        ([[0, 1], [1, 0]], 0.2 * _ONE, "with theta for psi and psi for theta they"),
+        # -theta was written as psi, and psi as theta: what was written as theta is psi, and so on.
+        ([[0, -1], [1, 0]], _ONE, "with theta for psi and -psi for theta they"),
+    ],
+)
+def test_wrong_signs_and_orders_are_named_and_not_used(
+    windy: tuple[Scene, FloatArray], plain: Alignment, change: list[list[int]], std: float, named: str
+) -> None:
+    given, measured = windy
+    found = _aligned(given, measured @ np.array(change).T, std)
+    (message,) = found.messages
+    assert (message.severity, message.code) == ("warning", "attitudes-contradicted")
+    assert named in message.text
+    assert found.rms == plain.rms
+    np.testing.assert_array_equal(found.homographies, plain.homographies)
+
+
+def test_attitudes_of_other_images_are_not_used(windy: tuple[Scene, FloatArray]) -> None:
+    given, measured = windy
+    (message,) = _aligned(given, np.roll(measured, 5, axis=0), math.radians(0.2)).messages
+    assert "no signs and no order" in message.text
+
+
+def test_attitudes_that_say_less_than_their_scatter_are_no_contradiction() -> None:
+    rng = np.random.default_rng(3)
+    given = scene(grid(4, 3, (0.4, 0.3), 0.25, rng), tilt=(0.04, -0.03), rng=rng, per_link=120)
+    assert _aligned(given, rng.normal(scale=_ONE, size=(12, 2)), _ONE).messages == ()
+
+
+@pytest.mark.parametrize(("tilt", "right"), [((0.05, -0.03), True), ((-0.05, 0.03), False), ((0.05, 0.03), False)])
+def test_a_tilt_of_the_wrong_sign_is_not_used(tilt: tuple[float, float], right: bool) -> None:
+    rng = np.random.default_rng(5)
+    given = scene(grid(4, 3, (0.5, 0.4), 0.3, rng), tilt=(0.05, -0.03), rng=rng)
+    found = align(given.cameras, given.links, AlignmentOptions(tilt=tilt))
+    assert (found.messages == ()) == right
+    assert found.tilt == pytest.approx((0.05, -0.03), abs=0.002)
+    assert right or "they show 2.8" in found.messages[0].text
