@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing import Canvas, Composite, CompositePlan
 from rdstitch.errors import ArgumentError
+from rdstitch.export.georeference import Georeference
 from rdstitch.inputs.frame import ChannelOrder, in_order
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.io.preview import encode_preview, read_preview
@@ -104,6 +105,10 @@ class StitchResult(OutputImage):
         Size and digest of the file.
     local_alignment : LocalAlignment
         Displacement fields of the pictures that are used, in their order.
+    georeference : Georeference or None
+        Where the output lies on the Earth.
+    not_georeferenced : str
+        Why that is not known; empty where it is.
     """
 
     registration: Registration
@@ -114,6 +119,8 @@ class StitchResult(OutputImage):
     plan: CompositePlan | None = None
     fingerprint: Fingerprint | None = None
     local_alignment: LocalAlignment = field(default_factory=partial(no_local_alignment, "not tried"))
+    georeference: Georeference | None = None
+    not_georeferenced: str = "not tried"
 
     @property
     def ok(self) -> bool:

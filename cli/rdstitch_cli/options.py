@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import click
 from click.core import ParameterSource
 
-from rdstitch_cli.parameter_types import Angle, Angles, Bytes, FileOr, UserPath, WordOrNumber
+from rdstitch_cli.parameter_types import Angle, Angles, Bytes, Epsg, FileOr, UserPath, WordOrNumber
 from rdstitch_cli.terminal import Reporter
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -272,7 +272,19 @@ compositing = together(
         help="Longest side of the output, pixels; smaller than --scale makes it where that is more.",
     ),
     _number("--quality", click.IntRange(1, 100), 95, "Quality of JPEG and WebP, 1 to 100.", "Q"),
-    _number("--rotate", float, 0.0, "Turn the output clockwise, degrees.", "DEG"),
+    _number("--rotate", float, 0.0, "Turn the output clockwise, degrees; north is then not turned up.", "DEG"),
+    click.option(
+        "--north-up/--no-north-up",
+        default=True,
+        help="Turn north up where three images or more have a GPS position that fits.  [default: north up]",
+    ),
+    click.option("--gsd", type=float, metavar="M", help="Metres on the ground that a pixel takes, instead of --scale."),
+    click.option(
+        "--crs",
+        "epsg",
+        type=Epsg(),
+        help="Coordinate system of the map; otherwise UTM on WGS 84. Others than UTM need rasterio.",
+    ),
     click.option(
         "--dry-run", is_flag=True, help="Say what compositing would take (size, memory, time); write nothing."
     ),

@@ -114,3 +114,15 @@ class Angle(click.ParamType):  # type: ignore[type-arg]  # generic since click 8
         if not 0.0 <= angle < math.inf:
             self.fail(f"{value!r} is no angle in degrees like 0.5", param, ctx)
         return angle
+
+
+class Epsg(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
+    """The code of a coordinate system like ``EPSG:25832``; the value is the number."""
+
+    name = "EPSG:N"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        number = str(value).upper().removeprefix("EPSG:")
+        if not (number.isdecimal() and 0 < int(number) < 2**16):
+            self.fail(f"{value!r} is not a code like EPSG:25832", param, ctx)
+        return int(number)

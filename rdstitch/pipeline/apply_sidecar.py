@@ -132,6 +132,8 @@ def apply(
             (*doubts, *found.messages, *guard.messages, *composed.messages),
             channel_order,
             composed.fingerprint,
+            composed.place,
+            composed.place_reason,
         )
         if output is not None and not dry_run:
             names = [source.name for source in used.values()]
@@ -149,6 +151,7 @@ def _placed(saved: SavedRegistration, used: Mapping[int, Source]) -> PlacedImage
         list(used).index(saved.reference) if saved.reference in used else None,
         [_displacement(saved, index, source) for index, source in used.items()],
         saved.turned,
+        saved.place,
     )
 
 

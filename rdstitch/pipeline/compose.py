@@ -22,7 +22,7 @@ from rdstitch.compositing import (
 )
 from rdstitch.compositing.blocks import Block, BlockRunner, BlockStrip
 from rdstitch.executors import in_order
-from rdstitch.export.georeference import Georeference, georeference, has_place, world_file_paths
+from rdstitch.export.georeference import Georeference, has_place, world_file_paths
 from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.io.atomic import check_output, text_bytes
@@ -32,7 +32,8 @@ from rdstitch.io.outputs import Outputs
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
 from rdstitch.messages import Message
-from rdstitch.pipeline.placed_images import PlacedImages, plan
+from rdstitch.pipeline.map_canvas import moved, place_messages, plan_on_map
+from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.process_memory import return_freed_memory
 from rdstitch.progress import Progress
 from rdstitch.stitch_result import StitchResult
@@ -61,6 +62,10 @@ class Composed:
         Size and digest of the file.
     written : FileComposite or None
         The picture in its file.
+    place : Georeference or None
+        Of the canvas.
+    place_reason : str
+        Why there is none.
     """
 
     canvas: Canvas
@@ -69,6 +74,8 @@ class Composed:
     messages: tuple[Message, ...] = ()
     fingerprint: Fingerprint | None = None
     written: FileComposite | None = None
+    place: Georeference | None = None
+    place_reason: str = ""
 
 
 def compose_pictures(
@@ -106,7 +113,8 @@ def compose_pictures(
     """
     return_freed_memory()
     world_files = _files_beside(output, placed, overwrite)
-    canvas = plan(placed, options)
+    canvas, place, reason = plan_on_map(placed, options)
+    notes = [*_masked(placed), *place_messages(place, reason, placed)]
     # A crop may yet make it fit.
     if output is not None and options.crop == "none":
         check_size(output, canvas.size)
@@ -120,33 +128,41 @@ def compose_pictures(
         channels = 1 if probe.pixels.ndim == 2 else probe.pixels.shape[2]
         size = probe.pixels.dtype.itemsize
         masked = probe.alpha is not None
-        return Composed(canvas, plan=plan_composite(placed.cameras, canvas, options, channels, size, masked=masked))
+        planned = plan_composite(placed.cameras, canvas, options, channels, size, masked=masked)
+        return Composed(canvas, plan=planned, messages=tuple(notes), place=place, place_reason=reason)
 
     def report(share: float) -> None:
         progress("compositing", round(100 * share), 100)
 
     if output is None:
         composite = compose(pictures, canvas, options, report, elsewhere)
-        return Composed(composite.canvas, composite, messages=(*_masked(placed), *composite.messages))
-    located: list[tuple[Georeference | None, str]] = []
+        return Composed(
+            composite.canvas,
+            composite,
+            messages=(*notes, *composite.messages),
+            place=moved(place, canvas, composite.canvas),
+            place_reason=reason,
+        )
 
     def tags(final: Canvas) -> list[ExtraTag]:
-        located.append(georeference(placed.positions, placed.cameras, final.matrix @ placed.homographies))
-        return located[0][0].tiff_tags() if located[0][0] is not None else []
+        there = moved(place, canvas, final)
+        return [] if there is None else there.tiff_tags()
 
     file = OutputFile(output, placed.sources[0].metadata, tags, outputs)
     written = compose_to_file(file, pictures, canvas, options, report, elsewhere)
-    place, note = located[0]
-    if place is not None and world_files:
-        for path, text in zip(world_files, place.world_file_texts(), strict=True):
+    place = moved(place, canvas, written.canvas)
+    if place is not None:
+        for path, text in zip(world_files, place.world_file_texts(), strict=False):
             outputs.write(path, text_bytes(text))
-    messages = (
-        *_masked(placed),
-        *written.messages,
-        *([Message(note)] if note else []),
-        *_profile_lost(placed.sources[0], Path(output)),
+    messages = (*notes, *written.messages, *_profile_lost(placed.sources[0], Path(output)))
+    return Composed(
+        written.canvas,
+        messages=messages,
+        fingerprint=written.fingerprint,
+        written=written,
+        place=place,
+        place_reason=reason,
     )
-    return Composed(written.canvas, messages=messages, fingerprint=written.fingerprint, written=written)
 
 
 def _masked(placed: PlacedImages) -> list[Message]:
