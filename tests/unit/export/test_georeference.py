@@ -1,6 +1,7 @@
 """The place of a mosaic on the Earth, from made-up positions."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,12 @@ def located(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], Float
     return paths, utm(latitude, longitude, -34)
 
 
+@pytest.fixture(scope="module")
+def cached(tmp_path_factory: pytest.TempPathFactory) -> StitchOptions:
+    """The pictures are registered once for all tests."""
+    return StitchOptions(workers=1, cache=tmp_path_factory.mktemp("cache"))
+
+
 def _middles(output: Path) -> FloatArray:
     """Px of the output where the pictures' middles are, by the sidecar."""
     record = json.loads(output.with_name(output.name + ".json").read_text(encoding="utf-8"))
@@ -70,11 +77,11 @@ def _middles(output: Path) -> FloatArray:
 
 @pytest.mark.parametrize("crop", ["none", "auto"])
 def test_a_tiff_lies_in_the_right_place_and_north_is_up(
-    located: tuple[list[Path], FloatArray], tmp_path: Path, crop: Any
+    located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path, crop: Any
 ) -> None:
     paths, truth = located
     options = CompositeOptions(scale=0.7, crop=crop)
-    result = mosaic(paths, tmp_path / "a.tif", StitchOptions(workers=1, composite=options))
+    result = mosaic(paths, tmp_path / "a.tif", replace(cached, composite=options))
     with rasterio.open(tmp_path / "a.tif") as opened:
         assert opened.crs.to_epsg() == 32734
         transform = opened.transform
@@ -88,8 +95,8 @@ def test_a_tiff_lies_in_the_right_place_and_north_is_up(
     assert (record["crs"], record["north_up"], record["positions"], record["positions_used"]) == (
         "EPSG:32734",
         True,
-        12,
-        12,
+        6,
+        6,
     )
     assert record["gsd_m"] == pytest.approx(transform.a)
     assert record["rms_m"] < 4 * METRES_PER_TEXEL
@@ -97,10 +104,12 @@ def test_a_tiff_lies_in_the_right_place_and_north_is_up(
     assert result.georeference.summary in [message.text for message in result.messages]
 
 
-def test_the_frame_of_the_reference_is_kept_on_request(located: tuple[list[Path], FloatArray]) -> None:
+def test_the_frame_of_the_reference_is_kept_on_request(
+    located: tuple[list[Path], FloatArray], cached: StitchOptions
+) -> None:
     paths = located[0]
     turned = [
-        mosaic(paths, options=StitchOptions(workers=1, composite=CompositeOptions(scale=0.3, **given)))
+        mosaic(paths, options=replace(cached, composite=CompositeOptions(scale=0.3, **given)))
         for given in ({"north_up": False}, {"rotate": 30.0})
     ]
     places = [result.georeference for result in turned]
@@ -110,11 +119,11 @@ def test_the_frame_of_the_reference_is_kept_on_request(located: tuple[list[Path]
 
 
 def test_ground_sample_distance_and_coordinate_system_as_requested(
-    located: tuple[list[Path], FloatArray], tmp_path: Path
+    located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
 ) -> None:
     paths, truth = located
     options = CompositeOptions(gsd=0.25, epsg=2048)  # Hartebeesthoek94 / Lo19
-    mosaic(paths, tmp_path / "a.tif", StitchOptions(workers=1, composite=options))
+    mosaic(paths, tmp_path / "a.tif", replace(cached, composite=options))
     with rasterio.open(tmp_path / "a.tif") as opened:
         assert opened.crs.to_epsg() == 2048
         assert opened.res == pytest.approx((0.25, 0.25))
@@ -125,7 +134,7 @@ def test_ground_sample_distance_and_coordinate_system_as_requested(
 
 
 def test_what_is_requested_of_the_map_is_checked_before_the_work(
-    located: tuple[list[Path], FloatArray], tmp_path: Path
+    located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
 ) -> None:
     plain = flight(4, 2).write(tmp_path)
     for paths, options, message in (
@@ -134,15 +143,15 @@ def test_what_is_requested_of_the_map_is_checked_before_the_work(
         (located[0], CompositeOptions(epsg=99999), "EPSG:99999 is not known"),
     ):
         with pytest.raises(ArgumentError, match=message):
-            mosaic(paths, options=StitchOptions(workers=1, composite=options))
+            mosaic(paths, options=replace(cached, composite=options))
 
 
 def test_bands_that_are_applied_lie_where_the_first_one_does(
-    located: tuple[list[Path], FloatArray], tmp_path: Path
+    located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
 ) -> None:
     paths = located[0]
     options = CompositeOptions(scale=0.3)
-    mosaic(paths, tmp_path / "a.tif", StitchOptions(workers=1, composite=options))
+    mosaic(paths, tmp_path / "a.tif", replace(cached, composite=options))
     (tmp_path / "band").mkdir()
     for path in paths:  # without positions
         with Image.open(path) as image:
@@ -153,9 +162,11 @@ def test_bands_that_are_applied_lie_where_the_first_one_does(
         np.testing.assert_allclose(one.transform, two.transform, atol=1e-6)
 
 
-def test_other_formats_get_a_world_file(located: tuple[list[Path], FloatArray], tmp_path: Path) -> None:
+def test_other_formats_get_a_world_file(
+    located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
+) -> None:
     paths, truth = located
-    mosaic(paths, tmp_path / "a.jpg", StitchOptions(workers=1))
+    mosaic(paths, tmp_path / "a.jpg", cached)
     a, d, b, e, c, f = map(float, (tmp_path / "a.jgw").read_text(encoding="ascii").split())
     px = _middles(tmp_path / "a.jpg")
     place = np.column_stack([a * px[:, 0] + b * px[:, 1] + c, d * px[:, 0] + e * px[:, 1] + f])
@@ -163,14 +174,16 @@ def test_other_formats_get_a_world_file(located: tuple[list[Path], FloatArray], 
     assert "UTM_Zone_34S" in (tmp_path / "a.prj").read_text(encoding="ascii")
 
 
-def test_files_beside_are_not_replaced_unasked(located: tuple[list[Path], FloatArray], tmp_path: Path) -> None:
+def test_files_beside_are_not_replaced_unasked(
+    located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
+) -> None:
     somebodys = tmp_path / "a.prj"
     somebodys.write_text("mine", encoding="ascii")
     with pytest.raises(OutputError, match=r"a\.prj: exists already"):
-        mosaic(located[0], tmp_path / "a.jpg", StitchOptions(workers=1))
+        mosaic(located[0], tmp_path / "a.jpg", cached)
     assert somebodys.read_text(encoding="ascii") == "mine"
     assert sorted(tmp_path.iterdir()) == [somebodys]
-    mosaic(located[0], tmp_path / "a.jpg", StitchOptions(workers=1, overwrite=True))
+    mosaic(located[0], tmp_path / "a.jpg", replace(cached, overwrite=True))
     assert "UTM_Zone_34S" in somebodys.read_text(encoding="ascii")
 
 
@@ -214,8 +227,8 @@ def test_one_bad_position_of_eight_is_named_and_left_out(wrong: GpsPosition, off
     np.testing.assert_allclose(place.to_map(corner), whole.to_map(corner), atol=0.1)
 
 
-def test_pictures_without_positions_leave_no_world_file(tmp_path: Path) -> None:
-    mosaic(flight(4, 2).write(tmp_path), tmp_path / "a.png", StitchOptions(workers=1))
+def test_pictures_without_positions_leave_no_world_file(cached: StitchOptions, tmp_path: Path) -> None:
+    mosaic(flight(4, 2).write(tmp_path), tmp_path / "a.png", cached)
     assert not list(tmp_path.glob("*.pgw"))
     assert not list(tmp_path.glob("*.prj"))
 
