@@ -18,7 +18,7 @@ from rdstitch.io.read import read_image
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
-from rdstitch.registration import Registration
+from rdstitch.registration import Registration, Verdict
 
 _PREVIEW = 800  # pixels of the longer side
 
@@ -126,6 +126,11 @@ class StitchResult(OutputImage):
     def ok(self) -> bool:
         """Whether the result passed its own checks."""
         return self.registration.ok
+
+    @property
+    def verdict(self) -> Verdict:
+        """The same, with failures and warnings in words, as the sidecar has it."""
+        return self.registration.verdict
 
     @property
     def distortion(self) -> float:

@@ -32,6 +32,47 @@ class UserPath(click.Path):
             return path
 
 
+def _one_number(number: click.IntRange | click.FloatRange, kind: str) -> str:
+    """What was expected, in words."""
+    if number.min is None:
+        return f"expected one {kind}"
+    if number.max is None:
+        return f"expected one {kind} {'above' if number.min_open else 'of at least'} {number.min:g}"
+    return f"expected one {kind} from {number.min:g} to {number.max:g}"
+
+
+class WholeNumber(click.IntRange):
+    """A whole number within limits, called N in help pages."""
+
+    name = "N"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        try:
+            return super().convert(value, param, ctx)
+        except click.BadParameter:
+            self.fail(f"{_one_number(self, 'whole number')}, not {value!r}", param, ctx)
+
+    def _describe_range(self) -> str:
+        """Nothing, in help pages: their texts say what matters."""
+        return ""
+
+
+class RealNumber(click.FloatRange):
+    """A number within limits, or any, called N in help pages."""
+
+    name = "N"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        try:
+            return super().convert(value, param, ctx)
+        except click.BadParameter:
+            self.fail(f"{_one_number(self, 'number')}, not {value!r}", param, ctx)
+
+    def _describe_range(self) -> str:
+        """Nothing, in help pages: their texts say what matters."""
+        return ""
+
+
 class Angles(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
     """Two angles in degrees, ``PSI,THETA``; the value is in radians."""
 

@@ -83,7 +83,7 @@ def _read_table(file: str | Path) -> dict[str, tuple[float, float]]:
     try:
         return _read_rows(file)
     except csv.Error as error:
-        raise InputError(f"{file}: is no table with commas: {error}") from error
+        raise InputError(f"{file}: is not a CSV file: {error}") from error
 
 
 def _read_rows(file: str | Path) -> dict[str, tuple[float, float]]:

@@ -43,6 +43,7 @@ def apply(
     match: MatchBy = "auto",
     mask: str | Path | None = None,
     every: int | None = 1,
+    topic: str | None = None,
     workers: int = 0,
     overwrite: bool = False,
     strict: bool = False,
@@ -70,6 +71,8 @@ def apply(
         Picture, or folder of them, that is dark where the pictures do not count.
     every : int, optional
         Look among every n-th frame of videos and ROS bags; None: among those that show new ground.
+    topic : str, optional
+        Of the images in ROS bags; None: the only one.
     workers : int
         Pictures worked on at the same time; 0: as many as there are cores.
     overwrite : bool
@@ -102,7 +105,7 @@ def apply(
     if strict and doubts:
         raise InputError(doubts[0].text)
     given = as_inputs(images, channel_order)
-    with found_pictures(given, output=output, every=every) as found, Outputs(overwrite) as outputs:
+    with found_pictures(given, output=output, every=every, topic=topic) as found, Outputs(overwrite) as outputs:
         if output is not None:
             _check_outputs(Path(output), overwrite, found.files, saved.path)
         chosen, matched = _match(saved, found.frames, match)

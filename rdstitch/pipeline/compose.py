@@ -21,6 +21,7 @@ from rdstitch.compositing import (
     plan_composite,
 )
 from rdstitch.compositing.blocks import Block, BlockRunner, BlockStrip
+from rdstitch.errors import OutputError
 from rdstitch.executors import in_order
 from rdstitch.export.georeference import Georeference, has_place, world_file_paths
 from rdstitch.inputs.input_guard import GuardNotes
@@ -179,8 +180,13 @@ def _files_beside(output: str | Path | None, placed: PlacedImages, overwrite: bo
         return ()
     world_files = tuple(map(Path, world_file_paths(output))) if has_place(placed.positions) else ()
     page = viewer_path(output)
-    for file in (*world_files, *([] if page is None else [page])):
+    for file in world_files:
         check_output(file, overwrite, suffixes=())
+    if page is not None:
+        try:
+            check_output(page, overwrite, suffixes=())
+        except OutputError as error:
+            raise OutputError(f"{error} (it becomes the page that shows {output})") from error
     return world_files
 
 

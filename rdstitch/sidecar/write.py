@@ -60,12 +60,7 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
         "local_alignment": _local_alignment(result.local_alignment),
         "images": _images(result),
         "pairs": _pairs(result),
-        "verdict": {
-            "ok": result.ok,
-            "failures": [message.clause for message in registration.failures],
-            "warnings": [message.clause for message in registration.warnings],
-            "relief": alignment.relief,
-        },
+        "verdict": {**dataclasses.asdict(result.verdict), "relief": alignment.relief},
         "options": result.options,
         "seed": result.options.seed,
         "versions": versions(),
