@@ -4,7 +4,7 @@ import math
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Self
+from typing import Literal, Self
 
 from rdstitch.alignment import LENSES, MODELS
 from rdstitch.camera import Camera
@@ -16,7 +16,10 @@ from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.local_alignment import MAX_CELLS, LocalAlignmentMode
 from rdstitch.machine import processor_count
 from rdstitch.matching.options import MatchingOptions, PairOptions
-from rdstitch.robust import SOLVERS
+from rdstitch.robust import SOLVERS, SolverName
+
+LensName = Literal["auto", "division", "division-center", "division2", "division3"]
+ModelName = Literal["auto", "rigid", "similarity", "tilting", "pose", "homography", "rotation"]
 
 _MAX_WORKERS = 1024  # threads; more than any machine has cores for
 _MAX_THRESHOLD = 1e4  # pixels; more than a picture is wide
@@ -105,9 +108,9 @@ class StitchOptions:
     features: FeatureOptions = field(default_factory=FeatureOptions)
     ratio: float | None = None
     lightglue_model: str | Path | None = None
-    solver: str = "auto"
-    lens: str = "auto"
-    model: str = "auto"
+    solver: SolverName = "auto"
+    lens: LensName = "auto"
+    model: ModelName = "auto"
     threshold: float = 3.0
     confidence: float = 0.999
     max_iterations: int = 10000

@@ -246,7 +246,7 @@ class RadialHomography:
     inliers : ndarray of shape (N,), bool
         Correspondences that agree with this model.
     covariance : ndarray of shape (P, P)
-        Of λ (first) and the free parameters of the homography's model; empty after a failure.
+        Of :attr:`parameters`; empty after a failure.
     distortion_std : float
         Standard deviation of λ in the half-diagonal frame; inf where λ is not observable, 0 where it was given.
     model : str
@@ -262,6 +262,10 @@ class RadialHomography:
     reason : str
         Why this model was chosen, or why the fit failed.
     ok : bool
+    parameters : tuple of str
+        "distortion", then the free parameters of the model: "psi" and "theta" of the tilt and "yaw", radians, "tx" and
+        "ty" in heights, "log_height" of the change of height, "log_focal"; or "tangent_1" to "tangent_8", orthonormal
+        directions that change a homography of unit norm.
     """
 
     homography: FloatArray
@@ -277,6 +281,7 @@ class RadialHomography:
     iterations: int = 0
     reason: str = ""
     ok: bool = True
+    parameters: tuple[str, ...] = ()
 
     @classmethod
     def failed(cls, reason: str, camera: Camera, camera2: Camera, count: int, iterations: int = 0) -> Self:

@@ -13,6 +13,25 @@ from rdstitch.matching.two_view import PairRegistration
 from rdstitch.messages import Message, of_severity
 
 
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a result can be relied on.
+
+    Attributes
+    ----------
+    ok : bool
+        Whether it passed its own checks.
+    failures : tuple of str
+        Why it did not; empty if ``ok``.
+    warnings : tuple of str
+        What to look at.
+    """
+
+    ok: bool
+    failures: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True, repr=False)
 class Registration:
     """Pictures registered as one.
@@ -55,6 +74,12 @@ class Registration:
     def ok(self) -> bool:
         """Whether it passed its checks."""
         return not self.failures
+
+    @property
+    def verdict(self) -> Verdict:
+        """The same, with failures and warnings in words."""
+        clauses = ([message.clause for message in messages] for messages in (self.failures, self.warnings))
+        return Verdict(self.ok, *map(tuple, clauses))
 
     @property
     def failures(self) -> tuple[Message, ...]:

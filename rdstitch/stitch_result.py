@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing import Canvas, Composite, CompositePlan
 from rdstitch.errors import ArgumentError
+from rdstitch.export.georeference import Georeference
 from rdstitch.inputs.frame import ChannelOrder, in_order
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.io.preview import encode_preview, read_preview
@@ -17,7 +18,7 @@ from rdstitch.io.read import read_image
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
-from rdstitch.registration import Registration
+from rdstitch.registration import Registration, Verdict
 
 _PREVIEW = 800  # pixels of the longer side
 
@@ -104,6 +105,10 @@ class StitchResult(OutputImage):
         Size and digest of the file.
     local_alignment : LocalAlignment
         Displacement fields of the pictures that are used, in their order.
+    georeference : Georeference or None
+        Where the output lies on the Earth.
+    not_georeferenced : str
+        Why that is not known; empty where it is.
     """
 
     registration: Registration
@@ -114,11 +119,18 @@ class StitchResult(OutputImage):
     plan: CompositePlan | None = None
     fingerprint: Fingerprint | None = None
     local_alignment: LocalAlignment = field(default_factory=partial(no_local_alignment, "not tried"))
+    georeference: Georeference | None = None
+    not_georeferenced: str = "not tried"
 
     @property
     def ok(self) -> bool:
         """Whether the result passed its own checks."""
         return self.registration.ok
+
+    @property
+    def verdict(self) -> Verdict:
+        """The same, with failures and warnings in words, as the sidecar has it."""
+        return self.registration.verdict
 
     @property
     def distortion(self) -> float:

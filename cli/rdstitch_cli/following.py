@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rdstitch_cli import options
+from rdstitch_cli.parameter_types import RealNumber
 from rdstitch_cli.stitching import warn_of
 from rdstitch_cli.terminal import Reporter
 
@@ -28,7 +29,7 @@ follow = options.together(
     ),
     click.option(
         "--idle",
-        type=click.FloatRange(0.0, min_open=True),
+        type=RealNumber(0.0, min_open=True),
         metavar="SECONDS",
         help="With --follow: end when no frame has come for so long; otherwise a folder is followed until Ctrl-C.",
     ),
@@ -36,7 +37,7 @@ follow = options.together(
 
 refresh = click.option(
     "--refresh",
-    type=click.FloatRange(0.0),
+    type=RealNumber(0.0),
     default=5.0,
     show_default=True,
     metavar="SECONDS",

@@ -4,6 +4,7 @@ import re
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -16,29 +17,69 @@ _GROUPS = {
         "features aliked_model lightglue_model max_features work_megapixels solver model threshold"
     ),
     "Output": (
-        "rotate crop projection max_stretch max_size local_alignment exposure seam blend interpolation background "
-        "quality plot as_json"
+        "gsd epsg north_up rotate crop projection max_stretch max_size local_alignment exposure seam blend "
+        "interpolation background quality plot as_json"
     ),
-    "Control": "strict force dry_run cache max_memory workers scheduler seed verbose config help",
+    "Control": "strict force dry_run cache max_memory workers scheduler seed verbose config help help_all",
 }
 _OTHERS = "Other options"
+_BRIEF = (
+    "output overwrite images preview camera distortion focal mask exclude every following reference scale gsd crop "
+    "max_size exposure report cache workers quiet config help help_all"
+)
+_FEW = 25  # options that are shown all at once
+_ALL = "rdstitch_cli.help_all"
+
+
+def _show_all(context: click.Context, _option: click.Parameter, wanted: bool) -> None:
+    """Print the page with all options, and end."""
+    if wanted and not context.resilient_parsing:
+        context.meta[_ALL] = True
+        click.echo(context.get_help())
+        context.exit()
 
 
 class GroupedCommand(click.Command):
-    """A command whose help page shows its options in groups."""
+    """A command whose help page shows its options in groups; of many, first those that matter.
+
+    ``--help-all`` shows all of them.
+    """
+
+    def __init__(self, *arguments: Any, **given: Any) -> None:
+        super().__init__(*arguments, **given)
+        if len(self.params) > _FEW:
+            self.params.append(
+                click.Option(
+                    ["--help-all"],
+                    is_flag=True,
+                    is_eager=True,
+                    expose_value=False,
+                    callback=_show_all,
+                    help="Show all options.",
+                )
+            )
 
     def format_options(self, context: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the groups in their order, each with the options that this command has of it."""
         rows: dict[str, list[tuple[int, tuple[str, str]]]] = {group: [] for group in (*_GROUPS, _OTHERS)}
+        brief = any(parameter.name == "help_all" for parameter in self.params) and not context.meta.get(_ALL)
+        left = 0
         for parameter in self.get_params(context):
             record = parameter.get_help_record(context)
             if record is not None and isinstance(parameter, click.Option):
-                group, rank = place_of("help" if "--help" in parameter.opts else parameter.name or "")
-                rows[group].append((rank, record))
+                name = "help" if "--help" in parameter.opts else parameter.name or ""
+                group, rank = place_of(name)
+                if not brief or name in _BRIEF.split():
+                    rows[group].append((rank, record))
+                else:
+                    left += 1
         for group, found in rows.items():
             if found:
                 with formatter.section(group):
                     formatter.write_dl([record for _, record in sorted(found)])
+        if left:
+            formatter.write_paragraph()
+            formatter.write_text(f"{left} more options: {context.command_path} --help-all")
 
 
 def place_of(name: str) -> tuple[str, int]:
@@ -49,7 +90,11 @@ def place_of(name: str) -> tuple[str, int]:
     return _OTHERS, 0
 
 
-@click.command("help", epilog="\b\nExamples:\n  rdstitch help\n  rdstitch help pano\n  rdstitch help no-overlap\n")
+@click.command(
+    "help",
+    short_help="Help on a command, or on the code of a message.",
+    epilog="\b\nExamples:\n  rdstitch help\n  rdstitch help pano\n  rdstitch help no-overlap\n",
+)
 @click.argument("topics", nargs=-1, metavar="[COMMAND|CODE]")
 @click.pass_context
 def help_command(context: click.Context, topics: Sequence[str]) -> None:

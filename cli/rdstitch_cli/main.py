@@ -4,6 +4,7 @@ import ctypes
 import errno
 import logging
 import os
+import shlex
 import signal
 import sys
 import traceback
@@ -59,7 +60,28 @@ _DECODERS = ("PIL", "tifffile")
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
+class _Commands(click.Group):
+    """The commands; whoever gives files or options without one is told to name one first."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        given = list(args)
+        try:
+            return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            if any(error.option_name in option.opts for command in self.commands.values() for option in command.params):
+                ctx.fail(f"{error.option_name} belongs to a command: rdstitch pano {shlex.join(given)}")
+            raise
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if self.get_command(ctx, args[0]) is None and (Path(args[0]).suffix or Path(args[0]).exists()):
+            ctx.fail(f"{args[0]!r} is not a command; name one first: rdstitch pano {shlex.join(args)}")
+        return super().resolve_command(ctx, args)
+
+
 @click.group(
+    cls=_Commands,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
     epilog=f"{_EXAMPLES}\n\n{EXIT_STATUSES}",
 )
@@ -125,9 +147,9 @@ def run(arguments: list[str]) -> int:
     try:
         return _invoke(arguments)
     except (KeyboardInterrupt, click.exceptions.Abort):
-        return _complain("interrupted", _INTERRUPTED, debug)
+        return _complain(_interrupted(arguments), _INTERRUPTED, debug)
     except _AskedToEndError as asked:
-        return _complain("interrupted", 128 + asked.number, debug)
+        return _complain(_interrupted(arguments), 128 + asked.number, debug)
     except click.ClickException as error:
         return _complain(_usage(error), error.exit_code, debug)
     except RdstitchError as error:
@@ -155,7 +177,7 @@ def _invoke(arguments: list[str]) -> int:
     if completion := os.environ.get("_RDSTITCH_COMPLETE"):
         return shell_complete(cli, {}, "rdstitch", "_RDSTITCH_COMPLETE", completion)
     if not arguments:  # click before 8.2 takes this for success
-        click.echo(cli.get_help(click.Context(cli, info_name="rdstitch")), err=True)
+        click.echo(cli.get_help(click.Context(cli, info_name="rdstitch", **cli.context_settings)), err=True)
         return _USAGE
     try:
         with cli.make_context("rdstitch", list(arguments)) as context:
@@ -200,6 +222,11 @@ class _AskedToEndError(BaseException):
 
 def _end(number: int, frame: object) -> Never:
     raise _AskedToEndError(number)
+
+
+def _interrupted(arguments: list[str]) -> str:
+    cached = any(argument.partition("=")[0] == "--cache" for argument in arguments)
+    return "interrupted" + "; the same command goes on from the cache" * cached
 
 
 def _usage(error: click.ClickException) -> str:

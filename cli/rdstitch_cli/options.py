@@ -10,7 +10,17 @@ from typing import Any, TypeVar
 import click
 from click.core import ParameterSource
 
-from rdstitch_cli.parameter_types import Angle, Angles, Bytes, FileOr, UserPath, WordOrNumber
+from rdstitch_cli.parameter_types import (
+    Angle,
+    Angles,
+    Bytes,
+    Epsg,
+    FileOr,
+    RealNumber,
+    UserPath,
+    WholeNumber,
+    WordOrNumber,
+)
 from rdstitch_cli.terminal import Reporter
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -71,13 +81,13 @@ inputs = click.argument("inputs", nargs=-1, required=True, type=UserPath(allow_d
 
 def _every(otherwise: int | None) -> Decorator[Any]:
     """The option, and what a command takes without it: None for "auto"."""
+    usual = "auto" if otherwise is None else otherwise
     return click.option(
         "--every",
         type=WordOrNumber(("auto",), 1, 1_000_000),
         callback=lambda _context, _option, value: {None: otherwise, "auto": None}.get(value, value),
         metavar="auto|N",
-        help="Of a video or ROS bag, every N-th frame; auto: those that show new ground.  [default: auto; of "
-        "trajectory and apply 1]",
+        help=f"Of a video or ROS bag, every N-th frame; auto: those that show new ground.  [default: {usual}]",
     )
 
 
@@ -91,9 +101,10 @@ output = click.option(
 
 overwrite = click.option("--overwrite", is_flag=True, help="Replace existing output files.")
 
-as_json = click.option(
-    "--json", "as_json", is_flag=True, help="Print everything as JSON: the sidecar, the camera, or what doctor found."
-)
+
+def as_json(what: str) -> Decorator[Any]:
+    """The option, of a command that would print so much."""
+    return click.option("--json", "as_json", is_flag=True, help=f"Print {what} as JSON.")
 
 
 def verbosity(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -116,13 +127,19 @@ lens = together(
         "Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap or Hugin; its lens is kept.",
     ),
     click.option(
-        "--lambda", "distortion", type=float, metavar="L", help="Known λ for half the image diagonal; it is kept."
+        "--lambda",
+        "distortion",
+        type=RealNumber(),
+        metavar="L",
+        help="Known λ for half the image diagonal; it is kept.",
     ),
 )
 
 known = together(
     lens,
-    click.option("--focal", type=float, metavar="PX", help="Focal length, pixels; otherwise from EXIF, else guessed."),
+    click.option(
+        "--focal", type=RealNumber(), metavar="PX", help="Focal length, pixels; otherwise from EXIF, else guessed."
+    ),
     click.option("--tilt", type=Angles(), help="Known tilt of the camera to the plane, degrees."),
     click.option(
         "--attitude",
@@ -144,7 +161,7 @@ mask = _file(
 )
 
 workers = click.option(
-    "-j", "--workers", type=click.IntRange(0), default=0, help="Threads; 0, the default, is one for each usable core."
+    "-j", "--workers", type=WholeNumber(0), default=0, help="Threads; 0, the default, is one for each usable core."
 )
 
 estimation = together(
@@ -166,14 +183,14 @@ estimation = together(
     _file("--lightglue-model", "FILE", "Match by this LightGlue network for these features."),
     click.option(
         "--max-features",
-        type=click.IntRange(1),
+        type=WholeNumber(1),
         metavar="N",
         help="At most so many features a picture.  [default: 2000; of fewer than 8 pictures 16000 together, "
         "at most 4000 each]",
     ),
     click.option(
         "--work-megapixels",
-        type=click.FloatRange(0.0),
+        type=RealNumber(0.0),
         metavar="MP",
         help="Pictures are halved until they have no more megapixels before features are detected, once less where "
         "that shows too few; 0 is full size.  [default: 0.6; of fewer than 8 pictures 4.8 together, at most 2.4 each]",
@@ -188,12 +205,12 @@ estimation = together(
     _choice("--model", MODELS, "auto", "How freely the camera moved."),
     _number(
         "--threshold",
-        float,
+        RealNumber(),
         3.0,
         "Largest error of an inlier, pixels of the size that features are detected at (see --work-megapixels).",
         "PX",
     ),
-    _number("--seed", click.IntRange(0), 0, "Seed of random sampling."),
+    _number("--seed", WholeNumber(0), 0, "Seed of random sampling."),
     _file(
         "--cache",
         "DIR",
@@ -237,7 +254,12 @@ compositing = together(
         "multiband",
         "How pictures pass into one another; none cuts, for measuring.",
     ),
-    _choice("--crop", ["none", "auto"], "none", "Cut to the largest rectangle without holes."),
+    click.option(
+        "--crop/--no-crop",
+        default=False,
+        callback=lambda _context, _option, value: "auto" if value else "none",
+        help="Cut to the largest rectangle without holes.",
+    ),
     _choice(
         "--projection",
         ["auto", "plane", "cylinder", "sphere", "mercator"],
@@ -247,7 +269,7 @@ compositing = together(
     _choice("--interpolation", ["linear", "cubic", "lanczos"], "cubic", "Kernel of the one resampling."),
     _number(
         "--background",
-        click.IntRange(0, 255),
+        WholeNumber(0, 255),
         0,
         "What no picture covers, in JPEG and .dzi: 0 black to 255 white.",
         "GREY",
@@ -257,29 +279,43 @@ compositing = together(
         type=Bytes(),
         help="Memory that compositing may take, as 800M; otherwise a quarter of what is available, at least 400M.",
     ),
-    _number("--scale", float, 1.0, "Factor to the size of the output; 1 keeps resolution."),
+    _number("--scale", RealNumber(), 1.0, "Factor to the size of the output; 1 keeps resolution."),
     _number(
         "--max-stretch",
-        click.FloatRange(1.0, min_open=True),
+        RealNumber(1.0, min_open=True),
         3.0,
         "What an oblique picture shows N times coarser than the reference picture is not drawn.",
         "N",
     ),
     click.option(
         "--max-size",
-        type=click.IntRange(1),
+        type=WholeNumber(1),
         metavar="N",
         help="Longest side of the output, pixels; smaller than --scale makes it where that is more.",
     ),
-    _number("--quality", click.IntRange(1, 100), 95, "Quality of JPEG and WebP, 1 to 100.", "Q"),
-    _number("--rotate", float, 0.0, "Turn the output clockwise, degrees.", "DEG"),
+    _number("--quality", WholeNumber(1, 100), 95, "Quality of JPEG and WebP, 1 to 100.", "Q"),
+    _number("--rotate", RealNumber(), 0.0, "Turn the output clockwise, degrees; north is then not turned up.", "DEG"),
+    click.option(
+        "--north-up/--no-north-up",
+        default=True,
+        help="Turn north up where three images or more have a GPS position that fits.  [default: north up]",
+    ),
+    click.option(
+        "--gsd", type=RealNumber(), metavar="M", help="Metres on the ground that a pixel takes, instead of --scale."
+    ),
+    click.option(
+        "--crs",
+        "epsg",
+        type=Epsg(),
+        help="Coordinate system of the map; otherwise UTM on WGS 84. Others than UTM need rasterio.",
+    ),
     click.option(
         "--dry-run", is_flag=True, help="Say what compositing would take (size, memory, time); write nothing."
     ),
 )
 
 # What every command that registers pictures takes, and what those take that also compose them.
-registration = together(overwrite, known, estimation, report, trust, as_json, verbosity)
+registration = together(overwrite, known, estimation, report, trust)
 
 stitching = together(
     output,
@@ -306,4 +342,6 @@ stitching = together(
         "Write the estimated camera: .json, .yml (OpenCV), .pto (Hugin), camera_info.yaml (ROS) and others.",
     ),
     registration,
+    as_json("the sidecar"),
+    verbosity,
 )

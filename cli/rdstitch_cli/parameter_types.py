@@ -32,6 +32,47 @@ class UserPath(click.Path):
             return path
 
 
+def _one_number(number: click.IntRange | click.FloatRange, kind: str) -> str:
+    """What was expected, in words."""
+    if number.min is None:
+        return f"expected one {kind}"
+    if number.max is None:
+        return f"expected one {kind} {'above' if number.min_open else 'of at least'} {number.min:g}"
+    return f"expected one {kind} from {number.min:g} to {number.max:g}"
+
+
+class WholeNumber(click.IntRange):
+    """A whole number within limits, called N in help pages."""
+
+    name = "N"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        try:
+            return super().convert(value, param, ctx)
+        except click.BadParameter:
+            self.fail(f"{_one_number(self, 'whole number')}, not {value!r}", param, ctx)
+
+    def _describe_range(self) -> str:
+        """Nothing, in help pages: their texts say what matters."""
+        return ""
+
+
+class RealNumber(click.FloatRange):
+    """A number within limits, or any, called N in help pages."""
+
+    name = "N"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        try:
+            return super().convert(value, param, ctx)
+        except click.BadParameter:
+            self.fail(f"{_one_number(self, 'number')}, not {value!r}", param, ctx)
+
+    def _describe_range(self) -> str:
+        """Nothing, in help pages: their texts say what matters."""
+        return ""
+
+
 class Angles(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
     """Two angles in degrees, ``PSI,THETA``; the value is in radians."""
 
@@ -114,3 +155,15 @@ class Angle(click.ParamType):  # type: ignore[type-arg]  # generic since click 8
         if not 0.0 <= angle < math.inf:
             self.fail(f"{value!r} is no angle in degrees like 0.5", param, ctx)
         return angle
+
+
+class Epsg(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
+    """The code of a coordinate system like ``EPSG:25832``; the value is the number."""
+
+    name = "EPSG:N"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        number = str(value).upper().removeprefix("EPSG:")
+        if not (number.isdecimal() and 0 < int(number) < 2**16):
+            self.fail(f"{value!r} is not a code like EPSG:25832", param, ctx)
+        return int(number)

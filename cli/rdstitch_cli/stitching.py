@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rdstitch.compositing import CompositePlan
     from rdstitch.io.outputs import Outputs
     from rdstitch.pipeline import Registration, StitchOptions, StitchResult
+    from rdstitch.robust import SolverName
 
 
 def read_lens(file: Path | None, reporter: Reporter) -> "Camera | None":
@@ -69,7 +70,7 @@ def stitch_options(
             aliked_model=aliked_model,
         ),
         composite=CompositeOptions(**composite),
-        solver=solver.replace("-", "_"),
+        solver=cast("SolverName", solver.replace("-", "_")),
         **given,
     )
 

@@ -12,10 +12,10 @@ from itertools import product
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.model_selection import choose_model
 from rdstitch.alignment.motion_models import POSE, PSI, THETA, PlanarModel
 from rdstitch.alignment.options import AlignmentOptions
 from rdstitch.alignment.rotation_model import ROTATION
+from rdstitch.alignment.select import select_model
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.messages import Message
 
@@ -63,7 +63,7 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
         known, attitudes=np.zeros_like(known.attitudes), attitudes_std=None, tilt=(0.0, 0.0), tilt_known=False
     )
     bare = replace(problem, camera_priors=nothing)
-    fit = choose_model(bare, [name for name in without.models if name != ROTATION.name]).fit
+    fit = select_model(bare, [name for name in without.models if name != ROTATION.name]).fit
     if not isinstance(fit.model, PlanarModel):
         return None
     if PSI in fit.model.free and fit.model is not POSE:  # whose prior draws tilts together

@@ -286,8 +286,8 @@ def _warnings(found: AdjustedPictures, camera: Camera) -> tuple[Message, ...]:
         off = max(found.lens.corner_shift, _CONFIDENT * float(radius_std(camera, _RADII)[-1]))
         if off > WORTH_SAYING:
             text = (
-                f"{len(found.pictures)} pictures show the lens to {off:.1f} pixels at the corners only; "
-                f"take {ENOUGH_PICTURES} or more, or give the lens"
+                f"from {len(found.pictures)} images the lens distortion is known to about {off:.2g} pixels at the "
+                f"corners; {ENOUGH_PICTURES} or more images, or --camera, make it surer"
             )
             result.append(Message(text, severity="note" if found.layout_matters else "warning", code="few-pictures"))
     if not found.choice.fit.adjusted.converged:

@@ -15,6 +15,7 @@ from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.motion_models import PlanarModel, X, Y
 from rdstitch.alignment.noise_model import EXACTNESS
 from rdstitch.arrays import FloatArray
+from rdstitch.robust.similarity_fit import OUTLYING, fit_similarity
 
 POSITION_STD = 3.0
 """Metres: of one coordinate of a position by a receiver without corrections, within one flight."""
@@ -24,9 +25,6 @@ _MIN_POSITIONS, _MIN_SPREAD = 4, 5.0
 
 _ROUNDS, _SETTLED = 6, 0.1
 """Of fitting the similarity and adjusting again; standard deviations by which positions still move at the end."""
-
-_OUTLYING = 3.0
-"""Standard deviations from which on a position counts little."""
 
 _MAX_GROWTH = 1.1
 """Times by which the errors of the pictures may grow."""
@@ -48,8 +46,7 @@ def hold_positions(problem: Problem, fit: Fit) -> tuple[Problem, Fit, str]:
     str
         Why they do not count; empty where they do, or where there are too few.
     """
-    positions = problem.camera_priors.positions
-    metres = positions @ np.array([1.0, -1.0j])
+    metres = problem.camera_priors.positions @ np.array([1.0, -1.0j])
     known = np.isfinite(metres)
     if not isinstance(fit.model, PlanarModel) or known.sum() < _MIN_POSITIONS or _spread(metres[known]) < _MIN_SPREAD:
         return problem, fit, ""
@@ -65,21 +62,20 @@ def hold_positions(problem: Problem, fit: Fit) -> tuple[Problem, Fit, str]:
     there, precision = _prior(metres, _places(found), known)
     off = np.abs(_places(found) - there @ np.array([1.0, 1.0j]))[known] * math.sqrt(precision.max())
     growth = math.hypot(found.adjusted.sigma, EXACTNESS) / math.hypot(fit.adjusted.sigma, EXACTNESS)
-    if growth <= _MAX_GROWTH and np.median(off) <= _OUTLYING:
+    if growth <= _MAX_GROWTH and np.median(off) <= OUTLYING:
         return held, found, ""
-    return (
-        problem,
-        fit,
-        (
-            f"the GPS positions disagree with the pictures, by {POSITION_STD * np.median(off):.0f} m in the median: "
-            "they were not used"
-        ),
+    why = (
+        f"they are {POSITION_STD * np.median(off):.0f} m off in the median"
+        if np.median(off) > OUTLYING
+        else f"with them the errors of the matches grow by {growth - 1.0:.0%}"
     )
+    return problem, fit, f"the GPS positions contradict the images ({why}) and were not used for the alignment"
 
 
 def _spread(metres: NDArray[np.complex128]) -> float:
-    """Of positions, standard deviations."""
-    return float(np.std(metres)) / POSITION_STD
+    """Of positions, standard deviations, whatever a few of them are."""
+    middle = complex(np.median(metres.real), np.median(metres.imag))
+    return float(np.median(np.abs(metres - middle))) / POSITION_STD
 
 
 def _places(fit: Fit) -> NDArray[np.complex128]:
@@ -92,16 +88,9 @@ def _prior(
     metres: NDArray[np.complex128], here: NDArray[np.complex128], known: NDArray[np.bool_]
 ) -> tuple[FloatArray, FloatArray]:
     """Where the positions say that the cameras are (N, 2), and how surely, as inverse variances (N,)."""
-    weight, scale, origin, away = known.astype(np.float64), 0.0j, 0.0j, np.zeros(len(metres))
-    filled = np.where(known, metres, 0.0)
-    for _ in range(10):
-        a, b = (np.average(points, weights=weight) for points in (filled, here))
-        power = float(np.vdot(filled - a, weight * (filled - a)).real)
-        scale = complex(np.vdot(filled - a, weight * (here - b))) / max(power, 1e-300)
-        origin = complex(b - scale * a)
-        away = np.abs(here - scale * filled - origin) / max(abs(scale), 1e-300)
-        width = _OUTLYING * max(POSITION_STD, float(np.median(away[known])))
-        weight = known / (1.0 + (away / width) ** 2) ** 2
-    there = np.where(known, scale * filled + origin, 0.0)
-    precision = weight / max(abs(scale) * POSITION_STD, 1e-12) ** 2
-    return np.stack([there.real, there.imag], axis=1), precision
+    fit = fit_similarity(here[known], metres[known], POSITION_STD)
+    scale = fit.scale or 1e-300
+    there, precision = np.zeros((len(metres), 2)), np.zeros(len(metres))
+    there[known] = ((metres[known] - fit.origin) / scale).view(np.float64).reshape(-1, 2)
+    precision[known] = fit.weights * (abs(scale) / POSITION_STD) ** 2
+    return there, precision

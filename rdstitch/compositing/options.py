@@ -48,7 +48,13 @@ class CompositeOptions:
     max_stretch : float
         What a picture shows so many times coarser than the reference picture is not drawn.
     rotate : float
-        Degrees that the output is turned clockwise.
+        Degrees that the output is turned clockwise; other than 0, north is not turned up.
+    north_up : bool
+        Turn north up where the output is georeferenced.
+    gsd : float, optional
+        Metres on the map that a pixel takes, instead of ``scale``; the output must be georeferenced.
+    epsg : int, optional
+        Code of the map's coordinate system; None: UTM on WGS 84. Others need the extra ``crs``.
     max_memory : int, optional
         Bytes that the compositor may hold in pictures and tiles; None: a quarter of the memory that is
         available, at least 400 MB, or more where the canvas needs it.
@@ -80,6 +86,9 @@ class CompositeOptions:
     quality: int = 95
     max_stretch: float = 3.0
     rotate: float = 0.0
+    north_up: bool = True
+    gsd: float | None = None
+    epsg: int | None = None
     max_memory: int | None = None
     interpolation: Interpolation = "cubic"
     background: int = 0
@@ -104,6 +113,8 @@ class CompositeOptions:
             raise ArgumentError(f"max_stretch must be greater than 1, not {self.max_stretch}")
         if not math.isfinite(self.rotate):
             raise ArgumentError(f"rotate must be an angle in degrees, not {self.rotate}")
+        if self.gsd is not None and not 0.0 < self.gsd < math.inf:
+            raise ArgumentError(f"gsd must be metres, more than 0, not {self.gsd}")
         if self.max_memory is not None and self.max_memory <= 0:
             raise ArgumentError(f"max_memory must be positive, not {self.max_memory}")
         if not 0 <= self.background <= 255:

@@ -129,7 +129,12 @@ class _Examined:
 
 
 def examine(
-    inputs: Images, *, every: int | None = None, channel_order: ChannelOrder = "bgr", progress: Progress = silent
+    inputs: Images,
+    *,
+    every: int | None = None,
+    topic: str | None = None,
+    channel_order: ChannelOrder = "bgr",
+    progress: Progress = silent,
 ) -> Examination:
     """Find out at a glance what a run will meet.
 
@@ -138,8 +143,10 @@ def examine(
 
     Parameters
     ----------
-    inputs, every, channel_order, progress
+    inputs, every, progress
         As for :func:`rdstitch.mosaic`.
+    topic, channel_order : str
+        As of :class:`rdstitch.StitchOptions`.
 
     Returns
     -------
@@ -150,7 +157,7 @@ def examine(
     InputError
         When an input names nothing, or nothing can be read.
     """
-    with found_pictures(as_inputs(inputs, channel_order), every=every) as pictures:
+    with found_pictures(as_inputs(inputs, channel_order), every=every, topic=topic) as pictures:
         sources, unread = read_sources(pictures.frames, skip_bad=True)
         unreadable = [f"{message.images[0]}: {message.text}" for message in unread]
         found: dict[int, _Examined] = {}

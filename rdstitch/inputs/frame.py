@@ -93,6 +93,10 @@ def files_of(frames: Iterable[Frame]) -> list[Path]:
 def _as_input(item: Any, index: int, channel_order: ChannelOrder) -> Named:
     if isinstance(item, (str, os.PathLike, Frame)):
         return item
+    if item is None:
+        raise ArgumentError(
+            f"image {index} is None, which cv2.imread returns for a file that it cannot read; check the name"
+        )
     if not isinstance(item, np.ndarray):
         kind = type(item).__name__
         raise ArgumentError(f"image {index}: expected a path or a NumPy array, not {kind}; convert it by numpy.asarray")

@@ -83,7 +83,7 @@ def _read_table(file: str | Path) -> dict[str, tuple[float, float]]:
     try:
         return _read_rows(file)
     except csv.Error as error:
-        raise InputError(f"{file}: is no table with commas: {error}") from error
+        raise InputError(f"{file}: is not a CSV file: {error}") from error
 
 
 def _read_rows(file: str | Path) -> dict[str, tuple[float, float]]:
@@ -107,14 +107,14 @@ def _read_rows(file: str | Path) -> dict[str, tuple[float, float]]:
 
 
 def positions_of(sources: Sequence[Source]) -> FloatArray:
-    """Metres east and north (N, 2) of the middle of the pictures' GPS positions; NaN where unknown."""
+    """Metres east and north (N, 2) of the median of the pictures' GPS positions; NaN where unknown."""
     known = [source.metadata.gps for source in sources]
     degrees = [(np.nan, np.nan) if gps is None else (gps.latitude, gps.longitude) for gps in known]
     latitude, longitude = np.radians(np.array(degrees, dtype=np.float64).reshape(-1, 2)).T
     if np.isnan(latitude).all():
         return np.full((len(known), 2), np.nan)
     up = np.stack([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
-    x, y, z = np.nanmean(up, axis=1)
+    x, y, z = np.nanmedian(up, axis=1)
     level = max(float(np.hypot(x, y)), 1e-12)
     east = np.array([-y, x, 0.0]) / level
     north = np.array([-x * z / level, -y * z / level, level])

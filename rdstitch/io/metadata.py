@@ -297,6 +297,8 @@ def _gps(tags: dict[int, Any]) -> GpsPosition | None:
     longitude = _degrees(tags.get(ExifTags.GPS.GPSLongitude), _text(tags.get(ExifTags.GPS.GPSLongitudeRef)) == "W")
     if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
         return None
+    if latitude == longitude == 0.0:  # what receivers write that have no fix
+        return None
     altitude = finite(tags.get(ExifTags.GPS.GPSAltitude))
     below_sea = tags.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01")
     return GpsPosition(latitude, longitude, -altitude if altitude and below_sea else altitude)

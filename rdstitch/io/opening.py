@@ -4,6 +4,7 @@ Failures of the decoders end as one InputError. Their warnings and log messages 
 process that this runs in decides what becomes of them, since Python's filters and handlers belong to all its threads.
 """
 
+import difflib
 import os
 import stat
 import struct
@@ -89,8 +90,7 @@ def check_readable(path: Path) -> None:
     try:
         status = path.stat()
     except FileNotFoundError:
-        hint = "a link to nothing" if path.is_symlink() else "no such file"
-        raise InputError(f"{path}: {hint}; check the name") from None
+        raise InputError(f"{path}: {_missing(path)}") from None
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}; check the name") from error
     if stat.S_ISDIR(status.st_mode):
@@ -102,6 +102,20 @@ def check_readable(path: Path) -> None:
     check_reader(path)
     if not os.access(path, os.R_OK):
         raise InputError(f"{path}: permission denied; make it readable")
+
+
+def _missing(path: Path) -> str:
+    """What is wrong with a name that leads nowhere, and which one may be meant."""
+    if path.is_symlink():
+        return "a link to nothing; check the name"
+    try:
+        names = [entry.name for entry in path.parent.iterdir()]
+    except OSError:
+        return f"no such file, since there is no folder {path.parent}; check the name"
+    what = "file" if path.suffix else "folder"
+    alike = [name for name in names if name.lower() == path.name.lower()]
+    alike = alike or difflib.get_close_matches(path.name, names, n=1, cutoff=0.8)
+    return f"no such {what}; " + (f"did you mean {path.with_name(alike[0])}?" if alike else "check the name")
 
 
 def _check_remote(path: Path) -> None:

@@ -44,6 +44,7 @@ def apply(
     match: MatchBy = "auto",
     mask: str | Path | None = None,
     every: int | None = 1,
+    topic: str | None = None,
     workers: int = 0,
     overwrite: bool = False,
     strict: bool = False,
@@ -71,6 +72,8 @@ def apply(
         Picture, or folder of them, that is dark where the pictures do not count.
     every : int, optional
         Look among every n-th frame of videos and ROS bags; None: among those that show new ground.
+    topic : str, optional
+        Of the images in ROS bags; None: the only one.
     workers : int
         Pictures worked on at the same time; 0: as many as there are cores.
     overwrite : bool
@@ -103,7 +106,7 @@ def apply(
     if strict and doubts:
         raise InputError(doubts[0].text)
     given = as_inputs(images, channel_order)
-    with found_pictures(given, output=output, every=every) as found, Outputs(overwrite) as outputs:
+    with found_pictures(given, output=output, every=every, topic=topic) as found, Outputs(overwrite) as outputs:
         if output is not None:
             _check_outputs(Path(output), overwrite, found.files, saved.path)
         chosen, matched = _match(saved, found.frames, match)
@@ -133,6 +136,8 @@ def apply(
             (*doubts, *found.messages, *guard.messages, *composed.messages),
             channel_order,
             composed.fingerprint,
+            composed.place,
+            composed.place_reason,
         )
         if output is not None and not dry_run:
             return _written(result, output, composed, list(used.values()), outputs)
@@ -158,6 +163,7 @@ def _placed(saved: SavedRegistration, used: Mapping[int, Source]) -> PlacedImage
         list(used).index(saved.reference) if saved.reference in used else None,
         [_displacement(saved, index, source) for index, source in used.items()],
         saved.turned,
+        saved.place,
     )
 
 

@@ -22,8 +22,9 @@ from rdstitch.compositing import (
     plan_composite,
 )
 from rdstitch.compositing.blocks import Block, BlockRunner, BlockStrip
+from rdstitch.errors import OutputError
 from rdstitch.executors import in_order
-from rdstitch.export.georeference import Georeference, georeference, has_place, world_file_paths
+from rdstitch.export.georeference import Georeference, has_place, world_file_paths
 from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.io.atomic import check_output, text_bytes
@@ -33,7 +34,8 @@ from rdstitch.io.outputs import Outputs
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
 from rdstitch.messages import Message
-from rdstitch.pipeline.placed_images import PlacedImages, plan
+from rdstitch.pipeline.map_canvas import moved, place_messages, plan_on_map
+from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.process_memory import return_freed_memory
 from rdstitch.progress import Progress
 from rdstitch.stitch_result import StitchResult
@@ -62,6 +64,10 @@ class Composed:
         Size and digest of the file.
     written : FileComposite or None
         The picture in its file.
+    place : Georeference or None
+        Of the canvas.
+    place_reason : str
+        Why there is none.
     """
 
     canvas: Canvas
@@ -70,6 +76,8 @@ class Composed:
     messages: tuple[Message, ...] = ()
     fingerprint: Fingerprint | None = None
     written: FileComposite | None = None
+    place: Georeference | None = None
+    place_reason: str = ""
 
 
 def compose_pictures(
@@ -107,7 +115,8 @@ def compose_pictures(
     """
     return_freed_memory()
     world_files = _files_beside(output, placed, overwrite)
-    canvas = plan(placed, options)
+    canvas, place, reason = plan_on_map(placed, options)
+    notes = [*_masked(placed), *place_messages(place, reason, placed)]
     # A crop may yet make it fit.
     if output is not None and options.crop == "none":
         check_size(output, canvas.size)
@@ -121,34 +130,41 @@ def compose_pictures(
         channels = 1 if probe.pixels.ndim == 2 else probe.pixels.shape[2]
         size = probe.pixels.dtype.itemsize
         masked = probe.alpha is not None
-        return Composed(canvas, plan=plan_composite(placed.cameras, canvas, options, channels, size, masked=masked))
+        planned = plan_composite(placed.cameras, canvas, options, channels, size, masked=masked)
+        return Composed(canvas, plan=planned, messages=tuple(notes), place=place, place_reason=reason)
 
     def report(share: float) -> None:
         progress("compositing", round(100 * share), 100)
 
     if output is None:
         composite = compose(pictures, canvas, options, report, elsewhere)
-        return Composed(composite.canvas, composite, messages=(*_masked(placed), *composite.messages))
-    located: list[tuple[Georeference | None, str]] = []
+        return Composed(
+            composite.canvas,
+            composite,
+            messages=(*notes, *composite.messages),
+            place=moved(place, canvas, composite.canvas),
+            place_reason=reason,
+        )
 
     def tags(final: Canvas) -> list[ExtraTag]:
-        located.append(georeference(placed.positions, placed.cameras, final.matrix @ placed.homographies))
-        return located[0][0].tiff_tags() if located[0][0] is not None else []
+        there = moved(place, canvas, final)
+        return [] if there is None else there.tiff_tags()
 
     file = OutputFile(output, placed.sources[0].metadata, tags, outputs)
     written = compose_to_file(file, pictures, canvas, options, report, elsewhere)
-    place, note = located[0]
+    place = moved(place, canvas, written.canvas)
     beside = []
     if place is not None and world_files:
         beside = outputs.attempt(world_files[0], partial(_write_world_files, outputs, world_files, place))
-    messages = (
-        *_masked(placed),
-        *written.messages,
-        *([Message(note)] if note else []),
-        *_profile_lost(placed.sources[0], Path(output)),
-        *beside,
+    messages = (*notes, *written.messages, *_profile_lost(placed.sources[0], Path(output)), *beside)
+    return Composed(
+        written.canvas,
+        messages=messages,
+        fingerprint=written.fingerprint,
+        written=written,
+        place=place,
+        place_reason=reason,
     )
-    return Composed(written.canvas, messages=messages, fingerprint=written.fingerprint, written=written)
 
 
 def _masked(placed: PlacedImages) -> list[Message]:
@@ -165,8 +181,13 @@ def _files_beside(output: str | Path | None, placed: PlacedImages, overwrite: bo
         return ()
     world_files = tuple(map(Path, world_file_paths(output))) if has_place(placed.positions) else ()
     page = viewer_path(output)
-    for file in (*world_files, *([] if page is None else [page])):
+    for file in world_files:
         check_output(file, overwrite, suffixes=())
+    if page is not None:
+        try:
+            check_output(page, overwrite, suffixes=())
+        except OutputError as error:
+            raise OutputError(f"{error} (it becomes the page that shows {output})") from error
     return world_files
 
 

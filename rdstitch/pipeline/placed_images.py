@@ -16,6 +16,7 @@ from rdstitch.compositing.near_part import NearPart
 from rdstitch.compositing.placed_picture import Displacement, PlacedPicture, place_pictures
 from rdstitch.compositing.static_pixels import MIN_PICTURES, static_pixels
 from rdstitch.errors import ArgumentError
+from rdstitch.export.georeference import Georeference
 from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import GpsPosition
 from rdstitch.io.read import Picture
@@ -71,6 +72,8 @@ class PlacedImages:
         What local alignment adds to the measured pixels of each picture.
     turned : bool
         Whether the camera turned on the spot, so that the homographies lead to directions, not to a plane.
+    place : Georeference or None
+        Of the plane, where it is known from an earlier run.
     """
 
     sources: Sequence[Source]
@@ -79,6 +82,7 @@ class PlacedImages:
     reference: int | None
     displacements: Sequence[Displacement | None] | None = None
     turned: bool = False
+    place: Georeference | None = None
 
     @classmethod
     def of(cls, registration: Registration, displacements: Sequence[Displacement | None] | None) -> Self:

@@ -52,10 +52,13 @@ def read_inputs(
     """
     # Before the first large picture is freed.
     return_freed_memory()
-    sources, unread = read_frames(selected(frames, options.exclude, options.include_only), options, skip_bad=skip_bad)
+    chosen = selected(frames, options.exclude, options.include_only)
+    sources, unread = read_frames(chosen, options, skip_bad=skip_bad)
     if len(sources) < 2:
         if unread:
-            raise InputError(f"fewer than two pictures can be read; {unread[0].images[0]}: {unread[0].text}")
-        raise ArgumentError("stitching needs two different pictures or more; name at least one more")
+            few = "" if len(chosen) == 1 else "fewer than two images can be read; "
+            raise InputError(f"{few}{unread[0].images[0]}: {unread[0].text}")
+        twice = f"{chosen[0].path} is named twice: " if len(chosen) > 1 else ""
+        raise ArgumentError(f"{twice}stitching needs two different images or more; name at least one more")
     sources = with_attitudes(with_masks(sources, options.mask), options.attitude)
     return (sources if options.scheduler is None else [s.with_absolute_paths() for s in sources]), unread

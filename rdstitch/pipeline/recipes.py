@@ -19,6 +19,7 @@ from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.compose import blocks_on, compose_pictures, viewed_pictures, write_page
+from rdstitch.pipeline.map_canvas import check_map
 from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally
 from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs
 from rdstitch.pipeline.register import register, with_frontal_reference
@@ -139,6 +140,7 @@ def _stitch(
     with found_pictures(given, output=output, every=every, topic=options.topic) as found:
         _check_outputs(output, options, found.files)
         sources, unread = read_inputs(in_lasting_order(found.frames), options, skip_bad=not pano)
+        check_map(sources, options.composite)
         with options.executor(len(sources)) as executor:
             registration = register(sources, options, executor, skip_bad=not pano, prefer_turn=pano, progress=progress)
             registration = registration.with_messages([*unread, *found.messages])
@@ -300,6 +302,8 @@ def _composite(
             composed.plan,
             composed.fingerprint,
             local,
+            composed.place,
+            composed.place_reason,
         )
         if not options.dry_run:
             failed = outputs.attempt(options.save_camera or "", partial(_save_camera, registration, options, outputs))

@@ -6,12 +6,22 @@ from pathlib import Path
 from typing import Any
 
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, CompositePlan
+from rdstitch.export.georeference import Georeference
 from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.inputs.source import Source
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.messages import Message
 from rdstitch.sidecar.read import SavedRegistration
-from rdstitch.sidecar.write import VERSION, identity_fields, lens_fields, output_geometry, plain, to_output, versions
+from rdstitch.sidecar.write import (
+    VERSION,
+    georeference_fields,
+    identity_fields,
+    lens_fields,
+    output_geometry,
+    plain,
+    to_output,
+    versions,
+)
 from rdstitch.stitch_result import OutputImage
 
 
@@ -42,6 +52,8 @@ class Recomposition(OutputImage):
         Of :attr:`image`: "bgr" or "rgb".
     fingerprint : Fingerprint or None
         Size and digest of the file.
+    georeference, not_georeferenced
+        As of :class:`rdstitch.StitchResult`.
     """
 
     saved: SavedRegistration
@@ -56,6 +68,8 @@ class Recomposition(OutputImage):
     messages: tuple[Message, ...] = ()
     channel_order: ChannelOrder = "bgr"
     fingerprint: Fingerprint | None = None
+    georeference: Georeference | None = None
+    not_georeferenced: str = "not tried"
 
     @property
     def image_order(self) -> ChannelOrder:
@@ -100,6 +114,7 @@ def applied_sidecar(result: Recomposition) -> dict[str, Any]:
         "output": {
             **identity_fields(result.output, result.fingerprint),
             **output_geometry(result.canvas, turned=result.saved.turned),
+            "georeference": georeference_fields(result.georeference, result.not_georeferenced),
         },
         "images": entries,
         "pairs": [],

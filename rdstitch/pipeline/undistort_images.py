@@ -35,6 +35,7 @@ def undistort(
     distortion: float | None = None,
     view: Framing = "same",
     overwrite: bool = False,
+    topic: str | None = None,
     channel_order: ChannelOrder = "bgr",
     warn: Callable[[Message], None] = ignored,
     progress: Progress = silent,
@@ -50,6 +51,7 @@ def undistort(
     distortion: float | None = None,
     view: Framing = "same",
     overwrite: bool = False,
+    topic: str | None = None,
     channel_order: ChannelOrder = "bgr",
     warn: Callable[[Message], None] = ignored,
     progress: Progress = silent,
@@ -64,6 +66,7 @@ def undistort(
     distortion: float | None = None,
     view: Framing = "same",
     overwrite: bool = False,
+    topic: str | None = None,
     channel_order: ChannelOrder = "bgr",
     warn: Callable[[Message], None] = ignored,
     progress: Progress = silent,
@@ -85,6 +88,8 @@ def undistort(
         "same": size and scale at the centre stay. "all": everything that the picture shows, at that scale. "valid":
         the largest upright rectangle around the centre that the picture covers, at that scale.
     overwrite : bool
+    topic : str, optional
+        Of the images in ROS bags; None: the only one.
     channel_order : str
         Of arrays that come in or go out: "bgr" or "rgb".
     warn : callable
@@ -101,7 +106,7 @@ def undistort(
     if view not in ("same", "all", "valid"):
         raise ArgumentError(f"unknown view {view!r}; choose same, all or valid")
     given = as_inputs(inputs, channel_order)
-    with found_pictures(given, every=1) as found:
+    with found_pictures(given, every=1, topic=topic) as found:
         guard = InputGuard()
         sources, _ = read_sources(found.frames, camera=camera, distortion=distortion, skip_bad=False, guard=guard)
         for message in found.messages:

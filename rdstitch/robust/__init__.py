@@ -11,6 +11,7 @@ from rdstitch.robust.estimate import (
     SOLVERS,
     EstimationOptions,
     PairMatches,
+    SolverName,
     estimate_radial_homographies,
     estimate_radial_homography,
 )
@@ -21,6 +22,7 @@ __all__ = [
     "EstimationOptions",
     "PairMatches",
     "RansacOptions",
+    "SolverName",
     "estimate_radial_homographies",
     "estimate_radial_homography",
 ]

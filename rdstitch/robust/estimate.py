@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +19,8 @@ from rdstitch.robust.pair_models import PlanarPairModel
 from rdstitch.robust.ransac import RansacOptions, ransac
 from rdstitch.robust.verification import MIN_PLACES, places, rejection_reason
 
-SOLVERS = ("auto", "two_point", "three_point", "three_point_similarity", "four_point", "five_point")
+SolverName = Literal["auto", "two_point", "three_point", "three_point_similarity", "four_point", "five_point"]
+SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
 
 _NOT_IN_AUTO = "four_point"  # finds what three points find, from more samples
 _MATCHES_AT_ONCE = 1 << 14
@@ -112,7 +114,7 @@ def estimate_radial_homography(
     focal: float | None = None,
     focal_source: str | None = None,
     center: tuple[float, float] | None = None,
-    solver: str = "auto",
+    solver: SolverName = "auto",
     tilt: ArrayLike | None = None,
     distortion: float | None = None,
     quality: ArrayLike | None = None,
@@ -297,6 +299,7 @@ def _result(
         camera2=camera1.resized(pair.camera2.image_size),
         inliers=inliers,
         covariance=fit.covariance,
+        parameters=("distortion", *fit.model.parameters),
         distortion_std=fit.distortion_std,
         model=fit.model.name,
         motion=fit.model.motion(fit.state) if isinstance(fit.model, PlanarPairModel) else None,

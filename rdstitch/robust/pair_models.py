@@ -36,6 +36,11 @@ class PairModel(Protocol):
         """Name of the model in the family."""
         ...
 
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the P entries of a step."""
+        ...
+
     def initialize(self, homography: FloatArray, tilts: FloatArray | None = None) -> FloatArray:
         """States (B, S) that describe homographies (B, 3, 3), or come close; known tilts (B, 2, 2), radians."""
         ...
@@ -62,6 +67,7 @@ class HomographyPairModel:
     """Any homography, at unit norm: eight degrees of freedom orthogonal to H itself."""
 
     name: str = "homography"
+    parameters: tuple[str, ...] = field(default=tuple(f"tangent_{number}" for number in range(1, 9)), repr=False)
 
     def initialize(self, homography: FloatArray, tilts: FloatArray | None = None) -> FloatArray:
         """The homographies at unit norm."""
@@ -124,6 +130,13 @@ class PlanarPairModel:
         for row, entries in zip(directions, free, strict=True):
             row[[*entries]] = 1.0
         object.__setattr__(self, "_directions", directions)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the P entries of a step."""
+        free = () if self.tilts_known else ("psi", "theta")
+        height = ("log_height",) if self.height_free else ()
+        return (*free, "yaw", "tx", "ty", *height, *(("log_focal",) if self.focal_free else ()))
 
     @property
     def focal_free(self) -> bool:

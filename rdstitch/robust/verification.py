@@ -56,7 +56,9 @@ def rejection_reason(
     count = int(inliers.sum())
     cells = places(points1[inliers], points2[inliers], image_size)
     if cells < MIN_PLACES:
-        return f"{count} of {len(inliers)} matches agree, in only {cells} places of the picture"
+        if count < MIN_PLACES:
+            return f"only {count} of {len(inliers)} matches agree"
+        return f"{count} of {len(inliers)} matches agree, but they lie in {cells} places of the image only"
     by_chance = min(0.5, np.pi * threshold**2 / (image_size[0] * image_size[1]) + 0.01)
     trials = len(inliers) - 4
     if trials > 0 and betainc(max(1, count - 4), trials - count + 5, by_chance) > _MAX_CHANCE:

@@ -1,5 +1,6 @@
 """Reading a sidecar: a registration that was found before, checked field by field."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -13,6 +14,8 @@ from rdstitch.camera_record import read_lens
 from rdstitch.compositing import CompositeOptions
 from rdstitch.compositing.options import PROJECTIONS
 from rdstitch.errors import ArgumentError
+from rdstitch.export.crs import Crs
+from rdstitch.export.georeference import Georeference
 from rdstitch.io.deepzoom import tiles_folder
 from rdstitch.io.fingerprint import Fingerprint, fingerprint
 from rdstitch.local_alignment import DisplacementField
@@ -64,6 +67,8 @@ class SavedRegistration:
         Whether the camera turned on the spot, so that ``to_plane`` leads to directions.
     composite : CompositeOptions
         What the picture was composited with.
+    place : Georeference or None
+        Of the plane, where the output was georeferenced.
     content : dict
         The whole sidecar.
     """
@@ -74,6 +79,7 @@ class SavedRegistration:
     distortion: float
     turned: bool
     composite: CompositeOptions
+    place: Georeference | None
     content: dict[str, Any]
 
 
@@ -100,6 +106,7 @@ def read_sidecar(path: str | Path) -> SavedRegistration:
         record["lambda"].number(),
         record["model"].text() == "rotation",
         _as_laid_out(_composite_options(record["options"]["composite"]), record),
+        _place(record["output"]),
         record.value,
     )
 
@@ -128,6 +135,35 @@ def _check_output(record: Record) -> None:
         size.integer(0)
     if (digest := record.get("sha256")) is not None:
         digest.text()
+
+
+def _place(output: Record) -> Georeference | None:
+    """Where the plane lies on the Earth; versions before did not say."""
+    record = output.get("georeference")
+    if record is None or (code := record.get("crs")) is None:
+        return None
+    prefix, _, number = code.text().partition(":")
+    if prefix != "EPSG" or not number.isdecimal():
+        code.expected("EPSG: and a number")
+    try:
+        crs = Crs(int(number))
+    except ArgumentError as error:
+        code.fail(str(error))
+    (a, b, east), (_, _, north) = (row.numbers(3) for row in _two(record["pixel_to_map"]))
+    from_plane = output["plane_to_output"].matrix()
+    if not (a or b) or not np.any(from_plane[0, :2]):
+        record["pixel_to_map"].expected("a similarity")
+    off = [(item["name"].text(), item.get("off_m")) for item in record["rejected"].items()]
+    place = Georeference(
+        crs,
+        complex(a, b),
+        complex(east, north),
+        record["rms_m"].number(),
+        record["positions_used"].integer(0),
+        record["positions"].integer(0),
+        tuple((name, math.inf if away is None else away.number()) for name, away in off),
+    )
+    return place.after(np.linalg.inv(from_plane).astype(np.float64))
 
 
 def _picture(record: Record) -> SavedPicture:

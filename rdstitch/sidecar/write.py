@@ -14,6 +14,7 @@ from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas
 from rdstitch.compositing.panorama_canvas import center_of_view, field_of_view
 from rdstitch.compositing.projection import PLANE
+from rdstitch.export.georeference import Georeference
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.local_alignment import DisplacementField, LocalAlignment
 from rdstitch.stitch_result import StitchResult
@@ -54,16 +55,12 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
         "output": {
             **identity_fields(result.output, result.fingerprint),
             **output_geometry(result.canvas, turned=alignment.on_sphere),
+            "georeference": georeference_fields(result.georeference, result.not_georeferenced),
         },
         "local_alignment": _local_alignment(result.local_alignment),
         "images": _images(result),
         "pairs": _pairs(result),
-        "verdict": {
-            "ok": result.ok,
-            "failures": [message.clause for message in registration.failures],
-            "warnings": [message.clause for message in registration.warnings],
-            "relief": alignment.relief,
-        },
+        "verdict": {**dataclasses.asdict(result.verdict), "relief": alignment.relief},
         "options": result.options,
         "seed": result.options.seed,
         "versions": versions(),
@@ -116,6 +113,22 @@ def output_geometry(canvas: Canvas, *, turned: bool) -> dict[str, Any]:
         "wraps_around": canvas.period is not None,
         "field_of_view_deg": np.degrees(field_of_view(canvas)) if turned else None,
         "center_deg": np.degrees(center_of_view(canvas)) if turned else None,
+    }
+
+
+def georeference_fields(place: Georeference | None, reason: str) -> dict[str, Any]:
+    """Where the output lies on the Earth, by what; or why that is not known."""
+    if place is None:
+        return {"reason": reason}
+    return {
+        "crs": f"EPSG:{place.crs.epsg}",
+        "gsd_m": place.gsd,
+        "pixel_to_map": place.pixel_to_map,
+        "north_up": place.north_up,
+        "positions": place.positions,
+        "positions_used": place.used,
+        "rms_m": place.rms,
+        "rejected": [{"name": name, "off_m": away} for name, away in place.rejected],
     }
 
 

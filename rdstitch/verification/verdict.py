@@ -181,9 +181,8 @@ def _shape(paths: Sequence[str], alignment: Alignment) -> list[Message]:
     if shape.shown:
         text = f"may be off by {size}: the errors have a pattern that was not modelled, most likely {shape.cause}"
     else:
-        text = (
-            f"may be off by {size}: the pictures cannot exclude {shape.cause}; give the lens, or more rows of pictures"
-        )
+        remedy = "more rows of images" if alignment.distortion_std == 0.0 else "the lens, or more rows of images"
+        text = f"may be off by {size}: the images cannot exclude {shape.cause}; give {remedy}"
     return [Message(text, (image,), code="shape")]
 
 
@@ -209,7 +208,12 @@ def _outvoted(
         own = [pair for pair in pairs if (pair in ambiguous) == twice]
         if own:
             named = shortened([" and ".join(names_of([paths[i], paths[j]])) for i, j in own])
-            text = f"{len(own)} of the pairs fit {what}, and little depends on them: {named}"
+            fit = (
+                f"one pair fits {what}, and little depends on it"
+                if len(own) == 1
+                else (f"{len(own)} pairs fit {what}, and little depends on them")
+            )
+            text = f"{fit}: {named}"
             images = tuple(paths[k] for k in sorted({k for pair in own for k in pair}))
             text += "; look at the seams between them" if seams else ""
             result.append(Message(text, images, "note", code="doubtful-seam"))

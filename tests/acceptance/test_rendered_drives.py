@@ -24,6 +24,7 @@ def test_drive(path: str, tmp_path: Path) -> None:
     assert abs(registration.alignment.distortion - DISTORTION) < 0.001
 
 
+@pytest.mark.slow
 def test_short_drive_by_the_command(tmp_path: Path) -> None:
     sequence = floor_drive("parking", 12, seed=7, size=(320, 240), overlap=0.7)
     frames, output = tmp_path / "frames", tmp_path / "path.csv"

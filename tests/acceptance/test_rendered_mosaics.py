@@ -44,6 +44,7 @@ def _sequence(view: View, seed: int) -> Sequence:
     return sequence_over(lambda size: ground(size, seed), lens, poses, photometry=light, seed=seed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SETS)
 def test_mosaic(name: str, tmp_path: Path) -> None:
     view = SETS[name]

@@ -201,7 +201,7 @@ def is_rdstitch_output(file: Path) -> Any:
 _CONFIGURATIONS = (
     b'[common]\nfeatures = "sift"\nwork-megapixels = 2.5\noverwrite = true\nworkers = 2\n\n[mosaic]\nscale = 0.5\n'
     b'blend = "feather"\ntilt = "1.5,-0.5"\nmax-memory = "800M"\n[trajectory]\nformat = "tum"\nheight = 0.42\n',
-    b'[pano]\nlambda = -0.2\nattitude-std = "0.5"\nseed = 0x10\n[apply]\ncrop = """auto"""\nmatch = "name"\n',
+    b'[pano]\nlambda = -0.2\nattitude-std = "0.5"\nseed = 0x10\n[apply]\ncrop = true\nmatch = """name"""\n',
 )
 _TABLES = b"name,psi,theta\na.jpg,1.5,-2\nb.jpg,0,0\n", b'theta,"x",psi,name\r\n1,2,3,"a.jpg"\r\n4,5,6,b.jpg'
 _LISTS = b"a.jpg\nb c.jpg\n\n*.png\n@list\n", b"/nowhere/[a]?.tif\r\nx\0y\n"

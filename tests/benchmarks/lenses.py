@@ -23,7 +23,7 @@ from rdstitch.camera import Camera
 from rdstitch.errors import RdstitchError
 from rdstitch.executors import open_executor
 from rdstitch.inputs.source import read_sources
-from rdstitch.options import StitchOptions
+from rdstitch.options import LensName, StitchOptions
 from rdstitch.pipeline.register import register
 from rdstitch.radial_homography import to_plane
 from rdstitch.synthetic import (
@@ -89,7 +89,7 @@ class Figures:
     percentile95: float
 
 
-def measure(name: str, seed: int, chosen: str, files: list[Path], sequence: Sequence) -> Figures:
+def measure(name: str, seed: int, chosen: LensName, files: list[Path], sequence: Sequence) -> Figures:
     """One set through the registration, with a line of its own."""
     start = time.process_time()
     sources, _ = read_sources(files, camera=None, focal=None, distortion=None, skip_bad=False)

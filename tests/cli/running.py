@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -38,6 +39,11 @@ DISTORTION = -0.2
 
 # Small pictures need no more, and every command of these tests takes a second less.
 FAST = ("-j", "1", "--max-features", "600")
+
+_cache = tempfile.TemporaryDirectory(prefix="rdstitch-tests-")
+
+# For tests of what comes before and after registration: the same pictures are registered once in a process of tests.
+CACHED = (*FAST, "--cache", _cache.name)
 
 
 _MADE = re.compile(r", \d+\.\d s$")

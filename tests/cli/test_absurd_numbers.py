@@ -11,7 +11,7 @@ from PIL import Image
 
 from rdstitch.errors import ImpossibleCameraError
 from rdstitch.pipeline import register
-from tests.cli.running import FAST, Run
+from tests.cli.running import CACHED, Run
 
 
 @pytest.mark.parametrize(
@@ -25,13 +25,13 @@ from tests.cli.running import FAST, Run
     ],
 )
 def test_options(rdstitch: Run, frames: list[Path], tmp_path: Path, options: tuple[str, str], words: str) -> None:
-    done = rdstitch("pano", *frames[:2], "-o", tmp_path / "out.png", *FAST, *options)
+    done = rdstitch("pano", *frames[:2], "-o", tmp_path / "out.png", *CACHED, *options)
     assert (done.status, words in done.line) == (2, True)
 
 
 def test_numbers_where_a_configuration_may_have_units(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text("[common]\nattitude-std = 1.0\nmax-memory = 800_000_000\n", encoding="utf-8")
-    arguments = ("pano", *frames[:2], "-o", tmp_path / "out.png", *FAST, "--config", tmp_path / "a.toml")
+    arguments = ("pano", *frames[:2], "-o", tmp_path / "out.png", *CACHED, "--config", tmp_path / "a.toml")
     assert rdstitch(*arguments).status == 0
     for value in ("-1.0", "nan", "true", "[1.0]"):
         (tmp_path / "a.toml").write_text(f"[common]\nattitude-std = {value}\n", encoding="utf-8")
@@ -55,7 +55,7 @@ def _scaled(factor: float) -> Any:
 )
 def test_sidecars(rdstitch: Run, frames: list[Path], tmp_path: Path, field: str, value: Any) -> None:
     sidecar = tmp_path / "a.png.json"
-    assert rdstitch("pano", *frames[:2], "-o", tmp_path / "a.png", *FAST).status == 0
+    assert rdstitch("pano", *frames[:2], "-o", tmp_path / "a.png", *CACHED).status == 0
     record = json.loads(sidecar.read_text(encoding="utf-8"))
     record["images"][1][field] = value
     sidecar.write_text(json.dumps(record), encoding="utf-8")
@@ -70,7 +70,7 @@ def test_an_impossible_estimate_is_no_wrong_usage(
         raise ImpossibleCameraError("distortion -1.2 folds the picture")
 
     monkeypatch.setattr(register, "separate_lenses", fail)
-    done = rdstitch("pano", *frames[:2], "-o", tmp_path / "out.png", *FAST)
+    done = rdstitch("pano", *frames[:2], "-o", tmp_path / "out.png", *CACHED)
     assert (done.status, "no reliable result" in done.line) == (4, True)
 
 
@@ -81,12 +81,12 @@ def test_no_memory_for_opencv(
         cv2.resize(np.zeros((1000, 1000)), (2**20, 2**20))
 
     monkeypatch.setattr(register, "separate_lenses", fail)
-    done = rdstitch("pano", *frames[:2], "-o", tmp_path / "out.png", *FAST)
+    done = rdstitch("pano", *frames[:2], "-o", tmp_path / "out.png", *CACHED)
     assert (done.status, "out of memory" in done.line) == (7, True)
 
 
 def test_webp_obeys_the_memory_limit(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    arguments = ("pano", *frames[:2], *FAST, "--scale", "5", "--max-memory", "120M")
+    arguments = ("pano", *frames[:2], *CACHED, "--scale", "5", "--max-memory", "120M")
     done = rdstitch(*arguments, "-o", tmp_path / "out.webp")
     assert (done.status, "--max-memory allows 120 MB; write a .tif" in done.line) == (7, True)
     assert not list(tmp_path.iterdir())
@@ -95,7 +95,7 @@ def test_webp_obeys_the_memory_limit(rdstitch: Run, frames: list[Path], tmp_path
 def test_a_picture_larger_than_the_memory_limit(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     large = tmp_path / "large.png"
     Image.new("RGB", (6000, 5000)).save(large)
-    done = rdstitch("pano", frames[0], large, "-o", tmp_path / "out.png", *FAST, "--max-memory", "100M")
+    done = rdstitch("pano", frames[0], large, "-o", tmp_path / "out.png", *CACHED, "--max-memory", "100M")
     assert (done.status, f"{large}: 6000 x 5000 pixels need" in done.line) == (7, True)
-    done = rdstitch("mosaic", *frames[:2], large, "-o", tmp_path / "out.png", *FAST, "--max-memory", "100M")
+    done = rdstitch("mosaic", *frames[:2], large, "-o", tmp_path / "out.png", *CACHED, "--max-memory", "100M")
     assert (done.status, f"left out {large}" in done.line) == (0, True)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rdstitch.io import read_image
-from tests.cli.running import FAST, Outcome, Run
+from tests.cli.running import CACHED, Outcome, Run
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +19,7 @@ def stitched(frames: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Pa
 
     folder = tmp_path_factory.mktemp("stitched")
     arguments = ["mosaic", *map(str, frames), "-o", str(folder / "field.tif"), "--scale", "0.8", "--rotate", "10"]
-    assert run([*arguments, *FAST]) == 0
+    assert run([*arguments, *CACHED]) == 0
     return folder / "field.tif"
 
 
@@ -51,7 +51,7 @@ def test_local_alignment_is_applied_again(rdstitch: Run, frames: list[Path], tmp
     made = {}
     for choice in ("auto", "off", "5"):
         made[choice] = tmp_path / f"{choice}.png"
-        done = rdstitch("mosaic", *frames, "-o", made[choice], "--local-alignment", choice, *FAST)
+        done = rdstitch("mosaic", *frames, "-o", made[choice], "--local-alignment", choice, *CACHED)
         assert done.status == 0
     assert made["auto"].read_bytes() == made["off"].read_bytes() != made["5"].read_bytes()
     content = json.loads(_sidecar(made["5"]).read_text(encoding="utf-8"))
@@ -82,7 +82,7 @@ def test_given_options_win_over_those_of_the_sidecar(
     changed, direct = tmp_path / "changed.png", tmp_path / "direct.png"
     options = ("--scale", "0.4", "--rotate", "0", "--blend", "feather")
     assert _apply(rdstitch, _sidecar(stitched), frames[0].parent, changed, *options).status == 0
-    assert rdstitch("mosaic", *frames, "-o", direct, *options, *FAST).status == 0
+    assert rdstitch("mosaic", *frames, "-o", direct, *options, *CACHED).status == 0
     assert changed.read_bytes() == direct.read_bytes()
 
 

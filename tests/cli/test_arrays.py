@@ -80,7 +80,7 @@ def test_arrays_mix_with_paths_and_the_sidecar_names_them(
 def test_a_single_path_is_one_input(frames: list[Path], of_files: rdstitch.StitchResult) -> None:
     for single in (str(frames[0].parent), frames[0].parent):
         assert rdstitch.pano(single, options=_OPTIONS).distortion == of_files.distortion
-    with pytest.raises(ArgumentError, match="two different pictures"):
+    with pytest.raises(ArgumentError, match="two different images"):
         rdstitch.mosaic(str(frames[0]))
     with pytest.raises(InputError, match=r"no_such\.jpg"):
         rdstitch.mosaic("no_such.jpg")
@@ -152,3 +152,9 @@ def test_what_a_notebook_shows(of_files: rdstitch.StitchResult) -> None:
     assert planned._repr_png_() is None
     with pytest.raises(ArgumentError, match="no picture in memory"):
         _ = planned.image
+
+
+def test_none_is_told_what_it_is() -> None:
+    unreadable: Any = [None, "b.png"]
+    with pytest.raises(ArgumentError, match=r"image 0 is None, which cv2\.imread returns"):
+        rdstitch.pano(unreadable)

@@ -9,7 +9,7 @@ from PIL import Image
 import rdstitch
 from rdstitch.camera import Camera
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
-from tests.cli.running import FAST, Run
+from tests.cli.running import CACHED, Run
 from tests.drone_xmp import euler_angles, xmp_of
 
 
@@ -77,7 +77,7 @@ def test_pictures_without_attitude_are_named(
     rdstitch: Run, windy: Sequence, frames: list[Path], tmp_path: Path
 ) -> None:
     paths = _with_xmp(windy, tmp_path, "parrot-camera")[:2]
-    arguments = ("calibrate", "--attitude", "xmp", "-o", tmp_path / "camera.json", *FAST)
+    arguments = ("calibrate", "--attitude", "xmp", "-o", tmp_path / "camera.json", *CACHED)
     assert rdstitch(*arguments, *paths).status == 0
     (tmp_path / "camera.json").unlink()
     some = rdstitch(*arguments, *paths, frames[0])
@@ -136,7 +136,7 @@ def test_pairs_get_one_tilt_a_picture(windy: Sequence, tmp_path: Path) -> None:
 )
 def test_tables_that_are_none(rdstitch: Run, frames: list[Path], tmp_path: Path, content: str, wrong: str) -> None:
     (tmp_path / "imu.csv").write_text(content.replace("frame_0000.png", frames[0].name))
-    arguments = ("mosaic", *frames, "--attitude", tmp_path / "imu.csv", "-o", tmp_path / "out.png", *FAST)
+    arguments = ("mosaic", *frames, "--attitude", tmp_path / "imu.csv", "-o", tmp_path / "out.png", *CACHED)
     done = rdstitch(*arguments)
     assert done.status == 3
     assert "imu.csv" in done.line
@@ -147,6 +147,6 @@ def test_tables_that_are_none(rdstitch: Run, frames: list[Path], tmp_path: Path,
 def test_the_command_takes_degrees(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     rows = [f"{frame.name},0,0" for frame in frames]
     (tmp_path / "imu.csv").write_text("\n".join(["name,psi,theta", *rows]))
-    arguments = ("calibrate", *frames, "--attitude", tmp_path / "imu.csv", "-o", tmp_path / "camera.json", *FAST)
+    arguments = ("calibrate", *frames, "--attitude", tmp_path / "imu.csv", "-o", tmp_path / "camera.json", *CACHED)
     assert rdstitch(*arguments, "--attitude-std", "10").status == 0
     assert rdstitch(*arguments, "--overwrite", "--attitude-std", "-1").status == 2

@@ -10,7 +10,7 @@ import rdstitch as library
 from rdstitch.camera_files import load_camera
 from rdstitch.camera_files.lens_models import Fisheye, fisheye_of
 from rdstitch.synthetic import FisheyeLens, ground
-from tests.cli.running import FAST, Run
+from tests.cli.running import CACHED, Run
 
 SIZE = (400, 300)
 LENS = FisheyeLens(SIZE, 105.0, offset=(4.0, -3.0))  # 90 degrees off the axis at 165 pixels
@@ -88,7 +88,7 @@ def test_undistorted_pictures_are_masked(rdstitch: Run, folder: Path, tmp_path: 
 def test_a_mosaic_of_what_is_before_the_camera(rdstitch: Run, folder: Path, tmp_path: Path) -> None:
     pictures = [folder / f"{number}.png" for number in range(3)]
     lens = ("--camera", folder / "fisheye.yml")
-    assert rdstitch("pano", *pictures, "-o", tmp_path / "a.png", *lens, *FAST).status == 0
+    assert rdstitch("pano", *pictures, "-o", tmp_path / "a.png", *lens, *CACHED).status == 0
     picture = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
     assert picture is not None
     assert (picture[[0, 0, -1, -1], [0, -1, 0, -1], 3] == 0).all()

@@ -8,12 +8,12 @@ import pytest
 
 from rdstitch.camera import Camera
 from rdstitch.camera_files import load_camera
-from tests.cli.running import DISTORTION, FAST, Run
+from tests.cli.running import CACHED, DISTORTION, Run
 
 
 def test_writes_a_camera_that_pano_takes(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     file = tmp_path / "camera.json"
-    done = rdstitch("calibrate", frames[0].parent, "-o", file, *FAST)
+    done = rdstitch("calibrate", frames[0].parent, "-o", file, *CACHED)
     assert done.status == 0
     camera = Camera.load(file)
     first, *others = done.err.splitlines()
@@ -25,25 +25,25 @@ def test_writes_a_camera_that_pano_takes(rdstitch: Run, frames: list[Path], tmp_
     assert camera.image_size == (400, 300)
     assert [path.name for path in tmp_path.iterdir()] == ["camera.json"]
 
-    stitched = rdstitch("pano", *frames[:2], "-o", tmp_path / "pano.jpg", "--camera", file, *FAST)
+    stitched = rdstitch("pano", *frames[:2], "-o", tmp_path / "pano.jpg", "--camera", file, *CACHED)
     assert (stitched.status, stitched.out) == (0, done.out)
 
 
 def test_keeps_an_existing_camera_file(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     file = tmp_path / "camera.json"
     file.write_text("mine", encoding="utf-8")
-    done = rdstitch("calibrate", *frames, "-o", file, *FAST)
+    done = rdstitch("calibrate", *frames, "-o", file, *CACHED)
     assert done.status == 6
     assert str(file) in done.line
     assert "--overwrite" in done.line
     assert file.read_text(encoding="utf-8") == "mine"
-    assert rdstitch("calibrate", *frames, "-o", file, "--overwrite", *FAST).status == 0
+    assert rdstitch("calibrate", *frames, "-o", file, "--overwrite", *CACHED).status == 0
     assert Camera.load(file).image_size == (400, 300)
 
 
 @pytest.mark.parametrize("name", ["camera.yml", "cameras.json", "lens.pto"])
 def test_camera_files_of_others(rdstitch: Run, frames: list[Path], tmp_path: Path, name: str) -> None:
-    done = rdstitch("calibrate", *frames[:2], "-o", tmp_path / name, *FAST)
+    done = rdstitch("calibrate", *frames[:2], "-o", tmp_path / name, *CACHED)
     assert done.status == 0
     assert re.search(rf"{name}: its lens model is at most 0\.\d+ pixels from the lens", done.err)
     assert f"{load_camera(tmp_path / name).distortion:.6f}\n" == done.out
@@ -63,6 +63,6 @@ def test_the_residual_of_a_foreign_lens_is_reported(rdstitch: Run, frames: list[
 
 
 def test_a_name_that_is_no_camera_file_is_refused_early(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    done = rdstitch("calibrate", *frames, "-o", tmp_path / "camera.txt", *FAST)
+    done = rdstitch("calibrate", *frames, "-o", tmp_path / "camera.txt", *CACHED)
     assert done.status == 6
     assert ".yml" in done.line

@@ -87,6 +87,7 @@ def test_a_cluster_gives_the_same_bytes_though_a_worker_dies(
     assert [done for stage, done in steps if stage == "detecting features"] == list(range(1, _PICTURES + 1))
 
 
+@pytest.mark.slow
 def test_one_and_four_worker_processes_give_the_same_bytes(
     pictures: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,7 +13,7 @@ from rdstitch.compositing import CompositeOptions
 from rdstitch.io import read_image
 from rdstitch.io.deepzoom import read_deep_zoom
 from rdstitch.pipeline import StitchOptions, mosaic
-from tests.cli.running import FAST, Run
+from tests.cli.running import CACHED, Run
 
 LIBRARY_ONLY = {"bands", "tile_size", "workers"}
 
@@ -33,7 +33,7 @@ def sidecar(frames: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Pat
     from rdstitch_cli.main import run
 
     output = tmp_path_factory.mktemp("registered") / "small.png"
-    assert run(["mosaic", *map(str, frames), "-o", str(output), "--scale", "0.3", *FAST]) == 0
+    assert run(["mosaic", *map(str, frames), "-o", str(output), "--scale", "0.3", *CACHED]) == 0
     return output.with_name("small.png.json")
 
 
@@ -65,7 +65,7 @@ def test_every_way_makes_another_picture_of_the_same_place(
 
 def test_crop_leaves_no_hole(rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path) -> None:
     output = tmp_path / "cropped.png"
-    done = rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--crop", "auto", "--scale", "1")
+    done = rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--crop", "--scale", "1")
     assert (done.status, done.err) == (0, "")
     picture = read_image(output)
     assert picture.alpha is None or (picture.alpha == 255).all()
@@ -104,7 +104,7 @@ def test_amounts_of_memory() -> None:
 
 
 def test_dry_run_reports_and_writes_nothing(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    done = rdstitch("mosaic", *frames, "-o", tmp_path / "a.tif", "--dry-run", *FAST)
+    done = rdstitch("mosaic", *frames, "-o", tmp_path / "a.tif", "--dry-run", *CACHED)
     assert (done.status, done.err) == (0, "")
     assert not list(tmp_path.iterdir())
     distortion, *plan = done.out.splitlines()
@@ -112,7 +112,7 @@ def test_dry_run_reports_and_writes_nothing(rdstitch: Run, frames: list[Path], t
     told = dict(line.split(": ") for line in plan)
     assert set(told) == {"pictures", "canvas", "output", "memory", "time"}
     assert told["pictures"] == "3"
-    assert rdstitch("mosaic", *frames, "-o", tmp_path / "a.png", *FAST).status == 0
+    assert rdstitch("mosaic", *frames, "-o", tmp_path / "a.png", *CACHED).status == 0
     height, width = read_image(tmp_path / "a.png").pixels.shape[:2]
     assert told["canvas"].startswith(f"{width} x {height} pixels")
 
@@ -130,12 +130,12 @@ def test_file_and_memory_hold_the_same_picture(frames: list[Path], tmp_path: Pat
 
 def test_deep_zoom_is_the_same_picture(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     output, report = tmp_path / "a.dzi", tmp_path / "report.html"
-    command = ("mosaic", *frames, "-o", output, "--report", report, *FAST)
+    command = ("mosaic", *frames, "-o", output, "--report", report, *CACHED)
     assert rdstitch(*command, "--dry-run").status == 0
     assert not list(tmp_path.iterdir())
     assert rdstitch(*command).status == 0
     assert {path.name for path in tmp_path.iterdir()} == {"a.dzi", "a_files", "a.dzi.json", "a.html", "report.html"}
-    assert rdstitch("mosaic", *frames, "-o", tmp_path / "a.png", *FAST).status == 0
+    assert rdstitch("mosaic", *frames, "-o", tmp_path / "a.png", *CACHED).status == 0
     whole = read_image(tmp_path / "a.png")
     assert whole.alpha is not None
     height, width = whole.alpha.shape

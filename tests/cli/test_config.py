@@ -15,7 +15,7 @@ from rdstitch_cli.main import cli
 
 from rdstitch.camera import Camera
 from rdstitch.errors import InputError
-from tests.cli.running import FAST, Run
+from tests.cli.running import CACHED, Run
 from tests.damaged_texts import damaged_text
 
 _DOCUMENT = Path(__file__).parents[2] / "docs" / "configuration.md"
@@ -91,7 +91,7 @@ def test_what_does_not_fit_is_refused(
 ) -> None:
     file = _written(tmp_path, text)
     # The whole file is checked, whichever command runs.
-    done = rdstitch("pano", *frames[:2], "-o", tmp_path / "out.png", "--config", file, *FAST)
+    done = rdstitch("pano", *frames[:2], "-o", tmp_path / "out.png", "--config", file, *CACHED)
     assert done.status == 3
     assert done.line.startswith(f"rdstitch: {file}: ")
     assert named in done.line
@@ -111,14 +111,19 @@ def _plausible(option: click.Option) -> Any:
         return str(option.type.choices[0])
     if isinstance(option.type, (click.types.IntParamType, click.types.FloatParamType)):
         return 2
-    return {"tilt": "1,2", "attitude_std": "0.5", "max_memory": "1G", "local_alignment": "auto", "every": "auto"}.get(
-        option.name or "", "name"
-    )
+    return {
+        "tilt": "1,2",
+        "attitude_std": "0.5",
+        "max_memory": "1G",
+        "local_alignment": "auto",
+        "every": "auto",
+        "epsg": "25832",
+    }.get(option.name or "", "name")
 
 
 @pytest.mark.parametrize("name", sorted(cli.commands))
 def test_every_option_can_be_in_the_file(name: str, tmp_path: Path) -> None:
-    options = [p for p in cli.commands[name].params if isinstance(p, click.Option) and p.name != "config"]
+    options = [p for p in cli.commands[name].params if isinstance(p, click.Option) and p.expose_value]
     values = {p.name: [_plausible(p)] if p.multiple else _plausible(p) for p in options}
     lines = [f"{max(p.opts, key=len)[2:]} = {json.dumps(values[p.name])}" for p in options]
     assert read_config(_written(tmp_path, "\n".join([f"[{name}]", *lines])), cli.commands, name) == values

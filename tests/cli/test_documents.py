@@ -2,10 +2,12 @@
 
 import doctest
 import re
+import runpy
 import tomllib
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from rdstitch_cli.main import cli
 
 from tests.documented_figures import FEATURES, README, ROOT, feature_row, readme, without_seconds
@@ -65,3 +67,16 @@ def test_every_page_is_in_the_site() -> None:
 def test_version_is_the_same_everywhere() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert f"version: {project['version']}" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+
+
+def test_the_python_of_readme_runs(tmp_path: Path, frames: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    (block,) = re.findall(r"(?ms)^```python\n(.*?)^```$", README.read_text(encoding="utf-8"))
+    example = ROOT / "examples" / "readme.py"
+    # There mypy checks it.
+    assert example.read_text(encoding="utf-8").endswith(block)
+    for name, frame in zip(("left", "right"), frames, strict=False):
+        with Image.open(frame) as image:
+            image.save(tmp_path / f"{name}.jpg")
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(example))
+    assert (tmp_path / "pano.png").exists()

@@ -22,8 +22,11 @@ def _options(command: click.Command) -> list[click.Option]:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_has_examples_exit_statuses_and_every_option(rdstitch: Run, name: str) -> None:
-    shown = rdstitch(name, "--help")
-    assert shown.status == 0
+    brief = rdstitch(name, "--help")
+    shown = rdstitch(name, "--help-all") if "--help-all" in brief.out else brief
+    assert (brief.status, shown.status) == (0, 0)
+    assert sum(line.startswith("  -") for line in brief.out.splitlines()) <= 25
+    assert "RANGE" not in shown.out
     assert f"rdstitch {name} " in shown.out
     assert "Exit status:" in shown.out
     assert "Other options" not in shown.out, "options without a group in help_pages.py"
@@ -57,13 +60,29 @@ def test_every_status_of_the_error_tree_is_documented() -> None:
         assert re.search(rf"^\s+{kind.exit_status}\s+\S", EXIT_STATUSES, re.MULTILINE), kind
 
 
-def test_options_of_one_name_mean_the_same_everywhere() -> None:
-    meanings: dict[str, set[str]] = {}
-    for name in COMMANDS:
-        for option in _options(cli.commands[name]):
-            if option.name not in ("output", "reference"):
-                meanings.setdefault(option.opts[-1], set()).add(f"{option.help} {option.default}")
-    assert {text: found for text, found in meanings.items() if len(found) > 1} == {}
+@pytest.mark.parametrize("name", COMMANDS)
+def test_options_speak_of_their_own_command(name: str) -> None:
+    for option in _options(cli.commands[name]):
+        others = {other for other in COMMANDS if other != name and re.search(rf"\b{other}\b", option.help or "")}
+        # What INPUT may be is described once.
+        assert others <= {"mosaic"}, option.name
+
+
+def test_the_bare_command_shows_all_of_its_help(rdstitch: Run) -> None:
+    assert rdstitch().err == rdstitch("-h").out
+    assert "..." not in rdstitch("-h").out.partition("Examples:")[0].partition("[ARGS]...")[2]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_topic_of_a_bag_can_be_given_wherever_a_bag_is_read(name: str) -> None:
+    assert any(option.name == "topic" for option in _options(cli.commands[name]))
+
+
+@pytest.mark.parametrize("given", [("--max-size", "2000x1000"), ("--scale", "large"), ("--quality", "101")])
+def test_what_is_no_number_is_told_what_was_expected(rdstitch: Run, given: tuple[str, str]) -> None:
+    done = rdstitch("pano", "a.jpg", "b.jpg", "-o", "c.jpg", *given)
+    assert done.status == 2
+    assert re.search(rf"'{given[0]}': expected one (whole )?number.*, not '{given[1]}'", done.line)
 
 
 @pytest.mark.parametrize("name", ["pano", "mosaic", "calibrate", "trajectory"])

@@ -13,9 +13,10 @@ if not hasattr(cv2, "ALIKED"):
     pytest.skip("this OpenCV has no ALIKED", allow_module_level=True)
 
 from tests.networks import KEYPOINTS, save_aliked, save_lightglue
+from tests.sampled import sampled
 
 
-@pytest.mark.parametrize("matcher", ["distances", "lightglue"])
+@pytest.mark.parametrize("matcher", sampled(["lightglue", "distances"]))
 def test_pictures_are_stitched_by_networks(rdstitch: Run, frames: list[Path], tmp_path: Path, matcher: str) -> None:
     aliked = save_aliked(tmp_path / "aliked.onnx")
     matching = ("--lightglue-model", save_lightglue(tmp_path / "glue.onnx")) if matcher == "lightglue" else ()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rdstitch.io import read_image, write_image
-from tests.cli.running import DISTORTION, FAST, Run, flight
+from tests.cli.running import CACHED, DISTORTION, Run, flight
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def test_a_picture_that_fails_its_checks_is_left_out_by_name(
     rdstitch: Run, spoiled: list[Path], tmp_path: Path, strict: bool
 ) -> None:
     extra = ("--strict",) if strict else ()
-    done = rdstitch("mosaic", *spoiled, "-o", tmp_path / "out.png", *FAST, *extra)
+    done = rdstitch("mosaic", *spoiled, "-o", tmp_path / "out.png", *CACHED, *extra)
     assert done.status == (5 if strict else 0)
     assert f"left out {spoiled[4]}" in done.err
     assert not any(f"left out {path}" in done.err for path in spoiled[:4])
@@ -36,6 +36,6 @@ def test_a_picture_that_fails_its_checks_is_left_out_by_name(
 
 def test_pictures_of_another_block_are_named_in_one_line(rdstitch: Run, tmp_path: Path) -> None:
     own, others = flight(3, 3).write(tmp_path, "a{}.png"), flight(29, 2).write(tmp_path, "b{}.png")
-    done = rdstitch("mosaic", *own, *others, "-o", tmp_path / "out.png", *FAST)
+    done = rdstitch("mosaic", *own, *others, "-o", tmp_path / "out.png", *CACHED)
     (line,) = [line for line in done.err.splitlines() if "left out" in line]
     assert f"left out {others[0]}, {others[1].name}: in block 2 of 2, whose 2 pictures overlap with none" in line

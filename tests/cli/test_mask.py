@@ -10,7 +10,7 @@ import pytest
 
 from rdstitch.io import read_image
 from tests.adverse_sets import adverse_set
-from tests.cli.running import DISTORTION, FAST, Run
+from tests.cli.running import CACHED, DISTORTION, Run
 
 LEG = (255, 0, 255)
 
@@ -54,7 +54,7 @@ def test_a_leg_is_neither_matched_nor_shown(
             shutil.copy(mask, tmp_path / "masks" / path.name)
         mask = tmp_path / "masks"
     output = tmp_path / "out.png"
-    done = rdstitch(command, *sorted(legs.iterdir()), "-o", output, "--mask", mask, *FAST)
+    done = rdstitch(command, *sorted(legs.iterdir()), "-o", output, "--mask", mask, *CACHED)
     assert (done.status, done.err) == (0, "")
     assert abs(float(done.out) - DISTORTION) < 0.01
     assert leg_pixels(output) == 0
@@ -64,7 +64,7 @@ def test_a_leg_is_neither_matched_nor_shown(
 
 def test_without_a_mask_the_leg_is_seen_and_apply_takes_masks_too(rdstitch: Run, legs: Path, tmp_path: Path) -> None:
     output, again = tmp_path / "out.png", tmp_path / "again.png"
-    assert rdstitch("mosaic", legs, "-o", output, "--mask", tmp_path / "mask.png", *FAST).status == 0
+    assert rdstitch("mosaic", legs, "-o", output, "--mask", tmp_path / "mask.png", *CACHED).status == 0
     arguments = ("apply", f"{output}.json", "--images", legs, "-o", again, "--overwrite", "-j", "1")
     assert rdstitch(*arguments).status == 0
     assert leg_pixels(again) > 1000
@@ -76,7 +76,7 @@ def test_without_a_mask_the_leg_is_seen_and_apply_takes_masks_too(rdstitch: Run,
 def test_masks_help_where_nothing_is_composited(
     rdstitch: Run, legs: Path, tmp_path: Path, command: str, suffix: str
 ) -> None:
-    done = rdstitch(command, legs, "-o", tmp_path / f"out.{suffix}", "--mask", tmp_path / "mask.png", *FAST)
+    done = rdstitch(command, legs, "-o", tmp_path / f"out.{suffix}", "--mask", tmp_path / "mask.png", *CACHED)
     assert done.status == 0
     assert abs(float(done.out) - DISTORTION) < 0.01
 
@@ -84,14 +84,14 @@ def test_masks_help_where_nothing_is_composited(
 def test_pictures_without_a_mask_are_reported(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     (tmp_path / "masks").mkdir()
     assert cv2.imwrite(str(tmp_path / "masks" / f"{frames[0].stem}.bmp"), np.full((30, 40), 255, np.uint8))
-    done = rdstitch("pano", *frames, "-o", tmp_path / "out.png", "--mask", tmp_path / "masks", *FAST)
+    done = rdstitch("pano", *frames, "-o", tmp_path / "out.png", "--mask", tmp_path / "masks", *CACHED)
     assert done.status == 0
     assert done.line.endswith(f"2 of 3 pictures have no mask: {frames[1].name}, {frames[2].name}")
 
 
 def test_a_mask_that_does_not_fit_is_named(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     mask = tmp_path / "mask.png"
-    arguments = ("mosaic", frames[0].parent, "-o", tmp_path / "out.png", "--mask", mask, *FAST)
+    arguments = ("mosaic", frames[0].parent, "-o", tmp_path / "out.png", "--mask", mask, *CACHED)
     done = rdstitch(*arguments)
     assert done.status == 3
     assert str(mask) in done.line
@@ -107,7 +107,7 @@ def test_a_black_border_in_all_pictures_is_masked(rdstitch: Run, tmp_path: Path)
     pictures = tmp_path / "pictures"
     pictures.mkdir()
     adverse_set("round border", 2).write(pictures)
-    done = rdstitch("mosaic", pictures, "-o", tmp_path / "out.png", *FAST)
+    done = rdstitch("mosaic", pictures, "-o", tmp_path / "out.png", *CACHED)
     assert done.status == 0
     assert "of every picture is black, or stays where it is" in done.err
     found = read_image(tmp_path / "out.png")

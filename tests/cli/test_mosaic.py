@@ -11,13 +11,13 @@ import pytest
 from examples.judging import alignment_error
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.synthetic import Sequence
-from tests.cli.running import DISTORTION, FAST, Run, finished, start, transfers
+from tests.cli.running import CACHED, DISTORTION, Run, finished, start, transfers
 
 
 def test_a_folder_becomes_one_rectified_picture(
     rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path
 ) -> None:
-    done = rdstitch("mosaic", frames[0].parent, "-o", tmp_path / "mosaic.tif", *FAST)
+    done = rdstitch("mosaic", frames[0].parent, "-o", tmp_path / "mosaic.tif", *CACHED)
     assert (done.status, done.err) == (0, "")
     assert abs(float(done.out) - DISTORTION) < 0.01
     record = json.loads((tmp_path / "mosaic.tif.json").read_text(encoding="utf-8"))
@@ -36,7 +36,7 @@ def test_every_way_to_name_pictures(frames: list[Path], tmp_path: Path, how: str
     inputs = {"files": names, "pattern": [f"{frames[0].parent}/frame_*.png"], "list": [f"@{listing}"]}.get(how, ["-"])
     if inputs == ["-"]:
         data = ("\n" if how == "newlines" else "\0").join(names).encode()
-    process = start("mosaic", *inputs, "-o", tmp_path / "mosaic.jpg", "--scale", "0.5", *FAST, stdin=-1)
+    process = start("mosaic", *inputs, "-o", tmp_path / "mosaic.jpg", "--scale", "0.5", *CACHED, stdin=-1)
     assert finished(process, data).status == 0
     record = json.loads((tmp_path / "mosaic.jpg.json").read_text(encoding="utf-8"))
     assert [image["name"] for image in record["images"]] == [path.name for path in frames]
@@ -47,7 +47,7 @@ def test_an_unreadable_picture_is_left_out_by_name(rdstitch: Run, frames: list[P
     shutil.copytree(frames[0].parent, folder)
     broken = folder / "broken.png"
     broken.write_bytes(frames[0].read_bytes()[:2000])
-    done = rdstitch("mosaic", folder, "-o", tmp_path / "mosaic.jpg", *FAST)
+    done = rdstitch("mosaic", folder, "-o", tmp_path / "mosaic.jpg", *CACHED)
     assert done.status == 0
     assert str(broken) in done.line
     record = json.loads((tmp_path / "mosaic.jpg.json").read_text(encoding="utf-8"))
@@ -60,14 +60,14 @@ def test_an_unreadable_picture_is_left_out_by_name(rdstitch: Run, frames: list[P
 def test_its_own_output_is_no_input(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     folder = tmp_path / "folder"
     shutil.copytree(frames[0].parent, folder)
-    arguments = ("mosaic", folder, "-o", folder / "mosaic.png", "--overwrite", *FAST)
+    arguments = ("mosaic", folder, "-o", folder / "mosaic.png", "--overwrite", *CACHED)
     first, second = rdstitch(*arguments), rdstitch(*arguments)
     assert (first.status, first.err, first.out) == (second.status, second.err, second.out) == (0, "", first.out)
 
 
 def test_a_camera_that_stands_still_for_a_while(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     paused = [shutil.copy(frames[0], tmp_path / f"frame_0000_{again}.png") for again in range(2)]
-    done = rdstitch("mosaic", *paused, *frames, "-o", tmp_path / "out.png", "--strict", *FAST)
+    done = rdstitch("mosaic", *paused, *frames, "-o", tmp_path / "out.png", "--strict", *CACHED)
     assert (done.status, done.err) == (0, "")
     assert abs(float(done.out) - DISTORTION) < 0.005
 
@@ -89,4 +89,4 @@ def test_every_picture_finds_its_place_whatever_the_prescreen_does(
     glance: Callable[[Pairing, list[tuple[int, int]]], dict[tuple[int, int], None]],
 ) -> None:
     monkeypatch.setattr(Pairing, "prescreen_pairs", glance)
-    assert rdstitch("mosaic", *frames, "-o", tmp_path / "out.png", "--strict", *FAST).status == 0
+    assert rdstitch("mosaic", *frames, "-o", tmp_path / "out.png", "--strict", *CACHED).status == 0

@@ -11,14 +11,14 @@ from examples.judging import alignment_error, compare_with_plane
 from rdstitch.camera import Camera
 from rdstitch.io import read_image
 from rdstitch.synthetic import Sequence
-from tests.cli.running import DISTORTION, FAST, Run, finished, start, transfers
+from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, start, transfers
 
 
 def test_writes_picture_sidecar_and_camera_and_prints_lambda(
     rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path
 ) -> None:
     output, camera = tmp_path / "pano.png", tmp_path / "camera.json"
-    done = rdstitch("pano", *frames, "-o", output, "--save-camera", camera, *FAST)
+    done = rdstitch("pano", *frames, "-o", output, "--save-camera", camera, *CACHED)
     assert (done.status, done.err) == (0, "")
     assert done.out == f"{float(done.out):.6f}\n"
     assert abs(float(done.out) - DISTORTION) < 0.01
@@ -47,7 +47,7 @@ def test_writes_picture_sidecar_and_camera_and_prints_lambda(
 
 def test_order_does_not_matter_and_reference_keeps_its_frame(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     output = tmp_path / "pano.tif"
-    done = rdstitch("pano", frames[2], frames[0], frames[1], "-o", output, "--reference", frames[0].name, *FAST)
+    done = rdstitch("pano", frames[2], frames[0], frames[1], "-o", output, "--reference", frames[0].name, *CACHED)
     assert done.status == 0
     record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
     assert record["reference"] == frames[0].name
@@ -63,7 +63,7 @@ def test_order_does_not_matter_and_reference_keeps_its_frame(rdstitch: Run, fram
 def test_known_lens_is_kept(rdstitch: Run, frames: list[Path], tmp_path: Path, how: str) -> None:
     Camera((400, 300), distortion=-0.21).save(tmp_path / "camera.json")
     known = ("--lambda", "-0.21") if how == "lambda" else ("--camera", tmp_path / "camera.json")
-    done = rdstitch("pano", *frames[:2], "-o", tmp_path / "pano.jpg", *known, *FAST)
+    done = rdstitch("pano", *frames[:2], "-o", tmp_path / "pano.jpg", *known, *CACHED)
     assert (done.status, done.out) == (0, "-0.210000\n")
     record = json.loads((tmp_path / "pano.jpg.json").read_text(encoding="utf-8"))
     assert record["lambda_known"] is True
@@ -71,14 +71,14 @@ def test_known_lens_is_kept(rdstitch: Run, frames: list[Path], tmp_path: Path, h
 
 
 def test_a_picture_without_overlap_is_named(rdstitch: Run, frames: list[Path], stranger: Path, tmp_path: Path) -> None:
-    done = rdstitch("pano", *frames[:2], stranger, "-o", tmp_path / "pano.jpg", *FAST)
+    done = rdstitch("pano", *frames[:2], stranger, "-o", tmp_path / "pano.jpg", *CACHED)
     assert done.status == 0
     assert str(stranger) in done.line
     record = json.loads((tmp_path / "pano.jpg.json").read_text(encoding="utf-8"))
     assert [image["used"] for image in record["images"]] == [True, True, False]
     assert record["images"][2]["reason"]
 
-    strict = rdstitch("pano", *frames[:2], stranger, "-o", tmp_path / "strict.jpg", "--strict", *FAST)
+    strict = rdstitch("pano", *frames[:2], stranger, "-o", tmp_path / "strict.jpg", "--strict", *CACHED)
     assert strict.status == 5
     assert str(stranger) in strict.line
     assert not (tmp_path / "strict.jpg").exists()
@@ -87,7 +87,7 @@ def test_a_picture_without_overlap_is_named(rdstitch: Run, frames: list[Path], s
 def test_quiet_prints_nothing_and_verbose_prints_more(
     rdstitch: Run, frames: list[Path], stranger: Path, tmp_path: Path
 ) -> None:
-    arguments = ("pano", *frames[:2], stranger, "-o", tmp_path / "pano.jpg", "--overwrite", *FAST)
+    arguments = ("pano", *frames[:2], stranger, "-o", tmp_path / "pano.jpg", "--overwrite", *CACHED)
     quiet, usual, verbose = rdstitch(*arguments, "-q"), rdstitch(*arguments), rdstitch(*arguments, "-v")
     assert quiet.err == ""
     assert len(usual.err.splitlines()) < len(verbose.err.splitlines())
@@ -95,10 +95,10 @@ def test_quiet_prints_nothing_and_verbose_prints_more(
 
 
 def test_json_is_the_sidecar(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    done = rdstitch("pano", *frames[:2], "-o", tmp_path / "pano.png", "--json", *FAST)
+    done = rdstitch("pano", *frames[:2], "-o", tmp_path / "pano.png", "--json", *CACHED)
     assert (done.status, done.err) == (0, "")
     assert json.loads(done.out) == json.loads((tmp_path / "pano.png.json").read_text(encoding="utf-8"))
-    found = rdstitch("calibrate", *frames[:2], "-o", tmp_path / "camera.json", "--json", *FAST)
+    found = rdstitch("calibrate", *frames[:2], "-o", tmp_path / "camera.json", "--json", *CACHED)
     assert found.status == 0
     assert json.loads(found.out) == json.loads((tmp_path / "camera.json").read_text(encoding="utf-8"))
 
@@ -118,13 +118,13 @@ def test_same_bytes_whatever_the_number_of_workers(rdstitch: Run, frames: list[P
 def test_unobservable_lambda_is_nan(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     again = tmp_path / "again.png"
     again.write_bytes(frames[0].read_bytes())
-    done = rdstitch("pano", frames[0], again, "-o", tmp_path / "pano.jpg", *FAST)
+    done = rdstitch("pano", frames[0], again, "-o", tmp_path / "pano.jpg", *CACHED)
     assert done.status == 0
     assert math.isnan(float(done.out))
     assert "not observable" in done.err
 
 
 def test_as_a_process(frames: list[Path], tmp_path: Path) -> None:
-    done = finished(start("pano", *frames[:2], "-o", tmp_path / "pano.jpg", *FAST))
+    done = finished(start("pano", *frames[:2], "-o", tmp_path / "pano.jpg", *CACHED))
     assert (done.status, done.err) == (0, "")
     assert abs(float(done.out) - DISTORTION) < 0.01

@@ -25,7 +25,7 @@ from rdstitch.report import report_page, write_report
 from rdstitch.report.pairs import matched
 from rdstitch.report.summary import _motion
 from rdstitch.report.svg import counted
-from tests.cli.running import FAST, Run
+from tests.cli.running import CACHED, Run
 
 _VOID = {"meta", "img"}
 _SECTIONS = ["Summary", "Warnings and left-out pictures", "Mosaic", "Match graph", "Votes on λ", "Lens", "Lens curve"]
@@ -86,7 +86,7 @@ def reported(frames: list[Path], stranger: Path, tmp_path_factory: pytest.TempPa
 
     report = tmp_path_factory.mktemp("report") / "report.html"
     pictures = [*map(str, frames), str(stranger)]
-    assert run(["mosaic", *pictures, "-o", str(report.with_name("out.png")), "--report", str(report), *FAST]) == 0
+    assert run(["mosaic", *pictures, "-o", str(report.with_name("out.png")), "--report", str(report), *CACHED]) == 0
     return report
 
 
@@ -135,13 +135,13 @@ def test_the_numbers_are_those_of_the_result(frames: list[Path]) -> None:
 
 def test_calibrate_has_no_mosaic(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     report = tmp_path / "lens.html"
-    done = rdstitch("calibrate", *frames, "-o", tmp_path / "camera.json", "--report", report, *FAST)
+    done = rdstitch("calibrate", *frames, "-o", tmp_path / "camera.json", "--report", report, *CACHED)
     assert done.status == 0
     headings = [heading for heading in _SECTIONS if heading not in _OF_PICTURES]
     assert _checked(report.read_text(encoding="utf-8")).headings == headings
-    again = rdstitch("calibrate", *frames, "-o", tmp_path / "b.json", "--report", report, *FAST)
+    again = rdstitch("calibrate", *frames, "-o", tmp_path / "b.json", "--report", report, *CACHED)
     assert (again.status, str(report) in again.line) == (6, True)
-    wrong = rdstitch("calibrate", *frames, "-o", tmp_path / "b.json", "--report", tmp_path / "report.pdf", *FAST)
+    wrong = rdstitch("calibrate", *frames, "-o", tmp_path / "b.json", "--report", tmp_path / "report.pdf", *CACHED)
     assert (wrong.status, ".html" in wrong.line) == (6, True)
     assert not (tmp_path / "b.json").exists()
 
@@ -155,7 +155,7 @@ def test_what_is_refused_is_shown(
     found = (Message("the pictures <disagree>", severity="failure"), Message("look at that seam"))
     monkeypatch.setattr(accept, "judge", lambda *arguments, **options: found)
     report = tmp_path / "report.html"
-    arguments = (command, *frames[:2], "-o", tmp_path / output, "--report", report, *FAST)
+    arguments = (command, *frames[:2], "-o", tmp_path / output, "--report", report, *CACHED)
     assert rdstitch(*arguments).status == 4
     assert not (tmp_path / output).exists()
     refused = _checked(report.read_text(encoding="utf-8"))

@@ -14,7 +14,7 @@ from rdstitch_cli.parameter_types import UserPath
 from rdstitch_cli.terminal import Reporter, spell_out
 
 from rdstitch.io import read_image
-from tests.cli.running import FAST, Run
+from tests.cli.running import CACHED, Run
 
 _RUN = "from rdstitch_cli.main import main; main()"
 
@@ -28,7 +28,7 @@ def _process(*arguments: str | Path, **environment: str) -> "subprocess.Complete
 
 
 def test_the_last_line_says_what_was_made(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    done = rdstitch("pano", *frames, "-o", tmp_path / "pano.png", *FAST)
+    done = rdstitch("pano", *frames, "-o", tmp_path / "pano.png", *CACHED)
     width, height = read_image(tmp_path / "pano.png").pixels.shape[1::-1]
     made = f"{tmp_path / 'pano.png'}: {width} x {height} pixels, 3 of 3 pictures, "
     assert done.made.startswith(made)
@@ -36,17 +36,17 @@ def test_the_last_line_says_what_was_made(rdstitch: Run, frames: list[Path], tmp
     assert "pixels" not in done.out
     again = rdstitch("apply", tmp_path / "pano.png.json", "--images", frames[0].parent, "-o", tmp_path / "again.png")
     assert f"again.png: {width} x {height} pixels, 3 of 3 pictures," in again.made
-    camera = rdstitch("calibrate", *frames, "-o", tmp_path / "camera.json", *FAST)
+    camera = rdstitch("calibrate", *frames, "-o", tmp_path / "camera.json", *CACHED)
     assert re.search(r"camera\.json: 3 of 3 pictures, λ = -0\.\d{4} ±", camera.made)
-    path = rdstitch("trajectory", *frames, "-o", tmp_path / "path.csv", *FAST)
+    path = rdstitch("trajectory", *frames, "-o", tmp_path / "path.csv", *CACHED)
     assert "path.csv: 3 of 3 pictures" in path.made
     straight = rdstitch("undistort", *frames, "-o", tmp_path / "straight", "--lambda", "-0.2")
     assert "straight: 3 pictures undistorted" in straight.made
 
 
 def test_nothing_is_said_when_quiet_or_nothing_was_made(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    assert rdstitch("pano", *frames, "-o", tmp_path / "pano.png", "-q", *FAST).made == ""
-    assert rdstitch("pano", *frames, "-o", tmp_path / "dry.png", "--dry-run", *FAST).made == ""
+    assert rdstitch("pano", *frames, "-o", tmp_path / "pano.png", "-q", *CACHED).made == ""
+    assert rdstitch("pano", *frames, "-o", tmp_path / "dry.png", "--dry-run", *CACHED).made == ""
 
 
 def test_the_bar_is_gone_before_lambda(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
@@ -69,10 +69,10 @@ def test_quality_makes_files_smaller(rdstitch: Run, frames: list[Path], tmp_path
     sizes = []
     for quality in ("95", "40"):
         file = tmp_path / f"q{quality}.jpg"
-        assert rdstitch("pano", *frames, "-o", file, "--quality", quality, *FAST).status == 0
+        assert rdstitch("pano", *frames, "-o", file, "--quality", quality, *CACHED).status == 0
         sizes.append(file.stat().st_size)
     assert sizes[1] < 0.5 * sizes[0]
-    assert rdstitch("pano", *frames, "-o", tmp_path / "q.jpg", "--quality", "0", *FAST).status == 2
+    assert rdstitch("pano", *frames, "-o", tmp_path / "q.jpg", "--quality", "0", *CACHED).status == 2
 
 
 @pytest.mark.parametrize("name", sorted(set(cli.commands) - {"help"}))
@@ -104,7 +104,7 @@ def test_output_without_greek_letters(environment: dict[str, str], frames: list[
         shown = _process(name, "--help", **environment)
         assert (shown.returncode, shown.stderr) == (0, b"")
         assert b"lambda" in shown.stdout or "λ".encode() in shown.stdout
-    done = _process("pano", *frames, "-o", tmp_path / "pano.png", *FAST, **environment, PYTHONUTF8="0")
+    done = _process("pano", *frames, "-o", tmp_path / "pano.png", *CACHED, **environment, PYTHONUTF8="0")
     assert done.returncode == 0, done.stderr
     assert float(done.stdout) < 0
     last = done.stderr.splitlines()[-1]
@@ -130,14 +130,14 @@ def test_tilde_is_the_home_folder_where_no_shell_saw_it(
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("USERPROFILE", str(tmp_path))
-    assert rdstitch("pano", *frames, "--output=~/pano.png", *FAST).status == 0
+    assert rdstitch("pano", *frames, "--output=~/pano.png", *CACHED).status == 0
     assert (tmp_path / "pano.png").exists()
     assert UserPath().convert("~no-such-user/x", None, None) == Path("~no-such-user/x")
 
 
 def test_patterns_are_expanded_where_the_shell_leaves_them(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     pattern = str(frames[0].parent / "*.png")
-    done = rdstitch("pano", pattern, "-o", tmp_path / "pano.png", *FAST)
+    done = rdstitch("pano", pattern, "-o", tmp_path / "pano.png", *CACHED)
     assert "3 of 3 pictures" in done.made
     assert rdstitch("undistort", pattern, "-o", tmp_path / "straight", "--lambda", "-0.2").status == 0
     assert len(list((tmp_path / "straight").iterdir())) == 3

@@ -7,12 +7,12 @@ from xml.etree import ElementTree
 import numpy as np
 
 from rdstitch.synthetic import Sequence
-from tests.cli.running import DISTORTION, FAST, Run
+from tests.cli.running import CACHED, DISTORTION, Run
 
 
 def test_csv_holds_the_path(rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path) -> None:
     known = ("--focal", str(sequence.lens.focal), "--plot", tmp_path / "path.svg")
-    done = rdstitch("trajectory", frames[0].parent, "-o", tmp_path / "path.csv", *known, *FAST)
+    done = rdstitch("trajectory", frames[0].parent, "-o", tmp_path / "path.csv", *known, *CACHED)
     assert (done.status, done.err) == (0, "")
     assert abs(float(done.out) - DISTORTION) < 0.01
     with (tmp_path / "path.csv").open(encoding="utf-8", newline="") as stream:
@@ -25,7 +25,7 @@ def test_csv_holds_the_path(rdstitch: Run, frames: list[Path], sequence: Sequenc
 
 
 def test_height_scales_positions_and_tum_has_eight_columns(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    arguments = ("trajectory", *frames, "--format", "tum", *FAST)
+    arguments = ("trajectory", *frames, "--format", "tum", *CACHED)
     one = rdstitch(*arguments, "-o", tmp_path / "one.txt")
     assert one.status == 0
     assert "lengths may be off" in one.err  # by a common factor, where nothing tells the focal length

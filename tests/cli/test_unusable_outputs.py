@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from rdstitch.io import read_image
-from tests.cli.running import FAST, Run, check_refused, finished, start, state_of
+from tests.cli.running import CACHED, FAST, Run, check_refused, finished, start, state_of
+from tests.sampled import sampled
 
 
 def _exists(place: Path) -> Path:
@@ -71,11 +72,11 @@ def _too_long(place: Path) -> Path:
 def test_outputs_that_cannot_be(rdstitch: Run, place: Path, make: Callable[[Path], Path], command: str) -> None:
     output = make(place)
     before = state_of(place)
-    done = rdstitch(command, place / "a.png", place / "b.png", "-o", output, *FAST)
+    done = rdstitch(command, place / "a.png", place / "b.png", "-o", output, *CACHED)
     check_refused(done, 6, output)
     assert state_of(place) == before
     if make in (_is_input, _links_to_input):
-        done = rdstitch(command, place / "a.png", place / "b.png", "-o", output, "--overwrite", *FAST)
+        done = rdstitch(command, place / "a.png", place / "b.png", "-o", output, "--overwrite", *CACHED)
         check_refused(done, 6, output)
         assert state_of(place) == before
 
@@ -84,11 +85,11 @@ def test_a_folder_that_may_not_be_written(rdstitch: Run, place: Path, monkeypatc
     # Simulated: the superuser, under whom tests may run, may write everywhere.
     allowed = os.access
     monkeypatch.setattr(os, "access", lambda path, mode: not mode & os.W_OK and allowed(path, mode))
-    done = rdstitch("pano", place / "a.png", place / "b.png", "-o", place / "out.png", *FAST)
+    done = rdstitch("pano", place / "a.png", place / "b.png", "-o", place / "out.png", *CACHED)
     check_refused(done, 6, place / "out.png")
 
 
-@pytest.mark.parametrize("command", ["pano", "calibrate", "trajectory", "undistort"])
+@pytest.mark.parametrize("command", sampled(["pano", "calibrate", "trajectory", "undistort"]))
 def test_a_full_disk(place: Path, command: str) -> None:
     output = place / {"pano": "out.png", "calibrate": "out.json", "trajectory": "out.csv", "undistort": "out"}[command]
     lens = ("--lambda", "-0.2") if command == "undistort" else FAST
@@ -112,7 +113,7 @@ def test_a_full_disk_keeps_the_old_picture(rdstitch: Run, place: Path, monkeypat
     def full(handle: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    arguments = ("pano", place / "a.png", place / "b.png", "-o", place / "out.png", "--overwrite", *FAST)
+    arguments = ("pano", place / "a.png", place / "b.png", "-o", place / "out.png", "--overwrite", *CACHED)
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
         check_refused(rdstitch(*arguments), 6, place / "out.png")

@@ -13,7 +13,7 @@ from PIL import Image
 
 from rdstitch.io import read_image
 from tests.cli.faulty import Make
-from tests.cli.running import DISTORTION, FAST, Run, check_refused
+from tests.cli.running import CACHED, DISTORTION, Run, check_refused
 
 
 def _saved(good: Path, file: Path, change: Callable[[Image.Image], Image.Image], **options: Any) -> Path:
@@ -77,7 +77,7 @@ def _hostile_exif(good: Path, folder: Path) -> Path:
 )
 def test_unusual_pictures_are_stitched(rdstitch: Run, place: Path, make: Make) -> None:
     odd = make(place / "b.png", place)
-    done = rdstitch("pano", place / "a.png", odd, "-o", place / "out.tif", *FAST)
+    done = rdstitch("pano", place / "a.png", odd, "-o", place / "out.tif", *CACHED)
     assert (done.status, done.err) == (0, "")
     assert abs(float(done.out) - DISTORTION) < 0.02
     record = json.loads((place / "out.tif.json").read_text(encoding="utf-8"))
@@ -88,6 +88,6 @@ def test_unusual_pictures_are_stitched(rdstitch: Run, place: Path, make: Make) -
 def test_samples_of_two_kinds_arecheck_refused(rdstitch: Run, place: Path) -> None:
     deep = place / "deep.png"
     assert cv2.imwrite(str(deep), read_image(place / "b.png").pixels.astype(np.uint16) * 257)
-    done = rdstitch("pano", place / "a.png", deep, "-o", place / "out.png", *FAST)
+    done = rdstitch("pano", place / "a.png", deep, "-o", place / "out.png", *CACHED)
     check_refused(done, 3, deep)
     assert not (place / "out.png").exists()

@@ -10,10 +10,10 @@ from PIL import ExifTags, Image
 from rdstitch.camera import Camera
 from rdstitch.messages import Message
 from rdstitch.pipeline import accept
-from tests.cli.running import DISTORTION, FAST, Run, flight
+from tests.cli.running import CACHED, DISTORTION, Run, flight
 
 # Without a focal length, a path says that its lengths are guessed.
-GIVEN = (*FAST, "--focal", "380")
+GIVEN = (*CACHED, "--focal", "380")
 OUTPUTS = {"pano": "out.png", "mosaic": "out.png", "calibrate": "camera.json", "trajectory": "path.csv"}
 
 
@@ -53,7 +53,7 @@ def test_two_pictures_of_two_lenses_are_noticed(rdstitch: Run, tmp_path: Path) -
     assert isinstance(sequence.lens, Camera)
     other = replace(sequence, lens=replace(sequence.lens, distortion=-0.12))
     pictures = [sequence.write(tmp_path, "own_{}.png")[0], other.write(tmp_path, "other_{}.png")[1]]
-    done = rdstitch("pano", *pictures, "-o", tmp_path / "out.png", *FAST)
+    done = rdstitch("pano", *pictures, "-o", tmp_path / "out.png", *CACHED)
     assert done.status == 4
     found = re.search(
         r"two lenses or zooms are mixed: (\w+\.png) \(λ about (-0\.\d+)\) and (\w+\.png) \((-0\.\d+)\)", done.line
@@ -69,7 +69,7 @@ def test_the_last_picture_through_another_lens_is_left_out(rdstitch: Run, tmp_pa
     assert isinstance(sequence.lens, Camera)
     other = replace(sequence, lens=replace(sequence.lens, distortion=-0.12))
     pictures = [*sequence.write(tmp_path, "own_{}.png")[:2], other.write(tmp_path, "other_{}.png")[2]]
-    done = rdstitch("mosaic", *pictures, "-o", tmp_path / "out.png", *FAST)
+    done = rdstitch("mosaic", *pictures, "-o", tmp_path / "out.png", *CACHED)
     assert done.status == 0
     warning, left_out = done.err.splitlines()
     assert "own_0.png and own_1.png fit without the pictures of another lens" in warning
@@ -84,7 +84,7 @@ def test_pictures_of_two_lenses_are_parted(rdstitch: Run, frames: list[Path], tm
     zoomed = replace(sequence, lens=replace(sequence.lens, distortion=-0.12))
     own, others = sequence.write(tmp_path, "own_{:04d}.png")[:3], zoomed.write(tmp_path, "other_{:04d}.png")[3:]
     extra = ("--strict",) if strict else ()
-    done = rdstitch("mosaic", *own, *others, "-o", tmp_path / "out.png", *extra, *FAST)
+    done = rdstitch("mosaic", *own, *others, "-o", tmp_path / "out.png", *extra, *CACHED)
     assert done.status == (5 if strict else 0)
     assert all(path.name in done.err for path in others)
     assert not any(path.name in done.err for path in own)
@@ -114,6 +114,6 @@ def test_pictures_of_several_cameras_are_reported(
         exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLengthIn35mmFilm: length}
         with Image.open(frame) as image:
             image.save(tmp_path / f"{number}.jpg", exif=exif, quality=95)
-    done = rdstitch("mosaic", tmp_path, "-o", tmp_path / "out.png", *FAST)
+    done = rdstitch("mosaic", tmp_path, "-o", tmp_path / "out.png", *CACHED)
     assert done.status == 0
     assert told in done.line

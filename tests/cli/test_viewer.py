@@ -15,7 +15,7 @@ import pytest
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.io import read_image
 from rdstitch.viewer.page import seam_picture
-from tests.cli.running import FAST, Run
+from tests.cli.running import CACHED, Run
 
 _ROOT = Path(__file__).parents[2]
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -24,7 +24,7 @@ _BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 @pytest.fixture
 def page(rdstitch: Run, frames: list[Path], tmp_path: Path) -> Path:
     """The page of a small mosaic."""
-    assert rdstitch("mosaic", *frames, "-o", tmp_path / "x.dzi", *FAST).status == 0
+    assert rdstitch("mosaic", *frames, "-o", tmp_path / "x.dzi", *CACHED).status == 0
     return tmp_path / "x.html"
 
 
@@ -59,7 +59,7 @@ def test_the_page_knows_the_pictures_and_needs_no_network(
 
 def test_a_page_that_exists_is_not_replaced_unasked(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     (tmp_path / "x.html").write_text("mine", encoding="utf-8")
-    done = rdstitch("mosaic", *frames, "-o", tmp_path / "x.dzi", *FAST)
+    done = rdstitch("mosaic", *frames, "-o", tmp_path / "x.dzi", *CACHED)
     assert done.status == 6
     assert "x.html" in done.line
     assert not (tmp_path / "x.dzi").exists()
@@ -132,12 +132,12 @@ def test_the_wheel_without_the_viewer_is_small() -> None:
 
 
 def test_the_page_is_no_report(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    done = rdstitch("mosaic", *frames, "-o", tmp_path / "x.dzi", "--report", tmp_path / "x.html", *FAST)
+    done = rdstitch("mosaic", *frames, "-o", tmp_path / "x.dzi", "--report", tmp_path / "x.html", *CACHED)
     assert done.status == 6
     assert "two outputs" in done.line
 
 
 def test_other_formats_have_no_page(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    assert rdstitch("pano", *frames[:2], "-o", tmp_path / "x.png", *FAST).status == 0
+    assert rdstitch("pano", *frames[:2], "-o", tmp_path / "x.png", *CACHED).status == 0
     assert not (tmp_path / "x.html").exists()
     assert read_image(tmp_path / "x.png").pixels.size

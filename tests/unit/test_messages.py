@@ -18,3 +18,7 @@ def test_pictures_left_out_for_one_reason_are_named_together() -> None:
 def test_the_folder_is_named_where_it_changes() -> None:
     (message,) = told_once([left_out(path, "no overlap") for path in ("a/1.jpg", "a/2.jpg", "b/1.jpg")])
     assert str(message) == "left out a/1.jpg, 2.jpg, b/1.jpg: no overlap [left-out]"
+
+
+def test_the_temporary_folder_of_a_video_is_not_named() -> None:
+    assert str(left_out("/tmp/rdstitch-x1.part/drive_0003.jpg", "is blurred")).startswith("left out drive_0003.jpg: ")

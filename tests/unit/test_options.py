@@ -1,12 +1,14 @@
 """Options of the recipes."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
 from rdstitch import StitchOptions
+from rdstitch.alignment import LENSES, MODELS
 from rdstitch.errors import ArgumentError
+from rdstitch.options import LensName, ModelName
 
 
 def test_text_is_as_good_as_a_path() -> None:
@@ -37,3 +39,8 @@ def test_text_is_as_good_as_a_path() -> None:
 def test_what_contradicts_itself_is_refused(wrong: dict[str, Any], named: str) -> None:
     with pytest.raises(ArgumentError, match=named):
         StitchOptions(**wrong)
+
+
+def test_the_types_name_what_there_is() -> None:
+    assert get_args(LensName) == ("auto", *LENSES)
+    assert get_args(ModelName) == ("auto", *MODELS)

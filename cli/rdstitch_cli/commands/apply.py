@@ -14,6 +14,7 @@ from rdstitch_cli.terminal import Reporter
 
 @click.command(
     cls=GroupedCommand,
+    short_help="Compose again by a saved sidecar, without estimating.",
     epilog="""\b
 Examples:
   rdstitch apply field.tif.json --images flight/ -o field_again.tif --blend feather
@@ -33,6 +34,7 @@ Examples:
 @options.output
 @options.overwrite
 @options.every_frame
+@options.topic
 @click.option(
     "--match",
     type=click.Choice(["auto", "name", "order"]),
@@ -51,6 +53,7 @@ def apply(
     output: Path,
     overwrite: bool,
     every: int | None,
+    topic: str | None,
     match: Literal["auto", "name", "order"],
     mask: Path | None,
     workers: int,
@@ -78,6 +81,7 @@ def apply(
         match=match,
         mask=mask,
         every=every,
+        topic=topic,
         workers=workers,
         overwrite=overwrite,
         strict=strict,

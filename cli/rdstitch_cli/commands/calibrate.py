@@ -13,6 +13,7 @@ from rdstitch_cli.terminal import Reporter
 
 @click.command(
     cls=GroupedCommand,
+    short_help="The lens, from pictures of a plane.",
     epilog="""\b
 Examples:
   rdstitch calibrate wall/ -o camera.json
@@ -33,6 +34,8 @@ Examples:
 @options.every
 @options.topic
 @options.registration
+@options.as_json("the camera")
+@options.verbosity
 def calibrate(
     inputs: tuple[Path, ...],
     output: Path,

@@ -11,6 +11,7 @@ from rdstitch_cli.terminal import Reporter
 
 @click.command(
     cls=GroupedCommand,
+    short_help="What to expect of a run, and what to change before it.",
     epilog="""\b
 Examples:
   rdstitch doctor flight/
@@ -19,9 +20,10 @@ Examples:
 )
 @options.inputs
 @options.every
-@options.as_json
+@options.topic
+@options.as_json("what was found")
 @options.verbosity
-def doctor(inputs: tuple[Path, ...], every: int | None, as_json: bool, reporter: Reporter) -> None:
+def doctor(inputs: tuple[Path, ...], every: int | None, topic: str | None, as_json: bool, reporter: Reporter) -> None:
     """Find out at a glance what a run will meet, and what to change before it.
 
     INPUT is what 'rdstitch mosaic' takes. Shown are sizes, cameras and zooms by EXIF, blur, exposure, overlap, and the
@@ -30,7 +32,7 @@ def doctor(inputs: tuple[Path, ...], every: int | None, as_json: bool, reporter:
     from rdstitch.doctor import examine
     from rdstitch.io.atomic import json_bytes
 
-    found = examine(options.resolve(inputs), every=every, progress=reporter)
+    found = examine(options.resolve(inputs), every=every, topic=topic, progress=reporter)
     reporter.finish()
     if as_json:
         click.echo(json_bytes(found.as_dict()), nl=False)

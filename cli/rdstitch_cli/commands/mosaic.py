@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 @click.command(
     cls=GroupedCommand,
+    short_help="One rectified picture of a whole folder or video.",
     epilog="""\b
 Examples:
   rdstitch mosaic floor/ -o floor.tif

@@ -13,6 +13,7 @@ from rdstitch_cli.terminal import Reporter
 
 @click.command(
     cls=GroupedCommand,
+    short_help="One picture of a few that overlap.",
     epilog="""\b
 Examples:
   rdstitch pano left.jpg right.jpg -o pano.jpg

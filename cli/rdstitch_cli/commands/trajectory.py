@@ -10,6 +10,7 @@ import click
 from rdstitch_cli import following as live
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import GroupedCommand
+from rdstitch_cli.parameter_types import RealNumber
 from rdstitch_cli.stitching import report_registration, stitch_options
 from rdstitch_cli.terminal import Reporter
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 @click.command(
     cls=GroupedCommand,
+    short_help="The path of the camera over the plane, for robots.",
     epilog="""\b
 Examples:
   rdstitch trajectory floor/ -o poses.csv
@@ -40,7 +42,8 @@ Examples:
 )
 @click.option(
     "--height",
-    type=float,
+    type=RealNumber(),
+    metavar="H",
     default=1.0,
     show_default=True,
     help="Height of the first frame above the plane, in the unit that positions shall have.",

@@ -13,6 +13,7 @@ from rdstitch_cli.terminal import Reporter
 
 @click.command(
     cls=GroupedCommand,
+    short_help="Pictures with straight lines straight, by a known lens.",
     epilog="""\b
 Examples:
   rdstitch undistort frames/*.jpg --camera camera.json -o straight/
@@ -25,6 +26,7 @@ Examples:
     "-o", "--output", type=options.PICTURE, required=True, metavar="DIR", help="Folder to write to; made if missing."
 )
 @options.overwrite
+@options.topic
 @click.option(
     "--view",
     type=click.Choice(["same", "all", "valid"]),
@@ -39,6 +41,7 @@ def undistort(
     distortion: float | None,
     output: Path,
     overwrite: bool,
+    topic: str | None,
     view: Literal["same", "all", "valid"],
     reporter: Reporter,
 ) -> None:
@@ -59,6 +62,7 @@ def undistort(
         distortion=distortion,
         view=view,
         overwrite=overwrite,
+        topic=topic,
         warn=lambda message: reporter.warn(str(message)),
         progress=reporter,
     )

@@ -10,7 +10,7 @@ from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.robust import estimate_radial_homography
+from rdstitch.robust import SolverName, estimate_radial_homography
 from rdstitch.synthetic import Poses, line_poses, parking_poses, turn_poses
 from rdstitch.synthetic.poses import pixels_of_texels, texels_of_pixels
 
@@ -93,7 +93,7 @@ def drive(path: str, frames: int, *, seed: int, noise: float = 0.5) -> Drive:
     return Drive(camera, tilt, poses, tuple(pairs))
 
 
-def estimated_links(pairs: Iterable[FramePair], camera: Camera, solver: str = "auto") -> list[Link]:
+def estimated_links(pairs: Iterable[FramePair], camera: Camera, solver: SolverName = "auto") -> list[Link]:
     """What rdstitch makes of each pair, for the adjustment; pairs for which it finds nothing are left out.
 
     Parameters

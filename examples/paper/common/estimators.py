@@ -12,7 +12,7 @@ from examples.paper.common.peers import optional_module
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.radial_homography import RadialHomography, transfer
-from rdstitch.robust import estimate_radial_homography
+from rdstitch.robust import SolverName, estimate_radial_homography
 
 THRESHOLD = 3.0
 """Largest error of an inlier, px, for all."""
@@ -100,7 +100,7 @@ def judge(estimator: Estimator, pair: JudgedPair) -> Judgement:
     return Judgement(mean, abs(found.distortion - pair.distortion), seconds)
 
 
-def _own(solver: str) -> Callable[[FloatArray, FloatArray, tuple[int, int]], Estimate]:
+def _own(solver: SolverName) -> Callable[[FloatArray, FloatArray, tuple[int, int]], Estimate]:
     def run(points1: FloatArray, points2: FloatArray, size: tuple[int, int]) -> Estimate:
         found: RadialHomography = estimate_radial_homography(
             points1, points2, size, solver=solver, threshold=THRESHOLD, confidence=CONFIDENCE, max_iterations=ITERATIONS

@@ -20,6 +20,7 @@ from rdstitch.matching.match_graph import SpanningTree, spanning_tree
 from rdstitch.planar_motion import PlanarMotion
 from rdstitch.radial_homography import RadialHomography, transfer
 from tests.alignment_scenes import Scene, grid, jittered, robot_path, scene
+from tests.sampled import sampled
 
 
 def _run(given: Scene, **options: object) -> Alignment:
@@ -272,7 +273,7 @@ def test_the_order_of_links_does_not_matter() -> None:
     assert there.model == back.model
 
 
-@pytest.mark.parametrize(("most", "read"), [(40, None), (200, 200)])
+@pytest.mark.parametrize(("most", "read"), sampled([(40, None), (200, 200)]))
 def test_links_need_no_more_matches_than_are_read(most: int, read: int | None) -> None:
     rng = np.random.default_rng(5)
     given = scene(grid(5, 4, (0.4, 0.3), 0.1, rng), per_link=220, rng=rng)

@@ -33,6 +33,7 @@ def test_all_pictures_together_show_a_third_coefficient_that_pairs_do_not(monkey
     assert lens_distance(found.cameras[0], truth) < lens_distance(simpler.cameras[0], truth)
 
 
+@pytest.mark.slow
 def test_a_third_coefficient_that_is_smaller_than_its_deviation_does_no_harm() -> None:
     truth = replace(FISHEYE, distortion3=0.0)
     given = lens_scene(truth, 0)

@@ -10,6 +10,7 @@ from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.result import Alignment, PlanarPoses
 from tests.alignment_scenes import Scene, grid, jittered, scene
+from tests.sampled import sampled
 
 
 def _drone(height: float, tilt: float) -> Scene:
@@ -39,7 +40,7 @@ def _same(found: Alignment, cold: Alignment) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("height", "tilt", "model"), [(0.0, 0.0, "rigid"), (0.2, 0.0, "similarity"), (0.2, 3.0, "tilting")]
+    ("height", "tilt", "model"), sampled([(0.2, 3.0, "tilting"), (0.0, 0.0, "rigid"), (0.2, 0.0, "similarity")])
 )
 def test_more_links_give_what_they_give_without_the_earlier_alignment(
     links_apart: list[str], height: float, tilt: float, model: str
@@ -84,7 +85,7 @@ def _of_another_focal_length(former: Alignment) -> Alignment:
     return replace(former, focal=1.3 * former.focal)
 
 
-@pytest.mark.parametrize("spoil", [_misplaced, _without_one, _of_another_lens, _of_another_focal_length])
+@pytest.mark.parametrize("spoil", sampled([_misplaced, _of_another_lens, _without_one, _of_another_focal_length], 1))
 def test_an_earlier_alignment_that_the_links_contradict_changes_nothing(spoil) -> None:  # type: ignore[no-untyped-def]
     given = _drone(0.2, 3.0)
     cold = align(given.cameras, given.links)

@@ -173,6 +173,7 @@ def test_figure9_adjustment_brings_every_start_to_the_same_trajectory() -> None:
     assert np.median(uncorrected) > 5.0
 
 
+@pytest.mark.slow
 def test_figure10_ignoring_the_distortion_makes_surveys_drift() -> None:
     table = figure10.run(TINY).tables[0]
     ignored = table.row(figure10.IGNORED)
@@ -199,6 +200,7 @@ def test_a_bent_lane_is_measured_whatever_its_frame() -> None:
     assert aerial.bend(truth, truth) < 1e-12
 
 
+@pytest.mark.slow
 def test_homography_estimation_needs_the_distortion() -> None:
     for table in homography_estimation.run(TINY).tables:
         row = table.row("rdstitch")
@@ -258,6 +260,7 @@ def test_end_to_end_rdstitch_lies_on_the_true_plane() -> None:
     assert row["processor time, s"] > 0.5
 
 
+@pytest.mark.slow
 def test_panoramas_lie_on_the_true_sphere() -> None:
     (own, peer) = panoramas.run(TINY).tables[0].rows
     assert own[0] == "rdstitch mosaic"

@@ -1,23 +1,25 @@
 """The place of a mosaic on the Earth, from made-up positions."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import rasterio
-import tifffile
+import rasterio.warp
 from PIL import ExifTags, Image
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions
-from rdstitch.errors import OutputError
-from rdstitch.export.georeference import Georeference, georeference, utm
+from rdstitch.errors import ArgumentError, OutputError
+from rdstitch.export.crs import Crs, utm
+from rdstitch.export.georeference import Georeference, georeference
 from rdstitch.io import Layout, write_strips
 from rdstitch.io.metadata import GpsPosition
-from rdstitch.pipeline import StitchOptions, mosaic
+from rdstitch.pipeline import StitchOptions, apply, mosaic
 from tests.cli.running import flight, transfers
 
 
@@ -60,6 +62,12 @@ def located(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], Float
     return paths, utm(latitude, longitude, -34)
 
 
+@pytest.fixture(scope="module")
+def cached(tmp_path_factory: pytest.TempPathFactory) -> StitchOptions:
+    """The pictures are registered once for all tests."""
+    return StitchOptions(workers=1, cache=tmp_path_factory.mktemp("cache"))
+
+
 def _middles(output: Path) -> FloatArray:
     """Px of the output where the pictures' middles are, by the sidecar."""
     record = json.loads(output.with_name(output.name + ".json").read_text(encoding="utf-8"))
@@ -68,24 +76,97 @@ def _middles(output: Path) -> FloatArray:
 
 
 @pytest.mark.parametrize("crop", ["none", "auto"])
-def test_a_tiff_lies_in_the_right_place(located: tuple[list[Path], FloatArray], tmp_path: Path, crop: Any) -> None:
+def test_a_tiff_lies_in_the_right_place_and_north_is_up(
+    located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path, crop: Any
+) -> None:
     paths, truth = located
-    mosaic(paths, tmp_path / "a.tif", StitchOptions(workers=1, composite=CompositeOptions(scale=0.7, crop=crop)))
-    with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
-        tags = tiff.pages.first.tags
-        keys, matrix = tags[34735].value, np.reshape(tags[34264].value, (4, 4))
-    assert keys[-4:] == (3072, 0, 1, 32734)
-    px = _middles(tmp_path / "a.tif")
-    # GeoTIFF counts from the corner of the first px.
-    corners = np.column_stack([px + 0.5, np.zeros(len(px)), np.ones(len(px))])
-    error = np.hypot(*((corners @ matrix.T)[:, :2] - truth).T)
+    options = CompositeOptions(scale=0.7, crop=crop)
+    result = mosaic(paths, tmp_path / "a.tif", replace(cached, composite=options))
+    with rasterio.open(tmp_path / "a.tif") as opened:
+        assert opened.crs.to_epsg() == 32734
+        transform = opened.transform
+    assert (transform.b, transform.d) == (0.0, 0.0)
+    assert transform.e == -transform.a
+    x, y = _middles(tmp_path / "a.tif").T
+    error = np.hypot(*(np.stack(transform @ (x + 0.5, y + 0.5), axis=1) - truth).T)
     assert error.max() < 4 * METRES_PER_TEXEL
-    assert np.hypot(matrix[0, 0], matrix[1, 0]) == pytest.approx(METRES_PER_TEXEL / 0.7, rel=0.25)
+    assert transform.a == pytest.approx(METRES_PER_TEXEL / 0.7, rel=0.25)
+    record = json.loads((tmp_path / "a.tif.json").read_text(encoding="utf-8"))["output"]["georeference"]
+    assert (record["crs"], record["north_up"], record["positions"], record["positions_used"]) == (
+        "EPSG:32734",
+        True,
+        6,
+        6,
+    )
+    assert record["gsd_m"] == pytest.approx(transform.a)
+    assert record["rms_m"] < 4 * METRES_PER_TEXEL
+    assert result.georeference is not None
+    assert result.georeference.summary in [message.text for message in result.messages]
 
 
-def test_other_formats_get_a_world_file(located: tuple[list[Path], FloatArray], tmp_path: Path) -> None:
+def test_the_frame_of_the_reference_is_kept_on_request(
+    located: tuple[list[Path], FloatArray], cached: StitchOptions
+) -> None:
+    paths = located[0]
+    turned = [
+        mosaic(paths, options=replace(cached, composite=CompositeOptions(scale=0.3, **given)))
+        for given in ({"north_up": False}, {"rotate": 30.0})
+    ]
+    places = [result.georeference for result in turned]
+    assert places[0] is not None
+    assert places[1] is not None
+    assert places[1].clockwise_deg == pytest.approx(places[0].clockwise_deg - 30.0, abs=1e-6)
+
+
+def test_ground_sample_distance_and_coordinate_system_as_requested(
+    located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
+) -> None:
     paths, truth = located
-    mosaic(paths, tmp_path / "a.jpg", StitchOptions(workers=1))
+    options = CompositeOptions(gsd=0.25, epsg=2048)  # Hartebeesthoek94 / Lo19
+    mosaic(paths, tmp_path / "a.tif", replace(cached, composite=options))
+    with rasterio.open(tmp_path / "a.tif") as opened:
+        assert opened.crs.to_epsg() == 2048
+        assert opened.res == pytest.approx((0.25, 0.25))
+        x, y = _middles(tmp_path / "a.tif").T
+        east, north = opened.transform @ (x + 0.5, y + 0.5)
+        back = rasterio.warp.transform(opened.crs, "EPSG:32734", east, north)
+    assert np.hypot(*(np.stack(back, axis=1) - truth).T).max() < 4 * METRES_PER_TEXEL + 0.05
+
+
+def test_what_is_requested_of_the_map_is_checked_before_the_work(
+    located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
+) -> None:
+    plain = flight(4, 2).write(tmp_path)
+    for paths, options, message in (
+        (plain, CompositeOptions(gsd=0.1), "gsd needs GPS positions of 3 images"),
+        (located[0], CompositeOptions(epsg=4326), "EPSG:4326 is not a projected coordinate system"),
+        (located[0], CompositeOptions(epsg=99999), "EPSG:99999 is not known"),
+    ):
+        with pytest.raises(ArgumentError, match=message):
+            mosaic(paths, options=replace(cached, composite=options))
+
+
+def test_bands_that_are_applied_lie_where_the_first_one_does(
+    located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
+) -> None:
+    paths = located[0]
+    options = CompositeOptions(scale=0.3)
+    mosaic(paths, tmp_path / "a.tif", replace(cached, composite=options))
+    (tmp_path / "band").mkdir()
+    for path in paths:  # without positions
+        with Image.open(path) as image:
+            image.save(tmp_path / "band" / path.name)
+    apply(tmp_path / "a.tif.json", [tmp_path / "band"], tmp_path / "b.tif", workers=1)
+    with rasterio.open(tmp_path / "a.tif") as one, rasterio.open(tmp_path / "b.tif") as two:
+        assert (one.crs, one.shape) == (two.crs, two.shape)
+        np.testing.assert_allclose(one.transform, two.transform, atol=1e-6)
+
+
+def test_other_formats_get_a_world_file(
+    located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
+) -> None:
+    paths, truth = located
+    mosaic(paths, tmp_path / "a.jpg", cached)
     a, d, b, e, c, f = map(float, (tmp_path / "a.jgw").read_text(encoding="ascii").split())
     px = _middles(tmp_path / "a.jpg")
     place = np.column_stack([a * px[:, 0] + b * px[:, 1] + c, d * px[:, 0] + e * px[:, 1] + f])
@@ -93,55 +174,83 @@ def test_other_formats_get_a_world_file(located: tuple[list[Path], FloatArray], 
     assert "UTM_Zone_34S" in (tmp_path / "a.prj").read_text(encoding="ascii")
 
 
-def test_files_beside_are_not_replaced_unasked(located: tuple[list[Path], FloatArray], tmp_path: Path) -> None:
+def test_files_beside_are_not_replaced_unasked(
+    located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
+) -> None:
     somebodys = tmp_path / "a.prj"
     somebodys.write_text("mine", encoding="ascii")
     with pytest.raises(OutputError, match=r"a\.prj: exists already"):
-        mosaic(located[0], tmp_path / "a.jpg", StitchOptions(workers=1))
+        mosaic(located[0], tmp_path / "a.jpg", cached)
     assert somebodys.read_text(encoding="ascii") == "mine"
     assert sorted(tmp_path.iterdir()) == [somebodys]
-    mosaic(located[0], tmp_path / "a.jpg", StitchOptions(workers=1, overwrite=True))
+    mosaic(located[0], tmp_path / "a.jpg", replace(cached, overwrite=True))
     assert "UTM_Zone_34S" in somebodys.read_text(encoding="ascii")
 
 
+def _row(count: int) -> tuple[list[GpsPosition | None], list[Camera], FloatArray, list[str]]:
+    """Positions 7 m apart along a parallel, and images that lie along a curve."""
+    to_output = np.stack([np.array([[250.0, 0, 300 * k], [0, 250.0, 4 * k**2], [0, 0, 1]]) for k in range(count)])
+    return (
+        [GpsPosition(50.0, 8.0 + 1e-4 * k) for k in range(count)],
+        [Camera((400, 300))] * count,
+        to_output,
+        [f"{k}.jpg" for k in range(count)],
+    )
+
+
 def test_positions_that_do_not_fit_are_refused() -> None:
-    lens = Camera((400, 300))
-    to_output = np.stack([np.array([[250.0, 0, 300 * k], [0, 250.0, 40 * k**2], [0, 0, 1]]) for k in range(4)])
-    straight = [GpsPosition(50.0, 8.0 + 1e-4 * k) for k in range(4)]
-    place, reason = georeference(straight, [lens] * 4, to_output)
+    straight, lens, to_output, names = _row(8)
+    place, reason = georeference(straight, lens, to_output, names)
     assert place is not None
     assert reason == ""
-    mixed = [straight[k] for k in (2, 0, 3, 1)]
-    place, reason = georeference(mixed, [lens] * 4, to_output)
+    mixed = [straight[k] for k in (4, 0, 7, 2, 5, 1, 6, 3)]
+    place, reason = georeference(mixed, lens, to_output, names)
     assert place is None
-    assert "not georeferenced" in reason
-    assert georeference([straight[0], None, straight[1], None], [lens] * 4, to_output) == (None, "")
+    assert "GPS positions are" in reason
+    place, reason = georeference([*straight[:2], *[None] * 6], lens, to_output, names)
+    assert place is None
+    assert reason == "2 of 8 images have a GPS position, and 3 are needed"
 
 
-def test_pictures_without_positions_leave_no_world_file(tmp_path: Path) -> None:
-    mosaic(flight(4, 2).write(tmp_path), tmp_path / "a.png", StitchOptions(workers=1))
+@pytest.mark.parametrize(("wrong", "off"), [(GpsPosition(0.0, 1e-9), 5e6), (GpsPosition(50.0027, 8.0004), 300.0)])
+def test_one_bad_position_of_eight_is_named_and_left_out(wrong: GpsPosition, off: float) -> None:
+    straight, lens, to_output, names = _row(8)
+    whole, _ = georeference([*straight[:4], None, *straight[5:]], lens, to_output, names)
+    place, _ = georeference([*straight[:4], wrong, *straight[5:]], lens, to_output, names)
+    assert whole is not None
+    assert place is not None
+    assert (place.used, place.positions) == (7, 8)
+    ((name, away),) = place.rejected
+    assert name == "4.jpg"
+    assert away == pytest.approx(off, rel=0.2)
+    corner = [(0.0, 0.0)]
+    np.testing.assert_allclose(place.to_map(corner), whole.to_map(corner), atol=0.1)
+
+
+def test_pictures_without_positions_leave_no_world_file(cached: StitchOptions, tmp_path: Path) -> None:
+    mosaic(flight(4, 2).write(tmp_path), tmp_path / "a.png", cached)
     assert not list(tmp_path.glob("*.pgw"))
     assert not list(tmp_path.glob("*.prj"))
 
 
 def test_geotiff_counts_from_the_corner_of_the_first_pixel() -> None:
-    place = Georeference(33, 0.1 * np.exp(-0.4j), complex(448_251.8, 5_411_935.1), 0.1)
+    place = Georeference(Crs(32633), 0.1 * np.exp(-0.4j), complex(448_251.8, 5_411_935.1), 0.1)
     tags = {tag[0]: tag[3] for tag in place.tiff_tags()}
     matrix = np.reshape(tags[34264], (4, 4))
     pixels = np.array([(0.0, 0.0), (899.0, 0.0), (0.0, 599.0)])
     corners = np.column_stack([pixels + 0.5, np.zeros(3), np.ones(3)])
-    np.testing.assert_allclose((corners @ matrix.T)[:, :2], place.to_utm(pixels), atol=1e-6)
+    np.testing.assert_allclose((corners @ matrix.T)[:, :2], place.to_map(pixels), atol=1e-6)
 
 
 def test_gdal_sees_what_was_meant(tmp_path: Path) -> None:
-    place = Georeference(-34, 0.05 * np.exp(0.3j), complex(268_832.3, 6_246_117.8), 0.1)
+    place = Georeference(Crs(32734), 0.05 * np.exp(0.3j), complex(268_832.3, 6_246_117.8), 0.1)
     alpha = np.full((600, 900), 255, np.uint8)
     alpha[:100] = 0
     layout = Layout((900, 600), 3, np.dtype(np.uint8), transparent=True)
     write_strips(tmp_path / "a.tif", layout, [(np.full((600, 900, 3), 9, np.uint8), alpha)], place.tiff_tags())
     with rasterio.open(tmp_path / "a.tif") as opened:
-        assert opened.crs.to_epsg() == place.epsg
+        assert opened.crs.to_epsg() == place.crs.epsg
         for x, y in ((0, 0), (899, 599), (300, 20)):
-            np.testing.assert_allclose(opened.xy(y, x), place.to_utm([(x, y)])[0], atol=1e-6)
+            np.testing.assert_allclose(opened.xy(y, x), place.to_map([(x, y)])[0], atol=1e-6)
         assert opened.overviews(1) == [2, 4]
         np.testing.assert_array_equal(opened.dataset_mask(), alpha)

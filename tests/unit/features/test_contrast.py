@@ -79,6 +79,7 @@ def test_a_picture_unlike_the_rest_does_not_decide() -> None:
     assert usual_stretch(View(np.zeros((4, 4), np.uint8), np.zeros((4, 4), np.bool_))) is None
 
 
+@pytest.mark.slow
 def test_a_board_shows_few_features_but_no_little_contrast() -> None:
     """Equalized, the noise of its plain squares would drown them."""
     lens = Camera((640, 480), distortion=-0.25, focal=600.0)

@@ -24,5 +24,5 @@ def test_a_pattern_longer_than_any_name_is_refused_at_once(tmp_path: Path) -> No
 def test_a_table_with_an_endless_field_is_named(tmp_path: Path, text: str) -> None:
     table = tmp_path / "attitudes.csv"
     table.write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=r"attitudes.csv: is no table with commas"):
+    with pytest.raises(InputError, match=r"attitudes.csv: is not a CSV file"):
         _read_table(table)

@@ -94,7 +94,7 @@ def test_masks_are_found_by_the_names_of_pictures(tmp_path: Path) -> None:
 def test_masks_that_cannot_be_meant_are_refused(tmp_path: Path) -> None:
     white = np.full((30, 40), 255, np.uint8)
     picture = save(tmp_path / "a.png", white)
-    with pytest.raises(InputError, match=r"absent.*no such file"):
+    with pytest.raises(InputError, match=r"absent.*no such folder"):
         with_masks([source(picture)], tmp_path / "absent")
     with pytest.raises(InputError, match="is the picture itself"):
         with_masks([source(picture)], tmp_path)

@@ -34,5 +34,5 @@ def test_pictures_are_chosen_by_name(exclude: tuple[str, ...], include_only: tup
 @pytest.mark.parametrize("option", ["exclude", "include-only"])
 def test_a_name_that_is_none_is_refused(option: str) -> None:
     wanted = (("c.jpg",), ()) if option == "exclude" else ((), ("c.jpg",))
-    with pytest.raises(ArgumentError, match=f"--{option} c.jpg: none of the 4 pictures"):
+    with pytest.raises(ArgumentError, match=f"--{option} c.jpg: none of the 4 images"):
         selected(FRAMES, *wanted)

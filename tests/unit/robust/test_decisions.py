@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 import rdstitch
+from rdstitch.robust import SolverName
 from rdstitch.robust.verification import rejection_reason
 from rdstitch.synthetic import correspondences
 
 
 @pytest.mark.parametrize(("solver", "size"), [("three_point", 3), ("four_point", 4), ("five_point", 5)])
-def test_sampling_goes_on_until_a_sample_without_outliers_is_likely(solver: str, size: int) -> None:
+def test_sampling_goes_on_until_a_sample_without_outliers_is_likely(solver: SolverName, size: int) -> None:
     """Fischler and Bolles: a share w of inliers needs log(1 - confidence) / log(1 - w^size) samples."""
     matches = correspondences(300, seed=1, outliers=0.6)
     found = rdstitch.estimate_radial_homography(

@@ -7,7 +7,7 @@ import pytest
 
 from rdstitch.errors import ArgumentError
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies, estimate_radial_homography
-from rdstitch.robust.estimate import SOLVERS
+from rdstitch.robust.estimate import SOLVERS, SolverName
 from rdstitch.robust.ransac import RansacOptions
 from rdstitch.synthetic import correspondences
 
@@ -55,7 +55,7 @@ def test_values_at_the_limits_are_taken(fits: dict[str, float]) -> None:
 
 
 @pytest.mark.parametrize("solver", [name for name in SOLVERS if name != "two_point"])
-def test_each_solver_finds_the_motion(solver: str) -> None:
+def test_each_solver_finds_the_motion(solver: SolverName) -> None:
     found = estimate_radial_homography(
         MATCHES.points1, MATCHES.points2, LENS.image_size, focal=LENS.focal, solver=solver
     )
@@ -67,7 +67,7 @@ def test_each_solver_finds_the_motion(solver: str) -> None:
 
 @pytest.mark.parametrize("solver", ["auto", "two_point", "three_point"])
 @pytest.mark.parametrize("both", [False, True])
-def test_a_known_tilt_is_used(solver: str, both: bool) -> None:
+def test_a_known_tilt_is_used(solver: SolverName, both: bool) -> None:
     assert TRUE is not None
     tilt = np.array([TRUE.tilt, TRUE.tilt]) if both else TRUE.tilt
     found = estimate_radial_homography(
@@ -112,3 +112,11 @@ def test_pairs_with_many_inliers_need_no_other_model() -> None:
         for limit in (None, inliers + 20, inliers - 20)
     ]
     assert models == ["rigid", "rigid", "homography"]
+
+
+@pytest.mark.parametrize("tilt", [None, (0.0, 0.0)])
+def test_the_covariance_names_its_parameters(tilt: tuple[float, float] | None) -> None:
+    fit = estimate_radial_homography(MATCHES.points1, MATCHES.points2, LENS.image_size, focal=LENS.focal, tilt=tilt)
+    assert fit.covariance.shape == (len(fit.parameters),) * 2
+    assert fit.parameters[0] == "distortion"
+    assert fit.covariance[0, 0] == pytest.approx(fit.distortion_std**2)

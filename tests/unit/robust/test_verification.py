@@ -48,7 +48,7 @@ def test_neighbouring_matches_count_once() -> None:
     everything = np.ones(len(points), dtype=np.bool_)
     assert (
         rejection_reason(points, points, everything, SIZE, 3.0)
-        == "350 of 350 matches agree, in only 7 places of the picture"
+        == "350 of 350 matches agree, but they lie in 7 places of the image only"
     )
     one_more = np.vstack([points, _apart(MIN_PLACES)[-1:]])
     assert rejection_reason(one_more, one_more, np.ones(len(one_more), dtype=np.bool_), SIZE, 3.0) is None

@@ -12,6 +12,7 @@ from rdstitch.messages import Message
 from rdstitch.pipeline import StitchOptions, pano
 from rdstitch.synthetic import Photometry, camera_rotations, turning_sequence
 from rdstitch.verification.parallax import find_parallax
+from tests.sampled import sampled
 
 LENS = Camera((320, 240), -0.2, focal=260.0, focal_source="option")
 HEADINGS = np.radians([-35.0, 0.0, 35.0])
@@ -34,7 +35,7 @@ def _warnings(folder: Path, radius: float) -> tuple[str, list[Message]]:
     return registration.alignment.model, list(registration.messages)
 
 
-@pytest.mark.parametrize("radius", [0.02, 0.05])
+@pytest.mark.parametrize("radius", sampled([0.02, 0.05]))
 def test_a_turn_by_hand_is_warned_of_with_the_pair_and_the_size(tmp_path: Path, radius: float) -> None:
     model, messages = _warnings(tmp_path, radius)
     assert model == "rotation"
