@@ -27,6 +27,7 @@ from rdstitch.division_model import (
     undistort,
 )
 from rdstitch.errors import ArgumentError, ImpossibleCameraError
+from rdstitch.orientation import turned_size, turning_matrix
 
 FILE_VERSION = 2
 """Of camera files; version 1 had λ and μ only, as ``lambda`` and ``lambda2``."""
@@ -287,6 +288,20 @@ class Camera:
         center = ((image_size[0] - 1) / 2 + offset[0], (image_size[1] - 1) / 2 + offset[1])
         focal = None if self.focal is None else self.focal * factor
         return replace(self, image_size=image_size, center=center, focal=focal)
+
+    def turned(self, orientation: int) -> Self:
+        """The same lens on the picture after an EXIF orientation: centre, size and covariances are turned with it."""
+        if orientation == 1:
+            return self
+        matrix, size = turning_matrix(orientation), turned_size(self.image_size, orientation)
+        offset = matrix @ (np.array(self.center) - (np.array(self.image_size) - 1.0) / 2.0)
+        x, y = (offset + (np.array(size) - 1.0) / 2.0).tolist()
+        covariance = self.lens_covariance
+        if covariance is not None:
+            lens = np.eye(len(LENS_PARAMETERS))
+            lens[3:, 3:] = matrix
+            covariance = tuple(map(tuple, (lens @ np.array(covariance) @ lens.T).tolist()))
+        return replace(self, image_size=size, center=(x, y), lens_covariance=covariance)
 
     def as_dict(self) -> dict[str, Any]:
         """Everything known of the camera as plain values, the content of a camera file."""

@@ -14,9 +14,11 @@ _COEFFICIENT_NAMES = ("λ", "μ", "ν")
 _ORDINALS = ("first", "second", "third")
 
 
-def describe_lens(alignment: Alignment) -> tuple[str, ...]:
-    """One line on λ, one on each of μ, ν and the distortion centre, and one on the choice of the lens."""
-    camera = alignment.cameras[alignment.reference]
+def describe_lens(alignment: Alignment, camera: Camera) -> tuple[str, ...]:
+    """One line on λ, one on each of μ, ν and the distortion centre, and one on the choice of the lens.
+
+    ``camera`` is that of the reference picture, upright or as it is stored.
+    """
     if not math.isfinite(alignment.distortion_std):
         return ("λ is not observable",)
     if alignment.distortion_std == 0.0 and camera.lens_covariance is None:

@@ -9,9 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tifffile
-from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 from rdstitch.camera import is_focal_length
@@ -19,11 +17,8 @@ from rdstitch.file_access import open_regular
 from rdstitch.io.attitude import Attitude, finite, read_attitude, xmp_number, xmp_text
 from rdstitch.io.opening import check_megapixels, check_readable, decoding, has_late_metadata, opened_picture
 from rdstitch.io.optional_readers import is_raw, raw_exif, raw_size
+from rdstitch.orientation import turned_size, turning_matrix
 
-SIDEWAYS = (5, 6, 7, 8)
-"""Orientations that exchange the axes; what runs backwards, runs so after that."""
-
-_X_BACKWARDS, _Y_BACKWARDS = (2, 3, 6, 7), (3, 4, 7, 8)
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _BIT_DEPTHS = {"1": 1, "I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
@@ -37,24 +32,6 @@ _COLOUR_SPACE = slice(16, 20)  # of a profile's header
 _UNWRITABLE = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, struct.error)
 _HEADER = 16
 _ORIENTATION, _PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE = 0x0112, 0xA002, 0xA003, 0x927C
-
-
-def turned(samples: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """Samples (h, w) or (h, w, C) with an orientation (1 to 8) applied; a view."""
-    if orientation in SIDEWAYS:
-        samples = np.swapaxes(samples, 0, 1)
-    if orientation in _Y_BACKWARDS:
-        samples = samples[::-1]
-    if orientation in _X_BACKWARDS:
-        samples = samples[:, ::-1]
-    return samples
-
-
-def turned_direction(x: float, y: float, orientation: int) -> tuple[float, float]:
-    """A direction in a stored picture, to the right and down, as it is after :func:`turned`."""
-    if orientation in SIDEWAYS:
-        x, y = y, x
-    return (-x if orientation in _X_BACKWARDS else x), (-y if orientation in _Y_BACKWARDS else y)
 
 
 @dataclass(frozen=True)
@@ -127,8 +104,9 @@ class Metadata:
         """Unit vector straight down from the camera: to the right, to the bottom of the picture as read, and ahead."""
         if self.attitude is None:
             return None
-        x, y, z = self.attitude.nadir
-        return *turned_direction(x, y, self.orientation), z
+        *direction, z = self.attitude.nadir
+        x, y = (turning_matrix(self.orientation) @ direction).tolist()
+        return x, y, z
 
 
 def read_metadata(path: str | Path) -> Metadata:
@@ -177,14 +155,13 @@ def metadata_of(image: Image.Image) -> Metadata:
     bit_depth = _bit_depth(image)
     exif = image.getexif()
     orientation = _orientation(exif.get(_ORIENTATION))
-    width, height = image.size
     photo = exif.get_ifd(ExifTags.IFD.Exif)
     xmp = xmp_text(image)
     focal, source = _focal_px(exif, photo, xmp, image.size)
     dpi = image.info.get("dpi")
     profile, profile_lost = _colour_profile(image)
     return Metadata(
-        size=(height, width) if orientation in SIDEWAYS else (width, height),
+        size=turned_size(image.size, orientation),
         bit_depth=bit_depth,
         orientation=orientation,
         focal_px=focal,

@@ -17,11 +17,12 @@ from PIL import Image
 
 from rdstitch.errors import InputError
 from rdstitch.file_access import open_regular
-from rdstitch.io.metadata import Metadata, metadata_of, read_metadata, turned
+from rdstitch.io.metadata import Metadata, metadata_of, read_metadata
 from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, opened_picture
 from rdstitch.io.optional_readers import is_raw, read_raw
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
 from rdstitch.opencv_state import silent_opencv
+from rdstitch.orientation import turned
 
 _END_OF_IMAGE = b"\xff\xd9"
 _PADDING = re.compile(r"(\d+) extraneous bytes before marker 0xd9")

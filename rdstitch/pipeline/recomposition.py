@@ -10,6 +10,7 @@ from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.inputs.source import Source
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.messages import Message
+from rdstitch.orientation import inverse
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.write import VERSION, identity_fields, lens_fields, output_geometry, plain, to_output, versions
 from rdstitch.stitch_result import OutputImage
@@ -90,7 +91,7 @@ def applied_sidecar(result: Recomposition) -> dict[str, Any]:
         "lambda_px": camera.distortion_px,
         "lambda_focal": camera.distortion_focal,
         "camera": {
-            **camera.as_dict(),
+            **camera.turned(inverse(source.metadata.orientation)).as_dict(),
             # How far the lens was determined then.
             "lambda_std": then.get("lambda_std"),
             "lens_covariance": then["camera"].get("lens_covariance"),
