@@ -15,6 +15,7 @@ from PIL import ExifTags, Image
 from rdstitch.camera import is_focal_length
 from rdstitch.file_access import open_regular
 from rdstitch.io.attitude import Attitude, finite, read_attitude, xmp_number, xmp_text
+from rdstitch.io.colour import ink_transform
 from rdstitch.io.opening import check_megapixels, check_readable, decoding, has_late_metadata, opened_picture
 from rdstitch.io.optional_readers import is_raw, raw_exif, raw_size
 from rdstitch.orientation import turned_size, turning_matrix
@@ -219,7 +220,9 @@ def _colour_profile(image: Image.Image) -> tuple[bytes, str]:
     if len(profile) > MAX_PROFILE:
         return b"", f"its colour profile of {len(profile) / 1e6:.1f} MB is too large for PNG readers"
     if profile[_COLOUR_SPACE] == b"CMYK":
-        return b"", "its colour profile is one of inks (CMYK), and the output is RGB"
+        return b"", "" if ink_transform(profile) else "its colour profile of inks (CMYK) cannot be used"
+    if profile[_COLOUR_SPACE] == b"Lab ":
+        return b"", ""
     return profile, ""
 
 
