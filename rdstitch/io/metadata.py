@@ -2,12 +2,12 @@
 
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import tifffile
 from PIL import ExifTags, Image
@@ -32,6 +32,11 @@ _EXIF_OF_PNG = {"exif", "Raw profile type exif"}
 _COLOUR_SPACE = slice(16, 20)  # of a profile's header
 _UNWRITABLE = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, struct.error)
 _HEADER = 16
+_TIMES = {int(getattr(ExifTags.Base, name)) for name in ("DateTimeOriginal", "OffsetTimeOriginal")}
+_OF_WHOM = {
+    int(getattr(ExifTags.Base, name))
+    for name in ("Make", "Model", "Artist", "Copyright", "DateTime", "Software", "ImageDescription", "Orientation")
+}
 _ORIENTATION, _PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE = 0x0112, 0xA002, 0xA003, 0x927C
 
 
@@ -109,6 +114,14 @@ class Metadata:
         x, y = (turning_matrix(self.orientation) @ direction).tolist()
         return x, y, z
 
+    def in_another_size(self) -> Self:
+        """Of the same picture at the same scale but cut or extended: of what film it would be that of is not true."""
+        return replace(self, exif=_edited(self.exif, _without_equivalent))
+
+    def of_composite(self) -> Self:
+        """Of a picture made from several: no lens, exposure or place of one of them is true of it."""
+        return replace(self, exif=_edited(self.exif, _who_and_when))
+
 
 def read_metadata(path: str | Path) -> Metadata:
     """Read a picture file's header; no pixel is decoded.
@@ -175,7 +188,7 @@ def metadata_of(image: Image.Image) -> Metadata:
         dpi=(float(dpi[0]), float(dpi[1])) if dpi and all(finite(d) for d in dpi) else None,
         exposure=_exposure(photo),
         timestamp=_timestamp(photo),
-        exif=_clean_exif(exif),
+        exif=_clean_exif(exif, image.width),
         icc_profile=profile,
         profile_lost=profile_lost,
         channels=_channels(image),
@@ -293,21 +306,50 @@ def _degrees(value: Any, negative: bool) -> float | None:
     return -degrees if negative else degrees
 
 
-def _clean_exif(exif: Image.Exif) -> bytes:
-    """EXIF for the output: what orientation, size and maker note said is no longer true of it."""
+def _clean_exif(exif: Image.Exif, width: int) -> bytes:
+    """EXIF for the output: what orientation, size and maker note said is no longer true of it.
+
+    The resolution of the focal plane counts pixels of the size that EXIF says; ``width`` is that of the picture.
+    """
     if not len(exif):
         return b""
+
+    def clean(kept: Image.Exif) -> None:
+        photo = kept.get_ifd(ExifTags.IFD.Exif)
+        original = finite(photo.get(_PIXEL_WIDTH))
+        for tag in (ExifTags.Base.FocalPlaneXResolution, ExifTags.Base.FocalPlaneYResolution):
+            if original and (resolution := finite(photo.get(tag))) and original != width:
+                photo[tag] = resolution * width / original
+        for gone in (_PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE):
+            photo.pop(gone, None)
+
     # First, since what is not of the type that belongs to it cannot be written.
     exif[_ORIENTATION] = 1
-    kept = Image.Exif()
     try:
-        kept.load(exif.tobytes())
+        data = exif.tobytes()
     except _UNWRITABLE:
         return b""
-    photo = kept.get_ifd(ExifTags.IFD.Exif)
-    for tag in (_PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE):
-        photo.pop(tag, None)
+    return _edited(data, clean)
+
+
+def _edited(data: bytes, edit: Callable[[Image.Exif], None]) -> bytes:
+    """An EXIF block after a change; empty where it cannot be written, or says nothing."""
+    exif = Image.Exif()
     try:
-        return kept.tobytes()
+        exif.load(data)
+        edit(exif)
+        return exif.tobytes() if len(exif) else b""
     except _UNWRITABLE:
         return b""
+
+
+def _without_equivalent(exif: Image.Exif) -> None:
+    exif.get_ifd(ExifTags.IFD.Exif).pop(ExifTags.Base.FocalLengthIn35mmFilm, None)
+
+
+def _who_and_when(exif: Image.Exif) -> None:
+    photo = exif.get_ifd(ExifTags.IFD.Exif)
+    for tag in set(photo) - _TIMES:
+        del photo[tag]
+    for tag in set(exif) - _OF_WHOM - {int(ExifTags.IFD.Exif)}:
+        del exif[tag]

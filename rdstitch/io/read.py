@@ -118,8 +118,8 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
 
     JPEG, PNG, TIFF, WebP and whatever else Pillow reads, with 8 or 16 bit or floating-point samples; with optional
     packages also HEIC, and raw files, which become 16-bit sRGB. Of an animated or multi-page file the first picture
-    counts. CMYK (by its profile), CIELAB and palette colours become RGB. NaN or infinite samples of a floating-point file become transparent
-    zeros.
+    counts. CMYK (by its profile), CIELAB and palette colours become RGB. NaN or infinite samples of a floating-point
+    file become transparent zeros.
 
     Parameters
     ----------

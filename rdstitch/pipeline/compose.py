@@ -26,12 +26,13 @@ from rdstitch.export.georeference import Georeference, georeference, has_place, 
 from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.io.atomic import check_output, text_bytes
+from rdstitch.io.colour import colour_space
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.io.outputs import Outputs
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
-from rdstitch.messages import Message
+from rdstitch.messages import Message, names_of, shortened
 from rdstitch.pipeline.placed_images import PlacedImages, plan
 from rdstitch.process_memory import return_freed_memory
 from rdstitch.progress import Progress
@@ -134,7 +135,7 @@ def compose_pictures(
         located.append(georeference(placed.positions, placed.cameras, final.matrix @ placed.homographies))
         return located[0][0].tiff_tags() if located[0][0] is not None else []
 
-    file = OutputFile(output, placed.sources[0].metadata, tags, outputs)
+    file = OutputFile(output, placed.sources[0].metadata.of_composite(), tags, outputs)
     written = compose_to_file(file, pictures, canvas, options, report, elsewhere)
     place, note = located[0]
     if place is not None and world_files:
@@ -145,6 +146,7 @@ def compose_pictures(
         *written.messages,
         *([Message(note)] if note else []),
         *_profile_lost(placed.sources[0], Path(output)),
+        *_profiles_differ(placed.sources),
     )
     return Composed(written.canvas, messages=messages, fingerprint=written.fingerprint, written=written)
 
@@ -174,6 +176,18 @@ def _profile_lost(source: Source, output: Path) -> list[Message]:
     if output.suffix.lower() == ".dzi" and size > MAX_TILE_PROFILE:
         lost = f"its colour profile of {size / 1e3:.0f} kB is too large to be in every tile"
     return [Message(f"{lost}; colours are as if it had none", (str(source.path),))] if lost else []
+
+
+def _profiles_differ(sources: Sequence[Source]) -> list[Message]:
+    """Which pictures have other colours than those of the output, whose profile is the first picture's."""
+    spaces = [colour_space(source.metadata.icc_profile) for source in sources]
+    others = [str(source.path) for source, space in zip(sources, spaces, strict=True) if space != spaces[0]]
+    if not others:
+        return []
+    what = f"another colour profile than {sources[0].name}, whose the output has"
+    who = "has" if len(others) == 1 else f"{len(others)} of the pictures ({shortened(names_of(others))}) have"
+    text = f"{who} {what}: their colours are off; convert them to one colour space first"
+    return [Message(text, tuple(others), code="colour-profiles")]
 
 
 @dataclass(frozen=True, eq=False)

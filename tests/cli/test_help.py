@@ -61,7 +61,7 @@ def test_options_of_one_name_mean_the_same_everywhere() -> None:
     meanings: dict[str, set[str]] = {}
     for name in COMMANDS:
         for option in _options(cli.commands[name]):
-            if option.name not in ("output", "reference"):
+            if option.name not in ("output", "reference", "layout", "image_format"):
                 meanings.setdefault(option.opts[-1], set()).add(f"{option.help} {option.default}")
     assert {text: found for text, found in meanings.items() if len(found) > 1} == {}
 
