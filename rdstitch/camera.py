@@ -94,9 +94,11 @@ class Camera:
     focal_source : str or None
         Where the focal length comes from, a key of :data:`FOCAL_LOG_STD`.
     distortion_std : float or None
-        Standard deviation of :attr:`nearest_distortion`; None where it was given and not estimated.
+        Standard deviation of :attr:`nearest_distortion`, with what is left open of parameters that were not estimated,
+        and of the ground; None where it was given and not estimated.
     lens_covariance : tuple of 5 tuples of 5 floats, or None
-        Covariance of :data:`LENS_PARAMETERS`, zero for those that were not estimated; None where nothing was.
+        Covariance of :data:`LENS_PARAMETERS` by the matches alone, if those that were not estimated, for which it is
+        zero, are exactly as given; None where nothing was.
 
     Raises
     ------
@@ -296,8 +298,7 @@ class Camera:
         matrix, size = turning_matrix(orientation), turned_size(self.image_size, orientation)
         offset = matrix @ (np.array(self.center) - (np.array(self.image_size) - 1.0) / 2.0)
         x, y = (offset + (np.array(size) - 1.0) / 2.0).tolist()
-        covariance = self.lens_covariance
-        if covariance is not None:
+        if (covariance := self.lens_covariance) is not None:
             lens = np.eye(len(LENS_PARAMETERS))
             lens[3:, 3:] = matrix
             covariance = tuple(map(tuple, (lens @ np.array(covariance) @ lens.T).tolist()))

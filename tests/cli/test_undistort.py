@@ -156,3 +156,19 @@ def test_what_fails_leaves_no_folder(rdstitch: Run, frames: list[Path], tmp_path
         done = rdstitch("undistort", *inputs, "--lambda", "-0.1", "-o", tmp_path / "a" / "b")
         assert done.status == 3
         assert not (tmp_path / "a").exists()
+
+
+def test_a_camera_file_without_a_size_takes_it_from_the_pictures(
+    rdstitch: Run, frames: list[Path], tmp_path: Path
+) -> None:
+    camera = tmp_path / "camera.yml"
+    matrix = "camera_matrix:\n   rows: 3\n   cols: 3\n   data: [380., 0., 199.5, 0., 403., 149.5, 0., 0., 1.]\n"
+    values = "distortion_coefficients:\n   rows: 1\n   cols: 5\n   data: [-0.2, 0.05, 0., 0., 0.]\n"
+    camera.write_text("%YAML:1.0\n---\n" + matrix + values)
+    done = rdstitch("undistort", frames[0], "--camera", camera, "-o", tmp_path / "out")
+    assert done.status == 0
+    assert "focal lengths along x and y differ by 5.7%" in done.err
+    (tmp_path / "list").write_text(str(tmp_path / "absent.png"))
+    done = rdstitch("undistort", f"@{tmp_path / 'list'}", "--camera", camera, "-o", tmp_path / "none")
+    assert done.status == 3
+    assert "has no image size; add image_width and image_height" in done.line
