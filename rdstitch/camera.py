@@ -27,6 +27,7 @@ from rdstitch.division_model import (
     undistort,
 )
 from rdstitch.errors import ArgumentError, ImpossibleCameraError
+from rdstitch.orientation import turned_size, turning_matrix
 
 FILE_VERSION = 2
 """Of camera files; version 1 had λ and μ only, as ``lambda`` and ``lambda2``."""
@@ -99,9 +100,11 @@ class Camera:
     tilt, tilt_std : (float, float) or None
         (ψ, θ) of the camera to the plane of its images, radians, and their standard deviations; None where not known.
     distortion_std : float or None
-        Standard deviation of :attr:`nearest_distortion`; None where it was given and not estimated.
+        Standard deviation of :attr:`nearest_distortion`, with what is left open of parameters that were not estimated,
+        and of the ground; None where it was given and not estimated.
     lens_covariance : tuple of 5 tuples of 5 floats, or None
-        Covariance of :data:`LENS_PARAMETERS`, zero for those that were not estimated; None where nothing was.
+        Covariance of :data:`LENS_PARAMETERS` by the matches alone, if those that were not estimated, for which it is
+        zero, are exactly as given; None where nothing was.
 
     Raises
     ------
@@ -299,6 +302,19 @@ class Camera:
         center = ((image_size[0] - 1) / 2 + offset[0], (image_size[1] - 1) / 2 + offset[1])
         focal, std = (None if value is None else value * factor for value in (self.focal, self.focal_std))
         return replace(self, image_size=image_size, center=center, focal=focal, focal_std=std)
+
+    def turned(self, orientation: int) -> Self:
+        """The same lens on the picture after an EXIF orientation: centre, size and covariances are turned with it."""
+        if orientation == 1:
+            return self
+        matrix, size = turning_matrix(orientation), turned_size(self.image_size, orientation)
+        offset = matrix @ (np.array(self.center) - (np.array(self.image_size) - 1.0) / 2.0)
+        x, y = (offset + (np.array(size) - 1.0) / 2.0).tolist()
+        if (covariance := self.lens_covariance) is not None:
+            lens = np.eye(len(LENS_PARAMETERS))
+            lens[3:, 3:] = matrix
+            covariance = tuple(map(tuple, (lens @ np.array(covariance) @ lens.T).tolist()))
+        return replace(self, image_size=size, center=(x, y), lens_covariance=covariance)
 
     def as_dict(self) -> dict[str, Any]:
         """Everything known of the camera as plain values, the content of a camera file."""

@@ -226,7 +226,8 @@ def _first_zero(coefficients: FloatArray) -> float:
         return 0.0
     inverse = np.roots([1.0, *coefficients])  # roots in 1 / q, which exist whatever coefficients are zero
     largest = inverse.real[np.abs(inverse.imag) <= 1e-9 * np.abs(inverse)].max(initial=0.0)
-    return float(1.0 / np.sqrt(largest)) if largest > 0.0 else np.inf
+    with np.errstate(divide="ignore", over="ignore"):  # the zero of a subnormal λ is so far out that its square is inf
+        return float(np.sqrt(1.0 / largest))
 
 
 def _distorted_radius(radius: FloatArray, distortion: float, higher: tuple[float, ...]) -> FloatArray:

@@ -11,6 +11,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.matching.mixed_lenses import TwoLenses
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.messages import Message, of_severity
+from rdstitch.orientation import inverse
 
 
 @dataclass(frozen=True)
@@ -112,6 +113,12 @@ class Registration:
         return f"{pictures}, λ = {distortion:.4f} " + ("(given)" if deviation == 0.0 else f"± {deviation:.4f}")
 
     @property
-    def camera(self) -> Camera:
-        """The camera of the reference picture, with everything that was found of it."""
+    def upright_camera(self) -> Camera:
+        """The camera of the reference picture as its pixels are read, upright."""
         return self.alignment.cameras[self.alignment.reference]
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the reference picture as its file stores it, with everything that was found of it."""
+        orientation = self.sources[self.alignment.reference].metadata.orientation
+        return self.upright_camera.turned(inverse(orientation))

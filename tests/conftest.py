@@ -6,8 +6,12 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-# For an evening's search: pytest --hypothesis-profile long tests/property
+# The same examples in every run; the slow tests search at random.
+settings.register_profile("fixed", derandomize=True)
+settings.register_profile("search", max_examples=300, deadline=None)
+# For an evening: pytest --hypothesis-profile long tests/property
 settings.register_profile("long", max_examples=20_000, deadline=None)
+settings.load_profile("fixed")
 
 # The development pictures lie beside the checkout; they are not part of the project.
 _SHARED_DATA = Path(__file__).resolve().parents[1] / "../shared/data"

@@ -5,6 +5,7 @@ import shlex
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -29,13 +30,30 @@ def read_lens(file: Path | None, reporter: Reporter) -> "Camera | None":
 
     if file is None:
         return None
-    found = read_camera_file(file)
+    found = read_camera_file(file, partial(_size_of_images, file))
     if found.fit is not None:
+        cause = f"; {found.cause}" if found.cause else ""
         reporter.warn(
             f"{file}: λ = {found.camera.nearest_distortion:.6f} was fitted to the {found.kind} lens model, "
-            f"rms {found.fit.rms:.2f} pixels, at most {found.fit.largest:.2f} pixels"
+            f"rms {found.fit.rms:.2f} pixels, at most {found.fit.largest:.2f} pixels{cause}"
         )
     return found.camera
+
+
+def _size_of_images(file: Path) -> tuple[int, int]:
+    """Width and height of the first input image as it is stored, for a camera file that does not say them."""
+    from rdstitch.errors import InputError
+    from rdstitch.inputs.find import find_pictures
+    from rdstitch.io import read_metadata
+    from rdstitch.orientation import inverse, turned_size
+
+    # The names on standard input are read later, and a video only once.
+    named = [path for path in click.get_current_context().params["inputs"] if str(path) != "-"]
+    try:
+        metadata = read_metadata(find_pictures(named).frames[0].path)
+    except (InputError, IndexError) as error:
+        raise InputError(f"{file}: has no image size; add image_width and image_height") from error
+    return turned_size(metadata.size, inverse(metadata.orientation))
 
 
 def stitch_options(

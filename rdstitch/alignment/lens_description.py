@@ -14,23 +14,25 @@ _COEFFICIENT_NAMES = ("λ", "μ", "ν")
 _ORDINALS = ("first", "second", "third")
 
 
-def describe_camera(alignment: Alignment) -> tuple[str, ...]:
+def describe_camera(alignment: Alignment, camera: Camera) -> tuple[str, ...]:
     """The lines of :func:`describe_lens`, one on the focal length, and one on the tilt."""
-    camera = alignment.cameras[alignment.reference]
     if camera.focal is None or camera.focal_std is None or alignment.focal is None:
-        return (*describe_lens(alignment), "focal length and tilt are not observable with one homography per image")
+        unseen = "focal length and tilt are not observable with one homography per image"
+        return (*describe_lens(alignment, camera), unseen)
     lines = [f"focal length {camera.focal:.1f} ± {camera.focal_std:.1f} pixels"]
     if camera.tilt is not None and camera.tilt_std is not None:
         (psi, theta), (psi_std, theta_std) = np.degrees(camera.tilt), np.degrees(camera.tilt_std)
         spread = math.degrees(alignment.tilt_spread)
         varies = f", of single images ± {spread:.2f}" if spread else ""
         lines.append(f"tilt ψ = {psi:.3f} ± {psi_std:.3f}, θ = {theta:.3f} ± {theta_std:.3f} degrees{varies}")
-    return (*describe_lens(alignment), *lines)
+    return (*describe_lens(alignment, camera), *lines)
 
 
-def describe_lens(alignment: Alignment) -> tuple[str, ...]:
-    """One line on λ, one on each of μ, ν and the distortion centre, and one on the choice of the lens."""
-    camera = alignment.cameras[alignment.reference]
+def describe_lens(alignment: Alignment, camera: Camera) -> tuple[str, ...]:
+    """One line on λ, one on each of μ, ν and the distortion centre, and one on the choice of the lens.
+
+    ``camera`` is that of the reference picture, upright or as it is stored.
+    """
     if not math.isfinite(alignment.distortion_std):
         return ("λ is not observable",)
     if alignment.distortion_std == 0.0 and camera.lens_covariance is None:

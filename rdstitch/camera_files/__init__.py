@@ -25,6 +25,7 @@ from rdstitch.camera import Camera
 from rdstitch.camera_files.hugin import hugin_project, is_hugin, read_hugin
 from rdstitch.camera_files.lens_fit import LensFit
 from rdstitch.camera_files.opencv import (
+    ImageSize,
     is_opencv,
     opencv_fisheye_yaml,
     opencv_json,
@@ -57,12 +58,14 @@ _STATED = re.compile(r"(?<!lambda_)fit_largest_px\"?: ([-+.\de]+)")
 """The residual that files of others state."""
 
 
-def load_camera(path: str | Path) -> Camera:
+def load_camera(path: str | Path, image_size: tuple[int, int] | None = None) -> Camera:
     """Read a camera file of any known format; see :func:`read_camera_file`, which also gives how well λ fits.
 
     Parameters
     ----------
     path : path
+    image_size : (int, int), optional
+        Width and height of the pictures, pixels, for a file of OpenCV that does not say them.
 
     Returns
     -------
@@ -73,13 +76,19 @@ def load_camera(path: str | Path) -> Camera:
     InputError
         When the file cannot be read, or holds no camera.
     """
-    return read_camera_file(path).camera
+    return read_camera_file(path, None if image_size is None else lambda: image_size).camera
 
 
-def read_camera_file(path: str | Path) -> CameraFile:
+def read_camera_file(path: str | Path, image_size: ImageSize | None = None) -> CameraFile:
     """Read a camera file of any known format.
 
     A file that rdstitch wrote gives back λ exactly; to the lens model of any other, λ is fitted.
+
+    Parameters
+    ----------
+    path : path
+    image_size : callable, optional
+        Gives width and height of the pictures, pixels, for a file of OpenCV that does not say them.
 
     Raises
     ------
@@ -90,7 +99,7 @@ def read_camera_file(path: str | Path) -> CameraFile:
     if text.lstrip().startswith("{"):
         record = parse_json(text, file)
         if is_opencv(record):
-            return read_opencv(record)
+            return read_opencv(record, image_size)
         if is_opendronemap(record):
             return read_opendronemap(record)
         return CameraFile(camera_from_record(record), "rdstitch")
@@ -102,7 +111,7 @@ def read_camera_file(path: str | Path) -> CameraFile:
         return read_colmap(text, file)
     if is_kalibr(text):
         return read_kalibr(text, file)
-    return read_opencv(parse_yaml(text, file))
+    return read_opencv(parse_yaml(text, file), image_size)
 
 
 def save_camera(camera: Camera, path: str | Path) -> None:

@@ -1,5 +1,6 @@
 """Lens models of others that several formats share: Brown's polynomial, and Kannala and Brandt's fisheye."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
@@ -18,7 +19,7 @@ CLOSE = 0.1
 
 
 @dataclass(frozen=True)
-class _ForeignLens:
+class ForeignLens(ABC):
     """What both models have.
 
     Attributes
@@ -32,6 +33,10 @@ class _ForeignLens:
     focal: tuple[float, float]
     center: tuple[float, float]
 
+    @abstractmethod
+    def distort(self, points: FloatArray) -> FloatArray:
+        """Pixels (..., 2) of a lens without distortion and with square pixels to measured pixels."""
+
     @property
     def mean_focal(self) -> float:
         """One focal length for both directions, pixels."""
@@ -39,7 +44,7 @@ class _ForeignLens:
 
 
 @dataclass(frozen=True)
-class Brown(_ForeignLens):
+class Brown(ForeignLens):
     """Brown's model, a polynomial of the undistorted radius in focal lengths, with OpenCV's rational denominator.
 
     Attributes
@@ -102,7 +107,7 @@ class Brown(_ForeignLens):
 
 
 @dataclass(frozen=True)
-class Fisheye(_ForeignLens):
+class Fisheye(ForeignLens):
     """A lens that measures a ray at angle θ from the axis ``f (θ + k1 θ³ + k2 θ⁵ + k3 θ⁷ + k4 θ⁹)`` from the centre.
 
     Attributes

@@ -8,13 +8,14 @@ OpenCV's own reader is not used: it says on standard error what it does not like
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from rdstitch.camera import Camera
 from rdstitch.camera_files.lens_fit import LensFit
 from rdstitch.camera_files.lens_models import Brown, Fisheye, fisheye_of, least_brown_of
-from rdstitch.camera_files.own_camera import CameraFile, fitted_camera, own_node
+from rdstitch.camera_files.own_camera import CameraFile, fitted_lens, own_node
 from rdstitch.camera_record import camera_from_record
 from rdstitch.errors import InputError
 from rdstitch.records import Record, parse_json
@@ -28,6 +29,13 @@ _FISHEYE = ("equidistant", "fisheye")
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
 
 _COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "Distortion_Coefficients", "D")
+_WIDE = 0.9  # half diagonals in focal lengths: fisheyes begin there, at 84 degrees by the usual model
+_ASYMMETRIC, _TIMES_CLOSER = 0.005, 4.0  # half diagonals off every symmetric lens, and times the fisheye's error
+_OFF_CENTER = 0.15  # of the picture's sides: principal points lie nearer to the middle
+
+ImageSize = Callable[[], tuple[int, int]]
+"""Gives width and height, pixels, where a file does not say them."""
+
 _WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height")
 
 
@@ -102,8 +110,11 @@ def is_opencv(record: Record) -> bool:
     return isinstance(record.value, dict) and any(name in record.value for name in _MATRIX)
 
 
-def read_opencv(record: Record) -> CameraFile:
+def read_opencv(record: Record, image_size: ImageSize | None = None) -> CameraFile:
     """The camera of a FileStorage; without rdstitch's own node, λ is fitted.
+
+    Four coefficients may be Brown's or those of ``cv2.fisheye``, and only a mark says which. Where there is none they
+    are Brown's, unless they clearly make a fisheye.
 
     Raises
     ------
@@ -115,25 +126,61 @@ def read_opencv(record: Record) -> CameraFile:
     (fx, skew, cx), (_, fy, cy) = _rows(_first(record, _MATRIX), 3, 3)[:2]
     if not (fx > 0.0 and fy > 0.0 and abs(skew) < 1e-6 * fx):
         _first(record, _MATRIX).fail("expected positive focal lengths and no skew")
-    size = (_first(record, _WIDTH).side(), _first(record, _HEIGHT).side())
+    size = _size(record, (cx, cy), image_size)
     given = _first(record, _COEFFICIENTS)
     k = [value for row in _rows(given) for value in row]
-    lens: Brown | Fisheye
-    if _is_fisheye(record):
-        if len(k) != 4:
-            given.fail("expected the 4 coefficients of a fisheye")
-        lens = Fisheye((fx, fy), (cx, cy), tuple(k))
-    else:
-        lens = _brown(given, k, (fx, fy), (cx, cy))
-    return fitted_camera(record, _KIND, lens.distort, size, lens.center, lens.mean_focal, given)
+    marked = _is_fisheye(record)
+    if marked and len(k) != 4:
+        given.fail("expected the 4 coefficients of a fisheye")
+    lens = Fisheye((fx, fy), (cx, cy), tuple(k)) if marked else _brown(given, k, (fx, fy), (cx, cy))
+    read = partial(fitted_lens, record, _KIND, size=size, model=given)
+    if marked is not None or len(k) != 4 or not any(k):
+        return read(lens)
+    try:
+        fisheye = read(Fisheye((fx, fy), (cx, cy), tuple(k)))
+    except InputError:
+        return read(lens)
+    try:
+        found = read(lens)
+    except InputError:
+        found = None
+    if found is None or _is_rather(fisheye, found):
+        given.fail(
+            "these 4 coefficients make no lens of OpenCV's usual model, but one of cv2.fisheye; if they are that, add "
+            '"fisheye_model: 1", else "distortion_model: plumb_bob"'
+        )
+    return found
 
 
-def _is_fisheye(record: Record) -> bool:
-    """Whether the coefficients are those of the fisheye model."""
+def _is_rather(fisheye: CameraFile, brown: CameraFile) -> bool:
+    """Whether coefficients are a fisheye's: these make a symmetric lens of a wide field of view, Brown's do not."""
+    camera, one, other = brown.camera, fisheye.fit, brown.fit
+    assert camera.focal is not None
+    assert one is not None
+    assert other is not None
+    wide = camera.half_diagonal > _WIDE * camera.focal
+    return wide and other.largest > max(_ASYMMETRIC * camera.half_diagonal, _TIMES_CLOSER * one.largest)
+
+
+def _size(record: Record, center: tuple[float, float], image_size: ImageSize | None) -> tuple[int, int]:
+    """Width and height, of the pictures where the file does not say them."""
+    if image_size is None or any(record.get(name) is not None for name in (*_WIDTH, *_HEIGHT)):
+        return _first(record, _WIDTH).side(), _first(record, _HEIGHT).side()
+    size = image_size()
+    if any(abs((c + 0.5) / side - 0.5) > _OFF_CENTER for c, side in zip(center, size, strict=True)):
+        record.fail(
+            f"has no image_width and image_height, and its principal point {center[0]:.0f}, {center[1]:.0f} is not "
+            f"that of pictures of {size[0]} x {size[1]} pixels; add the size that it was calibrated for"
+        )
+    return size
+
+
+def _is_fisheye(record: Record) -> bool | None:
+    """Whether the coefficients are those of the fisheye model; None where nothing says."""
     model, flag = record.get("distortion_model"), record.get("fisheye_model")
     if model is not None:
         return model.choice(("plumb_bob", "rational_polynomial", *_FISHEYE)) in _FISHEYE
-    return flag is not None and flag.integer(0) > 0
+    return None if flag is None else flag.integer(0) > 0
 
 
 def _brown(given: Record, k: list[float], focal: tuple[float, float], center: tuple[float, float]) -> Brown:

@@ -4,7 +4,7 @@ import json
 
 from rdstitch.camera import Camera
 from rdstitch.camera_files.lens_models import Brown, Fisheye, brown_of, closer_fisheye
-from rdstitch.camera_files.own_camera import CameraFile, fitted_camera, own_node
+from rdstitch.camera_files.own_camera import CameraFile, fitted_lens, own_node
 from rdstitch.camera_record import camera_from_record
 from rdstitch.records import Record
 
@@ -48,7 +48,7 @@ def read_opendronemap(record: Record) -> CameraFile:
     lens: Brown | Fisheye = Brown(focal, center, (k1, k2, k3), (p1, p2))
     if kind == _FISHEYE:
         lens = Fisheye(focal, center, (k1, k2, k3, k4))
-    return fitted_camera(entry, _KIND, lens.distort, size, lens.center, lens.mean_focal)
+    return fitted_lens(entry, _KIND, lens, size)
 
 
 def opendronemap_json(camera: Camera) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from rdstitch.camera import Camera
 from rdstitch.camera_files.lens_models import Brown, Fisheye, brown_of, closer_fisheye, least_brown_of, rational_of
 from rdstitch.camera_files.opencv import parse_yaml
-from rdstitch.camera_files.own_camera import CameraFile, comments, fitted_camera
+from rdstitch.camera_files.own_camera import CameraFile, comments, fitted_lens
 from rdstitch.records import Record, parse_json
 
 _COLMAP = {
@@ -103,7 +103,7 @@ def _fitted(
     lens: Brown | Fisheye = Brown.of_opencv((fx, fy), (cx, cy), coefficients)
     if fisheye:
         lens = Fisheye((fx, fy), (cx, cy), tuple(coefficients))
-    return fitted_camera(record, kind, lens.distort, size.size(), lens.center, lens.mean_focal)
+    return fitted_lens(record, kind, lens, size.size())
 
 
 def colmap_text(camera: Camera) -> str:

@@ -12,7 +12,7 @@ import cv2
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.find import is_rdstitch_output, natural_key, pictures_in
 from rdstitch.inputs.frame import Frame, Named, array_as_picture
-from rdstitch.io.video import VIDEO_SUFFIXES, write_frame
+from rdstitch.io.video import VIDEO_SUFFIXES, opened_capture, write_frame
 
 _POLL_SECONDS = 0.2  # seconds between two looks at a folder
 _COMPLETE_AFTER_SECONDS = 1.0  # seconds after its last change from which on a file counts as complete
@@ -134,9 +134,8 @@ class Arrivals:
     def _of_capture(self) -> Iterator[Frame]:
         """Every n-th frame of a video, camera or stream; those of a camera and a stream are kept as files too."""
         live = self._kind == "stream"
-        capture = cv2.VideoCapture(int(self._source) if self._source.isdecimal() else self._source)
         stem = "frame" if live else Path(self._source).stem
-        try:
+        with opened_capture(int(self._source) if self._source.isdecimal() else self._source) as capture:
             if not capture.isOpened():
                 raise InputError(f"{self._source}: OpenCV cannot open this camera, video or stream")
             number, last = 0, time.monotonic()
@@ -155,8 +154,6 @@ class Arrivals:
                         self._seen.append(Frame(write_frame(self._frames_folder() / name, pixels), number, stamp))
                     yield Frame(Path(name), number, stamp, array_as_picture(name, pixels, "bgr"))
                 number += 1
-        finally:
-            capture.release()
 
     def _is_over(self, last: float) -> bool:
         return self._idle is not None and time.monotonic() - last >= self._idle

@@ -2,12 +2,14 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from rdstitch.errors import InputError, OutputError
 from rdstitch.inputs.frame import Frame
@@ -112,8 +114,7 @@ class _Messages:
         for connection, _, data in self.reader.messages(connections=self.connections):
             message = self.reader.deserialize(data, connection.msgtype)
             if connection.msgtype == _COMPRESSED:
-                decoded = cv2.imdecode(message.data, cv2.IMREAD_GRAYSCALE)
-                yield np.zeros((1, 1), np.uint8) if decoded is None else np.asarray(decoded, dtype=np.uint8)
+                yield _grey_of_compressed(message.data)
                 continue
             pixels = _pixels(self.path, message)
             pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
@@ -139,6 +140,16 @@ class _Messages:
 def _suffix(data: NDArray[np.uint8]) -> str:
     """Of a compressed image, by its first bytes: the format field is free text."""
     return ".png" if bytes(data[:4]) == b"\x89PNG" else ".jpg"
+
+
+def _grey_of_compressed(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A JPEG or PNG image, (H, W); black where it cannot be decoded. OpenCV's decoders write on standard error."""
+    try:
+        with Image.open(BytesIO(data.tobytes()), formats=("JPEG", "PNG")) as image:
+            deep = image.mode.startswith("I")
+            return (np.asarray(image) >> 8).astype(np.uint8) if deep else np.asarray(image.convert("L"))
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        return np.zeros((1, 1), np.uint8)
 
 
 def _pixels(path: Path, message: Any) -> NDArray[Any]:

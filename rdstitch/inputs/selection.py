@@ -9,7 +9,7 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.find import PICTURE_SUFFIXES
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.source import Source
-from rdstitch.io.mask import check_mask
+from rdstitch.io.mask import mask_frame
 
 
 def selected(frames: Sequence[Frame], exclude: Sequence[str], include_only: Sequence[str]) -> list[Frame]:
@@ -54,12 +54,12 @@ def _fits(frame: Frame, pattern: str) -> bool:
     return pattern in names or any(fnmatchcase(name, pattern) for name in names)
 
 
-def with_masks(sources: Sequence[Source], mask: str | Path | None) -> list[Source]:
+def with_masks(sources: Sequence[Source], masks: str | Path | None) -> list[Source]:
     """The sources, each with its mask, if it has one.
 
     Parameters
     ----------
-    mask : path or None
+    masks : path or None
         A picture: the mask of all pictures, such as of a camera that sees its own vehicle. Or a folder with a mask for
         each picture, or for some, of the picture's name; the suffix may differ.
 
@@ -69,18 +69,22 @@ def with_masks(sources: Sequence[Source], mask: str | Path | None) -> list[Sourc
         When there is no such file or folder, nothing in the folder is the mask of a picture, or a mask has another
         shape than its picture.
     """
-    if mask is None:
+    if masks is None:
         return list(sources)
-    path = Path(mask)
-    masks = _by_stem(path) if path.is_dir() else dict.fromkeys((source.path.stem for source in sources), path)
-    masked = [replace(source, mask=masks.get(source.path.stem)) for source in sources]
+    path = Path(masks)
+    several = path.is_dir()
+    by_stem = _by_stem(path) if several else dict.fromkeys((source.path.stem for source in sources), path)
+    masked = []
+    for source in sources:
+        mask, frame = by_stem.get(source.path.stem), None
+        if mask is not None:
+            if mask.resolve() == source.path.resolve():
+                raise InputError(f"{mask}: is the picture itself, not its mask; masks lie in another folder")
+            metadata = source.metadata
+            frame = mask_frame(mask, source.path, metadata.size, metadata.orientation, of_camera=not several)
+        masked.append(replace(source, mask=mask, mask_frame=frame))
     if sources and all(source.mask is None for source in masked):
         raise InputError(f"{path}: none of the masks has the name of a picture, such as {sources[0].path.stem}.png")
-    for source in masked:
-        if source.mask is not None:
-            if source.mask.resolve() == source.path.resolve():
-                raise InputError(f"{source.mask}: is the picture itself, not its mask; masks lie in another folder")
-            check_mask(source.mask, source.path, source.metadata.size)
     return masked
 
 

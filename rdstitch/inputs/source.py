@@ -22,7 +22,11 @@ from rdstitch.io.metadata import Metadata, read_metadata
 from rdstitch.io.read import Picture, read_image, reduced
 from rdstitch.io.reduction import block_minimum, fitting_reduction, reduced_size
 from rdstitch.messages import Message, left_out
+from rdstitch.orientation import inverse, turned_size
 from rdstitch.planar_motion import rotation_from_tilt
+
+_HELD_UPRIGHT = 6
+"""EXIF orientation."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,8 @@ class Source:
         What is known of the camera before registration: size, centre, focal length, and λ where it was given.
     mask : Path or None
         Picture that is dark where this one does not count.
+    mask_frame : int or None
+        How it is turned, see :func:`rdstitch.io.mask.mask_frame`.
     attitude : (float, float) or None
         (ψ, θ), radians, as a gimbal or an IMU has measured it.
     frame : Frame or None
@@ -51,6 +57,7 @@ class Source:
     metadata: Metadata
     camera: Camera
     mask: Path | None = None
+    mask_frame: int | None = None
     attitude: tuple[float, float] | None = None
     frame: Frame | None = field(default=None, compare=False, repr=False)
     decoded_images: DecodedImageCache = field(
@@ -87,6 +94,10 @@ class Source:
             return cache.file(self.path)
         return cache.digest((self.frame.picture.pixels, self.frame.picture.alpha))
 
+    def mask_content(self, cache: Cache) -> tuple[str, int | None]:
+        """The same of its mask."""
+        return cache.file(self.mask), self.mask_frame
+
     def reduction(self, megapixels: float | None) -> int:
         """By how much it can be read smaller and has no fewer pixels than a picture halved to so many 10⁶ pixels."""
         return 1 if megapixels is None else fitting_reduction(halving(self.camera.image_size, megapixels))
@@ -108,7 +119,7 @@ class Source:
         usual = self.reduction(WORK_MEGAPIXELS)
         if reduction % usual:
             return self._load(reduction)
-        key = (self.path, self.mask)
+        key = (self.path, self.mask, self.mask_frame)
         picture = self.decoded_images.take(key) or self._load(usual)
         if keep:
             self.decoded_images.put(key, picture)
@@ -135,7 +146,7 @@ class Source:
             raise InputError(f"{self.path}: has {now} pixels now, but had {before} before; run again")
         if self.mask is None:
             return picture
-        alpha = block_minimum(read_mask(self.mask, expected), reduction)
+        alpha = block_minimum(read_mask(self.mask, expected, self.mask_frame), reduction)
         if picture.alpha is not None:
             alpha = np.minimum(alpha, picture.alpha)
         return replace(picture, alpha=alpha)
@@ -213,7 +224,7 @@ def _check_memory(path: Path, metadata: Metadata, max_memory: int | None) -> Non
 
 def _camera(metadata: Metadata, camera: Camera | None, focal: float | None, distortion: float | None) -> Camera:
     """The best that is known of one picture's camera: what the user says, then EXIF; the guess comes later."""
-    found = Camera(metadata.size) if camera is None else _fitted(camera, metadata.size)
+    found = Camera(metadata.size) if camera is None else _fitted(camera, metadata)
     if focal is not None:
         found = found.with_focal(focal, "option")
     elif found.focal is None and metadata.focal_px is not None:
@@ -223,14 +234,17 @@ def _camera(metadata: Metadata, camera: Camera | None, focal: float | None, dist
     return found.with_coefficients(distortion)
 
 
-def _fitted(camera: Camera, size: tuple[int, int]) -> Camera:
-    """A known camera for a picture of another size or turned by a quarter."""
-    if size == camera.image_size:
-        return camera
-    ratio, own = size[0] / size[1], camera.image_size[0] / camera.image_size[1]
-    if not any(abs(ratio / shape - 1.0) < 0.02 for shape in (own, 1.0 / own)):
-        raise ArgumentError(
-            f"the camera file is for {camera.image_size[0]} x {camera.image_size[1]} pixels; "
-            f"a picture of {size[0]} x {size[1]} pixels was cropped or comes from another camera"
-        )
-    return camera.resized(size)
+def _fitted(camera: Camera, metadata: Metadata) -> Camera:
+    """A known camera for an upright picture: it belongs to the frame, stored or upright, whose shape it has.
+
+    Where the picture is turned by a quarter and no tag says which way, as cameras are that are held upright.
+    """
+    upright, orientation = metadata.size, metadata.orientation
+    for turning in (orientation, 1, _HELD_UPRIGHT):
+        size = turned_size(upright, inverse(turning))
+        if abs(size[0] * camera.image_size[1] / (size[1] * camera.image_size[0]) - 1.0) < 0.02:
+            return camera.resized(size).turned(turning)
+    raise ArgumentError(
+        f"the camera file is for {camera.image_size[0]} x {camera.image_size[1]} pixels; "
+        f"a picture of {upright[0]} x {upright[1]} pixels was cropped or comes from another camera"
+    )

@@ -8,35 +8,54 @@ from numpy.typing import NDArray
 from rdstitch.errors import InputError
 from rdstitch.io.metadata import read_metadata
 from rdstitch.io.read import read_image
+from rdstitch.orientation import inverse, turned, turned_size
 
 _OPAQUE = 255
 
 
-def check_mask(path: str | Path, picture: str | Path, size: tuple[int, int]) -> None:
-    """Find out from its header whether a mask fits to a picture.
+def mask_frame(
+    path: str | Path, picture: str | Path, size: tuple[int, int], orientation: int = 1, *, of_camera: bool = False
+) -> int | None:
+    """Find out from its header whether, and in which frame, a mask fits to a picture.
+
+    What the camera sees in every picture belongs to the stored frame, as its lens does; the mask of one picture is as
+    that looks. Where a mask fits in one of the two only, it belongs there.
 
     Parameters
     ----------
     path, picture : path
         The mask, and the picture that it is for.
     size : (int, int)
-        Width and height of the picture, pixels.
+        Width and height of the picture, upright, pixels.
+    orientation : int
+        EXIF orientation of the picture.
+    of_camera : bool
+        Whether it is the mask of all pictures.
+
+    Returns
+    -------
+    int or None
+        The orientation by which it is to be turned from how its file stores it; None where it is used as it looks.
 
     Raises
     ------
     InputError
         When the mask cannot be read, or has another shape than the picture; the text names it.
     """
-    (width, height), (w, h) = size, read_metadata(path).size
-    # Sizes are whole pixels, so that the shape may differ by one pixel of the larger.
-    if abs(width * h - height * w) > max(width, height, w, h):
-        raise InputError(
-            f"{path}: a mask of {w} x {h} pixels does not fit on {picture}, which has {width} x {height} pixels; "
-            "a mask has its picture's size, or another size of the same shape"
-        )
+    own, (width, height) = read_metadata(path), size
+    stored = turned_size(turned_size(own.size, inverse(own.orientation)), orientation)
+    frames: list[tuple[int | None, tuple[int, int]]] = [(None, own.size), (orientation, stored)]
+    for frame, (w, h) in frames[::-1] if of_camera else frames:
+        # Sizes are whole pixels, so that the shape may differ by one pixel of the larger.
+        if abs(width * h - height * w) <= max(width, height, w, h):
+            return frame
+    raise InputError(
+        f"{path}: a mask of {own.size[0]} x {own.size[1]} pixels does not fit on {picture}, which has "
+        f"{width} x {height} pixels; a mask has its picture's size, or another size of the same shape"
+    )
 
 
-def read_mask(path: str | Path, size: tuple[int, int]) -> NDArray[np.uint8]:
+def read_mask(path: str | Path, size: tuple[int, int], frame: int | None = None) -> NDArray[np.uint8]:
     """Read a mask as alpha for a picture.
 
     What is darker than half of the mask's brightest value is excluded, so that masks of 0 and 1, masks of 0 and 255,
@@ -46,6 +65,8 @@ def read_mask(path: str | Path, size: tuple[int, int]) -> NDArray[np.uint8]:
     ----------
     size : (int, int)
         Width and height, pixels, that the mask is brought to; nearest pixels.
+    frame : int or None
+        As :func:`mask_frame` gives it.
 
     Returns
     -------
@@ -63,6 +84,8 @@ def read_mask(path: str | Path, size: tuple[int, int]) -> NDArray[np.uint8]:
     counts = light >= (brightest / 2 if brightest > 0 else 1)
     if mask.alpha is not None:
         counts &= mask.alpha >= (_OPAQUE + 1) // 2
+    if frame is not None:
+        counts = turned(turned(counts, inverse(mask.metadata.orientation)), frame)
     height, width = counts.shape
     rows = (np.arange(size[1]) + 0.5) * (height / size[1])
     columns = (np.arange(size[0]) + 0.5) * (width / size[0])

@@ -2,28 +2,24 @@
 
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-import numpy as np
 import tifffile
-from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 from rdstitch.camera import is_focal_length
 from rdstitch.file_access import open_regular
 from rdstitch.io.attitude import Attitude, finite, read_attitude, xmp_number, xmp_text
+from rdstitch.io.colour import ink_transform
 from rdstitch.io.opening import check_megapixels, check_readable, decoding, has_late_metadata, opened_picture
 from rdstitch.io.optional_readers import is_raw, raw_exif, raw_size
+from rdstitch.orientation import turned_size, turning_matrix
 
-SIDEWAYS = (5, 6, 7, 8)
-"""Orientations that exchange the axes; what runs backwards, runs so after that."""
-
-_X_BACKWARDS, _Y_BACKWARDS = (2, 3, 6, 7), (3, 4, 7, 8)
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _BIT_DEPTHS = {"1": 1, "I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
@@ -36,25 +32,12 @@ _EXIF_OF_PNG = {"exif", "Raw profile type exif"}
 _COLOUR_SPACE = slice(16, 20)  # of a profile's header
 _UNWRITABLE = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, struct.error)
 _HEADER = 16
+_TIMES = {int(getattr(ExifTags.Base, name)) for name in ("DateTimeOriginal", "OffsetTimeOriginal")}
+_OF_WHOM = {
+    int(getattr(ExifTags.Base, name))
+    for name in ("Make", "Model", "Artist", "Copyright", "DateTime", "Software", "ImageDescription", "Orientation")
+}
 _ORIENTATION, _PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE = 0x0112, 0xA002, 0xA003, 0x927C
-
-
-def turned(samples: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """Samples (h, w) or (h, w, C) with an orientation (1 to 8) applied; a view."""
-    if orientation in SIDEWAYS:
-        samples = np.swapaxes(samples, 0, 1)
-    if orientation in _Y_BACKWARDS:
-        samples = samples[::-1]
-    if orientation in _X_BACKWARDS:
-        samples = samples[:, ::-1]
-    return samples
-
-
-def turned_direction(x: float, y: float, orientation: int) -> tuple[float, float]:
-    """A direction in a stored picture, to the right and down, as it is after :func:`turned`."""
-    if orientation in SIDEWAYS:
-        x, y = y, x
-    return (-x if orientation in _X_BACKWARDS else x), (-y if orientation in _Y_BACKWARDS else y)
 
 
 @dataclass(frozen=True)
@@ -127,8 +110,17 @@ class Metadata:
         """Unit vector straight down from the camera: to the right, to the bottom of the picture as read, and ahead."""
         if self.attitude is None:
             return None
-        x, y, z = self.attitude.nadir
-        return *turned_direction(x, y, self.orientation), z
+        *direction, z = self.attitude.nadir
+        x, y = (turning_matrix(self.orientation) @ direction).tolist()
+        return x, y, z
+
+    def in_another_size(self) -> Self:
+        """Of the same picture at the same scale but cut or extended: of what film it would be that of is not true."""
+        return replace(self, exif=_edited(self.exif, _without_equivalent))
+
+    def of_composite(self) -> Self:
+        """Of a picture made from several: no lens, exposure or place of one of them is true of it."""
+        return replace(self, exif=_edited(self.exif, _who_and_when))
 
 
 def read_metadata(path: str | Path) -> Metadata:
@@ -177,14 +169,13 @@ def metadata_of(image: Image.Image) -> Metadata:
     bit_depth = _bit_depth(image)
     exif = image.getexif()
     orientation = _orientation(exif.get(_ORIENTATION))
-    width, height = image.size
     photo = exif.get_ifd(ExifTags.IFD.Exif)
     xmp = xmp_text(image)
     focal, source = _focal_px(exif, photo, xmp, image.size)
     dpi = image.info.get("dpi")
     profile, profile_lost = _colour_profile(image)
     return Metadata(
-        size=(height, width) if orientation in SIDEWAYS else (width, height),
+        size=turned_size(image.size, orientation),
         bit_depth=bit_depth,
         orientation=orientation,
         focal_px=focal,
@@ -197,7 +188,7 @@ def metadata_of(image: Image.Image) -> Metadata:
         dpi=(float(dpi[0]), float(dpi[1])) if dpi and all(finite(d) for d in dpi) else None,
         exposure=_exposure(photo),
         timestamp=_timestamp(photo),
-        exif=_clean_exif(exif),
+        exif=_clean_exif(exif, image.width),
         icc_profile=profile,
         profile_lost=profile_lost,
         channels=_channels(image),
@@ -242,7 +233,9 @@ def _colour_profile(image: Image.Image) -> tuple[bytes, str]:
     if len(profile) > MAX_PROFILE:
         return b"", f"its colour profile of {len(profile) / 1e6:.1f} MB is too large for PNG readers"
     if profile[_COLOUR_SPACE] == b"CMYK":
-        return b"", "its colour profile is one of inks (CMYK), and the output is RGB"
+        return b"", "" if ink_transform(profile) else "its colour profile of inks (CMYK) cannot be used"
+    if profile[_COLOUR_SPACE] == b"Lab ":
+        return b"", ""
     return profile, ""
 
 
@@ -315,21 +308,50 @@ def _degrees(value: Any, negative: bool) -> float | None:
     return -degrees if negative else degrees
 
 
-def _clean_exif(exif: Image.Exif) -> bytes:
-    """EXIF for the output: what orientation, size and maker note said is no longer true of it."""
+def _clean_exif(exif: Image.Exif, width: int) -> bytes:
+    """EXIF for the output: what orientation, size and maker note said is no longer true of it.
+
+    The resolution of the focal plane counts pixels of the size that EXIF says; ``width`` is that of the picture.
+    """
     if not len(exif):
         return b""
+
+    def clean(kept: Image.Exif) -> None:
+        photo = kept.get_ifd(ExifTags.IFD.Exif)
+        original = finite(photo.get(_PIXEL_WIDTH))
+        for tag in (ExifTags.Base.FocalPlaneXResolution, ExifTags.Base.FocalPlaneYResolution):
+            if original and (resolution := finite(photo.get(tag))) and original != width:
+                photo[tag] = resolution * width / original
+        for gone in (_PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE):
+            photo.pop(gone, None)
+
     # First, since what is not of the type that belongs to it cannot be written.
     exif[_ORIENTATION] = 1
-    kept = Image.Exif()
     try:
-        kept.load(exif.tobytes())
+        data = exif.tobytes()
     except _UNWRITABLE:
         return b""
-    photo = kept.get_ifd(ExifTags.IFD.Exif)
-    for tag in (_PIXEL_WIDTH, _PIXEL_HEIGHT, _MAKER_NOTE):
-        photo.pop(tag, None)
+    return _edited(data, clean)
+
+
+def _edited(data: bytes, edit: Callable[[Image.Exif], None]) -> bytes:
+    """An EXIF block after a change; empty where it cannot be written, or says nothing."""
+    exif = Image.Exif()
     try:
-        return kept.tobytes()
+        exif.load(data)
+        edit(exif)
+        return exif.tobytes() if len(exif) else b""
     except _UNWRITABLE:
         return b""
+
+
+def _without_equivalent(exif: Image.Exif) -> None:
+    exif.get_ifd(ExifTags.IFD.Exif).pop(ExifTags.Base.FocalLengthIn35mmFilm, None)
+
+
+def _who_and_when(exif: Image.Exif) -> None:
+    photo = exif.get_ifd(ExifTags.IFD.Exif)
+    for tag in set(photo) - _TIMES:
+        del photo[tag]
+    for tag in set(exif) - _OF_WHOM - {int(ExifTags.IFD.Exif)}:
+        del exif[tag]

@@ -17,11 +17,13 @@ from PIL import Image
 
 from rdstitch.errors import InputError
 from rdstitch.file_access import open_regular
-from rdstitch.io.metadata import Metadata, metadata_of, read_metadata, turned
+from rdstitch.io.colour import srgb_of_lab, without_inks
+from rdstitch.io.metadata import Metadata, metadata_of, read_metadata
 from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, opened_picture
 from rdstitch.io.optional_readers import is_raw, read_raw
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
 from rdstitch.opencv_state import silent_opencv
+from rdstitch.orientation import turned
 
 _END_OF_IMAGE = b"\xff\xd9"
 _PADDING = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
@@ -29,6 +31,9 @@ _MIN_JPEG_SIDE = 8  # pixels a side; below, different reductions give pictures o
 _OPAQUE = 255
 # A page of a TIFF file that masks the picture, and how many pages are looked at for one.
 _MASK, _MASK_WITHIN = 4, 40
+
+_LAB = (tifffile.PHOTOMETRIC.CIELAB, tifffile.PHOTOMETRIC.ICCLAB)
+_PLAIN = (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.MINISWHITE, tifffile.PHOTOMETRIC.RGB)
 
 _MAX_DECODED_REDUCTION = 8  # of the JPEG decoder
 _ROWS_AT_A_TIME = 128
@@ -113,8 +118,8 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
 
     JPEG, PNG, TIFF, WebP and whatever else Pillow reads, with 8 or 16 bit or floating-point samples; with optional
     packages also HEIC, and raw files, which become 16-bit sRGB. Of an animated or multi-page file the first picture
-    counts. CMYK and palette colours become RGB. NaN or infinite samples of a floating-point file become transparent
-    zeros.
+    counts. CMYK (by its profile), CIELAB and palette colours become RGB. NaN or infinite samples of a floating-point
+    file become transparent zeros.
 
     Parameters
     ----------
@@ -188,6 +193,7 @@ def _from_pillow(image: Image.Image, factor: int) -> tuple[Pixels, Pixels | None
     if image.mode == "F":
         return _samples(image), None
     transparent = "A" in image.getbands() or "transparency" in image.info or image.mode in ("La", "RGBa")
+    image = without_inks(image)
     grey = image.mode in ("1", "L", "LA", "La") or (image.mode == "P" and _is_grey(image))
     mode = "RGBA" if transparent else "L" if grey else "RGB"
     samples = _samples(image if image.mode == mode else image.convert(mode))
@@ -259,7 +265,8 @@ def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
     """Samples and alpha of the first page, with any number of bands, or the mask on a page of its own."""
     with open_regular(file) as stream, tifffile.TiffFile(stream, name=str(file)) as tiff:
         page = tiff.pages.first
-        plain = page.photometric in (tifffile.PHOTOMETRIC.MINISBLACK, tifffile.PHOTOMETRIC.RGB)
+        kind = page.photometric
+        plain = kind in _PLAIN or kind in _LAB
         has_alpha = any(extra in (1, 2) for extra in page.extrasamples)
         try:
             samples = page.asarray() if plain else None
@@ -272,6 +279,9 @@ def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
         others = (other for other in tiff.pages[1:_MASK_WITHIN] if isinstance(other, tifffile.TiffPage))
         masks = (other for other in others if other.subfiletype == _MASK and other.shape == size)
         mask = next((other.asarray() for other in masks), None)
+    if samples is None and kind == tifffile.PHOTOMETRIC.SEPARATED:
+        with opened_picture(file) as image:
+            return _from_pillow(image, 1)
     if samples is None:
         with open_regular(file) as stream:
             return _split(_decode_with_opencv(stream.read()))
@@ -279,6 +289,13 @@ def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
         samples, axes = np.moveaxis(samples, 0, -1), axes[1:] + "S"
     if axes not in ("YX", "YXS"):
         raise ValueError(f"unexpected axes {axes}")
+    if kind == tifffile.PHOTOMETRIC.MINISWHITE:
+        samples = ~samples
+    if kind in _LAB:
+        if samples.dtype not in (np.uint8, np.uint16):
+            raise ValueError(f"CIELAB of type {samples.dtype}")
+        samples = samples.copy()
+        samples[..., :3] = srgb_of_lab(samples[..., :3], signed=kind == tifffile.PHOTOMETRIC.CIELAB)
     if samples.dtype == np.bool_:
         samples = samples.astype(np.uint8) * _OPAQUE
     if axes == "YXS" and has_alpha:

@@ -1,6 +1,8 @@
 """Frames of a video, as picture files."""
 
+import os
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,6 +12,9 @@ from numpy.typing import NDArray
 
 from rdstitch.errors import InputError, OutputError
 from rdstitch.io.opening import check_readable
+from rdstitch.opencv_state import silent_opencv
+
+_FFMPEG_LEVEL, _FFMPEG_QUIET = "OPENCV_FFMPEG_LOGLEVEL", "-8"
 
 VIDEO_SUFFIXES = frozenset((".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"))
 
@@ -60,16 +65,30 @@ def extract_frames(path: Path, folder: Path, wanted: Callable[[int], bool]) -> l
 def _grabbed(path: Path) -> Iterator[tuple[int, float, cv2.VideoCapture]]:
     """Number and time, s, of each frame of a video, and what decodes it."""
     check_readable(path)
-    capture = cv2.VideoCapture(str(path))
-    try:
+    with opened_capture(str(path)) as capture:
         if not capture.isOpened():
             raise InputError(f"{path}: cannot be read as a video; convert it, or extract its frames with another tool")
         number = 0
         while capture.grab():
             yield number, capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0, capture
             number += 1
-    finally:
-        capture.release()
+
+
+@contextmanager
+def opened_capture(source: str | int) -> Iterator[cv2.VideoCapture]:
+    """A video, stream or camera, whether it can be opened or not, while neither OpenCV nor FFmpeg logs anything."""
+    with silent_opencv():
+        # What OpenCV gives to FFmpeg as its level when it loads it, once.
+        unset = os.environ.setdefault(_FFMPEG_LEVEL, _FFMPEG_QUIET) is _FFMPEG_QUIET
+        try:
+            capture = cv2.VideoCapture(source)
+        finally:
+            if unset:
+                os.environ.pop(_FFMPEG_LEVEL, None)
+        try:
+            yield capture
+        finally:
+            capture.release()
 
 
 def write_frame(file: Path, frame: cv2.typing.MatLike) -> Path:

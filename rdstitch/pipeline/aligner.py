@@ -10,6 +10,7 @@ import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align, most_matches_read
 from rdstitch.alignment.result import LinkFit, PlanarPoses, ReliefTest, ShapeTest
+from rdstitch.alignment.stored_frame import stored, turned_alignment, turned_link, turned_tilts, turns
 from rdstitch.arrays import FloatArray
 from rdstitch.cache import Cache
 from rdstitch.camera import Camera
@@ -24,6 +25,7 @@ from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.messages import Message, names_of
 from rdstitch.options import StitchOptions
+from rdstitch.orientation import quarter_turn
 from rdstitch.pipeline.inlier_selection import reselect_inliers
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.process_memory import return_freed_memory
@@ -89,6 +91,9 @@ class Aligner:
         Largest transfer error of an inlier, pixels.
     needs_poses : bool
         Whether every alignment must have metric poses, see :meth:`metric`.
+    orientations : tuple of int
+        By which quarter turns of EXIF (1, 3, 6, 8) the pictures became upright; ``options`` are of the stored ones.
+        All upright as they are if empty.
     """
 
     paths: tuple[str, ...]
@@ -97,6 +102,7 @@ class Aligner:
     cache: Cache
     threshold: float
     needs_poses: bool = False
+    orientations: tuple[int, ...] = ()
 
     @classmethod
     def of(
@@ -118,8 +124,21 @@ class Aligner:
         paths = tuple(str(source.path) for source in sources)
         megapixels = options.features.for_pictures(len(sources)).limits[1]
         cameras = tuple(at_working_size(source.camera.with_focal(), megapixels) for source in sources)
+        orientations = tuple(quarter_turn(source.metadata.orientation) for source in sources)
         decided = replace(alignment_options(sources, options), prefer_turn=prefer_turn, layout_matters=layout_matters)
-        return cls(paths, cameras, decided, cache, options.threshold)
+        return cls(paths, cameras, decided, cache, options.threshold, orientations=orientations)
+
+    @property
+    def _turns(self) -> tuple[int, ...]:
+        return self.orientations or (1,) * len(self.cameras)
+
+    @property
+    def exact_tilts(self) -> list[tuple[float, float]] | None:
+        """(ψ, θ), radians, of each upright picture, where they are known exactly; None where not."""
+        tilts = self.options.exact_tilts(len(self.cameras))
+        if not tilts:
+            return tilts
+        return [(psi, theta) for psi, theta in turned_tilts(np.array(tilts), self._turns).tolist()]
 
     def align(self, pairs: Sequence[PairRegistration], former: Alignment | None = None) -> AlignedPairs:
         """Align the pictures by the pairs that were registered; from an earlier run where the cache has it.
@@ -165,16 +184,22 @@ class Aligner:
         links = tuple(pair.link().thinned(most) for pair in found)
         if not links:
             raise RegistrationError(_no_overlap(self.paths, pairs))
-        inputs = (self.cameras, self.cache.digest(links), self.options, self.cache.digest(former))
-        compute = partial(align, self.cameras, links, self.options, former=former)
+        back, gravity = stored(self._turns), self.options.gravity
+        cameras = tuple(camera.turned(own) for camera, own in zip(self.cameras, back, strict=True))
+        links = tuple(turned_link(link, self.cameras, back) for link in links)
+        former = None if former is None else turned_alignment(former, back, None)
+        inputs = (cameras, self.cache.digest(links), self.options, self.cache.digest(former))
+        compute = partial(align, cameras, links, self.options, former=former)
         kinds = (Alignment, Camera, LinkFit, PlanarPoses, ReliefTest, ShapeTest, Message)
 
         def valid(alignment: Alignment) -> bool:
             count = len(self.cameras)
-            found, given = ([camera.image_size for camera in cameras] for cameras in (alignment.cameras, self.cameras))
+            found, given = ([camera.image_size for camera in every] for every in (alignment.cameras, cameras))
             return found == given and alignment.used.shape == (count,) and alignment.homographies.shape == (count, 3, 3)
 
-        return self.cache.recall("alignment", kinds, inputs, compute, valid=valid)
+        alignment = self.cache.recall("alignment", kinds, inputs, compute, valid=valid)
+        down = None if gravity is None else np.einsum("nij,nj->ni", turns(self._turns), np.asarray(gravity))
+        return turned_alignment(alignment, self._turns, down)
 
     def metric(self, aligned: AlignedPairs) -> AlignedPairs:
         """The same pairs with a model that has metric poses, where the user left the choice of the model open."""
@@ -229,7 +254,11 @@ def _same_lens(former: Camera, found: Camera) -> bool:
 
 
 def alignment_options(sources: Sequence[Source], options: StitchOptions) -> AlignmentOptions:
-    """What is decided or known beforehand; measured attitudes that are not exact leave the mount's tilt open."""
+    """What is decided or known beforehand of pictures as the camera stored them.
+
+    Measured attitudes that are not exact leave the mount's tilt open.
+    """
+    back = stored([quarter_turn(source.metadata.orientation) for source in sources])
     attitudes = [source.attitude for source in sources if source.attitude is not None]
     exact = bool(attitudes) and options.attitude_std == 0.0
     return AlignmentOptions(
@@ -238,19 +267,21 @@ def alignment_options(sources: Sequence[Source], options: StitchOptions) -> Alig
         lens=options.lens,
         lens_known=options.known_distortion is not None,
         tilt=options.tilt or ((0.0, 0.0) if exact else None),
-        attitudes=np.array(attitudes) if attitudes else None,
+        attitudes=turned_tilts(np.array(attitudes), back) if attitudes else None,
         attitudes_std=options.attitude_std,
-        gravity=_gravity(sources),
+        gravity=_gravity(sources, back),
         positions=positions_of(sources) if sources else None,
     )
 
 
-def _gravity(sources: Sequence[Source]) -> FloatArray | None:
+def _gravity(sources: Sequence[Source], back: Sequence[int]) -> FloatArray | None:
     """Direction down in the axes of each camera, (N, 3), by its attitude or its XMP; None where all lack both."""
     known = [source.down for source in sources]
     if all(down is None for down in known):
         return None
-    return np.array([(np.nan,) * 3 if down is None else down for down in known])
+    directions = np.array([(np.nan,) * 3 if down is None else down for down in known])
+    gravity: FloatArray = np.einsum("nij,nj->ni", turns(back), directions)
+    return gravity
 
 
 def _reference(sources: Sequence[Source], name: str | None) -> int | None:

@@ -28,12 +28,13 @@ from rdstitch.export.georeference import Georeference, has_place, world_file_pat
 from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.io.atomic import check_output, text_bytes
+from rdstitch.io.colour import colour_space
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.io.outputs import Outputs
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
-from rdstitch.messages import Message
+from rdstitch.messages import Message, names_of, shortened
 from rdstitch.pipeline.map_canvas import moved, place_messages, plan_on_map
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.process_memory import return_freed_memory
@@ -150,13 +151,19 @@ def compose_pictures(
         there = moved(place, canvas, final)
         return [] if there is None else there.tiff_tags()
 
-    file = OutputFile(output, placed.sources[0].metadata, tags, outputs)
+    file = OutputFile(output, placed.sources[0].metadata.of_composite(), tags, outputs)
     written = compose_to_file(file, pictures, canvas, options, report, elsewhere)
     place = moved(place, canvas, written.canvas)
     beside = []
     if place is not None and world_files:
         beside = outputs.attempt(world_files[0], partial(_write_world_files, outputs, world_files, place))
-    messages = (*notes, *written.messages, *_profile_lost(placed.sources[0], Path(output)), *beside)
+    messages = (
+        *notes,
+        *written.messages,
+        *_profile_lost(placed.sources[0], Path(output)),
+        *_profiles_differ(placed.sources),
+        *beside,
+    )
     return Composed(
         written.canvas,
         messages=messages,
@@ -202,6 +209,18 @@ def _profile_lost(source: Source, output: Path) -> list[Message]:
     if output.suffix.lower() == ".dzi" and size > MAX_TILE_PROFILE:
         lost = f"its colour profile of {size / 1e3:.0f} kB is too large to be in every tile"
     return [Message(f"{lost}; colours are as if it had none", (str(source.path),))] if lost else []
+
+
+def _profiles_differ(sources: Sequence[Source]) -> list[Message]:
+    """Which pictures have other colours than those of the output, whose profile is the first picture's."""
+    spaces = [colour_space(source.metadata.icc_profile) for source in sources]
+    others = [str(source.path) for source, space in zip(sources, spaces, strict=True) if space != spaces[0]]
+    if not others:
+        return []
+    what = f"another colour profile than {sources[0].name}, whose the output has"
+    who = "has" if len(others) == 1 else f"{len(others)} of the pictures ({shortened(names_of(others))}) have"
+    text = f"{who} {what}: their colours are off; convert them to one colour space first"
+    return [Message(text, tuple(others), code="colour-profiles")]
 
 
 @dataclass(frozen=True, eq=False)

@@ -124,7 +124,7 @@ def _detected(source: Source, task: DetectionTask) -> StoredFeatures:
     size, megapixels = source.camera.image_size, options.limits[1]
     halvings = None if megapixels is None else (halving(size, megapixels), halving(size, CLOSER * megapixels))
     wanted = replace(wanted, work_megapixels=None)
-    inputs = (source.content(store), store.file(source.mask), size, wanted, halvings, network)
+    inputs = (source.content(store), source.mask_content(store), size, wanted, halvings, network)
 
     def compute() -> PackedFeatures:
         return PackedFeatures.pack(detect_view(source.view, options))
@@ -249,5 +249,5 @@ def _stretch_of_one(task: _StretchTask) -> tuple[Stretch | None, GuardNotes]:
         except InputError:  # left out, or reported, by the detection
             return None
 
-    inputs = (source.content(store), store.file(source.mask), task.megapixels)
+    inputs = (source.content(store), source.mask_content(store), task.megapixels)
     return store.recall("stretches", (), inputs, compute), source.guard.notes_on([source.path])

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from rdstitch.alignment.stored_frame import stored, turned_alignment
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.camera_files import CAMERA_SUFFIXES, camera_file_text
 from rdstitch.export.trajectory_files import WRITERS, has_times, path_as_svg
@@ -17,6 +18,7 @@ from rdstitch.io.atomic import check_distinct, check_output, json_bytes, text_by
 from rdstitch.io.outputs import Outputs
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
+from rdstitch.orientation import quarter_turn
 from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.compose import blocks_on, compose_pictures, viewed_pictures, write_page
 from rdstitch.pipeline.map_canvas import check_map
@@ -239,7 +241,9 @@ def trajectory(
             registration = registration.with_messages([*unread, *found.messages])
             registration = accept(registration, options, executor, metric=True)
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
-    path = Trajectory.from_alignment(registration.alignment, height)
+    # Of the camera itself, whatever EXIF says of how its pictures are looked at.
+    back = stored([quarter_turn(source.metadata.orientation) for source in registration.sources])
+    path = Trajectory.from_alignment(turned_alignment(registration.alignment, back, None), height)
     path = path.labelled([s.name for s in sources], [s.number(k) for k, s in enumerate(sources)], times)
     if layout == "tum" and not has_times(path):
         registration = registration.with_messages([_NO_TIMES])

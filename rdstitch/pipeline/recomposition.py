@@ -11,6 +11,7 @@ from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.inputs.source import Source
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.messages import Message
+from rdstitch.orientation import inverse
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.write import (
     VERSION,
@@ -104,7 +105,7 @@ def applied_sidecar(result: Recomposition) -> dict[str, Any]:
         "lambda_px": camera.distortion_px,
         "lambda_focal": camera.distortion_focal,
         "camera": {
-            **camera.as_dict(),
+            **camera.turned(inverse(source.metadata.orientation)).as_dict(),
             # How far the lens was determined then.
             "lambda_std": then.get("lambda_std"),
             "lens_covariance": then["camera"].get("lens_covariance"),

@@ -92,7 +92,7 @@ def register(
         executor,
         cache,
         store,
-        aligner.options.exact_tilts(len(sources)),
+        aligner.exact_tilts,
     )
     moving = pairing.remove_static_background(pairing.estimate_candidates(candidates), candidates)
     found = moving.pairing.match_repeated_patterns(moving.pairs) if lens_only else moving.pairs

@@ -1,8 +1,10 @@
 """Undistorting single pictures with a known lens."""
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, Literal, get_args, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +17,15 @@ from rdstitch.inputs.find import found_pictures
 from rdstitch.inputs.frame import ChannelOrder, Images, as_inputs, in_order
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
-from rdstitch.io.atomic import check_output
+from rdstitch.io.atomic import PICTURE_SUFFIXES, check_output
 from rdstitch.io.read import Picture
 from rdstitch.io.write import write_image
 from rdstitch.messages import Message, ignored
 from rdstitch.progress import Progress, silent
 
 Framing = Literal["same", "all", "valid"]
+
+ImageFormat = Literal["jpg", "png", "tif", "webp"]
 
 _POINTS_PER_SIDE = 256
 
@@ -34,6 +38,7 @@ def undistort(
     camera: Camera | None = None,
     distortion: float | None = None,
     view: Framing = "same",
+    image_format: ImageFormat | None = None,
     overwrite: bool = False,
     topic: str | None = None,
     channel_order: ChannelOrder = "bgr",
@@ -50,6 +55,7 @@ def undistort(
     camera: Camera | None = None,
     distortion: float | None = None,
     view: Framing = "same",
+    image_format: ImageFormat | None = None,
     overwrite: bool = False,
     topic: str | None = None,
     channel_order: ChannelOrder = "bgr",
@@ -65,6 +71,7 @@ def undistort(
     camera: Camera | None = None,
     distortion: float | None = None,
     view: Framing = "same",
+    image_format: ImageFormat | None = None,
     overwrite: bool = False,
     topic: str | None = None,
     channel_order: ChannelOrder = "bgr",
@@ -87,6 +94,9 @@ def undistort(
     view : str
         "same": size and scale at the centre stay. "all": everything that the picture shows, at that scale. "valid":
         the largest upright rectangle around the centre that the picture covers, at that scale.
+    image_format : str, optional
+        "jpg", "png", "tif" or "webp": of all files written. Without it each has that of its input, or, where that
+        cannot be written (HEIC, raw, BMP, …), is a PNG file.
     overwrite : bool
     topic : str, optional
         Of the images in ROS bags; None: the only one.
@@ -103,8 +113,10 @@ def undistort(
     """
     if (camera is None) == (distortion is None):
         raise ArgumentError("give either a camera or a distortion")
-    if view not in ("same", "all", "valid"):
+    if view not in get_args(Framing):
         raise ArgumentError(f"unknown view {view!r}; choose same, all or valid")
+    if image_format is not None and image_format not in get_args(ImageFormat):
+        raise ArgumentError(f"unknown format {image_format!r}; choose {', '.join(get_args(ImageFormat))}")
     given = as_inputs(inputs, channel_order)
     with found_pictures(given, every=1, topic=topic) as found:
         guard = InputGuard()
@@ -116,11 +128,15 @@ def undistort(
             for message in guard.messages:
                 warn(message)
             return pictures
-        outputs = _outputs(sources, Path(folder), found.files, overwrite)
-        for done, (source, output) in enumerate(zip(sources, outputs, strict=True), start=1):
-            picture = _undistorted(source, view)
-            write_image(output, picture.pixels, picture.alpha, metadata=source.metadata, overwrite=overwrite)
-            progress("undistorting", done, len(sources))
+        outputs = _outputs(sources, Path(folder), image_format)
+        with _existing(Path(folder)):
+            for output in outputs:
+                check_output(output, overwrite, found.files)
+            for done, (source, output) in enumerate(zip(sources, outputs, strict=True), start=1):
+                picture = _undistorted(source, view)
+                metadata = source.metadata if view == "same" else source.metadata.in_another_size()
+                write_image(output, picture.pixels, picture.alpha, metadata=metadata, overwrite=overwrite)
+                progress("undistorting", done, len(sources))
         for message in guard.messages:
             warn(message)
         return outputs
@@ -133,27 +149,46 @@ def _undistorted(source: Source, view: Framing) -> Composite:
     return compose([PlacedPicture(read, source.camera, np.eye(3))], canvas, plain)
 
 
-def _outputs(sources: Sequence[Source], folder: Path, inputs: Sequence[Path], overwrite: bool) -> list[Path]:
-    """The files to write, of different names and none of them an input; the folder is made."""
+@contextmanager
+def _existing(folder: Path) -> Iterator[None]:
+    """A folder that exists inside the block, and afterwards if anything was written into it."""
+    missing = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{folder}: cannot make the folder: {error.strerror}") from error
-    outputs = [folder / _output_name(source) for source in sources]
-    twice = {path for path in outputs if outputs.count(path) > 1}
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            for place in missing:
+                place.rmdir()
+        raise
+
+
+def _outputs(sources: Sequence[Source], folder: Path, image_format: ImageFormat | None) -> list[Path]:
+    """The files to write, of different names."""
+    outputs = [folder / _output_name(source, image_format) for source in sources]
+    twice = [path for path, count in Counter(outputs).items() if count > 1]
     if twice:
         raise OutputError(f"{min(twice)}: two of the pictures have this name; undistort them into different folders")
-    for output in outputs:
-        check_output(output, overwrite, inputs)
     return outputs
 
 
-def _output_name(source: Source) -> str:
-    if source.frame is None or source.frame.picture is None:
+def _output_name(source: Source, image_format: ImageFormat | None) -> str:
+    in_memory = source.frame is not None and source.frame.picture is not None
+    if image_format is None and not in_memory and source.path.suffix.lower() in PICTURE_SUFFIXES:
         return source.name
+    stem = source.name if in_memory else source.path.stem
+    return f"{stem}.{image_format or ('png' if _fits_png(source) else 'tif')}"
+
+
+def _fits_png(source: Source) -> bool:
+    """Whether PNG holds its samples; of the files that cannot be written in their own format, it holds all."""
+    if source.frame is None or source.frame.picture is None:
+        return True
     pixels = source.frame.picture.pixels
-    fits_png = pixels.dtype != np.float32 and (pixels.ndim == 2 or pixels.shape[2] == 3)
-    return f"{source.name}.png" if fits_png else f"{source.name}.tif"
+    return pixels.dtype != np.float32 and (pixels.ndim == 2 or pixels.shape[2] == 3)
 
 
 def undistorted_canvas(camera: Camera, view: Framing) -> Canvas:

@@ -28,7 +28,7 @@ _TICKS = 6
 
 def grid(registration: Registration) -> str:
     """Straight lines as the lens bends them, and the picture's rows and columns as undistortion straightens them."""
-    camera = registration.camera
+    camera = registration.upright_camera
     reference = registration.sources[registration.alignment.reference]
     return section(
         "Lens",
@@ -76,7 +76,7 @@ def _after(camera: Camera) -> str:
 
 def lens_curve(registration: Registration) -> str:
     """Measured radii of the lens against those of the nearest one-parameter lens, with uncertainty and support."""
-    alignment, camera = registration.alignment, registration.camera
+    alignment, camera = registration.alignment, registration.upright_camera
     places = _places(registration)
     farthest = float(np.linalg.norm(camera.normalize(camera.outline(1)), axis=1).max())
     radii = np.linspace(0.0, farthest, _SAMPLES + 1)[1:]
@@ -85,14 +85,14 @@ def lens_curve(registration: Registration) -> str:
         "How many pixels farther from the distortion centre the lens measures a ray than the one-parameter lens with "
         f"λ = {alignment.distortion:.4f} (red) does, with twice the standard deviation on either side; below it, how "
         f"many matches there are at each radius. {_support(camera, places, farthest)}",
-        element("ul", "".join(element("li", escape(line)) for line in describe_lens(alignment))),
+        element("ul", "".join(element("li", escape(line)) for line in describe_lens(alignment, camera))),
         _curve(camera, radii, _counts(camera, places, farthest)),
     )
 
 
 def _places(registration: Registration) -> FloatArray:
     """Where the matches that agree with the alignment are, pixels of pictures of the reference's size, (N, 2)."""
-    alignment, camera = registration.alignment, registration.camera
+    alignment, camera = registration.alignment, registration.upright_camera
     found = [np.empty((0, 2))]
     for fit in alignment.links:
         if fit.used and fit.rms > 0.0:

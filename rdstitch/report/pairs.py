@@ -137,7 +137,7 @@ def residual_map(registration: Registration) -> str:
     # Pictures of several sizes are laid over one another.
     places = np.concatenate([(p + 0.5) / camera.image_size for (p, _), camera in zip(found, cameras, strict=True)])
     off = np.concatenate([residual for _, residual in found])
-    width, height = registration.camera.image_size
+    width, height = registration.upright_camera.image_size
     rows = max(1, round(_COLUMNS * height / width))
     cell = np.clip((places * (_COLUMNS, rows)).astype(int), 0, (_COLUMNS - 1, rows - 1)) @ (1, _COLUMNS)
     cells = _COLUMNS * rows

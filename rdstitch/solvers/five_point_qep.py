@@ -49,7 +49,8 @@ def five_point_qep(
 
     def solve(points: FloatArray, _: IndexArray) -> Solutions:
         low, high = lens_range(points, distortion_range)
-        usable = np.flatnonzero(low < high)
+        # LAPACK raises where the fourth powers in the matrices overflow.
+        usable = np.flatnonzero((low < high) & np.isfinite((points**4).sum(axis=(0, 1, 2))))
         a, b = points[..., usable].transpose(1, 3, 2, 0)
         eigenvalues, vectors = np.linalg.eig(_companion(*_shifted(_dlt_rows(a, b), shift)))
         real = (np.abs(eigenvalues.imag) <= _REAL * np.abs(eigenvalues)) & (eigenvalues.real != 0.0)

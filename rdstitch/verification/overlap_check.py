@@ -113,7 +113,7 @@ def check_overlaps(registration: Registration, executor: Executor, cache: Cache 
     chosen = _least_confirmed([fit for fit in alignment.links if fit.used])
     pictures = sorted(set(chain.from_iterable((fit.image1, fit.image2) for fit in chosen)))
     placed = [
-        (k, source.content(cache), cache.file(source.mask), alignment.cameras[k], alignment.homographies[k])
+        (k, source.content(cache), source.mask_content(cache), alignment.cameras[k], alignment.homographies[k])
         for k, source in ((k, registration.sources[k]) for k in pictures)
     ]
 

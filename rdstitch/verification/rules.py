@@ -21,28 +21,35 @@ class Situation:
     ----------
     alike : float
         Median share of the overlaps that looks alike, [0, 1].
+    flat : bool
+        Whether the images are said to show a plane that three or more of them hold together: of a turn, and of two
+        images, only the overlaps can be wrong, and they are looked at.
     depth : bool
         Whether the scene has depth, or the camera moved while it turned.
-    shape_shown : bool
-        Whether the errors show that the shape of the whole is off, by less than an image.
+    shape_doubtful : bool
+        Whether the shape of the whole may be off, by less than an image.
     """
 
     alike: float
+    flat: bool
     depth: bool
-    shape_shown: bool
+    shape_doubtful: bool
 
 
 @dataclass(frozen=True)
 class Rule:
-    """When one kind of finding is said.
+    """When a finding is said.
 
     Attributes
     ----------
+    code : str
+        Of the message.
     kind : str
-        Code of the message.
+        What it is about; of one kind the first is said.
     speaks : callable
     """
 
+    code: str
     kind: str
     speaks: Callable[[Situation], bool]
 
@@ -52,28 +59,27 @@ _HIDDEN = 0.25
 sets of hand-held images that a person would keep, and a flight over trees (``python -m tests.benchmarks.world``)."""
 
 RULES = (
-    Rule("parallax", lambda found: found.alike < _HIDDEN),
-    Rule("relief", lambda found: found.alike < _HIDDEN),
-    Rule("shape", lambda found: found.shape_shown and not found.depth),
-    Rule("rival-motion", lambda found: not found.depth),
+    Rule("shape", "flatness", lambda found: found.flat and found.shape_doubtful),
+    Rule("relief", "flatness", lambda found: found.flat or found.alike < _HIDDEN),
+    Rule("parallax", "flatness", lambda found: found.alike < _HIDDEN),
+    Rule("rival-motion", "rival-motion", lambda found: found.flat or not found.depth),
 )
-"""By how much they put a result at risk, the gravest first; kinds without a rule speak always, and before these."""
+"""The gravest first; what has no rule is always said, and before these."""
 
 
 def spoken(messages: Iterable[Message], found: Situation) -> tuple[Message, ...]:
     """Make notes of warnings that their rule silences, of all but the first of a kind, and of more than a few."""
-    order = {rule.kind: number for number, rule in enumerate(RULES)}
-    given = list(messages)
-    said: set[str] = set()
+    given, order = list(messages), {rule.code: number for number, rule in enumerate(RULES)}
+    kinds: set[str] = set()
     aloud: set[int] = set()
     for number in sorted(range(len(given)), key=lambda index: order.get(given[index].code, -1)):
         message = given[number]
-        if message.severity != "warning" or len(aloud) == MAX_WARNINGS or (message.code and message.code in said):
-            continue
-        if message.code in order and not RULES[order[message.code]].speaks(found):
-            continue
-        aloud.add(number)
-        said.add(message.code)
+        rule = RULES[order[message.code]] if message.code in order else None
+        kind = message.code if rule is None else rule.kind
+        silent = (kind and kind in kinds) or (rule is not None and not rule.speaks(found))
+        if message.severity == "warning" and not silent and len(aloud) < MAX_WARNINGS:
+            aloud.add(number)
+            kinds.add(kind)
     return tuple(
         replace(message, severity="note") if message.severity == "warning" and number not in aloud else message
         for number, message in enumerate(given)

@@ -126,8 +126,10 @@ def judge(
         *doubtful_inputs(registration.sources),
     )
     shape, size = alignment.shape, min(2.0 * camera.half_diagonal for camera in alignment.cameras)
-    shown = shape is not None and shape.shown and math.hypot(shape.shift, shape.shift_std) < size
-    return spoken(messages, Situation(_usual_agreement(checked), alignment.relief.found or bool(parallax), shown))
+    doubtful = shape is not None and math.hypot(shape.shift, shape.shift_std) < size
+    flat = not alignment.on_sphere and int(alignment.used.sum()) > 2
+    depth = alignment.relief.found or bool(parallax)
+    return spoken(messages, Situation(_usual_agreement(checked), flat, depth, doubtful))
 
 
 def _failure(text: str, images: Sequence[str] = ()) -> Message:

@@ -1,4 +1,4 @@
-"""Sets of the world, as a user would stitch them: ``python -m tests.benchmarks.world FOLDER… [--output DIR] [--peer STITCH]``.
+"""Sets of the world, as a user would stitch them: ``python -m tests.benchmarks.world FOLDER… [--output DIR]``.
 
 Every subfolder that holds images is one set; each is stitched by ``rdstitch mosaic`` with no option. A row a set: exit
 status, images used, model, λ, the ratio of the areas that a pixel gets within the output (98 % over 2 %), the focal
@@ -60,8 +60,8 @@ class Row:
     def __str__(self) -> str:
         """One line of the table."""
         return (
-            f"{'good' if self.good else '-':4s} {self.name:24s} {self.status:3d} {self.used:3d}/{self.count:<3d} {self.model:10s} "
-            f"{self.distortion:+7.3f} {self.stretch:8.1f}{'F' if self.folded else ' '} {self.focal:6.2f} "
+            f"{'good' if self.good else '-':4s} {self.name:24s} {self.status:3d} {self.used:3d}/{self.count:<3d} "
+            f"{self.model:10s} {self.distortion:+7.3f} {self.stretch:8.1f}{'F' if self.folded else ' '} {self.focal:6.2f} "
             f"{len(self.messages):3d} {self.seconds:7.1f} {self.peer_seconds:7.1f}"
         )
 
@@ -77,7 +77,7 @@ def to_output(image: dict[str, Any], points: FloatArray) -> tuple[FloatArray, Fl
 
 
 def shape_of(images: list[dict[str, Any]]) -> tuple[float, bool]:
-    """Ratio of the areas that a pixel gets in a planar output, and whether an image is folded; (1, False) on a sphere."""
+    """Ratio of the areas of pixels in a planar output, and whether an image is folded; (1, False) on a sphere."""
     areas, folded = [], False
     for image in images:
         if image["to_output"] is None:

@@ -59,6 +59,24 @@ def test_measured_tilts_are_used(windy: Sequence, tmp_path: Path, error: float, 
     assert len(path.position) == len(paths)
 
 
+def test_measured_tilts_and_poses_are_those_of_the_camera_whatever_exif_turns(windy: Sequence, tmp_path: Path) -> None:
+    paths = windy.write(tmp_path)
+    (tmp_path / "imu.csv").write_text(_table(windy, paths, 0.0))
+    for path, orientation in zip(paths, (1, 6, 3, 8, 6, 1), strict=True):
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        Image.open(path).save(path, exif=exif)
+    lens = windy.lens
+    assert isinstance(lens, Camera)
+    options = rdstitch.StitchOptions(attitude=tmp_path / "imu.csv", attitude_std=0.0, focal=lens.focal, workers=1)
+    trajectory, registration = rdstitch.trajectory(paths, options=options)
+    assert registration.alignment.used.all()
+    assert registration.alignment.model != "homography"
+    assert abs(registration.alignment.distortion - lens.distortion) < 0.005
+    turn = np.degrees(trajectory.yaw - windy.poses.yaw)
+    assert np.abs(np.remainder(turn - turn[0] + 180.0, 360.0) - 180.0).max() < 0.2
+
+
 @pytest.mark.parametrize(("source", "std"), [("dji-gimbal", 0.0), ("pix4d-camera", np.radians(1.0))])
 def test_drones_write_tilts_into_their_pictures(windy: Sequence, tmp_path: Path, source: str, std: float) -> None:
     paths = _with_xmp(windy, tmp_path, source)

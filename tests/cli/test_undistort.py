@@ -3,10 +3,11 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from rdstitch.camera import Camera
-from rdstitch.io import read_image
+from rdstitch.io import read_image, read_metadata
 from rdstitch.synthetic import Sequence
 from tests.cli.running import DISTORTION, FAST, Run
 
@@ -79,3 +80,95 @@ def test_own_outputs_and_damaged_pictures_are_named(rdstitch: Run, frames: list[
     assert "mosaic.png" in done.err
     assert "damaged.jpg: is damaged" in done.err
     assert sorted(path.name for path in (tmp_path / "straight").iterdir()) == ["damaged.jpg", "good.jpg"]
+
+
+def _photograph(path: Path, size: tuple[int, int] = (400, 300)) -> Path:
+    """With the tags of a camera of 24 mm for 35 mm film, shrunk from four times the size, and a position."""
+    exif = Image.Exif()
+    exif[0x010F], exif[0x013B] = "Maker", "Somebody"
+    photo = exif.get_ifd(0x8769)
+    photo[0x920A], photo[0xA20E], photo[0xA210], photo[0xA002], photo[0xA405] = 4.0, 4000.0, 3, 4 * size[0], 24
+    photo[0x9003], photo[0x829A] = "2024:05:06 07:08:09", 0.01
+    place = exif.get_ifd(0x8825)
+    place[1], place[2], place[3], place[4] = "N", (52.0, 30.0, 1.5), "E", (1.0, 2.0, 3.0)
+    samples = np.random.default_rng(1).integers(0, 256, (size[1] // 4, size[0] // 4, 3), dtype=np.uint8)
+    Image.fromarray(samples).resize(size).save(path, exif=exif, quality=95)
+    return path
+
+
+@pytest.mark.parametrize("direct", [True, False])
+@pytest.mark.parametrize("view", ["same", "all", "valid"])
+def test_focal_lengths_in_what_is_written_are_true(rdstitch: Run, tmp_path: Path, view: str, direct: bool) -> None:
+    path = _photograph(tmp_path / "a.jpg")
+    if not direct:
+        with Image.open(path) as image:
+            exif = image.getexif()
+            del exif.get_ifd(0x8769)[0xA20E]
+            image.save(path, exif=exif, quality=95)
+    before = read_metadata(path)
+    assert before.focal_px is not None
+    assert rdstitch("undistort", path, "--lambda", "-0.3", "-o", tmp_path / view, "--view", view).status == 0
+    after = read_metadata(tmp_path / view / "a.jpg")
+    assert after.gps is not None
+    # The scale at the centre stays, and the focal length with it.
+    if direct or view == "same":
+        assert after.focal_px == pytest.approx(before.focal_px, rel=1e-3)
+    else:
+        assert after.focal_px is None
+
+
+def test_a_mosaic_has_no_lens_and_no_place_of_one_picture(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    with Image.open(_photograph(tmp_path / "tags.jpg")) as image:
+        exif = image.getexif()
+    paths = []
+    for frame in frames:
+        paths.append(tmp_path / f"{frame.stem}.jpg")
+        Image.open(frame).convert("RGB").save(paths[-1], exif=exif, quality=95)
+    assert rdstitch("pano", *paths, "-o", tmp_path / "out.jpg", *FAST).status == 0
+    found = read_metadata(tmp_path / "out.jpg")
+    assert (found.focal_px, found.gps, found.exposure) == (None, None, None)
+    assert (found.make, found.timestamp) == ("Maker", read_metadata(paths[0]).timestamp)
+    with Image.open(tmp_path / "out.jpg") as image:
+        assert image.getexif()[0x013B] == "Somebody"
+
+
+def test_formats_that_cannot_be_written_become_png(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    suffixes = ("bmp", "gif", "ppm", "jp2", "tga", "JPEG")
+    for suffix in suffixes:
+        Image.open(frames[0]).convert("RGB").save(tmp_path / f"{suffix}.{suffix}")
+    pictures = [tmp_path / f"{suffix}.{suffix}" for suffix in suffixes]
+    assert rdstitch("undistort", *pictures, "--lambda", "-0.1", "-o", tmp_path / "out").status == 0
+    expected = ["JPEG.JPEG", *sorted(f"{suffix}.png" for suffix in suffixes[:-1])]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == expected
+    done = rdstitch("undistort", *pictures, "--lambda", "-0.1", "-o", tmp_path / "tif", "--format", "tif")
+    assert done.status == 0
+    assert {path.suffix for path in (tmp_path / "tif").iterdir()} == {".tif"}
+
+
+def test_what_fails_leaves_no_folder(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    broken = tmp_path / "broken.jpg"
+    Image.open(frames[0]).convert("RGB").save(broken, quality=95)
+    broken.write_bytes(broken.read_bytes()[:5000])
+    twice = tmp_path / "twice"
+    twice.mkdir()
+    (twice / broken.name).write_bytes(b"x")
+    for inputs in ([broken], [frames[0], twice / broken.name]):
+        done = rdstitch("undistort", *inputs, "--lambda", "-0.1", "-o", tmp_path / "a" / "b")
+        assert done.status == 3
+        assert not (tmp_path / "a").exists()
+
+
+def test_a_camera_file_without_a_size_takes_it_from_the_pictures(
+    rdstitch: Run, frames: list[Path], tmp_path: Path
+) -> None:
+    camera = tmp_path / "camera.yml"
+    matrix = "camera_matrix:\n   rows: 3\n   cols: 3\n   data: [380., 0., 199.5, 0., 403., 149.5, 0., 0., 1.]\n"
+    values = "distortion_coefficients:\n   rows: 1\n   cols: 5\n   data: [-0.2, 0.05, 0., 0., 0.]\n"
+    camera.write_text("%YAML:1.0\n---\n" + matrix + values)
+    done = rdstitch("undistort", frames[0], "--camera", camera, "-o", tmp_path / "out")
+    assert done.status == 0
+    assert "focal lengths along x and y differ by 5.7%" in done.err
+    (tmp_path / "list").write_text(str(tmp_path / "absent.png"))
+    done = rdstitch("undistort", f"@{tmp_path / 'list'}", "--camera", camera, "-o", tmp_path / "none")
+    assert done.status == 3
+    assert "has no image size; add image_width and image_height" in done.line

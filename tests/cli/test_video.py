@@ -6,7 +6,7 @@ import cv2
 import pytest
 
 from rdstitch.io import read_image
-from tests.cli.running import DISTORTION, FAST, Run
+from tests.cli.running import DISTORTION, FAST, Run, finished, start
 
 
 @pytest.fixture
@@ -62,3 +62,15 @@ def test_a_video_is_never_written_over(rdstitch: Run, video: Path, tmp_path: Pat
         done = rdstitch("trajectory", named, "-o", output, "--overwrite", *following, *FAST)
         assert (done.status, "is read as input" in done.line) == (6, True)
     assert video.read_bytes() == before
+
+
+@pytest.mark.parametrize("follow", [(), ("--follow", "--idle", "0.1")])
+@pytest.mark.parametrize("damage", ["text", "cut"])
+def test_nobody_but_rdstitch_writes_on_standard_error(
+    frames: list[Path], tmp_path: Path, damage: str, follow: tuple[str, ...]
+) -> None:
+    broken = tmp_path / "broken.mp4"
+    broken.write_bytes(b"no video\n" * 20 if damage == "text" else b"\0\0\0\x18ftypmp42" + bytes(400))
+    done = finished(start("trajectory", *follow, str(broken), "-o", str(tmp_path / "path.csv")))
+    assert done.status == 3
+    assert done.line.startswith(f"rdstitch: {broken}: ")

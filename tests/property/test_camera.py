@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from rdstitch.camera import Camera
@@ -17,6 +17,8 @@ HIGHER = [(), (-0.02,), (0.03,), (-0.08, -0.02), (0.1, -0.05), (0.0, 0.04)]
 
 
 @given(x=coordinates, y=coordinates, distortion=distortions, higher=st.sampled_from(HIGHER))
+@example(x=0.5, y=0.5, distortion=2.2e-313, higher=())
+@example(x=0.5, y=0.5, distortion=-2.2e-313, higher=(5e-324, 0.0))
 def test_distort_inverts_undistort(x: float, y: float, distortion: float, higher: tuple[float, ...]) -> None:
     point = np.array([x, y])
     radius2 = float(point @ point)

@@ -64,6 +64,9 @@ def calibrate(
     with report_page.explaining():
         registration = recipe(paths, wanted, every=every, progress=report_page.progress, beside=report_page.stage)
     report_registration(registration, reporter, as_json=as_json)
-    for line in (*describe_camera(registration.alignment), *export_note(registration.camera, output)):
+    for line in (
+        *describe_camera(registration.alignment, registration.camera),
+        *export_note(registration.camera, output),
+    ):
         reporter.note(line)
     reporter.made(f"{output}: {registration.summary}")

@@ -34,6 +34,12 @@ Examples:
     show_default=True,
     help="What to show: the same scale and size as the picture, all of it, or only where it has no empty border.",
 )
+@click.option(
+    "--format",
+    "image_format",
+    type=click.Choice(["jpg", "png", "tif", "webp"]),
+    help="Of the files written; that of each picture, or png where that cannot be written, if not given.",
+)
 @options.verbosity
 def undistort(
     inputs: tuple[Path, ...],
@@ -43,6 +49,7 @@ def undistort(
     overwrite: bool,
     topic: str | None,
     view: Literal["same", "all", "valid"],
+    image_format: Literal["jpg", "png", "tif", "webp"] | None,
     reporter: Reporter,
 ) -> None:
     """Undistort pictures with a known lens, each into a file of the same name in a folder.
@@ -61,6 +68,7 @@ def undistort(
         camera=lens,
         distortion=distortion,
         view=view,
+        image_format=image_format,
         overwrite=overwrite,
         topic=topic,
         warn=lambda message: reporter.warn(str(message)),

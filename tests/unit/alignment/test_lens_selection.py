@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rdstitch.alignment import LENSES, AlignmentOptions, lens_selection
+from rdstitch.alignment import LENSES, Alignment, AlignmentOptions, lens_selection
 from rdstitch.alignment.adjustment_problem import homography_apart
 from rdstitch.alignment.lens_description import describe_lens, radius_std
 from rdstitch.alignment.lens_selection import LensChoice, _Judge, _parts, free_parameters, has_plausible_center
@@ -33,6 +33,10 @@ def test_one_parameter_stays_one_parameter(seed: int) -> None:
     assert found.cameras[0].coefficients[1:] == (0.0, 0.0)
     assert found.cameras[0].center == (319.5, 239.5)
     assert abs(found.distortion + 0.25) < 4.0 * found.distortion_std < 0.002
+
+
+def described(alignment: Alignment) -> tuple[str, ...]:
+    return describe_lens(alignment, alignment.cameras[alignment.reference])
 
 
 def test_a_fisheye_off_centre_is_found() -> None:
@@ -154,7 +158,7 @@ def test_a_pair_keeps_the_centre_in_the_middle_and_says_so() -> None:
     assert found.lens in ("division2", "division3")
     assert found.cameras[0].center == (319.5, 239.5)
     assert "too few pictures to find the distortion centre" in found.lens_reason
-    assert "distortion centre: the middle of the picture" in describe_lens(found)
+    assert "distortion centre: the middle of the picture" in described(found)
 
 
 def test_a_known_lens_is_kept_whole() -> None:
@@ -167,7 +171,7 @@ def test_a_known_lens_is_kept_whole() -> None:
     assert found.cameras[0].center == pytest.approx(FISHEYE.center)
     assert found.distortion_std == 0.0
     assert found.rms < 0.6
-    assert describe_lens(found) == (f"λ = {found.distortion:.6f}, given",)
+    assert described(found) == (f"λ = {found.distortion:.6f}, given",)
 
 
 def test_an_unknown_lens_is_refused() -> None:
@@ -176,10 +180,10 @@ def test_an_unknown_lens_is_refused() -> None:
 
 
 def test_the_description_says_what_is_needed() -> None:
-    plain = describe_lens(aligned(lens_scene(Camera(SIZE, -0.25), 0, columns=3, rows=2)))
+    plain = described(aligned(lens_scene(Camera(SIZE, -0.25), 0, columns=3, rows=2)))
     assert "±" in plain[0]
     assert "second coefficient not needed" in plain
-    strong = describe_lens(aligned(lens_scene(FISHEYE, 0)))
+    strong = described(aligned(lens_scene(FISHEYE, 0)))
     assert "nearest one-parameter lens" in strong[0]
     assert any(line.startswith("second coefficient μ = -0.0") for line in strong)
     assert any(line.startswith("centre 33") for line in strong)

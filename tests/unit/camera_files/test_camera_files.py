@@ -424,3 +424,65 @@ def test_the_methods_of_a_camera_fail_as_the_functions_do(tmp_path: Path) -> Non
     with pytest.raises(InputError):
         Camera.load(tmp_path / "camera.json")
     assert list(tmp_path.iterdir()) == []
+
+
+def _opencv_file(
+    path: Path, focal: tuple[float, float], coefficients: list[float], size: tuple[int, int] | None, mark: str = ""
+) -> Path:
+    """What somebody else's script writes, for pictures of 1280 x 960 pixels."""
+    (fx, fy), count = focal, len(coefficients)
+    sides = "" if size is None else f"image_width: {size[0]}\nimage_height: {size[1]}\n"
+    path.write_text(
+        f"%YAML:1.0\n---\n{sides}{mark}camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+        f"   data: [{fx}, 0., 641., 0., {fy}, 478., 0., 0., 1.]\n"
+        f"distortion_coefficients: !!opencv-matrix\n   rows: {count}\n   cols: 1\n   dt: d\n   data: {coefficients}\n"
+    )
+    return path
+
+
+FISHEYES = {
+    "gopro": (582.0, [-0.018, 0.019, -0.03, 0.014]),
+    "tutorial": (558.0, [-0.0014, -0.0033, 0.0051, -0.0026]),
+    "wide": (478.0, [0.0034, 0.0007, -0.0020, 0.0002]),
+    "narrow": (780.0, [-0.0127, 0.0198, -0.0245, 0.0093]),
+}
+BROWNS = {
+    "strong": (590.0, [-0.25, 0.06, 0.0005, 0.001]),
+    "webcam": (1280.0, [0.05, -0.2, 0.01, -0.005]),
+    "ultra-wide, nearly straight": (640.0, [-0.05, 0.01, 0.0, 0.0]),
+    "none": (500.0, [0.0, 0.0, 0.0, 0.0]),
+}
+
+
+@pytest.mark.parametrize("name", FISHEYES)
+def test_coefficients_of_a_fisheye_without_a_mark_are_refused_with_the_remedy(tmp_path: Path, name: str) -> None:
+    focal, k = FISHEYES[name]
+    bare = _opencv_file(tmp_path / "bare.yml", (focal, focal), k, (1280, 960))
+    with pytest.raises(InputError, match=r"bare\.yml: distortion_coefficients: .*cv2\.fisheye.* \"fisheye_model: 1\""):
+        load_camera(bare)
+    marked = _opencv_file(tmp_path / "marked.yml", (focal, focal), k, (1280, 960), "fisheye_model: 1\n")
+    assert load_camera(marked).distortion < -0.2
+
+
+@pytest.mark.parametrize("name", BROWNS)
+def test_four_coefficients_of_usual_lenses_need_no_mark(tmp_path: Path, name: str) -> None:
+    focal, k = BROWNS[name]
+    found = load_camera(_opencv_file(tmp_path / "c.yml", (focal, focal), k, (1280, 960)))
+    marked = _opencv_file(tmp_path / "m.yml", (focal, focal), k, (1280, 960), "distortion_model: plumb_bob\n")
+    assert found == load_camera(marked)
+
+
+def test_pixels_that_are_no_squares_are_named_as_the_cause(tmp_path: Path) -> None:
+    found = read_camera_file(_opencv_file(tmp_path / "c.yml", (900.0, 955.0), [-0.2, 0.05, 0.0, 0.0, 0.0], (1280, 960)))
+    assert "focal lengths along x and y differ by 5.8%" in found.cause
+    usual = read_camera_file(_opencv_file(tmp_path / "d.yml", (900.0, 901.0), [-0.2, 0.05, 0.0, 0.0, 0.0], (1280, 960)))
+    assert usual.cause == ""
+
+
+def test_a_file_without_a_size_takes_that_of_the_pictures(tmp_path: Path) -> None:
+    file = _opencv_file(tmp_path / "c.yml", (900.0, 900.0), [-0.2, 0.05, 0.0, 0.0, 0.0], None)
+    with pytest.raises(InputError, match="image_width"):
+        load_camera(file)
+    assert load_camera(file, image_size=(1280, 960)).image_size == (1280, 960)
+    with pytest.raises(InputError, match=r"principal point 641, 478 is not that of pictures of 640 x 480"):
+        load_camera(file, image_size=(640, 480))

@@ -12,8 +12,9 @@ from rdstitch.camera import Camera
 from rdstitch.errors import InputError
 from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source
-from rdstitch.io.mask import check_mask, read_mask
+from rdstitch.io.mask import mask_frame, read_mask
 from rdstitch.io.metadata import Metadata
+from rdstitch.orientation import SIDEWAYS, turned, turned_size
 
 SIZE = (40, 30)
 
@@ -49,7 +50,7 @@ def source(path: Path) -> Source:
 )
 def test_a_mask_means_what_it_shows(tmp_path: Path, name: str, pixels: NDArray[np.uint8]) -> None:
     path = save(tmp_path / name, pixels)
-    check_mask(path, "picture.png", SIZE)
+    mask_frame(path, "picture.png", SIZE)
     mask = read_mask(path, SIZE)
     assert mask.dtype == np.uint8
     np.testing.assert_array_equal(mask, np.where(leg(), 255, 0))
@@ -65,7 +66,23 @@ def test_a_black_mask_leaves_nothing_and_a_white_one_all(tmp_path: Path) -> None
 def test_a_mask_of_another_shape_is_named(tmp_path: Path, shape: tuple[int, int]) -> None:
     path = save(tmp_path / "a.png", np.zeros(shape, np.uint8))
     with pytest.raises(InputError, match=rf"a\.png: a mask of {shape[1]} x {shape[0]} pixels does not fit on .*b\.png"):
-        check_mask(path, tmp_path / "b.png", SIZE)
+        mask_frame(path, tmp_path / "b.png", SIZE)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_what_a_camera_hides_turns_with_the_stored_picture(tmp_path: Path, orientation: int) -> None:
+    upright = turned_size(SIZE, orientation)
+    path = save(tmp_path / "leg.png", leg().astype(np.uint8))
+    expected = np.where(turned(leg(), orientation), 255, 0)
+    frame = mask_frame(path, "picture.png", upright, orientation, of_camera=True)
+    np.testing.assert_array_equal(read_mask(path, upright, frame), expected)
+    # The mask of one picture is as that looks; of one for all only its shape can say that.
+    shown = save(tmp_path / "shown.png", np.ascontiguousarray(turned(leg(), orientation)).astype(np.uint8))
+    frame = mask_frame(shown, "picture.png", upright, orientation)
+    np.testing.assert_array_equal(read_mask(shown, upright, frame), expected)
+    if orientation in SIDEWAYS:
+        assert mask_frame(shown, "picture.png", upright, orientation, of_camera=True) is None
+        assert mask_frame(path, "picture.png", upright, orientation) == orientation
 
 
 def test_what_a_mask_excludes_is_transparent_with_what_was(tmp_path: Path) -> None:

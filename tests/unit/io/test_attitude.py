@@ -10,7 +10,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from rdstitch.io import Attitude, Metadata, read_metadata
 from rdstitch.io.attitude import read_attitude
-from rdstitch.io.metadata import turned, turned_direction
+from rdstitch.orientation import turned, turning_matrix
 from rdstitch.planar_motion import tilt_from_normal
 from rdstitch.synthetic import Poses
 from tests.drone_xmp import DIALECTS, euler_angles, xmp_of
@@ -56,7 +56,7 @@ def test_directions_turn_with_the_picture(orientation: int) -> None:
     x, y, ahead = attitude.nadir
     rows, columns = np.mgrid[0:3, 0:4]
     slope = np.gradient(turned(x * columns + y * rows, orientation))
-    assert turned_direction(x, y, orientation) == pytest.approx((slope[1][0, 0], slope[0][0, 0]))
+    assert turning_matrix(orientation) @ (x, y) == pytest.approx((slope[1][0, 0], slope[0][0, 0]))
     metadata = Metadata((4, 3), orientation=orientation, attitude=attitude)
     assert metadata.nadir == pytest.approx((slope[1][0, 0], slope[0][0, 0], ahead))
 

@@ -149,6 +149,13 @@ def test_samples_that_are_not_finite_are_skipped(case: Case, value: float) -> No
 
 
 @every_solver
+@pytest.mark.parametrize("scale", [1e80, 1e160])
+def test_points_too_far_out_to_compute_with_have_no_solution(case: Case, scale: float) -> None:
+    x1, x2 = samples(case, batch=5)
+    assert len(case.solve(x1 * scale, x2 * scale)) == 0
+
+
+@every_solver
 @pytest.mark.parametrize("picture", [0, 1, 2])
 def test_coincident_points_have_no_solution(case: Case, picture: int) -> None:
     x1, x2 = samples(case, batch=50)
