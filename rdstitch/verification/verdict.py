@@ -126,10 +126,10 @@ def judge(
         *doubtful_inputs(registration.sources),
     )
     shape, size = alignment.shape, min(2.0 * camera.half_diagonal for camera in alignment.cameras)
-    doubtful = shape is not None and math.hypot(shape.shift, shape.shift_std) < size
+    bent = shape is not None and math.hypot(shape.shift, shape.shift_std) < size
     flat = not alignment.on_sphere and int(alignment.used.sum()) > 2
     depth = alignment.relief.found or bool(parallax)
-    return spoken(messages, Situation(_usual_agreement(checked), flat, depth, doubtful))
+    return spoken(messages, Situation(_usual_agreement(checked), flat, depth, bent))
 
 
 def _failure(text: str, images: Sequence[str] = ()) -> Message:

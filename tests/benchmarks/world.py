@@ -61,8 +61,8 @@ class Row:
         """One line of the table."""
         return (
             f"{'good' if self.good else '-':4s} {self.name:24s} {self.status:3d} {self.used:3d}/{self.count:<3d} "
-            f"{self.model:10s} {self.distortion:+7.3f} {self.stretch:8.1f}{'F' if self.folded else ' '} {self.focal:6.2f} "
-            f"{len(self.messages):3d} {self.seconds:7.1f} {self.peer_seconds:7.1f}"
+            f"{self.model:10s} {self.distortion:+7.3f} {self.stretch:8.1f}{'F' if self.folded else ' '} "
+            f"{self.focal:6.2f} {len(self.messages):3d} {self.seconds:7.1f} {self.peer_seconds:7.1f}"
         )
 
 
