@@ -36,6 +36,9 @@ _STEP = 1e-5
 _RADII = np.linspace(0.05, 1.0, 20)
 """Half diagonals: where the lens is looked at, out to the corner."""
 
+_OVERRULED = 1.5
+"""Ratio from which on EXIF was wrong, not rounded or of another focus."""
+
 _CONFIDENT = 2.0
 """Standard deviations within which the lens is taken to be known: 95 %."""
 
@@ -273,6 +276,18 @@ def _link_fits(found: AdjustedPictures, squared: FloatArray, agreeing: BoolArray
     return tuple(result)
 
 
+def _overruled_focal(found: AdjustedPictures, camera: Camera) -> str | None:
+    """That the images show another focal length than EXIF says, where they do."""
+    given, shared = found.problem.camera_priors, found.choice.fit.model.shared_names
+    if given.focal_source != "exif" or not shared or camera.focal is None:
+        return None
+    ratio = camera.focal / camera.half_diagonal / math.exp(given.log_focal)
+    if abs(math.log(ratio)) < math.log(_OVERRULED):
+        return None
+    shown, said = camera.focal, camera.focal / ratio
+    return f"the images show a focal length of {shown:.0f} pixels, not of {said:.0f} as EXIF says; --focal gives it"
+
+
 def _warnings(found: AdjustedPictures, camera: Camera) -> tuple[Message, ...]:
     """What the user should know of the whole."""
     result: list[Message] = []
@@ -290,6 +305,8 @@ def _warnings(found: AdjustedPictures, camera: Camera) -> tuple[Message, ...]:
                 f"corners; {ENOUGH_PICTURES} or more images, or --camera, make it surer"
             )
             result.append(Message(text, severity="note" if found.layout_matters else "warning", code="few-pictures"))
+    if (overruled := _overruled_focal(found, camera)) is not None:
+        result.append(Message(overruled))
     if not found.choice.fit.adjusted.converged:
         result.append(Message("the adjustment did not converge; judge the result with care", code="not-converged"))
     if found.positions_disagree:

@@ -79,7 +79,7 @@ def level_frame(rotations: FloatArray, reference: int, down_by_gravity: FloatArr
 def _upright(rotations: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Axes right, down and ahead (N, 3) of cameras, turned by quarters about the last so that most agree on down."""
     right, down, ahead = np.moveaxis(rotations, 1, 0)
-    usual = down[np.argmax((down @ down.T).sum(axis=1))]
+    usual = down[np.argmax(down @ down.sum(axis=0))]
     roll = np.rint(np.arctan2(right @ usual, down @ usual) / (np.pi / 2)) * (np.pi / 2)
     roll = np.where(np.abs(ahead @ usual) < _STEEP, roll, 0.0)[:, None]
     return np.cos(roll) * right - np.sin(roll) * down, np.sin(roll) * right + np.cos(roll) * down, ahead

@@ -26,9 +26,6 @@ from rdstitch.alignment.model_family import MODELS
 from rdstitch.alignment.motion_models import HOMOGRAPHY, LOG_HEIGHT, POSE, PSI, THETA, MotionModel, PlanarModel
 from rdstitch.arrays import BoolArray, FloatArray
 
-NOT_ONE_CAMERA = "the images do not come from one camera with one focal length"
-"""Why free homographies were taken."""
-
 _MIN_RATIO = 3.0
 """Times by which the errors of one camera must exceed those of free homographies, one an image: these fit relief better
 than any camera does, by up to 2.2 times over strips of rendered relief, and their chains drift projectively."""
@@ -258,7 +255,8 @@ def _description(fit: Fit) -> str:
     if fit.model.on_sphere:
         return "the camera turned on the spot"
     if not isinstance(fit.model, PlanarModel):
-        return NOT_ONE_CAMERA if len(fit.adjusted.parameters.poses) > 2 else "two images need no more"
+        several = len(fit.adjusted.parameters.poses) > 2
+        return "no camera with one focal length explains the images" if several else "two images need no more"
     parts = ["height and tilt stay the same"]
     if LOG_HEIGHT in fit.model.free:
         heights = float(np.std(fit.adjusted.parameters.poses[:, LOG_HEIGHT]))

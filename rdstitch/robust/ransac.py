@@ -150,7 +150,8 @@ def ransac(
     turns, batch = lanes[-1:], _FIRST_BATCH
     while len(active):
         for lane in turns:
-            lane.advance(best, active[lane.drawn[active] < lane.needed(best, active, explore=True)], batch)
+            left = options.max_iterations - int(np.sum([own.drawn[active] for own in lanes], axis=0).max())
+            lane.advance(best, active[lane.drawn[active] < lane.needed(best, active, explore=True)], min(batch, left))
         needed = np.stack([lane.needed(best, active) for lane in lanes])
         drawn = np.stack([lane.drawn[active] for lane in lanes])
         explored = (drawn >= np.minimum(_MIN_EXPLORATION, needed)).all(axis=0)
@@ -196,7 +197,7 @@ class _Lane:
 
     def advance(self, best: Hypotheses, rows: IntArray, batch: int) -> None:
         """Draw a batch of samples of some pairs, and put the best hypotheses where they are better."""
-        if not len(rows):
+        if not len(rows) or batch < 1:
             return
         picks = self._sampler.draw(self.drawn[rows], batch, self._data.count[rows], self._ordered[rows])
         self.drawn[rows] += batch

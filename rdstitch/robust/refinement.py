@@ -129,7 +129,8 @@ class PairProblems:
         moved = np.empty_like(parameters)
         moved[:, 0] = parameters[:, 0] + (step[:, 0] if free else 0.0)
         moved[:, 1:] = self.model.retract(parameters[:, 1:], step[:, free:])
-        possible = (np.abs(moved[:, 0]) < MAX_ABS_DISTORTION) & np.isfinite(moved).all(axis=1)
+        within = (np.abs(moved[:, 0]) < MAX_ABS_DISTORTION) | self.fixed_distortion
+        possible = within & np.isfinite(moved).all(axis=1)
         return np.where(possible[:, None], moved, parameters), possible
 
     def inspect(self, fits: Fits) -> Inspection:

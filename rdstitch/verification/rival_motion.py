@@ -113,7 +113,7 @@ def find_rival_motions(
         rests = [rest for rest in rests if rest.agreeing.any()]
         tried = [rest for rest in rests if len(rest.unexplained) >= MIN_INLIERS]
         # All pictures have one lens.
-        how = EstimationOptions("auto", alignment.cameras[aligned[0].image1].distortion, limits)
+        how = EstimationOptions("auto", alignment.cameras[aligned[0].image1].nearest_distortion, limits)
         relations = estimate_radial_homographies([rest.matches for rest in tried], how)
         found = {rest.images: rest.rival(relation) for rest, relation in zip(tried, relations, strict=True)}
         rivals += [found.get(rest.images, rest.nothing) for rest in rests]

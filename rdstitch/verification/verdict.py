@@ -8,7 +8,6 @@ from contextlib import nullcontext
 import numpy as np
 
 from rdstitch.alignment.result import Alignment, LinkFit
-from rdstitch.alignment.select import NOT_ONE_CAMERA
 from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.errors import RegistrationError
 from rdstitch.matching.match_graph import connected_components
@@ -127,9 +126,16 @@ def judge(
     )
     shape, size = alignment.shape, min(2.0 * camera.half_diagonal for camera in alignment.cameras)
     bent = shape is not None and math.hypot(shape.shift, shape.shift_std) < size
-    flat = not alignment.on_sphere and int(alignment.used.sum()) > 2
+    flat = not alignment.on_sphere and _has_chains(alignment)
     depth = alignment.relief.found or bool(parallax)
     return spoken(messages, Situation(_usual_agreement(checked), flat, depth, bent))
+
+
+def _has_chains(alignment: Alignment) -> bool:
+    """Whether images are joined through others, so that errors of overlaps add up unseen."""
+    pairs = [{fit.image1, fit.image2} for fit in alignment.links if fit.used]
+    around = {image for pair in pairs if alignment.reference in pair for image in pair}
+    return len(around) < int(alignment.used.sum())
 
 
 def _failure(text: str, images: Sequence[str] = ()) -> Message:
@@ -170,11 +176,11 @@ def _shape(paths: Sequence[str], alignment: Alignment) -> list[Message]:
     if shape is None:
         return []
     image = paths[shape.image]
-    if NOT_ONE_CAMERA in alignment.model_reason:
+    if alignment.focal is None:
         # Chains of free homographies bend with whatever is not modelled, a curved wall for one.
         text = (
-            f"nobody knows how far it is off in the whole: {NOT_ONE_CAMERA}, or what they show is no plane; every "
-            "picture has a homography of its own, and their errors add up from picture to picture"
+            "global accuracy unknown: the images do not come from one camera with one focal length, or what they show "
+            "is not flat; each has a homography of its own, and their errors add up from image to image"
         )
         return [Message(text, (image,), code="shape")]
     if not shape.doubtful:

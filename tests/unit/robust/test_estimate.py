@@ -5,6 +5,7 @@ import inspect
 import numpy as np
 import pytest
 
+from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies, estimate_radial_homography
 from rdstitch.robust.estimate import SOLVERS, SolverName
@@ -120,3 +121,23 @@ def test_the_covariance_names_its_parameters(tilt: tuple[float, float] | None) -
     assert fit.covariance.shape == (len(fit.parameters),) * 2
     assert fit.parameters[0] == "distortion"
     assert fit.covariance[0, 0] == pytest.approx(fit.distortion_std**2)
+
+
+@pytest.mark.parametrize("limit", [1, 10, 100, 700])
+def test_no_more_samples_are_drawn_than_were_allowed(limit: int) -> None:
+    rng = np.random.default_rng(0)
+    points1, points2 = rng.uniform((0, 0), (639, 479), (2, 300, 2))
+    points2[:40] = points1[:40] + np.array([40.0, 10.0])
+    assert estimate_radial_homography(points1, points2, (640, 480), max_iterations=limit).iterations == limit
+
+
+def test_a_given_wide_lens_is_kept_while_the_motion_is_refined() -> None:
+    lens = Camera((640, 480), -0.985)
+    rng = np.random.default_rng(1)
+    points1 = rng.uniform((160, 120), (480, 360), (300, 2))
+    shift = lens.undistort(points1) + np.array([60.0, 20.0])
+    points2 = lens.distort(shift) + rng.normal(0.0, 0.1, (300, 2))
+    given = points1 + rng.normal(0.0, 0.1, (300, 2))
+    found = estimate_radial_homography(given, points2, (640, 480), distortion=-0.985)
+    assert found.ok
+    assert np.median(np.linalg.norm(found.transfer(points1) - lens.distort(shift), axis=1)) < 0.05

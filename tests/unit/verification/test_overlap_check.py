@@ -105,7 +105,7 @@ def test_cached_overlaps_are_those_of_the_same_links(monkeypatch: pytest.MonkeyP
             return checked
 
     alignment = SimpleNamespace(links=links, cameras=[None] * 3, homographies=[None] * 3, on_sphere=True)
-    source = SimpleNamespace(content=lambda cache: "", mask=None)
+    source = SimpleNamespace(content=lambda cache: "", mask_content=lambda cache: "")
     registration: Any = SimpleNamespace(alignment=alignment, sources=[source] * 3, stretch=None)
     cache: Any = Recorded()
     assert overlap_check.check_overlaps(registration, ThreadPoolExecutor(1), cache) == checked
