@@ -25,6 +25,9 @@ NO_OWNER = -1
 # Band in which a seam may wander: the new picture's share of both border weights.
 _MIN_SHARE, _MAX_SHARE = 0.2, 0.8
 _AROUND_FREE = 2
+# What a difference of edges, a pixel, counts beside one of brightness, and the root of the largest cost of a pixel, in
+# that of the length of a seam; OpenCV's cut keeps to what it must separate up to a cost of 10,000.
+_EDGES, _VISIBLE = 2.0, 64.0
 # pixels from which on a cut is found at half the size first, and by how much it may then move.
 _MAX_CUT = 30_000
 _MOVED = 3
@@ -183,8 +186,7 @@ def _cut(
     won = surely_new.copy()
     for part in _parts(free) if apart else [_around(free)]:
         masks = [(free | sure)[part].astype(np.uint8) * np.uint8(255) for sure in (surely_old, surely_new)]
-        images = [_three_channels(image[part]) for image in (below, pixels)]
-        won[part] |= free[part] & _graph_cut(images, masks)
+        won[part] |= free[part] & _graph_cut(_visibility(pixels[part] - below[part]), masks)
     return won
 
 
@@ -208,13 +210,24 @@ def _around(free: NDArray[np.bool_]) -> tuple[slice, slice]:
     )
 
 
-def _graph_cut(images: list[Float32Array], masks: list[NDArray[np.uint8]]) -> NDArray[np.bool_]:
+def _visibility(difference: Float32Array) -> Float32Array:
+    """How much a seam shows at each pixel (h, w): the square of what the images differ by in brightness and in edges.
+
+    One broken edge shows more than many small differences.
+    """
+    grey = np.ascontiguousarray(difference.mean(axis=-1))
+    edges = sum(np.abs(cv2.Sobel(grey, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=_EDGES / 8)) for dx in (1, 0))
+    return np.asarray((_VISIBLE * np.minimum(np.abs(difference).mean(axis=-1) + edges, 1.0)) ** 2, dtype=np.float32)
+
+
+def _graph_cut(cost: Float32Array, masks: list[NDArray[np.uint8]]) -> NDArray[np.bool_]:
     """Where the second of two images wins; the pixels that one mask alone has are what the cut must separate.
 
-    A large cut is found at half the size first, and then only moved by a few pixels.
+    A large cut is found at half the size first, and then only moved by a few pixels. What the images differ by is
+    averaged then, not the images: fine detail that is a little off would vanish from a smaller image, not from the cut.
     """
     if masks[0].size > _MAX_CUT:
-        halved = [np.asarray(block_mean(image, 2), dtype=np.float32) for image in images]
+        halved = np.asarray(block_mean(cost, 2), dtype=np.float32)
         masks = _near_cut(_graph_cut(halved, [mask[::2, ::2] for mask in masks]), masks)
     won = masks[1] > 0
     free = won & (masks[0] > 0)
@@ -223,8 +236,13 @@ def _graph_cut(images: list[Float32Array], masks: list[NDArray[np.uint8]]) -> ND
     part = _around(free)
     # The type stubs lack the class, and a UMat made of an array.
     detail: Any = cv2
-    finder = detail.detail_GraphCutSeamFinder("COST_COLOR_GRAD")
-    cut_images, cut_masks = ([detail.UMat(np.ascontiguousarray(a[part])) for a in both] for both in (images, masks))
+    finder = detail.detail_GraphCutSeamFinder("COST_COLOR")
+    # Its cost is the squared distance of two colours.
+    root = np.sqrt(cost[part])
+    colours = [np.zeros((*root.shape, 3), dtype=np.float32), np.stack([root, root * 0, root * 0], axis=-1)]
+    cut_images, cut_masks = (
+        [detail.UMat(np.ascontiguousarray(a)) for a in both] for both in (colours, [m[part] for m in masks])
+    )
     won[part] = finder.find(cut_images, [(0, 0), (0, 0)], cut_masks)[1].get() > 0
     return won
 
@@ -240,9 +258,3 @@ def _near_cut(won: NDArray[np.bool_], masks: list[NDArray[np.uint8]]) -> list[ND
         np.where(free & settled, np.uint8(0), mask)
         for mask, settled in zip(masks, (surely_new, surely_old), strict=True)
     ]
-
-
-def _three_channels(pixels: Float32Array) -> Float32Array:
-    """The finder's cost is made for three channels with values of 0 to 255."""
-    channels = [pixels[..., k] for k in range(3)] if pixels.shape[2] >= 3 else [pixels[..., 0]] * 3
-    return np.stack(channels, axis=-1) * np.float32(255.0)

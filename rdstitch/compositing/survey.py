@@ -16,7 +16,7 @@ from rdstitch.compositing.sampling import border_weight, sample, sample_opacity
 from rdstitch.compositing.source_images import PictureReader
 from rdstitch.compositing.warp import Geometry, Warp, locate, plan_warps
 
-_MAX_PICTURE = 150_000
+_MAX_PICTURE = 600_000
 _MAX_TOTAL = 16_000_000
 
 

@@ -38,3 +38,21 @@ def test_a_seam_runs_where_two_pictures_look_alike(place: int, swapped: bool) ->
     assert canvas.size == (SIZE[0] + SHIFT, SIZE[1])
     assert (found.pixels[:, : place - 6] == LEFT).all()
     assert (found.pixels[:, place + 7 :] == RIGHT).all()
+
+
+def test_a_seam_avoids_fine_detail_that_is_off_by_a_pixel() -> None:
+    """Grain that is the same in both pictures in a winding path alone; it is even grey in small ones."""
+    rng, (width, height, shift) = np.random.default_rng(2), (1200, 900, 400)
+    grain = np.repeat(rng.integers(88, 168, (height, width + shift, 1)), 3, axis=2).astype(np.uint8)
+    column = np.arange(width + shift)[None, :]
+    path = 800 + 60 * np.sin(np.arange(height) / 120)[:, None]
+    off = np.where((np.abs(column - path) < 30)[..., None], grain, np.roll(grain, 1, axis=1))
+    frames, lens, move = [grain[:, :width], off[:, shift:]], Camera((width, height)), np.eye(3)
+    move[0, 2] = shift / lens.half_diagonal
+    homographies = np.stack([np.eye(3), move])
+    canvas = plan_canvas([lens, lens], homographies)
+    pictures = place_pictures([partial(as_picture, frame) for frame in frames], [lens, lens], homographies)
+    found = compose(pictures, canvas, CompositeOptions(exposure="none", blend="none")).pixels
+    left, right = column < path - 30, column > path + 30
+    assert (found == grain).all(axis=-1)[left].mean() > 0.99
+    assert (found == off).all(axis=-1)[right].mean() > 0.99

@@ -39,8 +39,8 @@ def test_crops_become_the_image_that_they_are_of(name: str, noise: float) -> Non
         # Not resampled: noise is as it was, but where images are blended.
         assert difference.std() > 0.9 * np.abs(np.random.default_rng(0).normal(0, noise, 10**5)).std()
     else:
+        # But where one that ends is blended into others.
         assert (difference > 0).mean() < 1e-3
-        assert difference.max() <= 2
 
 
 @pytest.mark.parametrize("shift", [0.25, 0.5])
