@@ -20,14 +20,14 @@ from typing import Any, Self, TypeVar
 
 from rdstitch.errors import ArgumentError, InputError, OutputError
 from rdstitch.file_access import is_url, open_regular, read_limited, remote_status
-from rdstitch.io.packing import digest, pack, unpack
+from rdstitch.io.packing import digest, is_of, pack, unpack
 from rdstitch.io.staging import lock, remove_dead_files
 from rdstitch.stored import MAX_ENTRY, Stored, TemporaryFolder, entry_name
 
 Value = TypeVar("Value")
 
 _FORMAT = 1
-_CORRUPT_ENTRY_ERRORS = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError)
+_CORRUPT_ENTRY_ERRORS = (ValueError, LookupError, ArithmeticError)
 _OPENCV = tuple(f"opencv-{kind}" for kind in ("contrib-python-headless", "contrib-python", "python-headless", "python"))
 _PACKAGES = ("numpy", "scipy", *_OPENCV, "pillow", "simplejpeg", "tifffile")
 
@@ -88,6 +88,8 @@ class Cache:
         inputs: tuple[Any, ...],
         compute: Callable[[], Value],
         valid: Callable[[Value], bool] = lambda value: True,
+        *,
+        hint: Any = object,
     ) -> Value:
         """What a stage gives for its inputs: from an earlier run, else computed now and kept.
 
@@ -104,11 +106,13 @@ class Cache:
         valid : callable
             Whether an entry is a result for these inputs by its shapes and ranges; else it is computed again, as where
             it raises one of the errors that wrong values lead to.
+        hint : type, optional
+            What ``valid`` takes: an entry of another type is computed again.
         """
         if self.folder is None:
             return compute()
         file = self._file(stage, inputs)
-        kept = _read(file, kinds, valid)
+        kept = _read(file, kinds, valid, hint)
         if kept:
             return kept[0]
         value = compute()
@@ -122,12 +126,14 @@ class Cache:
         inputs: tuple[Any, ...],
         compute: Callable[[], Value],
         valid: Callable[[Value], bool] = lambda value: True,
+        *,
+        hint: Any = object,
     ) -> Stored[Value]:
         """As :meth:`recall`, but the result stays on disk until it is loaded."""
         if self.folder is None:
             return Stored(value=compute())
         file = self._file(stage, inputs)
-        if _read(file, kinds, valid):
+        if _read(file, kinds, valid, hint):
             return Stored(file, kinds, folder=self.temporary)
         value = compute()
         return Stored(file, kinds, folder=self.temporary) if self._keep(file, value) else Stored(value=value)
@@ -139,6 +145,8 @@ class Cache:
         inputs: Sequence[tuple[Any, ...]],
         compute: Callable[[list[int]], list[Value]],
         valid: Callable[[int, Value], bool] = lambda index, value: True,
+        *,
+        hint: Any = object,
     ) -> list[Value]:
         """As :meth:`recall` for a stage that computes several results at once.
 
@@ -152,11 +160,13 @@ class Cache:
             Gives the results of some of the inputs, called with their places.
         valid : callable
             As in :meth:`recall`, with the place.
+        hint
+            As in :meth:`recall`, of each.
         """
         if self.folder is None:
             return compute(list(range(len(inputs))))
         files = [self._file(stage, own) for own in inputs]
-        found = [_read(file, kinds, partial(valid, index)) for index, file in enumerate(files)]
+        found = [_read(file, kinds, partial(valid, index), hint) for index, file in enumerate(files)]
         missing = [index for index, kept in enumerate(found) if not kept]
         for index, value in zip(missing, compute(missing) if missing else [], strict=True):
             found[index] = [value]
@@ -237,11 +247,11 @@ def _sources(folder: Traversable, prefix: str) -> Iterator[tuple[str, bytes]]:
             yield prefix + entry.name, entry.read_bytes()
 
 
-def _read(file: Path, kinds: tuple[type, ...], valid: Callable[[Value], bool]) -> list[Value]:
+def _read(file: Path, kinds: tuple[type, ...], valid: Callable[[Value], bool], hint: Any) -> list[Value]:
     """The result that a file holds; none where it is missing, damaged, or no result for these inputs."""
     with suppress(InputError, ArgumentError, OSError, *_CORRUPT_ENTRY_ERRORS):
         kept: tuple[str, Value] = unpack(read_limited(file, MAX_ENTRY), kinds)
-        if isinstance(kept, tuple) and kept[0] == entry_name(file) and valid(kept[1]):
+        if is_of(kept, tuple[str, hint]) and kept[0] == entry_name(file) and valid(kept[1]):
             return [kept[1]]
     return []
 

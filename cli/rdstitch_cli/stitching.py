@@ -101,7 +101,7 @@ def _check_written(read: Iterable[Path | None]) -> None:
     files = [file for file in (*read, context.meta.get(CONFIG_FILE)) if file is not None]
     for name in ("output", "save_camera", "plot", "report"):
         if context.params.get(name) is not None:
-            check_not_read(context.params[name], files)
+            check_not_read([context.params[name]], files)
 
 
 def _preview(

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -216,7 +217,7 @@ class Alignment:
         """Relative standard deviation that all lengths on the plane share, that of the focal length; NaN without."""
         return math.nan if self.focal is None or self.focal_std is None else self.focal_std / self.focal
 
-    @property
+    @cached_property
     def support(self) -> dict[tuple[int, int], int]:
         """Number of inliers of every pair of pictures that the alignment uses."""
         return {(fit.image1, fit.image2): fit.inliers for fit in self.links if fit.used}

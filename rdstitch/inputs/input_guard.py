@@ -4,6 +4,7 @@ import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Lock
 
 from rdstitch.errors import InputError
 from rdstitch.file_access import is_url, open_regular, remote_status
@@ -33,6 +34,7 @@ class InputGuard:
         self._stamps: dict[Path, _Stamp | None] = {}
         self._checksums: dict[Path, int] = {}
         self._damaged: dict[Path, str] = {}
+        self._lock = Lock()
 
     @contextmanager
     def reading(self, path: Path) -> Iterator[None]:
@@ -45,11 +47,13 @@ class InputGuard:
         """
         before = _stamp(path)
         yield
-        if path not in self._checksums:
-            self._checksums[path] = _checksum(path)
-        elif before != self._stamps[path] and _checksum(path) != self._checksums[path]:
-            raise InputError(f"{path}: its content has changed during the run; run again")
-        self._stamps[path] = before
+        # One after the other: of two that read a file first, both would take it for unknown.
+        with self._lock:
+            if path not in self._checksums or before != self._stamps[path]:
+                checksum = _checksum(path)
+                if self._checksums.setdefault(path, checksum) != checksum:
+                    raise InputError(f"{path}: its content has changed during the run; run again")
+            self._stamps[path] = before
         if _stamp(path) != before:
             raise InputError(f"{path}: is being written to; run again when that has ended")
 
@@ -91,11 +95,12 @@ class InputGuard:
             When a file had another content there.
         """
         stamps, checksums, damaged = notes
-        for path, checksum in checksums.items():
-            if self._checksums.setdefault(path, checksum) != checksum:
-                raise InputError(f"{path}: its content has changed during the run; run again")
-            self._stamps.setdefault(path, stamps[path])
-        self._damaged |= damaged
+        with self._lock:
+            for path, checksum in checksums.items():
+                if self._checksums.setdefault(path, checksum) != checksum:
+                    raise InputError(f"{path}: its content has changed during the run; run again")
+                self._stamps.setdefault(path, stamps[path])
+            self._damaged |= damaged
 
     def __reduce__(self) -> tuple[type["InputGuard"], tuple[bool]]:
         """Copies and other processes begin anew."""

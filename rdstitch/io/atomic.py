@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,13 @@ def check_output(
     return file
 
 
+def check_outputs(paths: Sequence[Path], overwrite: bool, inputs: Iterable[str | Path]) -> None:
+    """Find out of many files what :func:`check_output` does of one, in a time linear in their number."""
+    check_not_read(paths, inputs)
+    for path in paths:
+        check_output(path, overwrite)
+
+
 def _check_place(file: Path, overwrite: bool, inputs: Iterable[str | Path]) -> None:
     """The part of :func:`check_output` that needs the file system."""
     folder = file.parent
@@ -62,7 +69,7 @@ def _check_place(file: Path, overwrite: bool, inputs: Iterable[str | Path]) -> N
     if file.is_symlink() and not file.exists():
         raise OutputError(f"{file}: is a link to nothing; remove it, or choose another name")
     if file.exists():
-        check_not_read(file, inputs)
+        check_not_read([file], inputs)
         if not overwrite:
             raise OutputError(f"{file}: exists already; choose another name or use --overwrite")
         # A link stays, and what it leads to is replaced.
@@ -71,16 +78,18 @@ def _check_place(file: Path, overwrite: bool, inputs: Iterable[str | Path]) -> N
         raise OutputError(f"{file}: no permission to write into the folder {folder}")
 
 
-def check_not_read(file: Path, inputs: Iterable[str | Path]) -> None:
+def check_not_read(files: Iterable[Path], inputs: Iterable[str | Path]) -> None:
     """Refuse to write over what is read, by whatever name.
 
     Raises
     ------
     OutputError
-        When the file is one of the inputs.
+        When one of the files is one of the inputs.
     """
-    if any(_same_file(file, Path(other)) for other in inputs):
-        raise OutputError(f"{file}: is read as input; choose another name")
+    read = {_identity(local_file(Path(path))) for path in inputs} - {None}
+    for file in files:
+        if _identity(file) in read:
+            raise OutputError(f"{file}: is read as input; choose another name")
 
 
 def check_distinct(paths: Iterable[str | Path]) -> None:
@@ -99,12 +108,13 @@ def check_distinct(paths: Iterable[str | Path]) -> None:
         seen.add(place)
 
 
-def _same_file(first: Path, second: Path) -> bool:
-    """Whether two names lead to the same file; a missing file is the same as none."""
+def _identity(file: Path) -> tuple[int, int] | None:
+    """The same for all names that lead to one file; None for a missing one."""
     try:
-        return first.samefile(local_file(second))
+        status = file.stat()
     except (OSError, ValueError):
-        return False
+        return None
+    return status.st_dev, status.st_ino
 
 
 def write_bytes_atomic(path: str | Path, data: bytes, overwrite: bool = True) -> None:

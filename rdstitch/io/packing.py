@@ -115,17 +115,19 @@ _hints_of = cache(get_type_hints)
 """Of a dataclass; to read them takes longer than to build it."""
 
 
-def _is_of(value: Any, hint: Any) -> bool:
-    """Whether a value is what a field of a dataclass is declared as, as far as that can be seen."""
+def is_of(value: Any, hint: Any) -> bool:
+    """Whether a value is what it is declared as, such as a field of a dataclass, as far as that can be seen."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Literal:
         return value in arguments
     if origin in (Union, UnionType):
-        return any(_is_of(value, part) for part in arguments)
+        return any(is_of(value, part) for part in arguments)
     if origin is tuple and isinstance(value, tuple):
         if arguments[1:] == (...,):
-            return all(_is_of(item, arguments[0]) for item in value)
-        return len(value) == len(arguments) and all(map(_is_of, value, arguments))
+            return all(is_of(item, arguments[0]) for item in value)
+        return len(value) == len(arguments) and all(map(is_of, value, arguments))
+    if origin is list and isinstance(value, list):
+        return all(is_of(item, arguments[0]) for item in value)
     if hint is float:
         return isinstance(value, (float, int)) and not isinstance(value, bool)
     if hint is int:
@@ -159,7 +161,7 @@ def _build(described: Any, blocks: memoryview, kinds: dict[str, type]) -> Any:
             given = part["fields"]
             values = {f.name: build(given[f.name]) for f in dataclasses.fields(kind)}
             for name, hint in _hints_of(kind).items():
-                if name in values and not _is_of(values[name], hint):
+                if name in values and not is_of(values[name], hint):
                     raise TypeError(f"{kind.__name__}.{name} is a {type(values[name]).__name__}")
             return kind(**values)
         ((name, content),) = part.items()

@@ -1,12 +1,11 @@
 """Pairs of pictures taken from one centre that show a part of each other."""
 
 from collections.abc import Sequence
-from itertools import combinations
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
+from rdstitch.camera import Camera, border_of
 
 _MIN_OVERLAP = 0.15
 """Share of the picture of which more is seen in the other."""
@@ -31,9 +30,18 @@ def neighbours_around(
     known = np.flatnonzero(np.isfinite(directions).all(axis=(1, 2))).tolist()
     rays = {k: _rays(cameras[k], directions[k]) for k in known}
     back = {k: np.linalg.inv(directions[k]) for k in known}
+    axes = directions[known, :, 2] / np.linalg.norm(directions[known, :, 2], axis=1, keepdims=True)
+    reach = np.array([_reach(cameras[k], directions[k], axis) for k, axis in zip(known, axes, strict=True)])
+    # Only cones around the optical axes that meet: of many pictures all round, few of the pairs.
+    near = (
+        (i, known[position])
+        for first, i in enumerate(known)
+        for position in np.flatnonzero(_angles(axes[first:], axes[first]) <= reach[first:] + reach[first]) + first
+        if known[position] != i
+    )
     return [
         (i, j)
-        for i, j in combinations(known, 2)
+        for i, j in near
         if (i, j) not in tried
         and max(_share_seen(rays[a], cameras[b], back[b]) for a, b in ((i, j), (j, i))) >= _MIN_OVERLAP
     ]
@@ -47,6 +55,21 @@ def _rays(camera: Camera, matrix: FloatArray) -> FloatArray:
     flat = camera.normalize(camera.undistort(places))
     rays: FloatArray = np.concatenate([flat, np.ones((len(flat), 1))], axis=1) @ matrix.T
     return rays
+
+
+def _reach(camera: Camera, matrix: FloatArray, axis: FloatArray) -> float:
+    """Largest angle, radians, between the optical axis and what a picture shows."""
+    flat = camera.normalize(camera.undistort(border_of(camera.image_size, _PLACES)))
+    if not np.isfinite(flat).all():
+        return np.pi
+    rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1) @ matrix.T
+    return float(_angles(rays / np.linalg.norm(rays, axis=1, keepdims=True), axis).max())
+
+
+def _angles(directions: FloatArray, axis: FloatArray) -> FloatArray:
+    """Radians between unit vectors (K, 3) and one."""
+    angles: FloatArray = np.arccos(np.clip(directions @ axis, -1.0, 1.0))
+    return angles
 
 
 def _share_seen(rays: FloatArray, camera: Camera, back: FloatArray) -> float:

@@ -127,7 +127,7 @@ def _match_pair(
 
     cache = task.cache
     inputs = (one.key(cache), two.key(cache), task.how, None if known is None else known.key(cache))
-    stored = cache.stored("matches", (Correspondences,), inputs, compute, valid)
+    stored = cache.stored("matches", (Correspondences,), inputs, compute, valid, hint=Correspondences)
     return StoredMatches(stored, len(stored.load()))
 
 
@@ -181,7 +181,7 @@ def estimate_pairs(task: EstimationTask) -> list[tuple[StoredMatches, RadialHomo
         return relation.homography.shape == (3, 3) and relation.inliers.shape == (len(matches[place]),)
 
     kinds = (RadialHomography, Camera, PlanarMotion)
-    relations = task.cache.recall_many("pairs", kinds, inputs, estimate, valid)
+    relations = task.cache.recall_many("pairs", kinds, inputs, estimate, valid, hint=RadialHomography)
     return list(zip(matches, relations, strict=True))
 
 

@@ -197,7 +197,7 @@ class Aligner:
             found, given = ([camera.image_size for camera in every] for every in (alignment.cameras, cameras))
             return found == given and alignment.used.shape == (count,) and alignment.homographies.shape == (count, 3, 3)
 
-        alignment = self.cache.recall("alignment", kinds, inputs, compute, valid=valid)
+        alignment = self.cache.recall("alignment", kinds, inputs, compute, valid, hint=Alignment)
         down = None if gravity is None else np.einsum("nij,nj->ni", turns(self._turns), np.asarray(gravity))
         return turned_alignment(alignment, self._turns, down)
 

@@ -129,8 +129,9 @@ def _detected(source: Source, task: DetectionTask) -> StoredFeatures:
     def compute() -> PackedFeatures:
         return PackedFeatures.pack(detect_view(source.view, options))
 
+    kinds = (PackedFeatures, Features)
     stored = store.stored(
-        "features", (PackedFeatures, Features), inputs, compute, lambda found: _are_of(source, found.unpack())
+        "features", kinds, inputs, compute, lambda found: _are_of(source, found.unpack()), hint=PackedFeatures
     )
     return StoredFeatures.at(stored)
 

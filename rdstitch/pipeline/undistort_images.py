@@ -17,7 +17,7 @@ from rdstitch.inputs.find import found_pictures
 from rdstitch.inputs.frame import ChannelOrder, Images, as_inputs, in_order
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
-from rdstitch.io.atomic import PICTURE_SUFFIXES, check_output
+from rdstitch.io.atomic import PICTURE_SUFFIXES, check_outputs
 from rdstitch.io.read import Picture
 from rdstitch.io.write import write_image
 from rdstitch.messages import Message, ignored
@@ -130,8 +130,7 @@ def undistort(
             return pictures
         outputs = _outputs(sources, Path(folder), image_format)
         with _existing(Path(folder)):
-            for output in outputs:
-                check_output(output, overwrite, found.files)
+            check_outputs(outputs, overwrite, found.files)
             for done, (source, output) in enumerate(zip(sources, outputs, strict=True), start=1):
                 picture = _undistorted(source, view)
                 metadata = source.metadata if view == "same" else source.metadata.in_another_size()

@@ -7,7 +7,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import scipy
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
@@ -209,9 +211,10 @@ def versions() -> dict[str, str]:
     """Versions of what has a say in the result."""
     return {
         "rdstitch": version("rdstitch"),
-        "numpy": version("numpy"),
-        "scipy": version("scipy"),
-        "opencv": version("opencv-contrib-python-headless"),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        # Whichever of its wheels is installed.
+        "opencv": cv2.__version__,
         "python": platform.python_version(),
     }
 

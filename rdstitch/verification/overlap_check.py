@@ -131,7 +131,7 @@ def check_overlaps(registration: Registration, executor: Executor, cache: Cache 
 
     kinds = (CheckedLink, LinkFit, Agreement, Ambiguity)
     inputs = (placed, chosen, registration.stretch, list(parallax.values()))
-    return cache.recall("overlaps", kinds, inputs, compute, valid=valid)
+    return cache.recall("overlaps", kinds, inputs, compute, valid, hint=list[CheckedLink])
 
 
 def share_alike(checked: Sequence[CheckedLink]) -> float:

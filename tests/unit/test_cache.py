@@ -6,6 +6,7 @@ import sys
 import tempfile
 import tracemalloc
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +107,29 @@ def test_entries_that_are_no_result_are_computed_again(tmp_path: Path) -> None:
     assert recall([-1]) == [-1]
     assert recall([3]) == [3]
     assert recall([4]) == [3]
+
+
+def test_an_entry_of_another_type_is_computed_again(tmp_path: Path) -> None:
+    def recall(value: Any, hint: Any) -> Any:
+        return Cache(tmp_path / "cache").recall("stage", (), ("x",), lambda: value, lambda kept: kept[0] > 0, hint=hint)
+
+    assert recall(["text"], list[int]) == ["text"]
+    assert recall([2], list[int]) == [2]
+    assert recall((5,), tuple[int]) == (5,)
+    assert recall([6], tuple[int]) == (5,)
+
+
+@pytest.mark.parametrize("error", [TypeError, AttributeError])
+def test_a_programming_error_in_the_validation_is_raised(tmp_path: Path, error: type[Exception]) -> None:
+    """It would make every run compute everything anew."""
+
+    def wrong(kept: int) -> bool:
+        raise error
+
+    recall = partial(Cache(tmp_path / "cache").recall, "stage", (), ("x",), lambda: 1)
+    assert recall() == 1
+    with pytest.raises(error):
+        recall(wrong)
 
 
 def test_an_entry_that_is_a_pipe_is_computed_again(tmp_path: Path, package: Path) -> None:

@@ -1,6 +1,7 @@
 """Files that change during a run, pictures that a decoder doubts, and those that need too much memory."""
 
 import os
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
 import numpy as np
@@ -84,3 +85,33 @@ def test_a_picture_that_needs_too_much_memory(tmp_path: Path) -> None:
     _source(path, max_memory=3_000_000)
     with pytest.raises(LimitError, match=r"a\.png: 1000 x 500 pixels need 3 MB .* --max-memory allows 3 MB"):
         _source(path, max_memory=2_999_999)
+
+
+def test_a_second_thread_reads_a_file_while_the_first_notes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.bmp"
+    _save(path, 1)
+    guard, pool = InputGuard(), ThreadPoolExecutor(1)
+    second: list[Future[None]] = []
+
+    def read() -> None:
+        with guard.reading(path):
+            pass
+
+    class Watched(dict[Path, int]):
+        """Has the other thread read the file as soon as the checksum is known."""
+
+        def __setitem__(self, key: Path, value: int) -> None:
+            super().__setitem__(key, value)
+            if not second:
+                second.append(pool.submit(read))
+                wait(second, timeout=0.5)
+
+        def setdefault(self, key: Path, default: int = 0) -> int:
+            if key not in self:
+                self[key] = default
+            return self[key]
+
+    monkeypatch.setattr(guard, "_checksums", Watched())
+    read()
+    second[0].result(60)
+    pool.shutdown()
