@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rdstitch.errors import InputError
+from rdstitch.export.trajectory_files import TrajectoryFrame, in_frame
 from rdstitch.features import FeatureOptions, detect_view, match
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.measurements import timestamps_of
@@ -20,11 +21,44 @@ from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import alignment_options
 from rdstitch.pipeline.read_inputs import read_frames
 from rdstitch.pipeline.working_size import at_working_size
-from rdstitch.tracking import Preview, Tracked, Tracker, TrackingOptions
+from rdstitch.tracking import CameraPose, Preview, Tracked, Tracker, TrackingOptions
 
 _FEATURES = 600  # of a frame, that suffice to follow it
 _MEGAPIXELS = 0.1  # 10⁶ pixels in which they are detected: a frame of 640 x 480 pixels is halved once
 _PREVIEW_MEGAPIXELS = 0.08
+
+
+@dataclass(frozen=True)
+class FollowedPoses:
+    """How poses are printed: as :func:`rdstitch.trajectory` writes them.
+
+    Attributes
+    ----------
+    height : float
+        Of the first keyframe above the plane, in the unit that positions shall have.
+    timestamps : path, optional
+        File of time stamps, see :func:`rdstitch.inputs.measurements.timestamps_of`.
+    frame : str
+        "enu" or "camera", see :mod:`rdstitch.export.trajectory_files`.
+    """
+
+    height: float = 1.0
+    timestamps: str | Path | None = None
+    frame: TrajectoryFrame = "enu"
+
+    def timestamp(self, source: Source) -> float:
+        """Of a frame, s; NaN where nothing is known of it, or not yet."""
+        try:
+            return float(timestamps_of([source], self.timestamps)[0])
+        except InputError:  # the table may grow as the frames do; at the end it must be whole
+            return math.nan
+
+    def fields(self, pose: CameraPose | None) -> dict[str, float | None]:
+        """x, y, yaw and height."""
+        if pose is None:
+            return dict.fromkeys(("x", "y", "yaw_deg", "height"))
+        x, y = in_frame(pose.x * self.height, pose.y * self.height, self.frame)
+        return {"x": x, "y": y, "yaw_deg": math.degrees(pose.yaw), "height": pose.height * self.height}
 
 
 @dataclass(frozen=True)
@@ -42,6 +76,8 @@ class FollowedFrame:
         Its place and λ; None where it could not be read.
     reason : str
         Why there is no place; empty where there is one.
+    poses : FollowedPoses
+        How the pose is printed.
     """
 
     name: str
@@ -49,20 +85,17 @@ class FollowedFrame:
     timestamp: float
     tracked: Tracked | None
     reason: str = ""
+    poses: FollowedPoses = FollowedPoses()
 
     def as_dict(self) -> dict[str, Any]:
         """As a line of JSON takes it; null for what is not known."""
         found = self.tracked
-        pose = None if found is None else found.pose
         placement = None if found is None else found.placement
         return {
             "name": self.name,
             "frame": self.number,
             "timestamp": _known(self.timestamp),
-            "x": None if pose is None else pose.x,
-            "y": None if pose is None else pose.y,
-            "yaw_deg": None if pose is None else math.degrees(pose.yaw),
-            "height": None if pose is None else pose.height,
+            **self.poses.fields(None if found is None else found.pose),
             "homography": None if placement is None else placement.homography.tolist(),
             "lambda": None if found is None else _known(found.distortion),
             "lambda_std": None if found is None else _known(found.distortion_std),
@@ -76,7 +109,12 @@ class FollowedFrame:
 
 
 def follow(
-    frames: Iterable[Frame], options: StitchOptions, *, preview: Path | None = None, refresh: float = 5.0
+    frames: Iterable[Frame],
+    options: StitchOptions,
+    poses: FollowedPoses | None = None,
+    *,
+    preview: Path | None = None,
+    refresh: float = 5.0,
 ) -> Iterator[FollowedFrame]:
     """Register frames as they arrive, against the last keyframes.
 
@@ -88,6 +126,7 @@ def follow(
     ----------
     frames : iterable of Frame
         See :class:`rdstitch.inputs.arrivals.Arrivals`.
+    poses : FollowedPoses, optional
     preview : path, optional
         Picture to write of what has been seen so far; JPEG or PNG.
     refresh : float
@@ -103,7 +142,7 @@ def follow(
     tracker = Tracker(TrackingOptions(pair, alignment_options([], options)), partial(match, ratio=options.ratio))
     sketch = None if preview is None else _Sketch(preview, refresh)
     labels: dict[int, FollowedFrame] = {}  # of the frames that may still find their place
-    order = 0
+    order, printed = 0, poses or FollowedPoses()
     for arrived in frames:
         if not is_selected(arrived, options.exclude, options.include_only):
             continue
@@ -111,9 +150,9 @@ def follow(
         order += 1
         source, reason = _source(frame, options)
         if source is None:
-            yield FollowedFrame(frame.path.name, frame.number or 0, math.nan, None, reason)
+            yield FollowedFrame(frame.path.name, frame.number or 0, math.nan, None, reason, printed)
             continue
-        label = FollowedFrame(source.name, source.number(0), float(timestamps_of([source])[0]), None)
+        label = FollowedFrame(source.name, source.number(0), printed.timestamp(source), None, poses=printed)
         try:
             found = detect_view(source.view, features)
         except InputError as error:

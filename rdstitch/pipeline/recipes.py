@@ -7,7 +7,7 @@ from typing import Literal
 
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.camera_files import CAMERA_SUFFIXES, camera_file_text
-from rdstitch.export.trajectory_files import WRITERS, has_times, path_as_svg
+from rdstitch.export.trajectory_files import WRITERS, TrajectoryFrame, frame_of, has_times, path_as_svg
 from rdstitch.inputs.find import found_pictures
 from rdstitch.inputs.frame import Images, as_inputs
 from rdstitch.inputs.measurements import timestamps_of
@@ -193,6 +193,7 @@ def trajectory(
     timestamps: str | Path | None = None,
     plot: str | Path | None = None,
     height: float = 1.0,
+    frame: TrajectoryFrame | None = None,
     every: int | None = 1,
     progress: Progress = silent,
 ) -> tuple[Trajectory, Registration]:
@@ -213,6 +214,9 @@ def trajectory(
         SVG file to draw the path to.
     height : float
         Height of the first frame above the plane, in the unit that positions shall have.
+    frame : str, optional
+        "enu" or "camera": the axes of the file, see :mod:`rdstitch.export.trajectory_files`. "enu" if not given, but
+        for "kitti", whose axes are the camera's.
 
     Returns
     -------
@@ -239,7 +243,7 @@ def trajectory(
         registration = registration.with_messages([_NO_TIMES])
     with Outputs(options.overwrite) as outputs:
         if output is not None:
-            outputs.write(output, text_bytes(WRITERS[layout](path)))
+            outputs.write(output, text_bytes(WRITERS[layout](path, frame or frame_of(layout))))
         if plot is not None:
             outputs.write(plot, text_bytes(path_as_svg(path)))
     return path, registration

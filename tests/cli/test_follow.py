@@ -1,5 +1,6 @@
 """``--follow``: a line for each frame as it arrives, and in the end what a run over the whole folder gives."""
 
+import csv
 import json
 import shutil
 import signal
@@ -103,6 +104,32 @@ def test_names_on_standard_input_are_taken_as_they_come(drive: list[Path], tmp_p
     *_, last = _rest(process)
     assert process.returncode == 0
     assert last["used"] == 5
+
+
+@pytest.mark.parametrize("frame", ["enu", "camera"])
+def test_lines_have_the_units_and_the_times_of_the_table(
+    rdstitch: Run, drive: list[Path], folder: Path, tmp_path: Path, frame: str
+) -> None:
+    for picture in drive:
+        shutil.copy(picture, folder)
+    times = tmp_path / "times.csv"
+    times.write_text("name,timestamp\n" + "".join(f"{p.name},{50 + k / 4}\n" for k, p in enumerate(drive)))
+    output = tmp_path / "path.csv"
+    known = ("--height", "0.42", "--timestamps", times, "--frame", frame, "--focal", "380", *FAST)
+    done = rdstitch("trajectory", folder, "-o", output, "--follow", "--idle", "0.1", *known)
+    assert done.status == 0
+    lines = [json.loads(line) for line in done.out.splitlines()][:-1]
+    live = {line["name"]: line for line in lines if line["x"] is not None}
+    with output.open(encoding="utf-8", newline="") as stream:
+        table = list(csv.DictReader(stream))
+    assert [row["name"] for row in table] == sorted(live)
+    for row in table:
+        line = live[row["name"]]
+        assert line["timestamp"] == float(row["timestamp"]) >= 50.0
+        for key, within in (("x", 0.01), ("y", 0.01), ("height", 0.01), ("yaw_deg", 0.5)):
+            assert line[key] == pytest.approx(float(row[key]), abs=within)
+    assert abs(float(table[-1]["y"])) > 0.03
+    assert float(table[0]["height"]) == pytest.approx(0.42)
 
 
 def test_a_frame_that_cannot_be_read_has_a_line_with_the_reason(
