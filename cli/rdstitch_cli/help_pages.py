@@ -9,7 +9,7 @@ import click
 
 _FIRST = "Options that matter first"
 _GROUPS = {
-    _FIRST: "output overwrite images preview reference camera focal mask scale report layout height view quiet",
+    _FIRST: "output overwrite images preview reference camera focal mask scale report layout frame height view quiet",
     "Input": "following idle refresh every exclude include_only match topic timestamps",
     "Camera": "distortion lens tilt attitude attitude_std save_camera",
     "Features and registration": (
