@@ -91,7 +91,9 @@ def followed(
     with temporary_folder() as folder:
         arrivals = Arrivals(str(inputs[0]), frames_folder=lambda: folder, names=sys.stdin, every=every or 1, idle=idle)
         try:
-            for frame in follow_frames(arrivals, stitch, poses, preview=preview, refresh=refresh or 0.0):
+            again = arrivals.comes_again
+            found = follow_frames(arrivals, stitch, poses, comes_again=again, preview=preview, refresh=refresh or 0.0)
+            for frame in found:
                 print_line(frame.as_dict())
         except KeyboardInterrupt:
             reporter.note("interrupted: registering what has arrived; interrupt once more to give up")

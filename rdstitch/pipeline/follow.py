@@ -2,15 +2,16 @@
 
 import math
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 from rdstitch.errors import InputError
 from rdstitch.export.trajectory_files import TrajectoryFrame, in_frame
-from rdstitch.features import FeatureOptions, detect_view, match
+from rdstitch.features import FeatureOptions, Features, detect_view, match
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.selection import is_selected, with_masks
@@ -113,6 +114,7 @@ def follow(
     options: StitchOptions,
     poses: FollowedPoses | None = None,
     *,
+    comes_again: Callable[[Frame], bool] = lambda frame: False,
     preview: Path | None = None,
     refresh: float = 5.0,
 ) -> Iterator[FollowedFrame]:
@@ -127,6 +129,9 @@ def follow(
     frames : iterable of Frame
         See :class:`rdstitch.inputs.arrivals.Arrivals`.
     poses : FollowedPoses, optional
+    comes_again : callable
+        Whether a frame that could not be read whole will come again, so that it need not be reported yet; see
+        :meth:`rdstitch.inputs.arrivals.Arrivals.comes_again`.
     preview : path, optional
         Picture to write of what has been seen so far; JPEG or PNG.
     refresh : float
@@ -142,22 +147,23 @@ def follow(
     tracker = Tracker(TrackingOptions(pair, alignment_options([], options)), partial(match, ratio=options.ratio))
     sketch = None if preview is None else _Sketch(preview, refresh)
     labels: dict[int, FollowedFrame] = {}  # of the frames that may still find their place
-    order, printed = 0, poses or FollowedPoses()
+    printed, numbers = poses or FollowedPoses(), count()
+    unread: dict[Path, int] = {}  # numbers of frames that come again
     for arrived in frames:
         if not is_selected(arrived, options.exclude, options.include_only):
             continue
-        frame = arrived if arrived.number is not None else replace(arrived, number=order)
-        order += 1
-        source, reason = _source(frame, options)
-        if source is None:
-            yield FollowedFrame(frame.path.name, frame.number or 0, math.nan, None, reason, printed)
+        number = unread.pop(arrived.path, -1)
+        number = next(numbers) if number < 0 else number
+        frame = arrived if arrived.number is not None else replace(arrived, number=number)
+        source, found, reason = _read(frame, options, features)
+        if (found is None or (source is not None and source.guard.messages)) and comes_again(arrived):
+            unread[arrived.path] = number
             continue
-        label = FollowedFrame(source.name, source.number(0), printed.timestamp(source), None, poses=printed)
-        try:
-            found = detect_view(source.view, features)
-        except InputError as error:
-            yield replace(label, reason=str(error))
+        label = FollowedFrame(frame.path.name, frame.number or 0, math.nan, None, reason, printed)
+        if source is None or found is None:
+            yield label
             continue
+        label = replace(label, name=source.name, timestamp=printed.timestamp(source))
         camera = at_working_size(source.camera, features.limits[1])
         results = tracker.add(FeatureStore.of([found]).at_sizes([camera.image_size])[0], camera)
         labels[results[-1].number] = label
@@ -207,13 +213,17 @@ def _live_features(options: FeatureOptions) -> FeatureOptions:
     )
 
 
-def _source(frame: Frame, options: StitchOptions) -> tuple[Source | None, str]:
-    """The frame as a source, or why there is none."""
+def _read(frame: Frame, options: StitchOptions, features: FeatureOptions) -> tuple[Source | None, Features | None, str]:
+    """The frame as a source, and its features; or why there are none."""
     sources, unread = read_frames([frame], options, skip_bad=True)
     if not sources:
-        return None, unread[0].text
+        return None, None, unread[0].text
     common = options.mask is not None and not Path(options.mask).is_dir()
-    return with_masks(sources, options.mask if common else None)[0], ""
+    source = with_masks(sources, options.mask if common else None)[0]
+    try:
+        return source, detect_view(source.view, features), ""
+    except InputError as error:
+        return source, None, str(error)
 
 
 def _why(tracker: Tracker, result: Tracked) -> str:
