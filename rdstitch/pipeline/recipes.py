@@ -2,18 +2,21 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.camera_files import CAMERA_SUFFIXES, camera_file_text
+from rdstitch.errors import RegistrationError
 from rdstitch.export.trajectory_files import WRITERS, TrajectoryFrame, frame_of, has_times, path_as_svg
 from rdstitch.inputs.find import found_pictures
 from rdstitch.inputs.frame import Images, as_inputs
 from rdstitch.inputs.measurements import timestamps_of
+from rdstitch.inputs.source import Source
 from rdstitch.io.atomic import check_distinct, check_output, json_bytes, text_bytes
 from rdstitch.io.outputs import Outputs
-from rdstitch.messages import Message
+from rdstitch.messages import Message, told_once
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.compose import blocks_on, compose_pictures, viewed_pictures, write_page
@@ -137,8 +140,8 @@ def _stitch(
         _check_outputs(output, options, found.files)
         sources, unread = read_inputs(found.frames, options, skip_bad=not pano)
         with options.executor(len(sources)) as executor:
-            registration = register(sources, options, executor, skip_bad=not pano, progress=progress)
-            accepted = accept(registration.with_messages([*unread, *found.messages]), options, executor)
+            known = [*unread, *found.messages]
+            accepted = _accepted(sources, known, options, executor, progress, skip_bad=not pano)
             return _composite(accepted, executor, output, options, progress, beside, frontal=pano)
 
 
@@ -174,9 +177,8 @@ def calibrate(
         _check_outputs(None, options, found.files)
         sources, unread = read_inputs(found.frames, options, skip_bad=True)
         with options.executor(len(sources)) as executor:
-            registration = register(sources, options, executor, skip_bad=True, lens_only=True, progress=progress)
-            registration = registration.with_messages([*unread, *found.messages])
-            result = _finished(accept(registration, options, executor, lens_only=True))
+            known = [*unread, *found.messages]
+            result = _finished(_accepted(sources, known, options, executor, progress, skip_bad=True, lens_only=True))
     with Outputs(options.overwrite) as outputs:
         _save_camera(result, options, outputs)
         if beside is not None:
@@ -233,9 +235,8 @@ def trajectory(
         sources, unread = read_inputs(found.frames, options, skip_bad=True)
         times = timestamps_of(sources, timestamps)
         with options.executor(len(sources)) as executor:
-            registration = register(sources, options, executor, skip_bad=True, metric=True, progress=progress)
-            registration = registration.with_messages([*unread, *found.messages])
-            registration = accept(registration, options, executor, metric=True)
+            known = [*unread, *found.messages]
+            registration = _accepted(sources, known, options, executor, progress, skip_bad=True, metric=True)
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     path = Trajectory.from_alignment(registration.alignment, height)
     path = path.labelled([s.name for s in sources], [s.number(k) for k, s in enumerate(sources)], times)
@@ -247,6 +248,28 @@ def trajectory(
         if plot is not None:
             outputs.write(plot, text_bytes(path_as_svg(path)))
     return path, registration
+
+
+def _accepted(
+    sources: Sequence[Source],
+    known: Sequence[Message],
+    options: StitchOptions,
+    executor: Executor,
+    progress: Progress,
+    *,
+    skip_bad: bool,
+    metric: bool = False,
+    lens_only: bool = False,
+) -> Registration:
+    """Register and check, with what is known of the inputs already; a failure names those that could not be read."""
+    purpose = {"metric": metric, "lens_only": lens_only}
+    try:
+        registration = register(sources, options, executor, skip_bad=skip_bad, progress=progress, **purpose)
+        return accept(registration.with_messages(known), options, executor, **purpose)
+    except RegistrationError as error:
+        unread = [str(replace(message, code="")) for message in told_once(known) if message.severity == "left out"]
+        error.args = ("; ".join([str(error), *unread]),)
+        raise
 
 
 def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Sequence[str | Path]) -> None:
