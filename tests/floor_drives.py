@@ -46,9 +46,9 @@ def true_path(sequence: Sequence) -> Trajectory:
 
 
 def read_path(file: Path) -> Trajectory:
-    """The path of a CSV file that the command has written."""
+    """The path of a CSV file that the command has written, z up."""
     with file.open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
-    x, y, yaw, height = (np.array([float(row[name]) for row in rows]) for name in ("x", "y", "phi_deg", "height"))
+    x, y, yaw, height = (np.array([float(row[name]) for row in rows]) for name in ("x", "y", "yaw_deg", "height"))
     frame = np.array([int(row["frame"]) for row in rows], dtype=np.intp)
-    return Trajectory(frame, np.stack([x, y], axis=1), np.radians(yaw), height)
+    return Trajectory(frame, np.stack([x, -y], axis=1), np.radians(yaw), height)

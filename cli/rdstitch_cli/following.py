@@ -17,6 +17,7 @@ from rdstitch_cli.terminal import Reporter
 if TYPE_CHECKING:
     from rdstitch.inputs.frame import Named
     from rdstitch.pipeline import Registration, StitchOptions
+    from rdstitch.pipeline.follow import FollowedPoses
 
 follow = options.together(
     click.option(
@@ -56,10 +57,12 @@ def followed(
     idle: float | None,
     refresh: float | None = None,
     plot: Path | None = None,
+    poses: "FollowedPoses | None" = None,
 ) -> Iterator[list["Named"]]:
     """Print a line for each frame as it arrives; then, inside the block, what all of them are as inputs of a recipe.
 
-    ``refresh`` is None where no picture is made; ``plot`` will be written at the end too.
+    ``refresh`` is None where no picture is made; ``plot`` will be written at the end too. ``poses`` says how poses are
+    printed: as the file that is written at the end has them.
     """
     from rdstitch.camera_files import CAMERA_SUFFIXES
     from rdstitch.inputs.arrivals import Arrivals
@@ -89,7 +92,9 @@ def followed(
     with temporary_folder() as folder:
         arrivals = Arrivals(str(inputs[0]), frames_folder=lambda: folder, names=sys.stdin, every=every or 1, idle=idle)
         try:
-            for frame in follow_frames(arrivals, stitch, preview=preview, refresh=refresh or 0.0):
+            again = arrivals.comes_again
+            found = follow_frames(arrivals, stitch, poses, comes_again=again, preview=preview, refresh=refresh or 0.0)
+            for frame in found:
                 print_line(frame.as_dict())
         except KeyboardInterrupt:
             reporter.note("interrupted: registering what has arrived; interrupt once more to give up")

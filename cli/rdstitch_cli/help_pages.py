@@ -11,7 +11,8 @@ import click
 _FIRST = "Options that matter first"
 _GROUPS = {
     _FIRST: (
-        "output overwrite images preview reference camera focal mask scale report layout image_format height view quiet"
+        "output overwrite images preview reference camera focal mask scale report layout image_format frame height "
+        "view quiet"
     ),
     "Input": "following idle refresh every exclude include_only match topic timestamps",
     "Camera": "distortion lens tilt attitude attitude_std save_camera",

@@ -122,18 +122,16 @@ def align(
         problem, overdispersion=noise_of_links(problem.observations, problem.homographies, problem.lens).overdispersion
     )
     if (doubt := check_attitudes(problem, options)) is not None:
-        alignment = align(cameras, links, doubt[0], former=former, progress=progress)
-        return replace(alignment, messages=(*alignment.messages, doubt[1]))
-    choice = None if former is None else _choose_from(former, cameras, problem, pictures, options, chosen.refinements)
-    choice = choice or select_model(
+        return align(cameras, links, doubt[0], former=former, progress=progress).with_messages([doubt[1]])
+    earlier = _choose_from(former, cameras, problem, pictures, options, chosen.refinements)
+    choice = earlier or select_model(
         problem,
         options.models,
         chosen.refinements,
         prefer_turn=options.prefer_turn,
         layout_matters=options.layout_matters,
     )
-    held = replace(graph, free_lens=choice.fit.free_lens)
-    choice, pictures, wrong = _drop_wrong_pairs(held, problem, pictures, choice, wrong)
+    choice, pictures, wrong = _drop_wrong_pairs(graph, problem, pictures, choice, wrong)
     choice = choose_over_relief(graph.problem(~wrong, pictures)[0], choice, options.models)
 
     report("adjustment")
@@ -214,7 +212,7 @@ def _lens_of(camera: Camera) -> FloatArray:
 
 
 def _choose_from(
-    former: Alignment,
+    former: Alignment | None,
     cameras: Sequence[Camera],
     problem: Problem,
     pictures: IntArray,
@@ -222,6 +220,8 @@ def _choose_from(
     refinements: Sequence[BoolArray],
 ) -> ModelChoice | None:
     """The choice from the solution of an earlier alignment; None where that does not explain every link any more."""
+    if former is None:
+        return None
     warm = WarmStart.of(former, cameras, pictures, problem.lens, problem.free_lens)
     if warm is None or options.attitudes is not None:
         return None
@@ -315,6 +315,7 @@ def _drop_wrong_pairs(
     graph: _Graph, problem: Problem, pictures: IntArray, choice: ModelChoice, wrong: BoolArray
 ) -> tuple[ModelChoice, IntArray, BoolArray]:
     """Test all links against the adjusted poses, and adjust again without those that do not fit."""
+    graph = replace(graph, free_lens=choice.fit.free_lens)
     for _ in range(_ROUNDS):
         adjusted, model = choice.fit.adjusted, choice.fit.model
         everything, _ = graph.problem(np.ones_like(wrong), pictures)

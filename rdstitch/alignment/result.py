@@ -1,8 +1,10 @@
 """What the adjustment gives: the cameras and poses of all pictures over one plane."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -201,6 +203,10 @@ class Alignment:
         """One line: of how many pictures, by which motion model, and how well they agree."""
         used, count = int(self.used.sum()), len(self.used)
         return f"<Alignment {used} of {count} pictures, {self.model}, rms {self.rms:.2f} pixels>"
+
+    def with_messages(self, messages: Iterable[Message]) -> Self:
+        """The same with more to know about it."""
+        return replace(self, messages=(*self.messages, *messages))
 
     def relation(self, image1: int, image2: int) -> FloatArray:
         """Homography (3, 3) from undistorted normalized coordinates of one picture to those of another."""

@@ -1,22 +1,37 @@
 """Trajectories as files: a table, a drawing, and the formats of the TUM and KITTI benchmarks, which ``evo`` reads.
 
-In the latter two the plane lies at z = 0 and z points into it, away from the camera, which therefore is at minus its
-height. The orientation is that of the camera with its tilt removed, ``Rz(-φ)``: from the frame of the camera to the
-plane's.
+The plane lies at z = 0; at the first frame x, y and yaw are zero. Two frames of reference, both right-handed:
+
+========= ============================================================= ==================
+"enu"     x to the right and y to the top of the first image, z up      the camera above 0
+"camera"  x to the right and y to the bottom of the first image, z down the camera below 0
+========= ============================================================= ==================
+
+The yaw, in all files, is the heading of the camera, counterclockwise as seen from above (as in ROS's REP 103): φ of
+:class:`Trajectory`. Orientations are those of the camera with its tilt removed, from its axes, which are those of the
+frame of reference when the yaw is zero, to the frame: a turn about z by the yaw where z points up, by minus the yaw
+where it points down.
 """
 
 import csv
 import io
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 
 from rdstitch.alignment.trajectory import Trajectory
+from rdstitch.arrays import FloatArray
+
+TrajectoryFrame = Literal["enu", "camera"]
+
+_SIGNS: dict[TrajectoryFrame, float] = {"enu": -1.0, "camera": 1.0}
+"""Of y, of z and of the turn about z, with respect to the axes of the first image."""
 
 _SIDE = 800.0  # pixels of the drawing's longer side
 _MARGIN = 60.0  # pixels
 _ARROWS = 40  # at most so many headings are drawn
-_COLUMNS = ("frame", "name", "source_frame", "timestamp", "x", "y", "phi_deg", "height")
+_COLUMNS = ("frame", "name", "source_frame", "timestamp", "x", "y", "yaw_deg", "height")
 
 
 def path_as_svg(path: Trajectory) -> str:
@@ -47,7 +62,17 @@ def path_as_svg(path: Trajectory) -> str:
 """
 
 
-def as_csv(path: Trajectory) -> str:
+def frame_of(layout: str) -> TrajectoryFrame:
+    """The frame of reference of a format where none is asked for: KITTI's axes are the camera's."""
+    return "camera" if layout == "kitti" else "enu"
+
+
+def in_frame(x: float, y: float, frame: TrajectoryFrame) -> tuple[float, float]:
+    """Coordinates x and y in a frame of reference, given in the axes of the first image."""
+    return x, _SIGNS[frame] * y + 0.0  # no minus zero
+
+
+def as_csv(path: Trajectory, frame: TrajectoryFrame) -> str:
     """A table with a header; what is not known of a frame is empty."""
     count = len(path)
     names = path.name or ("",) * count
@@ -57,29 +82,36 @@ def as_csv(path: Trajectory) -> str:
     table = csv.writer(text, lineterminator="\n")
     table.writerow(_COLUMNS)
     rows = zip(path.frame, names, numbers, times, path.position, np.degrees(path.yaw), path.height, strict=True)
-    for frame, name, number, time, (x, y), yaw, height in rows:
+    for index, name, number, time, (x, y), yaw, height in rows:
         seconds = f"{time:.6f}" if np.isfinite(time) else ""
-        table.writerow([frame, name, number, seconds, *(f"{value:.9g}" for value in (x, y, yaw, height))])
+        pose = (*in_frame(x, y, frame), yaw, height)
+        table.writerow([index, name, number, seconds, *(f"{value:.9g}" for value in pose)])
     return text.getvalue()
 
 
-def as_tum(path: Trajectory) -> str:
+def as_tum(path: Trajectory, frame: TrajectoryFrame) -> str:
     """Lines ``timestamp tx ty tz qx qy qz qw``; where not every frame has a time, numbers of frames stand for them."""
     times = path.timestamp if path.timestamp is not None and has_times(path) else path.frame
-    half = -path.yaw / 2
-    rows = zip(times, path.position, path.height, np.sin(half), np.cos(half), strict=True)
-    lines = [f"{time:.6f} {x:.9g} {y:.9g} {-height:.9g} 0 0 {qz:.9g} {qw:.9g}" for time, (x, y), height, qz, qw in rows]
+    half = -_SIGNS[frame] * path.yaw / 2
+    rows = zip(times, _positions(path, frame), np.sin(half), np.cos(half), strict=True)
+    lines = [f"{time:.6f} {x:.9g} {y:.9g} {z:.9g} 0 0 {qz:.9g} {qw:.9g}" for time, (x, y, z), qz, qw in rows]
     return "\n".join(lines) + "\n"
 
 
-def as_kitti(path: Trajectory) -> str:
+def as_kitti(path: Trajectory, frame: TrajectoryFrame) -> str:
     """Lines of the 12 numbers of ``[R t]``, row by row; frames that were left out have no line."""
     lines = []
-    for (x, y), yaw, height in zip(path.position, path.yaw, path.height, strict=True):
-        c, s = np.cos(yaw), np.sin(yaw)
-        pose = (c, s, 0.0, x, -s, c, 0.0, y, 0.0, 0.0, 1.0, -height)
+    for (x, y, z), turn in zip(_positions(path, frame), -_SIGNS[frame] * path.yaw, strict=True):
+        c, s = np.cos(turn), np.sin(turn)
+        pose = (c, -s, 0.0, x, s, c, 0.0, y, 0.0, 0.0, 1.0, z)
         lines.append(" ".join(f"{value:.9g}" for value in pose))
     return "\n".join(lines) + "\n"
+
+
+def _positions(path: Trajectory, frame: TrajectoryFrame) -> FloatArray:
+    """x, y and z of the camera, shape (F, 3)."""
+    sign = _SIGNS[frame]
+    return np.column_stack([path.position * (1.0, sign), -sign * path.height]) + 0.0  # no minus zero
 
 
 def has_times(path: Trajectory) -> bool:
@@ -87,5 +119,5 @@ def has_times(path: Trajectory) -> bool:
     return path.timestamp is not None and bool(np.isfinite(path.timestamp).all())
 
 
-WRITERS: dict[str, Callable[[Trajectory], str]] = {"csv": as_csv, "tum": as_tum, "kitti": as_kitti}
+WRITERS: dict[str, Callable[[Trajectory, TrajectoryFrame], str]] = {"csv": as_csv, "tum": as_tum, "kitti": as_kitti}
 """By the name of the format."""

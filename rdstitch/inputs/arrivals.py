@@ -15,7 +15,8 @@ from rdstitch.inputs.frame import Frame, Named, array_as_picture
 from rdstitch.io.video import VIDEO_SUFFIXES, opened_capture, write_frame
 
 _POLL_SECONDS = 0.2  # seconds between two looks at a folder
-_COMPLETE_AFTER_SECONDS = 1.0  # seconds after its last change from which on a file counts as complete
+_COMPLETE_AFTER_SECONDS = 1.0  # seconds after its last change from which on a file is read at the first look
+_GIVE_UP_SECONDS = 3.0  # seconds after its last change from which on a file that is not whole is reported
 _MAX_PENDING = 256  # names that are read ahead
 
 
@@ -52,6 +53,10 @@ class Arrivals:
         self._source, self._names, self._every, self._idle = str(source), names, every, idle
         self._frames_folder = frames_folder
         self._seen: list[Frame] = []
+        self._done: set[Path] = set()
+        self._not_whole: dict[
+            Path, tuple[int, int]
+        ] = {}  # files, and the size and time of change that they were read at
         path = Path(self._source)
         if self._source == "-":
             if names is None:
@@ -76,6 +81,19 @@ class Arrivals:
             return [self._source]
         return list(self._seen)
 
+    def comes_again(self, frame: Frame) -> bool:
+        """Whether a frame whose file is not whole will come again, since its file may still be written.
+
+        A file that has not changed for so long that it should be reported comes again only if it changes after all.
+        """
+        if self._kind != "folder" or (state := _state(frame.path)) is None:
+            return False
+        self._not_whole[frame.path] = state
+        if time.time() - state[1] / 1e9 > _GIVE_UP_SECONDS:
+            return False
+        self._done.discard(frame.path)
+        return True
+
     def __iter__(self) -> Iterator[Frame]:
         """Every frame, once it is complete."""
         if self._kind == "folder":
@@ -84,30 +102,35 @@ class Arrivals:
 
     def _of_folder(self, folder: Path) -> Iterator[Frame]:
         """New pictures of a folder, in natural order as far as they come at the same time."""
-        done: set[Path] = set()
-        sizes: dict[Path, int] = {}
+        states: dict[Path, tuple[int, int]] = {}
         last = time.monotonic()
         while True:
-            complete = []
+            complete, waiting = [], False
             for path in pictures_in(folder):
-                if path in done:
+                read_at = self._not_whole.get(path)
+                if path in self._done and read_at is None:
                     continue
-                try:
-                    status = path.stat()
-                except OSError:  # gone again
+                state = _state(path)
+                if state is None or (path in self._done and state == read_at):
                     continue
-                grown = sizes.get(path) != status.st_size
-                sizes[path] = status.st_size
-                if status.st_size and (not grown or time.time() - status.st_mtime > _COMPLETE_AFTER_SECONDS):
+                age, still = time.time() - state[1] / 1e9, states.get(path) == state
+                waiting |= read_at is not None
+                states[path] = state
+                if read_at is not None:
+                    ready = (still and state != read_at) or age > _GIVE_UP_SECONDS
+                else:
+                    ready = still or age > _COMPLETE_AFTER_SECONDS
+                if state[0] and ready:
                     complete.append(path)
             for path in sorted(complete, key=natural_key):
-                done.add(path)
-                sizes.pop(path, None)
+                self._done.add(path)
+                self._not_whole.pop(path, None)
+                states.pop(path)
                 if not is_rdstitch_output(path):
                     yield Frame(path)
                     last = time.monotonic()
             if not complete:
-                if self._is_over(last):
+                if not waiting and self._is_over(last):
                     return
                 time.sleep(_POLL_SECONDS)
 
@@ -157,6 +180,15 @@ class Arrivals:
 
     def _is_over(self, last: float) -> bool:
         return self._idle is not None and time.monotonic() - last >= self._idle
+
+
+def _state(path: Path) -> tuple[int, int] | None:
+    """Size and time of the last change, ns; None where the file is gone again."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_size, status.st_mtime_ns
 
 
 def _read_lines(stream: IO[str], read: "queue.Queue[str | None]") -> None:

@@ -4,6 +4,7 @@ import csv
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -152,15 +153,32 @@ def timestamps_of(sources: Sequence[Source], file: str | Path | None = None) -> 
     """
     if file is None:
         return np.array([_own_time(source) for source in sources])
-    lines = [line.strip() for line in read_text(file).splitlines()]
-    lines = [line for line in lines if line and not line.startswith("#")]
-    if lines and all(_is_number(line) for line in lines):
-        return _by_number(sources, [float(line) for line in lines], file)
-    named = _by_name(lines, file)
+    named = _read_times(file, _state_of(file))
+    if isinstance(named, list):
+        return _by_number(sources, named, file)
     for source in sources:
         if source.name not in named:
             raise InputError(f"{file}: has no time for {source.name}; add a line with its name and time")
     return np.array([named[source.name] for source in sources])
+
+
+def _state_of(file: str | Path) -> tuple[int, int]:
+    """What changes when a file does; zeros where it is not there, so that reading it says so."""
+    try:
+        status = Path(file).stat()
+    except OSError:
+        return 0, 0
+    return status.st_size, status.st_mtime_ns
+
+
+@lru_cache(maxsize=1)  # frames that are followed ask one after the other
+def _read_times(file: str | Path, state: tuple[int, int]) -> list[float] | dict[str, float]:
+    """The times in order, or by the names of the pictures."""
+    lines = [line.strip() for line in read_text(file).splitlines()]
+    lines = [line for line in lines if line and not line.startswith("#")]
+    if lines and all(_is_number(line) for line in lines):
+        return [float(line) for line in lines]
+    return _by_name(lines, file)
 
 
 def _own_time(source: Source) -> float:

@@ -2,14 +2,16 @@
 
 import math
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 from rdstitch.errors import InputError
-from rdstitch.features import FeatureOptions, detect_view, match
+from rdstitch.export.trajectory_files import TrajectoryFrame, in_frame
+from rdstitch.features import FeatureOptions, Features, detect_view, match
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.selection import is_selected, with_masks
@@ -20,11 +22,44 @@ from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import alignment_options
 from rdstitch.pipeline.read_inputs import read_frames
 from rdstitch.pipeline.working_size import at_working_size
-from rdstitch.tracking import Preview, Tracked, Tracker, TrackingOptions
+from rdstitch.tracking import CameraPose, Preview, Tracked, Tracker, TrackingOptions
 
 _FEATURES = 600  # of a frame, that suffice to follow it
 _MEGAPIXELS = 0.1  # 10⁶ pixels in which they are detected: a frame of 640 x 480 pixels is halved once
 _PREVIEW_MEGAPIXELS = 0.08
+
+
+@dataclass(frozen=True)
+class FollowedPoses:
+    """How poses are printed: as :func:`rdstitch.trajectory` writes them.
+
+    Attributes
+    ----------
+    height : float
+        Of the first keyframe above the plane, in the unit that positions shall have.
+    timestamps : path, optional
+        File of time stamps, see :func:`rdstitch.inputs.measurements.timestamps_of`.
+    frame : str
+        "enu" or "camera", see :mod:`rdstitch.export.trajectory_files`.
+    """
+
+    height: float = 1.0
+    timestamps: str | Path | None = None
+    frame: TrajectoryFrame = "enu"
+
+    def timestamp(self, source: Source) -> float:
+        """Of a frame, s; NaN where nothing is known of it, or not yet."""
+        try:
+            return float(timestamps_of([source], self.timestamps)[0])
+        except InputError:  # the table may grow as the frames do; at the end it must be whole
+            return math.nan
+
+    def fields(self, pose: CameraPose | None) -> dict[str, float | None]:
+        """x, y, yaw and height."""
+        if pose is None:
+            return dict.fromkeys(("x", "y", "yaw_deg", "height"))
+        x, y = in_frame(pose.x * self.height, pose.y * self.height, self.frame)
+        return {"x": x, "y": y, "yaw_deg": math.degrees(pose.yaw), "height": pose.height * self.height}
 
 
 @dataclass(frozen=True)
@@ -42,6 +77,8 @@ class FollowedFrame:
         Its place and λ; None where it could not be read.
     reason : str
         Why there is no place; empty where there is one.
+    poses : FollowedPoses
+        How the pose is printed.
     """
 
     name: str
@@ -49,20 +86,17 @@ class FollowedFrame:
     timestamp: float
     tracked: Tracked | None
     reason: str = ""
+    poses: FollowedPoses = FollowedPoses()
 
     def as_dict(self) -> dict[str, Any]:
         """As a line of JSON takes it; null for what is not known."""
         found = self.tracked
-        pose = None if found is None else found.pose
         placement = None if found is None else found.placement
         return {
             "name": self.name,
             "frame": self.number,
             "timestamp": _known(self.timestamp),
-            "x": None if pose is None else pose.x,
-            "y": None if pose is None else pose.y,
-            "yaw_deg": None if pose is None else math.degrees(pose.yaw),
-            "height": None if pose is None else pose.height,
+            **self.poses.fields(None if found is None else found.pose),
             "homography": None if placement is None else placement.homography.tolist(),
             "lambda": None if found is None else _known(found.distortion),
             "lambda_std": None if found is None else _known(found.distortion_std),
@@ -76,7 +110,13 @@ class FollowedFrame:
 
 
 def follow(
-    frames: Iterable[Frame], options: StitchOptions, *, preview: Path | None = None, refresh: float = 5.0
+    frames: Iterable[Frame],
+    options: StitchOptions,
+    poses: FollowedPoses | None = None,
+    *,
+    comes_again: Callable[[Frame], bool] = lambda frame: False,
+    preview: Path | None = None,
+    refresh: float = 5.0,
 ) -> Iterator[FollowedFrame]:
     """Register frames as they arrive, against the last keyframes.
 
@@ -88,6 +128,10 @@ def follow(
     ----------
     frames : iterable of Frame
         See :class:`rdstitch.inputs.arrivals.Arrivals`.
+    poses : FollowedPoses, optional
+    comes_again : callable
+        Whether a frame that could not be read whole will come again, so that it need not be reported yet; see
+        :meth:`rdstitch.inputs.arrivals.Arrivals.comes_again`.
     preview : path, optional
         Picture to write of what has been seen so far; JPEG or PNG.
     refresh : float
@@ -103,22 +147,23 @@ def follow(
     tracker = Tracker(TrackingOptions(pair, alignment_options([], options)), partial(match, ratio=options.ratio))
     sketch = None if preview is None else _Sketch(preview, refresh)
     labels: dict[int, FollowedFrame] = {}  # of the frames that may still find their place
-    order = 0
+    printed, numbers = poses or FollowedPoses(), count()
+    unread: dict[Path, int] = {}  # numbers of frames that come again
     for arrived in frames:
         if not is_selected(arrived, options.exclude, options.include_only):
             continue
-        frame = arrived if arrived.number is not None else replace(arrived, number=order)
-        order += 1
-        source, reason = _source(frame, options)
-        if source is None:
-            yield FollowedFrame(frame.path.name, frame.number or 0, math.nan, None, reason)
+        number = unread.pop(arrived.path, -1)
+        number = next(numbers) if number < 0 else number
+        frame = arrived if arrived.number is not None else replace(arrived, number=number)
+        source, found, reason = _read(frame, options, features)
+        if (found is None or (source is not None and source.guard.messages)) and comes_again(arrived):
+            unread[arrived.path] = number
             continue
-        label = FollowedFrame(source.name, source.number(0), float(timestamps_of([source])[0]), None)
-        try:
-            found = detect_view(source.view, features)
-        except InputError as error:
-            yield replace(label, reason=str(error))
+        label = FollowedFrame(frame.path.name, frame.number or 0, math.nan, None, reason, printed)
+        if source is None or found is None:
+            yield label
             continue
+        label = replace(label, name=source.name, timestamp=printed.timestamp(source))
         camera = at_working_size(source.camera, features.limits[1])
         results = tracker.add(FeatureStore.of([found]).at_sizes([camera.image_size])[0], camera)
         labels[results[-1].number] = label
@@ -168,13 +213,17 @@ def _live_features(options: FeatureOptions) -> FeatureOptions:
     )
 
 
-def _source(frame: Frame, options: StitchOptions) -> tuple[Source | None, str]:
-    """The frame as a source, or why there is none."""
+def _read(frame: Frame, options: StitchOptions, features: FeatureOptions) -> tuple[Source | None, Features | None, str]:
+    """The frame as a source, and its features; or why there are none."""
     sources, unread = read_frames([frame], options, skip_bad=True)
     if not sources:
-        return None, unread[0].text
+        return None, None, unread[0].text
     common = options.mask is not None and not Path(options.mask).is_dir()
-    return with_masks(sources, options.mask if common else None)[0], ""
+    source = with_masks(sources, options.mask if common else None)[0]
+    try:
+        return source, detect_view(source.view, features), ""
+    except InputError as error:
+        return source, None, str(error)
 
 
 def _why(tracker: Tracker, result: Tracked) -> str:

@@ -10,13 +10,15 @@ from typing import Literal
 from rdstitch.alignment.stored_frame import stored, turned_alignment
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.camera_files import CAMERA_SUFFIXES, camera_file_text
-from rdstitch.export.trajectory_files import WRITERS, has_times, path_as_svg
+from rdstitch.errors import RegistrationError
+from rdstitch.export.trajectory_files import WRITERS, TrajectoryFrame, frame_of, has_times, path_as_svg
 from rdstitch.inputs.find import found_pictures
 from rdstitch.inputs.frame import Images, as_inputs
 from rdstitch.inputs.measurements import timestamps_of
+from rdstitch.inputs.source import Source
 from rdstitch.io.atomic import check_distinct, check_output, json_bytes, text_bytes
 from rdstitch.io.outputs import Outputs
-from rdstitch.messages import Message
+from rdstitch.messages import Message, told_once
 from rdstitch.options import StitchOptions
 from rdstitch.orientation import quarter_turn
 from rdstitch.pipeline.accept import accept, scale_uncertainty
@@ -144,9 +146,8 @@ def _stitch(
         sources, unread = read_inputs(in_lasting_order(found.frames), options, skip_bad=not pano)
         check_map(sources, options.composite)
         with options.executor(len(sources)) as executor:
-            registration = register(sources, options, executor, skip_bad=not pano, prefer_turn=pano, progress=progress)
-            registration = registration.with_messages([*unread, *found.messages])
-            accepted = accept(registration, options, executor, prefer_turn=pano)
+            known = [*unread, *found.messages]
+            accepted = _accepted(sources, known, options, executor, progress, skip_bad=not pano, prefer_turn=pano)
             return _composite(accepted, executor, output, options, progress, beside, frontal=pano)
 
 
@@ -182,9 +183,8 @@ def calibrate(
         _check_outputs(None, options, found.files)
         sources, unread = read_inputs(found.frames, options, skip_bad=True)
         with options.executor(len(sources)) as executor:
-            registration = register(sources, options, executor, skip_bad=True, lens_only=True, progress=progress)
-            registration = registration.with_messages([*unread, *found.messages])
-            result = _finished(accept(registration, options, executor, lens_only=True))
+            known = [*unread, *found.messages]
+            result = _finished(_accepted(sources, known, options, executor, progress, skip_bad=True, lens_only=True))
     with Outputs(options.overwrite) as outputs:
         _save_camera(result, options, outputs)
         if beside is not None:
@@ -201,6 +201,7 @@ def trajectory(
     timestamps: str | Path | None = None,
     plot: str | Path | None = None,
     height: float = 1.0,
+    frame: TrajectoryFrame | None = None,
     every: int | None = 1,
     progress: Progress = silent,
 ) -> tuple[Trajectory, Registration]:
@@ -221,6 +222,9 @@ def trajectory(
         SVG file to draw the path to.
     height : float
         Height of the first frame above the plane, in the unit that positions shall have.
+    frame : str, optional
+        "enu" or "camera": the axes of the file, see :mod:`rdstitch.export.trajectory_files`. "enu" if not given, but
+        for "kitti", whose axes are the camera's.
 
     Returns
     -------
@@ -237,9 +241,8 @@ def trajectory(
         sources, unread = read_inputs(found.frames, options, skip_bad=True)
         times = timestamps_of(sources, timestamps)
         with options.executor(len(sources)) as executor:
-            registration = register(sources, options, executor, skip_bad=True, metric=True, progress=progress)
-            registration = registration.with_messages([*unread, *found.messages])
-            registration = accept(registration, options, executor, metric=True)
+            known = [*unread, *found.messages]
+            registration = _accepted(sources, known, options, executor, progress, skip_bad=True, metric=True)
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
     # Of the camera itself, whatever EXIF says of how its pictures are looked at.
     back = stored([quarter_turn(source.metadata.orientation) for source in registration.sources])
@@ -249,12 +252,35 @@ def trajectory(
         registration = registration.with_messages([_NO_TIMES])
     with Outputs(options.overwrite) as outputs:
         if output is not None:
-            outputs.write(output, text_bytes(WRITERS[layout](path)))
+            outputs.write(output, text_bytes(WRITERS[layout](path, frame or frame_of(layout))))
         if plot is not None:
             file = plot
             failed = outputs.attempt(file, lambda: outputs.write(file, text_bytes(path_as_svg(path))))
             registration = registration.with_messages(failed)
     return path, registration
+
+
+def _accepted(
+    sources: Sequence[Source],
+    known: Sequence[Message],
+    options: StitchOptions,
+    executor: Executor,
+    progress: Progress,
+    *,
+    skip_bad: bool,
+    metric: bool = False,
+    lens_only: bool = False,
+    prefer_turn: bool = False,
+) -> Registration:
+    """Register and check, with what is known of the inputs already; a failure names those that could not be read."""
+    purpose = {"metric": metric, "lens_only": lens_only, "prefer_turn": prefer_turn}
+    try:
+        registration = register(sources, options, executor, skip_bad=skip_bad, progress=progress, **purpose)
+        return accept(registration.with_messages(known), options, executor, **purpose)
+    except RegistrationError as error:
+        unread = [str(replace(message, code="")) for message in told_once(known) if message.severity == "left out"]
+        error.args = ("; ".join([str(error), *unread]),)
+        raise
 
 
 def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Sequence[str | Path]) -> None:

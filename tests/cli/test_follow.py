@@ -1,15 +1,23 @@
 """``--follow``: a line for each frame as it arrives, and in the end what a run over the whole folder gives."""
 
+import csv
 import json
+import os
 import shutil
 import signal
 import subprocess
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from rdstitch.inputs.arrivals import Arrivals
 from rdstitch.io.read import read_image
+from rdstitch.io.write import write_image
+from rdstitch.options import StitchOptions
+from rdstitch.pipeline.follow import follow
 from tests.cli.running import DISTORTION, FAST, Run, flight, start
 
 
@@ -25,6 +33,11 @@ def folder(tmp_path: Path) -> Path:
     made = tmp_path / "incoming"
     made.mkdir()
     return made
+
+
+def _written_as(picture: Path, file: Path) -> Path:
+    write_image(file, read_image(picture).pixels)
+    return file
 
 
 def _line(process: "subprocess.Popen[bytes]") -> dict[str, Any]:
@@ -105,6 +118,32 @@ def test_names_on_standard_input_are_taken_as_they_come(drive: list[Path], tmp_p
     assert last["used"] == 5
 
 
+@pytest.mark.parametrize("frame", ["enu", "camera"])
+def test_lines_have_the_units_and_the_times_of_the_table(
+    rdstitch: Run, drive: list[Path], folder: Path, tmp_path: Path, frame: str
+) -> None:
+    for picture in drive:
+        shutil.copy(picture, folder)
+    times = tmp_path / "times.csv"
+    times.write_text("name,timestamp\n" + "".join(f"{p.name},{50 + k / 4}\n" for k, p in enumerate(drive)))
+    output = tmp_path / "path.csv"
+    known = ("--height", "0.42", "--timestamps", times, "--frame", frame, "--focal", "380", *FAST)
+    done = rdstitch("trajectory", folder, "-o", output, "--follow", "--idle", "0.1", *known)
+    assert done.status == 0
+    lines = [json.loads(line) for line in done.out.splitlines()][:-1]
+    live = {line["name"]: line for line in lines if line["x"] is not None}
+    with output.open(encoding="utf-8", newline="") as stream:
+        table = list(csv.DictReader(stream))
+    assert [row["name"] for row in table] == sorted(live)
+    for row in table:
+        line = live[row["name"]]
+        assert line["timestamp"] == float(row["timestamp"]) >= 50.0
+        for key, within in (("x", 0.01), ("y", 0.01), ("height", 0.01), ("yaw_deg", 0.5)):
+            assert line[key] == pytest.approx(float(row[key]), abs=within)
+    assert abs(float(table[-1]["y"])) > 0.03
+    assert float(table[0]["height"]) == pytest.approx(0.42)
+
+
 def test_a_frame_that_cannot_be_read_has_a_line_with_the_reason(
     rdstitch: Run, drive: list[Path], folder: Path, tmp_path: Path
 ) -> None:
@@ -113,9 +152,47 @@ def test_a_frame_that_cannot_be_read_has_a_line_with_the_reason(
     (folder / "frame_0001.png").write_bytes(b"no picture")
     outcome = rdstitch("trajectory", folder, "-o", tmp_path / "path.csv", "--follow", "--idle", "0.1", *FAST)
     lines = [json.loads(line) for line in outcome.out.splitlines()]
-    assert lines[1]["name"] == "frame_0001.png"
-    assert "no picture" in lines[1]["reason"]
-    assert lines[1]["x"] is None
+    assert [line["name"] for line in lines[:3]] == ["frame_0000.png", "frame_0002.png", "frame_0001.png"]
+    assert lines[2]["frame"] == 1
+    assert "no picture" in lines[2]["reason"]
+    assert lines[2]["x"] is None
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
+def test_a_file_whose_writer_pauses_is_read_when_it_is_whole(drive: list[Path], folder: Path, suffix: str) -> None:
+    whole = [_written_as(picture, folder.parent / f"{picture.stem}{suffix}").read_bytes() for picture in drive[:3]]
+    arrivals = Arrivals(folder, frames_folder=Path, idle=2.0)
+    frames = follow(arrivals, StitchOptions(workers=1), comes_again=arrivals.comes_again)
+    (folder / f"a{suffix}").write_bytes(whole[0])
+    assert next(frames).name == f"a{suffix}"
+
+    def write_slowly() -> None:
+        for share in (0.01, 0.5, 0.9, 1.0):
+            (folder / f"b{suffix}").write_bytes(whole[1][: int(share * len(whole[1]))])
+            time.sleep(0.8)
+        (folder / f"c{suffix}").write_bytes(whole[2])
+
+    writer = threading.Thread(target=write_slowly)
+    writer.start()
+    found = [(frame.name, frame.number, bool(frame.tracked and frame.tracked.inliers > 100)) for frame in frames]
+    writer.join()
+    assert found[:2] == [(f"b{suffix}", 1, True), (f"c{suffix}", 2, True)]
+
+
+def test_a_file_that_is_mended_after_it_was_reported_is_read(drive: list[Path], folder: Path) -> None:
+    for picture in drive[:2]:
+        shutil.copy(picture, folder)
+    (bad := folder / "z.png").write_bytes(drive[2].read_bytes()[:9000])
+    os.utime(bad, (0, 0))
+    arrivals = Arrivals(folder, frames_folder=Path, idle=2.0)
+    reasons = []
+    for frame in follow(arrivals, StitchOptions(workers=1), comes_again=arrivals.comes_again):
+        if frame.name == "z.png":
+            reasons.append(frame.reason)
+            shutil.copy(drive[2], bad)
+    assert len(reasons) == 2
+    assert reasons[0]
+    assert reasons[1] in ("", "the first frames wait for others")
 
 
 def test_what_would_fail_at_the_end_fails_at_the_beginning(

@@ -102,7 +102,7 @@ def test_without_times_numbers_stand_for_them_and_that_is_said(
 def test_kitti_is_the_same_path(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     known = ("--focal", "380", *CACHED)
     assert rdstitch("trajectory", *frames, "-o", tmp_path / "a.txt", "--format", "kitti", *known).status == 0
-    assert rdstitch("trajectory", *frames, "-o", tmp_path / "b.csv", *known).status == 0
+    assert rdstitch("trajectory", *frames, "-o", tmp_path / "b.csv", "--frame", "camera", *known).status == 0
     poses = np.loadtxt(tmp_path / "a.txt").reshape(-1, 3, 4)
     rows = _rows(tmp_path / "b.csv")
     np.testing.assert_allclose(poses[:, :2, 3], [[float(r["x"]), float(r["y"])] for r in rows], atol=1e-8)
@@ -110,7 +110,7 @@ def test_kitti_is_the_same_path(rdstitch: Run, frames: list[Path], tmp_path: Pat
         poses[:, :, :3] @ poses[:, :, :3].transpose(0, 2, 1), np.tile(np.eye(3), (3, 1, 1)), atol=1e-8
     )
     turn = np.arctan2(poses[:, 0, 1], poses[:, 0, 0])
-    np.testing.assert_allclose(np.degrees(turn), [float(r["phi_deg"]) for r in rows], atol=1e-6)
+    np.testing.assert_allclose(np.degrees(turn), [float(r["yaw_deg"]) for r in rows], atol=1e-6)
 
 
 @pytest.mark.filterwarnings("ignore")

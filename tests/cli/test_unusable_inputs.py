@@ -72,6 +72,20 @@ def test_one_picture_or_the_same_twice(rdstitch: Run, place: Path) -> None:
         assert "two different images" in done.line
 
 
+@pytest.mark.parametrize("command", ["mosaic", "calibrate", "trajectory"])
+def test_a_failure_names_what_could_not_be_read(rdstitch: Run, place: Path, stranger: Path, command: str) -> None:
+    (place / "empty.png").write_bytes(b"")
+    (place / "half.png").write_bytes((place / "b.png").read_bytes()[:3000])
+    arguments = (place / "a.png", stranger, place / "empty.png", place / "half.png", "-o", place / "out.json")
+    if command == "mosaic":
+        arguments = (*arguments[:-1], place / "out.png")
+    done = rdstitch(command, *arguments, *FAST)
+    assert done.status == 4
+    assert "no two pictures overlap" in done.line
+    assert "empty.png: is empty" in done.line
+    assert "half.png: " in done.line
+
+
 def test_no_overlap(rdstitch: Run, place: Path, stranger: Path) -> None:
     before = state_of(place)
     done = rdstitch("pano", place / "a.png", stranger, "-o", place / "out.png", *CACHED)

@@ -37,8 +37,14 @@ Examples:
     type=click.Choice(["csv", "tum", "kitti"]),
     default="csv",
     show_default=True,
-    help="csv: a table with names, time stamps, x, y, yaw in degrees and height. tum: time, position and quaternion. "
+    help="csv: a table with names, time stamps, x, y, yaw_deg and height. tum: time, position and quaternion. "
     "kitti: matrices.",
+)
+@click.option(
+    "--frame",
+    type=click.Choice(["enu", "camera"]),
+    help="Axes of positions. enu: x to the right and y to the top of the first image, z up; default but for kitti. "
+    "camera: x to the right, y to the bottom, z down. yaw_deg is counterclockwise as seen from above in both.",
 )
 @click.option(
     "--height",
@@ -68,6 +74,7 @@ def trajectory(
     inputs: tuple[Path, ...],
     output: Path,
     layout: Literal["csv", "tum", "kitti"],
+    frame: Literal["enu", "camera"] | None,
     height: float,
     timestamps: Path | None,
     plot: Path | None,
@@ -83,12 +90,23 @@ def trajectory(
     metres when --height says how many those are; they are as good as the focal length (see --focal). With --follow,
     poses are printed as frames arrive.
     """
+    from rdstitch.export.trajectory_files import frame_of
     from rdstitch.pipeline import trajectory as recipe
+    from rdstitch.pipeline.follow import FollowedPoses
 
     with ExitStack() as stack:
         stitch = stitch_options(reporter, **given)
         if following:
-            arrived = live.followed(inputs, stitch, reporter, output=output, plot=plot, every=every, idle=idle)
+            arrived = live.followed(
+                inputs,
+                stitch,
+                reporter,
+                output=output,
+                plot=plot,
+                every=every,
+                idle=idle,
+                poses=FollowedPoses(height, timestamps, frame or frame_of(layout)),
+            )
             paths: Sequence[Named] = stack.enter_context(arrived)
         else:
             paths = options.resolve(inputs)
@@ -100,6 +118,7 @@ def trajectory(
             timestamps=timestamps,
             plot=plot,
             height=height,
+            frame=frame,
             every=every,
             progress=reporter,
         )

@@ -1,14 +1,19 @@
 """Paths: frames, units, files and errors."""
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
+from rdstitch.arrays import FloatArray
+from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
-from rdstitch.export.trajectory_files import as_csv, as_tum
+from rdstitch.export.trajectory_files import as_csv, as_kitti, as_tum
+from rdstitch.synthetic.poses import Poses, texels_of_pixels
 
 
 def _poses() -> PlanarPoses:
@@ -30,22 +35,46 @@ def test_a_path_starts_at_the_origin_with_the_height_given() -> None:
     np.testing.assert_allclose(path.position[1], np.array([[c, -s], [s, c]]) @ [1.0, 0.5] * 0.75)
 
 
-def test_files() -> None:
+@pytest.mark.parametrize(("frame", "up"), [("enu", 1.0), ("camera", -1.0)])
+def test_files_agree_on_yaw_and_on_what_is_up(frame: Literal["enu", "camera"], up: float) -> None:
     path = Trajectory.from_poses(_poses())
-    header, *rows = as_csv(path).splitlines()
-    assert header == "frame,name,source_frame,timestamp,x,y,phi_deg,height"
+    place = np.column_stack([path.position * (1.0, -up), up * path.height])
+    header, *rows = as_csv(path, frame).splitlines()
+    assert header == "frame,name,source_frame,timestamp,x,y,yaw_deg,height"
     numbers = np.array([[float(value or "nan") for value in row.split(",")] for row in rows])
-    np.testing.assert_allclose(numbers[:, 4:6], path.position, atol=1e-8)
-    np.testing.assert_allclose(numbers[:, 6], np.degrees(path.yaw), atol=1e-6)
+    np.testing.assert_allclose(numbers[:, 4:6], place[:, :2], atol=1e-8)
+    np.testing.assert_allclose(numbers[:, 6:], np.column_stack([np.degrees(path.yaw), path.height]), atol=1e-6)
     timed = replace(path, timestamp=np.array([0.0, 0.1, 0.3, 0.4]))
-    tum = np.array([[float(value) for value in row.split()] for row in as_tum(timed).splitlines()])
+    tum = np.array([[float(value) for value in row.split()] for row in as_tum(timed, frame).splitlines()])
+    kitti = np.array([[float(value) for value in row.split()] for row in as_kitti(path, frame).splitlines()])
     assert tum.shape == (4, 8)
     np.testing.assert_allclose(tum[:, 0], [0.0, 0.1, 0.3, 0.4])
-    np.testing.assert_allclose(tum[:, 3], -path.height, atol=1e-8)
-    np.testing.assert_allclose(
-        np.remainder(2 * np.arctan2(tum[:, 6], tum[:, 7]) + path.yaw, 2 * np.pi) % 6.28318, 0, atol=1e-4
-    )
-    assert [row.split()[0] for row in as_tum(path).splitlines()] == ["0.000000", "1.000000", "3.000000", "4.000000"]
+    np.testing.assert_allclose(tum[:, 1:4], place, atol=1e-8)
+    np.testing.assert_allclose(kitti.reshape(-1, 3, 4)[:, :, 3], place, atol=1e-8)
+    # Counterclockwise from above: about z where that points up.
+    turned = [Rotation.from_quat(tum[:, 4:]), Rotation.from_matrix(kitti.reshape(-1, 3, 4)[:, :, :3])]
+    for rotation in turned:
+        np.testing.assert_allclose(rotation.as_rotvec(), np.outer(up * _principal(path.yaw), [0, 0, 1]), atol=1e-7)
+    assert [row.split()[0] for row in as_tum(path, frame).splitlines()] == [f"{k}.000000" for k in (0, 1, 3, 4)]
+
+
+def test_a_camera_that_turns_left_and_goes_where_its_top_points_has_positive_yaw() -> None:
+    lens = Camera((400, 300), focal=300.0)
+    turn = np.radians([0.0, 90.0])
+    # In the first image the ground of the second lies towards its top; there x of the plane points to the bottom.
+    poses = Poses.of([(0.0, 0.0), (0.0, -50.0)], 300.0, turn)
+    right, left = texels_of_pixels(lens, poses.from_plane()[1], [(399.0, 149.5), (0.0, 149.5)])
+    assert right[1] < left[1]  # the right of the turned image is the top of the first
+    table = as_csv(Trajectory.from_poses(PlanarPoses(turn, poses.position, poses.height, poses.tilt)), "enu")
+    x, y, yaw, _ = (float(value) for value in table.splitlines()[2].split(",")[4:])
+    assert x == 0.0
+    assert y > 0.0
+    assert yaw == pytest.approx(90.0)
+
+
+def _principal(angle: FloatArray) -> FloatArray:
+    wrapped: FloatArray = np.remainder(angle + np.pi, 2 * np.pi) - np.pi
+    return wrapped
 
 
 def test_neither_frame_nor_unit_matter_to_the_error() -> None:
