@@ -191,7 +191,9 @@ def georeference(
     away[usable] = fit.residuals
     rms = math.sqrt(float(np.mean(away[used] ** 2)))
     spread = math.sqrt(float(np.mean(np.abs(places[used] - places[used].mean()) ** 2)))
-    if used.sum() < max(MIN_POSITIONS, len(known) / 2) or not rms < _MAX_ERROR * spread:
+    # Four of the coordinates are used up by the fit: three positions agree with anything to some extent.
+    free = max(1.0 - 2.0 / max(int(used.sum()), 1), 1e-9)
+    if used.sum() < max(MIN_POSITIONS, len(known) / 2) or not rms < _MAX_ERROR * spread * math.sqrt(free):
         return None, (
             f"the GPS positions are {float(np.median(away)):.1f} m off in the median, and spread over {spread:.1f} m"
         )

@@ -68,6 +68,8 @@ def unpack(data: bytes, kinds: Iterable[type] = ()) -> Any:
         raise InputError("damaged: it is not what was written")
     try:
         (length,) = struct.unpack_from("<Q", body)
+        if 8 + length > len(body):
+            raise ValueError("it ends too early")
         arrays = memoryview(body)[8 + length :]
         return _build(json.loads(body[8 : 8 + length]), arrays, {kind.__name__: kind for kind in kinds})
     except _DAMAGED as error:

@@ -43,7 +43,8 @@ FAST = ("-j", "1", "--max-features", "600")
 _cache = tempfile.TemporaryDirectory(prefix="rdstitch-tests-")
 
 # For tests of what comes before and after registration: the same pictures are registered once in a process of tests.
-CACHED = (*FAST, "--cache", _cache.name)
+CACHE = ("--cache", _cache.name)
+CACHED = (*FAST, *CACHE)
 
 
 _MADE = re.compile(r", \d+\.\d s$")

@@ -67,6 +67,7 @@ def test_every_page_is_in_the_site() -> None:
 def test_version_is_the_same_everywhere() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert f"version: {project['version']}" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"## [{project['version']}]" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
 def test_the_python_of_readme_runs(tmp_path: Path, frames: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -99,7 +99,7 @@ def test_nobody_reads_the_output(place: Path) -> None:
     assert (place / "out.png").exists()
 
 
-@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("signal_number", sampled([signal.SIGTERM, signal.SIGINT]))
 def test_termination_leaves_nothing_behind(place: Path, signal_number: int) -> None:
     before = state_of(place)
     process = start("pano", place / "a.png", place / "b.png", "-o", place / "out.png", "-v", *FAST)

@@ -17,7 +17,7 @@ from rdstitch.pipeline.compose import viewed_pictures
 from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, panorama_rotations, turning_sequence
 from rdstitch.synthetic.rendering import Photometry
 from rdstitch.viewer import viewer_page
-from tests.cli.running import Run
+from tests.cli.running import CACHE, Run
 from tests.drone_xmp import euler_angles, xmp_of
 
 _BUNDLED = Path(__file__).parents[2] / "examples" / "data" / "garfield_red"
@@ -39,7 +39,7 @@ def around(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 def test_a_full_turn_becomes_a_sphere_that_viewers_turn(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
     output = tmp_path / "sphere.jpg"
     report = tmp_path / "report.html"
-    done = rdstitch("pano", *around, "-o", output, "--report", report)
+    done = rdstitch("pano", *around, "-o", output, "--report", report, *CACHE)
     assert done.status == 0
     record = json.loads((tmp_path / "sphere.jpg.json").read_text(encoding="utf-8"))
     assert record["model"] == "rotation"
@@ -97,7 +97,7 @@ def test_outlines_are_where_the_pictures_are_at_both_ends_of_a_full_turn(around:
 
 def test_the_projection_is_the_users(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
     output = tmp_path / "few.tif"
-    done = rdstitch("pano", *around[:3], "-o", output, "--projection", "mercator")
+    done = rdstitch("pano", *around[:3], "-o", output, "--projection", "mercator", *CACHE)
     assert done.status == 0
     record = json.loads((tmp_path / "few.tif.json").read_text(encoding="utf-8"))
     assert record["output"]["projection"] == "mercator"
@@ -105,14 +105,14 @@ def test_the_projection_is_the_users(rdstitch: Run, around: list[Path], tmp_path
 
 
 def test_pictures_of_a_plane_have_no_other_projection(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    done = rdstitch("pano", *frames, "-o", tmp_path / "out.png", "--projection", "sphere")
+    done = rdstitch("pano", *frames, "-o", tmp_path / "out.png", "--projection", "sphere", *CACHE)
     assert done.status == 2
     assert "--projection" in done.err
 
 
 def test_a_lens_is_calibrated_by_turning(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
     camera = tmp_path / "camera.json"
-    done = rdstitch("calibrate", around[0].parent, "-o", camera)
+    done = rdstitch("calibrate", around[0].parent, "-o", camera, *CACHE)
     assert done.status == 0
     found = Camera.load(camera)
     assert found.distortion == pytest.approx(-0.2, abs=0.005)
@@ -120,7 +120,7 @@ def test_a_lens_is_calibrated_by_turning(rdstitch: Run, around: list[Path], tmp_
 
 
 def test_a_turning_camera_has_no_path(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
-    done = rdstitch("trajectory", around[0].parent, "-o", tmp_path / "path.csv")
+    done = rdstitch("trajectory", around[0].parent, "-o", tmp_path / "path.csv", *CACHE)
     assert done.status == 2
     assert "turned on the spot" in done.err
 
@@ -171,7 +171,7 @@ def test_orientation_in_exif_says_what_is_down(tmp_path: Path) -> None:
 
 def test_deep_zoom_of_a_full_turn_is_joined_at_the_edge(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
     plain, tiles = tmp_path / "around.png", tmp_path / "around.dzi"
-    assert rdstitch("pano", *around, "-o", plain).status == 0
+    assert rdstitch("pano", *around, "-o", plain, *CACHE).status == 0
     arguments = ("--images", around[0].parent, "-o", tiles, "--max-memory", "200M")
     assert rdstitch("apply", f"{plain}.json", *arguments).status == 0
     with Image.open(plain) as picture:

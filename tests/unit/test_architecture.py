@@ -31,29 +31,3 @@ def test_what_the_page_names_is_there() -> None:
         path = ROOT / "rdstitch" / module.replace(".", "/")
         source = path.with_suffix(".py") if path.with_suffix(".py").exists() else path / "__init__.py"
         assert re.search(rf"\b{kind}\b", source.read_text(encoding="utf-8")), (kind, module)
-
-
-UNIT = ROOT / "tests" / "unit"
-ABOUT_THE_TREE = {"architecture", "sizes", "troubleshooting"}
-THROUGH_COMMANDS = {"doctor", "report", "sidecar", "viewer"}
-"""Rooms whose tests run the command that they serve."""
-
-
-@pytest.mark.parametrize("test", sorted(UNIT.rglob("test_*.py")), ids=lambda path: str(path.relative_to(UNIT)))
-def test_unit_tests_lie_where_the_code_lies(test: Path) -> None:
-    """A test of a room is in the folder of its name, and is named after a module of it, or uses it."""
-    parts = test.relative_to(UNIT).parts
-    if len(parts) == 1:
-        assert test.stem.removeprefix("test_") in ABOUT_THE_TREE | set(ROOMS)
-        return
-    room = ".".join(parts[:-1])
-    home = f"rdstitch.{room}" if parts[0] != "examples" else room
-    module = ROOT.joinpath("rdstitch", *parts[:-1], test.name.removeprefix("test_"))
-    text = test.read_text(encoding="utf-8")
-    assert module.exists() or home in text or f"from rdstitch import {room}" in text, f"tests nothing of {home}"
-
-
-def test_every_room_has_a_folder_of_tests() -> None:
-    rooms = {room for room in ROOMS if (ROOT / "rdstitch" / room).is_dir()}
-    folders = {path.name for path in UNIT.iterdir() if path.is_dir() and any(path.glob("**/test_*.py"))}
-    assert folders - {"examples"} == rooms - THROUGH_COMMANDS

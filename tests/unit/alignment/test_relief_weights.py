@@ -13,7 +13,6 @@ from rdstitch.alignment.relief_weights import choose_over_relief, weighted_by_re
 from rdstitch.alignment.select import ModelChoice
 from rdstitch.radial_homography import measurement_whitening
 from tests.alignment_scenes import Scene, grid, scene
-from tests.sampled import sampled
 
 
 def _scene(relief: float, seed: int = 0) -> Scene:
@@ -33,7 +32,8 @@ def _fitted(given: Scene) -> tuple[Problem, Fit]:
     return problem, problem.fit(SIMILARITY)
 
 
-@pytest.mark.parametrize("relief", sampled([0.08, 0.03]))
+@pytest.mark.slow
+@pytest.mark.parametrize("relief", [0.08, 0.03])
 def test_hills_hardly_move_the_lens(relief: float) -> None:
     """By errors that all count alike λ is off by 0.005 and 0.012 in the root mean square."""
     errors, misses = [], []

@@ -86,6 +86,7 @@ def test_the_stated_deviation_covers_relief(relief: float) -> None:
     assert np.median(misses) > 0.33
 
 
+@pytest.mark.slow
 def test_the_stated_deviation_covers_what_two_pictures_do_not_show() -> None:
     """Two hardly show an axis off the middle: a tilt and a change of height stand for it, and λ is off."""
     lens = Camera(SIZE, -0.25, center=(333.0, 233.0))

@@ -95,13 +95,21 @@ class _Whole:
 
 
 @given(st.binary(max_size=200))
-def test_anything_that_only_pretends_is_refused(body: bytes) -> None:
+def test_what_has_the_right_digest_but_was_not_packed_is_refused_or_a_value(body: bytes) -> None:
+    """A description of a value, "null" for one, may come about by chance; it then stands for that value."""
     for inner in (body, struct.pack("<Q", len(body)) + body, struct.pack("<Q", 2**63)):
         forged = packing._MAGIC + hashlib.sha256(inner).digest() + inner
         try:
-            unpack(forged, [_Whole, Camera])
+            value = unpack(forged, [_Whole, Camera])
         except RdstitchError:
             continue
+        assert _same(unpack(pack(value), [_Whole, Camera]), value)
+
+
+@pytest.mark.parametrize("inner", [b"", struct.pack("<Q", 2**63), struct.pack("<Q", 3) + b"{x}", b"12345678null"])
+def test_what_only_pretends_is_refused(inner: bytes) -> None:
+    with pytest.raises(RdstitchError):
+        unpack(packing._MAGIC + hashlib.sha256(inner).digest() + inner)
 
 
 @pytest.mark.parametrize(
