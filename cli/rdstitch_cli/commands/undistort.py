@@ -67,7 +67,7 @@ def undistort(
         view=view,
         image_format=image_format,
         overwrite=overwrite,
-        warn=lambda message: reporter.warn(str(message)),
+        warn=reporter.tell,
         progress=reporter,
     )
     reporter.finish()
