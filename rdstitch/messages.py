@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-Severity = Literal["note", "warning", "left out", "failure"]
+Severity = Literal["detail", "note", "warning", "left out", "failure"]
 
 MAX_NAMED = 3
 """Pictures or pairs that one message names."""
@@ -22,9 +22,9 @@ class Message:
     images : tuple of str
         Paths of the pictures that it concerns; empty where it concerns all of them.
     severity : str
-        "note": how the result was made. "warning": there is a result, to be looked at. "left out": the one picture
-        named, or each of several, is not in the result, for the reason that the text gives. "failure": the result
-        cannot be relied on.
+        "detail": what only who asks need know. "note": how the result was made. "warning": there is a result, to be
+        looked at. "left out": the one picture named, or each of several, is not in the result, for the reason that the
+        text gives. "failure": the result cannot be relied on.
     code : str
         Heading in docs/troubleshooting.md; empty where the text says it all.
     """

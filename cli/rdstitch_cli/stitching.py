@@ -218,8 +218,8 @@ def warn_of(registration: "Registration", reporter: Reporter) -> None:
     alignment = registration.alignment
     for message in told_once((*registration.failures, *registration.warnings, *registration.left_out)):
         reporter.warn(str(message))
-    for message in registration.notes:
-        reporter.note(str(message))
+    for message in (*registration.notes, *registration.details):
+        reporter.tell(message)
     used = int(alignment.used.sum())
     reporter.log(f"{used} of {len(alignment.used)} pictures, rms {alignment.rms:.2f} pixels; {alignment.model_reason}")
 

@@ -5,9 +5,12 @@ import sys
 import time
 from contextlib import suppress
 from io import TextIOWrapper
-from typing import Never, Self
+from typing import TYPE_CHECKING, Never, Self
 
 from tqdm import tqdm
+
+if TYPE_CHECKING:
+    from rdstitch.messages import Message
 
 _ASCII = {
     "λ": "lambda",
@@ -95,6 +98,11 @@ class Reporter:
         """Log what is going on, under ``-v``."""
         if self._verbosity >= 1:
             self._line(f"rdstitch: {text}")
+
+    def tell(self, message: "Message") -> None:
+        """Say a message as loudly as it is grave."""
+        say = {"detail": self.log, "note": self.note}.get(message.severity, self.warn)
+        say(str(message))
 
     def finish(self) -> None:
         """Take the bar away before anything goes to standard output."""

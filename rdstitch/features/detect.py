@@ -98,7 +98,7 @@ def detect(image: PixelArray, options: FeatureOptions | None = None, mask: Mask 
 
     Parameters
     ----------
-    image : ndarray of shape (height, width) or (height, width, 1 to 4)
+    image : ndarray of shape (height, width) or (height, width, bands)
         Grey, grey with alpha, RGB or RGB with alpha; uint8, or uint16 or float, which are stretched to 8
         bits. Nothing is detected where alpha is zero or a float is not finite.
     mask : ndarray of shape (height, width), bool or uint8, optional

@@ -32,7 +32,7 @@ class View:
 
     Attributes
     ----------
-    image : ndarray of shape (height, width) or (height, width, 1 to 4)
+    image : ndarray of shape (height, width) or (height, width, bands)
     mask : ndarray of shape (height, width), bool or uint8, or None
         True or not zero where the picture counts; None for everywhere.
     reduction : int
@@ -105,9 +105,11 @@ def prepare(
 ) -> PreparedPicture:
     """Make a picture ready for detection; see :func:`rdstitch.features.detect.detect` for what it may be."""
     image, mask = view.image, view.mask
-    if image.ndim not in (2, 3) or image.size == 0 or (image.ndim == 3 and image.shape[2] > 4):
-        raise ArgumentError(f"expected a picture of shape (height, width[, 1 to 4]), not {image.shape}")
+    if image.ndim not in (2, 3) or image.size == 0:
+        raise ArgumentError(f"expected a picture of shape (height, width[, bands]), not {image.shape}")
     usable = _usable(image, mask)
+    if image.ndim == 3 and image.shape[2] > 4:
+        image = _grey(image)
     height, width = image.shape[:2]
     factor = 1 if work_megapixels is None else halving((width, height), work_megapixels)
     if factor > 1:
@@ -142,7 +144,7 @@ def _usable(image: PixelArray, mask: Mask | None) -> NDArray[np.bool_] | None:
 
 
 def _grey(image: PixelArray) -> PixelArray:
-    """Luminance of grey, grey with alpha, RGB and RGB with alpha; float64 counts as float32."""
+    """Luminance of grey, grey with alpha, RGB and RGB with alpha; the mean of more bands. float64 counts as float32."""
     if image.dtype.kind == "f":
         image = image.astype(np.float32)
     elif image.dtype not in (np.uint8, np.uint16):
@@ -151,6 +153,9 @@ def _grey(image: PixelArray) -> PixelArray:
         return image
     if image.shape[2] < 3:
         return np.ascontiguousarray(image[..., 0])
+    if image.shape[2] > 4:
+        mean: PixelArray = image.mean(axis=2, dtype=np.float32)
+        return mean if image.dtype.kind == "f" else np.rint(mean).astype(image.dtype)
     return cv2.cvtColor(image[..., :3], cv2.COLOR_RGB2GRAY)
 
 

@@ -4,7 +4,7 @@ import glob
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
@@ -124,7 +124,12 @@ def find_pictures(
     notes: list[Message] = []
     containers: list[Path] = []
     interrupted = cache(interrupted_outputs)
-    for frame, named in _expand(arguments, frames_folder, every, notes, containers, topic):
+    found = list(_expand(arguments, frames_folder, every, notes, containers, topic))
+    stills = [(item, named) for item, named in found if not isinstance(item, _Clip)]
+    if every is None and stills:
+        notes += [item.among(len(stills)) for item, _ in found if isinstance(item, _Clip)]
+        found = list(stills)
+    for frame, named in ((frame, named) for item, named in found for frame in _frames_of(item)):
         is_output = (
             frame.picture is None
             and not is_url(frame.path)
@@ -160,8 +165,8 @@ def _expand(
     containers: list[Path],
     topic: str | None,
     lists: tuple[Path, ...] = (),
-) -> Iterator[tuple[Frame, bool]]:
-    """Every frame, and whether it was named one by one; ``notes`` on videos and ``containers`` are added.
+) -> "Iterator[tuple[Frame | _Clip, bool]]":
+    """Every frame or video, and whether it was named one by one; ``notes`` and ``containers`` are added.
 
     ``lists`` are those that the arguments come from.
     """
@@ -189,20 +194,55 @@ def _expand(
             if frames_folder is None:
                 raise InputError(f"{path}: a ROS bag is no picture here; use 'rdstitch mosaic'")
             containers += path.iterdir() if path.is_dir() else [path]
-            images, wanted = extract_images(path, frames_folder(), every, topic)
-            notes += wanted.messages(path)
-            yield from ((frame, True) for frame in images)
+            yield _Clip(path, partial(_frames_of_bag, path, frames_folder, every, topic, notes)), True
         elif path.is_dir():
-            yield from ((Frame(found), False) for found in _in_folder(path))
+            yield from ((Frame(found), False) for found in _in_folder(path, notes))
         elif path.suffix.lower() in VIDEO_SUFFIXES:
             if frames_folder is None:
                 raise InputError(f"{path}: a video is no picture here; use 'rdstitch mosaic' or extract its frames")
             containers.append(path)
-            wanted = wanted_frames(every, partial(grey_frames, path))
-            notes += wanted.messages(path)
-            yield from ((Frame(*frame), True) for frame in extract_frames(path, frames_folder(), wanted.__contains__))
+            yield _Clip(path, partial(_frames_of_video, path, frames_folder, every, notes)), True
         else:
             yield Frame(path), True
+
+
+@dataclass(frozen=True)
+class _Clip:
+    """A video or bag among the arguments, whose frames are not extracted yet."""
+
+    path: Path
+    extract: Callable[[], list[Frame]]
+
+    def among(self, pictures: int) -> Message:
+        """Why it is not used beside pictures.
+
+        Raises
+        ------
+        InputError
+            When these are too few to be what was meant.
+        """
+        remedy = "give it alone, or --every N to use every N-th of its frames too"
+        if pictures < 2:
+            raise InputError(f"{self.path}: is a video beside one picture; {remedy}")
+        return Message(f"is a video among pictures, and was not used; {remedy}", (str(self.path),))
+
+
+def _frames_of(item: Frame | _Clip) -> list[Frame]:
+    return item.extract() if isinstance(item, _Clip) else [item]
+
+
+def _frames_of_bag(
+    path: Path, folder: Callable[[], Path], every: int | None, topic: str | None, notes: list[Message]
+) -> list[Frame]:
+    images, wanted = extract_images(path, folder(), every, topic)
+    notes += wanted.messages(path)
+    return images
+
+
+def _frames_of_video(path: Path, folder: Callable[[], Path], every: int | None, notes: list[Message]) -> list[Frame]:
+    wanted = wanted_frames(every, partial(grey_frames, path))
+    notes += wanted.messages(path)
+    return [Frame(*frame) for frame in extract_frames(path, folder(), wanted.__contains__)]
 
 
 def _at_url(url: str) -> Iterator[tuple[Frame, bool]]:
@@ -259,12 +299,32 @@ def pictures_in(folder: Path) -> list[Path]:
     return sorted(found, key=natural_key)
 
 
-def _in_folder(folder: Path) -> list[Path]:
-    """The same; a folder without pictures is an error."""
+def _in_folder(folder: Path, notes: list[Message]) -> list[Path]:
+    """The same; a folder without pictures is an error, and what else is in it a note."""
     found = pictures_in(folder)
+    others = sorted({path for path in folder.iterdir() if not path.name.startswith(".")} - set(found), key=natural_key)
     if not found:
-        raise InputError(f"{folder}: there are no pictures in this folder")
+        raise InputError(f"{folder}: there are no pictures in this folder{_elsewhere(others)}")
+    if others:
+        text = f"{folder}: not taken for pictures: {shortened([path.name for path in others])}"
+        notes.append(Message(text, severity="detail"))
     return found
+
+
+def _has_pictures(folder: Path) -> bool:
+    try:
+        return bool(pictures_in(folder))
+    except InputError:
+        return False
+
+
+def _elsewhere(others: Sequence[Path]) -> str:
+    """Where the pictures may be, if a folder has none."""
+    within = [str(path) for path in others if path.is_dir() and _has_pictures(path)]
+    videos = [str(path) for path in others if path.suffix.lower() in VIDEO_SUFFIXES]
+    if within:
+        return f", but in the folders within it; name those: {shortened(within)}"
+    return f", but a video; name it: {shortened(videos)}" if videos else ""
 
 
 def _matching(pattern: str) -> list[Path]:

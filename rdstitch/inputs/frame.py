@@ -8,11 +8,12 @@ from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
+import PIL.Image
 from numpy.typing import NDArray
 
 from rdstitch.errors import ArgumentError
-from rdstitch.io.metadata import Metadata
-from rdstitch.io.read import Picture, as_picture
+from rdstitch.io.metadata import Metadata, metadata_of
+from rdstitch.io.read import Picture, as_picture, from_pillow
 
 ChannelOrder = Literal["bgr", "rgb"]
 """Order of the colour channels of arrays that come in and go out: OpenCV's, or everybody else's."""
@@ -40,8 +41,8 @@ class Frame:
     picture: Picture | None = None
 
 
-Image = str | os.PathLike[str] | NDArray[Any]
-"""A file, whatever else stands for files (see :mod:`rdstitch.inputs.find`), or an array."""
+Image = str | os.PathLike[str] | NDArray[Any] | PIL.Image.Image
+"""A file, whatever else stands for files (see :mod:`rdstitch.inputs.find`), or an image in memory."""
 
 Images = Image | Iterable[Image | Frame]
 """One image or any number of them, an iterator for example."""
@@ -57,9 +58,10 @@ def as_inputs(images: Images, channel_order: ChannelOrder = "bgr") -> list[Named
     images : path, ndarray, or iterable of them
         A single path or array is one input. An array is of shape (H, W), (H, W, 1), (H, W, 3), or with alpha as the
         last channel (H, W, 2) or (H, W, 4), or of more bands; uint8, uint16 or floating point. An array of shape
-        (N, H, W, C) is a sequence of N images. The i-th input, if it is an array, is called ``image_000i``.
+        (N, H, W, C) is a sequence of N images. A Pillow image is in its own colours, whatever ``channel_order`` is,
+        with its EXIF. The i-th input, if it is an array or such an image, is called ``image_000i``.
     channel_order : str
-        "bgr" or "rgb": order of the channels of colour arrays.
+        "bgr" or "rgb": order of the channels of colour arrays; that of five bands and more stays.
 
     Raises
     ------
@@ -69,7 +71,7 @@ def as_inputs(images: Images, channel_order: ChannelOrder = "bgr") -> list[Named
     if channel_order not in get_args(ChannelOrder):
         raise ArgumentError(f"channel_order must be 'bgr' or 'rgb', not {channel_order!r}")
     listed: Iterable[Any]
-    if isinstance(images, (str, os.PathLike)) or (isinstance(images, np.ndarray) and images.ndim != 4):
+    if isinstance(images, (str, os.PathLike, PIL.Image.Image)) or (isinstance(images, np.ndarray) and images.ndim != 4):
         listed = [images]
     elif isinstance(images, Iterable):
         listed = images
@@ -97,10 +99,15 @@ def _as_input(item: Any, index: int, channel_order: ChannelOrder) -> Named:
         raise ArgumentError(
             f"image {index} is None, which cv2.imread returns for a file that it cannot read; check the name"
         )
-    if not isinstance(item, np.ndarray):
-        kind = type(item).__name__
-        raise ArgumentError(f"image {index}: expected a path or a NumPy array, not {kind}; convert it by numpy.asarray")
     name = f"image_{index:04d}"
+    if isinstance(item, PIL.Image.Image):
+        return Frame(Path(name), index, picture=as_picture(Path(name), *from_pillow(item), metadata_of(item)))
+    if not isinstance(item, np.ndarray):
+        kind, remedy = type(item).__name__, "convert it by numpy.asarray"
+        if type(item).__module__.partition(".")[0] == "torch":
+            kind = "a tensor of torch"
+            remedy = 'of shape (C, H, W) in RGB, give tensor.permute(1, 2, 0).numpy(force=True) and channel_order="rgb"'
+        raise ArgumentError(f"image {index}: expected a path, a NumPy array or a Pillow image, not {kind}; {remedy}")
     return Frame(Path(name), index, picture=array_as_picture(name, item, channel_order))
 
 

@@ -152,7 +152,7 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
             else:
                 factor = _decoders_share(image, metadata, reduction)
                 found, damage = _from_jpeg(file, image, factor)
-                samples, alpha = _from_pillow(image, factor) if found is None else (found, None)
+                samples, alpha = from_pillow(image, factor) if found is None else (found, None)
                 picture = replace(as_picture(file, samples, alpha, metadata), damage=damage)
                 return reduced(picture, reduction // factor)
         return reduced(as_picture(file, samples, alpha, metadata), reduction)
@@ -181,7 +181,7 @@ def _from_jpeg(file: Path, image: Image.Image, factor: int) -> tuple[Pixels | No
     return decoded_jpeg(file, image.size, factor, grey=image.mode == "L")
 
 
-def _from_pillow(image: Image.Image, factor: int) -> tuple[Pixels, Pixels | None]:
+def from_pillow(image: Image.Image, factor: int = 1) -> tuple[Pixels, Pixels | None]:
     """Samples and alpha of any mode of Pillow's, by such a share of the decoder smaller."""
     if factor > 1:
         wanted = reduced_size(image.size, factor)
@@ -281,7 +281,7 @@ def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
         mask = next((other.asarray() for other in masks), None)
     if samples is None and kind == tifffile.PHOTOMETRIC.SEPARATED:
         with opened_picture(file) as image:
-            return _from_pillow(image, 1)
+            return from_pillow(image)
     if samples is None:
         with open_regular(file) as stream:
             return _split(_decode_with_opencv(stream.read()))

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 import rdstitch
 from rdstitch.errors import ArgumentError, InputError
@@ -53,6 +54,47 @@ def test_rgb_arrays_give_an_rgb_picture(arrays: list[NDArray[np.uint8]], of_file
     ]
     np.testing.assert_allclose(means[0], means[1][::-1], atol=2.0)
     assert np.ptp(means[0]) > 5.0  # or the test would pass with any order
+
+
+def test_images_of_pillow_are_in_their_own_colours(frames: list[Path], of_files: rdstitch.StitchResult) -> None:
+    images = [Image.open(frame) for frame in frames]
+    for image, frame in zip(images, frames, strict=True):
+        (found,) = as_inputs(image)
+        assert isinstance(found, Frame)
+        assert found.picture is not None
+        np.testing.assert_array_equal(found.picture.pixels, rdstitch.io.read_image(frame).pixels)
+    result = rdstitch.pano(images, options=_OPTIONS)
+    np.testing.assert_array_equal(result.image, of_files.image)
+    sideways = images[0].copy()
+    sideways.getexif()[0x0112] = 6
+    (turned,) = as_inputs(sideways)
+    assert isinstance(turned, Frame)
+    assert turned.picture is not None
+    assert turned.picture.pixels.shape[:2] == sideways.size
+
+
+def test_tensors_are_refused_with_the_remedy() -> None:
+    class Tensor:
+        """What torch's class looks like from outside."""
+
+    Tensor.__module__ = "torch"
+    with pytest.raises(ArgumentError, match=r"image 0: .*tensor of torch; .*permute\(1, 2, 0\).*channel_order=\"rgb\""):
+        as_inputs([Tensor()])  # type: ignore[list-item]
+
+
+def test_bands_beyond_three_go_through_the_same_warp(arrays: list[NDArray[np.uint8]], tmp_path: Path) -> None:
+    five = [np.dstack([array, 255 - array[..., :1], array[..., 1:2] // 2]) for array in arrays]
+    result = rdstitch.pano(five, tmp_path / "five.tif", _OPTIONS)
+    assert result.registration.alignment.used.all()
+    plain = rdstitch.compositing.CompositeOptions(exposure="none", seam="none", blend="none")
+    again = rdstitch.apply(tmp_path / "five.tif.json", five, composite=plain)
+    assert again.image.shape[2] == 5
+    inside = again.alpha == 255
+    blue, fourth = again.image[..., 0][inside].astype(int), again.image[..., 3][inside].astype(int)
+    assert np.abs(blue + fourth - 255).max() <= 1
+    (straight,) = rdstitch.undistort(five[0], distortion=-0.2)
+    three = rdstitch.undistort(arrays[0], distortion=-0.2)[0]
+    np.testing.assert_array_equal(straight[..., :3], three)
 
 
 def test_a_generator_that_reuses_its_buffer(arrays: list[NDArray[np.uint8]], of_files: rdstitch.StitchResult) -> None:

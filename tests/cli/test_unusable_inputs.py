@@ -79,7 +79,7 @@ def test_a_failure_names_what_could_not_be_read(rdstitch: Run, place: Path, stra
     arguments = (place / "a.png", stranger, place / "empty.png", place / "half.png", "-o", place / "out.json")
     if command == "mosaic":
         arguments = (*arguments[:-1], place / "out.png")
-    done = rdstitch(command, *arguments, *FAST)
+    done = rdstitch(command, *arguments, *CACHED)
     assert done.status == 4
     assert "no two pictures overlap" in done.line
     assert "empty.png: is empty" in done.line

@@ -94,7 +94,7 @@ def apply(
     if result.matched == "order" and match == "auto":
         reporter.warn("no picture has a name of the sidecar; they were taken in order")
     for message in result.messages:
-        (reporter.note if message.severity == "note" else reporter.warn)(str(message))
+        reporter.tell(message)
     if result.plan is not None:
         show_plan(result.plan)
     else:

@@ -71,7 +71,7 @@ def undistort(
         image_format=image_format,
         overwrite=overwrite,
         topic=topic,
-        warn=lambda message: reporter.warn(str(message)),
+        warn=reporter.tell,
         progress=reporter,
     )
     reporter.finish()

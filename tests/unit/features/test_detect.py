@@ -196,7 +196,7 @@ def test_bad_arguments_are_refused(picture: NDArray[np.uint8]) -> None:
             FeatureOptions(**options)
     with pytest.raises(ArgumentError, match="mask of shape"):
         detect(picture, mask=np.ones((3, 3), bool))
-    for bad in (np.zeros((0, 5), np.uint8), np.zeros((5, 5, 5), np.uint8), np.zeros(5, np.uint8)):
+    for bad in (np.zeros((0, 5), np.uint8), np.zeros((5, 5, 5, 5), np.uint8), np.zeros(5, np.uint8)):
         with pytest.raises(ArgumentError, match="expected a picture"):
             detect(bad)
     with pytest.raises(ArgumentError, match="int32"):

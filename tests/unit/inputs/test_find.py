@@ -1,0 +1,71 @@
+"""What is not taken of folders, and videos among pictures."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from rdstitch.errors import InputError
+from rdstitch.inputs.find import find_pictures
+
+
+def pictures(folder: Path, count: int) -> list[Path]:
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{k}.png" for k in range(count)]
+    for path in paths:
+        Image.new("L", (32, 24)).save(path)
+    return paths
+
+
+def video(path: Path) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, (64, 48))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no videos")
+    for k in range(3):
+        writer.write(np.full((48, 64, 3), 80 * k, np.uint8))
+    writer.release()
+    return path
+
+
+def test_what_is_no_picture_in_a_folder_is_named_once(tmp_path: Path) -> None:
+    pictures(tmp_path / "set", 2)
+    (tmp_path / "set" / "notes.txt").write_text("x")
+    (tmp_path / "set" / ".hidden").write_text("x")
+    video(tmp_path / "set" / "clip.avi")
+    found = find_pictures([tmp_path / "set"])
+    assert [frame.path.name for frame in found.frames] == ["0.png", "1.png"]
+    (message,) = found.messages
+    assert message.severity == "detail"
+    assert message.text.endswith("not taken for pictures: clip.avi, notes.txt")
+
+
+def test_the_folders_or_the_video_in_a_folder_without_pictures_are_named(tmp_path: Path) -> None:
+    pictures(tmp_path / "set" / "a", 2)
+    (tmp_path / "set" / "empty").mkdir()
+    with pytest.raises(InputError, match=r"no pictures in this folder, but in the folders within it; name .*set/a$"):
+        find_pictures([tmp_path / "set"])
+    video(tmp_path / "set" / "empty" / "clip.avi")
+    with pytest.raises(InputError, match=r"no pictures in this folder, but a video; name it: .*clip\.avi$"):
+        find_pictures([tmp_path / "set" / "empty"])
+
+
+def test_a_video_among_pictures_is_used_only_when_asked_for(tmp_path: Path) -> None:
+    paths, clip = pictures(tmp_path, 2), video(tmp_path / "clip.avi")
+    (tmp_path / "frames").mkdir()
+
+    def folder() -> Path:
+        return tmp_path / "frames"
+
+    found = find_pictures([clip, *paths], frames_folder=folder)
+    assert [frame.path for frame in found.frames] == paths
+    (message,) = found.messages
+    assert str(message).startswith("clip.avi: is a video among pictures, and was not used; ")
+    assert list(folder().iterdir()) == []
+    asked = find_pictures([clip, *paths], frames_folder=folder, every=1)
+    assert len(asked.frames) == 5
+    assert asked.messages == []
+    assert len(find_pictures([clip], frames_folder=folder).frames) > 0
+    with pytest.raises(InputError, match=r"clip\.avi: is a video beside one picture"):
+        find_pictures([clip, paths[0]], frames_folder=folder)
