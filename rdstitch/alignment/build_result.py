@@ -304,7 +304,7 @@ def _warnings(found: AdjustedPictures, camera: Camera) -> tuple[Message, ...]:
                 f"from {len(found.pictures)} images the lens distortion is known to about {off:.2g} pixels at the "
                 f"corners; {ENOUGH_PICTURES} or more images, or --camera, make it surer"
             )
-            result.append(Message(text, severity="note" if found.layout_matters else "warning", code="few-pictures"))
+            result.append(Message(text, severity="detail" if found.layout_matters else "warning", code="few-pictures"))
     if (overruled := _overruled_focal(found, camera)) is not None:
         result.append(Message(overruled))
     if not found.choice.fit.adjusted.converged:

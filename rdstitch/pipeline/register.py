@@ -158,7 +158,7 @@ def _low_contrast(equalized: Sequence[int], alignment: Alignment, paths: Sequenc
     several = f"{len(images)} of the pictures ({shortened(names_of(images))})" if images else "the pictures"
     who = "shows" if len(images) == 1 else f"{several} show"
     text = f"{who} little contrast: features were found after equalizing it locally"
-    return [Message(text, images, "note", code="low-contrast")]
+    return [Message(text, images, "detail", code="low-contrast")]
 
 
 def _left_out(

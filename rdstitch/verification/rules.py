@@ -1,4 +1,4 @@
-"""Which findings are said aloud, in one table; what is not goes into the sidecar, the report and ``-v`` as a note.
+"""Which findings are said aloud, in one table; what is not goes into the report and ``-v`` as a detail.
 
 A warning is for what puts this result at risk. Where images look alike in the pixels, what their matches say of depth
 or of errors has been hidden by local alignment and seams, and does not.
@@ -68,7 +68,7 @@ RULES = (
 
 
 def spoken(messages: Iterable[Message], found: Situation) -> tuple[Message, ...]:
-    """Make notes of warnings that their rule silences, of all but the first of a kind, and of more than a few."""
+    """Make details of warnings that their rule silences, of all but the first of a kind, and of more than a few."""
     given, order = list(messages), {rule.code: number for number, rule in enumerate(RULES)}
     kinds: set[str] = set()
     aloud: set[int] = set()
@@ -81,6 +81,6 @@ def spoken(messages: Iterable[Message], found: Situation) -> tuple[Message, ...]
             aloud.add(number)
             kinds.add(kind)
     return tuple(
-        replace(message, severity="note") if message.severity == "warning" and number not in aloud else message
+        replace(message, severity="detail") if message.severity == "warning" and number not in aloud else message
         for number, message in enumerate(given)
     )

@@ -224,7 +224,7 @@ def _outvoted(
             text = f"{fit}: {named}"
             images = tuple(paths[k] for k in sorted({k for pair in own for k in pair}))
             text += "; look at the seams between them" if seams else ""
-            result.append(Message(text, images, "note", code="doubtful-seam"))
+            result.append(Message(text, images, "detail", code="doubtful-seam"))
     return result
 
 

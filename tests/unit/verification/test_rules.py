@@ -16,9 +16,9 @@ def _said(*messages: Message, found: Situation = GOOD) -> list[str]:
     return [message.code for message in spoken(messages, found) if message.severity == "warning"]
 
 
-def test_what_is_not_said_is_noted() -> None:
+def test_what_is_not_said_is_a_detail() -> None:
     (note,) = spoken([PARALLAX], GOOD)
-    assert note == replace(PARALLAX, severity="note")
+    assert note == replace(PARALLAX, severity="detail")
 
 
 @pytest.mark.parametrize("code", ["relief", "parallax"])

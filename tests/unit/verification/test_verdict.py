@@ -121,7 +121,7 @@ def test_relief_is_noted_with_the_pair_where_it_is_largest(good: Registration) -
     worst = links[position]
     names = [good.sources[k].name for k in (worst.image1, worst.image2)]
     (message,) = [m for m in judge(replace(good, alignment=rough), 3.0) if "most of all between" in m.text]
-    assert message.severity == "note"  # all images overlap with the reference
+    assert message.severity == "detail"  # all images overlap with the reference
     assert f"between {names[0]} and {names[1]} (9.0 pixels)" in message.text
 
 
@@ -225,7 +225,7 @@ def test_what_only_the_places_suffer_from_is_not_said_of_a_lens(
 
 
 @pytest.mark.parametrize(
-    ("rms", "share", "severity"), [(8.9, 0.26, "note"), (8.9, 0.24, "failure"), (9.1, 0.9, "failure")]
+    ("rms", "share", "severity"), [(8.9, 0.26, "detail"), (8.9, 0.24, "failure"), (9.1, 0.9, "failure")]
 )
 def test_errors_of_rough_ground_are_noted_where_pictures_look_alike(
     good: Registration, monkeypatch: pytest.MonkeyPatch, rms: float, share: float, severity: str
@@ -241,7 +241,7 @@ def test_errors_of_rough_ground_are_noted_where_pictures_look_alike(
 @pytest.mark.parametrize(
     ("size", "share", "rms", "severity"),
     [
-        (9.4, 0.51, 9.5, "note"),
+        (9.4, 0.51, 9.5, "detail"),
         (9.4, 0.49, 9.5, "failure"),
         (8.9, 0.9, 9.5, "failure"),
         (99.9, 0.9, 100.0, "failure"),
