@@ -200,15 +200,15 @@ def _with_wider_lenses(
 
 
 def _best(posterior: Posterior, tried: Sequence[Hypothesis]) -> Hypothesis:
-    """The one with the best score; where that has an absurd layout, the turn or, of the others, the best that joins."""
+    """The one with the best score; where a plane has an absurd layout, a turn that joins the images."""
     cameras = [one for one in tried if one.fit.model is not HOMOGRAPHY]
     free = [one for one in tried if one.fit.model is HOMOGRAPHY]
     best = min(cameras or free, key=_score)
-    if not best.absurd:
-        beyond = [one for one in free if _is_beyond_one_camera(posterior, best, one.field)]
-        return min([best, *beyond], key=_score)
-    joining = [one for one in tried if not one.absurd and one.field < _TOLERABLE * posterior.evidence.farthest]
-    return min(joining, key=lambda one: (not one.fit.model.on_sphere, one.score), default=min(tried, key=_score))
+    largest = _TOLERABLE * posterior.evidence.farthest
+    turns = [one for one in tried if one.fit.model.on_sphere and one.field < largest]
+    if best.absurd and turns:
+        return turns[0]
+    return min([best, *(one for one in free if _is_beyond_one_camera(posterior, best, one.field))], key=_score)
 
 
 def _score(one: Hypothesis) -> float:

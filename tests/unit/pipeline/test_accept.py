@@ -121,7 +121,7 @@ def test_what_is_damaged_is_left_out_where_the_others_fit_better(
     monkeypatch.setattr(f"{stage}._plane_of_most", lambda *_: None)
     monkeypatch.setattr(f"{stage}.at_full_size", lambda registration: registration)
     aligner = Aligner.of([], OPTIONS, NO_CACHE)
-    monkeypatch.setattr(f"{stage}.Aligner.of", lambda *_: aligner)
+    monkeypatch.setattr(f"{stage}.Aligner.of", lambda *_, **__: aligner)
     monkeypatch.setattr(f"{stage}.RefusedError", RegistrationError)
     nowhere: Any = None
     if left_out is None:
