@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -11,11 +12,12 @@ from rdstitch.alignment.bundle_adjustment import (
     BundleAdjustmentResult,
     FreeParameters,
     Parameters,
+    sigma_of,
 )
 from rdstitch.alignment.camera_priors import CameraPriors
 from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.initialization import MAX_ITERATIONS, adjust_pairs_independently
-from rdstitch.alignment.link_equations import whitened_errors
+from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.metric_upgrade import metric_upgrade
 from rdstitch.alignment.motion_models import (
     HOMOGRAPHY,
@@ -50,8 +52,8 @@ _TILT_SPREAD_START = math.radians(3.0)
 _MIN_TILT_SPREAD = math.radians(0.05)
 _TILT_SPREAD_ROUNDS = 3
 
-_SETTLED_OVERDISPERSION = 1.5
-"""Times by which the overdispersion of a model's errors may exceed that of the links without a second adjustment."""
+_MISFIT = 1.5
+"""Times the errors of links on their own from which on those of a model are its own."""
 
 
 @dataclass(frozen=True)
@@ -136,19 +138,27 @@ class Problem:
         return self.adjuster(model).squared(parameters)
 
     def refine(self, model: MotionModel, start: Parameters, tilt_spread: float | None = None) -> Fit:
-        """Adjust a model from a given start; again where its errors count for less than was thought.
+        """Adjust a model from a given start; again where its errors count for less than those of links do.
 
         What neighbours share in the errors belongs to the model: where that is large, priors count for more.
         """
         fit = self._refined(model, start, tilt_spread)
         adjusted, observations = fit.adjusted, self.observations
+        if adjusted.sigma <= _MISFIT * self._link_sigma:
+            return replace(fit, overdispersion=self.overdispersion)
         errors = whitened_errors(observations, adjusted.homographies, adjusted.parameters.lens)
         inliers = adjusted.squared <= (ALIGNMENT_WIDTH * adjusted.sigma) ** 2
         shared = coherence(observations, errors, inliers).overdispersion
-        if shared <= _SETTLED_OVERDISPERSION * self.overdispersion:
+        if shared <= self.overdispersion:
             return replace(fit, overdispersion=self.overdispersion)
         again = replace(self, overdispersion=shared)._refined(model, adjusted.parameters, fit.tilt_spread or None)
         return replace(again, overdispersion=shared)
+
+    @cached_property
+    def _link_sigma(self) -> float:
+        """Standard deviation of a coordinate of the errors of links on their own, pixels."""
+        squared = squared_lengths(whitened_errors(self.observations, self.homographies, self.lens))
+        return sigma_of(squared[self.observations.scale_inliers_mask])
 
     def _refined(self, model: MotionModel, start: Parameters, tilt_spread: float | None) -> Fit:
         if model is POSE and self.camera_priors.attitudes_std is None:
