@@ -11,6 +11,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
+from rdstitch.file_access import canonical_text
 from rdstitch.inputs.source import Source
 from rdstitch.orientation import turning_matrix
 from rdstitch.planar_motion import rotation_from_tilt, tilt_from_normal
@@ -104,7 +105,7 @@ def _read_rows(file: str | Path) -> dict[str, tuple[float, float]]:
         raise InputError(f"{file}: has no column {missing[0]!r}; its first line must be {','.join(_TILT_COLUMNS)}")
     attitudes: dict[str, tuple[float, float]] = {}
     for row in rows:
-        name = row["name"] or ""
+        name = canonical_text(row["name"] or "")
         try:
             psi, theta = (math.radians(float(row[column])) for column in _TILT_COLUMNS[1:])
         except (TypeError, ValueError):
@@ -205,7 +206,7 @@ def _by_name(lines: Sequence[str], file: str | Path) -> dict[str, float]:
         if not name or not _is_number(time):
             wanted = f"a table with the columns {','.join(_TIME_COLUMNS)}, lines TIMESTAMP NAME, or one time a line"
             raise InputError(f"{file}: found the time {time!r} for the name {name!r}; give {wanted}")
-        times[Path(name).name] = float(time)
+        times[canonical_text(Path(name).name)] = float(time)
     return times
 
 
