@@ -27,7 +27,8 @@ from rdstitch.division_model import (
     undistort,
 )
 from rdstitch.errors import ArgumentError, ImpossibleCameraError
-from rdstitch.orientation import turned_size, turning_matrix
+from rdstitch.orientation import SIDEWAYS, turned_size, turning_matrix
+from rdstitch.planar_motion import turned_tilt
 
 FILE_VERSION = 2
 """Of camera files; version 1 had λ and μ only, as ``lambda`` and ``lambda2``."""
@@ -304,7 +305,7 @@ class Camera:
         return replace(self, image_size=image_size, center=center, focal=focal, focal_std=std)
 
     def turned(self, orientation: int) -> Self:
-        """The same lens on the picture after an EXIF orientation: centre, size and covariances are turned with it."""
+        """The same camera on the picture after an EXIF orientation: what has a direction is turned with it."""
         if orientation == 1:
             return self
         matrix, size = turning_matrix(orientation), turned_size(self.image_size, orientation)
@@ -314,7 +315,12 @@ class Camera:
             lens = np.eye(len(LENS_PARAMETERS))
             lens[3:, 3:] = matrix
             covariance = tuple(map(tuple, (lens @ np.array(covariance) @ lens.T).tolist()))
-        return replace(self, image_size=size, center=(x, y), lens_covariance=covariance)
+        tilt, std = self.tilt, self.tilt_std
+        if tilt is not None:
+            tilt = turned_tilt(tilt, matrix)
+        if std is not None and orientation in SIDEWAYS:
+            std = std[1], std[0]
+        return replace(self, image_size=size, center=(x, y), lens_covariance=covariance, tilt=tilt, tilt_std=std)
 
     def as_dict(self) -> dict[str, Any]:
         """Everything known of the camera as plain values, the content of a camera file."""

@@ -8,8 +8,9 @@ import errno
 import os
 import re
 import stat
+import unicodedata
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from importlib import import_module
 from io import BufferedReader, BytesIO
@@ -23,6 +24,22 @@ _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 _LOCAL = ("file", "local")  # schemes of what is on this machine
 _SEVERAL = "::"  # between the parts of a chain, as in simplecache::s3://bucket/name
 _held: ContextVar[tuple[str, bytes] | None] = ContextVar("held", default=None)
+
+
+def canonical_name(name: str | Path) -> str:
+    """A file's name as one text, whatever the locale makes of its bytes and however its accents are composed."""
+    try:
+        data = os.fsencode(name)
+    except UnicodeEncodeError:
+        return canonical_text(str(name))
+    return unicodedata.normalize("NFC", data.decode("utf-8", "surrogateescape"))
+
+
+def canonical_text(name: str) -> str:
+    """The same for a name that a text file holds, which may have been written where its bytes meant nothing."""
+    with suppress(UnicodeEncodeError):  # halves of characters, in a damaged file
+        name = name.encode("utf-8", "surrogateescape").decode("utf-8", "surrogateescape")
+    return unicodedata.normalize("NFC", name)
 
 
 def is_url(path: str | Path) -> bool:

@@ -45,6 +45,13 @@ def tilt_from_normal(normal: ArrayLike) -> FloatArray:
     return np.stack([np.arctan2(-y, z), np.arcsin(np.clip(x, -1.0, 1.0))], axis=-1)
 
 
+def turned_tilt(tilt: tuple[float, float], turning: FloatArray) -> tuple[float, float]:
+    """The tilt (ψ, θ), radians, of a picture whose directions, to the right and down, are turned by a matrix (2, 2)."""
+    *direction, ahead = rotation_from_tilt(tilt)[:, 2]
+    psi, theta = tilt_from_normal([*turning @ direction, ahead]).tolist()
+    return psi, theta
+
+
 @dataclass(frozen=True)
 class PlanarMotion:
     """Motion between two pictures of one camera over one plane.

@@ -11,7 +11,7 @@ from functools import cache, partial
 from pathlib import Path
 
 from rdstitch.errors import InputError
-from rdstitch.file_access import is_url, read_limited, remote_names
+from rdstitch.file_access import canonical_name, canonical_text, is_url, read_limited, remote_names
 from rdstitch.inputs.frame import Frame, Named, files_of
 from rdstitch.inputs.keyframes import wanted_frames
 from rdstitch.inputs.rosbag import extract_images, is_bag
@@ -341,6 +341,7 @@ def is_rdstitch_output(path: Path) -> bool:
     """Whether rdstitch wrote this picture: the sidecar beside it says so, and means this one."""
     try:
         record = json.loads(read_limited(path.with_name(path.name + ".json"), MAX_FILE))
-        return bool(record["format"] == "rdstitch sidecar" and record["output"]["file"] == path.name)
+        own = record["format"] == "rdstitch sidecar"
+        return own and canonical_text(str(record["output"]["file"])) == canonical_name(path.name)
     except (OSError, ValueError, TypeError, LookupError, RecursionError):
         return False

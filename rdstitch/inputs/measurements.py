@@ -11,9 +11,10 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
+from rdstitch.file_access import canonical_text
 from rdstitch.inputs.source import Source
 from rdstitch.orientation import turning_matrix
-from rdstitch.planar_motion import rotation_from_tilt, tilt_from_normal
+from rdstitch.planar_motion import tilt_from_normal, turned_tilt
 from rdstitch.records import read_text
 
 XMP = "xmp"
@@ -77,16 +78,7 @@ def _of_table(sources: Sequence[Source], file: str | Path) -> list[tuple[float, 
     for source in sources:
         if source.name not in table:
             raise InputError(f"{file}: has no line for {source.name}; add one with its psi and theta")
-    return [_in_upright(table[source.name], source.metadata.orientation) for source in sources]
-
-
-def _in_upright(tilt: tuple[float, float], orientation: int) -> tuple[float, float]:
-    """The tilt of a camera, whose axes are those of the stored picture, in the axes of the upright one."""
-    if orientation == 1:
-        return tilt
-    *direction, ahead = rotation_from_tilt(tilt)[:, 2]
-    psi, theta = tilt_from_normal([*turning_matrix(orientation) @ direction, ahead]).tolist()
-    return psi, theta
+    return [turned_tilt(table[source.name], turning_matrix(source.metadata.orientation)) for source in sources]
 
 
 def _read_table(file: str | Path) -> dict[str, tuple[float, float]]:
@@ -104,7 +96,7 @@ def _read_rows(file: str | Path) -> dict[str, tuple[float, float]]:
         raise InputError(f"{file}: has no column {missing[0]!r}; its first line must be {','.join(_TILT_COLUMNS)}")
     attitudes: dict[str, tuple[float, float]] = {}
     for row in rows:
-        name = row["name"] or ""
+        name = canonical_text(row["name"] or "")
         try:
             psi, theta = (math.radians(float(row[column])) for column in _TILT_COLUMNS[1:])
         except (TypeError, ValueError):
@@ -205,7 +197,7 @@ def _by_name(lines: Sequence[str], file: str | Path) -> dict[str, float]:
         if not name or not _is_number(time):
             wanted = f"a table with the columns {','.join(_TIME_COLUMNS)}, lines TIMESTAMP NAME, or one time a line"
             raise InputError(f"{file}: found the time {time!r} for the name {name!r}; give {wanted}")
-        times[Path(name).name] = float(time)
+        times[canonical_text(Path(name).name)] = float(time)
     return times
 
 

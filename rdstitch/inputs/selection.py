@@ -6,6 +6,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from rdstitch.errors import ArgumentError, InputError
+from rdstitch.file_access import canonical_name
 from rdstitch.inputs.find import PICTURE_SUFFIXES
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.source import Source
@@ -50,7 +51,8 @@ def is_selected(frame: Frame, exclude: Sequence[str], include_only: Sequence[str
 
 
 def _fits(frame: Frame, pattern: str) -> bool:
-    names = frame.path.name, str(frame.path)
+    names = canonical_name(frame.path.name), canonical_name(frame.path)
+    pattern = canonical_name(pattern)
     return pattern in names or any(fnmatchcase(name, pattern) for name in names)
 
 
@@ -73,10 +75,12 @@ def with_masks(sources: Sequence[Source], masks: str | Path | None) -> list[Sour
         return list(sources)
     path = Path(masks)
     several = path.is_dir()
-    by_stem = _by_stem(path) if several else dict.fromkeys((source.path.stem for source in sources), path)
+    by_stem = (
+        _by_stem(path) if several else dict.fromkeys((canonical_name(source.path.stem) for source in sources), path)
+    )
     masked = []
     for source in sources:
-        mask, frame = by_stem.get(source.path.stem), None
+        mask, frame = by_stem.get(canonical_name(source.path.stem)), None
         if mask is not None:
             if mask.resolve() == source.path.resolve():
                 raise InputError(f"{mask}: is the picture itself, not its mask; masks lie in another folder")
@@ -96,7 +100,7 @@ def _by_stem(folder: Path) -> Mapping[str, Path]:
         raise InputError(f"{folder}: cannot read the folder: {error.strerror}") from error
     masks: dict[str, Path] = {}
     for path in files:
-        other = masks.setdefault(path.stem, path)
+        other = masks.setdefault(canonical_name(path.stem), path)
         if other != path:
             raise InputError(f"{path}: {other.name} is a mask for the same picture; remove one of them")
     return masks

@@ -13,7 +13,7 @@ from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError, LimitError, RdstitchError
 from rdstitch.features.options import WORK_MEGAPIXELS
 from rdstitch.features.picture import View, halving
-from rdstitch.file_access import held_in_memory, is_url
+from rdstitch.file_access import canonical_name, held_in_memory, is_url
 from rdstitch.inputs.decoded_image_cache import DecodedImageCache
 from rdstitch.inputs.frame import Frame, Named
 from rdstitch.inputs.input_guard import InputGuard
@@ -67,8 +67,8 @@ class Source:
 
     @property
     def name(self) -> str:
-        """File name, for messages and reports."""
-        return self.path.name
+        """File name, for messages, reports and tables, the same in every locale."""
+        return canonical_name(self.path.name)
 
     @property
     def down(self) -> tuple[float, float, float] | None:

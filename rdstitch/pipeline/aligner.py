@@ -15,6 +15,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.cache import Cache
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationError
+from rdstitch.file_access import canonical_name
 from rdstitch.inputs.measurements import positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import neighbours
@@ -288,7 +289,7 @@ def _reference(sources: Sequence[Source], name: str | None) -> int | None:
     if name is None:
         return None
     for index, source in enumerate(sources):
-        if name in (source.name, str(source.path)):
+        if canonical_name(name) in (source.name, canonical_name(source.path)):
             return index
     raise ArgumentError(f"the reference picture {name!r} is not among the input pictures")
 

@@ -13,6 +13,7 @@ import numpy as np
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, InputError, OutputError, PartialResultError
+from rdstitch.file_access import canonical_name, canonical_text
 from rdstitch.inputs.find import found_pictures
 from rdstitch.inputs.frame import ChannelOrder, Frame, Images, as_inputs, files_of
 from rdstitch.inputs.input_guard import InputGuard
@@ -204,8 +205,8 @@ def _match(saved: SavedRegistration, frames: Sequence[Frame], match: MatchBy) ->
     """For each picture of the registration the frame that takes its place, and by what it was found."""
     # Arrays have no names of their own.
     if match != "order" and any(frame.picture is None for frame in frames):
-        for key in (attrgetter("name"), attrgetter("stem")):
-            chosen = _by_name(saved, frames, key)
+        for part in ("name", "stem"):
+            chosen = _by_name(saved, frames, attrgetter(part))
             if any(frame is not None for frame in chosen):
                 return chosen, "name"
     if match == "name":
@@ -215,11 +216,11 @@ def _match(saved: SavedRegistration, frames: Sequence[Frame], match: MatchBy) ->
 
 
 def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[Path], str]) -> list[Frame | None]:
-    files = {key(frame.path): frame for frame in frames}
-    given = Counter(key(frame.path) for frame in frames)
-    names = [None if picture.to_plane is None else key(Path(picture.name)) for picture in saved.pictures]
+    given = [canonical_name(key(frame.path)) for frame in frames]
+    files, counts = dict(zip(given, frames, strict=True)), Counter(given)
+    names = [None if p.to_plane is None else canonical_text(key(Path(p.name))) for p in saved.pictures]
     for name, count in Counter(names).items():
-        if name is not None and name in files and (count > 1 or given[name] > 1):
+        if name is not None and name in files and (count > 1 or counts[name] > 1):
             raise InputError(f"{saved.path}: several pictures are called {name}; give all in the old order and say so")
     return [None if name is None else files.get(name) for name in names]
 

@@ -177,8 +177,8 @@ def _outputs(sources: Sequence[Source], folder: Path, image_format: ImageFormat 
 def _output_name(source: Source, image_format: ImageFormat | None) -> str:
     in_memory = source.frame is not None and source.frame.picture is not None
     if image_format is None and not in_memory and source.path.suffix.lower() in PICTURE_SUFFIXES:
-        return source.name
-    stem = source.name if in_memory else source.path.stem
+        return source.path.name
+    stem = source.path.name if in_memory else source.path.stem
     return f"{stem}.{image_format or ('png' if _fits_png(source) else 'tif')}"
 
 

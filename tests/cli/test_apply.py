@@ -1,8 +1,13 @@
 """``rdstitch apply``, run for real."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
+import unicodedata
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -187,3 +192,37 @@ def test_never_writes_over_the_sidecar_that_it_applies(
     assert _sidecar(own).read_bytes() == _sidecar(stitched).read_bytes()
     assert _apply(rdstitch, _sidecar(stitched), frames[0].parent, own).status == 6
     assert _apply(rdstitch, _sidecar(stitched), frames[0].parent, own, "--overwrite").status == 0
+
+
+_LATIN = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "latin-1"}
+_UTF8 = {"LC_ALL": "C", "PYTHONUTF8": "1"}
+
+
+def _run(locale: dict[str, str], *arguments: str) -> str:
+    command = [sys.executable, "-m", "rdstitch_cli", *arguments]
+    done = subprocess.run(command, capture_output=True, env={**os.environ, **locale}, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stderr.decode("latin-1")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are bytes")
+@pytest.mark.parametrize("written", [_LATIN, _UTF8], ids=["ascii", "utf-8"])
+@pytest.mark.parametrize("composed", ["NFC", "NFD"])
+def test_names_match_whatever_the_locale(
+    frames: list[Path], tmp_path: Path, written: dict[str, str], composed: Literal["NFC", "NFD"]
+) -> None:
+    names = [f"gr\u00fcn_{k}.png" for k in range(3)]
+    forms: list[tuple[str, Literal["NFC", "NFD"]]] = [("a", "NFC"), ("b", composed)]
+    for folder, form in forms:
+        (tmp_path / folder).mkdir()
+        for frame, name in zip(frames, names, strict=True):
+            data = unicodedata.normalize(form, name).encode()
+            shutil.copy(frame, tmp_path / folder / os.fsdecode(data))
+    read = _UTF8 if written is _LATIN else _LATIN
+    options = ("--max-features", "600", "-j", "1")
+    _run(written, "mosaic", str(tmp_path / "a"), "-o", str(tmp_path / "out.tif"), *options)
+    said = _run(read, "apply", f"{tmp_path}/out.tif.json", "--images", str(tmp_path / "b"), "-o", f"{tmp_path}/new.tif")
+    assert "taken in order" not in said
+    saved = json.loads((tmp_path / "new.tif.json").read_text(encoding="utf-8"))
+    assert saved["applied"]["matched"] == "name"
+    assert [image["name"] for image in saved["images"]] == names

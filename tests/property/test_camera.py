@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 from rdstitch.camera import Camera
 from rdstitch.division_model import distort, undistort, valid_radius
 from rdstitch.errors import ArgumentError, InputError
+from rdstitch.orientation import inverse, turned, turning_matrix
+from rdstitch.planar_motion import rotation_from_tilt
 
 coordinates = st.floats(-1.0, 1.0, allow_subnormal=False)
 distortions = st.floats(-0.95, 0.45)
@@ -62,6 +64,26 @@ def test_a_resized_picture_shows_the_same_rays() -> None:
     np.testing.assert_allclose((corner + 0.5) / 2 - 0.5, small.undistort([-0.5, -0.5]))
     assert small.focal == 350.0
     assert small.distortion == camera.distortion
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_camera_turns_with_its_picture(orientation: int) -> None:
+    camera = Camera((800, 600), -0.3, center=(410.0, 290.0), tilt=(0.1, -0.05), tilt_std=(0.01, 0.02))
+    upright = camera.turned(orientation)
+    rows, columns = np.mgrid[0:600, 0:800].astype(float)
+    # Where the image of a pixel's own coordinates says that it came from.
+    u, v = (turned(samples, orientation) for samples in (columns, rows))
+    assert upright.image_size == u.shape[::-1]
+    x, y = np.round(upright.center).astype(int)
+    assert (u[y, x], v[y, x]) == (410.0, 290.0)
+    back = upright.turned(inverse(orientation))
+    assert upright.tilt is not None
+    assert back.tilt is not None
+    down = rotation_from_tilt(upright.tilt)[:, 2]
+    expected = turning_matrix(orientation) @ rotation_from_tilt((0.1, -0.05))[:2, 2]
+    np.testing.assert_allclose(down[:2], expected, atol=1e-12)
+    np.testing.assert_allclose(back.tilt, (0.1, -0.05), atol=1e-12)
+    assert (back.image_size, back.center, back.tilt_std) == (camera.image_size, camera.center, camera.tilt_std)
 
 
 @pytest.mark.parametrize(

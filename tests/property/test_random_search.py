@@ -9,6 +9,7 @@ import pytest
 
 @pytest.mark.slow
 def test_properties_hold_for_random_examples() -> None:
-    command = [sys.executable, "-m", "pytest", "--quiet", "--hypothesis-profile", "search", "-p", "no:cacheprovider"]
+    command = [sys.executable, "-m", "pytest", "--quiet", "-m", "hypothesis", "-p", "no:cacheprovider"]
+    command += ["--hypothesis-profile", "search"]
     done = subprocess.run([*command, Path(__file__).parent], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-4000:]
