@@ -40,7 +40,7 @@ _CELL_SIGMA = 0.03  # how well fields can explain the means of a cell, log units
 # distance of the first by the third, in pictures.
 _OWN_SIGMA, _FIELD_SIGMA = 0.02, 0.3
 _RISE_SIGMA, _BEND_SIGMA = 0.1, 0.5
-_TUKEY = 4.685  # standard deviations from which on an error counts for nothing: 95 % efficient for Gaussian ones
+_TUKEY = 3.0  # standard deviations from which on an error counts for nothing: much of an overlap may be other content
 _VISIBLE = 0.004  # log units, a grey level of a light sample: differences below are as good as none
 _ROUNDS = 6
 # A model with more freedom must explain the data better by this share to be taken.
@@ -115,11 +115,10 @@ class _Differences:
         return cls(cells, offset, log[0] - log[1], np.sqrt((cells.values.mean(axis=-1) + offset).prod(axis=0)))
 
     def misfit(self, errors: FloatArray) -> float:
-        """Mean over the overlaps of the median difference that is left, share of the full range."""
+        """Geometric mean of what is left, share of the full range: content that differs hardly counts."""
         floor = _VISIBLE * float(np.median(self.cells.values))
         size = np.hypot(np.abs(errors).max(axis=1) * self.level, floor)
-        medians = _medians(size[:, None], self.cells.pair, self.cells.clear)
-        return float(medians[medians > 0.0].mean())
+        return float(np.exp(np.log(size[self.cells.clear]).mean()))
 
 
 def _fit(data: _Differences, pictures: Sequence[PlacedPicture]) -> tuple[Exposure, FloatArray]:

@@ -135,8 +135,8 @@ def find_seams(
     width, height = survey.canvas.size
     labels = np.full((height, width), NO_OWNER, dtype=np.int32)
     weights = np.zeros((height, width), dtype=np.float32)
-    channels = next((t.pixels.shape[2] for t in survey.tiles if t is not None), 1)
-    composite = np.zeros((height, width, channels), dtype=np.float32) if graphcut else None
+    shown = next((tile.pixels for tile in survey.tiles if tile is not None), np.zeros((0, 0, 1), np.uint8))
+    composite = np.zeros((height, width, shown.shape[2]), dtype=shown.dtype) if graphcut else None
     for index, tile in enumerate(survey.tiles):
         if tile is not None:
             x0, y0, x1, y1 = tile.box
@@ -146,8 +146,7 @@ def find_seams(
             if composite is None:
                 won = tile.inside & (weight > weights[cut])
             else:
-                corrected = exposure.correct(index, geometry, tile.pixels)
-                pixels = corrected * np.float32(1.0 / full_scale(corrected.dtype))
+                pixels = exposure.correct(index, geometry, tile.pixels)
                 apart = survey.canvas.period is not None
                 shares = weight / np.maximum(weight + weights[cut], np.float32(1e-12))
                 won = _cut(tile.inside, pixels, composite[cut], labels[cut] != NO_OWNER, shares, apart=apart)
@@ -161,8 +160,8 @@ def find_seams(
 
 def _cut(
     inside: NDArray[np.bool_],
-    pixels: Float32Array,
-    below: Float32Array,
+    pixels: NDArray[Any],
+    below: NDArray[Any],
     covered: NDArray[np.bool_],
     share: Float32Array,
     *,
@@ -186,7 +185,7 @@ def _cut(
     won = surely_new.copy()
     for part in _parts(free) if apart else [_around(free)]:
         masks = [(free | sure)[part].astype(np.uint8) * np.uint8(255) for sure in (surely_old, surely_new)]
-        won[part] |= free[part] & _graph_cut(_visibility(pixels[part] - below[part]), masks)
+        won[part] |= free[part] & _graph_cut(_visibility(pixels[part], below[part]), masks)
     return won
 
 
@@ -210,11 +209,12 @@ def _around(free: NDArray[np.bool_]) -> tuple[slice, slice]:
     )
 
 
-def _visibility(difference: Float32Array) -> Float32Array:
-    """How much a seam shows at each pixel (h, w): the square of what the images differ by in brightness and in edges.
+def _visibility(first: NDArray[Any], second: NDArray[Any]) -> Float32Array:
+    """How much a seam shows at each pixel (h, w): the square of what two images differ by in brightness and in edges.
 
     One broken edge shows more than many small differences.
     """
+    difference = (first.astype(np.float32) - second) * np.float32(1.0 / full_scale(first.dtype))
     grey = np.ascontiguousarray(difference.mean(axis=-1))
     edges = sum(np.abs(cv2.Sobel(grey, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=_EDGES / 8)) for dx in (1, 0))
     return np.asarray((_VISIBLE * np.minimum(np.abs(difference).mean(axis=-1) + edges, 1.0)) ** 2, dtype=np.float32)

@@ -180,12 +180,12 @@ def test_what_only_one_picture_shows_colours_nothing(share: float, noise: float)
     assert (same[0] | same[1]).all()
 
 
-@pytest.mark.parametrize("people", [0, 6])
-def test_gains_are_found_among_what_moved(people: int) -> None:
+@pytest.mark.parametrize(("seed", "people"), [(0, 0), (2, 6), (3, 6), (4, 6)])
+def test_gains_are_found_among_what_moved(seed: int, people: int) -> None:
     """Patches of other colours, a seventh of each picture, hardly change what is found for true gains."""
-    rng, gains = np.random.default_rng(9), np.random.default_rng(0).uniform(0.7, 1.3, 9)
+    rng, gains = np.random.default_rng(9 + seed), np.random.default_rng(seed).uniform(0.7, 1.3, 9)
     light = Photometry(gain=gains, vignetting=0.4, noise=0.004)
-    scene = render(3, 3, size=(360, 270), photometry=light, seed=0)
+    scene = render(3, 3, size=(360, 270), photometry=light, seed=seed)
     frames = [frame.copy() for frame in scene.frames]
     for frame in frames:
         for x, y in rng.integers(0, (310, 210), (people, 2)):
@@ -193,7 +193,7 @@ def test_gains_are_found_among_what_moved(people: int) -> None:
     sources = [partial(as_picture, frame) for frame in frames]
     placed = place_pictures(sources, scene.cameras, scene.homographies)
     exposure = compose(placed, scene.canvas, CompositeOptions(exposure="gain")).exposure
-    assert np.std(exposure.log_gain.mean(axis=1) - np.log(gains)) < 0.01
+    assert np.std(exposure.log_gain.mean(axis=1) - np.log(gains)) < 0.005
     np.testing.assert_allclose(np.exp(exposure.vignetting.sum()), 1 - 0.4, atol=0.05)
 
 
