@@ -6,7 +6,6 @@ be the identity, within what the links' covariances allow. After it, by the erro
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.link_equations import split_lens
@@ -14,6 +13,7 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.matching.thinning import spread_choice
 from rdstitch.radial_homography import transfer_jacobian
+from rdstitch.scipy_parts import sparse
 
 _PROBES = 6
 """Points of a link that are transferred round each triangle."""

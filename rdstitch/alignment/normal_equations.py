@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from rdstitch.alignment.link_equations import LinkEquations
 from rdstitch.alignment.motion_models import ModelMatrices, inverses
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.pose_blocks import PoseBlocks
 from rdstitch.arrays import FloatArray
+from rdstitch.scipy_parts import sparse, sparse_linalg
 
 _LEAST_DAMPING = 1e-12
 """Relative to the diagonal: what makes poses solvable that nothing holds."""
@@ -39,7 +38,7 @@ class SparseNormalEquations:
     """
 
     blocks: PoseBlocks
-    poses: sparse.csc_array
+    poses: "sparse.csc_array"
     coupling: FloatArray
     shared: FloatArray
     gradient_poses: FloatArray
@@ -103,7 +102,9 @@ class SparseNormalEquations:
         diagonal = self.poses.data[self.blocks.diagonal]
         floor = max(float(diagonal.max()), 1e-300) * 1e-14
         damped = self.blocks.with_diagonal(self.poses, damping * diagonal + floor)
-        factor = splu(damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        factor = sparse_linalg.splu(
+            damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
         solved = factor.solve(right)
         return self.shared - self.coupling.T @ solved[:, : self.coupling.shape[1]], solved
 

@@ -8,11 +8,11 @@ correlation gives the number of independent observations, which is smaller than 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.result import ReliefTest
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.scipy_parts import spatial
 
 _CELLS = (2, 3, 4)
 """Cells per side of a link's overlap within which errors are added up; the worst counts."""
@@ -84,7 +84,7 @@ def neighbours(observations: Observations, inliers: BoolArray) -> tuple[IntArray
     apart = np.column_stack([observations.points1[chosen], observations.link[chosen] * 10.0])
     if len(apart) < 2:
         return chosen[:0], chosen[:0]
-    nearby = cKDTree(apart).query(apart, k=min(4, len(apart)))
+    nearby = spatial.cKDTree(apart).query(apart, k=min(4, len(apart)))
     distance, neighbour = np.asarray(nearby[0]), np.asarray(nearby[1])
     pairs = (distance[:, 1:] > _MIN_DISTANCE) & (distance[:, 1:] < _MAX_DISTANCE)
     found = pairs.any(axis=1)

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from scipy import sparse
 
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.scipy_parts import sparse
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +55,12 @@ class PoseBlocks:
         indices = entries % max(total, 1)
         return cls(column, total, kept, own, indices.astype(np.int32), indptr.astype(np.int32), diagonal)
 
-    def matrix(self, local: FloatArray) -> sparse.csc_array:
+    def matrix(self, local: FloatArray) -> "sparse.csc_array":
         """The sum of blocks (L, 2 D, 2 D)."""
         data: FloatArray = np.bincount(self.place, local[self.kept], minlength=len(self.indices)).astype(np.float64)
         return self._of(data)
 
-    def with_diagonal(self, matrix: sparse.csc_array, added: FloatArray) -> sparse.csc_array:
+    def with_diagonal(self, matrix: "sparse.csc_array", added: FloatArray) -> "sparse.csc_array":
         """A matrix of this pattern with something (F,) added to its diagonal."""
         data = matrix.data.copy()
         data[self.diagonal] += added
@@ -72,5 +72,5 @@ class PoseBlocks:
         np.add.at(total, self.column, values)
         return total[:-1]
 
-    def _of(self, data: FloatArray) -> sparse.csc_array:
+    def _of(self, data: FloatArray) -> "sparse.csc_array":
         return sparse.csc_array((data, self.indices, self.indptr), shape=(self.free, self.free))

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, Parameters
@@ -24,6 +23,7 @@ from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
 from rdstitch.division_model import distort, undistort
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
+from rdstitch.scipy_parts import linalg
 
 _STEP = 1e-4
 """Of differences by an effect's size, in units of its own."""
@@ -129,7 +129,7 @@ class Directions:
         derivative = self.adjuster.named_parameters(parameters.shared)[1]
         camera = derivative.T @ (self.adjuster.prior_curvatures(parameters)[:, None] * derivative)
         effects = np.diag([effect.std**-2.0 for effect in self.effects])
-        return np.asarray(block_diag(camera, effects), dtype=np.float64)
+        return np.asarray(linalg.block_diag(camera, effects), dtype=np.float64)
 
 
 def places(found: Directions, cameras: Sequence[Camera], count: int) -> tuple[FloatArray, IntArray]:

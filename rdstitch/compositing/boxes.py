@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import minimum_spanning_tree
 
 from rdstitch.arrays import FloatArray
+from rdstitch.scipy_parts import csgraph, sparse
 
 Box = tuple[int, int, int, int]
 """x0, y0, x1, y1, pixels, end exclusive."""
@@ -115,6 +114,6 @@ def _largest(pairs: NDArray[np.intp], share: FloatArray, count: int, most: int) 
     kept[ranked[rank < most] % len(pairs)] = True
     # Weights above 0, smallest for the largest share.
     weights = sparse.csr_array((2.0 - share, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    tree = minimum_spanning_tree(weights).tocoo()
+    tree = csgraph.minimum_spanning_tree(weights).tocoo()
     kept |= np.isin(pairs @ [count, 1], tree.row.astype(np.intp) * count + tree.col)
     return pairs[kept]

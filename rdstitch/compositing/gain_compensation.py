@@ -15,8 +15,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import LinearOperator, cg
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import Camera
@@ -25,6 +23,7 @@ from rdstitch.compositing.overlap_cells import Cells, compare_overlaps
 from rdstitch.compositing.photometric import Exposure, bilinear_weights, full_scale, no_exposure, squared_radius
 from rdstitch.compositing.placed_picture import PlacedPicture
 from rdstitch.compositing.survey import Survey
+from rdstitch.scipy_parts import sparse, sparse_linalg
 
 _SRGB_OFFSET = 0.055
 # How well the gains of two pictures can explain their overlap, and how far gains stray (log units): keeps long chains
@@ -51,7 +50,7 @@ _MEDIAN_SAMPLES = 400_000  # of all pictures together
 # Residual, as a share of the right side, and decimals that are kept: both far below a grey level.
 _TOLERANCE, _MAX_STEPS, _DECIMALS = 1e-5, 3000, 5
 
-_Prior = tuple[sparse.csr_array, FloatArray, FloatArray]
+_Prior = tuple["sparse.csr_array", FloatArray, FloatArray]
 """Precision (K, K), its product with what is expected (K, C), and the inverse (B, B) of its blocks."""
 
 
@@ -197,7 +196,7 @@ def _evenness() -> FloatArray:
 
 
 def _fit_robustly(
-    cells: Cells, design: sparse.csr_array, weight: FloatArray, values: FloatArray, prior: _Prior
+    cells: Cells, design: "sparse.csr_array", weight: FloatArray, values: FloatArray, prior: _Prior
 ) -> tuple[FloatArray, FloatArray]:
     """Solution (K, C) of ``design x = values`` (M, C) and the errors, by iteratively reweighted least squares."""
     clear = cells.clear
@@ -218,7 +217,7 @@ def _fit_robustly(
 
 
 def _solve(
-    design: sparse.csr_array, weight: FloatArray, values: FloatArray, prior: _Prior, start: FloatArray
+    design: "sparse.csr_array", weight: FloatArray, values: FloatArray, prior: _Prior, start: FloatArray
 ) -> FloatArray:
     """Weighted least squares with a prior, by conjugate gradients, in memory that grows with the number of pictures."""
     precision, expected, inverse = prior
@@ -231,9 +230,13 @@ def _solve(
         return np.asarray((x.reshape(-1, len(inverse)) @ inverse).ravel())
 
     right = design.T @ (weight[:, None] * values) + expected
-    operator, better = (LinearOperator(shape, matvec=apply, dtype=np.float64) for apply in (normal, precondition))
+    operator, better = (
+        sparse_linalg.LinearOperator(shape, matvec=apply, dtype=np.float64) for apply in (normal, precondition)
+    )
     options: dict[str, Any] = {"rtol": _TOLERANCE, "maxiter": _MAX_STEPS, "M": better}
-    return np.stack([cg(operator, b, x, **options)[0] for b, x in zip(right.T, start.T, strict=True)], axis=1)
+    return np.stack(
+        [sparse_linalg.cg(operator, b, x, **options)[0] for b, x in zip(right.T, start.T, strict=True)], axis=1
+    )
 
 
 def _medians(values: FloatArray, pair: IntArray, which: BoolArray) -> FloatArray:

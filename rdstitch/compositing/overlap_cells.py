@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.compositing.boxes import cut
 from rdstitch.compositing.photometric import full_scale
 from rdstitch.compositing.survey import Survey
+from rdstitch.scipy_parts import sparse
 
 # Along the longest side of a picture or an overlap, and of all overlaps together: of thousands, each needs fewer.
 _CELLS, _MAX_CELLS = 16, 150_000
@@ -44,7 +44,7 @@ class Cells:
     points: FloatArray
     values: FloatArray
     clipped: BoolArray
-    overlap: sparse.csr_array
+    overlap: "sparse.csr_array"
 
     @property
     def clear(self) -> BoolArray:

@@ -9,13 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
-from scipy.spatial.distance import cdist
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.features.keypoints import Correspondences, Features
 from rdstitch.features.nearest import compare, mutual_nearest
+from rdstitch.scipy_parts import distance, spatial
 
 Matcher = Callable[[Features, Features], Correspondences]
 """What matches the features of two pictures: :func:`match`, or a network's."""
@@ -141,7 +140,9 @@ def _within(expected: FloatArray, points: FloatArray, radius: float) -> NDArray[
     places = np.flatnonzero(np.isfinite(expected).all(axis=1))
     if not len(places) or not len(points):
         return np.zeros((0, 2), dtype=np.intp)
-    near = cKDTree(expected[places]).sparse_distance_matrix(cKDTree(points), radius, output_type="coo_matrix")
+    near = spatial.cKDTree(expected[places]).sparse_distance_matrix(
+        spatial.cKDTree(points), radius, output_type="coo_matrix"
+    )
     return np.column_stack([places[near.row], near.col]).astype(np.intp)
 
 
@@ -235,4 +236,4 @@ def _around(features: Features, size: tuple[int, int], points: FloatArray, reach
 def _distances(points: FloatArray, others: FloatArray, size: tuple[int, int]) -> FloatArray:
     """Between all points (N, 2) and all others (M, 2), diagonals of the picture, (N, M)."""
     diagonal = np.hypot(*size)
-    return cdist(points / diagonal, others / diagonal)
+    return distance.cdist(points / diagonal, others / diagonal)

@@ -14,13 +14,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.linalg import LinearOperator, cg
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.local_alignment.field import DisplacementField, bilinear, grid_shape, node_points
 from rdstitch.local_alignment.matches import PicturesOnPlane, PlaneMatches
+from rdstitch.scipy_parts import sparse, sparse_linalg
 
 # Residuals are trusted up to about this many times their median, or their noise where relief makes them larger, but at
 # least so many pixels; at first, up to this percentile of them, then by this factor less from round to round, and as
@@ -137,7 +136,7 @@ def fit_fields(
 
 
 def _solve(
-    design: sparse.csr_array, weight: FloatArray, prior: sparse.csr_array, residual: FloatArray, start: FloatArray
+    design: "sparse.csr_array", weight: FloatArray, prior: "sparse.csr_array", residual: FloatArray, start: FloatArray
 ) -> FloatArray:
     """Both coordinates (nodes, 2) of the fields, from near ones, by conjugate gradients.
 
@@ -150,14 +149,14 @@ def _solve(
         return np.asarray(across @ (weighted * (design @ both)) + prior @ both).ravel()
 
     diagonal = np.repeat(design.power(2).T @ weight + prior.diagonal(), 2)
-    solution, _ = cg(LinearOperator((diagonal.size, diagonal.size), normal, dtype=np.float64),
-                     (across @ (weighted * residual)).ravel(), start.ravel(), rtol=_TOLERANCE, maxiter=_MAX_ITERATIONS,
-                     M=sparse.diags_array(1.0 / diagonal))  # fmt: skip
+    operator = sparse_linalg.LinearOperator((diagonal.size, diagonal.size), normal, dtype=np.float64)
+    solution, _ = sparse_linalg.cg(operator, (across @ (weighted * residual)).ravel(), start.ravel(), rtol=_TOLERANCE,
+                                   maxiter=_MAX_ITERATIONS, M=sparse.diags_array(1.0 / diagonal))  # fmt: skip
     return np.asarray(solution).reshape(-1, 2)
 
 
 def _expected(
-    matches: PlaneMatches, pictures: PicturesOnPlane, design: sparse.csr_array, values: FloatArray
+    matches: PlaneMatches, pictures: PicturesOnPlane, design: "sparse.csr_array", values: FloatArray
 ) -> FloatArray:
     """Pixels (2 M, 2) at which the alignment expects matches, in pictures that are displaced by ``values`` at nodes."""
     sides = sparse.csr_array(
@@ -172,7 +171,7 @@ def _expected(
     return expected
 
 
-def _design(matches: PlaneMatches, pixels: FloatArray, cameras: Sequence[Camera], shapes: Shapes) -> sparse.csr_array:
+def _design(matches: PlaneMatches, pixels: FloatArray, cameras: Sequence[Camera], shapes: Shapes) -> "sparse.csr_array":
     """What all nodes do to the residuals of matches at pixels (2 M, 2): four in either picture, shape (M, nodes)."""
     first = _first_nodes(shapes)
     columns, entries = np.empty((len(pixels), 4), dtype=np.int32), np.empty((len(pixels), 4))
@@ -190,7 +189,7 @@ def _first_nodes(shapes: Shapes) -> NDArray[np.intp]:
 
 
 @lru_cache(maxsize=8)
-def _smoothness(shape: tuple[int, int], image_size: tuple[int, int], stiffness: Stiffness) -> sparse.csr_array:
+def _smoothness(shape: tuple[int, int], image_size: tuple[int, int], stiffness: Stiffness) -> "sparse.csr_array":
     """Precision of one picture's nodes, for residuals in units of their robust scale: a membrane and a thin plate."""
     rows, columns = shape
     spacing, fade = max(image_size) / stiffness.cells, _FADE * max(image_size)

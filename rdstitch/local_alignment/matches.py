@@ -8,11 +8,11 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.radial_homography import from_plane, to_plane
+from rdstitch.scipy_parts import spatial
 
 # Matches that the alignment expects farther away than this share of the picture's diagonal are taken to be wrong; where
 # the ground rises by a tenth of the camera's height, and the alignment is that of the valleys, right ones are nearly as
@@ -115,7 +115,7 @@ class PlaneMatches:
         found = np.empty(len(self), dtype=np.intp)
         for start, stop in pairwise(first.tolist()):
             points = self.points[start:stop, 0]
-            nearest = np.asarray(cKDTree(points).query(points, k=2)[1])[:, 1]
+            nearest = np.asarray(spatial.cKDTree(points).query(points, k=2)[1])[:, 1]
             found[start:stop] = start + np.minimum(nearest, len(points) - 1)
         return found
 

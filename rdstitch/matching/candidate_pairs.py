@@ -10,14 +10,13 @@ from itertools import combinations, islice
 from typing import Protocol, TypeVar
 
 import numpy as np
-from scipy import sparse
-from scipy.spatial import KDTree
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.matching.retrieval import Similarity, similarity
 from rdstitch.radial_homography import to_plane
+from rdstitch.scipy_parts import sparse, spatial
 
 EXHAUSTIVE_UP_TO = 30
 """Number of pictures up to which every pair is tried."""
@@ -108,7 +107,7 @@ def _nearest_positions(positions: FloatArray) -> set[tuple[int, int]]:
     if len(known) < 2:
         return set()
     places = positions[known]
-    nearest = KDTree(places).query(places, k=min(_NEAREST + 1, len(known)))[1].reshape(len(known), -1)
+    nearest = spatial.KDTree(places).query(places, k=min(_NEAREST + 1, len(known)))[1].reshape(len(known), -1)
     pairs = np.sort(np.stack([np.repeat(known, nearest.shape[1]), known[nearest.ravel()]], axis=1), axis=1)
     return {(i, j) for i, j in pairs.tolist() if i != j}
 
@@ -164,7 +163,7 @@ def neighbours(cameras: Sequence[Camera], homographies: FloatArray, tried: set[t
         return []
     boxes = footprints[known]
     centres = boxes.mean(axis=1)
-    nearest = KDTree(centres).query(centres, k=min(_NEIGHBOURS + 1, len(known)))[1].reshape(len(known), -1)
+    nearest = spatial.KDTree(centres).query(centres, k=min(_NEIGHBOURS + 1, len(known)))[1].reshape(len(known), -1)
     partners: dict[int, set[int]] = {}
     for i, j in tried:
         partners.setdefault(i, set()).add(j)

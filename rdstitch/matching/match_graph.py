@@ -4,10 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import sparse
-from scipy.sparse import csgraph
 
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.scipy_parts import csgraph, sparse
 
 
 def connected_components(count: int, image1: ArrayLike, image2: ArrayLike) -> list[list[int]]:
@@ -61,7 +60,7 @@ def spanning_forest(count: int, image1: IntArray, image2: IntArray, weight: Floa
     return np.sort(order[kept.data.astype(np.intp) - 1])
 
 
-def _graph(count: int, image1: ArrayLike, image2: ArrayLike, value: FloatArray) -> sparse.csr_array:
+def _graph(count: int, image1: ArrayLike, image2: ArrayLike, value: FloatArray) -> "sparse.csr_array":
     """One edge a link. Indices are 32-bit, the only ones that csgraph takes before SciPy 1.17."""
     i, j = np.asarray(image1, dtype=np.int32), np.asarray(image2, dtype=np.int32)
     return sparse.csr_array(sparse.coo_array((value, (i, j)), shape=(count, count)))
@@ -95,7 +94,7 @@ def spanning_tree(
     return SpanningTree(root, step, parent, child)
 
 
-def _centre(tree: sparse.csr_array) -> list[int]:
+def _centre(tree: "sparse.csr_array") -> list[int]:
     """Middle of the longest path of a tree: one node, or two."""
     first = int(csgraph.breadth_first_order(tree, 0, directed=False)[0][-1])
     order, predecessor = csgraph.breadth_first_order(tree, first, directed=False)

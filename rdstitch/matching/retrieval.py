@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.features import Features
 from rdstitch.matching.feature_store import FeatureStore
+from rdstitch.scipy_parts import sparse
 
 _FEATURES_PER_IMAGE = 1000  # strongest features that describe a picture
 _DESCRIPTORS_PER_WORD = 16  # few enough that a word is rare, enough that one place on the ground is one word
@@ -59,7 +59,7 @@ class Similarity:
         Whether pictures that follow one another are alike, so that their order means something.
     """
 
-    scores: sparse.csr_array
+    scores: "sparse.csr_array"
     most_alike: IntArray
     peak: BoolArray
     ordered: bool
@@ -123,7 +123,7 @@ def similarity(features: FeatureStore, seed: int) -> Similarity | None:
     return None if weights is None else _compare(weights)
 
 
-def _weighted_words(features: FeatureStore, seed: int) -> sparse.csr_array | None:
+def _weighted_words(features: FeatureStore, seed: int) -> "sparse.csr_array | None":
     """The words of each picture, as unit vectors (N, words); zero for pictures without features."""
     counts = np.minimum(features.counts, _FEATURES_PER_IMAGE)
     total = int(counts.sum())
@@ -168,7 +168,7 @@ def _describing(features: Features) -> Array32:
     return (np.unpackbits(descriptors.astype(np.uint8), axis=1) if features.binary else descriptors).astype(np.float32)
 
 
-def _compare(weights: sparse.csr_array) -> Similarity:
+def _compare(weights: "sparse.csr_array") -> Similarity:
     """Compare all pictures with one another, some rows of the matrix at a time."""
     count = weights.shape[0]
     kept = min(_SHORTLIST, count - 1)
@@ -196,14 +196,14 @@ def _compare(weights: sparse.csr_array) -> Similarity:
     )
 
 
-def _with_shared_neighbours(best: IntArray, excess: FloatArray) -> sparse.csr_array:
+def _with_shared_neighbours(best: IntArray, excess: FloatArray) -> "sparse.csr_array":
     """Similarities (N, N), raised where pictures are alike to the same others."""
     own = _symmetric(best, excess)
     neighbours = _unit_rows(_symmetric(best[:, :_SHARED_NEIGHBOURS], excess[:, :_SHARED_NEIGHBOURS]))
     return sparse.csr_array(own + _SHARED_NEIGHBOUR_WEIGHT * float(np.mean(excess[:, 0])) * (neighbours @ neighbours.T))
 
 
-def _symmetric(columns: IntArray, values: FloatArray) -> sparse.csr_array:
+def _symmetric(columns: IntArray, values: FloatArray) -> "sparse.csr_array":
     """Sparse matrix (N, N) of the values (N, K) at the columns (N, K), or those mirrored, whichever is larger."""
     count, kept = columns.shape
     rows = np.repeat(np.arange(count), kept)
@@ -211,7 +211,7 @@ def _symmetric(columns: IntArray, values: FloatArray) -> sparse.csr_array:
     return sparse.csr_array(matrix.maximum(matrix.T))
 
 
-def _unit_rows(matrix: sparse.csr_array) -> sparse.csr_array:
+def _unit_rows(matrix: "sparse.csr_array") -> "sparse.csr_array":
     """The same with rows of length one; those of zeros stay."""
     length = np.sqrt(np.asarray(matrix.multiply(matrix).sum(axis=1)).ravel())
     return sparse.csr_array(sparse.diags_array((1.0 / np.maximum(length, 1e-12)).astype(matrix.dtype)) @ matrix)

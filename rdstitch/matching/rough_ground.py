@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rdstitch.arrays import BoolArray
 from rdstitch.division_model import undistort
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.scipy_parts import spatial
 from rdstitch.solvers.direct_linear import direct_linear
 
 _NEIGHBOURS = 6
@@ -59,7 +59,7 @@ def _continued(pair: PairRegistration, threshold: float) -> BoolArray:
     """The inliers of a pair together with the matches that continue them, shape (N,)."""
     matched, found = pair.correspondences, pair.relation.inliers
     parallax = matched.points2 - pair.relation.transfer(matched.points1)
-    tree = cKDTree(matched.points1)
+    tree = spatial.cKDTree(matched.points1)
     distances, neighbours = tree.query(matched.points1, k=min(_NEIGHBOURS + 1, len(found)))
     with np.errstate(invalid="ignore"):
         change = np.linalg.norm(parallax[:, None] - parallax[neighbours], axis=2)

@@ -8,13 +8,13 @@ plane moved.
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.matching.static_places import StaticPlaces
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.scipy_parts import spatial
 
 _MIN_PICTURES, _MIN_SHARE = 3, 0.5
 """Pictures, in number and as a share, that pairs which move must connect: two could agree by chance."""
@@ -66,8 +66,8 @@ def static_places(pairs: Sequence[PairRegistration], threshold: float) -> Static
         [np.empty((0, 2)), *(pair.correspondences.points1[_static_matches(pair, threshold)] for pair in pairs)]
     )
     radius = threshold * _MAX_STATIC_MOTION
-    matches = cKDTree(found).query_ball_point(found, radius, return_length=True)
-    return StaticPlaces(cKDTree(found[matches >= _MIN_CONFIRMATIONS]), radius)
+    matches = spatial.cKDTree(found).query_ball_point(found, radius, return_length=True)
+    return StaticPlaces(spatial.cKDTree(found[matches >= _MIN_CONFIRMATIONS]), radius)
 
 
 def _static_matches(pair: PairRegistration, threshold: float) -> BoolArray:

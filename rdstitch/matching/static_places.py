@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rdstitch.features import Correspondences
+from rdstitch.scipy_parts import spatial
 
 
 @dataclass(frozen=True)
@@ -17,13 +17,13 @@ class StaticPlaces:
 
     Attributes
     ----------
-    places : cKDTree
+    places : "spatial.cKDTree"
         Of shape (P, 2), pixels.
     radius : float
         Around a place, and motion of a static match at most, pixels.
     """
 
-    places: cKDTree
+    places: "spatial.cKDTree"
     radius: float
 
     def without_static(self, matched: Correspondences) -> Correspondences:

@@ -140,15 +140,13 @@ def apply(
             composed.place,
             composed.place_reason,
         )
-        if output is not None and not dry_run:
-            return _written(result, output, composed, list(used.values()), outputs)
+        return result if dry_run else _written(result, composed, list(used.values()), outputs)
+
+
+def _written(result: Recomposition, composed: Composed, used: Sequence[Source], outputs: Outputs) -> Recomposition:
+    """The result, with the page and the sidecar written, if the picture went to a file."""
+    if (output := result.output) is None:
         return result
-
-
-def _written(
-    result: Recomposition, output: str | Path, composed: Composed, used: Sequence[Source], outputs: Outputs
-) -> Recomposition:
-    """The result, with the page and the sidecar written."""
     page = partial(plainly_viewed, composed.canvas, [source.name for source in used])
     result = replace(result, messages=(*result.messages, *write_page(outputs, output, composed, page)))
     outputs.write(f"{output}.json", json_bytes(applied_sidecar(result)))

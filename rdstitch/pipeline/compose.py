@@ -125,13 +125,7 @@ def compose_pictures(
     options = replace(options, workers=threads)
     pictures = placed.pictures(canvas.near)
     if dry_run:
-        preview = pictures[0].preview
-        assert preview is not None
-        probe = preview(_PROBE_REDUCTION)
-        channels = 1 if probe.pixels.ndim == 2 else probe.pixels.shape[2]
-        size = probe.pixels.dtype.itemsize
-        masked = probe.alpha is not None
-        planned = plan_composite(placed.cameras, canvas, options, channels, size, masked=masked)
+        planned = _planned(placed, canvas, options)
         return Composed(canvas, plan=planned, messages=tuple(notes), place=place, place_reason=reason)
 
     def report(share: float) -> None:
@@ -172,6 +166,16 @@ def compose_pictures(
         place=place,
         place_reason=reason,
     )
+
+
+def _planned(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) -> CompositePlan:
+    """What compositing would take."""
+    preview = placed.pictures(canvas.near)[0].preview
+    assert preview is not None
+    probe = preview(_PROBE_REDUCTION)
+    channels = 1 if probe.pixels.ndim == 2 else probe.pixels.shape[2]
+    size, masked = probe.pixels.dtype.itemsize, probe.alpha is not None
+    return plan_composite(placed.cameras, canvas, options, channels, size, masked=masked)
 
 
 def _masked(placed: PlacedImages) -> list[Message]:

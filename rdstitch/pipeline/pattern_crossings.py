@@ -5,7 +5,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rdstitch.alignment import Alignment
 from rdstitch.arrays import FloatArray
@@ -20,6 +19,7 @@ from rdstitch.matching.two_view import PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.robust.verification import places
+from rdstitch.scipy_parts import spatial
 
 _MEGAPIXELS = WORK_MEGAPIXELS * CLOSER
 _ROUNDS = 2  # of matching, the second one with the lens that the first one has found
@@ -113,8 +113,8 @@ def _matched(
     seen = np.flatnonzero(np.isfinite(expected).all(axis=1))
     if min(len(seen), len(second)) < _MIN_MATCHES:
         return pair
-    distance, nearest = map(np.asarray, cKDTree(second).query(expected[seen], k=2))
-    back = np.asarray(cKDTree(expected[seen]).query(second)[1])
+    distance, nearest = map(np.asarray, spatial.cKDTree(second).query(expected[seen], k=2))
+    back = np.asarray(spatial.cKDTree(expected[seen]).query(second)[1])
     mutual = back[nearest[:, 0]] == np.arange(len(seen))
     chosen = (distance[:, 0] < threshold) & (distance[:, 1] > 2.0 * threshold) & mutual
     indices = np.column_stack([seen, nearest[:, 0]])[chosen]

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import LENS_STD
@@ -22,6 +21,7 @@ from rdstitch.robust.linearization import PairLenses, differentiate, entry_equat
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.model_selection import loss_width, noise_of
 from rdstitch.robust.pair_models import HomographyPairModel
+from rdstitch.scipy_parts import spatial
 
 _HOMOGRAPHY = HomographyPairModel()
 _OWN_STD = LENS_STD[[0, 0, 1, 3, 4]]  # of λ of image 1, λ of image 2, μ, and the distortion centre
@@ -88,7 +88,7 @@ def _coherence(points: FloatArray, errors: FloatArray) -> float:
     """Correlation of the errors (N, 2) of points (N, 2) and their nearest neighbours."""
     if len(points) < 2:
         return 0.0
-    nearest = np.asarray(cKDTree(points).query(points, k=2)[1])[:, 1]
+    nearest = np.asarray(spatial.cKDTree(points).query(points, k=2)[1])[:, 1]
     power = float(np.einsum("ni,ni->", errors, errors))
     return float(np.einsum("ni,ni->", errors, errors[nearest])) / power if power > 0.0 else 0.0
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betainc
 
 from rdstitch.arrays import FloatArray
+from rdstitch.scipy_parts import special
 
 _CELLS_PER_DIAGONAL = 32
 _CELL_STRIDE = 2.0**20
@@ -61,6 +61,6 @@ def rejection_reason(
         return f"{count} of {len(inliers)} matches agree, but they lie in {cells} places of the image only"
     by_chance = min(0.5, np.pi * threshold**2 / (image_size[0] * image_size[1]) + 0.01)
     trials = len(inliers) - 4
-    if trials > 0 and betainc(max(1, count - 4), trials - count + 5, by_chance) > _MAX_CHANCE:
+    if trials > 0 and special.betainc(max(1, count - 4), trials - count + 5, by_chance) > _MAX_CHANCE:
         return f"{count} of {len(inliers)} matches agree, no more than chance allows"
     return None

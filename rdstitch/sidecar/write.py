@@ -9,7 +9,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import scipy
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
@@ -209,6 +208,8 @@ def _pairs(result: StitchResult) -> list[dict[str, Any]]:
 
 def versions() -> dict[str, str]:
     """Versions of what has a say in the result."""
+    import scipy
+
     return {
         "rdstitch": version("rdstitch"),
         "numpy": np.__version__,

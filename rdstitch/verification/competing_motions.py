@@ -12,7 +12,6 @@ from functools import lru_cache
 from typing import Self
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rdstitch.alignment import Alignment
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
@@ -21,6 +20,7 @@ from rdstitch.matching.two_view import PairRegistration, estimation_batches
 from rdstitch.radial_homography import RadialHomography, from_plane, to_plane
 from rdstitch.registration import Registration
 from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
+from rdstitch.scipy_parts import spatial
 from rdstitch.verification.overlap_check import placed_picture
 from rdstitch.verification.photometric_agreement import CELL, Agreement, ComparedCells, PlacedPicture, compare_cells
 
@@ -88,7 +88,7 @@ class _Held:
         for (i, j), cells in compared:
             found.setdefault(i, []).append((cells.centers_in_first, cells.confirming))
             found.setdefault(j, []).append((cells.centers, cells.confirming))
-        self._places = {k: cKDTree(np.concatenate([places for places, _ in own])) for k, own in found.items()}
+        self._places = {k: spatial.cKDTree(np.concatenate([places for places, _ in own])) for k, own in found.items()}
         # One more, for places that have fewer neighbours.
         self._held = {k: np.concatenate([*(held for _, held in own), [False]]) for k, own in found.items()}
 

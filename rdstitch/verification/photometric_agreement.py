@@ -14,7 +14,6 @@ from typing import Self
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import Camera
@@ -23,6 +22,7 @@ from rdstitch.compositing.warp import Lattice
 from rdstitch.io.read import Picture
 from rdstitch.io.reduction import fitting_reduction, mean_of_channels, reduced_size
 from rdstitch.radial_homography import from_plane, to_plane
+from rdstitch.scipy_parts import spatial
 
 Grey = NDArray[np.float32]
 
@@ -105,7 +105,7 @@ class Parallax:
 
     def at(self, points: FloatArray) -> NDArray[np.intp]:
         """Of points (N, 2): the median of that of the nearest matches, whole pixels (N, 2)."""
-        nearest = cKDTree(self.places).query(points, k=min(_NEAREST, len(self.places)))[1]
+        nearest = spatial.cKDTree(self.places).query(points, k=min(_NEAREST, len(self.places)))[1]
         around = self.shifts[np.asarray(nearest).reshape(len(points), -1)]
         return np.rint(np.median(around, axis=1)).astype(np.intp)
 

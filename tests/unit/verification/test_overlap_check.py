@@ -100,7 +100,7 @@ def test_cached_overlaps_are_those_of_the_same_links(monkeypatch: pytest.MonkeyP
         def file(self, mask: object) -> str:
             return ""
 
-        def recall(self, kind: str, types: object, key: object, compute: object, *, valid: Any) -> list[CheckedLink]:
+        def recall(self, kind: str, types: object, key: object, compute: object, valid: Any, *, hint: object) -> Any:
             verdicts.extend([valid(checked), valid(checked[::-1]), valid(checked[:1])])
             return checked
 

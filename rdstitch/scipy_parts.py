@@ -1,0 +1,27 @@
+"""SciPy's parts, imported when they are first used: most of what a start would take, and no run needs all of them."""
+
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+
+class _Part(ModuleType):
+    def __getattr__(self, name: str) -> Any:
+        return getattr(import_module(self.__name__), name)
+
+
+if TYPE_CHECKING:
+    from scipy import linalg, ndimage, sparse, spatial, special
+    from scipy.sparse import csgraph
+    from scipy.sparse import linalg as sparse_linalg
+    from scipy.spatial import distance
+else:
+    linalg, ndimage, sparse, spatial, special, csgraph, sparse_linalg, distance = map(
+        _Part,
+        (
+            *("scipy.linalg", "scipy.ndimage", "scipy.sparse", "scipy.spatial", "scipy.special"),
+            *("scipy.sparse.csgraph", "scipy.sparse.linalg", "scipy.spatial.distance"),
+        ),
+    )
+
+__all__ = ["csgraph", "distance", "linalg", "ndimage", "sparse", "sparse_linalg", "spatial", "special"]
