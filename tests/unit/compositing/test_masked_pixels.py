@@ -22,7 +22,7 @@ def test_what_is_transparent_has_the_samples_of_the_nearest_opaque_pixel() -> No
     assert np.array_equal(made[opaque], pixels[opaque])
     hidden, source = np.argwhere(~opaque), made[~opaque][:, 1::-1].astype(np.intp)
     assert opaque[tuple(source.T)].all()
-    nearest = KDTree(np.argwhere(opaque)).query(hidden)[0]
+    nearest = np.asarray(KDTree(np.argwhere(opaque)).query(hidden)[0])
     assert (np.linalg.norm(source - hidden, axis=1) <= 1.05 * nearest).all()  # distances of 5 x 5 chamfers
 
 
@@ -45,7 +45,7 @@ def test_rows_apart_give_what_the_whole_does_near_the_mask_and_opaque_samples_el
     made = filled(pixels, opaque)
     hidden, source = np.argwhere(~opaque), made[~opaque][:, 1::-1].astype(np.intp)
     assert opaque[tuple(source.T)].all()
-    nearest = KDTree(np.argwhere(opaque)).query(hidden)[0]
+    nearest = np.asarray(KDTree(np.argwhere(opaque)).query(hidden)[0])
     near = nearest <= 60
     assert (np.linalg.norm(source - hidden, axis=1)[near] <= 1.05 * nearest[near]).all()
     reach = 0.125 * min(opaque.shape)
