@@ -115,6 +115,8 @@ class CompositeOptions:
             raise ArgumentError(f"rotate must be an angle in degrees, not {self.rotate}")
         if self.gsd is not None and not 0.0 < self.gsd < math.inf:
             raise ArgumentError(f"gsd must be metres, more than 0, not {self.gsd}")
+        if self.gsd is not None and self.scale != 1.0:
+            raise ArgumentError("scale and gsd both say how large the output is; leave one of them out")
         if self.max_memory is not None and self.max_memory <= 0:
             raise ArgumentError(f"max_memory must be positive, not {self.max_memory}")
         if not 0 <= self.background <= 255:

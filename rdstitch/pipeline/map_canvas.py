@@ -40,7 +40,7 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
     canvas = plan(placed, options)
     if placed.turned:
         place, reason = None, "the camera turned on the spot"
-    elif placed.place is not None:
+    elif placed.place is not None and options.epsg in (None, placed.place.crs.epsg):
         place, reason = placed.place.after(canvas.matrix), ""
     else:
         names = [source.name for source in placed.sources]
@@ -58,7 +58,7 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
     laid = (
         canvas
         if (rotate, scale) == (options.rotate, options.scale)
-        else plan(placed, replace(options, rotate=rotate, scale=scale))
+        else plan(placed, replace(options, rotate=rotate, scale=scale, gsd=None))
     )
     return laid, moved(place, canvas, laid), ""
 

@@ -106,9 +106,10 @@ def applied_sidecar(result: Recomposition) -> dict[str, Any]:
         "lambda_focal": camera.distortion_focal,
         "camera": {
             **camera.turned(inverse(source.metadata.orientation)).as_dict(),
-            # How far the lens was determined then.
+            # How far the camera was determined then.
             "lambda_std": then.get("lambda_std"),
-            "lens_covariance": then["camera"].get("lens_covariance"),
+            **{name: then["camera"].get(name) for name in ("lens_covariance", "tilt_deg", "tilt_std_deg")},
+            "focal_std_px": _resized_std(then["camera"], camera.focal),
         },
         "focal_px": camera.focal,
         "reference": source.name,
@@ -141,3 +142,9 @@ def _image(result: Recomposition, index: int, entry: dict[str, Any]) -> dict[str
         **lens_fields(source.camera),
         "to_output": to_output(result.canvas, picture.to_plane),
     }
+
+
+def _resized_std(then: Mapping[str, Any], focal: float | None) -> float | None:
+    """The standard deviation that a focal length had, for the same lens on an image of another size."""
+    std, former = then.get("focal_std_px"), then.get("focal_px")
+    return std * (focal / former) if std and former and focal else None

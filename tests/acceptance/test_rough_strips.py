@@ -28,6 +28,7 @@ def test_hills_do_not_move_the_distortion_centre() -> None:
     assert displacement(item, found) < 0.02
 
 
+@pytest.mark.slow
 def test_a_strip_does_not_go_downhill() -> None:
     """With all pairs from the earlier picture to the later one, heights fall by a quarter: off by 3.1 per cent."""
     item = strip("slopes", 0.1, 3, 40)

@@ -16,6 +16,7 @@ from rdstitch.io.read import read_image
 from rdstitch.orientation import turned, turning_matrix
 from rdstitch.radial_homography import to_plane
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
+from tests.sampled import sampled
 
 LENS = Camera((480, 360), -0.25, center=(244.5, 175.5), focal=400.0)
 PROPER, MIRRORED, ALL = (1, 6, 3, 8, 6, 1, 8, 3), (2, 5, 4, 7, 5, 2, 7, 4), (1, 2, 3, 4, 5, 6, 7, 8)
@@ -70,7 +71,7 @@ def errors_of(sequence: Sequence, orientations: tuple[int, ...], result: rdstitc
     return found
 
 
-@pytest.mark.parametrize("orientations", [PROPER, MIRRORED])
+@pytest.mark.parametrize("orientations", [MIRRORED, pytest.param(PROPER, marks=pytest.mark.slow)])
 def test_a_mosaic_finds_the_lens_of_the_stored_frame(
     sequence: Sequence, orientations: tuple[int, ...], tmp_path: Path
 ) -> None:
@@ -85,7 +86,7 @@ def test_a_mosaic_finds_the_lens_of_the_stored_frame(
     assert np.abs(np.subtract(saved.center, LENS.center)).max() < 0.5
 
 
-@pytest.mark.parametrize("orientations", [PROPER, ALL])
+@pytest.mark.parametrize("orientations", [ALL, pytest.param(PROPER, marks=pytest.mark.slow)])
 def test_a_camera_file_is_of_the_stored_frame(
     sequence: Sequence, orientations: tuple[int, ...], tmp_path: Path
 ) -> None:
@@ -108,7 +109,7 @@ def test_undistortion_turns_the_lens(sequence: Sequence, tmp_path: Path) -> None
         assert np.abs(difference).max() <= 2.0
 
 
-@pytest.mark.parametrize("orientation", [3, 6, 8])
+@pytest.mark.parametrize("orientation", sampled([6, 3, 8]))
 def test_a_mosaic_stands_as_its_reference_image_does(sequence: Sequence, orientation: int, tmp_path: Path) -> None:
     orientations = (1, 1, 1, orientation)
     files = written(sequence, orientations, tmp_path / "frames")

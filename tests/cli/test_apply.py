@@ -165,7 +165,7 @@ def test_what_does_not_fit_is_refused(rdstitch: Run, frames: list[Path], stitche
     done = _apply(rdstitch, sidecar, fewer, tmp_path / "out.tif")
     assert (done.status, str(sidecar) in done.line) == (3, True)
     done = _apply(rdstitch, sidecar, tmp_path / "nowhere", tmp_path / "out.tif")
-    assert (done.status, f"{tmp_path / 'nowhere'}: no such file" in done.line) == (3, True)
+    assert (done.status, f"{tmp_path / 'nowhere'}: no such folder" in done.line) == (3, True)
     cut = tmp_path / "cut"
     cut.mkdir()
     for frame in frames:

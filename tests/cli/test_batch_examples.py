@@ -117,6 +117,7 @@ def test_undistorting_a_tree(environment: dict[str, str], floors: Path, tmp_path
         assert made == originals
 
 
+@pytest.mark.slow
 def test_undistorting_a_tree_tells_of_failures(environment: dict[str, str], floors: Path, tmp_path: Path) -> None:
     Camera((400, 300), -0.2).save(tmp_path / "camera.json")
     arguments = (tmp_path / "camera.json", floors, tmp_path / "straight")

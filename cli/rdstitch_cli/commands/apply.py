@@ -73,6 +73,9 @@ def apply(
     from rdstitch.sidecar.read import read_sidecar
 
     given = {name: value for name, value in compositing.items() if options.is_given(name)}
+    # What is given takes the place of what the sidecar has for the same purpose.
+    if "scale" in given or "gsd" in given:
+        given = {"scale": 1.0, "gsd": None, **given}
     result = recipe(
         sidecar,
         options.resolve(images),

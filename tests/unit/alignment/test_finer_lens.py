@@ -56,6 +56,7 @@ def test_a_third_coefficient_is_small_where_no_matches_show_it() -> None:
     assert lens_distance(found.cameras[0], truth) < 1.0
 
 
+@pytest.mark.slow
 def test_a_third_coefficient_is_not_taken_from_relief() -> None:
     given = lens_scene(replace(FISHEYE, distortion3=0.0), 0, relief=0.01)
     assert aligned(given).lens == "division2"

@@ -157,6 +157,10 @@ def test_bands_that_are_applied_lie_where_the_first_one_does(
         with Image.open(path) as image:
             image.save(tmp_path / "band" / path.name)
     apply(tmp_path / "a.tif.json", [tmp_path / "band"], tmp_path / "b.tif", workers=1)
+    coarse = CompositeOptions(gsd=0.5)
+    apply(tmp_path / "a.tif.json", paths, tmp_path / "c.tif", replace(coarse, epsg=2048), workers=1)
+    with rasterio.open(tmp_path / "c.tif") as other:
+        assert (other.crs.to_epsg(), *other.res) == (2048, pytest.approx(0.5), pytest.approx(0.5))
     with rasterio.open(tmp_path / "a.tif") as one, rasterio.open(tmp_path / "b.tif") as two:
         assert (one.crs, one.shape) == (two.crs, two.shape)
         np.testing.assert_allclose(one.transform, two.transform, atol=1e-6)

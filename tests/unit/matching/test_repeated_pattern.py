@@ -56,6 +56,7 @@ def test_other_ground_has_no_such_matches(board: Sequence) -> None:
     assert len(match_pattern(detect(board.frame(0), FeatureOptions("orb")), _features(board, 1))) == 0
 
 
+@pytest.mark.slow
 def test_calibrate_matches_boards_so_and_mosaics_do_not(board: Sequence) -> None:
     """A mosaic could be off by whole squares."""
     stages: dict[bool, set[str]] = {True: set(), False: set()}
