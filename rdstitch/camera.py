@@ -28,6 +28,7 @@ from rdstitch.division_model import (
 )
 from rdstitch.errors import ArgumentError, ImpossibleCameraError
 from rdstitch.orientation import turned_size, turning_matrix
+from rdstitch.planar_motion import rotation_from_tilt, tilt_from_normal
 
 FILE_VERSION = 2
 """Of camera files; version 1 had λ and μ only, as ``lambda`` and ``lambda2``."""
@@ -314,7 +315,14 @@ class Camera:
             lens = np.eye(len(LENS_PARAMETERS))
             lens[3:, 3:] = matrix
             covariance = tuple(map(tuple, (lens @ np.array(covariance) @ lens.T).tolist()))
-        return replace(self, image_size=size, center=(x, y), lens_covariance=covariance)
+        tilt, std = self.tilt, self.tilt_std
+        if tilt is not None:
+            right, down, ahead = rotation_from_tilt(tilt)[:, 2]
+            psi, theta = tilt_from_normal([*(matrix @ (right, down)), ahead]).tolist()
+            tilt = (psi, theta)
+        if std is not None and matrix[0, 0] == 0.0:  # a quarter turn
+            std = std[1], std[0]
+        return replace(self, image_size=size, center=(x, y), lens_covariance=covariance, tilt=tilt, tilt_std=std)
 
     def as_dict(self) -> dict[str, Any]:
         """Everything known of the camera as plain values, the content of a camera file."""
