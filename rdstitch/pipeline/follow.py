@@ -9,9 +9,11 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from rdstitch.camera import Camera
 from rdstitch.errors import InputError
 from rdstitch.export.trajectory_files import TrajectoryFrame, in_frame
 from rdstitch.features import FeatureOptions, Features, detect_view, match
+from rdstitch.features.picture import PreparedPicture, prepare
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.selection import is_selected, with_masks
@@ -155,17 +157,17 @@ def follow(
         number = unread.pop(arrived.path, -1)
         number = next(numbers) if number < 0 else number
         frame = arrived if arrived.number is not None else replace(arrived, number=number)
-        source, found, reason = _read(frame, options, features)
-        if (found is None or (source is not None and source.guard.messages)) and comes_again(arrived):
+        source, picture, reason = _read(frame, options, features)
+        if (picture is None or (source is not None and source.guard.messages)) and comes_again(arrived):
             unread[arrived.path] = number
             continue
         label = FollowedFrame(frame.path.name, frame.number or 0, math.nan, None, reason, printed)
-        if source is None or found is None:
+        if source is None or picture is None:
             yield label
             continue
         label = replace(label, name=source.name, timestamp=printed.timestamp(source))
         camera = at_working_size(source.camera, features.limits[1])
-        results = tracker.add(FeatureStore.of([found]).at_sizes([camera.image_size])[0], camera)
+        results = tracker.add(partial(_features, source, features, camera), camera, picture)
         labels[results[-1].number] = label
         for result in results:
             known = labels[result.number]
@@ -213,17 +215,26 @@ def _live_features(options: FeatureOptions) -> FeatureOptions:
     )
 
 
-def _read(frame: Frame, options: StitchOptions, features: FeatureOptions) -> tuple[Source | None, Features | None, str]:
-    """The frame as a source, and its features; or why there are none."""
+def _read(
+    frame: Frame, options: StitchOptions, features: FeatureOptions
+) -> tuple[Source | None, PreparedPicture | None, str]:
+    """The frame as a source, and as it is tracked; or why it is not."""
     sources, unread = read_frames([frame], options, skip_bad=True)
     if not sources:
         return None, None, unread[0].text
     common = options.mask is not None and not Path(options.mask).is_dir()
     source = with_masks(sources, options.mask if common else None)[0]
+    megapixels = features.limits[1]
     try:
-        return source, detect_view(source.view, features), ""
+        view = source.view(megapixels)
+        return source, prepare(view, megapixels, stretch=features.stretch, equalize=bool(features.equalize)), ""
     except InputError as error:
         return source, None, str(error)
+
+
+def _features(source: Source, options: FeatureOptions, camera: Camera) -> Features:
+    """Of a frame, in pixels of a camera of working size."""
+    return FeatureStore.of([detect_view(source.view, options)]).at_sizes([camera.image_size])[0]
 
 
 def _why(tracker: Tracker, result: Tracked) -> str:

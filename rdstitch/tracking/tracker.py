@@ -1,19 +1,23 @@
 """The tracker: a frame comes in, its place on the plane comes out."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align
+from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.errors import RegistrationError
 from rdstitch.features import Features, Matcher
+from rdstitch.features.picture import PreparedPicture
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
 from rdstitch.matching.options import PairOptions
+from rdstitch.radial_homography import from_plane
 from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
+from rdstitch.tracking.flow import CornerFlow, fitted_affine
 from rdstitch.tracking.placement import CameraPose, Placement, PlaneSimilarity
 
 _WINDOW = 48  # keyframes that are kept
@@ -24,13 +28,16 @@ _GROWTH = 1.5  # from one alignment to the next, while λ is not known
 _ALIGNMENT_INTERVAL = 24  # keyframes from one alignment to the next afterwards
 _KNOWN_STD = 0.002  # of λ: a tenth of a pixel in the corner of a picture of 640 x 480 pixels, over half of it
 _MIN_KEYFRAMES_FOR_LENS = 12  # keyframes that λ is not known before
-_KEYFRAME_OVERLAP = 0.75  # share of a frame that its last keyframe shows, below which it becomes a keyframe
+_KEYFRAME_OVERLAP = 0.8  # share of a frame that its last keyframe shows, below which it becomes a keyframe
 _GRID = 8  # points a side by which that is measured
 _MAX_LOST_FRAMES = 10  # frames in a row without a place, after which a new map begins
 _MIN_INLIERS = 15
 _SELECT_MODEL_BELOW = 50  # inliers below which motions of the plane compete with a free homography
 _MATCHES = 80  # of a link, that the alignment uses
 _SAME_TILT = ("rigid", "similarity")
+_FLOW_ERROR = 1.5  # pixels by which a corner that was followed may be off the motion of the plane
+_AFFINE_ERROR = 0.02  # the same of an affine motion, in sides: lenses and tilts are not affine
+_FLOW_AGREEING = 0.5  # share of the corners that must agree on it
 
 
 @dataclass(frozen=True)
@@ -102,6 +109,7 @@ class Tracker:
     def __init__(self, options: TrackingOptions, matcher: Matcher) -> None:
         self._options, self._match = options, matcher
         self._count, self._map, self._lost = 0, 0, 0
+        self._flow = CornerFlow()
         self._model = options.alignment.model
         self._focal: float | None = None
         self._distortion, self._std = options.pair.distortion, math.inf
@@ -124,16 +132,66 @@ class Tracker:
         """Numbers of the keyframes that may still find their place."""
         return {keyframe.number for keyframe in self._keyframes if keyframe.placement is None}
 
-    def add(self, features: Features, camera: Camera) -> list[Tracked]:
+    def add(
+        self, features: Features | Callable[[], Features], camera: Camera, picture: PreparedPicture | None = None
+    ) -> list[Tracked]:
         """Register the next frame; it comes last, after those before it that only now have found their place.
 
         Parameters
         ----------
+        features : Features or callable
+            Of the frame, or what finds them: they are asked for only where corners of the last keyframe, which are
+            followed from frame to frame, do not place it, or it becomes a keyframe.
         camera : Camera
             Of the size that the features' points are measured at.
+        picture : PreparedPicture, optional
+            The frame at that size, in which corners are followed; without it none are.
         """
         number, self._count = self._count, self._count + 1
-        frame = _Keyframe(number, camera, features)
+        if (followed := self._followed(number, camera, picture)) is not None:
+            return [followed]
+        results = self._registered_frame(_Keyframe(number, camera, features() if callable(features) else features))
+        if results[-1].keyframe:
+            self._flow.begin(picture)
+        return results
+
+    def _followed(self, number: int, camera: Camera, picture: PreparedPicture | None) -> Tracked | None:
+        """The frame placed by the corners of the last keyframe, where these show enough of it."""
+        matched = None if picture is None else self._flow.follow(picture)
+        last = self._keyframes[-1] if self._keyframes else None
+        if matched is None or last is None or picture is None or picture.grey.shape[::-1] != camera.image_size:
+            return None
+        frame = _Keyframe(number, camera, last.features)
+        if last.placement is None and self.waits:
+            lens = camera.with_coefficients(self._distortion if self._distortion and math.isfinite(self._std) else 0.0)
+            error = _AFFINE_ERROR * max(camera.image_size)
+            move, inliers = fitted_affine(lens.undistort(matched[0]), lens.undistort(matched[1]), error)
+            if move is None:
+                return None
+            seen = lens.distort(lens.undistort(self._grid(camera)) @ move[:, :2].T + move[:, 2])
+        elif last.placement is not None and self._planar_model in _SAME_TILT:
+            coefficients = last.placement.camera.coefficients
+            stay = replace(last.placement, camera=camera.with_coefficients(*coefficients))
+            there, here = last.placement.to_plane(matched[0]), stay.to_plane(matched[1])
+            pixel = float(np.std(there)) / max(float(np.std(matched[0])), 1e-9)
+            _, inliers = fitted_affine(there, here, _FLOW_ERROR * pixel)
+            if inliers.sum() < _MIN_INLIERS:
+                return None
+            rigid = self._planar_model == "rigid"
+            frame.placement = PlaneSimilarity.fitted(here[inliers], there[inliers], keep_size=rigid).applied(stay)
+            ground = frame.placement.to_plane(self._grid(camera))
+            seen = from_plane(last.placement.camera, last.placement.homography, ground)
+        else:
+            return None
+        if inliers.sum() < max(_MIN_INLIERS, _FLOW_AGREEING * len(inliers)):
+            return None
+        if self._share_inside(seen, last.camera) < _KEYFRAME_OVERLAP:
+            return None
+        self._lost = 0
+        return self._tracked(frame, keyframe=False, inliers=int(inliers.sum()))
+
+    def _registered_frame(self, frame: _Keyframe) -> list[Tracked]:
+        """Register a frame by its features."""
         if not self._keyframes:
             self._keyframes.append(frame)
             return [self._tracked(frame, keyframe=True, inliers=0)]
@@ -214,11 +272,19 @@ class Tracker:
     def _shown_by_last(self, frame: _Keyframe, links: Sequence[Link]) -> float:
         """Share of the frame that the newest of its partners shows."""
         last = max(links, key=lambda link: link.image1)
-        size = np.array(frame.camera.image_size, dtype=np.float64)
-        axes = [np.linspace(0.0, side - 1.0, _GRID) for side in size]
-        points = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-        there = last.relation.transfer(points)  # the camera moved by about as much either way
-        inside = (there >= 0.0).all(axis=1) & (there <= size - 1.0).all(axis=1)
+        there = last.relation.transfer(self._grid(frame.camera))  # the camera moved by about as much either way
+        return self._share_inside(there, frame.camera)
+
+    @staticmethod
+    def _grid(camera: Camera) -> FloatArray:
+        """Points all over an image, pixels (N, 2)."""
+        axes = [(np.arange(_GRID) + 0.5) * side / _GRID - 0.5 for side in camera.image_size]
+        return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+
+    @staticmethod
+    def _share_inside(points: FloatArray, camera: Camera) -> float:
+        """Share of points (N, 2) that lie in an image."""
+        inside = (points >= 0.0).all(axis=1) & (points <= np.array(camera.image_size) - 1.0).all(axis=1)
         return float(inside.mean())
 
     def _add_keyframe(self, frame: _Keyframe, links: Sequence[Link]) -> list[Tracked]:

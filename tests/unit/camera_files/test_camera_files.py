@@ -16,6 +16,7 @@ from rdstitch.camera_files import load_camera, read_camera_file, save_camera
 from rdstitch.camera_files.lens_models import Brown
 from rdstitch.camera_files.opencv import parse_yaml
 from rdstitch.errors import InputError, OutputError
+from rdstitch.orientation import turning_matrix
 
 OPENCV = ["c.yml", "c.yaml", "opencv.json", "left.opencv.json", "a.fisheye.yml"]
 FOREIGN = [*OPENCV, "cameras.json", "c.pto", "camera_info.yaml", "camchain.yaml", "cameras.txt"]
@@ -59,6 +60,21 @@ def test_focal_length_and_tilt_keep_their_standard_deviations(tmp_path: Path, na
     assert found.tilt == pytest.approx(camera.tilt)
     assert found.tilt_std == pytest.approx(camera.tilt_std)
     assert found.with_focal(600.0, "option").focal_log_std == 0.01
+
+
+def test_the_tilt_turns_with_the_image() -> None:
+    upright = Camera((640, 480), focal=512.0, tilt=(0.05, -0.03), tilt_std=(0.002, 0.001))
+    (nadir,) = upright.denormalize([[-0.03 * 512.0 / 400.0, -0.05 * 512.0 / 400.0]])  # to first order
+    for orientation in (3, 6, 8):
+        turned = upright.turned(orientation)
+        assert turned.tilt is not None
+        psi, theta = turned.tilt
+        seen = turned.denormalize([theta * 512.0 / 400.0, -psi * 512.0 / 400.0])
+        matrix = turning_matrix(orientation)
+        expected = matrix @ (nadir - upright.center) + turned.center
+        np.testing.assert_allclose(seen, expected, atol=0.1)
+        assert sorted(turned.tilt_std or ()) == [0.001, 0.002]
+        assert (turned.tilt_std == upright.tilt_std) == (orientation == 3)
 
 
 @pytest.mark.parametrize("camera", CAMERAS)

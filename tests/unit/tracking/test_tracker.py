@@ -5,18 +5,23 @@ from functools import partial
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
 from rdstitch.camera import Camera
-from rdstitch.features import Features, match
+from rdstitch.features import FeatureOptions, Features, detect, match
+from rdstitch.features.picture import View, prepare
 from rdstitch.matching.options import PairOptions
 from rdstitch.synthetic import Sequence, blank, line_poses, sequence_over, turn_poses
 from rdstitch.tracking import Tracked, Tracker, TrackingOptions
 from rdstitch.tracking import tracker as module
+from rdstitch.tracking.flow import CornerFlow, fitted_affine
+from tests.floor_drives import floor_drive
 
 SIZE = (320, 240)
 DISTORTION = -0.25
+MASK = np.arange(240)[:, None].repeat(320, axis=1) < 190
 
 
 def _drive(count: int, overlap: float = 0.7, path: str = "turn") -> Sequence:
@@ -169,3 +174,48 @@ def test_frames_without_features_are_none_to_wait_for() -> None:
         result = tracker.add(frame, Camera(SIZE))[-1]
     assert result.map_number == 0
     assert result.placement is not None
+
+
+@pytest.fixture(scope="module")
+def video() -> tuple[Sequence, list[NDArray[np.uint8]]]:
+    """Frames of a floor that follow one another closely."""
+    drive = floor_drive("turn", 60, seed=4, size=SIZE, overlap=0.95)
+    return drive, [drive.frame(index) for index in range(len(drive))]
+
+
+@pytest.mark.parametrize("body", [False, True])
+def test_between_keyframes_corners_are_followed(video: tuple[Sequence, list[NDArray[np.uint8]]], body: bool) -> None:
+    drive, images = video
+    if body:  # of the robot, which stays where it is in the image and has corners of its own
+        part = np.kron(np.random.default_rng(1).integers(0, 255, (5, 32, 3)), np.ones((10, 10, 1))).astype(np.uint8)
+        images = [np.concatenate([image[:190], part]) for image in images]
+    asked: list[int] = []
+    tracker, results = _tracker(DISTORTION), []
+    for index, image in enumerate(images):
+
+        def features(index: int = index, image: NDArray[np.uint8] = image) -> Features:
+            asked.append(index)
+            return detect(image, FeatureOptions(max_features=600), mask=MASK if body else None)
+
+        results += tracker.add(features, Camera(SIZE), prepare(View(image), None))
+    last = {result.number: result for result in results if not result.revised}
+    keyframes = [number for number, result in last.items() if result.keyframe]
+    assert set(keyframes) <= set(asked)
+    assert len(asked) < len(keyframes) + 5 < 35
+    placed = [result for result in results if result.placement is not None]
+    assert {result.number for result in placed} >= set(range(keyframes[4], len(images)))
+    error = compare_trajectories(_path(placed), _truth(drive))
+    assert error.drift < 0.002
+    assert error.rotation < math.radians(0.1)
+
+
+def test_a_cut_is_no_motion(video: tuple[Sequence, list[NDArray[np.uint8]]]) -> None:
+    _, images = video
+    flow = CornerFlow()
+    flow.begin(prepare(View(images[0]), None))
+    found = flow.follow(prepare(View(np.ascontiguousarray(images[40][::-1])), None))
+    if found is not None:
+        _, inliers = fitted_affine(*found, 1.5)
+        assert inliers.mean() < 0.5
+    flow.begin(prepare(View(np.full((*SIZE[::-1], 3), 128, dtype=np.uint8)), None))
+    assert flow.follow(prepare(View(images[0]), None)) is None

@@ -1,0 +1,85 @@
+"""Corners of a keyframe, followed through the frames after it by Lucas and Kanade's method.
+
+Between keyframes that takes the place of detection and matching, which cost ten times as much.
+"""
+
+from typing import Any
+
+import cv2
+import numpy as np
+
+from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.features.picture import PreparedPicture
+
+_CORNERS, _QUALITY, _SPACING = 200, 0.005, 0.02  # the spacing is in sides of the image
+_WINDOW, _LEVELS = (15, 15), 3
+_MASK_MARGIN = 8.0  # pixels, half a window
+_STILL, _MOVED = 0.5, 3.0  # pixels: what stays in the image, such as a robot's body, and what moves with the ground
+_SEEN_TO_MOVE = 15  # corners that move, where those that do not are none of the ground
+_MIN_SHARE = 0.3  # of the corners, below which they no longer stand for the keyframe
+
+
+class CornerFlow:
+    """Corners of the last keyframe, and where they are in the latest frame."""
+
+    def __init__(self) -> None:
+        self._last: PreparedPicture | None = None
+        self._from = self._at = np.empty((0, 1, 2), dtype=np.float32)
+        self._count = 0
+
+    def begin(self, keyframe: PreparedPicture | None) -> None:
+        """Take the corners of a keyframe; None: there are none to be followed."""
+        self._last, self._count = keyframe, 0
+        if keyframe is None:
+            return
+        found = cv2.goodFeaturesToTrack(keyframe.grey, _CORNERS, _QUALITY, _SPACING * max(keyframe.grey.shape))
+        corners = np.empty((0, 1, 2), dtype=np.float32) if found is None else found
+        self._from = self._at = corners[_usable(keyframe, corners)]
+        self._count = len(self._from)
+
+    def follow(self, frame: PreparedPicture) -> tuple[FloatArray, FloatArray] | None:
+        """Where corners of the keyframe were, and where they are in the next frame, (N, 2) each, pixels of ``grey``.
+
+        None where too few of them can be followed.
+        """
+        last = self._last
+        if last is None or last.grey.shape != frame.grey.shape or len(self._at) < max(1.0, _MIN_SHARE * self._count):
+            return None
+        at, kept = _moved(last, frame, self._at)
+        kept &= _usable(frame, at)
+        self._last, self._from, self._at = frame, self._from[kept], at[kept]
+        if len(self._at) < _MIN_SHARE * self._count:
+            return None
+        there, here = self._from[:, 0].astype(np.float64), self._at[:, 0].astype(np.float64)
+        moved = np.linalg.norm(here - there, axis=1)
+        ground = moved > (_STILL if (moved > _MOVED).sum() >= _SEEN_TO_MOVE else -1.0)
+        return there[ground], here[ground]
+
+
+def fitted_affine(there: FloatArray, here: FloatArray, threshold: float) -> tuple[FloatArray | None, BoolArray]:
+    """The affine motion (2, 3) that brings most points (N, 2) to others, and which of them it brings there (N,)."""
+    known = np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
+    inliers = np.zeros(len(here), dtype=np.bool_)
+    if known.sum() < 3:
+        return None, inliers
+    found: Any = cv2.estimateAffine2D(here[known], there[known], method=cv2.RANSAC, ransacReprojThreshold=threshold)
+    motion, agree = found
+    if motion is None:
+        return None, inliers
+    inliers[known] = agree[:, 0] > 0
+    return np.asarray(motion, dtype=np.float64), inliers
+
+
+def _moved(before: PreparedPicture, after: PreparedPicture, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where corners (N, 1, 2) of one frame are in another, and whether they were found there (N,)."""
+    at, status, _ = cv2.calcOpticalFlowPyrLK(
+        before.grey, after.grey, corners, np.empty_like(corners), winSize=_WINDOW, maxLevel=_LEVELS
+    )
+    return np.asarray(at), np.asarray(status[:, 0] > 0)
+
+
+def _usable(frame: PreparedPicture, corners: np.ndarray) -> np.ndarray:
+    """Which corners (N, 1, 2) lie in the frame and clear of its mask."""
+    points = corners[:, 0].astype(np.float64)
+    inside = (points >= 0.0).all(axis=1) & (points <= np.array(frame.grey.shape[::-1]) - 1.0).all(axis=1)
+    return np.asarray(inside & frame.covers(points, np.full(len(points), _MASK_MARGIN)))
