@@ -26,6 +26,7 @@ from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.options import AlignmentOptions
 from rdstitch.alignment.planarity import COHERENT_CORRELATION, LARGE_RELIEF
 from rdstitch.alignment.position_priors import hold_positions
+from rdstitch.alignment.priors import LENS
 from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.rotation_model import ROTATION
@@ -56,6 +57,9 @@ _ROUNDS = 3
 _FEW_VIEWS, _LENS_OVER_DEPTH = 3, 4.0
 """Images from more than which depth does not look like a lens; times by which a lens must make errors of depth smaller
 to be no depth itself, whose power grows with the square of the wavelength."""
+
+_LITTLE_DEPTH = 0.0003
+"""Diagonals of an image: errors that neighbours share beside a lens, up to which there is no depth to speak of."""
 
 _AS_GOOD = 1.5
 """Errors of an earlier alignment, in units of those of pairs on their own, up to which a later one starts there."""
@@ -102,7 +106,9 @@ def align(
     few = everything.thinned(thin_for_selection(len(links)))
     relations = relations_at(few, own, lens)
     apart = homography_apart(few, relations, lens, free_lens, known)
-    observable = options.lens_known or (_observable(apart) and not _may_be_depth(few, own, apart, known))
+    observable = options.lens_known or _observable(apart)
+    depth = observable and not options.lens_known and _may_be_depth(few, own, apart, known)
+    observable &= not depth
     chosen = choose_lens(few, apart, options.lenses if observable else (), known)
     if observable:
         apart, free_lens = chosen.apart, chosen.free
@@ -152,6 +158,7 @@ def align(
         replace(choice, fit=fit),
         chosen.refined(fit.free_lens),
         observable,
+        depth,
         options.layout_matters,
         None if options.gravity is None else np.asarray(options.gravity, dtype=np.float64),
         disagreement,
@@ -258,13 +265,16 @@ def _may_be_depth(
     errors = [whitened_errors(observations, fit.homographies, fit.parameters.lens) for fit in (bent, flat)]
     evidence = Evidence.of(observations, errors[0])
     with_lens, without = (evidence.cost(each).field for each in errors)
-    return without < _LENS_OVER_DEPTH * with_lens
+    largest = _LITTLE_DEPTH * 2.0 * float(np.median(observations.scale2))
+    return with_lens > largest and without < _LENS_OVER_DEPTH * with_lens
 
 
 def _observable(apart: BundleAdjustmentResult) -> bool:
     """Whether one homography a pair leaves λ well determined, at a value that a lens can have."""
-    distortion, std = float(apart.parameters.lens[0]), float(np.sqrt(apart.covariance[0, 0]))
-    return std < OBSERVABLE_STD and PLAUSIBLE_DISTORTION[0] < distortion < PLAUSIBLE_DISTORTION[1]
+    distortion = float(apart.parameters.lens[0])
+    # Without what the prior says.
+    information = 1.0 / float(apart.covariance[0, 0]) - LENS[0].curvature(distortion)
+    return information > OBSERVABLE_STD**-2.0 and PLAUSIBLE_DISTORTION[0] < distortion < PLAUSIBLE_DISTORTION[1]
 
 
 @dataclass(frozen=True)

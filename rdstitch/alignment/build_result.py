@@ -27,7 +27,7 @@ from rdstitch.camera import LENS_PARAMETERS, Camera
 from rdstitch.errors import ImpossibleCameraError
 from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import connected_components
-from rdstitch.messages import Message
+from rdstitch.messages import Message, Severity
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 _STEP = 1e-5
@@ -62,6 +62,8 @@ class AdjustedPictures:
         The lens, with the distortion centre if the motion model freed it.
     observable : bool
         Whether λ is observable, or known.
+    depth : bool
+        Whether that is because what few pictures show has depth.
     layout_matters : bool
         Whether a picture is wanted; the lens or the poses otherwise.
     gravity : ndarray of shape (M, 3), optional
@@ -78,6 +80,7 @@ class AdjustedPictures:
     choice: ModelChoice
     lens: LensChoice
     observable: bool
+    depth: bool = False
     layout_matters: bool = True
     gravity: FloatArray | None = None
     positions_disagree: str = ""
@@ -291,7 +294,14 @@ def _overruled_focal(found: AdjustedPictures, camera: Camera) -> str | None:
 def _warnings(found: AdjustedPictures, camera: Camera) -> tuple[Message, ...]:
     """What the user should know of the whole."""
     result: list[Message] = []
-    if not found.observable:
+    if found.depth:
+        text = (
+            "λ is not observable: what the images show has depth, which looks like a lens in so few of them; "
+            "give λ, a camera file, or more images"
+        )
+        severity: Severity = "detail" if found.layout_matters else "warning"
+        result.append(Message(text, severity=severity, code="lambda-not-observable"))
+    elif not found.observable:
         text = (
             "λ is not observable: the pictures hardly move, or only turn about the optical axis; "
             "give λ, a camera file, or pictures that overlap by less"

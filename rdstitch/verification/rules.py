@@ -22,8 +22,8 @@ class Situation:
     alike : float
         Median share of the overlaps that looks alike, [0, 1].
     flat : bool
-        Whether the images are said to show a plane, and some are joined to it through others: of a turn, and of images
-        that all overlap with one, only overlaps can be wrong, and they are looked at.
+        Whether the images are said to show a plane that three or more of them hold together: of a turn, and of two
+        images, only overlaps can be wrong, and they are looked at.
     depth : bool
         Whether the scene has depth, or the camera moved while it turned.
     shape_doubtful : bool

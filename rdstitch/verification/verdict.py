@@ -126,16 +126,9 @@ def judge(
     )
     shape, size = alignment.shape, min(2.0 * camera.half_diagonal for camera in alignment.cameras)
     bent = shape is not None and math.hypot(shape.shift, shape.shift_std) < size
-    flat = not alignment.on_sphere and _has_chains(alignment)
+    flat = not alignment.on_sphere and int(alignment.used.sum()) > 2
     depth = alignment.relief.found or bool(parallax)
     return spoken(messages, Situation(_usual_agreement(checked), flat, depth, bent))
-
-
-def _has_chains(alignment: Alignment) -> bool:
-    """Whether images are joined through others, so that errors of overlaps add up unseen."""
-    pairs = [{fit.image1, fit.image2} for fit in alignment.links if fit.used]
-    around = {image for pair in pairs if alignment.reference in pair for image in pair}
-    return len(around) < int(alignment.used.sum())
 
 
 def _failure(text: str, images: Sequence[str] = ()) -> Message:
