@@ -194,9 +194,11 @@ def test_of_a_large_tiff_an_overview_is_read(
     monkeypatch.setattr(preview, "_OVERVIEW_FROM", 1000)
     monkeypatch.setattr(preview, "read_image", None)
     overview = _decoded(thumbnails.of_mosaic(result, 300))
-    assert overview.shape == whole.shape
-    assert max(whole.shape[:2]) == 300
-    assert np.abs(overview.astype(float) - whole).mean() < 12.0
+    assert max(whole.shape[:2]) == max(overview.shape[:2]) == 300
+    # Sides of an overview are rounded up.
+    height = min(len(whole), len(overview))
+    assert abs(len(whole) - len(overview)) <= 1
+    assert np.abs(overview[:height].astype(float) - whole[:height]).mean() < 12.0
 
 
 def _decoded(address: str | None) -> NDArray[np.uint8]:
