@@ -73,6 +73,7 @@ def turned_alignment(alignment: Alignment, orientations: Sequence[int], gravity:
     homographies = np.array(alignment.homographies)
     if alignment.on_sphere:
         matrices = turn[used] @ np.linalg.inv(homographies[used])
+        matrices /= np.linalg.norm(matrices[:, 2], axis=1)[:, None, None]  # diag(f, f, 1) R
         place = int(used[:reference].sum())
         homographies[used] = levelled(matrices, place, None if gravity is None else gravity[used])
     else:

@@ -53,7 +53,7 @@ class Recomposition(OutputImage):
         Of :attr:`image`: "bgr" or "rgb".
     fingerprint : Fingerprint or None
         Size and digest of the file.
-    georeference, not_georeferenced
+    georeference, not_georeferenced : Georeference or None, and str
         As of :class:`rdstitch.StitchResult`.
     """
 

@@ -80,7 +80,7 @@ def test_only_what_depends_on_a_changed_option_is_done_again(
     moved = [Path(shutil.copy(frame, tmp_path / f"moved_{frame.name}")) for frame in frames]
     work.clear()
     assert rdstitch("calibrate", *moved, "-o", tmp_path / "camera.json", *arguments[-2 - len(FAST) :]).status == 0
-    assert work == []
+    assert work == ["align"]  # whose layout does not matter to a lens
 
 
 def test_a_picture_more_needs_only_its_own(
