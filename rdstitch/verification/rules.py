@@ -63,6 +63,7 @@ RULES = (
     Rule("relief", "flatness", lambda found: found.flat or found.alike < _HIDDEN),
     Rule("parallax", "flatness", lambda found: found.alike < _HIDDEN),
     Rule("rival-motion", "rival-motion", lambda found: found.flat or not found.depth),
+    Rule("doubtful-seam", "doubtful-seam", lambda found: not found.depth or found.alike < _HIDDEN),
 )
 """The gravest first; what has no rule is always said, and before these."""
 

@@ -40,6 +40,12 @@ def test_depth_is_no_vehicle() -> None:
     assert _said(RIVAL) == ["rival-motion"]
 
 
+def test_a_seam_among_trees_is_no_doubtful_one() -> None:
+    seam = Message("only 8 of 61 places look alike", ("a.jpg", "b.jpg"), code="doubtful-seam")
+    assert _said(seam) == ["doubtful-seam"]
+    assert _said(seam, found=replace(GOOD, depth=True)) == []
+
+
 def test_failures_and_images_left_out_stay() -> None:
     given = [Message("no", (), "failure", "relief"), Message("no", ("a.jpg",), "left out")]
     assert list(spoken(given, replace(GOOD, flat=False))) == given
