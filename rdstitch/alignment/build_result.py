@@ -299,7 +299,7 @@ def _warnings(found: AdjustedPictures, camera: Camera) -> tuple[Message, ...]:
             "λ is not observable: what the images show has depth, which looks like a lens in so few of them; "
             "give λ, a camera file, or more images"
         )
-        severity: Severity = "detail" if found.layout_matters else "warning"
+        severity: Severity = "detail" if found.layout_matters else "failure"
         result.append(Message(text, severity=severity, code="lambda-not-observable"))
     elif not found.observable:
         text = (

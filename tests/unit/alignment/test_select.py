@@ -115,8 +115,12 @@ def test_tilts_of_their_own_are_found() -> None:
 def test_depth_in_two_images_is_not_taken_for_a_lens() -> None:
     """Something near at the bottom and far at the top, from two places."""
     rotations = camera_rotations([0.0, np.radians(8.0)], [0.0, 0.0])
-    found = align(*_views(rotations, np.array([[0.0, 0.0, 0.0], [0.25, 0.0, 0.1]]), (4.0, 12.0)))
-    assert abs(found.distortion) < 0.09
+    given = _views(rotations, np.array([[0.0, 0.0, 0.0], [0.25, 0.0, 0.1]]), (4.0, 12.0))
+    found = align(*given)
+    assert found.distortion == 0.0
+    assert [message.severity for message in found.messages if "depth" in message.text] == ["detail"]
+    lens = align(*given, AlignmentOptions(layout_matters=False))
+    assert [message.severity for message in lens.messages if "depth" in message.text] == ["failure"]
 
 
 def test_a_model_that_was_requested_is_taken() -> None:
