@@ -165,8 +165,8 @@ def select_model(
         if len(names) == 1 or trial.sigma <= posterior.largest_trial:
             tried.append(posterior.of(problem.fit(turn, shared=trial.parameters.shared)))
     for model in [MODELS[name] for name in names if not MODELS[name].on_sphere]:
-        if model is POSE and problem.count == 2 and len(names) > 1:  # one camera in any pose is a homography
-            continue
+        if problem.count == 2 and PSI in getattr(model, "free", ()) and HOMOGRAPHY.name in names:
+            continue  # with two images, one camera that tilts is a homography
         if tried and posterior.suffices(min(tried, key=_score), model):
             break
         planes = [one.fit for one in tried if not one.fit.model.on_sphere]

@@ -25,7 +25,7 @@ from rdstitch.verification.rules import Situation, spoken
 Pair = tuple[int, int]
 
 _MAX_RMS = 1.0  # of the whole, in thresholds
-_MAX_RMS_OF_RELIEF = 3.0  # the same where neighbours' errors agree and the pictures look alike
+_MAX_RMS_OF_RELIEF = 3.0  # the same where the pictures look alike
 _MAX_RELIEF = 0.02  # of a picture's diagonal: the same where relief explains them, and most of the overlaps look alike
 _MAX_AMBIGUITY = 0.4  # share of the pairs that may fit elsewhere: more is a pattern all over
 # Of the cells of an overlap that agree: chance lets up to 7 % do so, and right registrations of difficult pictures
@@ -145,9 +145,9 @@ def _error_of_the_whole(alignment: Alignment, threshold: float, checked: Sequenc
     largest = _MAX_RELIEF * 2.0 * max(camera.half_diagonal for camera in alignment.cameras)
     # Without what neighbours have in common, errors are those of a plane.
     explained = rms <= largest and rms**2 - relief.size**2 <= (_MAX_RMS * threshold) ** 2
-    rough = relief.found and (
-        (rms <= _MAX_RMS_OF_RELIEF * threshold and alike >= _USUAL_AGREEMENT)
-        or (explained and alike >= _CLEAR_AGREEMENT)
+    # Where the pixels agree, depth that one surface does not explain has been found a place all the same.
+    rough = (rms <= _MAX_RMS_OF_RELIEF * threshold and alike >= _USUAL_AGREEMENT) or (
+        relief.found and explained and alike >= _CLEAR_AGREEMENT
     )
     return [Message(f"{text}: the ground is rough", code="relief") if rough else _failure(text)]
 
