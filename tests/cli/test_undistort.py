@@ -86,11 +86,9 @@ def _photograph(path: Path, size: tuple[int, int] = (400, 300)) -> Path:
     """With the tags of a camera of 24 mm for 35 mm film, shrunk from four times the size, and a position."""
     exif = Image.Exif()
     exif[0x010F], exif[0x013B] = "Maker", "Somebody"
-    photo = exif.get_ifd(0x8769)
-    photo[0x920A], photo[0xA20E], photo[0xA210], photo[0xA002], photo[0xA405] = 4.0, 4000.0, 3, 4 * size[0], 24
-    photo[0x9003], photo[0x829A] = "2024:05:06 07:08:09", 0.01
-    place = exif.get_ifd(0x8825)
-    place[1], place[2], place[3], place[4] = "N", (52.0, 30.0, 1.5), "E", (1.0, 2.0, 3.0)
+    photo = {0x920A: 4.0, 0xA20E: 4000.0, 0xA210: 3, 0xA002: 4 * size[0], 0xA405: 24}
+    exif[0x8769] = {**photo, 0x9003: "2024:05:06 07:08:09", 0x829A: 0.01}
+    exif[0x8825] = {1: "N", 2: (52.0, 30.0, 1.5), 3: "E", 4: (1.0, 2.0, 3.0)}
     samples = np.random.default_rng(1).integers(0, 256, (size[1] // 4, size[0] // 4, 3), dtype=np.uint8)
     Image.fromarray(samples).resize(size).save(path, exif=exif, quality=95)
     return path
