@@ -1,7 +1,7 @@
-"""What each choice of ``--exposure`` does to a flight: python -m examples.brightness PICTURE … -o FILE.
+"""What each choice of ``--exposure`` does to a flight: python -m examples.brightness IMAGE … -o FILE.
 
-Stitches the pictures once for every choice, registered once, and writes the results side by side: samples as they are,
-one gain per picture, gains and smooth fields, and balanced, the default.
+Stitches the images once for every choice, registered once, and writes the results side by side: samples as they are,
+one gain per image, gains and smooth fields, and balanced, the default.
 """
 
 import argparse
@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from rdstitch.compositing import CompositeOptions
-from rdstitch.features.picture import PixelArray
+from rdstitch.features.prepared_image import PixelArray
 from rdstitch.io import write_image
 from rdstitch.pipeline import StitchOptions, mosaic
 
@@ -23,21 +23,21 @@ GAP = 6  # pixels between two results
 def main() -> None:
     """Read the command line, stitch, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pictures", nargs="+", type=Path)
+    parser.add_argument("images", nargs="+", type=Path)
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--size", type=int, default=420, help="longest side of each result, pixels")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as cache:
         options = StitchOptions(cache=Path(cache), composite=CompositeOptions(max_size=given.size, background=255))
-        results = [_stitched(given.pictures, options, choice) for choice in CHOICES]
+        results = [_stitched(given.images, options, choice) for choice in CHOICES]
     gap = np.full((results[0].shape[0], GAP, results[0].shape[2]), 255, results[0].dtype)
     parts = [part for result in results for part in (result, gap)][:-1]
     write_image(given.output, np.concatenate(parts, axis=1), quality=82)
 
 
-def _stitched(pictures: list[Path], options: StitchOptions, choice: str) -> PixelArray:
+def _stitched(images: list[Path], options: StitchOptions, choice: str) -> PixelArray:
     composite = replace(options.composite, exposure=choice)  # type: ignore[arg-type]
-    found = mosaic(pictures, None, replace(options, composite=composite)).composite
+    found = mosaic(images, None, replace(options, composite=composite)).composite
     assert found is not None
     covered = found.alpha[..., None] > 0
     return np.asarray(np.where(covered, found.pixels, np.iinfo(found.pixels.dtype).max))

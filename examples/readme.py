@@ -8,7 +8,7 @@ import rdstitch
 left = np.asarray(cv2.imread("left.jpg"))  # BGR like OpenCV; StitchOptions(channel_order="rgb")
 result = rdstitch.pano([left, "right.jpg"])
 cv2.imwrite("pano.png", result.image)  # result.alpha, result.verdict, result.registration, …
-print(result)  # <StitchResult … pixels, 2 of 2 pictures, λ = …>
+print(result)  # <StitchResult … pixels, 2 of 2 images, λ = …>
 
 matches = result.registration.pairs[0].correspondences  # or points of your own: pixels, (N, 2), many of them wrong
 fit = rdstitch.estimate_radial_homography(matches.points1, matches.points2, (1280, 960))

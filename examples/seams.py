@@ -1,8 +1,8 @@
-"""A seam, before and after: python -m examples.seams [PICTURE …] -o FILE [--at LEFT TOP] [--of local-alignment].
+"""A seam, before and after: python -m examples.seams [IMAGE …] -o FILE [--at LEFT TOP] [--of local-alignment].
 
-Stitches pictures (by default the bundled pair) twice and writes one place of both side by side, pixel for pixel, by
+Stitches images (by default the bundled pair) twice and writes one place of both side by side, pixel for pixel, by
 default that where they differ most. Left: plain, without exposure, seams and blending; right: the defaults. With ``--of
-local-alignment``: off and auto, both cut where pictures are equally far from their borders and not blended, so that one
+local-alignment``: off and auto, both cut where images are equally far from their borders and not blended, so that one
 sees how well they join over rough ground.
 """
 
@@ -28,9 +28,9 @@ CHOICES = {
 SIDE, GAP = 320, 8  # pixels
 
 
-def stitched(pictures: list[Path], options: StitchOptions) -> NDArray[Any]:
+def stitched(images: list[Path], options: StitchOptions) -> NDArray[Any]:
     """The composite with its alpha as last channel."""
-    result = mosaic(pictures, None, options)
+    result = mosaic(images, None, options)
     assert result.composite is not None
     print(f"{result!r}; local alignment: {result.local_alignment.reason}")
     return np.dstack([result.composite.pixels, result.composite.alpha])
@@ -40,7 +40,7 @@ def largest_difference(first: NDArray[Any], second: NDArray[Any]) -> tuple[int, 
     """Top and left of the square, covered by both, in which they differ most."""
     covered = ((first[..., -1] == 255) & (second[..., -1] == 255)).astype(np.float32)
     difference = np.abs(first[..., :-1].astype(np.float32) - second[..., :-1]).mean(axis=2) * covered
-    # Steps along a seam count, not all of a picture that is brighter by as much.
+    # Steps along a seam count, not all of an image that is brighter by as much.
     edges = np.abs(cv2.Laplacian(cv2.GaussianBlur(difference, (0, 0), 4.0), cv2.CV_32F))
     whole = cv2.boxFilter(covered, -1, (SIDE, SIDE), anchor=(0, 0), borderType=cv2.BORDER_CONSTANT) > 0.999
     score = cv2.boxFilter(edges, -1, (SIDE, SIDE), anchor=(0, 0), borderType=cv2.BORDER_CONSTANT) * whole
@@ -51,14 +51,14 @@ def largest_difference(first: NDArray[Any], second: NDArray[Any]) -> tuple[int, 
 def main() -> None:
     """Read the command line, stitch twice, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pictures", nargs="*", type=Path, default=BUNDLED)
+    parser.add_argument("images", nargs="*", type=Path, default=BUNDLED)
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--at", nargs=2, type=int, metavar=("LEFT", "TOP"), help="place, pixels of the output")
     parser.add_argument("--of", choices=CHOICES, default="seams", help="what is compared")
     given = parser.parse_args()
-    first, second = (stitched(given.pictures, options) for options in CHOICES[given.of])
+    first, second = (stitched(given.images, options) for options in CHOICES[given.of])
     top, left = given.at[::-1] if given.at else largest_difference(first, second)
-    crops = [picture[top : top + SIDE, left : left + SIDE, :-1] for picture in (first, second)]
+    crops = [image[top : top + SIDE, left : left + SIDE, :-1] for image in (first, second)]
     gap = np.full((SIDE, GAP, crops[0].shape[2]), np.iinfo(first.dtype).max, first.dtype)
     write_image(given.output, np.concatenate([crops[0], gap, crops[1]], axis=1), quality=85)
     print(f"pixel {left}, {top} of {first.shape[1]} x {first.shape[0]}")

@@ -1,6 +1,6 @@
-"""Stitch pictures of a flat scene taken through a lens that bends straight lines, without knowing the lens.
+"""Stitch images of a flat scene taken through a lens that bends straight lines, without knowing the lens.
 
-Homography and division-model distortion λ are estimated together from the pictures themselves. The names below are
+Homography and division-model distortion λ are estimated together from the images themselves. The names below are
 loaded when they are first used, so that importing the package costs nothing.
 """
 

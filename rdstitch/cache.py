@@ -1,6 +1,6 @@
 """Results of earlier runs, so that an interrupted run continues and a changed option repeats only what depends on it.
 
-Every result is a file named by everything that it depends on: the content of the pictures, the options that matter to
+Every result is a file named by everything that it depends on: the content of the images, the options that matter to
 it, the sources of this package, and the versions of the packages that it computes with. So nothing is ever out of date,
 whether or not a version number was raised; what is damaged is computed again.
 """

@@ -45,7 +45,7 @@ FOCAL_LOG_STD = {"option": 0.01, "file": 0.01, "estimate": 0.05, "exif": 0.05, "
 
 _LEAST_LOG_STD = 1e-6  # of a focal length: what is exact has no inverse variance
 
-_GRID = 33  # points along each side of the picture at which lenses are compared
+_GRID = 33  # points along each side of the image at which lenses are compared
 
 _FOCAL_LIMITS = 0.05, 1e3  # half diagonals; the widest fisheyes have 0.3
 
@@ -58,13 +58,13 @@ _GUESSED_FOCAL = 1.2  # half diagonals: a 26 mm lens on 36 x 24 mm, in the middl
 
 
 def is_focal_length(focal: float, image_size: tuple[int, int]) -> bool:
-    """Whether a number can be a focal length, pixels, of pictures of a size; damaged files hold others."""
+    """Whether a number can be a focal length, pixels, of images of a size; damaged files hold others."""
     low, high = _FOCAL_LIMITS
     return low < focal / (math.hypot(*image_size) / 2) < high
 
 
 def border_of(image_size: tuple[int, int], points_per_side: int) -> FloatArray:
-    """Outer border of a whole picture, clockwise from the top-left corner, pixels, (4 points_per_side, 2)."""
+    """Outer border of a whole image, clockwise from the top-left corner, pixels, (4 points_per_side, 2)."""
     width, height = image_size
     corners = np.array([(0, 0), (width, 0), (width, height), (0, height)], dtype=np.float64) - 0.5
     steps = np.arange(points_per_side)[:, None] / points_per_side
@@ -73,7 +73,7 @@ def border_of(image_size: tuple[int, int], points_per_side: int) -> FloatArray:
 
 
 def points_over(image_size: tuple[int, int], per_side: int) -> FloatArray:
-    """Points on a grid from edge to edge of a whole picture, row by row, pixels, (per_side², 2)."""
+    """Points on a grid from edge to edge of a whole image, row by row, pixels, (per_side², 2)."""
     u, v = (np.linspace(-0.5, side - 0.5, per_side) for side in image_size)
     return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
@@ -110,13 +110,13 @@ class Camera:
     Raises
     ------
     ArgumentError
-        When a value is not finite; when the lens folds the picture: its model must be one-to-one out to the corners, or
+        When a value is not finite; when the lens folds the image: its model must be one-to-one out to the corners, or
         to the horizon, the rays at 90 degrees to its axis; or when that is so near that next to nothing is seen.
 
     Notes
     -----
     What a fisheye of 180 degrees and more shows beyond its horizon has no place on a plane: it is undistorted to NaN,
-    and masked in pictures.
+    and masked in images.
     """
 
     image_size: tuple[int, int]
@@ -152,12 +152,12 @@ class Camera:
             corner = self._corner_radius
             if not (math.isfinite(corner * corner) and not folds(corner, self.coefficients)):
                 raise ImpossibleCameraError(
-                    f"distortion {', '.join(f'{value:g}' for value in self.coefficients if value)} folds the picture"
+                    f"distortion {', '.join(f'{value:g}' for value in self.coefficients if value)} folds the image"
                 )
             if horizon_radius(self.distortion, self.higher) < _NEAREST_HORIZON:
                 raise ImpossibleCameraError(
                     f"distortion {', '.join(f'{value:g}' for value in self.coefficients if value)} leaves next to "
-                    "nothing of the picture before the camera"
+                    "nothing of the image before the camera"
                 )
 
     @property
@@ -172,14 +172,14 @@ class Camera:
 
     @property
     def nearest_distortion(self) -> float:
-        """λ of the one-parameter model that is nearest to this lens over the picture; see :meth:`one_parameter_fit`."""
+        """λ of the one-parameter model that is nearest to this lens over the image; see :meth:`one_parameter_fit`."""
         return self.one_parameter_fit()[0]
 
     def one_parameter_fit(self) -> tuple[float, float, float]:
         """The one-parameter model nearest to this lens, and how far they are apart.
 
-        Nearest by least squares of the measured places of the same rays, evenly over the picture, up to the scale of
-        the undistorted picture; the distortion centre is the same.
+        Nearest by least squares of the measured places of the same rays, evenly over the image, up to the scale of
+        the undistorted image; the distortion centre is the same.
 
         Returns
         -------
@@ -208,7 +208,7 @@ class Camera:
 
     @property
     def sees_beyond_horizon(self) -> bool:
-        """Whether a part of the picture shows what is at 90 degrees to the axis and more."""
+        """Whether a part of the image shows what is at 90 degrees to the axis and more."""
         return not is_one_to_one(self._corner_radius, self.coefficients)
 
     @property
@@ -218,7 +218,7 @@ class Camera:
         return math.hypot(*farthest) / self.half_diagonal
 
     def _radii2(self) -> FloatArray:
-        """Squared radii, half diagonals, of points evenly over the picture, as far as it can be undistorted."""
+        """Squared radii, half diagonals, of points evenly over the image, as far as it can be undistorted."""
         x, y = self.normalize(points_over(self.image_size, _GRID)).T
         squares: FloatArray = x**2 + y**2
         farthest = self.drawn_radius / self.half_diagonal
@@ -226,7 +226,7 @@ class Camera:
 
     @property
     def drawn_radius(self) -> float:
-        """Measured radius, pixels, up to which pictures are drawn; inf where that is all of them."""
+        """Measured radius, pixels, up to which images are drawn; inf where that is all of them."""
         if not self.sees_beyond_horizon:
             return math.inf
         return stretch_radius(self.distortion, self.higher, _MAX_STRETCH) * self.half_diagonal
@@ -282,7 +282,7 @@ class Camera:
         return self.denormalize(distort(self.normalize(points), self.distortion, self.higher))
 
     def outline(self, points_per_side: int) -> FloatArray:
-        """Outer border of what is drawn of the picture, pixels, shape (4 points_per_side, 2).
+        """Outer border of what is drawn of the image, pixels, shape (4 points_per_side, 2).
 
         Clockwise from the top-left corner. Where the lens sees beyond the horizon, that lies within the circle up to
         which it stretches what it shows by less than 20 times.
@@ -295,7 +295,7 @@ class Camera:
         return np.asarray(self.center + offset * np.minimum(1.0, farthest / radius))
 
     def resized(self, image_size: tuple[int, int]) -> Self:
-        """The same lens on a picture of another size: λ stays, centre and focal length scale."""
+        """The same lens on an image of another size: λ stays, centre and focal length scale."""
         if image_size == self.image_size:
             return self
         factor = math.hypot(*image_size) / math.hypot(*self.image_size)
@@ -305,7 +305,7 @@ class Camera:
         return replace(self, image_size=image_size, center=center, focal=focal, focal_std=std)
 
     def turned(self, orientation: int) -> Self:
-        """The same camera on the picture after an EXIF orientation: what has a direction is turned with it."""
+        """The same camera on the image after an EXIF orientation: what has a direction is turned with it."""
         if orientation == 1:
             return self
         matrix, size = turning_matrix(orientation), turned_size(self.image_size, orientation)

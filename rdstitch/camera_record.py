@@ -47,7 +47,7 @@ def _angles(record: Record | None) -> tuple[float, float] | None:
 
 
 def read_lens(record: Record, size: tuple[int, int], focal_source: str | None) -> Camera:
-    """The lens that a record describes, on a picture of a size; not how far it is determined.
+    """The lens that a record describes, on an image of a size; not how far it is determined.
 
     Raises
     ------

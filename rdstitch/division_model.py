@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from rdstitch.arrays import FloatArray
 
 MAX_ABS_DISTORTION = 0.98
-"""Largest ``|λ|`` that is estimated, half-diagonal frame; at 1 the model folds at the corner of the picture."""
+"""Largest ``|λ|`` that is estimated, half-diagonal frame; at 1 the model folds at the corner of the image."""
 
 PLAUSIBLE_DISTORTION = (-1.0, 0.5)
 """Limits of λ: below, the corners would see behind the camera; no lens pulls its corners in as far as above."""
@@ -183,7 +183,7 @@ def _fold_radius(distortion: float, higher: tuple[float, ...]) -> float:
 def nearest_one_parameter(radius2: FloatArray, distortion: float, higher: Sequence[float] = ()) -> tuple[float, float]:
     """The λ of the one-parameter model nearest to a lens, by least squares of measured radii.
 
-    The scale of the undistorted picture is free, as no picture of a plane shows it. So this is the λ that the
+    The scale of the undistorted image is free, as no image of a plane shows it. So this is the λ that the
     estimation of one λ would find from points spread like those given.
 
     Parameters

@@ -7,7 +7,7 @@
     │   └── ImpossibleCameraError
     ├── InputError               3  a file cannot be read, or is not what it should be
     ├── RegistrationError        4  no overlap, or no result that can be relied on
-    ├── PartialResultError       5  pictures were left out, and --strict forbids that
+    ├── PartialResultError       5  images were left out, and --strict forbids that
     ├── OutputError              6  a file cannot be written, or exists already
     └── LimitError               7  refused: too large for memory, format or common sense
 
@@ -44,14 +44,14 @@ class InputError(RdstitchError):
 
 
 class RegistrationError(RdstitchError):
-    """The pictures do not overlap, or nothing reliable came out of them."""
+    """The images do not overlap, or nothing reliable came out of them."""
 
     exit_status = 4
     code = "no-overlap"
 
 
 class PartialResultError(RdstitchError):
-    """Pictures were left out although the caller requires all of them."""
+    """Images were left out although the caller requires all of them."""
 
     exit_status = 5
     code = "left-out"

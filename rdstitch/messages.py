@@ -1,4 +1,4 @@
-"""What a user should know of a result, as one type: what it is, which pictures it concerns, and how grave it is."""
+"""What a user should know of a result, as one type: what it is, which images it concerns, and how grave it is."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +8,7 @@ from typing import Literal
 Severity = Literal["detail", "note", "warning", "left out", "failure"]
 
 MAX_NAMED = 3
-"""Pictures or pairs that one message names."""
+"""Images or pairs that one message names."""
 
 
 @dataclass(frozen=True)
@@ -18,12 +18,12 @@ class Message:
     Attributes
     ----------
     text : str
-        One sentence without its full stop; it names the pictures where there are several.
+        One sentence without its full stop; it names the images where there are several.
     images : tuple of str
-        Paths of the pictures that it concerns; empty where it concerns all of them.
+        Paths of the images that it concerns; empty where it concerns all of them.
     severity : str
         "detail": what only who asks need know. "note": how the result was made. "warning": there is a result, to be
-        looked at. "left out": the one picture named, or each of several, is not in the result, for the reason that the
+        looked at. "left out": the one image named, or each of several, is not in the result, for the reason that the
         text gives. "failure": the result cannot be relied on.
     code : str
         Heading in docs/troubleshooting.md; empty where the text says it all.
@@ -43,7 +43,7 @@ class Message:
 
     @property
     def clause(self) -> str:
-        """The text with the picture that it concerns, where it is one."""
+        """The text with the image that it concerns, where it is one."""
         return f"{Path(self.images[0]).name}: {self.text}" if len(self.images) == 1 else self.text
 
 
@@ -52,12 +52,12 @@ def ignored(message: Message) -> None:
 
 
 def left_out(path: str | Path, reason: str) -> Message:
-    """A picture that is not in the result."""
+    """An image that is not in the result."""
     return Message(reason.removeprefix(f"{path}: "), (str(path),), "left out", "left-out")
 
 
 def told_once(messages: Iterable[Message]) -> list[Message]:
-    """The same; pictures left out for the same reason are named in one, each once, which stands where the first did."""
+    """The same; images left out for the same reason are named in one, each once, which stands where the first did."""
     told: dict[object, Message] = {}
     for number, message in enumerate(messages):
         key = message.text if message.severity == "left out" else number
@@ -72,7 +72,7 @@ def of_severity(messages: Iterable[Message], *severities: Severity) -> tuple[Mes
 
 
 def names_of(paths: Iterable[str]) -> list[str]:
-    """File names without their folders, as messages call pictures."""
+    """File names without their folders, as messages call images."""
     return [Path(path).name for path in paths]
 
 

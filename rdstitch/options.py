@@ -22,12 +22,12 @@ LensName = Literal["auto", "division", "division-center", "division2", "division
 ModelName = Literal["auto", "rigid", "similarity", "tilting", "pose", "homography", "rotation"]
 
 _MAX_WORKERS = 1024  # threads; more than any machine has cores for
-_MAX_THRESHOLD = 1e4  # pixels; more than a picture is wide
+_MAX_THRESHOLD = 1e4  # pixels; more than an image is wide
 
 
 @dataclass(frozen=True)
 class StitchOptions:
-    """How pictures are registered and composited.
+    """How images are registered and composited.
 
     Attributes
     ----------
@@ -41,9 +41,9 @@ class StitchOptions:
         Minimal solver of the pairs: "auto", "two_point", "three_point", "three_point_similarity", "four_point" or
         "five_point".
     lens : str
-        Lens model, one of ``rdstitch.alignment.LENSES``; "auto": the simplest that the pictures allow.
+        Lens model, one of ``rdstitch.alignment.LENSES``; "auto": the simplest that the images allow.
     model : str
-        Motion model of the whole, one of ``rdstitch.alignment.MODELS``; "auto": the least free that the pictures allow.
+        Motion model of the whole, one of ``rdstitch.alignment.MODELS``; "auto": the least free that the images allow.
     threshold : float
         Largest transfer error of an inlier, pixels of the size that features are detected at.
     confidence : float
@@ -57,43 +57,43 @@ class StitchOptions:
     focal : float, optional
         Known focal length, pixels.
     tilt : (float, float), optional
-        Known tilt (psi, theta) of all pictures, radians.
+        Known tilt (psi, theta) of all images, radians.
     attitude : path, optional
-        Measured tilt of each picture: CSV of name, psi, theta, degrees; or "xmp".
+        Measured tilt of each image: CSV of name, psi, theta, degrees; or "xmp".
     attitude_std : float
         Standard deviation of these tilts, radians; 0: exact.
     mask : path, optional
-        Picture, or folder of them, that is dark where the pictures do not count.
+        Image, or folder of them, that is dark where the images do not count.
     channel_order : str
         Order of the channels of arrays that come in or go out: "bgr", as OpenCV has it, or "rgb".
     exclude, include_only : tuple of str
-        Names, or patterns with ``*``, ``?`` and ``[...]``, of pictures that are not used, and of those that alone are
+        Names, or patterns with ``*``, ``?`` and ``[...]``, of images that are not used, and of those that alone are
         used; empty for all.
     topic : str, optional
         Topic of the images in ROS bags; None: the only one.
     reference : str, optional
-        Name of the picture whose frame is kept; None: the best connected.
+        Name of the image whose frame is kept; None: the best connected.
     local_alignment : "auto", "off" or int
-        Smooth displacements of the pictures where the ground is rough: where held-out matches come nearer by them,
-        never, or always, with so many cells along the longer side of a picture.
+        Smooth displacements of the images where the ground is rough: where held-out matches come nearer by them,
+        never, or always, with so many cells along the longer side of an image.
     composite : CompositeOptions
-        How the pictures are put together.
+        How the images are put together.
     cache : path, optional
         Folder of results of earlier runs, to continue from; made if missing.
     seed : int
         Seed of random sampling: the same gives the same result, bit for bit.
     workers : int
-        Pictures and pairs worked on at the same time; 0: as many as there are cores.
+        Images and pairs worked on at the same time; 0: as many as there are cores.
     scheduler : str, optional
         Address of the scheduler of a Dask cluster that does the work, or "local" for one on this machine; needs the
         extra ``distributed``. A cluster also needs ``cache``, a folder that all its machines see by the same name, as
-        they must see the pictures.
+        they must see the images.
     overwrite : bool
         Replace existing outputs.
     strict : bool
-        Fail when a picture is left out.
+        Fail when an image is left out.
     force : bool
-        Write the picture even when the result failed its checks.
+        Write the image even when the result failed its checks.
     save_camera : path, optional
         Camera file to write; see rdstitch.camera_files for formats.
     dry_run : bool
@@ -140,7 +140,7 @@ class StitchOptions:
 
     def __post_init__(self) -> None:
         for name in ("cache", "save_camera"):
-            # Text is as good as a path, as it is for pictures.
+            # Text is as good as a path, as it is for images.
             if isinstance(given := getattr(self, name), str):
                 object.__setattr__(self, name, Path(given))
         if self.solver not in SOLVERS:
@@ -176,9 +176,9 @@ class StitchOptions:
         if self.workers > _MAX_WORKERS:
             raise ArgumentError(f"workers must be at most {_MAX_WORKERS}, not {self.workers}")
 
-    def for_pictures(self, count: int) -> Self:
-        """The same with numbers for what depends on how many pictures there are."""
-        return replace(self, features=self.features.for_pictures(count))
+    def for_images(self, count: int) -> Self:
+        """The same with numbers for what depends on how many images there are."""
+        return replace(self, features=self.features.for_images(count))
 
     @property
     def known_distortion(self) -> float | None:
@@ -189,7 +189,7 @@ class StitchOptions:
 
     @property
     def files(self) -> list[Path]:
-        """The files that are read besides the pictures, none of which may be written over."""
+        """The files that are read besides the images, none of which may be written over."""
         named = (self.mask, self.attitude, self.lightglue_model, self.features.aliked_model)
         given = [Path(file) for file in named if file is not None]
         return [file for path in given for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
@@ -202,11 +202,11 @@ class StitchOptions:
         )
         return MatchingOptions(pair, self.ratio, self.lightglue_model, self.threads)
 
-    def executor(self, pictures: int) -> Executor:
-        """Where the tasks of a set of so many pictures are computed; to be used in a ``with`` block."""
-        return open_executor(self.threads, pictures, scheduler=self.scheduler, store=self.cache)
+    def executor(self, images: int) -> Executor:
+        """Where the tasks of a set of so many images are computed; to be used in a ``with`` block."""
+        return open_executor(self.threads, images, scheduler=self.scheduler, store=self.cache)
 
     @property
     def threads(self) -> int:
-        """Number of pictures or pairs to work on at the same time."""
+        """Number of images or pairs to work on at the same time."""
         return self.workers or processor_count()

@@ -1,8 +1,8 @@
 """Homographies of planar motion: a camera that keeps its tilt and its height while it moves over a plane.
 
 With tilt ``R = Rx(ψ) Ry(θ)``, yaw φ and translation ``t = (tx, ty, 0)`` in units of the height above the plane,
-the homography from picture 1 to picture 2 is ``H ~ R Rz(φ) T R'``, ``T = I - t e3'`` (Valtonen Örnhag et al.,
-eq. 1), in focal-normalized coordinates. When the second picture is taken from ``height`` times the height of the
+the homography from image 1 to image 2 is ``H ~ R Rz(φ) T R'``, ``T = I - t e3'`` (Valtonen Örnhag et al.,
+eq. 1), in focal-normalized coordinates. When the second image is taken from ``height`` times the height of the
 first, it is ``H ~ R Rz(φ) diag(1, 1, height) T R'``.
 """
 
@@ -46,7 +46,7 @@ def tilt_from_normal(normal: ArrayLike) -> FloatArray:
 
 
 def turned_tilt(tilt: tuple[float, float], turning: FloatArray) -> tuple[float, float]:
-    """The tilt (ψ, θ), radians, of a picture whose directions, to the right and down, are turned by a matrix (2, 2)."""
+    """The tilt (ψ, θ), radians, of an image whose directions, to the right and down, are turned by a matrix (2, 2)."""
     *direction, ahead = rotation_from_tilt(tilt)[:, 2]
     psi, theta = tilt_from_normal([*turning @ direction, ahead]).tolist()
     return psi, theta
@@ -54,18 +54,18 @@ def turned_tilt(tilt: tuple[float, float], turning: FloatArray) -> tuple[float, 
 
 @dataclass(frozen=True)
 class PlanarMotion:
-    """Motion between two pictures of one camera over one plane.
+    """Motion between two images of one camera over one plane.
 
     Attributes
     ----------
     tilt : (float, float)
-        (ψ, θ), radians, of the camera to the plane, the same in both pictures.
+        (ψ, θ), radians, of the camera to the plane, the same in both images.
     yaw : float
         φ, radians.
     translation : (float, float)
-        (tx, ty) in units of the first picture's height above the plane.
+        (tx, ty) in units of the first image's height above the plane.
     height : float
-        Height of the second picture in units of the first's; 1 for planar motion.
+        Height of the second image in units of the first's; 1 for planar motion.
     """
 
     tilt: tuple[float, float]

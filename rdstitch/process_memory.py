@@ -6,7 +6,7 @@ from contextlib import contextmanager, suppress
 from threading import Condition
 
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # of mallopt
-_LARGE = 8 * 2**20  # bytes: more than any array of a tile, which are made again and again; less than a picture
+_LARGE = 8 * 2**20  # bytes: more than any array of a tile, which are made again and again; less than an image
 _SCRATCH = 280 * 10**6  # bytes that the threads of this process may take at once for what they give back soon
 
 
@@ -29,7 +29,7 @@ def return_freed_memory() -> None:
 def reuse_freed_memory() -> None:
     """Keep what is freed until :func:`return_freed_memory` is called next (glibc).
 
-    For a stage that takes as much for one picture after the other as :func:`scratch_memory` allows, such as the
+    For a stage that takes as much for one image after the other as :func:`scratch_memory` allows, such as the
     pyramids of SIFT: the system would clear every page of it anew.
     """
     with suppress(AttributeError, OSError, TypeError):

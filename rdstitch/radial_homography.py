@@ -32,7 +32,7 @@ def project(homogeneous: FloatArray) -> FloatArray:
 
 
 def to_plane(camera: Camera, homography: FloatArray, points: ArrayLike) -> FloatArray:
-    """Where measured points of a picture, pixels (N, 2), lie on the plane; NaN at and beyond the horizon.
+    """Where measured points of an image, pixels (N, 2), lie on the plane; NaN at and beyond the horizon.
 
     Parameters
     ----------
@@ -44,13 +44,13 @@ def to_plane(camera: Camera, homography: FloatArray, points: ArrayLike) -> Float
 
 
 def from_plane(camera: Camera, homography: FloatArray, points: ArrayLike) -> FloatArray:
-    """Pixels where a picture shows points (N, 2) of the plane: the inverse of :func:`to_plane`; NaN where it cannot."""
+    """Pixels where an image shows points (N, 2) of the plane: the inverse of :func:`to_plane`; NaN where it cannot."""
     back = np.asarray(np.linalg.inv(homography), dtype=np.float64)
     return camera.distort(camera.denormalize(_mapped(back, np.asarray(points, dtype=np.float64))))
 
 
 def to_directions(camera: Camera, matrix: FloatArray, points: ArrayLike) -> FloatArray:
-    """Directions (N, 3), of any length, of measured points of a picture, pixels (N, 2), of a camera that only turned.
+    """Directions (N, 3), of any length, of measured points of an image, pixels (N, 2), of a camera that only turned.
 
     ``matrix`` (3, 3) leads from undistorted normalized coordinates to directions.
     """
@@ -66,12 +66,12 @@ def _mapped(homography: FloatArray, points: FloatArray) -> FloatArray:
 def transfer(
     homography: ArrayLike, distortion: ArrayLike, points: ArrayLike, higher: Sequence[float] = ()
 ) -> FloatArray:
-    """Where measured points of picture 1 are measured in picture 2: undistort, apply H, distort.
+    """Where measured points of image 1 are measured in image 2: undistort, apply H, distort.
 
     Parameters
     ----------
     homography : array_like of shape (..., 3, 3)
-        From picture 1 to picture 2, with positive third coordinates in front of the camera.
+        From image 1 to image 2, with positive third coordinates in front of the camera.
     distortion : array_like of shape (...)
         λ in the frame of the points.
     points : array_like of shape (N, 2)
@@ -97,15 +97,15 @@ class TransferJacobian:
     Attributes
     ----------
     points : ndarray of shape (N, 2)
-        Where the points of picture 1 are measured in picture 2.
+        Where the points of image 1 are measured in image 2.
     by_image : ndarray of shape (2, 3, N)
         By ``z = H p``.
     lifted : ndarray of shape (3, N)
         ``p``.
     by_point : ndarray of shape (N, 2, 2)
-        By the point in picture 1.
+        By the point in image 1.
     by_divisor, by_own_divisor : ndarray of shape (N, 2)
-        By ``g`` of the lens at the point in picture 1, and by that at the point in picture 2.
+        By ``g`` of the lens at the point in image 1, and by that at the point in image 2.
     radius2, own_radius2 : ndarray of shape (N,)
         Squared radii of those.
     """
@@ -128,7 +128,7 @@ class TransferJacobian:
     def by_lens(self, free: BoolArray) -> FloatArray:
         """By those of :data:`rdstitch.camera.LENS_PARAMETERS` that are ``free`` (5,), shape (2, K, N).
 
-        The centre shifts in both pictures.
+        The centre shifts in both images.
         """
         columns = [
             self.by_divisor.T * self.radius2**power + self.by_own_divisor.T * self.own_radius2**power
@@ -155,7 +155,7 @@ def transfer_jacobian(
     distortion : float
         λ in the frame of the points.
     points : ndarray of shape (N, 2)
-        Points of picture 1, normalized. Points that cannot be transferred give NaN everywhere.
+        Points of image 1, normalized. Points that cannot be transferred give NaN everywhere.
     higher : sequence of float
         μ and ν in the frame of the points.
     """
@@ -188,11 +188,11 @@ def transfer_jacobian(
 
 
 def measurement_whitening(by_point: FloatArray, common: FloatArray | None = None) -> FloatArray:
-    """Whitening of a transfer error whose noise comes from both pictures (Sampson's weighting).
+    """Whitening of a transfer error whose noise comes from both images (Sampson's weighting).
 
-    A point measured with the same noise in both pictures is transferred with covariance ``I + J J'``,
+    A point measured with the same noise in both images is transferred with covariance ``I + J J'``,
     ``J`` = ``by_point``. The returned upper triangular ``W`` has ``W'W = ((I + J J') / 2)⁻¹``, so that the whitened
-    error has the size of the error in one picture where the two have the same scale.
+    error has the size of the error in one image where the two have the same scale.
 
     Parameters
     ----------
@@ -231,18 +231,18 @@ def whiten(whitening: FloatArray, values: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, repr=False)
 class RadialHomography:
-    """The relation of two pictures of a plane: homography, λ, and how far both can be trusted.
+    """The relation of two images of a plane: homography, λ, and how far both can be trusted.
 
     A fit that failed is falsy and carries the reason.
 
     Attributes
     ----------
     homography : ndarray of shape (3, 3)
-        ``p2(λ) ~ H p1(λ)`` for points normalized by half the diagonal of their picture; NaN after a failure.
+        ``p2(λ) ~ H p1(λ)`` for points normalized by half the diagonal of their image; NaN after a failure.
     camera : Camera
-        The camera of picture 1, with the estimated λ (0 after a failure) and the focal length that was used.
+        The camera of image 1, with the estimated λ (0 after a failure) and the focal length that was used.
     camera2 : Camera
-        The same lens on picture 2, which may have another size.
+        The same lens on image 2, which may have another size.
     inliers : ndarray of shape (N,), bool
         Correspondences that agree with this model.
     covariance : ndarray of shape (P, P)
@@ -254,7 +254,7 @@ class RadialHomography:
     motion : PlanarMotion or None
         The motion where the model is one of planar motion.
     rms : float
-        Root mean square error of the inliers, pixels of picture 2.
+        Root mean square error of the inliers, pixels of image 2.
     solver : str
         Minimal solver that found the model.
     iterations : int
@@ -308,17 +308,17 @@ class RadialHomography:
 
     @property
     def distortion_observable(self) -> bool:
-        """Whether the pictures determine λ."""
+        """Whether the images determine λ."""
         return self.ok and bool(np.isfinite(self.distortion_std))
 
     @property
     def homography_px(self) -> FloatArray:
-        """H from undistorted pixels of picture 1 to undistorted pixels of picture 2, shape (3, 3)."""
+        """H from undistorted pixels of image 1 to undistorted pixels of image 2, shape (3, 3)."""
         to_px = _pixel_matrix(self.camera2)
         return to_px @ self.homography @ np.linalg.inv(_pixel_matrix(self.camera))
 
     def transfer(self, points1: ArrayLike) -> FloatArray:
-        """Measured pixels of picture 1 (N, 2) to measured pixels of picture 2; NaN where there is no such point."""
+        """Measured pixels of image 1 (N, 2) to measured pixels of image 2; NaN where there is no such point."""
         normalized = self.camera.normalize(points1)
         moved = transfer(self.homography, self.camera.distortion, normalized, self.camera.higher)
         return self.camera2.denormalize(moved)

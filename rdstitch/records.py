@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rdstitch.errors import InputError
 from rdstitch.file_access import read_limited
 
-MAX_FILE = 256 * 2**20  # bytes; a sidecar of ten thousand pictures has about 30 MB
+MAX_FILE = 256 * 2**20  # bytes; a sidecar of ten thousand images has about 30 MB
 _MAX_SIDE = 10**7  # pixels
 _MIN_ENTRY, _MAX_ENTRY = 1e-30, 1e30  # of matrices
 _DEEPEST = 50  # objects and lists within one another
@@ -186,14 +186,14 @@ class Record:
         return first, second
 
     def size(self) -> tuple[int, int]:
-        """Width and height of a picture, pixels."""
+        """Width and height of an image, pixels."""
         values = [item.side() for item in self.items()]
         if len(values) != 2:
             self.expected("width and height in pixels")
         return values[0], values[1]
 
     def side(self) -> int:
-        """Width or height of a picture, pixels."""
+        """Width or height of an image, pixels."""
         value = self.integer(1)
         if value > _MAX_SIDE:
             self.expected("a width or height in pixels")

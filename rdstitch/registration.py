@@ -1,4 +1,4 @@
-"""What registering a set of pictures gives."""
+"""What registering a set of images gives."""
 
 import math
 from collections.abc import Iterable
@@ -35,24 +35,24 @@ class Verdict:
 
 @dataclass(frozen=True, repr=False)
 class Registration:
-    """Pictures registered as one.
+    """Images registered as one.
 
     Attributes
     ----------
     sources : tuple of Source
     keypoints : tuple of int
-        Number of features of each picture.
+        Number of features of each image.
     pairs : tuple of PairRegistration
         Every pair that was compared.
     alignment : Alignment
     messages : tuple of Message
-        What the user should know: failed checks, warnings, and every picture that is not in the result.
+        What the user should know: failed checks, warnings, and every image that is not in the result.
     static_background : bool
-        Whether a part of what the pictures show stays where it is in them, and only what moves was registered.
+        Whether a part of what the images show stays where it is in them, and only what moves was registered.
     stretch : (float, float) or None
-        Grey levels of all pictures that count as black and white; None for those of 8 bits.
+        Grey levels of all images that count as black and white; None for those of 8 bits.
     mixed : TwoLenses or None
-        Where pictures of two lenses are mixed. If it is clear which belong together, the others are left out.
+        Where images of two lenses are mixed. If it is clear which belong together, the others are left out.
     """
 
     sources: tuple[Source, ...]
@@ -104,26 +104,26 @@ class Registration:
 
     @property
     def left_out(self) -> tuple[Message, ...]:
-        """Every picture that is not in the result, with the reason."""
+        """Every image that is not in the result, with the reason."""
         return of_severity(self.messages, "left out")
 
     @property
     def summary(self) -> str:
-        """How many pictures are in the result, and λ with its standard deviation, in one line."""
+        """How many images are in the result, and λ with its standard deviation, in one line."""
         used = int(self.alignment.used.sum())
-        pictures = f"{used} of {used + len(self.left_out)} pictures"
+        images = f"{used} of {used + len(self.left_out)} images"
         distortion, deviation = self.alignment.distortion, self.alignment.distortion_std
         if not math.isfinite(deviation):
-            return f"{pictures}, λ not observable"
-        return f"{pictures}, λ = {distortion:.4f} " + ("(given)" if deviation == 0.0 else f"± {deviation:.4f}")
+            return f"{images}, λ not observable"
+        return f"{images}, λ = {distortion:.4f} " + ("(given)" if deviation == 0.0 else f"± {deviation:.4f}")
 
     @property
     def upright_camera(self) -> Camera:
-        """The camera of the reference picture as its pixels are read, upright."""
+        """The camera of the reference image as its pixels are read, upright."""
         return self.alignment.cameras[self.alignment.reference]
 
     @property
     def camera(self) -> Camera:
-        """The camera of the reference picture as its file stores it, with everything that was found of it."""
+        """The camera of the reference image as its file stores it, with everything that was found of it."""
         orientation = self.sources[self.alignment.reference].metadata.orientation
         return self.upright_camera.turned(inverse(orientation))

@@ -1,4 +1,4 @@
-"""What stitching gives: the picture, in memory or in a file, and everything that was estimated for it."""
+"""What stitching gives: the image, in memory or in a file, and everything that was estimated for it."""
 
 from dataclasses import dataclass, field
 from functools import partial
@@ -24,7 +24,7 @@ _PREVIEW = 800  # pixels of the longer side
 
 
 class OutputImage:
-    """Base of results that have a picture."""
+    """Base of results that have an image."""
 
     canvas: Canvas
     output: Path | None
@@ -43,9 +43,9 @@ class OutputImage:
 
     @property
     def image(self) -> NDArray[Any]:
-        """The picture (H, W) or (H, W, C), channels in the order that was chosen for arrays; 0 where there is none.
+        """The image (H, W) or (H, W, C), channels in the order that was chosen for arrays; 0 where there is none.
 
-        A picture that went to a file is read from there.
+        An image that went to a file is read from there.
 
         Raises
         ------
@@ -58,7 +58,7 @@ class OutputImage:
 
     @property
     def alpha(self) -> NDArray[np.uint8]:
-        """255 where the picture is, (H, W), elsewhere 0; 255 everywhere where its file holds no alpha, as JPEG."""
+        """255 where the image is, (H, W), elsewhere 0; 255 everywhere where its file holds no alpha, as JPEG."""
         pixels, alpha = self._samples()
         return np.full(pixels.shape[:2], 255, np.uint8) if alpha is None else alpha
 
@@ -67,15 +67,15 @@ class OutputImage:
         if self.composite is not None:
             return self.composite.pixels, self.composite.alpha
         if self.plan is not None or self.output is None or self.output.suffix.lower() == ".dzi":
-            raise ArgumentError("there is no picture in memory: stitch without an output, or with one of another type")
-        picture = read_image(self.output)
-        return picture.pixels, picture.alpha
+            raise ArgumentError("there is no image in memory: stitch without an output, or with one of another type")
+        image = read_image(self.output)
+        return image.pixels, image.alpha
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.summary}>"
 
     def _repr_png_(self) -> bytes | None:
-        """A preview for notebooks; None where there is no picture."""
+        """A preview for notebooks; None where there is no image."""
         if self.composite is not None:
             return encode_preview(self.composite.pixels, _PREVIEW, self.composite.alpha, "PNG")
         if self.plan is not None or self.output is None or not self.output.is_file():
@@ -86,25 +86,25 @@ class OutputImage:
 
 @dataclass(frozen=True, repr=False)
 class StitchResult(OutputImage):
-    """A stitched picture and everything that was estimated for it.
+    """A stitched image and everything that was estimated for it.
 
     Attributes
     ----------
     registration : Registration
         With all that there is to know of the result in its ``messages``.
     canvas : Canvas
-        Where the pictures lie in the output.
+        Where the images lie in the output.
     options : StitchOptions
     output : Path or None
-        File that the picture was written to.
+        File that the image was written to.
     composite : Composite or None
-        The picture itself; None where it went to a file, or was only planned.
+        The image itself; None where it went to a file, or was only planned.
     plan : CompositePlan or None
         Of a dry run.
     fingerprint : Fingerprint or None
         Size and digest of the file.
     local_alignment : LocalAlignment
-        Displacement fields of the pictures that are used, in their order.
+        Displacement fields of the images that are used, in their order.
     georeference : Georeference or None
         Where the output lies on the Earth.
     not_georeferenced : str
@@ -139,7 +139,7 @@ class StitchResult(OutputImage):
 
     @property
     def messages(self) -> tuple[Message, ...]:
-        """What the user should know: failed checks, warnings, and every picture that is not in the result."""
+        """What the user should know: failed checks, warnings, and every image that is not in the result."""
         return self.registration.messages
 
     @property
@@ -149,6 +149,6 @@ class StitchResult(OutputImage):
 
     @property
     def summary(self) -> str:
-        """What was made, of how many pictures, and λ with its standard deviation, in one line."""
+        """What was made, of how many images, and λ with its standard deviation, in one line."""
         name, (width, height) = "" if self.output is None else f"{self.output}: ", self.canvas.size
         return f"{name}{width} x {height} pixels, {self.registration.summary}"

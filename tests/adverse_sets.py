@@ -1,4 +1,4 @@
-"""Rendered sets with what real pictures suffer from: bodies, vehicles, borders, blur, odd lenses and shutters, dirt.
+"""Rendered sets with what real images suffer from: bodies, vehicles, borders, blur, odd lenses and shutters, dirt.
 
 Each is a :class:`rdstitch.synthetic.Sequence`, so that the truth is known, and is judged as the other sets are; see
 :mod:`tests.trust_sets`.
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.synthetic import Photometry, PictureTexture, Sequence, grid_poses, ground, repeated, sequence_over
+from rdstitch.synthetic import ImageTexture, Photometry, Sequence, grid_poses, ground, repeated, sequence_over
 
 ADVERSE = (
     "body", "vehicle", "banner", "round border", "curved border", "blurred", "off centre", "crops", "rolling shutter",
@@ -24,7 +24,7 @@ ADVERSE = (
 """Kinds of sets. A right result, a warning that names the place, or a refusal: each is honest."""
 
 SOLVABLE_ADVERSE = ("body", "vehicle", "banner", "round border", "curved border", "blurred")
-"""Kinds of which a person would make a picture."""
+"""Kinds of which a person would make an image."""
 
 Surface = Callable[[FloatArray], FloatArray]
 
@@ -35,20 +35,20 @@ def _unchanged(index: int, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class AlteredSequence(Sequence):
-    """Pictures of a surface, altered after they were taken.
+    """Images of a surface, altered after they were taken.
 
     Attributes
     ----------
     alter : callable
-        Takes the index of a picture and its pixels to other pixels of the same shape.
+        Takes the index of an image and its pixels to other pixels of the same shape.
     height : callable, optional
         Height of the ground over places (..., 2), all in texels; smooth.
     shutter : ndarray of shape (N, 2)
-        How far the camera moves while a picture is read out from its first to its last row, texels.
+        How far the camera moves while an image is read out from its first to its last row, texels.
     offset : ndarray of shape (N, 2)
-        Where the corner of each picture lies in the uncropped one, pixels.
+        Where the corner of each image lies in the uncropped one, pixels.
     dispensable : frozenset of int
-        Pictures without which the set is solved, too.
+        Images without which the set is solved, too.
     """
 
     alter: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]] = _unchanged
@@ -74,15 +74,15 @@ class AlteredSequence(Sequence):
             place = position + (foot - position) * (1.0 - self.height(place)[..., None] / above)
         return place
 
-    def to_picture(self, index: int, points: ArrayLike) -> FloatArray:
-        """See :meth:`Sequence.to_picture`."""
+    def to_image(self, index: int, points: ArrayLike) -> FloatArray:
+        """See :meth:`Sequence.to_image`."""
         place = np.asarray(points, dtype=np.float64)
         if self.height is not None:
             position, above = self.poses.position[index], self.poses.height[index]
             place = position + (place - position) / (1.0 - self.height(place)[..., None] / above)
-        seen = super().to_picture(index, place)
+        seen = super().to_image(index, place)
         for _ in range(12):
-            seen = super().to_picture(index, place - self._moved(index, seen[..., 1]))
+            seen = super().to_image(index, place - self._moved(index, seen[..., 1]))
         return seen - self._of(self.offset, index)
 
     def _moved(self, index: int, row: FloatArray) -> FloatArray:
@@ -98,12 +98,12 @@ class AlteredSequence(Sequence):
 
 @dataclass(frozen=True)
 class RottenSequence(AlteredSequence):
-    """Pictures of which one has flipped bits in its JPEG file.
+    """Images of which one has flipped bits in its JPEG file.
 
     Attributes
     ----------
     rotten : int
-        Index of that picture.
+        Index of that image.
     flips : int
         Bits that are flipped.
     """
@@ -146,7 +146,7 @@ def adverse_set(kind: str, seed: int) -> Sequence:
 
 
 def _region(size: tuple[int, int], share: float, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """A strip along one side of the picture, or one of its corners, of a share of its area."""
+    """A strip along one side of the image, or one of its corners, of a share of its area."""
     width, height = size
     u, v = np.meshgrid(np.arange(width) / width, np.arange(height) / height)
     corner = (u < np.sqrt(share)) & (v < np.sqrt(share))
@@ -155,13 +155,13 @@ def _region(size: tuple[int, int], share: float, rng: np.random.Generator) -> ND
 
 
 def _body(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
-    """A part of the robot in every picture."""
+    """A part of the robot in every image."""
     region = _region(altered.lens.image_size, float(rng.uniform(0.15, 0.4)), rng)
     return replace(altered, alter=_pasted(altered.lens.image_size, region, rng))
 
 
 def _banner(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
-    """A logo and a line of data in every picture."""
+    """A logo and a line of data in every image."""
     width, height = altered.lens.image_size
     region = np.zeros((height, width), dtype=np.bool_)
     across, down = rng.uniform(0.4, 0.9) * width, rng.uniform(0.1, 0.3) * height
@@ -173,7 +173,7 @@ def _banner(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
 def _pasted(
     size: tuple[int, int], region: NDArray[np.bool_], rng: np.random.Generator
 ) -> Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]]:
-    """The same texture over a region of every picture, with noise of its own in each."""
+    """The same texture over a region of every image, with noise of its own in each."""
     texture = (ground(size, int(rng.integers(1 << 30))).region(0, 0, *size)[:, :, 0] * 255.0).astype(np.float32)
     seed = int(rng.integers(1 << 30))
 
@@ -187,7 +187,7 @@ def _pasted(
 
 
 def _vehicle(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
-    """A part of every picture shows another plane, which moves little and otherwise."""
+    """A part of every image shows another plane, which moves little and otherwise."""
     size = altered.lens.image_size
     region = _region(size, float(rng.uniform(0.15, 0.4)), rng)
     slow = altered.poses.position.mean(axis=0) + 0.15 * (altered.poses.position - altered.poses.position.mean(axis=0))
@@ -217,7 +217,7 @@ def _round_border(altered: AlteredSequence, rng: np.random.Generator) -> Sequenc
 
 
 def _curved_border(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
-    """Black beyond a curve on two sides, as pictures have that were undistorted before."""
+    """Black beyond a curve on two sides, as images have that were undistorted before."""
     width, height = altered.lens.image_size
     u, v = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
     bend = rng.uniform(0.1, 0.25)
@@ -234,7 +234,7 @@ def _blackened(outside: NDArray[np.bool_]) -> Callable[[int, NDArray[np.uint8]],
 
 
 def _blurred(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
-    """One picture out of focus."""
+    """One image out of focus."""
     which, sigma = int(rng.integers(len(altered))), float(rng.uniform(4.0, 8.0))
 
     def blur(index: int, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -244,13 +244,13 @@ def _blurred(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
 
 
 def _crops(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
-    """Pictures cut from larger ones, each elsewhere, so that the lens's axis is not at one place in them."""
+    """Images cut from larger ones, each elsewhere, so that the lens's axis is not at one place in them."""
     far = 0.05 * float(np.hypot(*altered.lens.image_size))
     return replace(altered, offset=rng.uniform(-far, far, (len(altered), 2)))
 
 
 def _rolling_shutter(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
-    """The camera moves on while its rows are read, by up to a tenth of the picture, not always equally fast."""
+    """The camera moves on while its rows are read, by up to a tenth of the image, not always equally fast."""
     speed = rng.uniform(0.03, 0.1) * altered.lens.image_size[0]
     angle = rng.uniform(0.0, 2.0 * np.pi)
     pace = rng.uniform(0.5, 1.0, (len(altered), 1))
@@ -277,7 +277,7 @@ def _dirt(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
     for _ in range(width * height // 40_000):
         place = (int(rng.integers(width)), int(rng.integers(height)))
         cv2.circle(pixels, place, int(rng.integers(2, 6)), [float(rng.uniform(0, 1))] * pixels.shape[2], -1)
-    return replace(altered, texture=PictureTexture(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels))
+    return replace(altered, texture=ImageTexture(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels))
 
 
 def _bit_rot(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:

@@ -22,7 +22,7 @@ class Scene:
         Without λ.
     links : list of Link
     truth : ndarray of shape (N, 3, 3)
-        True plane-to-picture homographies.
+        True plane-to-image homographies.
     poses : ndarray of shape (N, 6)
         True poses in the columns of the planar models.
     distortion : float
@@ -86,7 +86,7 @@ def scene(
     closed: bool = False,
     relief: float = 0.0,
 ) -> Scene:
-    """Links between all pictures whose overlap is at least ``overlap``, at most ``reach`` frames apart, also across
+    """Links between all images whose overlap is at least ``overlap``, at most ``reach`` frames apart, also across
     the end of the sequence where it is ``closed``.
 
     Outliers are what a pairwise estimation lets pass: off by up to 4 px. ``relief`` is the amplitude of smooth hills,

@@ -16,7 +16,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 SCALE = 500.0
-"""Half diagonals of all pictures, pixels."""
+"""Half diagonals of all images, pixels."""
 
 SHIFT = np.array([[1.0, 0.0, 0.1], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 """The homography of every link; without any motion links would count as static."""
@@ -24,10 +24,10 @@ SHIFT = np.array([[1.0, 0.0, 0.1], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 ONLY_DISTORTION = np.array([True, False, False, False, False])
 
 
-def observations(errors: FloatArray, pictures: int = 6) -> Observations:
+def observations(errors: FloatArray, images: int = 6) -> Observations:
     """Links of neighbours and of next but one, whose errors under :data:`SHIFT` are (L, K, 2), pixels."""
     links, each = errors.shape[:2]
-    pairs = [(i, i + step) for step in range(1, pictures) for i in range(pictures - step)][:links]
+    pairs = [(i, i + step) for step in range(1, images) for i in range(images - step)][:links]
     first, second = np.array(pairs, dtype=np.intp).T
     points = np.random.default_rng(7).uniform(-0.6, 0.6, (links * each, 2))
     start = np.arange(0, links * each + 1, each, dtype=np.intp)
@@ -67,7 +67,7 @@ def _focal_cost(parameters: Any) -> float:
     return float(((parameters.shared[-1:] - 0.2) ** 2).sum() / 0.3**2)
 
 
-def problem(seen: Observations, fits: Callable[[MotionModel], Fit], pictures: int = 6, **more: Any) -> Problem:
+def problem(seen: Observations, fits: Callable[[MotionModel], Fit], images: int = 6, **more: Any) -> Problem:
     """A problem whose fits are given; ``problem.fitted`` lists the models that were fitted."""
     fitted: list[str] = []
 
@@ -80,7 +80,7 @@ def problem(seen: Observations, fits: Callable[[MotionModel], Fit], pictures: in
         homographies=np.tile(SHIFT, (len(seen), 1, 1)),
         lens=np.zeros(5),
         free_lens=ONLY_DISTORTION,
-        count=pictures,
+        count=images,
         fit=fit,
         fitted=fitted,
         extend=lambda fit, lens: fit,

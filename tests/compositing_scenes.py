@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from examples.judging.comparison import plane_under
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.compositing import Canvas, PlacedPicture, place_pictures, plan_canvas
-from rdstitch.io import Metadata, Picture
+from rdstitch.compositing import Canvas, PlacedImage, place_images, plan_canvas
+from rdstitch.io import DecodedImage, Metadata
 from rdstitch.synthetic.layouts import grid_poses
 from rdstitch.synthetic.rendering import Photometry, sequence_over
 from rdstitch.synthetic.rendering import Sequence as Rendering
@@ -22,7 +22,7 @@ from rdstitch.synthetic.textures import ground
 
 @dataclass(frozen=True)
 class Scene:
-    """Pictures of a plane with their true cameras and homographies, and the canvas they give."""
+    """Images of a plane with their true cameras and homographies, and the canvas they give."""
 
     rendering: Rendering
     frames: Sequence[NDArray[Any]]
@@ -31,14 +31,14 @@ class Scene:
     canvas: Canvas
 
     @property
-    def sources(self) -> list[Callable[[], Picture]]:
+    def sources(self) -> list[Callable[[], DecodedImage]]:
         """What the compositor reads."""
-        return [partial(as_picture, frame) for frame in self.frames]
+        return [partial(as_image, frame) for frame in self.frames]
 
     @property
-    def pictures(self) -> list[PlacedPicture]:
+    def images(self) -> list[PlacedImage]:
         """What the compositor takes."""
-        return place_pictures(self.sources, self.cameras, self.homographies)
+        return place_images(self.sources, self.cameras, self.homographies)
 
     def truth(self, canvas: Canvas | None = None) -> NDArray[np.float32]:
         """The plane as a perfect composite shows it: grey (h, w), 0 to 1."""
@@ -46,9 +46,9 @@ class Scene:
         return drawn.astype(np.float32)
 
 
-def as_picture(frame: NDArray[Any], alpha: NDArray[np.uint8] | None = None) -> Picture:
-    """A picture as if it had been read from a file."""
-    return Picture(frame, alpha, Metadata((frame.shape[1], frame.shape[0])))
+def as_image(frame: NDArray[Any], alpha: NDArray[np.uint8] | None = None) -> DecodedImage:
+    """An image as if it had been read from a file."""
+    return DecodedImage(frame, alpha, Metadata((frame.shape[1], frame.shape[0])))
 
 
 def render(

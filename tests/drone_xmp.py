@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from rdstitch.arrays import FloatArray
 
 # By source: the properties of yaw, pitch and roll; and the axes of the body (ahead, right, below) in those of the
-# camera (right in the picture, down in it, ahead), as columns.
+# camera (right in the image, down in it, ahead), as columns.
 DIALECTS: dict[str, tuple[tuple[str, str, str], list[list[float]]]] = {
     "dji-gimbal": (
         ("drone-dji:GimbalYawDegree", "drone-dji:GimbalPitchDegree", "drone-dji:GimbalRollDegree"),

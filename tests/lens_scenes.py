@@ -11,7 +11,7 @@ FISHEYE = Camera(SIZE, -0.49, -0.055, (335.0, 226.0), distortion3=-0.008)
 
 
 def lens_scene(lens: Camera, seed: int, *, relief: float = 0.0, columns: int = 4, rows: int = 3) -> Scene:
-    """Links of a grid of pictures through a lens."""
+    """Links of a grid of images through a lens."""
     rng = np.random.default_rng(seed)
     poses = grid(columns, rows, (0.4, 0.35), np.pi, rng)
     return scene(poses, lens=lens, rng=rng, noise=0.25, relief=relief, focal=420.0)
@@ -23,7 +23,7 @@ def aligned(given: Scene, **options: object) -> Alignment:
 
 
 def lens_distance(found: Camera, truth: Camera) -> float:
-    """Largest distance of the two lenses, pixels, after the best similarity of the undistorted pictures."""
+    """Largest distance of the two lenses, pixels, after the best similarity of the undistorted images."""
     u, v = np.meshgrid(np.linspace(0, SIZE[0] - 1, 15), np.linspace(0, SIZE[1] - 1, 11))
     points = np.column_stack([u.ravel(), v.ravel()])
     ours, theirs = (camera.normalize(camera.undistort(points)) for camera in (found, truth))

@@ -1,4 +1,4 @@
-"""Small networks with the inputs and outputs of ALIKED and LightGlue, good enough to stitch rendered pictures.
+"""Small networks with the inputs and outputs of ALIKED and LightGlue, good enough to stitch rendered images.
 
 Imported by tests only after ``pytest.importorskip("onnx")``.
 """
@@ -15,7 +15,7 @@ from onnx import TensorProto, helper, numpy_helper
 SIDE = 640
 KEYPOINTS = 500
 WIDTH = 64
-_RADIUS = 12  # of the blobs, px of the network's picture
+_RADIUS = 12  # of the blobs, px of the network's image
 
 
 def save_aliked(path: Path) -> Path:

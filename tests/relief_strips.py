@@ -1,4 +1,4 @@
-"""Strips of pictures over rough ground, as matches: links as two-view estimation makes them, and their truth."""
+"""Strips of images over rough ground, as matches: links as two-view estimation makes them, and their truth."""
 
 from dataclasses import dataclass, replace
 
@@ -25,7 +25,7 @@ _OPTIONS = EstimationOptions("auto", None, RansacOptions(3.0, 0.999, 10000, 0), 
 
 @dataclass(frozen=True)
 class Strip:
-    """Pictures in a row, each linked with the three after it.
+    """Images in a row, each linked with the three after it.
 
     Attributes
     ----------
@@ -44,24 +44,24 @@ class Strip:
     links: list[Link]
 
     def window(self, first: int, count: int) -> "Strip":
-        """Some pictures that follow one another; their numbers stay."""
+        """Some images that follow one another; their numbers stay."""
         inside = range(first, first + count)
         return replace(self, links=[k for k in self.links if k.image1 in inside and k.image2 in inside])
 
 
-def strip(kind: str, height: float, seed: int, pictures: int) -> Strip:
+def strip(kind: str, height: float, seed: int, images: int) -> Strip:
     """A strip over ``kind`` of relief, or "flat", of so many heights of the camera; tilts differ by some degrees."""
     rng = np.random.default_rng((seed, 15))
     lens = Camera(LENS.image_size, float(rng.uniform(-0.3, 0.05)), focal=520.0)
     tilt = (float(rng.uniform(-0.06, 0.06)), float(rng.uniform(-0.06, 0.06)))
-    poses = grid_poses(lens, pictures, 1, overlap=float(rng.uniform(0.6, 0.75)), shift=0.03, tilt=tilt, seed=seed)
+    poses = grid_poses(lens, images, 1, overlap=float(rng.uniform(0.6, 0.75)), shift=0.03, tilt=tilt, seed=seed)
     poses = poses.shaken(seed=seed, height=0.05, yaw=0.05, tilt=0.03)
     width = int(rng.integers(100, 500))
     relief = None if kind == "flat" else lambda size: RELIEFS[kind](size, seed, height=height * 520.0, width=width)
     truth = sequence_over(blank, lens, poses, relief=relief, seed=seed)
     pairs, matched = [], []
-    for i in range(pictures):
-        for j in range(i + 1, min(i + 4, pictures)):
+    for i in range(images):
+        for j in range(i + 1, min(i + 4, images)):
             points1, points2 = _matches(truth, i, j, rng)
             if len(points1) >= _MATCHES // 5:
                 pairs.append((i, j))
@@ -74,7 +74,7 @@ def strip(kind: str, height: float, seed: int, pictures: int) -> Strip:
         if relation
     ]
     links = [pair.link() for pair in over_rough_ground(registered, _OPTIONS.ransac.threshold)]
-    return Strip(truth, lens.distortion, [Camera(lens.image_size).with_focal() for _ in range(pictures)], links)
+    return Strip(truth, lens.distortion, [Camera(lens.image_size).with_focal() for _ in range(images)], links)
 
 
 def _stored(found: PairMatches) -> StoredMatches:
@@ -84,10 +84,10 @@ def _stored(found: PairMatches) -> StoredMatches:
 
 
 def _matches(truth: Sequence, i: int, j: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Points of the ground that both pictures see, with noise; a tenth of them matched wrongly."""
+    """Points of the ground that both images see, with noise; a tenth of them matched wrongly."""
     width, height = truth.lens.image_size
     points1 = rng.uniform((5.0, 5.0), (width - 6.0, height - 6.0), (_MATCHES, 2))
-    points2 = truth.ground_to_picture(j, truth.to_ground(i, points1))
+    points2 = truth.ground_to_image(j, truth.to_ground(i, points1))
     seen = ((points2 >= 0.0) & (points2 <= (width - 1.0, height - 1.0))).all(axis=1)
     points1, points2 = points1[seen], points2[seen]
     wrong = rng.random(len(points2)) < 0.1
@@ -96,7 +96,7 @@ def _matches(truth: Sequence, i: int, j: int, rng: np.random.Generator) -> tuple
 
 
 def displacement(item: Strip, found: Alignment) -> float:
-    """Largest distance of a picture's centre from the truth, after a similarity, as a share of the strip's length."""
+    """Largest distance of an image's centre from the truth, after a similarity, as a share of the strip's length."""
     used = np.flatnonzero(found.used).tolist()
     centre = np.array([[(n - 1) / 2 for n in LENS.image_size]])
     true = np.concatenate([item.truth.to_plane(k, centre) for k in used])

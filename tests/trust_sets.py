@@ -1,4 +1,4 @@
-"""Random rendered picture sets, solvable and hopeless ones, and whether what was made of them is right."""
+"""Random rendered image sets, solvable and hopeless ones, and whether what was made of them is right."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -35,10 +35,10 @@ from tests.adverse_sets import ADVERSE, AlteredSequence, adverse_set
 
 SOLVABLE = ("pair", "chain", "grid")
 ODD = ("odd lens",)
-"""Solvable too, but only where asked for: the pictures of one lens that is no division model about their centre."""
+"""Solvable too, but only where asked for: the images of one lens that is no division model about their centre."""
 
 SPOILED = ("spoiled",)
-"""Ten pictures of which one to three show other ground or a repeated pattern, were zoomed, have a truncated file or one
+"""Ten images of which one to three show other ground or a repeated pattern, were zoomed, have a truncated file or one
 with flipped bits, are blurred, noisy or taken aslant: solved from the rest. Those that are blurred, noisy or aslant are
 used rightly, or named; all others are named."""
 
@@ -49,20 +49,20 @@ HOPELESS = (
 OTHERS = ((1.15, 0.0), (1.4, 0.0), (1.0, 0.05), (1.0, 0.1), (1.0, 0.2))
 """Other lenses: their focal length in units of the first lens's, and how far λ differs beyond what the zoom does."""
 
-MAX_MEDIAN, MAX_OF_A_PICTURE = 1.5, 4.0
-"""px of the pictures: more is a wrong registration."""
+MAX_MEDIAN, MAX_OF_AN_IMAGE = 1.5, 4.0
+"""px of the images: more is a wrong registration."""
 
 
 @dataclass(frozen=True)
 class MixedSequence(Sequence):
-    """Pictures of one plane of which some were taken with another lens, or show other ground.
+    """Images of one plane of which some were taken with another lens, or show other ground.
 
     Attributes
     ----------
     other : Sequence
         The same poses with what else there is.
     taken : frozenset of int
-        Pictures that come from ``other``.
+        Images that come from ``other``.
     usable : bool
         Whether these may be registered rightly with the rest.
     damaged : bool
@@ -96,9 +96,9 @@ class MixedSequence(Sequence):
         """See :meth:`Sequence.to_plane`."""
         return self._of(index).to_plane(index, points)
 
-    def to_picture(self, index: int, points: ArrayLike) -> FloatArray:
-        """See :meth:`Sequence.to_picture`."""
-        return self._of(index).to_picture(index, points)
+    def to_image(self, index: int, points: ArrayLike) -> FloatArray:
+        """See :meth:`Sequence.to_image`."""
+        return self._of(index).to_image(index, points)
 
     def frame(self, index: int) -> np.ndarray:
         """See :meth:`Sequence.frame`."""
@@ -130,9 +130,9 @@ class Judged:
     status : int
         That the command line would have ended with.
     right : bool
-        Whether the registration of all pictures used agrees with the truth; True without one.
+        Whether the registration of all images used agrees with the truth; True without one.
     complete : bool
-        Whether every picture was used that is needed.
+        Whether every image was used that is needed.
     error : float
         Median error, px.
     text : str
@@ -175,7 +175,7 @@ def trust_set(seed: int, kind: str | None = None) -> TrustSet:
 
 
 def _odd_lens(lens: Camera, rng: np.random.Generator) -> Lens:
-    """Much the same lens, with its axis off the centre of the picture, or with a profile of another kind."""
+    """Much the same lens, with its axis off the centre of the image, or with a profile of another kind."""
     assert lens.focal is not None
     kind = int(rng.integers(3))
     if kind == 0:
@@ -213,7 +213,7 @@ def _poses(kind: str, lens: Lens, tilt: tuple[float, float], rng: np.random.Gene
 
 
 def _mixed(kind: str, sequence: Sequence, rng: np.random.Generator, seed: int) -> MixedSequence:
-    """Some pictures through another lens (a zoom), or over other ground."""
+    """Some images through another lens (a zoom), or over other ground."""
     lens, usable, damaged = sequence.lens, False, False
     if kind == "mixed lenses":
         assert isinstance(lens, Camera)
@@ -275,11 +275,11 @@ def judge_set(item: TrustSet, folder: Path, options: StitchOptions | None = None
     except RdstitchError as refusal:
         return Judged(item.kind, refusal.exit_status, True, False, np.nan, str(refusal))
     alignment = registration.alignment
-    # Who is told that λ is not observable is promised pictures that fit, not straight lines.
+    # Who is told that λ is not observable is promised images that fit, not straight lines.
     measure = registration_error if np.isfinite(alignment.distortion_std) else overlap_error
     error, worst = measure(item.sequence, registration)
     text = "; ".join(map(str, registration.messages))
-    right = error < MAX_MEDIAN and worst < MAX_OF_A_PICTURE
+    right = error < MAX_MEDIAN and worst < MAX_OF_AN_IMAGE
     mixed = item.sequence if item.kind in SPOILED and isinstance(item.sequence, MixedSequence) else None
     missing = {_number(message.images[0]) for message in registration.left_out}
     dispensable = item.sequence.dispensable if isinstance(item.sequence, AlteredSequence) else frozenset()
@@ -291,7 +291,7 @@ def judge_set(item: TrustSet, folder: Path, options: StitchOptions | None = None
 
 
 def registration_error(sequence: Sequence, registration: Registration) -> tuple[float, float]:
-    """Median error of the pictures used, and that of the worst of them, px, up to one homography of the plane."""
+    """Median error of the images used, and that of the worst of them, px, up to one homography of the plane."""
     alignment = registration.alignment
     transfers = {}
     for position, number in _used(registration).items():
@@ -302,13 +302,13 @@ def registration_error(sequence: Sequence, registration: Registration) -> tuple[
 
 
 def overlap_error(sequence: Sequence, registration: Registration) -> tuple[float, float]:
-    """Median error where pictures overlap, and that of the worst pair, px."""
+    """Median error where images overlap, and that of the worst pair, px."""
     alignment = registration.alignment
     errors = []
     for (i, first), (j, second) in permutations(_used(registration).items(), 2):
         width, height = alignment.cameras[i].image_size
         points = np.stack(np.meshgrid(np.linspace(0, width - 1, 12), np.linspace(0, height - 1, 9)), -1).reshape(-1, 2)
-        true = sequence.to_picture(second, sequence.to_plane(first, points))
+        true = sequence.to_image(second, sequence.to_plane(first, points))
         found = alignment.transfer(i, j, points)
         width, height = alignment.cameras[j].image_size
         inside = ((true >= 0) & (true <= (width - 1, height - 1))).all(axis=1)
@@ -318,12 +318,12 @@ def overlap_error(sequence: Sequence, registration: Registration) -> tuple[float
 
 
 def _number(path: str) -> int:
-    """The number of a picture in its sequence."""
+    """The number of an image in its sequence."""
     return int(Path(path).stem.split("_")[-1])
 
 
 def _used(registration: Registration) -> dict[int, int]:
-    """The number in its sequence of every picture that was used, by its position in the registration."""
+    """The number in its sequence of every image that was used, by its position in the registration."""
     return {
         position: _number(str(source.path))
         for position, source in enumerate(registration.sources)

@@ -42,7 +42,7 @@ refresh = click.option(
     default=5.0,
     show_default=True,
     metavar="SECONDS",
-    help="With --follow: refresh the picture of what has been seen, OUTPUT with .preview.jpg, so often; 0: none.",
+    help="With --follow: refresh the image of what has been seen, OUTPUT with .preview.jpg, so often; 0: none.",
 )
 
 
@@ -61,7 +61,7 @@ def followed(
 ) -> Iterator[list["Named"]]:
     """Print a line for each frame as it arrives; then, inside the block, what all of them are as inputs of a recipe.
 
-    ``refresh`` is None where no picture is made; ``plot`` will be written at the end too. ``poses`` says how poses are
+    ``refresh`` is None where no image is made; ``plot`` will be written at the end too. ``poses`` says how poses are
     printed: as the file that is written at the end has them.
     """
     from rdstitch.camera_files import CAMERA_SUFFIXES

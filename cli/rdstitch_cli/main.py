@@ -31,7 +31,7 @@ from rdstitch_cli.terminal import one_line, write_whatever_the_encoding
 
 EXIT_STATUSES = """\b
 Exit status:
-  0    done; pictures left out are named on standard error
+  0    done; images left out are named on standard error
   1    unexpected failure
   2    wrong usage
   3    a file cannot be read
@@ -55,7 +55,7 @@ _UNEXPECTED, _USAGE, _INTERRUPTED, _BROKEN_PIPE = 1, 2, 130, 141
 _TERMINATION_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 _M_ARENA_MAX = -8
 _OPENCV_NO_MEMORY = -4  # cv2.Error.StsNoMem
-_OUT_OF_MEMORY = "out of memory; try smaller pictures or a smaller --scale"
+_OUT_OF_MEMORY = "out of memory; try smaller images or a smaller --scale"
 _DECODERS = ("PIL", "tifffile")
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -89,7 +89,7 @@ class _Commands(click.Group):
 @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
 @click.pass_context
 def cli(context: click.Context, debug: bool) -> None:
-    """Stitch pictures of a flat scene, and find the lens distortion from the pictures themselves."""
+    """Stitch images of a flat scene, and find the lens distortion from the images themselves."""
     context.obj = debug
 
 
@@ -104,7 +104,7 @@ def main() -> None:
     """Run the command line and leave with its exit status."""
     _open_standard_streams()
     write_whatever_the_encoding()
-    # Pictures and pairs are worked on side by side; threads within each matrix product would only be in the way.
+    # Images and pairs are worked on side by side; threads within each matrix product would only be in the way.
     # NumPy reads this when it is loaded, which is later.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _share_memory()

@@ -31,7 +31,7 @@ SOLVERS = ("auto", "two-point", "three-point", "three-point-similarity", "four-p
 LENSES = ("auto", "division", "division-center", "division2", "division3")
 MODELS = ("auto", "rigid", "similarity", "tilting", "pose", "homography", "rotation")
 
-PICTURE = UserPath()
+IMAGE = UserPath()
 
 
 def together(*options: Callable[[Any], Any]) -> Decorator[Any]:
@@ -73,7 +73,7 @@ def _number(name: str, kind: Any, usual: float, text: str, called: str | None = 
 
 def _file(name: str, called: str, text: str) -> Decorator[Any]:
     """An option that names a file or folder."""
-    return click.option(name, type=PICTURE, metavar=called, help=text)
+    return click.option(name, type=IMAGE, metavar=called, help=text)
 
 
 inputs = click.argument("inputs", nargs=-1, required=True, type=UserPath(allow_dash=True), metavar="INPUT...")
@@ -96,7 +96,7 @@ every, every_frame = _every(None), _every(1)
 topic = click.option("--topic", metavar="NAME", help="Of a ROS bag, the topic of its images.")
 
 output = click.option(
-    "-o", "--output", type=PICTURE, required=True, help="Picture to write: .jpg, .png, .tif, .webp or .dzi."
+    "-o", "--output", type=IMAGE, required=True, help="Image to write: .jpg, .png, .tif, .webp or .dzi."
 )
 
 overwrite = click.option("--overwrite", is_flag=True, help="Replace existing output files.")
@@ -145,7 +145,7 @@ known = together(
         "--attitude",
         type=FileOr("xmp"),
         metavar="FILE|xmp",
-        help="Tilt of each picture: CSV name,psi,theta in degrees; xmp: what drones write into their pictures.",
+        help="Tilt of each image: CSV name,psi,theta in degrees; xmp: what drones write into their images.",
     ),
     click.option(
         "--attitude-std",
@@ -157,7 +157,7 @@ known = together(
 )
 
 mask = _file(
-    "--mask", "DIR|FILE", "Black is excluded: a folder of masks with the pictures' names, or one mask for all pictures."
+    "--mask", "DIR|FILE", "Black is excluded: a folder of masks with the images' names, or one mask for all images."
 )
 
 workers = click.option(
@@ -170,13 +170,13 @@ estimation = together(
         "--exclude",
         multiple=True,
         metavar="NAME",
-        help="Leave out the picture of this name, or all that fit a pattern like 'img_49*'; repeatable.",
+        help="Leave out the image of this name, or all that fit a pattern like 'img_49*'; repeatable.",
     ),
     click.option(
         "--include-only",
         multiple=True,
         metavar="NAME",
-        help="Use only the pictures of this name or pattern; repeatable.",
+        help="Use only the images of this name or pattern; repeatable.",
     ),
     _choice("--features", FEATURES, "rootsift", "Features to match."),
     _file("--aliked-model", "FILE", "ONNX file of the network of --features aliked."),
@@ -185,15 +185,15 @@ estimation = together(
         "--max-features",
         type=WholeNumber(1),
         metavar="N",
-        help="At most so many features a picture.  [default: 2000; of fewer than 8 pictures 16000 together, "
+        help="At most so many features an image.  [default: 2000; of fewer than 8 images 16000 together, "
         "at most 4000 each]",
     ),
     click.option(
         "--work-megapixels",
         type=RealNumber(0.0),
         metavar="MP",
-        help="Pictures are halved until they have no more megapixels before features are detected, once less where "
-        "that shows too few; 0 is full size.  [default: 0.6; of fewer than 8 pictures 4.8 together, at most 2.4 each]",
+        help="Images are halved until they have no more megapixels before features are detected, once less where "
+        "that shows too few; 0 is full size.  [default: 0.6; of fewer than 8 images 4.8 together, at most 2.4 each]",
     ),
     _choice("--solver", SOLVERS, "auto", "Minimal solver of the pairs."),
     _choice(
@@ -219,13 +219,13 @@ estimation = together(
     click.option(
         "--scheduler",
         metavar="ADDRESS|local",
-        help="Let a Dask cluster do the work, whose machines see the pictures and the folder of --cache; local starts "
+        help="Let a Dask cluster do the work, whose machines see the images and the folder of --cache; local starts "
         "one here.",
     ),
     workers,
 )
 
-strict = click.option("--strict", is_flag=True, help="Fail with status 5 when a picture is left out.")
+strict = click.option("--strict", is_flag=True, help="Fail with status 5 when an image is left out.")
 
 report = _file("--report", "FILE", "Write a report to FILE (.html): graph, votes on λ, matches, residuals.")
 
@@ -238,21 +238,21 @@ compositing = together(
         "--exposure",
         ["none", "gain", "blocks", "balanced"],
         "balanced",
-        "Brightness: balanced leaves no step at seams, keeps every region near its own pictures' brightness and "
-        "clips nothing; gain makes the whole comparable (one factor per picture, one vignetting); blocks adds a "
-        "smooth field per picture to that.",
+        "Brightness: balanced leaves no step at seams, keeps every region near its own images' brightness and "
+        "clips nothing; gain makes the whole comparable (one factor per image, one vignetting); blocks adds a "
+        "smooth field per image to that.",
     ),
     _choice(
         "--seam",
         ["none", "voronoi", "graphcut"],
         "graphcut",
-        "Where pictures meet: round what differs, midway, or wherever they overlap.",
+        "Where images meet: round what differs, midway, or wherever they overlap.",
     ),
     _choice(
         "--blend",
         ["none", "feather", "multiband"],
         "multiband",
-        "How pictures pass into one another; none cuts, for measuring.",
+        "How images pass into one another; none cuts, for measuring.",
     ),
     click.option(
         "--crop/--no-crop",
@@ -264,14 +264,14 @@ compositing = together(
         "--projection",
         ["auto", "plane", "cylinder", "sphere", "mercator"],
         "auto",
-        "How pictures taken by turning on the spot are laid out.",
+        "How images taken by turning on the spot are laid out.",
     ),
     _choice("--interpolation", ["linear", "cubic", "lanczos"], "cubic", "Kernel of the one resampling."),
     _number(
         "--background",
         WholeNumber(0, 255),
         0,
-        "What no picture covers, in JPEG and .dzi: 0 black to 255 white.",
+        "What no image covers, in JPEG and .dzi: 0 black to 255 white.",
         "GREY",
     ),
     click.option(
@@ -284,7 +284,7 @@ compositing = together(
         "--max-stretch",
         RealNumber(1.0, min_open=True),
         3.0,
-        "What an oblique picture shows N times coarser than the reference picture is not drawn.",
+        "What an oblique image shows N times coarser than the reference image is not drawn.",
         "N",
     ),
     click.option(
@@ -314,16 +314,16 @@ compositing = together(
     ),
 )
 
-# What every command that registers pictures takes, and what those take that also compose them.
+# What every command that registers images takes, and what those take that also compose them.
 registration = together(overwrite, known, estimation, report, trust)
 
 stitching = together(
     output,
-    click.option("--reference", metavar="NAME", help="Picture that sets the frame; otherwise the best connected one."),
+    click.option("--reference", metavar="NAME", help="Image that sets the frame; otherwise the best connected one."),
     click.option(
         "--preview",
         is_flag=True,
-        help="A quick small picture: at most 1200 pixels, few features of small versions of the pictures, straight "
+        help="A quick small image: at most 1200 pixels, few features of small versions of the images, straight "
         "seams; options that are given stay as they are.",
     ),
     click.option(
@@ -332,8 +332,8 @@ stitching = together(
         metavar="auto|off|N",
         default="auto",
         show_default=True,
-        help="Where the ground is not quite a plane, bring pictures together by a smooth displacement of each: auto "
-        "where matches that took no part in it come nearer; a number of cells along a picture's longer side: always.",
+        help="Where the ground is not quite a plane, bring images together by a smooth displacement of each: auto "
+        "where matches that took no part in it come nearer; a number of cells along an image's longer side: always.",
     ),
     compositing,
     _file(

@@ -43,14 +43,14 @@ def read_lens(file: Path | None, reporter: Reporter) -> "Camera | None":
 def _size_of_images(file: Path) -> tuple[int, int]:
     """Width and height of the first input image as it is stored, for a camera file that does not say them."""
     from rdstitch.errors import InputError
-    from rdstitch.inputs.find import find_pictures
+    from rdstitch.inputs.find import find_images
     from rdstitch.io import read_metadata
     from rdstitch.orientation import inverse, turned_size
 
     # The names on standard input are read later, and a video only once.
     named = [path for path in click.get_current_context().params["inputs"] if str(path) != "-"]
     try:
-        metadata = read_metadata(find_pictures(named).frames[0].path)
+        metadata = read_metadata(find_images(named).frames[0].path)
     except (InputError, IndexError) as error:
         raise InputError(f"{file}: has no image size; add image_width and image_height") from error
     return turned_size(metadata.size, inverse(metadata.orientation))
@@ -114,7 +114,7 @@ def _preview(
 
 
 class Report:
-    """The report of a run: the progress that measures its stages, and the file that is written with the picture.
+    """The report of a run: the progress that measures its stages, and the file that is written with the image.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ class Report:
     inputs : sequence of Path
         Files that it must not be written over.
     output : Path, optional
-        Picture that is made, beside which there may be a page.
+        Image that is made, beside which there may be a page.
     """
 
     def __init__(
@@ -190,7 +190,7 @@ def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = Fal
 def show_plan(plan: "CompositePlan") -> None:
     """What compositing would take, to standard output."""
     (width, height), megapixels = plan.canvas_size, plan.canvas_size[0] * plan.canvas_size[1] / 1e6
-    click.echo(f"pictures: {plan.pictures}")
+    click.echo(f"images: {plan.images}")
     click.echo(f"canvas: {width} x {height} pixels, {megapixels:.4g} megapixels")
     click.echo(f"output: {bytes_in_words(plan.output_bytes)} of samples, before compression")
     click.echo(
@@ -200,7 +200,7 @@ def show_plan(plan: "CompositePlan") -> None:
 
 
 def report_registration(registration: "Registration", reporter: Reporter, *, as_json: bool = False) -> None:
-    """λ, or the camera, to standard output; pictures left out to standard error."""
+    """λ, or the camera, to standard output; images left out to standard error."""
     reporter.finish()
     warn_of(registration, reporter)
     if as_json:
@@ -221,7 +221,7 @@ def warn_of(registration: "Registration", reporter: Reporter) -> None:
     for message in (*registration.notes, *registration.details):
         reporter.tell(message)
     used = int(alignment.used.sum())
-    reporter.log(f"{used} of {len(alignment.used)} pictures, rms {alignment.rms:.2f} pixels; {alignment.model_reason}")
+    reporter.log(f"{used} of {len(alignment.used)} images, rms {alignment.rms:.2f} pixels; {alignment.model_reason}")
 
 
 def _echo_json(content: Any) -> None:

@@ -7,16 +7,16 @@ mkdir -p "$out"
 
 status=0
 for band in "$@"; do
-    picture=$out/$(basename "$band").tif
-    if [ -e "$picture" ]; then
-        # The sidecar is written last and names its picture by digest: only both together are a result.
-        ! grep -qs "$(sha256sum < "$picture" | cut -d " " -f 1)" "$picture.json" || continue
-        echo "$picture: is not the picture that its sidecar names; remove both to make them again" >&2
+    image=$out/$(basename "$band").tif
+    if [ -e "$image" ]; then
+        # The sidecar is written last and names its image by digest: only both together are a result.
+        ! grep -qs "$(sha256sum < "$image" | cut -d " " -f 1)" "$image.json" || continue
+        echo "$image: is not the image that its sidecar names; remove both to make them again" >&2
         status=1
         continue
     fi
     # Nothing is made equal: bands are measurements.
-    rdstitch apply "$sidecar" --images "$band" -o "$picture" --exposure none --blend none || {
+    rdstitch apply "$sidecar" --images "$band" -o "$image" --exposure none --blend none || {
         echo "$band: exit status $?" >&2
         status=1
     }

@@ -1,5 +1,5 @@
 #!/bin/sh
-# One mosaic for each folder of pictures: mosaics.sh FOLDER OUT [OPTION...]
+# One mosaic for each folder of images: mosaics.sh FOLDER OUT [OPTION...]
 set -eu
 folder=$1 out=$2
 shift 2
@@ -10,14 +10,14 @@ mkdir -p "$out"
 job='
     out=$1 folder=$2
     shift 2
-    picture=$out/$(basename "$folder").tif
-    if [ -e "$picture" ]; then
-        # The sidecar is written last and names its picture by digest: only both together are a result.
-        ! grep -qs "$(sha256sum < "$picture" | cut -d " " -f 1)" "$picture.json" || exit 0
-        echo "$picture: is not the picture that its sidecar names; remove both to make them again" >&2
+    image=$out/$(basename "$folder").tif
+    if [ -e "$image" ]; then
+        # The sidecar is written last and names its image by digest: only both together are a result.
+        ! grep -qs "$(sha256sum < "$image" | cut -d " " -f 1)" "$image.json" || exit 0
+        echo "$image: is not the image that its sidecar names; remove both to make them again" >&2
         exit 1
     fi
-    rdstitch mosaic "$folder" -o "$picture" "$@" > /dev/null || {
+    rdstitch mosaic "$folder" -o "$image" "$@" > /dev/null || {
         echo "$folder: exit status $?" >&2
         exit 1
     }

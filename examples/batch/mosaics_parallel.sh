@@ -1,5 +1,5 @@
 #!/bin/sh
-# One mosaic for each folder of pictures, by GNU parallel: mosaics_parallel.sh FOLDER OUT [OPTION...]
+# One mosaic for each folder of images, by GNU parallel: mosaics_parallel.sh FOLDER OUT [OPTION...]
 set -eu
 folder=$1 out=$2
 shift 2

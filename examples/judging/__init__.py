@@ -1,4 +1,4 @@
-"""How far a stitched picture or a registration is from the truth of :mod:`rdstitch.synthetic`, and from real ones."""
+"""How far a stitched image or a registration is from the truth of :mod:`rdstitch.synthetic`, and from real ones."""
 
 from examples.judging.alignment import AlignmentError, alignment_error
 from examples.judging.comparison import PlaneComparison, compare_with_plane, coverage, plane_under, sharpness

@@ -1,4 +1,4 @@
-"""How well an estimated registration agrees with the truth, from its numbers: no picture is looked at."""
+"""How well an estimated registration agrees with the truth, from its numbers: no image is looked at."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ Transfer = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class AlignmentError:
-    """Errors of a registration on a grid of points of its pictures, after the best transform to the true plane.
+    """Errors of a registration on a grid of points of its images, after the best transform to the true plane.
 
     Attributes
     ----------
@@ -25,9 +25,9 @@ class AlignmentError:
     image : ndarray of shape (N,), intp
         LinearPixels of each point.
     points : ndarray of shape (N, 2)
-        Measured px in that picture.
+        Measured px in that image.
     error : ndarray of shape (N,)
-        In px of that picture: distance from the point to where the true camera sees the place on the plane that the
+        In px of that image: distance from the point to where the true camera sees the place on the plane that the
         estimate gives to it; inf where the estimate gives none, or one that the true camera cannot see.
     error_mosaic : ndarray of shape (N,)
         In px of the mosaic: distance between the estimated and the true place of the point; inf as above.
@@ -41,21 +41,21 @@ class AlignmentError:
 
     @property
     def median(self) -> float:
-        """Median of ``error``, px of the pictures."""
+        """Median of ``error``, px of the images."""
         return quantile(self.error, 0.5)
 
     @property
     def percentile95(self) -> float:
-        """95 % of ``error`` are below this, px of the pictures."""
+        """95 % of ``error`` are below this, px of the images."""
         return quantile(self.error, 0.95)
 
     @property
     def max(self) -> float:
-        """Largest ``error``, px of the pictures."""
+        """Largest ``error``, px of the images."""
         return float(self.error.max())
 
     def per_image(self) -> dict[int, float]:
-        """Median error of each picture, px."""
+        """Median error of each image, px."""
         return {int(index): quantile(self.error[self.image == index], 0.5) for index in np.unique(self.image)}
 
 
@@ -68,14 +68,14 @@ def alignment_error(
 ) -> AlignmentError:
     """Compare an estimated registration with the truth.
 
-    A grid of points of each picture is mapped by the estimate to the mosaic and by the truth to the plane; the
+    A grid of points of each image is mapped by the estimate to the mosaic and by the truth to the plane; the
     transform between the two that minimises the sum of squared distances on the plane is what the mosaic is allowed to
     differ by; errors are what remains.
 
     Parameters
     ----------
     transfers : mapping of int to callable
-        For each picture that was registered: measured px (N, 2) to mosaic px (N, 2), NaN where there is no such place.
+        For each image that was registered: measured px (N, 2) to mosaic px (N, 2), NaN where there is no such place.
     model : str
         "similarity" or "homography": the transform to the plane.
     points_per_side : (int, int)
@@ -92,7 +92,7 @@ def alignment_error(
     points = np.stack(grid, axis=-1).reshape(-1, 2)
     indices = sorted(transfers)
     if not indices:
-        raise ArgumentError("no picture was registered")
+        raise ArgumentError("no image was registered")
     estimated = np.concatenate([np.asarray(transfers[index](points), dtype=np.float64) for index in indices])
     true = np.concatenate([sequence.to_plane(index, points) for index in indices])
     usable = np.isfinite(estimated).all(axis=1) & np.isfinite(true).all(axis=1)
@@ -100,10 +100,7 @@ def alignment_error(
 
     on_plane = apply(transform, estimated)
     seen = np.concatenate(
-        [
-            sequence.to_picture(index, part)
-            for index, part in zip(indices, np.split(on_plane, len(indices)), strict=True)
-        ]
+        [sequence.to_image(index, part) for index, part in zip(indices, np.split(on_plane, len(indices)), strict=True)]
     )
     measured = np.tile(points, (len(indices), 1))
     return AlignmentError(

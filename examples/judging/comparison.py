@@ -1,4 +1,4 @@
-"""How well a mosaic agrees with the true plane, measured on the picture: the stitcher's own numbers are not used."""
+"""How well a mosaic agrees with the true plane, measured on the image: the stitcher's own numbers are not used."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +11,7 @@ from examples.judging.fitting import FITS, apply, fit_similarity, quantile
 from examples.judging.patches import patch_displacements
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.synthetic.textures import LinearPixels, PictureTexture, Texture
+from rdstitch.synthetic.textures import ImageTexture, LinearPixels, Texture
 
 _ROUNDS = 5
 # A transform that moves no patch by more than this, px, will not change any more.
@@ -101,11 +101,11 @@ def compare_with_plane(
     mosaic : ndarray of shape (h, w), (h, w, 3) or (h, w, 4)
         uint8 or uint16; RGB with an optional alpha.
     plane : Texture
-        Held in memory once as a grey picture.
+        Held in memory once as a grey image.
     model : str
         "similarity" or "homography": what the mosaic may differ by from the plane.
     reachable : ndarray of bool, optional
-        Which texels the pictures show, for the coverage; see :meth:`Sequence.reachable`. Two texels at its border do
+        Which texels the images show, for the coverage; see :meth:`Sequence.reachable`. Two texels at its border do
         not count.
     valid : ndarray of shape (h, w), bool, optional
         Which px of the mosaic are filled; if not given, those whose alpha is not zero or, without alpha, that are not
@@ -168,7 +168,7 @@ def coverage(filled: NDArray[np.bool_], transform: ArrayLike, reachable: NDArray
     transform : array_like of shape (3, 3)
         Mosaic px to texels.
     reachable : ndarray of bool
-        Which texels the pictures show. Two texels at its border do not count: whether a picture shows them is a
+        Which texels the images show. Two texels at its border do not count: whether an image shows them is a
         matter of rounding.
     """
     inner = cv2.erode(reachable.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=(0.0,)) > 0
@@ -181,11 +181,11 @@ def coverage(filled: NDArray[np.bool_], transform: ArrayLike, reachable: NDArray
     return float((shown[inner] > 0).mean())
 
 
-def sharpness(picture: LinearPixels, reference: LinearPixels, where: NDArray[np.bool_]) -> float:
-    """Detail of a picture in units of the detail of another one that shows the same, both grey in [0, 1].
+def sharpness(image: LinearPixels, reference: LinearPixels, where: NDArray[np.bool_]) -> float:
+    """Detail of an image in units of the detail of another one that shows the same, both grey in [0, 1].
 
     Detail is the root mean square of the Laplacian of Gaussian (σ = 1 px) in units of the standard deviation of the
-    picture blurred by σ = 4 px: it takes no notice of gain and offset, but noise counts as detail.
+    image blurred by σ = 4 px: it takes no notice of gain and offset, but noise counts as detail.
     """
 
     def detail(grey: LinearPixels) -> float:
@@ -193,7 +193,7 @@ def sharpness(picture: LinearPixels, reference: LinearPixels, where: NDArray[np.
         coarse = cv2.GaussianBlur(grey, (0, 0), 4.0)
         return float(np.sqrt(np.mean(fine[where] ** 2)) / np.std(coarse[where]))
 
-    return detail(picture) / detail(reference)
+    return detail(image) / detail(reference)
 
 
 def plane_under(plane: Texture, transform: ArrayLike, size: tuple[int, int]) -> tuple[LinearPixels, NDArray[np.bool_]]:
@@ -252,7 +252,7 @@ def _place_by_features(grey: LinearPixels, filled: NDArray[np.bool_], truth: Lin
 
 
 def features(grey: LinearPixels, mask: NDArray[np.bool_] | None) -> tuple[FloatArray, NDArray[np.float32]]:
-    """SIFT points in px and descriptors, from a picture reduced to a moderate size."""
+    """SIFT points in px and descriptors, from an image reduced to a moderate size."""
     factor = min(1.0, float(np.sqrt(_FEATURE_PIXELS / grey.size)))
     size = (max(1, round(grey.shape[1] * factor)), max(1, round(grey.shape[0] * factor)))
     small = np.rint(cv2.resize(grey, size, interpolation=cv2.INTER_AREA) * 255.0).astype(np.uint8)
@@ -278,14 +278,14 @@ def grey_and_filled(mosaic: NDArray[Any]) -> tuple[LinearPixels, NDArray[np.bool
         lit = (colours if colours.ndim == 2 else colours.max(axis=2)) > 0
         filled = cv2.morphologyEx(lit.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)) > 0
     height, width = mosaic.shape[:2]
-    return _grey(PictureTexture(colours).region(0, 0, width, height)), filled
+    return _grey(ImageTexture(colours).region(0, 0, width, height)), filled
 
 
-def _grey(picture: LinearPixels) -> LinearPixels:
+def _grey(image: LinearPixels) -> LinearPixels:
     """Luma of RGB (h, w, 3), or the only channel of (h, w, 1); shape (h, w)."""
-    if picture.shape[2] == 1:
-        return np.ascontiguousarray(picture[:, :, 0])
-    return np.asarray(cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2GRAY), dtype=np.float32)
+    if image.shape[2] == 1:
+        return np.ascontiguousarray(image[:, :, 0])
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), dtype=np.float32)
 
 
 def _grey_agreement(grey: LinearPixels, drawn: LinearPixels, where: NDArray[np.bool_]) -> tuple[float, float]:

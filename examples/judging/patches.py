@@ -1,4 +1,4 @@
-"""Where patches of one picture are found in another, to a few hundredths of a pixel."""
+"""Where patches of one image are found in another, to a few hundredths of a pixel."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from rdstitch.synthetic.textures import LinearPixels
 
 _ITERATIONS = 5
 _PATCHES = 5000
-# Patches that are refined together, as one tall picture: OpenCV wants it lower than 32,768 px.
+# Patches that are refined together, as one tall image: OpenCV wants it lower than 32,768 px.
 _BATCH = 256
 # A patch whose refinement leaves the peak it started from has lost its way.
 _FARTHEST_FROM_PEAK = 1.5
@@ -26,7 +26,7 @@ class Displacements:
     center : ndarray of shape (P, 2)
         Centre of each patch, px.
     displacement : ndarray of shape (P, 2)
-        From there to where the other picture shows the same, px; NaN where it was not found.
+        From there to where the other image shows the same, px; NaN where it was not found.
     correlation : ndarray of shape (P,)
         Normalized cross-correlation there; that of the best place, if too low, for patches that were not found.
     """
@@ -43,7 +43,7 @@ class Displacements:
 
 
 def patch_displacements(
-    picture: LinearPixels,
+    image: LinearPixels,
     other: LinearPixels,
     valid: NDArray[np.bool_],
     *,
@@ -53,17 +53,17 @@ def patch_displacements(
     least_contrast: float = 0.02,
     least_correlation: float = 0.7,
 ) -> Displacements:
-    """Look for patches of a picture in another one that shows nearly the same.
+    """Look for patches of an image in another one that shows nearly the same.
 
     Each patch of a regular grid is looked for by normalized cross-correlation, and from the best whole pixel on by
     least squares over shift, gain and offset (Lucas and Kanade).
 
     Parameters
     ----------
-    picture, other : ndarray of shape (h, w), float32
+    image, other : ndarray of shape (h, w), float32
         In [0, 1].
     valid : ndarray of shape (h, w), bool
-        Where ``picture`` and ``other`` mean something; a patch must lie inside with all its px.
+        Where ``image`` and ``other`` mean something; a patch must lie inside with all its px.
     patch : int
         Side of a patch, px; odd.
     spacing : int, optional
@@ -76,13 +76,13 @@ def patch_displacements(
         What is less alike counts as not found.
     """
     half = patch // 2
-    step = max(24, int(np.sqrt(picture.size / _PATCHES))) if spacing is None else spacing
+    step = max(24, int(np.sqrt(image.size / _PATCHES))) if spacing is None else spacing
     inside = cv2.erode(valid.astype(np.uint8), np.ones((patch, patch), np.uint8), borderValue=(0.0,)) > 0
-    height, width = picture.shape
+    height, width = image.shape
     y, x = (g.ravel() for g in np.mgrid[half : height - half : step, half : width - half : step])
     keep = inside[y, x]
     y, x = y[keep], x[keep]
-    windows = np.lib.stride_tricks.sliding_window_view(picture, (patch, patch))
+    windows = np.lib.stride_tricks.sliding_window_view(image, (patch, patch))
     templates = windows[y - half, x - half].copy() if len(x) else np.empty((0, patch, patch), np.float32)
     textured = templates.std(axis=(1, 2)) >= least_contrast
     templates, y, x = templates[textured], y[textured], x[textured]
@@ -111,7 +111,7 @@ def _refine(
 ) -> tuple[FloatArray, FloatArray]:
     """Displacement (P, 2) that minimises the squared difference up to gain and offset, and the correlation there.
 
-    ``layers`` are the other picture and its derivatives along x and y.
+    ``layers`` are the other image and its derivatives along x and y.
     """
     count, patch = len(templates), templates.shape[1]
     offset = np.arange(patch) - patch // 2

@@ -1,4 +1,4 @@
-"""How well an equirectangular panorama agrees with the true sphere, measured on the picture alone."""
+"""How well an equirectangular panorama agrees with the true sphere, measured on the image alone."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +19,7 @@ from rdstitch.synthetic.textures import LinearPixels
 _ROUNDS = 3
 _MIN_MATCHES = 12
 _ROUGH = np.radians(2.0)
-_GRID = 25  # places of a picture, along each axis
+_GRID = 25  # places of an image, along each axis
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class SphereComparison:
         Angles between what the panorama shows and what the best turn, size and horizon of the whole put there,
         radians; inf for patches that do not look like the sphere anywhere near.
     coverage : float
-        Share of the directions that the pictures show which the panorama shows.
+        Share of the directions that the images show which the panorama shows.
     """
 
     error: FloatArray
@@ -80,7 +80,7 @@ def compare_with_sphere(panorama: NDArray[Any], sequence: TurningSequence, searc
     panorama : ndarray of shape (h, w), (h, w, 3) or (h, w, 4)
         Equirectangular, of any size, turned anyhow but nearly level.
     sequence : TurningSequence
-        The pictures that it was made of.
+        The images that it was made of.
     search : int
         Largest error that is told from a wrong place, pixels of the panorama.
     """
@@ -118,7 +118,7 @@ def _matches(grey: LinearPixels, filled: NDArray[np.bool_], truth: LinearPixels)
 
 
 def _rough(shown: FloatArray, seen: FloatArray, width: int, column: float) -> FloatArray | None:
-    """Heading, size and horizon by a similarity of both pictures, since both are nearly level."""
+    """Heading, size and horizon by a similarity of both images, since both are nearly level."""
     if len(shown) < _MIN_MATCHES:
         return None
     similarity, inliers = cv2.estimateAffinePartial2D(shown, seen, ransacReprojThreshold=30.0, maxIters=5000)
@@ -162,7 +162,7 @@ def _drawn(truth: LinearPixels, directions: FloatArray) -> LinearPixels:
 
 
 def _coverage(placed: _Placement, filled: NDArray[np.bool_], sequence: TurningSequence) -> float:
-    """Share of the directions in pictures that the panorama shows; each picture counts alike."""
+    """Share of the directions in images that the panorama shows; each image counts alike."""
     width, height = sequence.lens.image_size
     grid = np.stack(np.meshgrid(np.linspace(2, width - 3, _GRID), np.linspace(2, height - 3, _GRID)), -1).reshape(-1, 2)
     seen = placed.places(np.concatenate([sequence.rays(k, grid) for k in range(len(sequence))]))

@@ -25,7 +25,7 @@ FIGURES = {
 }
 """Modules in the order in which they run, with what they measure."""
 
-_REAL_PICTURES = Path(__file__).resolve().parents[2] / "../shared/data"
+_REAL_IMAGES = Path(__file__).resolve().parents[2] / "../shared/data"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -37,10 +37,8 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("figures", nargs="*", metavar="FIGURE", help="which ones; all if not given")
     parser.add_argument("--full", action="store_true", help="the paper's counts: minutes to hours")
-    parser.add_argument("--output", type=Path, metavar="DIR", help="write tables, plots and pictures there")
-    parser.add_argument(
-        "--pictures", type=Path, metavar="DIR", default=_REAL_PICTURES, help="folder of the real sequences"
-    )
+    parser.add_argument("--output", type=Path, metavar="DIR", help="write tables, plots and images there")
+    parser.add_argument("--images", type=Path, metavar="DIR", default=_REAL_IMAGES, help="folder of the real sequences")
     parser.add_argument("--peer-python", metavar="FILE", help="Python that has the package stitching")
     parser.add_argument("--hpatches", type=Path, metavar="DIR", help="folder of HPatches' sequences")
     options = parser.parse_args(arguments)
@@ -48,7 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
     if unknown:
         parser.error(f"unknown figure {', '.join(sorted(unknown))}; there are {', '.join(FIGURES)}")
     settings = Settings(
-        Effort.FULL if options.full else Effort.SMALL, options.pictures, options.peer_python, options.hpatches
+        Effort.FULL if options.full else Effort.SMALL, options.images, options.peer_python, options.hpatches
     )
     for name in options.figures or FIGURES:
         begun = time.perf_counter()

@@ -39,7 +39,7 @@ Measured = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class PictureSet:
+class ImageSet:
     """A grid of views of a floor, to be rendered."""
 
     name: str
@@ -51,7 +51,7 @@ class PictureSet:
     yaw: float  # degrees, ±
 
     def sequence(self, seed: int) -> Sequence:
-        """The pictures, with exposures that differ by ±15 %."""
+        """The images, with exposures that differ by ±15 %."""
         lens = Camera(self.size, self.distortion, focal=self.focal, focal_source="option")
         psi, theta = np.radians(self.tilt)
         poses = grid_poses(lens, *self.grid, yaw=math.radians(self.yaw), shift=0.1, tilt=(psi, theta), seed=seed)
@@ -66,12 +66,12 @@ class PictureSet:
 
 
 SETS = (
-    PictureSet("4x3 views, λ = -0.25", (640, 480), (4, 3), 520.0, -0.25, (2.5, -2.0), 8.0),
-    PictureSet("6x2 views, λ = -0.25", (800, 600), (6, 2), 650.0, -0.25, (2.0, -1.5), 8.0),
-    PictureSet("4x3 views, λ = -0.45", (640, 480), (4, 3), 420.0, -0.45, (-6.0, 5.0), 15.0),
-    PictureSet("4x3 views, λ = 0", (640, 480), (4, 3), 520.0, 0.0, (0.0, 0.0), 180.0),
+    ImageSet("4x3 views, λ = -0.25", (640, 480), (4, 3), 520.0, -0.25, (2.5, -2.0), 8.0),
+    ImageSet("6x2 views, λ = -0.25", (800, 600), (6, 2), 650.0, -0.25, (2.0, -1.5), 8.0),
+    ImageSet("4x3 views, λ = -0.45", (640, 480), (4, 3), 420.0, -0.45, (-6.0, 5.0), 15.0),
+    ImageSet("4x3 views, λ = 0", (640, 480), (4, 3), 520.0, 0.0, (0.0, 0.0), 180.0),
 )
-_TINY = PictureSet("2x1 views", (320, 240), (2, 1), 260.0, -0.25, (2.5, -2.0), 8.0)
+_TINY = ImageSet("2x1 views", (320, 240), (2, 1), 260.0, -0.25, (2.5, -2.0), 8.0)
 
 
 def run(settings: Settings) -> Report:
@@ -81,8 +81,8 @@ def run(settings: Settings) -> Report:
     return compare(settings, "end_to_end", chosen, 100, stitchers, notes, _measured)
 
 
-def _measured(mosaic: Pixels, sequence: Sequence, _: PictureSet) -> Measured:
-    """Errors are given in px of the pictures, for mosaics of any scale."""
+def _measured(mosaic: Pixels, sequence: Sequence, _: ImageSet) -> Measured:
+    """Errors are given in px of the images, for mosaics of any scale."""
     found = compare_with_plane(mosaic, sequence.texture, reachable=sequence.reachable(), search=SEARCH)
     return found.median * found.texels_per_pixel, found.percentile95 * found.texels_per_pixel, found.coverage
 
@@ -102,19 +102,19 @@ def compare(
     ----------
     settings : Settings
     name : str
-        Of the figure; pictures are named after it.
-    sets : sequence of PictureSet or of the like
+        Of the figure; images are named after it.
+    sets : sequence of ImageSet or of the like
     first_seed : int
         Of the first set.
     stitchers : sequence of Stitcher
     notes : tuple of str
         On stitchers that are not installed.
     measured : callable
-        Takes a mosaic, the truth and the set; gives the median error and 95 % of them, px of the pictures, inf
+        Takes a mosaic, the truth and the set; gives the median error and 95 % of them, px of the images, inf
         beyond what was searched, and the share that is covered.
     """
     timeout = float(settings.count(60, 120, 600))
-    tables, pictures = [], {}
+    tables, images = [], {}
     for number, chosen in enumerate(sets):
         with TemporaryDirectory(prefix="rdstitch-peers-") as folder:
             sequence = chosen.sequence(seed=first_seed + number)
@@ -130,10 +130,10 @@ def compare(
                 cost = (done.seconds, done.processor_seconds, done.megabytes, "" if done.ok else done.said)
                 rows.append((stitcher.name, status, *figures, distortion_error, *cost))
                 if mosaic is not None:
-                    pictures[f"{name}_set{number}_{k}.jpg"] = mosaic[:, :, :3] if mosaic.ndim == 3 else mosaic
+                    images[f"{name}_set{number}_{k}.jpg"] = mosaic[:, :, :3] if mosaic.ndim == 3 else mosaic
         title = f"{name.replace('_', ' ').capitalize()}: {chosen.name}, {chosen.size[0]}x{chosen.size[1]} px"
         tables.append(Table(title, HEADER, tuple(rows)))
-    return Report(tuple(tables), pictures=pictures, notes=notes)
+    return Report(tuple(tables), images=images, notes=notes)
 
 
 def _shown(median: float, percentile95: float, coverage: float) -> tuple[object, ...]:
@@ -146,14 +146,14 @@ def read_mosaic(folder: Path) -> Pixels | None:
     written = sorted(folder.glob("mosaic*.tif")) + sorted(folder.glob("mosaic*.jpg"))
     if not written:
         return None
-    picture: Any = read_image(written[0])
-    pixels = np.asarray(picture.pixels)
+    image: Any = read_image(written[0])
+    pixels = np.asarray(image.pixels)
     if pixels.dtype == np.uint16:
         pixels = (pixels >> 8).astype(np.uint8)
-    if picture.alpha is None:
+    if image.alpha is None:
         return pixels
     colours = pixels if pixels.ndim == 3 else np.repeat(pixels[:, :, None], 3, axis=2)
-    alpha = (np.asarray(picture.alpha) > 0).astype(np.uint8) * np.uint8(255)
+    alpha = (np.asarray(image.alpha) > 0).astype(np.uint8) * np.uint8(255)
     return np.concatenate([colours, alpha[:, :, None]], axis=2)
 
 

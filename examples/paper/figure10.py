@@ -1,7 +1,7 @@
 """Fig. 10: aerial mosaics, with λ and without: what goes wrong when mild distortion is ignored.
 
-Homographies of consecutive pictures, chained one after the other, add up the error that a wrong λ makes in each. The
-adjustment of all pictures spreads it, but pictures that are bent cannot fit: what is left are seams, and bent lanes.
+Homographies of consecutive images, chained one after the other, add up the error that a wrong λ makes in each. The
+adjustment of all images spreads it, but images that are bent cannot fit: what is left are seams, and bent lanes.
 """
 
 from collections.abc import Sequence as Many
@@ -40,14 +40,14 @@ _VARIANTS = {
     TWO_POINTS: StitchOptions(force=True, features=_FEW, solver="two_point", tilt=(0.0, 0.0)),
     IGNORED: StitchOptions(force=True, features=_FEW, distortion=0.0),
 }
-_TOLD = ("variant", "pictures", "λ", "model", "rms of the matches, px")
+_TOLD = ("variant", "images", "λ", "model", "rms of the matches, px")
 _MEASURED = ("median error, px", "95 %, px", "drift, px", "drift, chained, px", "bend of a lane, px")
 _COPR = "λ by structure from motion: -0.020 … -0.028"
 
 
 @dataclass
 class _Paths:
-    """Centres of the pictures (N, 2), texels: the true ones, and the estimates laid on them."""
+    """Centres of the images (N, 2), texels: the true ones, and the estimates laid on them."""
 
     truth: FloatArray
     found: dict[str, FloatArray] = field(default_factory=dict)
@@ -64,14 +64,14 @@ def run(settings: Settings) -> Report:
     if files:
         tables.append(_real(files))
     else:
-        notes.append("the real pictures copr are not here and were left out")
+        notes.append("the real images copr are not here and were left out")
 
     def draw(figure: Any) -> None:
         for axes, (_, paths) in zip(np.atleast_1d(figure.subplots(1, len(done))), done, strict=True):
             axes.plot(*paths.truth.T, label="truth", linewidth=3.0)
             for name, centres in paths.found.items():
                 axes.plot(*centres.T, label=name, linewidth=1.0)
-            axes.set_title(f"{len(paths.truth)} pictures", fontsize=8)
+            axes.set_title(f"{len(paths.truth)} images", fontsize=8)
             axes.set_aspect("equal", adjustable="datalim")
             axes.legend(fontsize=6)
 
@@ -98,7 +98,7 @@ def _rendered(count: int, size: tuple[int, int]) -> tuple[Table, _Paths]:
             if variant != TWO_POINTS:
                 paths.found[f"{variant}, adjusted"] = laid_on(paths.truth, adjusted)
                 paths.found[f"{variant}, chained"] = laid_on(paths.truth, chained)
-    title = f"Fig. 10: rendered survey of {count} pictures, {size[0]}x{size[1]} px, λ = {DISTORTION:g}"
+    title = f"Fig. 10: rendered survey of {count} images, {size[0]}x{size[1]} px, λ = {DISTORTION:g}"
     return Table(title, (*_TOLD, *_MEASURED), tuple(rows)), paths
 
 
@@ -113,7 +113,7 @@ def _real(files: Many[Path]) -> Table:
             else:
                 agreeing = sum(fit.inliers for fit in registration.alignment.links)
                 rows.append((*_told(variant, registration), agreeing))
-    return Table(f"Fig. 10: copr, {len(files)} real pictures, {_COPR}", (*_TOLD, "matches that agree"), tuple(rows))
+    return Table(f"Fig. 10: copr, {len(files)} real images, {_COPR}", (*_TOLD, "matches that agree"), tuple(rows))
 
 
 def _told(variant: str, registration: Registration) -> tuple[object, ...]:

@@ -20,11 +20,11 @@ def run(settings: Settings) -> Report:
     """λ beside that of the best division model, and the distance from the true plane."""
     size = (320, 240) if settings.effort is Effort.TINY else (640, 480)
     focals = _FOCAL_PER_WIDTH[-1:] if settings.effort is Effort.TINY else _FOCAL_PER_WIDTH
-    rows, pictures = [], {}
+    rows, images = [], {}
     for k, share in enumerate(focals):
-        row, picture = _rendered(FisheyeLens(size, share * size[0]), seed=50 + k)
+        row, image = _rendered(FisheyeLens(size, share * size[0]), seed=50 + k)
         rows.append(row)
-        pictures[f"figure5_fisheye{k}.jpg"] = picture
+        images[f"figure5_fisheye{k}.jpg"] = image
     header = (
         "focal length, px",
         "λ",
@@ -41,26 +41,26 @@ def run(settings: Settings) -> Report:
     for name, truth in REAL_PAIRS.items():
         files = settings.real_sequence(name)[:2]
         if not files:
-            notes.append(f"the real pictures {name} are not here and were left out")
+            notes.append(f"the real images {name} are not here and were left out")
             continue
         try:
-            registration, picture = stitch_files(files, StitchOptions())
+            registration, image = stitch_files(files, StitchOptions())
         except RegistrationError as error:
             real.append((name, None, truth, None, f"failed: {error}"))
             continue
         alignment = registration.alignment
         real.append((name, alignment.distortion, truth, alignment.rms, alignment.model))
-        pictures[f"figure5_{name}.jpg"] = picture
+        images[f"figure5_{name}.jpg"] = image
     if real:
         columns = ("pair", "λ", "λ of the maker's calibration", "rms, px", "model")
-        tables.append(Table("Fig. 5: the first two pictures of real sequences", columns, tuple(real)))
-    return Report(tuple(tables), pictures=pictures, notes=tuple(notes))
+        tables.append(Table("Fig. 5: the first two images of real sequences", columns, tuple(real)))
+    return Report(tuple(tables), images=images, notes=tuple(notes))
 
 
 def _rendered(lens: Lens, seed: int) -> tuple[tuple[object, ...], Pixels]:
     """One row, and the stitched pair."""
     sequence = rendered_pair(lens, seed=seed, tilt=_TILT, overlap=0.5)
-    registration, picture = stitch_rendered(sequence, StitchOptions())
+    registration, image = stitch_rendered(sequence, StitchOptions())
     error = registration_error(registration.alignment, sequence)
     nearest, misfit = best_division_model(lens)
     return (
@@ -71,5 +71,5 @@ def _rendered(lens: Lens, seed: int) -> tuple[tuple[object, ...], Pixels]:
         registration.alignment.model,
         error.median,
         error.percentile95,
-        "yes" if any(message.code == "few-pictures" for message in registration.alignment.messages) else "no",
-    ), picture
+        "yes" if any(message.code == "few-images" for message in registration.alignment.messages) else "no",
+    ), image

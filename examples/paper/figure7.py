@@ -49,7 +49,7 @@ def run(settings: Settings) -> Report:
 
     notes = absent("homlib")
     if not settings.real_sequence("garfield_red"):
-        notes += ("the real pictures garfield_red are not here and were left out",)
+        notes += ("the real images garfield_red are not here and were left out",)
     return Report(tables, draw, notes=notes)
 
 

@@ -1,7 +1,7 @@
 """Fig. 8: the pairs of a sequence vote on λ, and what they elect straightens and rectifies a chart.
 
 The votes on a drive come from plain RANSAC with each solver, as in the paper, and from rdstitch, which weights them
-by what each pair can know and then adjusts all pictures. Real chessboards, which move freely, vote by five points.
+by what each pair can know and then adjusts all images. Real chessboards, which move freely, vote by five points.
 """
 
 from collections.abc import Mapping, Sequence
@@ -63,19 +63,19 @@ class _Election:
 
 @dataclass(frozen=True)
 class BoardVotes:
-    """What pictures of a chessboard vote for.
+    """What images of a chessboard vote for.
 
     Attributes
     ----------
     votes : ndarray of shape (pairs,)
         λ of each pair.
     elected, adjusted : float
-        λ by the weighted votes, and by the adjustment of all pictures.
+        λ by the weighted votes, and by the adjustment of all images.
     off_before, off_by_truth, off_by_adjusted : float
-        Rms distance of the corners from the grid after a homography, % of a square, mean over the pictures: as
+        Rms distance of the corners from the grid after a homography, % of a square, mean over the images: as
         measured, undistorted with the given λ, and with the adjusted one.
-    picture : ndarray of shape (h, w, 3)
-        The picture with the largest board, beside itself undistorted and rectified.
+    image : ndarray of shape (h, w, 3)
+        The image with the largest board, beside itself undistorted and rectified.
     """
 
     votes: FloatArray
@@ -84,27 +84,27 @@ class BoardVotes:
     off_before: float
     off_by_truth: float
     off_by_adjusted: float
-    picture: Pixels
+    image: Pixels
 
 
 def run(settings: Settings) -> Report:
     """λ by votes, and how far the corners of charts are from a grid."""
     d = drive("parallel parking", settings.count(8, 24, 107), seed=80)
     election = _drive_election(d)
-    boards, notes, pictures, shown = [], [], {}, {}
+    boards, notes, images, shown = [], [], {}, {}
     tables = [_votes_table(d, election)]
-    table, pictures["figure8_chart.png"] = _rectified_chart(d, election.alignment)
+    table, images["figure8_chart.png"] = _rectified_chart(d, election.alignment)
     tables.append(table)
     for name, (corners, truth) in BOARDS.items():
         files = settings.real_sequence(name)
         if not files:
-            notes.append(f"the real pictures {name} are not here and were left out")
+            notes.append(f"the real images {name} are not here and were left out")
             continue
         found = vote_on_boards(files, corners, truth, reach=settings.count(1, 2, len(files)))
         lambdas = (truth, float(np.median(found.votes)), found.elected, found.adjusted)
         boards.append((name, len(found.votes), *lambdas, found.off_before, found.off_by_truth, found.off_by_adjusted))
         shown[name] = (found.votes, truth)
-        pictures[f"figure8_{name}.png"] = found.picture
+        images[f"figure8_{name}.png"] = found.image
     if boards:
         header = (
             "boards", "pairs", "λ of the fit to corners", "median of the votes", "weighted votes", "adjusted",
@@ -122,7 +122,7 @@ def run(settings: Settings) -> Report:
         for axes, (name, (votes, truth)) in zip(all_axes[1:], shown.items(), strict=True):
             _draw_votes(axes, {"5 points, rdstitch": votes}, truth, name)
 
-    return Report(tuple(tables), draw, pictures, tuple(notes))
+    return Report(tuple(tables), draw, images, tuple(notes))
 
 
 def _drive_election(d: Drive) -> _Election:
@@ -163,7 +163,7 @@ def _votes_table(d: Drive, election: _Election) -> Table:
 
 
 def _rectified_chart(d: Drive, alignment: Alignment) -> tuple[Table, Pixels]:
-    """A chart that the drive's camera sees, by the λ, tilt and focal length that the drive's pictures gave."""
+    """A chart that the drive's camera sees, by the λ, tilt and focal length that the drive's images gave."""
     sequence = rendered_chart(d.camera, d.tilt, _YAW)
     points, grid = seen_corners(sequence)
     assert alignment.tilt is not None
@@ -177,18 +177,18 @@ def _rectified_chart(d: Drive, alignment: Alignment) -> tuple[Table, Pixels]:
         (name, off_grid(place, grid, metric=False), off_grid(place, grid, metric=True))
         for name, place in stages.items()
     )
-    header = ("picture", "off by a homography, %", "off by a similarity, %")
+    header = ("image", "off by a homography, %", "off by a similarity, %")
     title = f"Fig. 8: {len(grid)} corners of a rendered chart, rms distance from a square grid, % of a square"
     to_grid = fit_similarity(from_above, grid - grid.min(axis=0)) @ level
     extent = np.ptp(grid, axis=0)
     with TemporaryDirectory(prefix="rdstitch-paper-") as folder:
         file = sequence.write(folder)[0]
-        picture = before_and_after(file, camera, to_grid, (float(extent[0]), float(extent[1])), 40.0)
-    return Table(title, header, rows), picture
+        image = before_and_after(file, camera, to_grid, (float(extent[0]), float(extent[1])), 40.0)
+    return Table(title, header, rows), image
 
 
 def vote_on_boards(files: list[Path], corners: tuple[int, int], truth: float, reach: int) -> BoardVotes:
-    """λ of a camera from the corners of a board, by pairs of pictures that are told nothing of the board.
+    """λ of a camera from the corners of a board, by pairs of images that are told nothing of the board.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ def vote_on_boards(files: list[Path], corners: tuple[int, int], truth: float, re
     truth : float
         λ that the corners are undistorted with for comparison.
     reach : int
-        Pictures are paired with so many that follow.
+        Images are paired with so many that follow.
     """
     camera, boards = find_boards(files, corners)
     grid, seen = board_grid(corners), list(boards.values())
@@ -221,7 +221,7 @@ def vote_on_boards(files: list[Path], corners: tuple[int, int], truth: float, re
         off_before=before,
         off_by_truth=by_truth,
         off_by_adjusted=by_adjusted,
-        picture=before_and_after(largest, adjusted, to_grid, extent, 50.0),
+        image=before_and_after(largest, adjusted, to_grid, extent, 50.0),
     )
 
 

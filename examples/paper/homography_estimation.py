@@ -19,7 +19,7 @@ LIMITS = (1.0, 3.0, 5.0)
 DISTORTION = -0.4
 """λ is uniform from this to 0."""
 
-_PICTURES_PER_SCENE = 5
+_IMAGES_PER_SCENE = 5
 
 
 def run(settings: Settings) -> Report:
@@ -68,7 +68,7 @@ def _families(settings: Settings) -> dict[str, Iterable[JudgedPair]]:
     families[f"as in HPatches, of {what}"] = scene_pairs(scenes, DISTORTION, seed=1500, per_scene=1)
     if settings.hpatches is not None:
         real = read_scenes(settings.hpatches)[: settings.count(1, 8, 1000)]
-        families["HPatches"] = scene_pairs(real, DISTORTION, seed=1800, per_scene=_PICTURES_PER_SCENE)
+        families["HPatches"] = scene_pairs(real, DISTORTION, seed=1800, per_scene=_IMAGES_PER_SCENE)
     return families
 
 
@@ -97,5 +97,5 @@ def _table(name: str, results: dict[str, list[Judgement]]) -> Table:
         "processor time, rdstitch's = 1",
     )
     count = len(next(iter(results.values())))
-    title = f"Homography estimation: {name}, {count} pairs, threshold {THRESHOLD:g} px, error in px of picture 2"
+    title = f"Homography estimation: {name}, {count} pairs, threshold {THRESHOLD:g} px, error in px of image 2"
     return Table(title, header, tuple(rows))

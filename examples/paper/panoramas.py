@@ -16,7 +16,7 @@ from rdstitch.synthetic import Photometry, TurningSequence, panorama_rotations, 
 
 @dataclass(frozen=True)
 class TurnSet:
-    """A turn on the spot, to be rendered: pictures of 640 x 480 with an angle of view of 60 degrees."""
+    """A turn on the spot, to be rendered: images of 640 x 480 with an angle of view of 60 degrees."""
 
     name: str
     count: int
@@ -36,7 +36,7 @@ class TurnSet:
         return math.degrees(2.0 * math.atan(self.size[0] / 2.0 / self.focal))
 
     def sequence(self, seed: int) -> TurningSequence:
-        """The pictures, held by hand: off by up to 3 degrees, with exposures that differ by 15 %."""
+        """The images, held by hand: off by up to 3 degrees, with exposures that differ by 15 %."""
         lens = Camera(self.size, self.distortion, focal=self.focal, focal_source="option")
         rotations = panorama_rotations(
             self.count, math.radians(self.step), rows=self.rows, jitter=math.radians(3.0), seed=seed
@@ -46,13 +46,13 @@ class TurnSet:
 
 
 SETS = (
-    TurnSet("3 pictures, λ = -0.2", 3, 25.0, 1, -0.2),
-    TurnSet("6 pictures, λ = -0.45", 6, 25.0, 1, -0.45),
-    TurnSet("13 pictures all the way round, λ = -0.2", 13, 360.0 / 13, 1, -0.2),
-    TurnSet("13 pictures all the way round, λ = 0", 13, 360.0 / 13, 1, 0.0),
+    TurnSet("3 images, λ = -0.2", 3, 25.0, 1, -0.2),
+    TurnSet("6 images, λ = -0.45", 6, 25.0, 1, -0.45),
+    TurnSet("13 images all the way round, λ = -0.2", 13, 360.0 / 13, 1, -0.2),
+    TurnSet("13 images all the way round, λ = 0", 13, 360.0 / 13, 1, 0.0),
     TurnSet("two rows of 13, λ = -0.2", 13, 360.0 / 13, 2, -0.2),
 )
-_TINY = TurnSet("2 pictures", 2, 25.0, 1, -0.2, (320, 240))
+_TINY = TurnSet("2 images", 2, 25.0, 1, -0.2, (320, 240))
 
 
 def run(settings: Settings) -> Report:
@@ -63,6 +63,6 @@ def run(settings: Settings) -> Report:
 
 
 def _measured(panorama: Pixels, sequence: TurningSequence, turn: TurnSet) -> Measured:
-    """Median error and 95 %, in px of the pictures, and coverage."""
+    """Median error and 95 %, in px of the images, and coverage."""
     found = compare_with_sphere(panorama, sequence, SEARCH)
     return found.quantile(0.5) * turn.focal, found.quantile(0.95) * turn.focal, found.coverage

@@ -1,4 +1,4 @@
-"""From pairs of pictures to all of them registered as one."""
+"""From pairs of images to all of them registered as one."""
 
 from rdstitch.alignment.align import align, most_matches_read
 from rdstitch.alignment.lens_selection import LENSES

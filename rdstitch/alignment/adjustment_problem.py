@@ -1,4 +1,4 @@
-"""One connected set of pictures, the priors of its camera, and the adjustment of one model to it."""
+"""One connected set of images, the priors of its camera, and the adjustment of one model to it."""
 
 import math
 from collections.abc import Sequence
@@ -40,13 +40,13 @@ _WIDEST_START = 0.05
 """Half diagonals: errors that a chain may have gathered before the adjustment, beyond which a link is down-weighted."""
 
 _LONG_CHAIN = 60
-"""Pictures over which chained homographies drift so far that a planar model is the better start."""
+"""Images over which chained homographies drift so far that a planar model is the better start."""
 
 _TRIAL_LINKS, _TRIAL_MATCHES, _TRIAL_ITERATIONS = 30, 40, 8
 """What the tilts to start from are tried on, and how long."""
 
 POSE_TILT_SPREAD = math.radians(35.0)
-"""Of pictures of which nothing is known: half of the tilts lie below 40 degrees."""
+"""Of images of which nothing is known: half of the tilts lie below 40 degrees."""
 
 _TILT_SPREAD_START = math.radians(3.0)
 _MIN_TILT_SPREAD = math.radians(0.05)
@@ -67,7 +67,7 @@ class Fit:
     free_lens : ndarray of shape (5,), bool
         Lens parameters that were estimated.
     tilt_spread : float
-        Standard deviation of the pictures' own tilts, radians; 0 where the model has none.
+        Standard deviation of the images' own tilts, radians; 0 where the model has none.
     overdispersion : float
         Of the errors that it leaves, at least that of the problem; see :class:`BundleAdjuster`.
     """
@@ -81,12 +81,12 @@ class Fit:
 
 @dataclass(frozen=True)
 class Problem:
-    """Connected pictures to be aligned.
+    """Connected images to be aligned.
 
     Attributes
     ----------
     observations : Observations
-        Links between the pictures 0 … N-1.
+        Links between the images 0 … N-1.
     homographies : ndarray of shape (L, 3, 3)
         Of the links, at the ``lens``.
     trust : ndarray of shape (L,)
@@ -94,7 +94,7 @@ class Problem:
     count : int
         N.
     reference : int
-        The picture that fixes the gauge.
+        The image that fixes the gauge.
     lens : ndarray of shape (4,)
         Where to start.
     free_lens : ndarray of shape (5,), bool
@@ -223,7 +223,7 @@ class Problem:
         return Parameters(model.nearest_poses(chained, shared, attitudes), shared, lens)
 
     def _upgraded(self) -> Parameters:
-        """Chained homographies with the metric of the plane that makes them pictures of one camera."""
+        """Chained homographies with the metric of the plane that makes them images of one camera."""
         o, prior = self.observations, self.camera_priors
         tree = spanning_tree(self.count, o.image1, o.image2, self.trust, self.reference)
         chained = tree.chained(self.homographies, o.image1, np.eye(3))

@@ -12,7 +12,7 @@ from rdstitch.alignment.adjustment_problem import (
     thin_for_selection,
 )
 from rdstitch.alignment.attitude_check import check_attitudes
-from rdstitch.alignment.build_result import AdjustedPictures, build_alignment
+from rdstitch.alignment.build_result import AdjustedImages, build_alignment
 from rdstitch.alignment.bundle_adjustment import BundleAdjustmentResult, sigma_of
 from rdstitch.alignment.camera_priors import CameraPriors
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
@@ -73,12 +73,12 @@ def align(
     former: Alignment | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Alignment:
-    """Align all pictures over one plane.
+    """Align all images over one plane.
 
     Parameters
     ----------
     cameras : sequence of Camera
-        One per picture, of one lens; sizes may differ.
+        One per image, of one lens; sizes may differ.
     links : sequence of Link
         The pairs that overlap, each once.
     options : AlignmentOptions, optional
@@ -91,9 +91,9 @@ def align(
     Raises
     ------
     ArgumentError
-        When an argument is out of range, or two links are between the same pictures.
+        When an argument is out of range, or two links are between the same images.
     RegistrationError
-        When no two pictures are linked.
+        When no two images are linked.
     """
     report, options = progress or (lambda stage: None), options or AlignmentOptions()
     _check(cameras, links, options)
@@ -122,14 +122,14 @@ def align(
     wrong, confirmed = cycle_consistency(apart, few, len(cameras))
     trust = _trust(few, confirmed)
     graph = _Graph(len(cameras), few, relations, trust, lens, free_lens, known, options)
-    problem, pictures = graph.problem(~wrong)
+    problem, images = graph.problem(~wrong)
     # Data weigh against priors as they will in the final adjustment.
     problem = replace(
         problem, overdispersion=noise_of_links(problem.observations, problem.homographies, problem.lens).overdispersion
     )
     if (doubt := check_attitudes(problem, options)) is not None:
         return align(cameras, links, doubt[0], former=former, progress=progress).with_messages([doubt[1]])
-    earlier = _choose_from(former, cameras, problem, pictures, options, chosen.refinements)
+    earlier = _choose_from(former, cameras, problem, images, options, chosen.refinements)
     choice = earlier or select_model(
         problem,
         options.models,
@@ -137,22 +137,22 @@ def align(
         prefer_turn=options.prefer_turn,
         layout_matters=options.layout_matters,
     )
-    choice, pictures, wrong = _drop_wrong_pairs(graph, problem, pictures, choice, wrong)
-    choice = choose_over_relief(graph.problem(~wrong, pictures)[0], choice, options.models)
+    choice, images, wrong = _drop_wrong_pairs(graph, problem, images, choice, wrong)
+    choice = choose_over_relief(graph.problem(~wrong, images)[0], choice, options.models)
 
     report("adjustment")
     if choice.fit.model is ROTATION and most_matches_read(len(links), options) is None:
-        # Few pictures of a turn hardly determine the focal length; all their matches are used.
+        # Few images of a turn hardly determine the focal length; all their matches are used.
         everything, _ = _observations(links, cameras, _MATCHES_OF_A_TURN // len(links))
     full = replace(graph, observations=everything, free_lens=choice.fit.free_lens)
-    problem, _ = full.problem(~wrong, pictures, choice.overdispersion)
+    problem, _ = full.problem(~wrong, images, choice.overdispersion)
     problem, fit = adjust_over_relief(problem, choice)
     problem, fit = with_third_coefficient(problem, fit) if options.lens_chosen else (problem, fit)
     problem, fit, disagreement = hold_positions(problem, fit)
-    found = AdjustedPictures(
+    found = AdjustedImages(
         cameras,
         links,
-        pictures,
+        images,
         ~wrong,
         problem,
         replace(choice, fit=fit),
@@ -186,14 +186,14 @@ def _observations(
 
 def _check(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions) -> None:
     if not links:
-        raise RegistrationError("nothing to align: no two pictures overlap")
+        raise RegistrationError("nothing to align: no two images overlap")
     pairs = [(min(k.image1, k.image2), max(k.image1, k.image2)) for k in links]
     if min(pairs)[0] < 0 or max(high for _, high in pairs) >= len(cameras):
-        raise ArgumentError(f"a link names a picture that is none of the {len(cameras)}")
+        raise ArgumentError(f"a link names an image that is none of the {len(cameras)}")
     if len(set(pairs)) != len(pairs):
-        raise ArgumentError("two links are between the same pictures")
+        raise ArgumentError("two links are between the same images")
     if options.reference is not None and not 0 <= options.reference < len(cameras):
-        raise ArgumentError(f"the reference picture {options.reference} is none of the {len(cameras)}")
+        raise ArgumentError(f"the reference image {options.reference} is none of the {len(cameras)}")
 
 
 def _trust(observations: Observations, confirmed: IntArray) -> FloatArray:
@@ -214,7 +214,7 @@ def _lens_start(cameras: Sequence[Camera], options: AlignmentOptions, votes: Con
 
 
 def _lens_of(camera: Camera) -> FloatArray:
-    """The lens of a camera; the pictures' points are already relative to its centre."""
+    """The lens of a camera; the images' points are already relative to its centre."""
     return np.array([*camera.coefficients, 0.0, 0.0])
 
 
@@ -222,14 +222,14 @@ def _choose_from(
     former: Alignment | None,
     cameras: Sequence[Camera],
     problem: Problem,
-    pictures: IntArray,
+    images: IntArray,
     options: AlignmentOptions,
     refinements: Sequence[BoolArray],
 ) -> ModelChoice | None:
     """The choice from the solution of an earlier alignment; None where that does not explain every link any more."""
     if former is None:
         return None
-    warm = WarmStart.of(former, cameras, pictures, problem.lens, problem.free_lens)
+    warm = WarmStart.of(former, cameras, images, problem.lens, problem.free_lens)
     if warm is None or options.attitudes is not None:
         return None
     squared, noise = (
@@ -291,55 +291,55 @@ class _Graph:
     options: AlignmentOptions
 
     def problem(
-        self, kept: BoolArray, pictures: IntArray | None = None, overdispersion: float = 1.0
+        self, kept: BoolArray, images: IntArray | None = None, overdispersion: float = 1.0
     ) -> tuple[Problem, IntArray]:
-        """The problem, and its pictures (those given, if given)."""
+        """The problem, and its images (those given, if given)."""
         o = self.observations
-        if pictures is None:
+        if images is None:
             groups = connected_components(self.count, o.image1[kept], o.image2[kept])
-            pictures = np.array(groups[0], dtype=np.intp)
+            images = np.array(groups[0], dtype=np.intp)
         number = np.full(self.count, -1, dtype=np.intp)
-        number[pictures] = np.arange(len(pictures))
+        number[images] = np.arange(len(images))
         links = np.flatnonzero(kept & (number[o.image1] >= 0) & (number[o.image2] >= 0))
         own = o.subset(links, number)
         chosen = self.options.reference
         if chosen is not None and number[chosen] >= 0:
             reference = int(number[chosen])
         else:
-            reference = spanning_tree(len(pictures), own.image1, own.image2, self.trust[links]).root
+            reference = spanning_tree(len(images), own.image1, own.image2, self.trust[links]).root
         problem = Problem(
             own,
             self.homographies[links],
             self.trust[links],
-            len(pictures),
+            len(images),
             reference,
             self.lens,
             self.free_lens,
-            self.known.of(pictures),
+            self.known.of(images),
             overdispersion,
         )
-        return problem, pictures
+        return problem, images
 
 
 def _drop_wrong_pairs(
-    graph: _Graph, problem: Problem, pictures: IntArray, choice: ModelChoice, wrong: BoolArray
+    graph: _Graph, problem: Problem, images: IntArray, choice: ModelChoice, wrong: BoolArray
 ) -> tuple[ModelChoice, IntArray, BoolArray]:
     """Test all links against the adjusted poses, and adjust again without those that do not fit."""
     graph = replace(graph, free_lens=choice.fit.free_lens)
     for _ in range(_ROUNDS):
         adjusted, model = choice.fit.adjusted, choice.fit.model
-        everything, _ = graph.problem(np.ones_like(wrong), pictures)
-        inside = np.isin(graph.observations.image1, pictures) & np.isin(graph.observations.image2, pictures)
+        everything, _ = graph.problem(np.ones_like(wrong), images)
+        inside = np.isin(graph.observations.image1, images) & np.isin(graph.observations.image2, images)
         judged = wrong.copy()
         judged[inside] = misfitting_links(everything.squared(model, adjusted.parameters), everything.observations)
         if (judged == wrong).all():
             break
         wrong = judged
         problem, kept = graph.problem(~wrong)
-        if np.isin(kept, pictures).all():
-            poses = adjusted.parameters.poses[np.searchsorted(pictures, kept)]
+        if np.isin(kept, images).all():
+            poses = adjusted.parameters.poses[np.searchsorted(images, kept)]
             fit = problem.refine(model, replace(adjusted.parameters, poses=poses), choice.fit.tilt_spread)
         else:
             fit = problem.fit(model)
-        choice, pictures = replace(choice, fit=fit), kept
-    return choice, pictures, wrong
+        choice, images = replace(choice, fit=fit), kept
+    return choice, images, wrong

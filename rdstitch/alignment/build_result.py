@@ -10,7 +10,7 @@ from rdstitch.alignment.adjustment_problem import Problem
 from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.alignment.cycle_consistency import link_medians
 from rdstitch.alignment.lens_description import radius_std
-from rdstitch.alignment.lens_selection import CENTER, ENOUGH_PICTURES, WORTH_SAYING, LensChoice
+from rdstitch.alignment.lens_selection import CENTER, ENOUGH_IMAGES, WORTH_SAYING, LensChoice
 from rdstitch.alignment.lens_uncertainty import considered_covariance
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, PlanarModel, X, Y
@@ -44,15 +44,15 @@ _CONFIDENT = 2.0
 
 
 @dataclass(frozen=True)
-class AdjustedPictures:
+class AdjustedImages:
     """What the adjustment found, and what it was made from.
 
     Attributes
     ----------
     cameras : sequence of Camera
     links : sequence of Link
-    pictures : ndarray of shape (N,), intp
-        The pictures aligned, ascending; the problem numbers them 0 … N-1.
+    images : ndarray of shape (N,), intp
+        The images aligned, ascending; the problem numbers them 0 … N-1.
     right : ndarray of shape (L,), bool
         Links not taken for wrong.
     problem : Problem
@@ -63,9 +63,9 @@ class AdjustedPictures:
     observable : bool
         Whether λ is observable, or known.
     depth : bool
-        Whether that is because what few pictures show has depth.
+        Whether that is because what few images show has depth.
     layout_matters : bool
-        Whether a picture is wanted; the lens or the poses otherwise.
+        Whether an image is wanted; the lens or the poses otherwise.
     gravity : ndarray of shape (M, 3), optional
         Direction down in the axes of every camera; NaN where it is unknown.
     positions_disagree : str
@@ -74,7 +74,7 @@ class AdjustedPictures:
 
     cameras: Sequence[Camera]
     links: Sequence[Link]
-    pictures: IntArray
+    images: IntArray
     right: BoolArray
     problem: Problem
     choice: ModelChoice
@@ -86,8 +86,8 @@ class AdjustedPictures:
     positions_disagree: str = ""
 
 
-def build_alignment(found: AdjustedPictures) -> Alignment:
-    """The alignment, in the frame of the reference picture."""
+def build_alignment(found: AdjustedImages) -> Alignment:
+    """The alignment, in the frame of the reference image."""
     problem, fit = found.problem, found.choice.fit
     adjusted, planar = fit.adjusted, isinstance(fit.model, PlanarModel)
     shared, lens = fit.model.physical_parameters(adjusted.parameters.shared)[0], adjusted.parameters.lens
@@ -118,20 +118,20 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
             result = result.with_focal(focal * size, "estimate", focal_std * size)
         return replace(result, tilt=tilt, tilt_std=tilt_std)
 
-    # Most pictures are of one camera.
+    # Most images are of one camera.
     adjusted_cameras = {camera: adjusted_camera(camera) for camera in dict.fromkeys(found.cameras)}
     cameras = tuple(adjusted_cameras[camera] for camera in found.cameras)
-    own = cameras[int(found.pictures[problem.reference])]
+    own = cameras[int(found.images[problem.reference])]
     groups = _groups(found)
     used = np.zeros(len(found.cameras), dtype=np.bool_)
-    used[found.pictures] = True
+    used[found.images] = True
     homographies, poses = _in_frame_of_reference(found)
     return Alignment(
         cameras=cameras,
         homographies=homographies,
         used=used,
         components=groups,
-        reference=int(found.pictures[problem.reference]),
+        reference=int(found.images[problem.reference]),
         model=fit.model.name,
         model_reason=found.choice.reason,
         poses=poses,
@@ -153,17 +153,17 @@ def build_alignment(found: AdjustedPictures) -> Alignment:
     )
 
 
-def _shape(found: AdjustedPictures) -> ShapeTest | None:
-    """Whether the whole may be bent, with the picture's index among all."""
+def _shape(found: AdjustedImages) -> ShapeTest | None:
+    """Whether the whole may be bent, with the image's index among all."""
     fit = found.choice.fit
     if fit.model is ROTATION or not found.observable:
         return None
-    pictures = found.pictures
-    judged = judge_shape(found.problem, fit, [found.cameras[k] for k in pictures])
-    return replace(judged, image=int(pictures[judged.image]))
+    images = found.images
+    judged = judge_shape(found.problem, fit, [found.cameras[k] for k in images])
+    return replace(judged, image=int(images[judged.image]))
 
 
-def _covariance(found: AdjustedPictures) -> FloatArray:
+def _covariance(found: AdjustedImages) -> FloatArray:
     """Covariance of the named parameters, for errors that are not independent."""
     fit = found.choice.fit
     if not fit.adjusted.covariance.size:
@@ -185,9 +185,9 @@ def _lens_covariance(names: Sequence[str], covariance: FloatArray) -> FloatArray
 
 
 def _with_lens(
-    found: AdjustedPictures, camera: Camera, lens: FloatArray, covariances: tuple[FloatArray, FloatArray]
+    found: AdjustedImages, camera: Camera, lens: FloatArray, covariances: tuple[FloatArray, FloatArray]
 ) -> Camera:
-    """The camera of a picture with the lens that was found; covariances of what was estimated, and of all of a lens."""
+    """The camera of an image with the lens that was found; covariances of what was estimated, and of all of a lens."""
     covariance, considered = covariances
     center = np.asarray(camera.center) + lens[CENTER] * camera.half_diagonal
     estimated = bool(covariance.any())
@@ -215,21 +215,21 @@ def _nearest_distortion_std(camera: Camera, covariance: FloatArray) -> float:
     return math.sqrt(max(float(gradient @ covariance @ gradient), 0.0))
 
 
-def _in_frame_of_reference(found: AdjustedPictures) -> tuple[FloatArray, PlanarPoses | None]:
-    """Picture-to-plane homographies of all pictures, and their poses where the model has them.
+def _in_frame_of_reference(found: AdjustedImages) -> tuple[FloatArray, PlanarPoses | None]:
+    """Image-to-plane homographies of all images, and their poses where the model has them.
 
-    The adjustment may have held the reference picture anywhere; here it comes to the origin, with yaw zero and, as
+    The adjustment may have held the reference image anywhere; here it comes to the origin, with yaw zero and, as
     the unit of length, height one.
     """
     count, fit, reference = len(found.cameras), found.choice.fit, found.problem.reference
     matrices = fit.adjusted.matrices.matrices
     homographies = np.full((count, 3, 3), np.nan)
     if fit.model is ROTATION:
-        gravity = None if found.gravity is None else found.gravity[found.pictures]
-        homographies[found.pictures] = levelled(matrices, reference, gravity)
+        gravity = None if found.gravity is None else found.gravity[found.images]
+        homographies[found.images] = levelled(matrices, reference, gravity)
         return homographies, None
     if not isinstance(fit.model, PlanarModel):
-        homographies[found.pictures] = matrices[reference] @ np.linalg.inv(matrices)
+        homographies[found.images] = matrices[reference] @ np.linalg.inv(matrices)
         return homographies, None
     shared, poses = fit.adjusted.parameters.shared, fit.adjusted.parameters.poses.copy()
     yaw, height = poses[reference, YAW], np.exp(poses[reference, LOG_HEIGHT])
@@ -238,37 +238,37 @@ def _in_frame_of_reference(found: AdjustedPictures) -> tuple[FloatArray, PlanarP
     poses[:, [X, Y]] = (poses[:, [X, Y]] - poses[reference, [X, Y]]) @ rotation.T / height
     poses[:, YAW] = np.remainder(poses[:, YAW] - yaw + np.pi, 2 * np.pi) - np.pi
     poses[:, LOG_HEIGHT] -= np.log(height)
-    homographies[found.pictures] = np.linalg.inv(fit.model.matrices(poses, shared).matrices)
+    homographies[found.images] = np.linalg.inv(fit.model.matrices(poses, shared).matrices)
     every = np.full((count, 6), np.nan)
-    every[found.pictures] = fit.model.metric_poses(poses, shared)
+    every[found.images] = fit.model.metric_poses(poses, shared)
     return homographies, PlanarPoses(
         every[:, YAW], every[:, [X, Y]], np.exp(every[:, LOG_HEIGHT]), every[:, [PSI, THETA]]
     )
 
 
-def _groups(found: AdjustedPictures) -> tuple[tuple[int, ...], ...]:
-    """Connected groups of pictures by the links not taken for wrong, the aligned one first."""
+def _groups(found: AdjustedImages) -> tuple[tuple[int, ...], ...]:
+    """Connected groups of images by the links not taken for wrong, the aligned one first."""
     right = [link for link, right in zip(found.links, found.right, strict=True) if right]
     groups = connected_components(len(found.cameras), [k.image1 for k in right], [k.image2 for k in right])
-    aligned = set(found.pictures.tolist())
+    aligned = set(found.images.tolist())
     ordered = sorted(groups, key=lambda group: group[0] not in aligned)
     return tuple(tuple(group) for group in ordered)
 
 
-def _link_fits(found: AdjustedPictures, squared: FloatArray, agreeing: BoolArray) -> tuple[LinkFit, ...]:
+def _link_fits(found: AdjustedImages, squared: FloatArray, agreeing: BoolArray) -> tuple[LinkFit, ...]:
     """How well each link agrees, in the order of the links given."""
     observations = found.problem.observations
     medians = link_medians(squared, observations)
-    pictures = found.pictures
+    images = found.images
     rows = {
-        frozenset((int(pictures[i]), int(pictures[j]))): row
+        frozenset((int(images[i]), int(images[j]))): row
         for row, (i, j) in enumerate(zip(observations.image1, observations.image2, strict=True))
     }
     result = []
     for link, right in zip(found.links, found.right, strict=True):
         row = rows.get(frozenset((link.image1, link.image2)))
         if row is None or not right:
-            why = "belongs to another group of pictures" if right else CONTRADICTS
+            why = "belongs to another group of images" if right else CONTRADICTS
             result.append(LinkFit(link.image1, link.image2, len(link), 0, math.nan, False, why))
             continue
         own = slice(observations.start[row], observations.start[row + 1])
@@ -279,7 +279,7 @@ def _link_fits(found: AdjustedPictures, squared: FloatArray, agreeing: BoolArray
     return tuple(result)
 
 
-def _overruled_focal(found: AdjustedPictures, camera: Camera) -> str | None:
+def _overruled_focal(found: AdjustedImages, camera: Camera) -> str | None:
     """That the images show another focal length than EXIF says, where they do."""
     given, shared = found.problem.camera_priors, found.choice.fit.model.shared_names
     if given.focal_source != "exif" or not shared or camera.focal is None:
@@ -291,7 +291,7 @@ def _overruled_focal(found: AdjustedPictures, camera: Camera) -> str | None:
     return f"the images show a focal length of {shown:.0f} pixels, not of {said:.0f} as EXIF says; --focal gives it"
 
 
-def _warnings(found: AdjustedPictures, camera: Camera) -> tuple[Message, ...]:
+def _warnings(found: AdjustedImages, camera: Camera) -> tuple[Message, ...]:
     """What the user should know of the whole."""
     result: list[Message] = []
     if found.depth:
@@ -303,18 +303,18 @@ def _warnings(found: AdjustedPictures, camera: Camera) -> tuple[Message, ...]:
         result.append(Message(text, severity=severity, code="lambda-not-observable"))
     elif not found.observable:
         text = (
-            "λ is not observable: the pictures hardly move, or only turn about the optical axis; "
-            "give λ, a camera file, or pictures that overlap by less"
+            "λ is not observable: the images hardly move, or only turn about the optical axis; "
+            "give λ, a camera file, or images that overlap by less"
         )
         result.append(Message(text, code="lambda-not-observable"))
-    elif len(found.pictures) < ENOUGH_PICTURES and found.problem.free_lens.any():
+    elif len(found.images) < ENOUGH_IMAGES and found.problem.free_lens.any():
         off = max(found.lens.corner_shift, _CONFIDENT * float(radius_std(camera, _RADII)[-1]))
         if off > WORTH_SAYING:
             text = (
-                f"from {len(found.pictures)} images the lens distortion is known to about {off:.2g} pixels at the "
-                f"corners; {ENOUGH_PICTURES} or more images, or --camera, make it surer"
+                f"from {len(found.images)} images the lens distortion is known to about {off:.2g} pixels at the "
+                f"corners; {ENOUGH_IMAGES} or more images, or --camera, make it surer"
             )
-            result.append(Message(text, severity="detail" if found.layout_matters else "warning", code="few-pictures"))
+            result.append(Message(text, severity="detail" if found.layout_matters else "warning", code="few-images"))
     if (overruled := _overruled_focal(found, camera)) is not None:
         result.append(Message(overruled))
     if not found.choice.fit.adjusted.converged:

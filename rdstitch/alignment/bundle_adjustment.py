@@ -79,7 +79,7 @@ class Priors:
 
     @classmethod
     def none(cls, model: MotionModel, count: int) -> Self:
-        """None, for ``count`` pictures."""
+        """None, for ``count`` images."""
         poses = np.zeros((count, model.pose_size))
         return cls((Prior(),) * len(model.shared_names), (Prior(),) * len(LENS_PARAMETERS), poses, poses)
 
@@ -99,7 +99,7 @@ class FreeParameters:
 
     @classmethod
     def fixing(cls, model: MotionModel, count: int, references: FloatArray | list[int], lens: BoolArray) -> Self:
-        """All but the gauge of the reference pictures, one for each connected part of the graph."""
+        """All but the gauge of the reference images, one for each connected part of the graph."""
         poses = np.ones((count, model.pose_size), dtype=np.bool_)
         poses[np.asarray(references, dtype=np.intp)] = ~model.gauge
         return cls(poses, lens)
@@ -221,7 +221,7 @@ class BundleAdjuster:
             normal = self._normal_equations(state, sigma)
             try:
                 flat, step_shared = normal.solve(damping)
-            except RuntimeError:  # singular: no correspondence of some pictures can be transferred
+            except RuntimeError:  # singular: no correspondence of some images can be transferred
                 return state, used, False
             step_poses = np.zeros(self.free.poses.shape)
             step_poses[self.free.poses] = flat

@@ -1,4 +1,4 @@
-"""What is known of the camera and of where the pictures were taken before they are aligned."""
+"""What is known of the camera and of where the images were taken before they are aligned."""
 
 import math
 from collections.abc import Sequence
@@ -27,11 +27,11 @@ class CameraPriors:
         (ψ, θ), radians.
     tilt_known : bool
     attitudes : ndarray of shape (N, 2)
-        How the tilt of each picture differs from the shared one, radians; zeros where that is not known.
+        How the tilt of each image differs from the shared one, radians; zeros where that is not known.
     attitudes_std : float or None
         Standard deviation of these, 0 for exact ones; None where they are not known.
     positions : ndarray of shape (N, 2)
-        Metres east and north where each picture was taken; NaN where that is not known.
+        Metres east and north where each image was taken; NaN where that is not known.
     places, places_precision : ndarray of shape (N, 2) and (N,)
         What those say of the poses, and its inverse variance; see :mod:`rdstitch.alignment.position_priors`.
     """
@@ -48,9 +48,9 @@ class CameraPriors:
     places_precision: FloatArray | None = None
 
     def priors(self, model: MotionModel, count: int, tilt_spread: float, log_focal: float | None = None) -> Priors:
-        """For ``count`` pictures whose tilts scatter by ``tilt_spread`` where nothing else is known of them.
+        """For ``count`` images whose tilts scatter by ``tilt_spread`` where nothing else is known of them.
 
-        Tilts are turned into what they do in the pictures with ``log_focal``, the prior one if not given.
+        Tilts are turned into what they do in the images with ``log_focal``, the prior one if not given.
         """
         none = Priors.none(model, count)
         tilts = map(exact, self.tilt) if self.tilt_known else (TILT, TILT)
@@ -72,9 +72,9 @@ class CameraPriors:
             poses[:, columns], precision[:, columns] = self.places, self.places_precision[:, None]
         return replace(known, poses=poses, poses_precision=precision)
 
-    def of(self, pictures: IntArray) -> "CameraPriors":
-        """Of some of the pictures only."""
-        return replace(self, attitudes=self.attitudes[pictures], positions=self.positions[pictures])
+    def of(self, images: IntArray) -> "CameraPriors":
+        """Of some of the images only."""
+        return replace(self, attitudes=self.attitudes[images], positions=self.positions[images])
 
 
 def known_focal(cameras: Sequence[Camera]) -> tuple[float, float, str]:

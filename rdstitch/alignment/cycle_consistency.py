@@ -61,7 +61,7 @@ def cycle_consistency(
         Every link on its own, with a homography.
     observations : Observations
     count : int
-        Number of pictures.
+        Number of images.
 
     Returns
     -------
@@ -87,13 +87,13 @@ def cycle_consistency(
 
 
 def _open_triangles(apart: BundleAdjustmentResult, observations: Observations, corners: IntArray) -> FloatArray:
-    """1 for triangles that do not close, 0 for those that do, NaN where the points leave the pictures; shape (T,)."""
+    """1 for triangles that do not close, 0 for those that do, NaN where the points leave the images; shape (T,)."""
     backward = observations.image1 > observations.image2
     homographies, covariance = _oriented(apart, backward)
     distortion, higher, center = split_lens(apart.parameters.lens)
     probes = [
         _probes(observations, link, bool(backward[link])) for link in range(len(observations))
-    ]  # in the picture of lower index
+    ]  # in the image of lower index
     points = np.stack([probes[link] for link in corners[:, 0]]).reshape(-1, 2) - center
     ij, jk, ik = (np.repeat(corner, _PROBES) for corner in corners.T)
     first = transfer_jacobian(homographies[ij], distortion, points, higher)
@@ -127,7 +127,7 @@ def _open_triangles(apart: BundleAdjustmentResult, observations: Observations, c
 def _usual_misclosure(misclosure: FloatArray, corners: IntArray, observations: Observations) -> float:
     """The lower quartile of the triangles (T,) with a link, as half of the matches have it.
 
-    Not that of all triangles: each wrong link between pictures far apart opens many.
+    Not that of all triangles: each wrong link between images far apart opens many.
     """
     links = corners.ravel()
     counts = np.bincount(links, minlength=len(observations))
@@ -138,14 +138,14 @@ def _usual_misclosure(misclosure: FloatArray, corners: IntArray, observations: O
 
 
 def _probes(observations: Observations, link: int, backward: bool) -> FloatArray:
-    """Points of a link in its picture of lower index, shape (:data:`_PROBES`, 2), repeated where there are few."""
+    """Points of a link in its image of lower index, shape (:data:`_PROBES`, 2), repeated where there are few."""
     rows = slice(observations.start[link], observations.start[link + 1])
     points = (observations.points2 if backward else observations.points1)[rows]
     return np.resize(points[spread_choice(points, _PROBES)], (_PROBES, 2))
 
 
 def _oriented(apart: BundleAdjustmentResult, backward: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Homographies (L, 3, 3) from the picture of lower index to the other, and their covariances (L, 9, 9)."""
+    """Homographies (L, 3, 3) from the image of lower index to the other, and their covariances (L, 9, 9)."""
     values, vectors = np.linalg.eigh(apart.equations.gram[:, :9, :9] / apart.sigma**2)
     floor = np.maximum(values[:, -1:] * 1e-12, 1e-300)
     inverse = 1.0 / np.maximum(values, floor)

@@ -71,7 +71,7 @@ def adjust_pairs_independently(
     priors : Priors
         On the shared parameters and the lens; those on the poses are not used.
     attitudes : ndarray of shape (N, 2)
-        How the tilt of each picture is known to differ from the shared one, radians.
+        How the tilt of each image is known to differ from the shared one, radians.
     iterations : int
         Linearizations at most.
     """

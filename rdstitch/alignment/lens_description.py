@@ -31,7 +31,7 @@ def describe_camera(alignment: Alignment, camera: Camera) -> tuple[str, ...]:
 def describe_lens(alignment: Alignment, camera: Camera) -> tuple[str, ...]:
     """One line on λ, one on each of μ, ν and the distortion centre, and one on the choice of the lens.
 
-    ``camera`` is that of the reference picture, upright or as it is stored.
+    ``camera`` is that of the reference image, upright or as it is stored.
     """
     if not math.isfinite(alignment.distortion_std):
         return ("λ is not observable",)
@@ -49,9 +49,9 @@ def describe_lens(alignment: Alignment, camera: Camera) -> tuple[str, ...]:
         x, y = camera.center
         dx, dy = std[CENTER] * camera.half_diagonal
         off = float(np.linalg.norm(camera.center - middle))
-        lines.append(f"centre {x:.1f} ± {dx:.1f}, {y:.1f} ± {dy:.1f} pixels, {off:.1f} off the middle of the picture")
+        lines.append(f"centre {x:.1f} ± {dx:.1f}, {y:.1f} ± {dy:.1f} pixels, {off:.1f} off the middle of the image")
     else:
-        lines.append("distortion centre: the middle of the picture")
+        lines.append("distortion centre: the middle of the image")
     return (*lines, alignment.lens_reason)
 
 
@@ -70,7 +70,7 @@ def _std(camera: Camera) -> FloatArray:
 def radius_std(camera: Camera, radii: FloatArray) -> FloatArray:
     """Standard deviation of where the lens measures the rays that it measures at some radii, pixels.
 
-    Up to the scale of the undistorted picture, which no picture of a plane shows.
+    Up to the scale of the undistorted image, which no image of a plane shows.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def radius_std(camera: Camera, radii: FloatArray) -> FloatArray:
     growth = g - 2.0 * q * divisor_slope(q, camera.distortion, camera.higher)
     by_coefficient = (radii / growth)[:, None] * q[:, None] ** np.arange(1, 4)
     by_scale = radii * g / growth
-    # What a change of scale makes up for, by least squares over the area of the picture, is no uncertainty.
+    # What a change of scale makes up for, by least squares over the area of the image, is no uncertainty.
     area = radii * by_scale
     by_coefficient = by_coefficient - np.outer(by_scale, area @ by_coefficient / max(float(area @ by_scale), 1e-300))
     covariance = np.array(camera.lens_covariance)[:3, :3]

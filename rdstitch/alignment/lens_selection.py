@@ -1,9 +1,9 @@
-"""The simplest lens that the pictures allow: λ; λ and the distortion centre; μ besides; ν besides.
+"""The simplest lens that the images allow: λ; λ and the distortion centre; μ besides; ν besides.
 
 The lenses are compared where nothing else is assumed: every link on its own with a homography, and one lens for all.
 What a richer lens gains there is no irregular motion that it takes the blame for. A lens is preferred when its robust
 likelihood pays for its parameters (Schwarz's criterion, with as many independent observations as the agreement of
-neighbouring residuals leaves), and when the links share the gain: a lens bends every picture alike, whereas relief
+neighbouring residuals leaves), and when the links share the gain: a lens bends every image alike, whereas relief
 bends each differently.
 """
 
@@ -39,7 +39,7 @@ CENTER = np.array([name.startswith("center") for name in LENS_PARAMETERS])
 
 _FARTHEST_CENTER, _FARTHEST_CENTER_OF_CROPS = 0.08, 0.25
 """Half diagonals: a distortion centre farther off than the first is no lens, but something else that it takes the blame
-for, or the centre of pictures that were cropped; one farther off than the second is neither."""
+for, or the centre of images that were cropped; one farther off than the second is neither."""
 
 NO_COHERENCE = 0.3
 """Correlation of the errors of neighbours up to which nothing else can be to blame: relief leaves more."""
@@ -51,13 +51,13 @@ where μ is needed already, so that it is certain that λ alone does not describ
 _CELLS = 4
 """Cells per side of a link's overlap, each of which is a part where there are few links."""
 
-ENOUGH_PICTURES, _ENOUGH_PICTURES_OF_A_MOTION = 4, 3
-"""Pictures from which on the distortion centre is freed: where every link is on its own, and where one camera explains
+ENOUGH_IMAGES, _ENOUGH_IMAGES_OF_A_MOTION = 4, 3
+"""Images from which on the distortion centre is freed: where every link is on its own, and where one camera explains
 all of them. In fewer a tilt and a change of height stand for it, and pairs like those of ``examples.paper figure5`` are
 registered worse with it free."""
 
 WORTH_SAYING = 0.5
-"""Pixels that the corners of too few pictures may lie elsewhere, from which on that is said."""
+"""Pixels that the corners of too few images may lie elsewhere, from which on that is said."""
 
 _RADII, _SCALE_STEPS, _SCALE_STEP = 64, 6, 1e-6
 
@@ -87,7 +87,7 @@ class LensChoice:
         What may still be freed, where the motion model shows it: a distortion centre that is off the middle looks like
         motion that is less regular. That μ is needed only pairs can say: it could stand for relief.
     corner_shift : float
-        Pixels by which μ would move the corners, where too few pictures do not show whether it is needed.
+        Pixels by which μ would move the corners, where too few images do not show whether it is needed.
     """
 
     name: str
@@ -129,8 +129,8 @@ def choose_lens(
         return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), apart, "given")
     if len(names) > 1 and len(observations) > _ENOUGH_LINKS:
         return _choose_by_some(observations, apart, names, known)
-    pictures = _pictures(observations)
-    few = len(names) > 1 and pictures < ENOUGH_PICTURES
+    images = _images(observations)
+    few = len(names) > 1 and images < ENOUGH_IMAGES
     if few:
         names = [name for name in names if name != "division-center"]
     free = [free_parameters(name) & ~(CENTER & few) for name in names]
@@ -150,13 +150,13 @@ def choose_lens(
             best = index
     reason, shift = _reason(names, fits, best), 0.0
     if few:
-        reason += "; too few pictures to find the distortion centre, which is taken to be the middle"
+        reason += "; too few images to find the distortion centre, which is taken to be the middle"
         shift = _distance(fits[0], fits[1], float(np.median(observations.scale1))) if best == 0 else 0.0
         if shift > WORTH_SAYING:
             reason += (
                 f"; they do not show whether μ is needed, with which corners would lie {shift:.1f} pixels elsewhere"
             )
-    refinements = (CENTER,) if best == 0 and pictures >= _ENOUGH_PICTURES_OF_A_MOTION else ()
+    refinements = (CENTER,) if best == 0 and images >= _ENOUGH_IMAGES_OF_A_MOTION else ()
     return LensChoice(names[best], free[best], fits[best], reason, refinements, shift)
 
 
@@ -188,7 +188,7 @@ def _distance(simple: BundleAdjustmentResult, rich: BundleAdjustmentResult, half
     return float(np.nanmax(np.abs(difference))) * half_diagonal
 
 
-def _pictures(observations: Observations) -> int:
+def _images(observations: Observations) -> int:
     return len(np.unique(np.concatenate([observations.image1, observations.image2])))
 
 
@@ -203,7 +203,7 @@ def has_plausible_center(adjusted: BundleAdjustmentResult, observations: Observa
 def shows_center(adjusted: BundleAdjustmentResult, observations: Observations) -> bool:
     """Whether one camera shows its distortion centre: the errors are noise, so that nothing else moved it.
 
-    Over rough ground a centre that is off, with an odd focal length, bends the whole as the ground bends the pictures.
+    Over rough ground a centre that is off, with an odd focal length, bends the whole as the ground bends the images.
     """
     off = float(np.abs(adjusted.parameters.lens[CENTER]).max())
     return off < _FARTHEST_CENTER_OF_CROPS and leaves_noise(adjusted, observations)
@@ -239,7 +239,7 @@ class _Judge:
     def prefers(
         self, richer: BundleAdjustmentResult, simpler: BundleAdjustmentResult, added: int, simpler_name: str
     ) -> bool:
-        """Whether a richer lens gains more than its parameters cost, and all over the pictures.
+        """Whether a richer lens gains more than its parameters cost, and all over the images.
 
         A lens that λ does not describe is a series that has been cut off: beyond μ a parameter costs what Akaike's
         criterion takes for it, not Schwarz's, which takes the simpler lens for the true one.

@@ -17,9 +17,9 @@ def considered_covariance(problem: Problem, fit: Fit, *, rough: bool) -> FloatAr
     """Covariance (5, 5) of all parameters of a lens, also of those that were not freed: consider parameters (Schmidt
     1966).
 
-    That a lens of fewer parameters explains the pictures does not make it the lens. What they leave open of the others,
-    within what lenses usually have, moves λ where these pictures show nothing. So does a focal length that next to no
-    lens has: something else bends the pictures, and λ may be what goes with the usual one. Where the ground is
+    That a lens of fewer parameters explains the images does not make it the lens. What they leave open of the others,
+    within what lenses usually have, moves λ where these images show nothing. So does a focal length that next to no
+    lens has: something else bends the images, and λ may be what goes with the usual one. Where the ground is
     ``rough`` that is known, and in the covariance.
     """
     free_every = replace(problem, free_lens=np.ones_like(problem.free_lens))
@@ -40,7 +40,7 @@ def considered_covariance(problem: Problem, fit: Fit, *, rough: bool) -> FloatAr
 def _with_free_motion(problem: Problem, fit: Fit, covariance: FloatArray, *, rough: bool) -> FloatArray:
     """The covariance (5, 5) over two models: the one taken, and a homography (Buckland, Burnham and Augustin 1997).
 
-    Of two pictures nothing but their errors says whether they were tilted alike, and over rough ground they say little.
+    Of two images nothing but their errors says whether they were tilted alike, and over rough ground they say little.
     Each model counts as much as Schwarz's criterion makes it likely.
     """
     free = problem.fit(HOMOGRAPHY)

@@ -81,7 +81,7 @@ def link_equations(
     ----------
     observations : Observations
     homographies : ndarray of shape (L, 3, 3)
-        Of each link, from its first to its second picture.
+        Of each link, from its first to its second image.
     lens : ndarray of shape (5,)
         λ, μ, ν and the shift of the distortion centre, in the half-diagonal frame.
     width : float

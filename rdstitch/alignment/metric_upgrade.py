@@ -1,8 +1,8 @@
 """From homographies of a plane to poses of one camera: planar self-calibration (Triggs, ECCV 1998).
 
-Homographies between pictures leave the plane's metric open. In the camera of the reference picture the plane has a
-normal, two angles; with it and the focal length f every plane-to-picture homography becomes ``diag(f, f, 1) [a b c]``
-with ``a`` and ``b`` orthogonal and of the same length. These two conditions a picture give normal and f. They are few
+Homographies between images leave the plane's metric open. In the camera of the reference image the plane has a
+normal, two angles; with it and the focal length f every plane-to-image homography becomes ``diag(f, f, 1) [a b c]``
+with ``a`` and ``b`` orthogonal and of the same length. These two conditions an image give normal and f. They are few
 unknowns, so all of them are tried on a grid, from which the adjustment finds the minimum.
 """
 
@@ -23,7 +23,7 @@ _FOCAL_RANGE = np.linspace(-1.5, 1.5, 7)
 """Standard deviations of the prior on log f."""
 
 _AT_ONCE = 2**15
-"""Pictures times tilts whose conditions are looked at together: more of them take memory, and no less time."""
+"""Images times tilts whose conditions are looked at together: more of them take memory, and no less time."""
 
 _OUTLYING = 0.3
 """Error of the two conditions, relative, beyond which all errors count alike."""
@@ -36,7 +36,7 @@ class MetricPoses:
     Attributes
     ----------
     poses : ndarray of shape (N, 6)
-        In the columns of the planar models; tilts are those of the pictures less the shared one.
+        In the columns of the planar models; tilts are those of the images less the shared one.
     tilt : ndarray of shape (2,)
         Shared (ψ, θ), radians: the median.
     log_focal : float
@@ -49,15 +49,15 @@ class MetricPoses:
 
 
 def metric_upgrade(homographies: FloatArray, reference: int, log_focal: float, log_focal_std: float) -> MetricPoses:
-    """The poses of one camera that come nearest to plane-to-picture homographies.
+    """The poses of one camera that come nearest to plane-to-image homographies.
 
     Parameters
     ----------
     homographies : ndarray of shape (N, 3, 3)
-        From any frame of the plane to undistorted coordinates of the pictures, half diagonals, with positive third
+        From any frame of the plane to undistorted coordinates of the images, half diagonals, with positive third
         coordinates in front of the camera.
     reference : int
-        Picture that lies at the origin of the plane, at height one.
+        Image that lies at the origin of the plane, at height one.
     log_focal, log_focal_std : float
         Prior on the logarithm of the focal length in half diagonals.
     """
@@ -75,7 +75,7 @@ def metric_upgrade(homographies: FloatArray, reference: int, log_focal: float, l
 
 
 def _cost(relative: FloatArray, tilts: FloatArray, log_focal: float) -> FloatArray:
-    """Mean truncated squared error of the conditions (T,) of the N pictures for each of T tilts of the reference."""
+    """Mean truncated squared error of the conditions (T,) of the N images for each of T tilts of the reference."""
     blocks = np.array_split(tilts, math.ceil(len(tilts) * len(relative) / _AT_ONCE))
     return np.concatenate([_cost_of_block(relative, block, log_focal) for block in blocks if len(block)])
 

@@ -1,13 +1,13 @@
-"""How a picture's pose and the camera's shared parameters make a homography: the family of motion models.
+"""How an image's pose and the camera's shared parameters make a homography: the family of motion models.
 
-Every model gives, for each picture i, the homography ``P_i`` from the plane to the picture's undistorted coordinates
+Every model gives, for each image i, the homography ``P_i`` from the plane to the image's undistorted coordinates
 (half diagonals from the distortion centre), and its derivatives; the adjustment uses nothing else of a model. Two
-pictures are related by ``H_ij = P_j P_i⁻¹``.
+images are related by ``H_ij = P_j P_i⁻¹``.
 
 From the least to the most free:
 
 ========== =============================================== ===================================================
-model      per picture                                     picture
+model      per image                                     image
 ========== =============================================== ===================================================
 rigid      φ, tx, ty                                       robot: tilt and height stay (Valtonen Örnhag et al.)
 similarity φ, tx, ty, log h                                drone that climbs and sinks
@@ -19,7 +19,7 @@ homography 8                                               any motion, any camer
 All but the last share the tilt (ψ, θ) and the focal length:
 ``P_i = diag(f, f, 1) Rx(ψ + δψ_i) Ry(θ + δθ_i) Rz(φ_i) diag(1, 1, h_i) T(t_i)``, ``T = I - t e3'``.
 
-The pictures see ψ/f, θ/f, their own δψ/f and δθ/f, and f t far better than f itself. The adjustment therefore moves
+The images see ψ/f, θ/f, their own δψ/f and δθ/f, and f t far better than f itself. The adjustment therefore moves
 those; otherwise it would have to follow a curved valley, and a prior on small tilts would ask for a short f.
 """
 
@@ -44,7 +44,7 @@ _TRACELESS[7] = np.diag([1.0, 1.0, -2.0]) / np.sqrt(6.0)
 
 @dataclass(frozen=True)
 class ModelMatrices:
-    """Plane-to-picture homographies of N pictures with their derivatives.
+    """Plane-to-image homographies of N images with their derivatives.
 
     Attributes
     ----------
@@ -69,22 +69,22 @@ class MotionModel(Protocol):
 
     @property
     def pose_size(self) -> int:
-        """Free parameters per picture, D."""
+        """Free parameters per image, D."""
 
     @property
     def on_sphere(self) -> bool:
-        """Whether pictures lie around one centre, not over a plane."""
+        """Whether images lie around one centre, not over a plane."""
 
     @property
     def shared_names(self) -> tuple[str, ...]:
-        """Parameters that all pictures share, S of them, without those of the lens."""
+        """Parameters that all images share, S of them, without those of the lens."""
 
     @property
     def gauge(self) -> BoolArray:
-        """Gauge: which of the D parameters of the reference picture the choice of the frame fixes, shape (D,)."""
+        """Gauge: which of the D parameters of the reference image the choice of the frame fixes, shape (D,)."""
 
     def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
-        """Homographies from the plane to the pictures, with derivatives."""
+        """Homographies from the plane to the images, with derivatives."""
 
     def physical_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
         """What :attr:`shared_names` names (S,), and its derivatives by the shared parameters (S, S)."""
@@ -96,13 +96,13 @@ class MotionModel(Protocol):
         """Poses after a step of shape (N, D)."""
 
     def prior_coordinates(self, poses: FloatArray) -> FloatArray:
-        """The D parameters of each picture (N, D) that priors are on; zeros where there can be none."""
+        """The D parameters of each image (N, D) that priors are on; zeros where there can be none."""
 
     def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
-        """Homographies (N, 3, 3) of pictures at the origin of the plane, with the tilts (N, 2) given."""
+        """Homographies (N, 3, 3) of images at the origin of the plane, with the tilts (N, 2) given."""
 
     def nearest_poses(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
-        """The poses with these tilts (N, 2) that come nearest to plane-to-picture homographies (N, 3, 3)."""
+        """The poses with these tilts (N, 2) that come nearest to plane-to-image homographies (N, 3, 3)."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class PlanarModel:
 
     @property
     def pose_size(self) -> int:
-        """Free parameters per picture."""
+        """Free parameters per image."""
         return len(self.free)
 
     @property
@@ -135,7 +135,7 @@ class PlanarModel:
         return np.array([column not in (PSI, THETA) for column in self.free])
 
     def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
-        """Homographies from the plane to the pictures, with derivatives."""
+        """Homographies from the plane to the images, with derivatives."""
         count = len(poses)
         focal = np.exp(shared[2])
         calibration = np.diag([focal, focal, 1.0])
@@ -180,7 +180,7 @@ class PlanarModel:
         return poses[:, list(self.free)]
 
     def _tilts(self, poses: FloatArray, shared: FloatArray) -> FloatArray:
-        """How the tilts of the pictures differ from the shared one (N, 2), radians."""
+        """How the tilts of the images differ from the shared one (N, 2), radians."""
         own: FloatArray = poses[:, [PSI, THETA]] * (np.exp(shared[2]) if PSI in self.free else 1.0)
         return own
 
@@ -211,7 +211,7 @@ class PlanarModel:
         return matrices
 
     def nearest_poses(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
-        """The nearest poses, given how the tilts of the pictures differ from the shared one."""
+        """The nearest poses, given how the tilts of the images differ from the shared one."""
         poses = self._tilted(attitudes, shared)
         motion = np.linalg.inv(self.origins(shared, attitudes)) @ homographies
         poses[:, YAW], translation, height = nearest_in_plane(motion)
@@ -235,11 +235,11 @@ def _motion_in_plane(poses: FloatArray, focal: float) -> tuple[FloatArray, Float
 
 @dataclass(frozen=True)
 class HomographyModel:
-    """One homography per picture: eight parameters, a step being ``P ← exp(Σ δ_k E_k) P``.
+    """One homography per image: eight parameters, a step being ``P ← exp(Σ δ_k E_k) P``.
 
-    The step acts in the picture's frame, where coordinates are of order one however far away the picture lies. ``E_k``
-    span the matrices without trace: only so does a change of the plane's frame, ``P M P⁻¹`` in every picture, leave
-    all relations of pictures as they are, to any order. Poses are P, row by row.
+    The step acts in the image's frame, where coordinates are of order one however far away the image lies. ``E_k``
+    span the matrices without trace: only so does a change of the plane's frame, ``P M P⁻¹`` in every image, leave
+    all relations of images as they are, to any order. Poses are P, row by row.
     """
 
     name: str = "homography"
@@ -249,11 +249,11 @@ class HomographyModel:
 
     @property
     def gauge(self) -> BoolArray:
-        """All of the reference picture: the plane may be mapped by any homography."""
+        """All of the reference image: the plane may be mapped by any homography."""
         return np.ones(8, dtype=np.bool_)
 
     def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
-        """Homographies from the plane to the pictures, with derivatives."""
+        """Homographies from the plane to the images, with derivatives."""
         matrices = poses.reshape(-1, 3, 3)
         return ModelMatrices(matrices, _TRACELESS @ matrices[:, None], np.zeros((len(poses), 0, 3, 3)))
 

@@ -38,7 +38,7 @@ class NoiseModel:
     effective : float
         Independent observations.
     common : float
-        Root mean square of what the errors of neighbours have in common, in diagonals of a picture.
+        Root mean square of what the errors of neighbours have in common, in diagonals of an image.
     """
 
     noise: float

@@ -1,6 +1,6 @@
 """Normal equations of the adjustment: what the links sum up, chained into sparse blocks.
 
-The model's derivatives turn the Gram matrix of each link into the blocks of its two pictures and of the shared
+The model's derivatives turn the Gram matrix of each link into the blocks of its two images and of the shared
 parameters.
 """
 
@@ -135,7 +135,7 @@ def chain(
     equations : LinkEquations
     observations : Observations
     model : ModelMatrices
-        Of all N pictures.
+        Of all N images.
     homographies : ndarray of shape (L, 3, 3)
         ``P_j P_i⁻¹`` of each link.
     blocks : PoseBlocks
@@ -164,7 +164,7 @@ def link_derivatives(
 ) -> FloatArray:
     """Derivatives of each link's homography and K parameters of the lens, shape (L, 9 + K, 2 D + S + K).
 
-    By the poses of its two pictures, the shared parameters of the model, and those of the lens.
+    By the poses of its two images, the shared parameters of the model, and those of the lens.
     """
     i, j = observations.image1, observations.image2
     count = len(observations)

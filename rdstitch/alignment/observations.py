@@ -25,19 +25,19 @@ class Observations:
     Attributes
     ----------
     image1, image2 : ndarray of shape (L,), intp
-        Indices of the pictures of each link.
+        Indices of the images of each link.
     start : ndarray of shape (L + 1,), intp
         Link l has the correspondences ``start[l]:start[l + 1]``.
     points1, points2 : ndarray of shape (M, 2)
         Measured, in half diagonals from the camera's distortion centre.
     scale1, scale2 : ndarray of shape (L,)
-        Half the diagonal of each link's pictures, pixels.
+        Half the diagonal of each link's images, pixels.
     matches : ndarray of shape (L,), intp
         Correspondences that each link had before thinning.
     reach : float
         Radius in half diagonals out to which a lens must be one-to-one: the corners, unless a given one is not.
     relief : ndarray of shape (M, 2), optional
-        By how much a standard deviation of the ground's height moves each point in the second picture, over the
+        By how much a standard deviation of the ground's height moves each point in the second image, over the
         standard deviation of the noise, see :mod:`rdstitch.alignment.relief_weights`; none over a plane.
     """
 
@@ -84,7 +84,7 @@ class Observations:
     def scale_inliers_mask(self) -> NDArray[np.bool_]:
         """Which correspondences, shape (M,), the scale of the errors is estimated from: all but those of static links.
 
-        What stays where it is in the picture is localised in the same pixel again, without the errors that a change of
+        What stays where it is in the image is localised in the same pixel again, without the errors that a change of
         view brings: by the scale of a camera that stands still for a while, all other links would be outliers. All
         correspondences where every link is static.
         """
@@ -115,7 +115,7 @@ class Observations:
             return np.where(counts > 0, (ends[0] + ends[1]) / 2.0, np.inf)
 
     def subset(self, links: IntArray | NDArray[np.bool_], image_index: IntArray | None = None) -> Self:
-        """Only some links; with ``image_index`` (N,) pictures get new numbers."""
+        """Only some links; with ``image_index`` (N,) images get new numbers."""
         chosen = np.flatnonzero(links) if np.asarray(links).dtype == np.bool_ else np.asarray(links)
         counts = np.diff(self.start)[chosen]
         start = np.concatenate([[0], np.cumsum(counts)]).astype(np.intp)
@@ -145,6 +145,6 @@ class Observations:
         return replace(self, start=start, points1=self.points1[rows], points2=self.points2[rows], relief=relief)
 
     def as_independent_pairs(self) -> Self:
-        """Every link on its own: link l is between the pictures 2l and 2l + 1."""
+        """Every link on its own: link l is between the images 2l and 2l + 1."""
         first = 2 * np.arange(len(self))
         return replace(self, image1=first, image2=first + 1)

@@ -1,4 +1,4 @@
-"""What the caller of the alignment decides, and what is given of the camera and the pictures."""
+"""What the caller of the alignment decides, and what is given of the camera and the images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ class AlignmentOptions:
     Attributes
     ----------
     reference : int, optional
-        The picture that defines the plane's frame; the centre of the match graph if not given.
+        The image that defines the plane's frame; the centre of the match graph if not given.
     model : str
         "rigid", "similarity", "tilting", "pose", "homography", or "auto": the least free one that the data allow.
     lens_known : bool
@@ -28,7 +28,7 @@ class AlignmentOptions:
     tilt : (float, float), optional
         (ψ, θ), radians, where it is known.
     attitudes : ndarray of shape (N, 2), optional
-        (ψ, θ) of each picture, radians, where an IMU or a gimbal has measured them; ``tilt`` is then how the camera
+        (ψ, θ) of each image, radians, where an IMU or a gimbal has measured them; ``tilt`` is then how the camera
         is mounted on that.
     attitudes_std : float
         Their standard deviation, radians; 0 for exact ones.
@@ -36,7 +36,7 @@ class AlignmentOptions:
         Direction down in the axes of each camera (right, down, ahead), where it is known; NaN elsewhere. It levels
         panoramas.
     positions : ndarray of shape (N, 2), optional
-        Metres east and north where each picture was taken; NaN where that is not known. A weak prior.
+        Metres east and north where each image was taken; NaN where that is not known. A weak prior.
     lens : str
         One of :data:`rdstitch.alignment.lens_selection.LENSES`, or "auto": the simplest that the data allow.
     prefer_turn : bool
@@ -70,7 +70,7 @@ class AlignmentOptions:
             raise ArgumentError("a standard deviation cannot be negative")
 
     def exact_tilts(self, count: int) -> list[tuple[float, float]] | None:
-        """(ψ, θ), radians, of each of ``count`` pictures, where they are known exactly; None where not."""
+        """(ψ, θ), radians, of each of ``count`` images, where they are known exactly; None where not."""
         if self.tilt is None or (self.attitudes is not None and self.attitudes_std > 0.0):
             return None
         attitudes = np.zeros((count, 2)) if self.attitudes is None else np.asarray(self.attitudes, dtype=np.float64)
@@ -81,12 +81,12 @@ class AlignmentOptions:
         count = len(cameras)
         attitudes = np.zeros((count, 2)) if self.attitudes is None else np.asarray(self.attitudes, dtype=np.float64)
         if attitudes.shape != (count, 2) or not np.isfinite(attitudes).all():
-            raise ArgumentError(f"expected one attitude (psi, theta) for each of the {count} pictures")
+            raise ArgumentError(f"expected one attitude (psi, theta) for each of the {count} images")
         positions = (
             np.full((count, 2), np.nan) if self.positions is None else np.asarray(self.positions, dtype=np.float64)
         )
         if positions.shape != (count, 2):
-            raise ArgumentError(f"expected one position (east, north) for each of the {count} pictures")
+            raise ArgumentError(f"expected one position (east, north) for each of the {count} images")
         return CameraPriors(
             *known_focal(cameras),
             tilt=self.tilt or (0.0, 0.0),
@@ -98,7 +98,7 @@ class AlignmentOptions:
 
     @property
     def lens_chosen(self) -> bool:
-        """Whether the pictures choose the lens, not the caller."""
+        """Whether the images choose the lens, not the caller."""
         return self.lens == "auto" and not self.lens_known
 
     @property

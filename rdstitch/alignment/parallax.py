@@ -1,4 +1,4 @@
-"""By how much measured points move with the height of the ground: away from below the camera, in every picture."""
+"""By how much measured points move with the height of the ground: away from below the camera, in every image."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,12 +17,12 @@ _STEP = 1e-4
 """Heights, of differences."""
 
 _ASIDE = 0.3
-"""Half diagonals from the middle of a picture, where its size on the ground is measured."""
+"""Half diagonals from the middle of an image, where its size on the ground is measured."""
 
 
 @dataclass(frozen=True)
 class Parallax:
-    """Of the pictures of an adjustment.
+    """Of the images of an adjustment.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Parallax:
         flat = undistort(o.points1[part.rows] - centre, distortion, higher)
         lifted = np.column_stack([flat, np.ones(len(flat))])
         place = self._places(np.einsum("mij,mj->mi", self._back[o.image1[link]], lifted))
-        moved = [self._moved(place, pictures[link]) for pictures in (o.image1, o.image2)]
+        moved = [self._moved(place, images[link]) for images in (o.image1, o.image2)]
         errors = np.einsum("mij,mj->mi", part.by_point1, moved[0]) + np.einsum("mij,mj->mi", part.by_point2, moved[1])
         return place, np.nan_to_num(errors, posinf=0.0, neginf=0.0)
 
@@ -57,12 +57,12 @@ class Parallax:
 
     @cached_property
     def size(self) -> float:
-        """Of half a diagonal of most pictures on the plane, or between directions."""
+        """Of half a diagonal of most images on the plane, or between directions."""
         return float(np.median(self._sizes))
 
     @cached_property
     def _back(self) -> FloatArray:
-        """Picture-to-plane homographies, or those to directions, (N, 3, 3)."""
+        """Image-to-plane homographies, or those to directions, (N, 3, 3)."""
         return inverses(self.adjusted.matrices.matrices)
 
     def _places(self, lifted: FloatArray) -> FloatArray:
@@ -74,12 +74,12 @@ class Parallax:
 
     @cached_property
     def _centres(self) -> FloatArray:
-        """What each picture's centre shows, (N, 2 or 3)."""
+        """What each image's centre shows, (N, 2 or 3)."""
         return self._places(self._back[:, :, 2])
 
     @cached_property
     def _sizes(self) -> FloatArray:
-        """Of half a diagonal of each picture on the plane, or between directions, (N,)."""
+        """Of half a diagonal of each image on the plane, or between directions, (N,)."""
         aside = [self._places(self._back @ np.array([x, y, 1.0])) for x, y in ((_ASIDE, 0.0), (0.0, _ASIDE))]
         away = [np.linalg.norm(places - self._centres, axis=1) / _ASIDE for places in aside]
         sizes: FloatArray = np.maximum((away[0] + away[1]) / 2.0, 1e-12)
@@ -96,18 +96,18 @@ class Parallax:
 
     @cached_property
     def _shifts(self) -> FloatArray:
-        """Of the camera away from where it turns, one a picture, (N, 2): any, since nothing is known of them."""
+        """Of the camera away from where it turns, one an image, (N, 2): any, since nothing is known of them."""
         return np.random.default_rng(0).normal(size=(len(self._back), 2))
 
-    def _moved(self, place: FloatArray, pictures: IntArray) -> FloatArray:
-        """By how much measured points (m, 2) of places move in their pictures (m,) with the height of the ground."""
+    def _moved(self, place: FloatArray, images: IntArray) -> FloatArray:
+        """By how much measured points (m, 2) of places move in their images (m,) with the height of the ground."""
         if self.is_turn:
-            shift: FloatArray = self._shifts[pictures]
+            shift: FloatArray = self._shifts[images]
             return shift
-        lens, matrices = self.adjusted.parameters.lens, self.adjusted.matrices.matrices[pictures]
+        lens, matrices = self.adjusted.parameters.lens, self.adjusted.matrices.matrices[images]
         distortion, higher, _ = split_lens(lens)
         feet, heights = self._feet
-        away = (place - feet[pictures]) / heights[pictures, None]
+        away = (place - feet[images]) / heights[images, None]
         ends = []
         for step in (_STEP, -_STEP):
             there = np.column_stack([place + step * self.size * away, np.ones(len(place))])

@@ -21,7 +21,7 @@ COHERENT_CORRELATION = 0.5
 """Correlation of neighbours from which on a scene does not count as flat, if what they have in common is large."""
 
 LARGE_RELIEF = 0.00075
-"""Of a picture's diagonal: lenses that one λ describes roughly leave less, flights over trees and houses more."""
+"""Of an image's diagonal: lenses that one λ describes roughly leave less, flights over trees and houses more."""
 
 _MAX_SAMPLES = 200_000
 """Correspondences of which the agreement is measured."""
@@ -44,11 +44,11 @@ class Coherence:
     size : float
         Root mean square of the common part, pixels.
     relative_size : float
-        The same in diagonals of a picture.
+        The same in diagonals of an image.
     overdispersion : float
         How many times fewer independent observations there are than correspondences; at least 1. The product of two
         things: the variance of the sum of the residuals in a part of an overlap, in units of that of independent
-        ones; and the number of links per picture, since every link counts the same measured points again.
+        ones; and the number of links per image, since every link counts the same measured points again.
     """
 
     correlation: float
@@ -61,7 +61,7 @@ def coherence(observations: Observations, errors: FloatArray, inliers: BoolArray
     """Agreement of the residuals (M, 2) of neighbouring inliers of the same link; of very many links, every n-th."""
     chosen = _sample(observations, inliers)
     link, points, residual = observations.link[chosen], observations.points1[chosen], errors[chosen]
-    pictures = len(np.unique(np.concatenate([observations.image1, observations.image2])))
+    images = len(np.unique(np.concatenate([observations.image1, observations.image2])))
     if len(points) < 2:
         return Coherence(0.0, 0.0, 0.0, 1.0)
     first, second = neighbours(observations, inliers)
@@ -74,7 +74,7 @@ def coherence(observations: Observations, errors: FloatArray, inliers: BoolArray
         size,
         size / (2.0 * float(np.median(observations.scale2))),
         max(_overdispersion(link, points, residual, len(observations), cells) for cells in _CELLS)
-        * max(1.0, len(observations) / max(pictures - 1, 1)),
+        * max(1.0, len(observations) / max(images - 1, 1)),
     )
 
 
@@ -134,12 +134,12 @@ def judge_relief(found: Coherence, model: str, links: int) -> ReliefTest:
     model : str
         Name of the model that left the residuals.
     links : int
-        Pairs of pictures; what is as wide as the overlap of one pair alone, its homography and λ absorb.
+        Pairs of images; what is as wide as the overlap of one pair alone, its homography and λ absorb.
     """
     agreement = f"errors of neighbours agree (correlation {found.correlation:.2f}, {found.size:.1f} pixels in common)"
     relief = found.correlation > COHERENT_CORRELATION and found.relative_size > LARGE_RELIEF
     if model == "rotation":
-        moved = "the camera moved between the pictures (parallax): what is near does not fit; turn about the lens"
+        moved = "the camera moved between the images (parallax): what is near does not fit; turn about the lens"
         text = f"{agreement}: {moved}" if relief else f"the camera hardly moved (correlation {found.correlation:.2f})"
     elif relief:
         text = (

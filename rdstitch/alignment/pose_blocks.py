@@ -17,7 +17,7 @@ class PoseBlocks:
     Attributes
     ----------
     column : ndarray of shape (L, 2 D)
-        Which of the free parameters those of the link's two pictures are; F for those that are not free.
+        Which of the free parameters those of the link's two images are; F for those that are not free.
     free : int
         F.
     kept : ndarray of shape (L, 2 D, 2 D), bool
@@ -40,7 +40,7 @@ class PoseBlocks:
 
     @classmethod
     def of(cls, observations: Observations, free: BoolArray) -> Self:
-        """Of links between N pictures, whose parameters (N, D) may move where ``free``."""
+        """Of links between N images, whose parameters (N, D) may move where ``free``."""
         total = int(free.sum())
         number = np.where(free, np.cumsum(free.reshape(-1)).reshape(free.shape) - 1, total)
         column = np.concatenate([number[observations.image1], number[observations.image2]], axis=1)

@@ -1,7 +1,7 @@
-"""GPS positions as a weak prior: what bends a long chain of pictures hardly changes how well neighbours fit.
+"""GPS positions as a weak prior: what bends a long chain of images hardly changes how well neighbours fit.
 
 The plane is a view from above, so that a similarity takes metres east and south to where the adjustment has put the
-cameras. It is fitted robustly, the cameras are drawn towards it, and so in turn. Where the pictures disagree, with
+cameras. It is fitted robustly, the cameras are drawn towards it, and so in turn. Where the images disagree, with
 larger errors or with cameras that stay away, the positions do not count.
 """
 
@@ -27,7 +27,7 @@ _ROUNDS, _SETTLED = 6, 0.1
 """Of fitting the similarity and adjusting again; standard deviations by which positions still move at the end."""
 
 _MAX_GROWTH = 1.1
-"""Times by which the errors of the pictures may grow."""
+"""Times by which the errors of the images may grow."""
 
 
 def hold_positions(problem: Problem, fit: Fit) -> tuple[Problem, Fit, str]:
@@ -42,7 +42,7 @@ def hold_positions(problem: Problem, fit: Fit) -> tuple[Problem, Fit, str]:
     Returns
     -------
     Problem, Fit
-        Those given where there are too few positions, or where the pictures disagree with them.
+        Those given where there are too few positions, or where the images disagree with them.
     str
         Why they do not count; empty where they do, or where there are too few.
     """

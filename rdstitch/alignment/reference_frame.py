@@ -1,4 +1,4 @@
-"""The undistorted reference picture as the plane that all pictures are mapped to, and which picture suits that."""
+"""The undistorted reference image as the plane that all images are mapped to, and which image suits that."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ _POINTS_PER_SIDE = 8
 
 
 def in_frame_of(alignment: Alignment, reference: int) -> Alignment:
-    """The same alignment with the undistorted picture ``reference`` as its plane, and its height as unit of poses."""
+    """The same alignment with the undistorted image ``reference`` as its plane, and its height as unit of poses."""
     homographies = np.linalg.inv(alignment.homographies[reference]) @ alignment.homographies
     poses = alignment.poses
     if poses is not None and reference != alignment.reference:
@@ -25,7 +25,7 @@ def in_frame_of(alignment: Alignment, reference: int) -> Alignment:
 
 
 def frontal_reference(alignment: Alignment) -> int:
-    """The reference picture, or, where another one is absurdly stretched by its frame, the one that stretches least."""
+    """The reference image, or, where another one is absurdly stretched by its frame, the one that stretches least."""
     used = np.flatnonzero(alignment.used)
     nearness = np.array([_nearest_to_horizon(alignment, used, int(k)) for k in used])
     own = int(np.flatnonzero(used == alignment.reference)[0])
@@ -36,7 +36,7 @@ def frontal_reference(alignment: Alignment) -> int:
 
 
 def _nearest_to_horizon(alignment: Alignment, used: IntArray, reference: int) -> FloatArray:
-    """Smallest third coordinate of each picture's border in the frame of ``reference``, in units of the largest."""
+    """Smallest third coordinate of each image's border in the frame of ``reference``, in units of the largest."""
     values = []
     for index in used:
         camera, relation = alignment.cameras[index], alignment.relation(int(index), reference)

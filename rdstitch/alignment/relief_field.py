@@ -1,6 +1,6 @@
-"""What relief does to a lens: hills are laid under the pictures, and the adjustment answers them.
+"""What relief does to a lens: hills are laid under the images, and the adjustment answers them.
 
-Relief moves all points of a place together, in every picture that shows it, and a part of that the parameters absorb:
+Relief moves all points of a place together, in every image that shows it, and a part of that the parameters absorb:
 hills as wide as an overlap are fitted by its homography and by λ. What is left over shows how high and how wide the
 hills are, and by how much they can have moved λ: errors agree from one neighbour to the next, and over some distance.
 The answers to waves of all widths give both, the agreement that they leave at every distance, and how far they move λ.
@@ -23,7 +23,7 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 
 _SHORTEST, _LONGEST = 0.5, 6.0
-"""Wavelengths, in half diagonals of a picture on the ground: what neighbours show, and what poses absorb whole."""
+"""Wavelengths, in half diagonals of an image on the ground: what neighbours show, and what poses absorb whole."""
 
 _WAVES = 32
 """Waves, each as a sine and a cosine."""
@@ -43,7 +43,7 @@ _NOISE_FIELDS = 16
 
 @dataclass(frozen=True)
 class ReliefField:
-    """Ground under the pictures of an adjustment.
+    """Ground under the images of an adjustment.
 
     Attributes
     ----------

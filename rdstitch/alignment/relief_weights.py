@@ -1,6 +1,6 @@
 """Over rough ground an error along the parallax says little of the camera, one across it as much as over a plane.
 
-The height of a place moves it in one picture against the other along the line between the cameras, and along that alone
+The height of a place moves it in one image against the other along the line between the cameras, and along that alone
 (plane and parallax; Kumar, Anandan and Hanna 1994). So heights are taken for random: their scatter is found from how
 much larger errors are along the parallax than across it, and the covariance of an error is that of the noise and of the
 heights together. Without that, a camera bends the strip, tilts and takes an odd focal length to follow hills.
@@ -23,7 +23,7 @@ from rdstitch.alignment.select import ModelChoice, best_of
 from rdstitch.arrays import FloatArray
 
 _FEWEST = 3
-"""Pictures: of two, tilts do what heights do, and the errors do not show which."""
+"""Images: of two, tilts do what heights do, and the errors do not show which."""
 
 _ROUNDS, _SETTLED = 4, 0.02
 """Of finding the scatter of the heights and adjusting again, and by how much it still changes at the end: at first the
@@ -42,7 +42,7 @@ _BISECTIONS = 40
 def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[str]) -> ModelChoice:
     """The model of one camera chosen again, with heights that account for errors, where such heights show.
 
-    Without a free distortion centre, which over rough ground bends the whole as the ground bends the pictures.
+    Without a free distortion centre, which over rough ground bends the whole as the ground bends the images.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def weighted_by_relief(problem: Problem, fit: Fit) -> Problem:
     for part in linearized_errors(o, adjusted.homographies, adjusted.parameters.lens, adjuster.free.lens):
         errors[part.rows], parallax[part.rows] = part.errors, field.of(part)[1]
         seen = part.by_point2[:, 0, 0] != 0.0
-        # Without the whitening, in half diagonals of the second picture.
+        # Without the whitening, in half diagonals of the second image.
         moved[part.rows][seen] = np.linalg.solve(-part.by_point2[seen], parallax[part.rows][seen, :, None])[:, :, 0]
     scatter = _scatter(errors, parallax, noise_of_links(o, plain.homographies, plain.lens).effective)
     if scatter == 0.0:

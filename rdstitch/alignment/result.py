@@ -1,4 +1,4 @@
-"""What the adjustment gives: the cameras and poses of all pictures over one plane."""
+"""What the adjustment gives: the cameras and poses of all images over one plane."""
 
 import math
 from collections.abc import Iterable
@@ -25,7 +25,7 @@ class LinkFit:
     Attributes
     ----------
     image1, image2 : int
-        Indices of the pictures.
+        Indices of the images.
     count : int
         Correspondences given.
     inliers : int
@@ -48,14 +48,14 @@ class LinkFit:
 
 @dataclass(frozen=True)
 class PlanarPoses:
-    """Where the camera was for each picture, in a metric plane.
+    """Where the camera was for each image, in a metric plane.
 
     Attributes
     ----------
     yaw : ndarray of shape (N,)
         φ, radians.
     position : ndarray of shape (N, 2)
-        (x, y) in the plane, in units of the reference picture's height above it.
+        (x, y) in the plane, in units of the reference image's height above it.
     height : ndarray of shape (N,)
         Height above the plane in the same unit.
     tilt : ndarray of shape (N, 2)
@@ -97,15 +97,15 @@ class ShapeTest:
     Attributes
     ----------
     doubtful : bool
-        A picture may be off by more than is tolerable.
+        An image may be off by more than is tolerable.
     shown : bool
-        The errors show that something is left out; otherwise the pictures only fail to exclude it.
+        The errors show that something is left out; otherwise the images only fail to exclude it.
     gain : float
         By how many squared standard deviations the errors would be smaller with what is left out.
     image : int
-        The picture that may be off the most.
+        The image that may be off the most.
     shift, shift_std : float
-        How far that picture would move with what is left out, and the standard deviation of that, pixels; up to one
+        How far that image would move with what is left out, and the standard deviation of that, pixels; up to one
         homography of the whole. The latter grows with ``gain``: what is left out is more than what was tried.
     cause : str
         What is most likely to be left out.
@@ -122,33 +122,33 @@ class ShapeTest:
 
 @dataclass(frozen=True, repr=False)
 class Alignment:
-    """All pictures registered as one.
+    """All images registered as one.
 
     Attributes
     ----------
     cameras : tuple of Camera
-        The camera of each picture with the estimated λ and, in planar models, focal length.
+        The camera of each image with the estimated λ and, in planar models, focal length.
     homographies : ndarray of shape (N, 3, 3)
-        From undistorted coordinates of picture i, in half diagonals from its distortion centre, to the plane; the
-        third coordinate is positive in front of the camera. NaN for pictures left out. In planar models the plane is
-        metric, rectified, with its unit the height of the reference picture; in the general model it is the
-        undistorted reference picture. In the rotation model they lead to directions (x right, y down, z ahead) of a
+        From undistorted coordinates of image i, in half diagonals from its distortion centre, to the plane; the
+        third coordinate is positive in front of the camera. NaN for images left out. In planar models the plane is
+        metric, rectified, with its unit the height of the reference image; in the general model it is the
+        undistorted reference image. In the rotation model they lead to directions (x right, y down, z ahead) of a
         level frame, whatever their third coordinate.
     used : ndarray of shape (N,), bool
     components : tuple of tuple of int
-        The groups of pictures that overlap, largest first; the first is the aligned one.
+        The groups of images that overlap, largest first; the first is the aligned one.
     reference : int
-        The picture that defines the plane's frame.
+        The image that defines the plane's frame.
     model : str
         "rigid", "similarity", "tilting", "pose", "homography" or "rotation".
     model_reason : str
         Why this model was taken.
     poses : PlanarPoses or None
-        None for the general model; NaN for pictures left out.
+        None for the general model; NaN for images left out.
     tilt : (float, float) or None
-        (ψ, θ), radians, shared by all pictures (the mean one where the tilt varies).
+        (ψ, θ), radians, shared by all images (the mean one where the tilt varies).
     tilt_spread : float
-        Standard deviation of the single pictures' tilts, radians; 0 where the model has none.
+        Standard deviation of the single images' tilts, radians; 0 where the model has none.
     focal : float or None
         Focal length in half diagonals; None for the general model.
     focal_std : float or None
@@ -200,16 +200,16 @@ class Alignment:
     messages: tuple[Message, ...] = ()
 
     def __repr__(self) -> str:
-        """One line: of how many pictures, by which motion model, and how well they agree."""
+        """One line: of how many images, by which motion model, and how well they agree."""
         used, count = int(self.used.sum()), len(self.used)
-        return f"<Alignment {used} of {count} pictures, {self.model}, rms {self.rms:.2f} pixels>"
+        return f"<Alignment {used} of {count} images, {self.model}, rms {self.rms:.2f} pixels>"
 
     def with_messages(self, messages: Iterable[Message]) -> Self:
         """The same with more to know about it."""
         return replace(self, messages=(*self.messages, *messages))
 
     def relation(self, image1: int, image2: int) -> FloatArray:
-        """Homography (3, 3) from undistorted normalized coordinates of one picture to those of another."""
+        """Homography (3, 3) from undistorted normalized coordinates of one image to those of another."""
         product: FloatArray = np.linalg.solve(self.homographies[image2], self.homographies[image1])
         return product
 
@@ -225,13 +225,13 @@ class Alignment:
 
     @cached_property
     def support(self) -> dict[tuple[int, int], int]:
-        """Number of inliers of every pair of pictures that the alignment uses."""
+        """Number of inliers of every pair of images that the alignment uses."""
         return {(fit.image1, fit.image2): fit.inliers for fit in self.links if fit.used}
 
     def transfer(self, image1: int, image2: int, points: FloatArray) -> FloatArray:
-        """Where points (N, 2) of one picture, pixels, are in another; NaN where its lens cannot see them."""
+        """Where points (N, 2) of one image, pixels, are in another; NaN where its lens cannot see them."""
         if self.on_sphere:
-            # What both pictures show may lie behind the plane that is before them.
+            # What both images show may lie behind the plane that is before them.
             seen = to_plane(self.cameras[image1], self.relation(image1, image2), points)
             return from_plane(self.cameras[image2], np.eye(3), seen)
         plane = to_plane(self.cameras[image1], self.homographies[image1], points)

@@ -1,29 +1,29 @@
-"""The common frame of pictures taken by turning on the spot: level, and centred on what they show."""
+"""The common frame of images taken by turning on the spot: level, and centred on what they show."""
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
 
 _FULL_CIRCLE = np.pi / 2
-"""Pictures whose centres leave no wider gap than this, radians, count as all the way round."""
+"""Images whose centres leave no wider gap than this, radians, count as all the way round."""
 
 _MAX_GRAVITY_SPREAD = np.radians(5.0)
 """Median angle between measured directions of gravity and their mean, up to which they are believed."""
 
 _STEEP = np.cos(np.radians(30.0))
-"""Pictures that look within 30 degrees of straight up or down do not show how the camera was held."""
+"""Images that look within 30 degrees of straight up or down do not show how the camera was held."""
 
 
 def levelled(matrices: FloatArray, reference: int, gravity: FloatArray | None = None) -> FloatArray:
-    """Matrices from undistorted coordinates of each picture to directions in a level frame.
+    """Matrices from undistorted coordinates of each image to directions in a level frame.
 
-    The frame has x to the right, y down, and z towards the middle of what the pictures show, or towards the reference
-    picture where they show everything around.
+    The frame has x to the right, y down, and z towards the middle of what the images show, or towards the reference
+    image where they show everything around.
 
     Parameters
     ----------
     matrices : ndarray of shape (N, 3, 3)
-        ``diag(f, f, 1) R_i``, from directions in any frame to the pictures, all with the same f.
+        ``diag(f, f, 1) R_i``, from directions in any frame to the images, all with the same f.
     reference : int
     gravity : ndarray of shape (N, 3), optional
         Direction down in the axes of each camera, as it has measured it; NaN where it has not.
@@ -58,9 +58,9 @@ def measured_down(rotations: FloatArray, gravity: FloatArray | None) -> FloatArr
 def level_frame(rotations: FloatArray, reference: int, down_by_gravity: FloatArray | None = None) -> FloatArray:
     """Rotation (3, 3) to the level frame from the one that rotations (N, 3, 3) lead from to the cameras.
 
-    People hold cameras so that the horizon is level, whichever way they turn: the x axes of all pictures lie in one
+    People hold cameras so that the horizon is level, whichever way they turn: the x axes of all images lie in one
     plane, and the direction down is the one they have least in common with (Brown and Lowe 2007, section 5). The less
-    the pictures turn, the more counts what is down in them; a few may be taken with the camera on its side. Gravity,
+    the images turn, the more counts what is down in them; a few may be taken with the camera on its side. Gravity,
     where cameras have measured it, decides alone.
     """
     right, down, ahead = _upright(rotations)

@@ -1,6 +1,6 @@
-"""A camera that turns on the spot, as a motion model: ``P_i = diag(f, f, 1) R_i`` from directions to the picture.
+"""A camera that turns on the spot, as a motion model: ``P_i = diag(f, f, 1) R_i`` from directions to the image.
 
-Two pictures are related by ``H_ij = P_j P_i⁻¹ = K R_j R_i' K⁻¹`` in all directions: no plane is needed, and there is
+Two images are related by ``H_ij = P_j P_i⁻¹ = K R_j R_i' K⁻¹`` in all directions: no plane is needed, and there is
 no horizon, so that a full circle closes. A step turns the camera in its own frame, ``R ← exp([δ]x) R``.
 """
 
@@ -39,11 +39,11 @@ class RotationModel:
 
     @property
     def gauge(self) -> BoolArray:
-        """All of the reference picture: the frame of directions may be turned."""
+        """All of the reference image: the frame of directions may be turned."""
         return np.ones(3, dtype=np.bool_)
 
     def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
-        """Matrices from directions to the pictures, with derivatives."""
+        """Matrices from directions to the images, with derivatives."""
         rotations = poses.reshape(-1, 3, 3)
         focal = _focal(shared)
         scale = np.array([[focal], [focal], [1.0]])

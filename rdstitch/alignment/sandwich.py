@@ -2,9 +2,9 @@
 2015).
 
 The inverse of the normal equations takes errors for independent. They are not, in three ways. A keypoint that several
-pairs share brings its error into all of them. Relief moves all points of a place together, in every pair of pictures
+pairs share brings its error into all of them. Relief moves all points of a place together, in every pair of images
 that shows it; see :mod:`rdstitch.alignment.relief_field`. A rolling shutter, or a lens that changes, moves all points
-of a picture. The influence of each correspondence on λ is added up per keypoint, or per picture, and the sums are
+of an image. The influence of each correspondence on λ is added up per keypoint, or per image, and the sums are
 squared.
 """
 
@@ -25,7 +25,7 @@ _SINGULAR = 1e-12
 def sandwich_covariance(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> FloatArray:
     """Covariance (S', S') of the model's named parameters and the free parameters of the lens.
 
-    In no direction less than that of independent errors, nor than where errors agree within pictures.
+    In no direction less than that of independent errors, nor than where errors agree within images.
 
     Parameters
     ----------
@@ -35,12 +35,12 @@ def sandwich_covariance(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResu
     """
     response, observations = LinearResponse.of(adjuster, adjusted), adjuster.observations
     influence, priors = _influence(response)
-    by_pictures = priors + _by_pictures(observations, influence)
+    by_images = priors + _by_images(observations, influence)
     count = int(adjuster.free.poses.sum()) + influence.shape[1]
     errors = 2 * int((response.weight > 0.0).sum())
     absorbed = errors / max(errors - count, 0.25 * errors)
     noise = absorbed * _by_keypoints(observations, influence)
-    found = _at_least(priors + noise + ReliefField(response).covariance(), by_pictures)
+    found = _at_least(priors + noise + ReliefField(response).covariance(), by_images)
     derivative = adjuster.named_parameters(adjusted.parameters.shared)[1]
     independent = replace(adjuster, overdispersion=1.0).covariance(adjusted)
     return _at_least(independent, derivative @ found @ derivative.T)
@@ -75,11 +75,11 @@ def _at_least(covariance: FloatArray, least: FloatArray) -> FloatArray:
 
 def _by_keypoints(observations: Observations, influence: FloatArray) -> FloatArray:
     """Covariance (S, S) when errors of correspondences that share a keypoint agree, by the influence (M, S) of each."""
-    pictures = np.concatenate([observations.image1, observations.image2])
+    images = np.concatenate([observations.image1, observations.image2])
     own = influence.T @ influence
     shared = -own  # each correspondence is among those of two keypoints
-    # One picture after the other: all keypoints at once would be most of the memory of an alignment.
-    for ends in np.split(np.argsort(pictures, kind="stable"), np.cumsum(np.bincount(pictures))[:-1]):
+    # One image after the other: all keypoints at once would be most of the memory of an alignment.
+    for ends in np.split(np.argsort(images, kind="stable"), np.cumsum(np.bincount(images))[:-1]):
         sides, links = np.divmod(ends, len(observations))
         rows = [np.arange(observations.start[link], observations.start[link + 1]) for link in links.tolist()]
         points = [
@@ -96,12 +96,12 @@ def _by_keypoints(observations: Observations, influence: FloatArray) -> FloatArr
     return _at_least(own, shared)
 
 
-def _by_pictures(observations: Observations, influence: FloatArray) -> FloatArray:
-    """Covariance (S, S) when errors of links that share a picture agree: dyadic clusters (Aronow et al. 2015)."""
+def _by_images(observations: Observations, influence: FloatArray) -> FloatArray:
+    """Covariance (S, S) when errors of links that share an image agree: dyadic clusters (Aronow et al. 2015)."""
     count = 1 + int(max(observations.image1.max(), observations.image2.max()))
-    link, picture = np.zeros((len(observations), influence.shape[1])), np.zeros((count, influence.shape[1]))
+    link, image = np.zeros((len(observations), influence.shape[1])), np.zeros((count, influence.shape[1]))
     np.add.at(link, observations.link, influence)
-    for pictures in (observations.image1, observations.image2):
-        np.add.at(picture, pictures, link)
-    covariance: FloatArray = picture.T @ picture - link.T @ link
+    for images in (observations.image1, observations.image2):
+        np.add.at(image, images, link)
+    covariance: FloatArray = image.T @ image - link.T @ link
     return covariance

@@ -1,6 +1,6 @@
-"""Ways to change the whole of an alignment a little, and how far the pictures move with each.
+"""Ways to change the whole of an alignment a little, and how far the images move with each.
 
-The ways are the parameters that all pictures share, and effects that are not modelled
+The ways are the parameters that all images share, and effects that are not modelled
 (:mod:`rdstitch.alignment.unmodelled`). The poses follow each of them, so that the overlaps go on agreeing.
 """
 
@@ -29,7 +29,7 @@ _STEP = 1e-4
 """Of differences by an effect's size, in units of its own."""
 
 _SIDE = 6
-"""Points along a side of each picture whose places are compared."""
+"""Points along a side of each image whose places are compared."""
 
 _ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 8
 """Correspondences in all, and of each link at least, that say what the shape is."""
@@ -133,33 +133,33 @@ class Directions:
 
 
 def places(found: Directions, cameras: Sequence[Camera], count: int) -> tuple[FloatArray, IntArray]:
-    """How far points of the pictures move in them with a step in each of the first directions, and their pictures.
+    """How far points of the images move in them with a step in each of the first directions, and their images.
 
     Returns
     -------
     places : ndarray of shape (P, 2, count)
         Pixels, without what one homography of the whole does.
-    pictures : ndarray of shape (P,), intp
+    images : ndarray of shape (P,), intp
     """
     grid = np.stack(np.meshgrid(np.linspace(0.0, 1.0, _SIDE), np.linspace(0.0, 1.0, _SIDE)), -1).reshape(-1, 2)
     points = np.concatenate([camera.normalize(grid * (np.array(camera.image_size) - 1.0)) for camera in cameras])
-    pictures = np.repeat(np.arange(len(cameras)), len(grid))
-    here = _Ground.of(found.fit, found.fit.adjusted.parameters, pictures)
+    images = np.repeat(np.arange(len(cameras)), len(grid))
+    here = _Ground.of(found.fit, found.fit.adjusted.parameters, images)
     ground = here.of_points(points)
     columns = []
     for index, size in enumerate(found.size[:count].tolist()):
         parameters, effect = found.moved(index, size)
-        measured = points if effect is None else effect.correct(points, pictures, size)
-        columns.append((_Ground.of(found.fit, parameters, pictures).of_points(measured) - ground) / size)
+        measured = points if effect is None else effect.correct(points, images, size)
+        columns.append((_Ground.of(found.fit, parameters, images).of_points(measured) - ground) / size)
     flat = (ground - np.nanmean(ground, axis=0)) / max(float(np.nanstd(ground)), 1e-12)
     frame = [np.outer(own, unit).reshape(-1, 2) for own in (np.ones(len(flat)), *flat.T) for unit in np.eye(2)]
     frame += [flat * flat[:, [axis]] for axis in (0, 1)]
-    by_ground = here.by_ground(ground) * np.array([camera.half_diagonal for camera in cameras])[pictures, None, None]
+    by_ground = here.by_ground(ground) * np.array([camera.half_diagonal for camera in cameras])[images, None, None]
     moved, by_frame = (np.einsum("pab,pbs->pas", by_ground, np.stack(each, axis=2)) for each in (columns, frame))
     seen = np.isfinite(moved).all(axis=(1, 2)) & np.isfinite(by_frame).all(axis=(1, 2))
     moved, by_frame = moved[seen], by_frame[seen]
     known = np.linalg.lstsq(by_frame.reshape(-1, len(frame)), moved.reshape(-1, len(columns)), rcond=None)[0]
-    return moved - np.einsum("pak,ks->pas", by_frame, known), pictures[seen]
+    return moved - np.einsum("pak,ks->pas", by_frame, known), images[seen]
 
 
 def _inliers(adjuster: BundleAdjuster, fit: Fit) -> Observations:
@@ -183,20 +183,20 @@ def _corrected(observations: Observations, effect: Effect, size: float) -> Obser
 
 @dataclass(frozen=True)
 class _Ground:
-    """Where the points of pictures lie on the plane, with some parameters."""
+    """Where the points of images lie on the plane, with some parameters."""
 
-    to_picture: FloatArray
+    to_image: FloatArray
     lens: FloatArray
 
     @classmethod
-    def of(cls, fit: Fit, parameters: Parameters, pictures: IntArray) -> Self:
-        """For points of these pictures (P,)."""
-        return cls(fit.model.matrices(parameters.poses, parameters.shared).matrices[pictures], parameters.lens)
+    def of(cls, fit: Fit, parameters: Parameters, images: IntArray) -> Self:
+        """For points of these images (P,)."""
+        return cls(fit.model.matrices(parameters.poses, parameters.shared).matrices[images], parameters.lens)
 
     def of_points(self, points: FloatArray) -> FloatArray:
         """Of measured points (P, 2), half diagonals; NaN beyond the horizon."""
         flat = undistort(points - self.lens[CENTER], float(self.lens[0]), tuple(self.lens[1:3].tolist()))
-        return mapped(inverses(self.to_picture), flat)
+        return mapped(inverses(self.to_image), flat)
 
     def by_ground(self, ground: FloatArray) -> FloatArray:
         """Derivatives (P, 2, 2) of measured points, half diagonals, by places on the plane (P, 2)."""
@@ -205,4 +205,4 @@ class _Ground:
         return np.stack([(ahead - behind) / (2.0 * size) for ahead, behind in ends], axis=2)
 
     def _measured(self, ground: FloatArray) -> FloatArray:
-        return distort(mapped(self.to_picture, ground), float(self.lens[0]), tuple(self.lens[1:3].tolist()))
+        return distort(mapped(self.to_image, ground), float(self.lens[0]), tuple(self.lens[1:3].tolist()))

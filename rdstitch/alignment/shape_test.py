@@ -1,18 +1,18 @@
 """Is the shape of the whole known? Overlaps that agree to a fifth of a pixel do not say so.
 
-Each picture hangs on its neighbours only, so what bends all overlaps alike, a lens whose axis is off the middle or a
-wall that is slightly curved, adds up along a row of pictures: homographies, tilts and heights take it up, and the far
+Each image hangs on its neighbours only, so what bends all overlaps alike, a lens whose axis is off the middle or a
+wall that is slightly curved, adds up along a row of images: homographies, tilts and heights take it up, and the far
 end is off by pixels where every seam is good. So the fit is tried against what it leaves out
-(:mod:`rdstitch.alignment.unmodelled`): how much smaller would the errors be, how well do the pictures exclude it, and
-how far would the pictures move, up to one homography of the whole?
+(:mod:`rdstitch.alignment.unmodelled`): how much smaller would the errors be, how well do the images exclude it, and
+how far would the images move, up to one homography of the whole?
 
-What is tried is a sample of what may be missing. So the fit is probed besides for what differs from picture to picture:
+What is tried is a sample of what may be missing. So the fit is probed besides for what differs from image to image:
 where that would make the errors smaller by more than noise does, the model is wrong even with the effects, and standard
 deviations that suppose it right are too small by as much: they are multiplied by the Birge ratio (R. T. Birge, The
 calculation of errors by the method of least squares, 1932).
 
 Effects are tried as large as they usually are. Of a much larger one, such as a wall whose radius is a few times the
-camera's distance, that prior would allow little: so extreme cases are tried, too. And a row of few pictures fits a
+camera's distance, that prior would allow little: so extreme cases are tried, too. And a row of few images fits a
 curved wall by a strong tilt and a focal length that next to no lens has: then the usual focal length is tried.
 """
 
@@ -31,10 +31,10 @@ from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.camera import Camera
 
 _LARGE = 0.004
-"""Of a picture's diagonal: a picture may be off by less; sets wrong by three pixels of 500 have 0.005 and more."""
+"""Of an image's diagonal: an image may be off by less; sets wrong by three pixels of 500 have 0.005 and more."""
 
 _SHOWN_PER_EFFECT = 4.0
-"""Gain of each effect, in squared standard deviations, from which on the pictures show that something is left out."""
+"""Gain of each effect, in squared standard deviations, from which on the images show that something is left out."""
 
 UNLIKELY_FOCAL = 4.0
 """Standard deviations of what is known of a focal length beyond which it may stand for something else."""
@@ -49,7 +49,7 @@ def judge_shape(problem: Problem, fit: Fit, cameras: Sequence[Camera]) -> ShapeT
     fit : Fit
         Of a model over a plane.
     cameras : sequence of Camera
-        Of the problem's pictures.
+        Of the problem's images.
     """
     effects, probes = unmodelled_effects(fit), cropping_effects(problem.count)
     found = Directions.of(problem, fit, [*effects, *probes])
@@ -62,8 +62,8 @@ def judge_shape(problem: Problem, fit: Fit, cameras: Sequence[Camera]) -> ShapeT
     extreme = _Prediction.of(effects, _with_extremes(information, effects), gradient, *at, max(1.0, probed))
     diagonals = np.array([2.0 * camera.half_diagonal for camera in cameras])
     judged, off = usual, np.hypot(usual.shifts, usual.stds)
-    # Extreme cases count where the errors show them. Where the pictures only fail to exclude them, as along any row, no
-    # picture would be good enough.
+    # Extreme cases count where the errors show them. Where the images only fail to exclude them, as along any row, no
+    # image would be good enough.
     doubtful = bool(off.max() > _LARGE * diagonals[off.argmax()])
     if not doubtful and extreme.shown and (extreme.shifts > _LARGE * diagonals).any():
         doubtful, judged, off = True, extreme, extreme.shifts
@@ -93,7 +93,7 @@ class _Prediction:
     gain, by_effect : float
         By how much they lessen the cost, in squared standard deviations; the same for each of them.
     shifts, stds : ndarray of shape (N,)
-        How far each picture moves, and the standard deviation of that, pixels.
+        How far each image moves, and the standard deviation of that, pixels.
     cause : str
         The kind of effects that is farthest from nothing.
     """
@@ -116,13 +116,13 @@ class _Prediction:
         information: FloatArray,
         gradient: FloatArray,
         moved: FloatArray,
-        pictures: IntArray,
+        images: IntArray,
         count: int,
         inflation: float,
     ) -> Self:
         """From the information (S, S) and gradient (S,) on the shared parameters and the effects.
 
-        ``moved`` and ``pictures`` are what :func:`places` gives; variances are multiplied by ``inflation``.
+        ``moved`` and ``images`` are what :func:`places` gives; variances are multiplied by ``inflation``.
         """
         kept = len(gradient) - len(effects)
         alone = information[:kept, :kept]
@@ -131,24 +131,24 @@ class _Prediction:
         step[:kept] += np.linalg.solve(alone, gradient[:kept])  # what the fit lacks without any effect
         covariance *= inflation
         squared = ((moved @ step) ** 2).sum(axis=1), np.einsum("pas,st,pat->p", moved, covariance, moved)
-        shifts, stds = (_per_picture(own, pictures, count) for own in squared)
+        shifts, stds = (_per_image(own, images, count) for own in squared)
         gain = _gain(information, gradient) - _gain(alone, gradient[:kept])
         cause = _cause(effects, step[kept:], np.asarray(covariance[kept:, kept:], dtype=np.float64))
         return cls(gain, gain / len(effects), shifts, stds, cause)
 
     def moved_along(
-        self, index: int, size: float, information: FloatArray, moved: FloatArray, pictures: IntArray, count: int
+        self, index: int, size: float, information: FloatArray, moved: FloatArray, images: IntArray, count: int
     ) -> Self:
         """What a step of one shared parameter, the logarithm of the focal length, changes when all others follow it."""
         response = np.linalg.inv(information)[:, index]
-        shifts = _per_picture(((moved @ response * (size / response[index])) ** 2).sum(axis=1), pictures, count)
+        shifts = _per_image(((moved @ response * (size / response[index])) ** 2).sum(axis=1), images, count)
         return replace(self, by_effect=0.0, shifts=shifts, stds=np.zeros(count), cause=USUAL_FOCAL)
 
 
-def _per_picture(squared: FloatArray, pictures: IntArray, count: int) -> FloatArray:
-    """Root mean square (N,) of the points (P,) of each picture."""
-    points = np.maximum(np.bincount(pictures, minlength=count), 1)
-    result: FloatArray = np.sqrt(np.maximum(np.bincount(pictures, squared, count), 0.0) / points)
+def _per_image(squared: FloatArray, images: IntArray, count: int) -> FloatArray:
+    """Root mean square (N,) of the points (P,) of each image."""
+    points = np.maximum(np.bincount(images, minlength=count), 1)
+    result: FloatArray = np.sqrt(np.maximum(np.bincount(images, squared, count), 0.0) / points)
     return result
 
 

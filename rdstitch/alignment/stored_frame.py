@@ -1,7 +1,7 @@
-"""Pictures that EXIF turns: they are aligned as the camera stored them, so that its lens and its tilt are one in all.
+"""Images that EXIF turns: they are aligned as the camera stored them, so that its lens and its tilt are one in all.
 
-Matches, cameras and homographies are those of upright pictures everywhere else. Mirrors stay where they are: of
-mirrored pictures among others the distortion centre is mirrored too, which one lens of all cannot show.
+Matches, cameras and homographies are those of upright images everywhere else. Mirrors stay where they are: of
+mirrored images among others the distortion centre is mirrored too, which one lens of all cannot show.
 """
 
 from collections.abc import Sequence
@@ -26,14 +26,14 @@ def turns(orientations: Sequence[int]) -> FloatArray:
 
 
 def turned_tilts(tilts: FloatArray, orientations: Sequence[int]) -> FloatArray:
-    """Tilts (ψ, θ) (N, 2), radians, of pictures after orientations 1, 3, 6 and 8."""
+    """Tilts (ψ, θ) (N, 2), radians, of images after orientations 1, 3, 6 and 8."""
     normals = rotation_from_tilt(tilts)[..., 2]
     turned = np.array(orientations)[:, None] != 1
     return np.where(turned, tilt_from_normal(np.einsum("nij,nj->ni", turns(orientations), normals)), tilts)
 
 
 def turned_link(link: Link, cameras: Sequence[Camera], orientations: Sequence[int]) -> Link:
-    """The same correspondences in pictures, of the cameras given, after orientations 1, 3, 6 and 8."""
+    """The same correspondences in images, of the cameras given, after orientations 1, 3, 6 and 8."""
     own = orientations[link.image1], orientations[link.image2]
     if own == (1, 1):
         return link
@@ -59,12 +59,12 @@ def _turned_points(points: FloatArray, camera: Camera, orientation: int) -> Floa
 
 
 def turned_alignment(alignment: Alignment, orientations: Sequence[int], gravity: FloatArray | None) -> Alignment:
-    """The same alignment of the pictures after orientations 1, 3, 6 and 8, in the frame of the reference as it is then.
+    """The same alignment of the images after orientations 1, 3, 6 and 8, in the frame of the reference as it is then.
 
     Parameters
     ----------
     gravity : ndarray of shape (N, 3), or None
-        Direction down in the axes of the cameras of the turned pictures; NaN where it is not known.
+        Direction down in the axes of the cameras of the turned images; NaN where it is not known.
     """
     if all(orientation == 1 for orientation in orientations):
         return alignment
@@ -124,5 +124,5 @@ def _turned_covariance(alignment: Alignment, own: FloatArray) -> FloatArray:
 
 
 def stored(orientations: Sequence[int]) -> tuple[int, ...]:
-    """What leads back from upright pictures."""
+    """What leads back from upright images."""
     return tuple(inverse(orientation) for orientation in orientations)

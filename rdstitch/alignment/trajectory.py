@@ -33,7 +33,7 @@ class Trajectory:
     height : ndarray of shape (F,)
         Above the plane, in the unit of the positions.
     name : tuple of str
-        Of each frame's picture; empty where not known.
+        Of each frame's image; empty where not known.
     source_frame : ndarray of shape (F,), intp, or None
         Number of each frame in the video or bag that it was taken from, else in the sequence.
     timestamp : ndarray of shape (F,), or None
@@ -49,7 +49,7 @@ class Trajectory:
     timestamp: FloatArray | None = None
 
     def labelled(self, names: Sequence[str], numbers: ArrayLike, timestamps: ArrayLike) -> Self:
-        """The same with name, number and time stamp of each picture of the whole sequence."""
+        """The same with name, number and time stamp of each image of the whole sequence."""
         chosen = self.frame
         return replace(
             self,
@@ -77,7 +77,7 @@ class Trajectory:
             raise ArgumentError("the camera turned on the spot: there is no path; --model tilting looks for one anyhow")
         if alignment.poses is None:
             raise ArgumentError(
-                "one homography per picture has no metric poses; choose a planar model (rigid, similarity or tilting)"
+                "one homography per image has no metric poses; choose a planar model (rigid, similarity or tilting)"
             )
         return cls.from_poses(alignment.poses, height)
 

@@ -1,7 +1,7 @@
 """What no model of the family describes, as small changes of the measured points that undo it.
 
-A lens whose axis is off the middle, pictures that were cropped, rows that are read one after the other while the camera
-moves, a surface that is curved: where such a thing is small, pictures of it are those of the model with their points
+A lens whose axis is off the middle, images that were cropped, rows that are read one after the other while the camera
+moves, a surface that is curved: where such a thing is small, images of it are those of the model with their points
 moved a little.
 """
 
@@ -18,18 +18,18 @@ from rdstitch.division_model import distort, undistort
 from rdstitch.radial_homography import project
 
 Correction = Callable[[FloatArray, IntArray, float], FloatArray]
-"""Takes measured points (M, 2), half diagonals, the picture of each (M,), and the size of the effect to the points that
+"""Takes measured points (M, 2), half diagonals, the image of each (M,), and the size of the effect to the points that
 the model would have measured."""
 
-OFF_CENTER = "a lens whose axis is off the middle (were the pictures cropped?)"
+OFF_CENTER = "a lens whose axis is off the middle (were the images cropped?)"
 OTHER_LENS = "a lens of another kind"
 ROLLING_SHUTTER = "rows that were read while the camera moved (a rolling shutter)"
 CURVED = "a curved surface"
-CROPPED = "pictures that were cropped, or stabilised, each differently"
+CROPPED = "images that were cropped, or stabilised, each differently"
 USUAL_FOCAL = "a usual focal length, far from the one that fits best"
 
 _PATTERNS = 8
-"""Random ways in which pictures are tried to be cropped: as many for few pictures as for many."""
+"""Random ways in which images are tried to be cropped: as many for few images as for many."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def unmodelled_effects(fit: Fit) -> list[Effect]:
     if not free[1]:
         effects.append(Effect(OTHER_LENS, _bent(lens), 0.03))
     # The camera's motion shears and stretches what its rows see, and so do pixels that are no squares: by a tenth where
-    # a picture passes in ten read-outs.
+    # an image passes in ten read-outs.
     effects += [Effect(ROLLING_SHUTTER, _sheared(np.array(matrix)), 0.01, 0.1) for matrix in _SHEARS]
     if isinstance(fit.model, PlanarModel):
         # At the most, the camera is as far from the surface as the centre of its curvature.
@@ -71,7 +71,7 @@ def unmodelled_effects(fit: Fit) -> list[Effect]:
 
 
 def cropping_effects(count: int) -> list[Effect]:
-    """The lens's axis lies elsewhere in each of so many pictures, in several random ways."""
+    """The lens's axis lies elsewhere in each of so many images, in several random ways."""
     patterns = np.random.default_rng(0).normal(0.0, 1.0, (_PATTERNS, count, 2))
     return [Effect(CROPPED, _cropped(pattern), 0.03) for pattern in patterns]
 
@@ -83,7 +83,7 @@ def _shifted(axis: int) -> Correction:
     """The distortion centre lies elsewhere."""
     direction = np.eye(2)[axis]
 
-    def correct(points: FloatArray, pictures: IntArray, size: float) -> FloatArray:
+    def correct(points: FloatArray, images: IntArray, size: float) -> FloatArray:
         moved: FloatArray = points - size * direction
         return moved
 
@@ -91,10 +91,10 @@ def _shifted(axis: int) -> Correction:
 
 
 def _cropped(pattern: FloatArray) -> Correction:
-    """The distortion centre lies elsewhere in each picture, by its row of (N, 2)."""
+    """The distortion centre lies elsewhere in each image, by its row of (N, 2)."""
 
-    def correct(points: FloatArray, pictures: IntArray, size: float) -> FloatArray:
-        moved: FloatArray = points - size * pattern[pictures]
+    def correct(points: FloatArray, images: IntArray, size: float) -> FloatArray:
+        moved: FloatArray = points - size * pattern[images]
         return moved
 
     return correct
@@ -104,7 +104,7 @@ def _bent(lens: FloatArray) -> Correction:
     """μ is another one."""
     center, (first, second, third) = lens[CENTER], lens[~CENTER].tolist()
 
-    def correct(points: FloatArray, pictures: IntArray, size: float) -> FloatArray:
+    def correct(points: FloatArray, images: IntArray, size: float) -> FloatArray:
         flat = undistort(points - center, first, (second + size, third))
         moved: FloatArray = distort(flat, first, (second, third)) + center
         return moved
@@ -113,9 +113,9 @@ def _bent(lens: FloatArray) -> Correction:
 
 
 def _sheared(matrix: FloatArray) -> Correction:
-    """The picture is changed linearly."""
+    """The image is changed linearly."""
 
-    def correct(points: FloatArray, pictures: IntArray, size: float) -> FloatArray:
+    def correct(points: FloatArray, images: IntArray, size: float) -> FloatArray:
         moved: FloatArray = points + size * points @ matrix.T
         return moved
 
@@ -127,17 +127,17 @@ def _curved(fit: Fit, model: PlanarModel, axes: tuple[int, int]) -> Correction:
     adjusted = fit.adjusted
     poses = model.metric_poses(adjusted.parameters.poses, adjusted.parameters.shared)
     position, height = poses[:, [X, Y]], np.exp(poses[:, LOG_HEIGHT])
-    to_picture, middle = adjusted.matrices.matrices, position.mean(axis=0)
-    to_ground = inverses(to_picture)
+    to_image, middle = adjusted.matrices.matrices, position.mean(axis=0)
+    to_ground = inverses(to_image)
     lens = adjusted.parameters.lens
     distortion, higher, center = float(lens[0]), tuple(lens[1:3].tolist()), lens[CENTER]
 
-    def correct(points: FloatArray, pictures: IntArray, size: float) -> FloatArray:
-        foot = mapped(to_ground[pictures], undistort(points - center, distortion, higher))
+    def correct(points: FloatArray, images: IntArray, size: float) -> FloatArray:
+        foot = mapped(to_ground[images], undistort(points - center, distortion, higher))
         a, b = (foot - middle)[:, axes].T
-        below = position[pictures]
-        place = below + (foot - below) * (1.0 - 0.5 * size * a * b / height[pictures])[:, None]
-        moved: FloatArray = distort(mapped(to_picture[pictures], place), distortion, higher) + center
+        below = position[images]
+        place = below + (foot - below) * (1.0 - 0.5 * size * a * b / height[images])[:, None]
+        moved: FloatArray = distort(mapped(to_image[images], place), distortion, higher) + center
         return moved
 
     return correct

@@ -1,4 +1,4 @@
-"""Where an alignment starts that follows another of the same pictures: at the cameras and poses of that one."""
+"""Where an alignment starts that follows another of the same images: at the cameras and poses of that one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ class WarmStart:
     ----------
     model : PlanarModel
     parameters : Parameters
-        Of the pictures that are to be aligned; heights relative to their median.
+        Of the images that are to be aligned; heights relative to their median.
     tilt_spread : float
         Standard deviation of the tilts, radians; 0 where the model has none.
     """
@@ -35,26 +35,26 @@ class WarmStart:
         cls,
         former: Alignment,
         cameras: Sequence[Camera],
-        pictures: IntArray,
+        images: IntArray,
         lens: FloatArray,
         free_lens: BoolArray,
     ) -> Self | None:
-        """From an alignment of the same ``cameras``; None where it was not of these ``pictures`` over a plane.
+        """From an alignment of the same ``cameras``; None where it was not of these ``images`` over a plane.
 
         What is not free of the lens (5,) stays as given.
         """
         model = PLANAR_MODELS.get(former.model)
         poses, tilt, focal = former.poses, former.tilt, former.focal
-        same = np.array_equal(np.flatnonzero(former.used), pictures)
+        same = np.array_equal(np.flatnonzero(former.used), images)
         if not isinstance(model, PlanarModel) or poses is None or tilt is None or focal is None or not same:
             return None
-        own = np.empty((len(pictures), 6))
-        logs = np.log(poses.height[pictures])
+        own = np.empty((len(images), 6))
+        logs = np.log(poses.height[images])
         median = float(np.median(logs))
-        own[:, 0] = poses.yaw[pictures]
-        own[:, [X, Y]] = poses.position[pictures] * focal / np.exp(median)
+        own[:, 0] = poses.yaw[images]
+        own[:, [X, Y]] = poses.position[images] * focal / np.exp(median)
         own[:, LOG_HEIGHT] = logs - median
-        own[:, [PSI, THETA]] = (poses.tilt[pictures] - np.array(tilt)) / focal  # free, or zero
+        own[:, [PSI, THETA]] = (poses.tilt[images] - np.array(tilt)) / focal  # free, or zero
         found, given = former.cameras[0], cameras[0]
         center = (np.asarray(found.center) - np.asarray(given.center)) / given.half_diagonal
         lens = np.where(free_lens, [*found.coefficients, *center], lens)
@@ -62,7 +62,7 @@ class WarmStart:
         return cls(model, Parameters(own, shared, lens), former.tilt_spread)
 
     def start_of(self, model: PlanarModel) -> Parameters:
-        """For any model over a plane: what is not free in that is the same in all pictures."""
+        """For any model over a plane: what is not free in that is the same in all images."""
         poses = np.zeros_like(self.parameters.poses)
         poses[:, list(model.free)] = self.parameters.poses[:, list(model.free)]
         return Parameters(poses, self.parameters.shared, self.parameters.lens)

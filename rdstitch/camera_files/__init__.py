@@ -65,7 +65,7 @@ def load_camera(path: str | Path, image_size: tuple[int, int] | None = None) -> 
     ----------
     path : path
     image_size : (int, int), optional
-        Width and height of the pictures, pixels, for a file of OpenCV that does not say them.
+        Width and height of the images, pixels, for a file of OpenCV that does not say them.
 
     Returns
     -------
@@ -88,7 +88,7 @@ def read_camera_file(path: str | Path, image_size: ImageSize | None = None) -> C
     ----------
     path : path
     image_size : callable, optional
-        Gives width and height of the pictures, pixels, for a file of OpenCV that does not say them.
+        Gives width and height of the images, pixels, for a file of OpenCV that does not say them.
 
     Raises
     ------

@@ -65,7 +65,7 @@ def read_hugin(text: str, file: str) -> CameraFile:
     focal = size[0] / 2 / (math.tan(half_view) if projection == _RECTILINEAR else half_view) * linear
 
     def forward(points: FloatArray) -> FloatArray:
-        # The file's undistorted picture is larger by what the polynomial takes away at the centre.
+        # The file's undistorted image is larger by what the polynomial takes away at the centre.
         rays = (points - center) / focal
         radius = np.linalg.norm(rays, axis=1, keepdims=True)
         ideal = bend(radius) * focal / (unit * linear)
@@ -98,7 +98,7 @@ def hugin_project(camera: Camera) -> str:
     lens = f"v{view!r} a{a!r} b{b!r} c{c!r} d{d!r} e{e!r} g0 t0"
     return (
         f'{_HEAD}{comments(camera, fit, "a, b, c")}p f0 w{width} h{height} v{view:.6g} n"TIFF_m c:LZW"\nm i0\n'
-        f'i w{width} h{height} f{projection} {lens} r0 p0 y0 TrX0 TrY0 TrZ0 n"picture.jpg"\n'
+        f'i w{width} h{height} f{projection} {lens} r0 p0 y0 TrX0 TrY0 TrZ0 n"image.jpg"\n'
     )
 
 

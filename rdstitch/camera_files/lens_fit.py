@@ -1,4 +1,4 @@
-"""From one lens model to another, by least squares over the picture, with what that costs in pixels.
+"""From one lens model to another, by least squares over the image, with what that costs in pixels.
 
 Every model is a *forward* map: pixels of a lens without distortion to measured pixels. The division model is fitted to
 others so that the measured pixels agree; others are fitted to the division model in the same way.
@@ -16,10 +16,10 @@ from rdstitch.errors import ArgumentError
 
 Forward = Callable[[FloatArray], FloatArray]
 
-_GRID = 65  # points along each side of the picture that polynomials are fitted at
+_GRID = 65  # points along each side of the image that polynomials are fitted at
 _RATIONAL_STEPS, _DIVISION_STEPS = 12, 8
 _EXACT_ERROR = 0.1  # pixels: as exactly as a lens can be described at all
-_MAX_ERROR = 0.1  # half diagonals: then the file is no lens of these pictures
+_MAX_ERROR = 0.1  # half diagonals: then the file is no lens of these images
 _RAYS, _STEPS, _REACH = 64, 1200, 8.0  # where other models are looked at: directions, steps, half diagonals
 
 
@@ -30,7 +30,7 @@ class LensFit:
     Attributes
     ----------
     rms, largest : float
-        Of the distances between the pixels that both models give, over the whole picture, pixels.
+        Of the distances between the pixels that both models give, over the whole image, pixels.
     """
 
     rms: float
@@ -39,7 +39,7 @@ class LensFit:
 
 @dataclass(frozen=True)
 class LensSamples:
-    """Radii of points all over what is drawn of a picture, N of them.
+    """Radii of points all over what is drawn of an image, N of them.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ def fit_lens(forward: Forward, camera: Camera) -> tuple[Camera, LensFit]:
     Raises
     ------
     ArgumentError
-        When the other model folds the picture, or is far from every division model.
+        When the other model folds the image, or is far from every division model.
     """
     straight, measured, weights = _rays(forward, camera)
     flat, bent = camera.normalize(straight), camera.normalize(measured)
@@ -161,7 +161,7 @@ def _fit_divisor(radius2: FloatArray, divisor: FloatArray, weights: FloatArray, 
 
 
 def _rays(forward: Forward, camera: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Points along rays from the centre to the border of the measured picture: straight, measured, and their areas."""
+    """Points along rays from the centre to the border of the measured image: straight, measured, and their areas."""
     angles = np.arange(_RAYS) * (2.0 * np.pi / _RAYS)
     radii = np.linspace(0.0, _REACH * camera.half_diagonal, _STEPS + 1)[1:]
     rays = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None] * radii[None, :, None] + camera.center
@@ -171,10 +171,10 @@ def _rays(forward: Forward, camera: Camera) -> tuple[FloatArray, FloatArray, Flo
         steps = np.diff(distance, axis=1, prepend=0.0)
     within = (measured > -0.5) & (measured < np.array(camera.image_size) - 0.5)
     inside = within[..., 0] & within[..., 1]
-    # Along each ray, what comes before it leaves the picture for the first time; with a fisheye of 180 degrees and
+    # Along each ray, what comes before it leaves the image for the first time; with a fisheye of 180 degrees and
     # more it never does, and of what is near the horizon there is no need to know.
     leaves = np.where(inside.all(axis=1), _STEPS, np.argmin(inside, axis=1))
     seen = np.arange(_STEPS) < leaves[:, None]
     if not inside[:, 0].all() or not (steps[seen] > 0.0).all():
-        raise ArgumentError("the lens model folds the picture; it does not belong to pictures of this size")
+        raise ArgumentError("the lens model folds the image; it does not belong to images of this size")
     return rays[seen], measured[seen], (distance * steps)[seen]

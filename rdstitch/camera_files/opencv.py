@@ -31,7 +31,7 @@ _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
 _COEFFICIENTS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "Distortion_Coefficients", "D")
 _WIDE = 0.9  # half diagonals in focal lengths: fisheyes begin there, at 84 degrees by the usual model
 _ASYMMETRIC, _TIMES_CLOSER = 0.005, 4.0  # half diagonals off every symmetric lens, and times the fisheye's error
-_OFF_CENTER = 0.15  # of the picture's sides: principal points lie nearer to the middle
+_OFF_CENTER = 0.15  # of the image's sides: principal points lie nearer to the middle
 
 ImageSize = Callable[[], tuple[int, int]]
 """Gives width and height, pixels, where a file does not say them."""
@@ -163,14 +163,14 @@ def _is_rather(fisheye: CameraFile, brown: CameraFile) -> bool:
 
 
 def _size(record: Record, center: tuple[float, float], image_size: ImageSize | None) -> tuple[int, int]:
-    """Width and height, of the pictures where the file does not say them."""
+    """Width and height, of the images where the file does not say them."""
     if image_size is None or any(record.get(name) is not None for name in (*_WIDTH, *_HEIGHT)):
         return _first(record, _WIDTH).side(), _first(record, _HEIGHT).side()
     size = image_size()
     if any(abs((c + 0.5) / side - 0.5) > _OFF_CENTER for c, side in zip(center, size, strict=True)):
         record.fail(
             f"has no image_width and image_height, and its principal point {center[0]:.0f}, {center[1]:.0f} is not "
-            f"that of pictures of {size[0]} x {size[1]} pixels; add the size that it was calibrated for"
+            f"that of images of {size[0]} x {size[1]} pixels; add the size that it was calibrated for"
         )
     return size
 

@@ -30,7 +30,7 @@ def read_opendronemap(record: Record) -> CameraFile:
     """
     cameras = record.fields()
     if len(cameras) != 1:
-        record.fail(f"has {len(cameras)} cameras; keep the one that took the pictures")
+        record.fail(f"has {len(cameras)} cameras; keep the one that took the images")
     ((_, entry),) = cameras.items()
     if (own := entry.get(_OWN)) is not None:
         return CameraFile(camera_from_record(own), _KIND)

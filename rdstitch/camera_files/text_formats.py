@@ -51,7 +51,7 @@ def read_colmap(text: str, file: str) -> CameraFile:
     numbers = parse_json(f"[{', '.join(values.split())}]", file).value
     record = Record(file, "", {"MODEL": model, "SIZE": [int(width), int(height)], "PARAMS": numbers})
     if len(cameras) > 1:
-        record.fail(f"holds {len(cameras)} cameras; keep the line of the one that took the pictures")
+        record.fail(f"holds {len(cameras)} cameras; keep the line of the one that took the images")
     focals, coefficients = _COLMAP[record["MODEL"].choice(_COLMAP)]
     given = record["PARAMS"]
     values = given.numbers(focals + 2 + coefficients)
@@ -78,7 +78,7 @@ def read_kalibr(text: str, file: str) -> CameraFile:
     chain = parse_yaml("\n".join(lines), file)
     cameras = [camera for name, camera in chain.fields().items() if _KALIBR_CAMERA.match(f"{name}:")]
     if len(cameras) > 1:
-        chain.fail(f"holds {len(cameras)} cameras; keep the one that took the pictures")
+        chain.fail(f"holds {len(cameras)} cameras; keep the one that took the images")
     camera = cameras[0]
     camera["camera_model"].choice(("pinhole",))
     model = camera["distortion_model"].choice(_KALIBR)

@@ -1,10 +1,10 @@
-"""From registered pictures to one picture: canvas, resampling, exposure, seams, blending."""
+"""From registered images to one image: canvas, resampling, exposure, seams, blending."""
 
 from rdstitch.compositing.canvas import Canvas, plan_canvas
 from rdstitch.compositing.compositor import Composite, FileComposite, OutputFile, compose, compose_to_file
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.panorama_canvas import plan_panorama
-from rdstitch.compositing.placed_picture import PlacedPicture, place_pictures
+from rdstitch.compositing.placed_image import PlacedImage, place_images
 from rdstitch.compositing.plan import CompositePlan, plan_composite
 
 __all__ = [
@@ -14,10 +14,10 @@ __all__ = [
     "CompositePlan",
     "FileComposite",
     "OutputFile",
-    "PlacedPicture",
+    "PlacedImage",
     "compose",
     "compose_to_file",
-    "place_pictures",
+    "place_images",
     "plan_canvas",
     "plan_composite",
     "plan_panorama",

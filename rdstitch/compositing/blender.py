@@ -71,7 +71,7 @@ class MultibandBlender:
             self._weights.append(np.zeros(shape, dtype=np.float32))
 
     def add(self, box: Box, pixels: Float32Array, weight: Float32Array) -> None:
-        """Add a picture's (h, w, C) samples and (h, w) weights on an aligned box within the blender's.
+        """Add an image's (h, w, C) samples and (h, w) weights on an aligned box within the blender's.
 
         ``pixels`` is used up.
         """

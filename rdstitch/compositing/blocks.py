@@ -1,7 +1,7 @@
 """Blocks of an output as tasks: workers elsewhere compute them, and they are put together here, strip by strip.
 
-A block is composed as a whole output is, of the pictures that reach it, which the worker reads. Its strips go to a
-store that both see, so that neither they nor the pictures travel with tasks and results.
+A block is composed as a whole output is, of the images that reach it, which the worker reads. Its strips go to a
+store that both see, so that neither they nor the images travel with tasks and results.
 """
 
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -18,7 +18,7 @@ from rdstitch.compositing.tiles import OutputStrip, ShareProgress, TiledOutput
 from rdstitch.opencv_state import one_opencv_thread
 from rdstitch.stored import Stored
 
-_MIN_TILES = 4  # tiles of a block, a side, at the least: pictures across the edges of blocks are read for each of them
+_MIN_TILES = 4  # tiles of a block, a side, at the least: images across the edges of blocks are read for each of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,13 +42,13 @@ class Block:
     Attributes
     ----------
     tiles : TiledOutput
-        With the pictures that reach it alone.
-    pictures : tuple of int
-        Which of the composite's pictures these are.
+        With the images that reach it alone.
+    images : tuple of int
+        Which of the composite's images these are.
     """
 
     tiles: TiledOutput
-    pictures: tuple[int, ...]
+    images: tuple[int, ...]
 
     def compute(self, store: Cache) -> list[Stored[BlockStrip]]:
         """Its strips from top to bottom, in the store, which must be this run's own."""
@@ -95,6 +95,6 @@ def strips_of_blocks(
 
 
 def _side(whole: TiledOutput) -> int:
-    """Side of a block, canvas pixels: about that of a picture, so that few blocks need the same one."""
+    """Side of a block, canvas pixels: about that of an image, so that few blocks need the same one."""
     sides = [max(warp.box[2] - warp.box[0], warp.box[3] - warp.box[1]) for warp in whole.renderer.warps]
     return whole.tile_size * max(_MIN_TILES, round(float(np.median(sides)) / whole.tile_size))

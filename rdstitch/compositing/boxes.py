@@ -1,4 +1,4 @@
-"""Boxes of pixels, on the canvas or in a picture, arrays of values on them, and which of many boxes overlap."""
+"""Boxes of pixels, on the canvas or in an image, arrays of values on them, and which of many boxes overlap."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -70,7 +70,7 @@ def overlapping_pairs(boxes: Sequence[Box | None], most: int = _MAX_NEIGHBOURS) 
     Parameters
     ----------
     boxes : sequence of Box or None
-        None for a picture that is nowhere.
+        None for an image that is nowhere.
     most : int
         Where a box overlaps more others, so many of them: those with which it shares most, and what it takes for all
         that is connected to stay so (a spanning tree of the largest overlaps).
@@ -103,7 +103,7 @@ def overlapping_pairs(boxes: Sequence[Box | None], most: int = _MAX_NEIGHBOURS) 
 
 
 def _largest(pairs: NDArray[np.intp], share: FloatArray, count: int, most: int) -> NDArray[np.intp]:
-    """The pairs of the largest shares, ``most`` of each picture, and a spanning tree."""
+    """The pairs of the largest shares, ``most`` of each image, and a spanning tree."""
     ends = pairs.T.ravel()
     degree = np.bincount(ends, minlength=count)
     if degree.max(initial=0) <= most:

@@ -1,7 +1,7 @@
-"""The canvas: where every picture lies in the output, and how large that is.
+"""The canvas: where every image lies in the output, and how large that is.
 
-A homography ``G`` maps the half-diagonal-normalized undistorted coordinates of its picture to *plane* coordinates,
-which have no unit; the canvas is the plane scaled, turned and shifted to pixels. Where pictures were taken by turning
+A homography ``G`` maps the half-diagonal-normalized undistorted coordinates of its image to *plane* coordinates,
+which have no unit; the canvas is the plane scaled, turned and shifted to pixels. Where images were taken by turning
 on the spot, G maps them to directions, and the canvas is what a projection makes of these.
 """
 
@@ -23,12 +23,12 @@ from rdstitch.radial_homography import to_directions, to_plane
 # Straight sides are curved after undistortion: 64 points a side put the extremes within 0.02 pixels on 4000 pixels.
 _POINTS_PER_SIDE = 64
 _MAX_GROWTH = 100.0
-_MAX_ENLARGEMENT = 400.0  # pixels of the canvas for each of the pictures, where --scale requests it
+_MAX_ENLARGEMENT = 400.0  # pixels of the canvas for each of the images, where --scale requests it
 
 
 @dataclass(frozen=True)
 class Canvas:
-    """The output picture's geometry.
+    """The output image's geometry.
 
     Attributes
     ----------
@@ -37,14 +37,14 @@ class Canvas:
     matrix : ndarray of shape (3, 3)
         Affine, from plane coordinates to canvas pixels (centre of the top-left pixel at (0, 0)).
     footprints : tuple of ndarray of shape (K, 2)
-        Outline of what is drawn of each picture, canvas pixels, clockwise. Of a canvas that goes all the way round,
+        Outline of what is drawn of each image, canvas pixels, clockwise. Of a canvas that goes all the way round,
         one of its places; it may reach beyond the canvas.
     projection : Projection
         What ``matrix`` is applied to: the places that it gives to directions.
     period : float or None
-        Width of a full turn, pixels, where the pictures go all the way round; None where they do not.
+        Width of a full turn, pixels, where the images go all the way round; None where they do not.
     near : tuple of NearPart or None
-        What of each picture is drawn; None for all of it, empty for all of all pictures.
+        What of each image is drawn; None for all of it, empty for all of all images.
     """
 
     size: tuple[int, int]
@@ -55,9 +55,9 @@ class Canvas:
     near: tuple[NearPart | None, ...] = ()
 
     def box(self, index: int) -> Box:
-        """Bounds (x0, y0, x1, y1) of a picture, whole pixels inside the canvas, end exclusive.
+        """Bounds (x0, y0, x1, y1) of an image, whole pixels inside the canvas, end exclusive.
 
-        A picture that lies across the edge of a canvas that goes all the way round has the whole width.
+        An image that lies across the edge of a canvas that goes all the way round has the whole width.
         """
         outline, (width, height) = self.footprints[index], self.size
         low, high = np.floor(outline.min(axis=0)), np.ceil(outline.max(axis=0)) + 1
@@ -67,7 +67,7 @@ class Canvas:
         return x0, y0, min(width, int(high[0])), min(height, int(high[1]))
 
     def areas(self) -> list[int]:
-        """Of the bounds of every picture, as if it had only one place on the canvas, square pixels."""
+        """Of the bounds of every image, as if it had only one place on the canvas, square pixels."""
         if self.period is None:
             return [(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in map(self.box, range(len(self.footprints)))]
         sizes = [np.minimum(np.ptp(outline, axis=0) + 1, self.size) for outline in self.footprints]
@@ -75,21 +75,21 @@ class Canvas:
 
     @property
     def outlines(self) -> list[tuple[FloatArray, ...]]:
-        """The footprint of every picture at each of its places: two, where it lies across the edge of a full turn."""
+        """The footprint of every image at each of its places: two, where it lies across the edge of a full turn."""
         return [
             tuple(outline + np.array([shift, 0.0]) for shift in self._shifts(outline[:, 0].min(), outline[:, 0].max()))
             for outline in self.footprints
         ]
 
     def _shifts(self, low: float, high: float) -> list[float]:
-        """From where a picture is, pixels, to all its places on the canvas, which repeat themselves with each turn."""
+        """From where an image is, pixels, to all its places on the canvas, which repeat themselves with each turn."""
         if self.period is None:
             return [0.0]
         turns = [k * self.period for k in range(-2, 3)]
         return [turn for turn in turns if low + turn < self.size[0] and high + turn > 0]
 
     def place(self, camera: Camera, homography: FloatArray, points: ArrayLike) -> FloatArray:
-        """Canvas pixels (N, 2) of measured pixels (N, 2) of a picture; NaN where it has no place."""
+        """Canvas pixels (N, 2) of measured pixels (N, 2) of an image; NaN where it has no place."""
         if self.projection == PLANE:
             return to_plane(camera, self.matrix @ homography, points)
         directions = to_directions(camera, homography, points)
@@ -127,33 +127,33 @@ def plan_canvas(
     names: Sequence[str] | None = None,
     max_stretch: float = math.inf,
 ) -> Canvas:
-    """Plan the smallest upright canvas that holds every picture.
+    """Plan the smallest upright canvas that holds every image.
 
     Parameters
     ----------
     homographies : array_like of shape (N, 3, 3)
-        ``G`` of each picture: normalized undistorted to plane coordinates.
+        ``G`` of each image: normalized undistorted to plane coordinates.
     scale : float
-        1 keeps, at its centre, the resolution of the reference picture, or of the median picture without one.
+        1 keeps, at its centre, the resolution of the reference image, or of the median image without one.
     rotate : float
         Degrees that the plane is turned clockwise in the output.
     reference : int, optional
-        Picture whose resolution counts.
+        Image whose resolution counts.
     names : sequence of str, optional
-        What to call the pictures in messages.
+        What to call the images in messages.
     max_stretch : float
-        What a picture shows so many times coarser than the reference picture has no place on the canvas; see
-        :mod:`rdstitch.compositing.near_part`. Without a limit, a picture that shows the horizon is refused.
+        What an image shows so many times coarser than the reference image has no place on the canvas; see
+        :mod:`rdstitch.compositing.near_part`. Without a limit, an image that shows the horizon is refused.
 
     Raises
     ------
     ArgumentError
         When shapes differ, a homography is not finite or singular, or ``scale`` is not positive.
     LimitError
-        When the canvas would be absurd; the text names the picture that makes it so.
+        When the canvas would be absurd; the text names the image that makes it so.
     """
     matrices = np.asarray(homographies, dtype=np.float64)
-    called = [f"picture {k + 1}" for k in range(len(cameras))] if names is None else list(names)
+    called = [f"image {k + 1}" for k in range(len(cameras))] if names is None else list(names)
     _check(cameras, matrices, scale, rotate, called)
     to_plane = [_oriented(c, g) for c, g in zip(cameras, matrices, strict=True)]
     px_per_unit = np.array([_resolution(c, g) for c, g in zip(cameras, to_plane, strict=True)])
@@ -204,7 +204,7 @@ def _check(cameras: Sequence[Camera], matrices: FloatArray, scale: float, rotate
 
 
 def _oriented(camera: Camera, matrix: FloatArray) -> FloatArray:
-    """The homography with the sign that puts the picture, or a part of it, in front of the camera."""
+    """The homography with the sign that puts the image, or a part of it, in front of the camera."""
     flat = camera.normalize(camera.undistort(camera.outline(1)))
     return matrix if (flat @ matrix[2, :2] + matrix[2, 2] > 0).any() else -matrix
 
@@ -214,12 +214,12 @@ def _outline_on_plane(camera: Camera, matrix: FloatArray, near: NearPart | None,
     outline = to_plane(camera, matrix, camera.outline(_POINTS_PER_SIDE) if near is None else near.outline())
     # What is in front of the horizon on the outline is so inside.
     if not len(outline) or not np.isfinite(outline).all():
-        raise LimitError(f"{name}: the horizon crosses the picture; leave it out, or choose another reference picture")
+        raise LimitError(f"{name}: the horizon crosses the image; leave it out, or choose another reference image")
     return outline
 
 
 def _resolution(camera: Camera, matrix: FloatArray) -> float:
-    """Picture pixels per plane unit at the picture's centre, negative where the picture is mirrored."""
+    """Image pixels per plane unit at the image's centre, negative where the image is mirrored."""
     width, height = camera.image_size
     middle = np.array([(width - 1) / 2, (height - 1) / 2])
     left, right, top, bottom = to_plane(camera, matrix, middle + np.array([(-0.5, 0), (0.5, 0), (0, -0.5), (0, 0.5)]))
@@ -229,7 +229,7 @@ def _resolution(camera: Camera, matrix: FloatArray) -> float:
 
 
 def _refuse_mirrored(px_per_unit: FloatArray, names: Sequence[str]) -> None:
-    """Refuse a picture that lies mirrored among the others."""
+    """Refuse an image that lies mirrored among the others."""
     usual = 1.0 if (px_per_unit > 0).sum() * 2 >= len(px_per_unit) else -1.0
     for value, name in zip(px_per_unit, names, strict=True):
         if value * usual < 0:
@@ -239,26 +239,26 @@ def _refuse_mirrored(px_per_unit: FloatArray, names: Sequence[str]) -> None:
 def _refuse_absurd(
     cameras: Sequence[Camera], outlines: Sequence[FloatArray], extent: FloatArray, scale: float, names: Sequence[str]
 ) -> None:
-    """Refuse a canvas, or a picture in it, that is out of all proportion to the input."""
+    """Refuse a canvas, or an image in it, that is out of all proportion to the input."""
     pixels = [c.image_size[0] * c.image_size[1] * scale**2 for c in cameras]
     for outline, own, name in zip(outlines, pixels, names, strict=True):
         growth = float(np.prod(np.ptp(outline, axis=0))) / own
         if growth > _MAX_GROWTH:
             raise LimitError(
                 f"{name}: would be stretched to {growth:.0f} times its size (near the horizon, or wrongly placed); "
-                "leave it out, or choose another reference picture"
+                "leave it out, or choose another reference image"
             )
     if float(np.prod(extent)) > _MAX_GROWTH * sum(pixels):
         middle = np.median([outline.mean(axis=0) for outline in outlines], axis=0)
         farthest = int(np.argmax([np.linalg.norm(outline.mean(axis=0) - middle) for outline in outlines]))
         raise LimitError(
             f"the canvas would have {extent[0]:.0f} x {extent[1]:.0f} pixels, over {_MAX_GROWTH:.0f} times all "
-            f"pictures; {names[farthest]} lies farthest off: leave it out"
+            f"images; {names[farthest]} lies farthest off: leave it out"
         )
 
 
 def refuse_scale(cameras: Sequence[Camera], extent: FloatArray) -> None:
-    """Refuse a scale that leaves nothing of the pictures, or blows them up beyond all sense."""
+    """Refuse a scale that leaves nothing of the images, or blows them up beyond all sense."""
     pixels = sum(c.image_size[0] * c.image_size[1] for c in cameras)
     if float(extent.min()) < 1.0 or float(np.prod(extent)) > _MAX_ENLARGEMENT * pixels:
         raise LimitError(f"the canvas would have {extent[0]:.3g} x {extent[1]:.3g} pixels; use a --scale nearer to 1")

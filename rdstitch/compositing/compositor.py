@@ -1,4 +1,4 @@
-"""The compositor: pictures, cameras and homographies in, one picture out, in memory or in a file."""
+"""The compositor: images, cameras and homographies in, one image out, in memory or in a file."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
@@ -14,7 +14,7 @@ from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.panorama_canvas import photo_sphere_xmp
 from rdstitch.compositing.photometric import Exposure
-from rdstitch.compositing.placed_picture import PlacedPicture
+from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.compositing.tiles import OutputStrip, ShareProgress
@@ -29,18 +29,18 @@ from rdstitch.messages import Message
 
 @dataclass(frozen=True, repr=False)
 class Composite:
-    """The stitched picture.
+    """The stitched image.
 
     Attributes
     ----------
     pixels : ndarray of shape (H, W) or (H, W, C)
-        In the sample type of the pictures, RGB order; 0 where no picture lies.
+        In the sample type of the images, RGB order; 0 where no image lies.
     alpha : ndarray of shape (H, W), uint8
-        255 where a picture lies, else 0.
+        255 where an image lies, else 0.
     canvas : Canvas
         Geometry of ``pixels``, after cropping.
     exposure : Exposure
-        What the pictures were corrected by.
+        What the images were corrected by.
     messages : tuple of Message
         What the user should know, such as why nothing was cropped.
     """
@@ -57,17 +57,17 @@ class Composite:
 
 @dataclass(frozen=True, repr=False)
 class FileComposite:
-    """A stitched picture that went to a file; attributes as of :class:`Composite`.
+    """A stitched image that went to a file; attributes as of :class:`Composite`.
 
     Attributes
     ----------
     path : Path
     coverage : float
-        Share of the output that pictures cover.
+        Share of the output that images cover.
     fingerprint : Fingerprint
         Size and digest of the file.
     seams : SeamMap or None
-        Which picture owns what of the canvas before cropping; None without seams.
+        Which image owns what of the canvas before cropping; None without seams.
     origin : (int, int)
         Where the output begins in that canvas, pixels.
     """
@@ -109,13 +109,13 @@ class OutputFile:
 
 
 def compose(
-    pictures: Sequence[PlacedPicture],
+    images: Sequence[PlacedImage],
     canvas: Canvas,
     options: CompositeOptions | None = None,
     progress: ShareProgress | None = None,
     elsewhere: BlockRunner | None = None,
 ) -> Composite:
-    """Put pictures together on a canvas, in memory.
+    """Put images together on a canvas, in memory.
 
     Parameters
     ----------
@@ -131,11 +131,11 @@ def compose(
     ArgumentError
         When the arguments do not fit together.
     InputError
-        When a picture cannot be read.
+        When an image cannot be read.
     LimitError
         When the memory limit is too low.
     """
-    with prepare_composite(pictures, canvas, options, progress) as prepared:
+    with prepare_composite(images, canvas, options, progress) as prepared:
         renderer, (width, height) = prepared.renderer, prepared.canvas.size
         pixels = np.zeros((height, width, renderer.channels), dtype=renderer.dtype)
         alpha = np.zeros((height, width), dtype=np.uint8)
@@ -150,23 +150,23 @@ def compose(
 
 def compose_to_file(
     file: OutputFile,
-    pictures: Sequence[PlacedPicture],
+    images: Sequence[PlacedImage],
     canvas: Canvas,
     options: CompositeOptions | None = None,
     progress: ShareProgress | None = None,
     elsewhere: BlockRunner | None = None,
 ) -> FileComposite:
-    """Put pictures together straight into a file, whatever its size: memory is that of a strip of tiles.
+    """Put images together straight into a file, whatever its size: memory is that of a strip of tiles.
 
     Parameters
     ----------
-    pictures, canvas, options, progress, elsewhere
+    images, canvas, options, progress, elsewhere
         As for :func:`compose`.
 
     Raises
     ------
     ArgumentError, InputError, LimitError
-        As for :func:`compose`; also LimitError when the picture is too large for the format.
+        As for :func:`compose`; also LimitError when the image is too large for the format.
     OutputError
         When the file cannot be written; nothing is left behind.
     """
@@ -178,7 +178,7 @@ def compose_to_file(
             covered += int(np.count_nonzero(alpha))
             yield samples, alpha
 
-    with prepare_composite(pictures, canvas, options, progress) as prepared:
+    with prepare_composite(images, canvas, options, progress) as prepared:
         renderer, size = prepared.renderer, prepared.canvas.size
         layout = Layout(
             size,

@@ -1,4 +1,4 @@
-"""Cropping: the largest upright rectangle of the canvas that pictures cover without a hole."""
+"""Cropping: the largest upright rectangle of the canvas that images cover without a hole."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.placed_picture import PlacedPicture
+from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.survey import Survey
 from rdstitch.compositing.warp import locate, plan_warps
 
@@ -19,7 +19,7 @@ _MIN_KEPT = 0.25
 
 
 def coverage_map(
-    pictures: Sequence[PlacedPicture], canvas: Canvas, survey: Survey | None = None
+    images: Sequence[PlacedImage], canvas: Canvas, survey: Survey | None = None
 ) -> tuple[NDArray[np.bool_], int]:
     """Which pixels of a reduced canvas are covered, and the reduction; with the masks of a survey if given."""
     if survey is not None:
@@ -33,7 +33,7 @@ def coverage_map(
     factor = max(1, -(-max(canvas.size) // _RESOLUTION))
     small = canvas.reduced(factor)
     covered = np.zeros(small.size[::-1], dtype=np.bool_)
-    for warp in plan_warps(pictures, small):
+    for warp in plan_warps(images, small):
         x0, y0, x1, y1 = warp.box
         covered[y0:y1, x0:x1] |= locate(warp, warp.box).inside
     return covered, factor
@@ -61,7 +61,7 @@ def crop_box(covered: NDArray[np.bool_], factor: int, size: tuple[int, int]) -> 
     x0, y0, x1, y1 = largest_rectangle(cells)
     kept = (x1 - x0) * (y1 - y0) * coarse**2 / max(1, int(covered.sum()))
     if kept < _MIN_KEPT:
-        return None, f"not cropped: the largest rectangle without holes would keep {100 * kept:.0f} % of the picture"
+        return None, f"not cropped: the largest rectangle without holes would keep {100 * kept:.0f} % of the image"
     unit = coarse * factor
     return (x0 * unit, y0 * unit, min(x1 * unit, size[0]), min(y1 * unit, size[1])), ""
 
@@ -84,7 +84,7 @@ def crop_rows(covered: NDArray[np.bool_], factor: int, size: tuple[int, int], wh
     first, last = first + (first > 0), last - (last < len(covered))
     kept = (last - first) * covered.shape[1] / max(1, int(covered.sum()))
     if kept < _MIN_KEPT:
-        return None, f"not cropped: the rows without holes would keep {max(0.0, 100 * kept):.0f} % of the picture"
+        return None, f"not cropped: the rows without holes would keep {max(0.0, 100 * kept):.0f} % of the image"
     return (whole[0], int(first) * factor, whole[2], min(int(last) * factor, size[1])), ""
 
 

@@ -1,13 +1,13 @@
-"""Gain compensation and vignetting correction: pictures agree where they overlap, and keep their own brightness.
+"""Gain compensation and vignetting correction: images agree where they overlap, and keep their own brightness.
 
-Two pictures of one point of the plane differ by gain, vignetting and a smooth field, which are linear in the logarithm
-(:mod:`rdstitch.compositing.photometric`): robust least squares over the cells that two pictures show, of gains and
+Two images of one point of the plane differ by gain, vignetting and a smooth field, which are linear in the logarithm
+(:mod:`rdstitch.compositing.photometric`): robust least squares over the cells that two images show, of gains and
 vignetting first, and then of the fields. What differs for other reasons (parallax, people, the header of a page) is no
 evidence of brightness, however much of it there is that agrees with itself: weights redescend to 0 (Tukey's biweight)
 around the median of each overlap, and a correction is made only where it explains the overlaps better than none.
 
 Gains alone carry the automatic exposure of one end of a flight to the other, where bright ground is then burnt out.
-With "balanced", fields tend to the brightness of each region's own pictures instead, as a photographer would leave it.
+With "balanced", fields tend to the brightness of each region's own images instead, as a photographer would leave it.
 """
 
 from collections.abc import Sequence
@@ -21,22 +21,22 @@ from rdstitch.camera import Camera
 from rdstitch.compositing.options import ExposureMethod
 from rdstitch.compositing.overlap_cells import Cells, compare_overlaps
 from rdstitch.compositing.photometric import Exposure, bilinear_weights, full_scale, no_exposure, squared_radius
-from rdstitch.compositing.placed_picture import PlacedPicture
+from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.survey import Survey
 from rdstitch.scipy_parts import sparse, sparse_linalg
 
 _SRGB_OFFSET = 0.055
-# How well the gains of two pictures can explain their overlap, and how far gains stray (log units): keeps long chains
+# How well the gains of two images can explain their overlap, and how far gains stray (log units): keeps long chains
 # from drifting. The last where the camera has written its exposure down: tone curves and apertures are not exact.
 _PAIR_SIGMA, _GAIN_SIGMA, _EXIF_SIGMA = 0.02, 0.5, 0.15
 # Power of the light that samples follow, for the prior: sRGB above its toe, or raw light.
 _SRGB_POWER = 2.4
 _VIGNETTING_SIGMA, _VIGNETTING_RANGE = 1.0, (0.15, 1.25)
-_NODES = 7  # of a field, along each side of a picture
+_NODES = 7  # of a field, along each side of an image
 _CELL_SIGMA = 0.03  # how well fields can explain the means of a cell, log units
-# How far a picture may stray from its own brightness, or, with gains that hold, from these (log units), and how much a
-# field may rise, and bend, from one side of a picture to the other. Brightness follows the pictures' own over a
-# distance of the first by the third, in pictures.
+# How far an image may stray from its own brightness, or, with gains that hold, from these (log units), and how much a
+# field may rise, and bend, from one side of an image to the other. Brightness follows the images' own over a
+# distance of the first by the third, in images.
 _OWN_SIGMA, _FIELD_SIGMA = 0.02, 0.3
 _RISE_SIGMA, _BEND_SIGMA = 0.1, 0.5
 _TUKEY = 3.0  # standard deviations from which on an error counts for nothing: much of an overlap may be other content
@@ -46,7 +46,7 @@ _ROUNDS = 6
 _MIN_RELATIVE_GAIN = 0.05
 # From here on, as a share of the full range, brightened samples are compressed instead of clipped.
 _KNEE = 0.75
-_MEDIAN_SAMPLES = 400_000  # of all pictures together
+_MEDIAN_SAMPLES = 400_000  # of all images together
 # Residual, as a share of the right side, and decimals that are kept: both far below a grey level.
 _TOLERANCE, _MAX_STEPS, _DECIMALS = 1e-5, 3000, 5
 
@@ -54,34 +54,32 @@ _Prior = tuple["sparse.csr_array", FloatArray, FloatArray]
 """Precision (K, K), its product with what is expected (K, C), and the inverse (B, B) of its blocks."""
 
 
-def estimate_exposure(
-    survey: Survey, pictures: Sequence[PlacedPicture], method: ExposureMethod = "balanced"
-) -> Exposure:
-    """Estimate what makes pictures agree where they overlap, with the median brightness of the set kept.
+def estimate_exposure(survey: Survey, images: Sequence[PlacedImage], method: ExposureMethod = "balanced") -> Exposure:
+    """Estimate what makes images agree where they overlap, with the median brightness of the set kept.
 
     Parameters
     ----------
-    pictures : sequence of PlacedPicture
+    images : sequence of PlacedImage
         The distortion centre is the centre of the vignetting, and the exposure that the camera wrote down is a weak
         prior of the gain.
     method : str
-        "gain": one factor per picture and channel, and one vignetting for all. "blocks": also a smooth field per
-        picture. "balanced": gains and fields that stay near the pictures' own brightness at large scale, and nothing
+        "gain": one factor per image and channel, and one vignetting for all. "blocks": also a smooth field per
+        image. "balanced": gains and fields that stay near the images' own brightness at large scale, and nothing
         is clipped.
 
     Returns
     -------
     Exposure
-        Without any correction where none makes pictures agree better.
+        Without any correction where none makes images agree better.
     """
     present, cells = [tile for tile in survey.tiles if tile is not None], compare_overlaps(survey)
     integer = any(tile.pixels.dtype.kind == "u" for tile in present)
     if cells is None or not cells.clear.any():
-        return no_exposure(len(pictures), present[0].pixels.shape[2] if present else 1)
+        return no_exposure(len(images), present[0].pixels.shape[2] if present else 1)
     responses = [_Differences.of(cells, b) for b in ((_SRGB_OFFSET, 0.0) if integer else (0.0,))]
-    fits = [(*_fit(data, pictures), data) for data in responses]
+    fits = [(*_fit(data, images), data) for data in responses]
     exposure, errors, data = min(fits, key=lambda fit: fit[0].rms_after)
-    cameras = [picture.camera for picture in pictures]
+    cameras = [image.camera for image in images]
     if method != "gain":
         fields, errors = _fit_fields(cells, errors, cameras, exposure.log_gain, balanced=method == "balanced")
         exposure = replace(exposure, fields=fields, rms_after=data.misfit(errors))
@@ -93,7 +91,7 @@ def estimate_exposure(
 
 @dataclass(frozen=True)
 class _Differences:
-    """What the first picture of each cell is brighter by, log units, for one response of the camera.
+    """What the first image of each cell is brighter by, log units, for one response of the camera.
 
     Attributes
     ----------
@@ -120,16 +118,16 @@ class _Differences:
         return float(np.exp(np.log(size[self.cells.clear]).mean()))
 
 
-def _fit(data: _Differences, pictures: Sequence[PlacedPicture]) -> tuple[Exposure, FloatArray]:
+def _fit(data: _Differences, images: Sequence[PlacedImage]) -> tuple[Exposure, FloatArray]:
     """Gains, and vignetting where it explains the data better; and the errors."""
-    cells, prior = data.cells, _gain_prior(pictures, data.offset)
+    cells, prior = data.cells, _gain_prior(images, data.offset)
     radius2 = np.empty((2, len(data.level)))
-    for end, picture, chosen in cells.by_picture():
-        radius2[end, chosen] = squared_radius(pictures[picture].camera, cells.points[end, chosen])
+    for end, image, chosen in cells.by_image():
+        radius2[end, chosen] = squared_radius(images[image].camera, cells.points[end, chosen])
     powers = np.stack([radius2[0] ** k - radius2[1] ** k for k in (1, 2, 3)], axis=1)
     gains, errors = _fit_gains(cells, data.values, powers[:, :0], prior)
     exposure = Exposure(data.offset, gains, rms_before=data.misfit(data.values), rms_after=data.misfit(errors))
-    coefficients = _fit_gains(cells, data.values, powers, prior)[0][len(pictures) :].mean(axis=1)
+    coefficients = _fit_gains(cells, data.values, powers, prior)[0][len(images) :].mean(axis=1)
     gains, flat = _fit_gains(cells, data.values - (powers @ coefficients)[:, None], powers[:, :0], prior)
     profile = np.exp(np.linspace(0.0, 1.0, 20)[:, None] ** (1, 2, 3) @ coefficients)
     possible = profile.min() > _VIGNETTING_RANGE[0] and profile.max() < _VIGNETTING_RANGE[1]
@@ -138,9 +136,9 @@ def _fit(data: _Differences, pictures: Sequence[PlacedPicture]) -> tuple[Exposur
     return exposure, errors
 
 
-def _gain_prior(pictures: Sequence[PlacedPicture], offset: float) -> tuple[FloatArray, FloatArray]:
-    """Expected log gain of each picture, and its precision (N,): from the exposures where two or more are known."""
-    light = np.array([np.log(p.exposure) if p.exposure and p.exposure > 0.0 else np.nan for p in pictures])
+def _gain_prior(images: Sequence[PlacedImage], offset: float) -> tuple[FloatArray, FloatArray]:
+    """Expected log gain of each image, and its precision (N,): from the exposures where two or more are known."""
+    light = np.array([np.log(p.exposure) if p.exposure and p.exposure > 0.0 else np.nan for p in images])
     known = np.isfinite(light)
     if known.sum() < 2:
         return np.zeros(len(light)), np.full(len(light), _GAIN_SIGMA**-2)
@@ -153,7 +151,7 @@ def _fit_gains(
 ) -> tuple[FloatArray, FloatArray]:
     """Gains (N, C) and below them the coefficients of further columns (M, K), and the errors (M, C)."""
     (mean, precision), (rows, extra) = prior, radial.shape
-    signed = np.tile([1.0, -1.0], rows), cells.pictures.T.ravel(), 2 * np.arange(rows + 1)
+    signed = np.tile([1.0, -1.0], rows), cells.images.T.ravel(), 2 * np.arange(rows + 1)
     design = sparse.hstack([sparse.csr_array(signed, shape=(rows, len(mean))), sparse.csr_array(radial)])
     # Clipped samples say nothing of gains, and a pair counts as one measurement however many cells it has.
     clear = cells.clear
@@ -169,12 +167,12 @@ def _fit_fields(
     """Fields (N, B, B, C) beside gains and vignetting, and the errors (M, C)."""
     (rows, channels), nodes = values.shape, _NODES**2
     columns, entries = np.empty((rows, 2, 4), dtype=np.intp), np.empty((rows, 2, 4))
-    for end, picture, chosen in cells.by_picture():
-        places, shares = bilinear_weights(cameras[picture], cells.points[end, chosen], _NODES)
-        columns[chosen, end], entries[chosen, end] = picture * nodes + places, (1 - 2 * end) * shares
+    for end, image, chosen in cells.by_image():
+        places, shares = bilinear_weights(cameras[image], cells.points[end, chosen], _NODES)
+        columns[chosen, end], entries[chosen, end] = image * nodes + places, (1 - 2 * end) * shares
     shape = (rows, len(cameras) * nodes)
     design = sparse.csr_array((entries.ravel(), columns.ravel(), 8 * np.arange(rows + 1)), shape=shape)
-    # What one picture alone is brighter by is to vanish: neighbours count by the share that they have in common.
+    # What one image alone is brighter by is to vanish: neighbours count by the share that they have in common.
     around = cells.overlap + sparse.eye_array(len(cameras))
     wanted = -(around @ log_gain) / around.sum(axis=1)[:, None] if balanced else np.zeros_like(log_gain)
     near = (_OWN_SIGMA if balanced else _FIELD_SIGMA) ** -2 / nodes
@@ -186,7 +184,7 @@ def _fit_fields(
 
 
 def _evenness() -> FloatArray:
-    """Precision of the nodes of one picture: fields rise and bend little."""
+    """Precision of the nodes of one image: fields rise and bend little."""
     total, one = np.zeros((_NODES**2, _NODES**2)), np.eye(_NODES)
     for order, sigma in ((1, _RISE_SIGMA), (2, _BEND_SIGMA)):
         step = np.diff(one, order, axis=0) * (_NODES - 1) ** order
@@ -219,7 +217,7 @@ def _fit_robustly(
 def _solve(
     design: "sparse.csr_array", weight: FloatArray, values: FloatArray, prior: _Prior, start: FloatArray
 ) -> FloatArray:
-    """Weighted least squares with a prior, by conjugate gradients, in memory that grows with the number of pictures."""
+    """Weighted least squares with a prior, by conjugate gradients, in memory that grows with the number of images."""
     precision, expected, inverse = prior
     shape = (design.shape[1],) * 2
 

@@ -1,4 +1,4 @@
-"""What takes the place of transparent pixels, and how opacity rises from them; some rows of a picture at a time."""
+"""What takes the place of transparent pixels, and how opacity rises from them; some rows of an image at a time."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -16,7 +16,7 @@ OPACITY_BYTES = 2
 """Bytes of a pixel's opacity."""
 
 _ROWS = 256
-# How far, pixels, samples are certainly those of the nearest opaque pixel: blending reaches so far at a picture's own
+# How far, pixels, samples are certainly those of the nearest opaque pixel: blending reaches so far at an image's own
 # scale. Where it reaches farther, these weigh next to nothing, and are of an opaque pixel all the same.
 _REACH = 64
 # Share of the shorter side over which the weight rises from the border of a mask.
@@ -70,7 +70,7 @@ def _windows(height: int, reach: int) -> Iterator[tuple[slice, slice]]:
 
 
 def _from_nearest(pixels: NDArray[Any], opaque: BoolImage, rows: slice) -> NDArray[Any]:
-    """Some rows of a part of a picture that has opaque pixels, where it is transparent with those of the nearest."""
+    """Some rows of a part of an image that has opaque pixels, where it is transparent with those of the nearest."""
     hidden = (~opaque).view(np.uint8)
     _, labels = cv2.distanceTransformWithLabels(hidden, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     # The nearest opaque pixel of a transparent one touches a transparent one itself.

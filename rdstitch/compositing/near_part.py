@@ -1,9 +1,9 @@
-"""What of an oblique picture is drawn: its near part, which is not much coarser than the reference picture.
+"""What of an oblique image is drawn: its near part, which is not much coarser than the reference image.
 
 A plane seen obliquely gets coarser towards the horizon, along the line of sight with the square of the distance. The
-distance is one over the third coordinate of ``G p``, undistorted points p of the picture mapped to the plane; so a
+distance is one over the third coordinate of ``G p``, undistorted points p of the image mapped to the plane; so a
 limit on the stretch is, in undistorted coordinates, a straight line parallel to the horizon. Beyond it nothing is
-drawn. What the lens itself stretches, towards the corners of a wide-angle picture, does not count.
+drawn. What the lens itself stretches, towards the corners of a wide-angle image, does not count.
 """
 
 from collections.abc import Sequence
@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera, points_over
-from rdstitch.io.read import Picture
+from rdstitch.io.read import DecodedImage
 
-_PROBES = 33  # points of a grid over the picture, a side, at which the stretch is measured
+_PROBES = 33  # points of a grid over the image, a side, at which the stretch is measured
 _POINTS_PER_SIDE = 64  # as the canvas samples outlines: undistorted, straight sides are curved
 _ROWS = 64  # rows of a mask that are computed at a time, so that they stay in the processor's cache
 
 
 @dataclass(frozen=True)
 class NearPart:
-    """The part of a picture that is drawn.
+    """The part of an image that is drawn.
 
     Attributes
     ----------
@@ -52,15 +52,15 @@ class NearPart:
         kept = border[: last + 1][inside[: last + 1]]
         return np.concatenate([kept, measured[np.isfinite(measured).all(axis=1)]])
 
-    def masked(self, picture: Picture) -> Picture:
-        """The picture, whole or reduced, with the rest transparent."""
-        height, width = picture.pixels.shape[:2]
+    def masked(self, image: DecodedImage) -> DecodedImage:
+        """The image, whole or reduced, with the rest transparent."""
+        height, width = image.pixels.shape[:2]
         shown = self._shown(width, height)
-        alpha = np.where(shown, np.uint8(255) if picture.alpha is None else picture.alpha, np.uint8(0))
-        return replace(picture, alpha=alpha)
+        alpha = np.where(shown, np.uint8(255) if image.alpha is None else image.alpha, np.uint8(0))
+        return replace(image, alpha=alpha)
 
     def _shown(self, width: int, height: int) -> NDArray[np.bool_]:
-        """Which pixels of the picture at a size are drawn; in measured coordinates the limit is a conic."""
+        """Which pixels of the image at a size are drawn; in measured coordinates the limit is a conic."""
         camera = self.camera.resized((width, height))
         x = (np.arange(width) - camera.center[0]) / camera.half_diagonal
         shown = np.empty((height, width), dtype=np.bool_)
@@ -89,16 +89,16 @@ class NearPart:
 def near_parts(
     cameras: Sequence[Camera], homographies: Sequence[FloatArray], resolution: float, max_stretch: float
 ) -> list[NearPart | None]:
-    """What of each picture is drawn; None for all of it.
+    """What of each image is drawn; None for all of it.
 
     Parameters
     ----------
     homographies : sequence of ndarray of shape (3, 3)
         Normalized undistorted coordinates to the plane, with positive third coordinates in front of the camera.
     resolution : float
-        Canvas pixels per unit of the plane at which the reference picture keeps its size.
+        Canvas pixels per unit of the plane at which the reference image keeps its size.
     max_stretch : float
-        How many times coarser than the reference picture, or than its own finest part where that is coarser, a picture
+        How many times coarser than the reference image, or than its own finest part where that is coarser, an image
         may be.
     """
     parts: list[NearPart | None] = []
@@ -116,7 +116,7 @@ def near_parts(
 
 
 def _stretch(camera: Camera, matrix: FloatArray, resolution: float) -> tuple[FloatArray, FloatArray]:
-    """Canvas pixels per undistorted pixel, in the direction in which they are most, and depth, over a picture (K,)."""
+    """Canvas pixels per undistorted pixel, in the direction in which they are most, and depth, over an image (K,)."""
     flat = camera.normalize(camera.undistort(points_over(camera.image_size, _PROBES)))
     flat = flat[np.isfinite(flat).all(axis=1)]  # a fisheye may see beyond its horizon
     moved = flat @ matrix[:, :2].T + matrix[:, 2]

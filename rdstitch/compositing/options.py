@@ -1,4 +1,4 @@
-"""How pictures are put together."""
+"""How images are put together."""
 
 import math
 from dataclasses import dataclass, fields
@@ -22,31 +22,31 @@ class CompositeOptions:
     Attributes
     ----------
     exposure : str
-        Gain compensation. "balanced" makes pictures agree where they overlap, keeps every region near the brightness of
-        its own pictures, and clips nothing; "gain" makes the whole comparable, with one factor per picture and channel
-        and one vignetting for all; "blocks" adds a smooth field per picture to that; "none" is for people who measure.
+        Gain compensation. "balanced" makes images agree where they overlap, keeps every region near the brightness of
+        its own images, and clips nothing; "gain" makes the whole comparable, with one factor per image and channel
+        and one vignetting for all; "blocks" adds a smooth field per image to that; "none" is for people who measure.
     seam : str
-        Where one picture ends and the next begins: "graphcut" goes round what differs between them (parallax,
+        Where one image ends and the next begins: "graphcut" goes round what differs between them (parallax,
         people), "voronoi" where their borders are equally far, "none" leaves it to the blending.
     blend : str
         "multiband" hides the seam over a width that suits each size of detail, "feather" averages over a
         strip along the seam (without seams: over the whole overlap), "none" cuts.
     crop : str
         "none"; "auto" cuts to the largest upright rectangle without holes, where that keeps a fair part of the
-        picture.
+        image.
     projection : str
-        How pictures taken by turning on the spot are laid out: "plane", "cylinder", "sphere" (equirectangular),
+        How images taken by turning on the spot are laid out: "plane", "cylinder", "sphere" (equirectangular),
         "mercator", or "auto": the plane up to a view of 90 degrees, the cylinder for what is wide and low, the sphere
-        for the rest. Pictures of a plane stay on it.
+        for the rest. Images of a plane stay on it.
     scale : float
-        Factor to the size of the output; 1 keeps the resolution of the reference picture, or the median one, at its
+        Factor to the size of the output; 1 keeps the resolution of the reference image, or the median one, at its
         centre.
     max_size : int, optional
         Longest side of the output, pixels; None: as ``scale`` makes it.
     quality : int
         Quality of JPEG and WebP, 1 to 100.
     max_stretch : float
-        What a picture shows so many times coarser than the reference picture is not drawn.
+        What an image shows so many times coarser than the reference image is not drawn.
     rotate : float
         Degrees that the output is turned clockwise; other than 0, north is not turned up.
     north_up : bool
@@ -56,14 +56,14 @@ class CompositeOptions:
     epsg : int, optional
         Code of the map's coordinate system; None: UTM on WGS 84. Others need the extra ``crs``.
     max_memory : int, optional
-        Bytes that the compositor may hold in pictures and tiles; None: a quarter of the memory that is
+        Bytes that the compositor may hold in images and tiles; None: a quarter of the memory that is
         available, at least 400 MB, or more where the canvas needs it.
     interpolation : str
         Kernel of the one resampling: "linear", "cubic" or "lanczos".
     background : int
-        Grey of what no picture covers, in formats without transparency: 0 black, 255 white.
+        Grey of what no image covers, in formats without transparency: 0 black, 255 white.
     bands : int, optional
-        Bands of "multiband"; the widest transition is about 2**bands pixels. None: by the size of the pictures.
+        Bands of "multiband"; the widest transition is about 2**bands pixels. None: by the size of the images.
     tile_size : int, optional
         Side of the square tiles that the canvas is worked on in, pixels, a multiple of 256; None: 512 where
         memory allows. It does not change the result.

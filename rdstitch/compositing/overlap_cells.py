@@ -1,4 +1,4 @@
-"""What overlapping pictures say of their light: means of the cells that two of them show."""
+"""What overlapping images say of their light: means of the cells that two of them show."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from rdstitch.compositing.photometric import full_scale
 from rdstitch.compositing.survey import Survey
 from rdstitch.scipy_parts import sparse
 
-# Along the longest side of a picture or an overlap, and of all overlaps together: of thousands, each needs fewer.
+# Along the longest side of an image or an overlap, and of all overlaps together: of thousands, each needs fewer.
 _CELLS, _MAX_CELLS = 16, 150_000
 _SAMPLES = 12  # along a side of a cell
 # Integer samples outside this part of the range are clipped or mostly noise.
@@ -22,25 +22,25 @@ _DARKEST, _BRIGHTEST = 0.02, 0.97
 
 @dataclass(frozen=True)
 class Cells:
-    """Cells that two pictures show.
+    """Cells that two images show.
 
     Attributes
     ----------
     pair : ndarray of shape (M,)
         Index of the overlap, ascending.
-    pictures : ndarray of shape (2, M)
+    images : ndarray of shape (2, M)
     points : ndarray of shape (2, M, 2)
-        Middle of the cell, measured pixels of either picture.
+        Middle of the cell, measured pixels of either image.
     values : ndarray of shape (2, M, C)
         Mean samples, share of the full range.
     clipped : ndarray of shape (2, M), bool
-        Where a picture is burnt out: its light is what the samples say, or more. Other cells hold no clipped sample.
+        Where an image is burnt out: its light is what the samples say, or more. Other cells hold no clipped sample.
     overlap : sparse array of shape (N, N)
-        What two pictures have in common, share of the smaller one.
+        What two images have in common, share of the smaller one.
     """
 
     pair: IntArray
-    pictures: IntArray
+    images: IntArray
     points: FloatArray
     values: FloatArray
     clipped: BoolArray
@@ -48,19 +48,19 @@ class Cells:
 
     @property
     def clear(self) -> BoolArray:
-        """Cells (M,) where neither picture is burnt out."""
+        """Cells (M,) where neither image is burnt out."""
         return np.asarray(~self.clipped.any(axis=0))
 
-    def by_picture(self) -> Iterator[tuple[int, int, IntArray]]:
-        """Side (0 or 1), picture, and its cells."""
-        for side, pictures in enumerate(self.pictures):
-            order = np.argsort(pictures, kind="stable")
-            for cells in np.split(order, np.flatnonzero(np.diff(pictures[order])) + 1):
-                yield side, int(pictures[cells[0]]), cells
+    def by_image(self) -> Iterator[tuple[int, int, IntArray]]:
+        """Side (0 or 1), image, and its cells."""
+        for side, images in enumerate(self.images):
+            order = np.argsort(images, kind="stable")
+            for cells in np.split(order, np.flatnonzero(np.diff(images[order])) + 1):
+                yield side, int(images[cells[0]]), cells
 
 
 def compare_overlaps(survey: Survey) -> Cells | None:
-    """Compare all pictures that lie over each other; None where no two show the same."""
+    """Compare all images that lie over each other; None where no two show the same."""
     pairs, count = survey.pairs(), len(survey.tiles)
     shares, found = np.zeros(len(pairs)), []
     for index, (i, j) in enumerate(pairs.tolist()):
@@ -85,10 +85,10 @@ def compare_overlaps(survey: Survey) -> Cells | None:
     overlap = sparse.csr_array((shares, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     clipped, points = means[:, -2:].T > 0.5, np.empty((2, len(pair), 2))
     cells = Cells(pair, pairs[pair].T, points, values, clipped, sparse.csr_array(overlap + overlap.T))
-    for end, picture, chosen in cells.by_picture():
-        points[end, chosen] = survey.warps[picture].source_points(*means[chosen, :2].T)
+    for end, image, chosen in cells.by_image():
+        points[end, chosen] = survey.warps[image].source_points(*means[chosen, :2].T)
     known = np.isfinite(points).all(axis=(0, 2))
-    parts = (cells.pictures[:, known], points[:, known], values[:, known], clipped[:, known])
+    parts = (cells.images[:, known], points[:, known], values[:, known], clipped[:, known])
     return Cells(pair[known], *parts, cells.overlap)
 
 

@@ -1,4 +1,4 @@
-"""The canvas of pictures taken by turning on the spot: projection, size, a full turn, Photo Sphere XMP."""
+"""The canvas of images taken by turning on the spot: projection, size, a full turn, Photo Sphere XMP."""
 
 import math
 from collections.abc import Sequence
@@ -34,12 +34,12 @@ _PROPERTIES = (
 
 @dataclass(frozen=True)
 class SeenDirections:
-    """What pictures show of the directions around their centre.
+    """What images show of the directions around their centre.
 
     Attributes
     ----------
     outlines : tuple of ndarray of shape (K, 2)
-        Longitude and latitude of each picture's border, radians; longitudes without a jump, around that of the picture.
+        Longitude and latitude of each image's border, radians; longitudes without a jump, around that of the image.
     around : bool
         Whether they go all the way round.
     start : float
@@ -64,12 +64,12 @@ class SeenDirections:
 
 
 def seen_directions(cameras: Sequence[Camera], directions: FloatArray) -> SeenDirections:
-    """What pictures show.
+    """What images show.
 
     Parameters
     ----------
     directions : ndarray of shape (N, 3, 3)
-        From undistorted normalized coordinates of each picture to directions.
+        From undistorted normalized coordinates of each image to directions.
     """
     outlines = [_outline(camera, matrix) for camera, matrix in zip(cameras, directions, strict=True)]
     low = np.array([outline[:, 0].min() for outline in outlines])
@@ -110,33 +110,33 @@ def plan_panorama(
     names: Sequence[str] | None = None,
     max_stretch: float = math.inf,
 ) -> Canvas:
-    """Plan the canvas that holds every picture of a panorama.
+    """Plan the canvas that holds every image of a panorama.
 
     Parameters
     ----------
     directions : ndarray of shape (N, 3, 3)
-        From undistorted normalized coordinates of each picture to directions.
+        From undistorted normalized coordinates of each image to directions.
     projection : str
         "plane", "cylinder", "sphere", "mercator", or "auto": what suits the field of view.
     scale, rotate, reference, names
         As for :func:`rdstitch.compositing.plan_canvas`.
     max_stretch : float
         What the projection would stretch more than so many times has no place on the canvas: the ends of a plane, the
-        top and the bottom of a cylinder. Without a limit, pictures that look too far up or down are refused.
+        top and the bottom of a cylinder. Without a limit, images that look too far up or down are refused.
 
     Raises
     ------
     ArgumentError
         When a panorama that goes all the way round should be turned.
     LimitError
-        When a picture looks farther than the projection shows, or the canvas would be absurd.
+        When an image looks farther than the projection shows, or the canvas would be absurd.
     """
     seen = seen_directions(cameras, directions)
     chosen = choose_projection(seen) if projection == "auto" else Projection(projection)
     if chosen == PLANE:
         how: dict[str, Any] = {"scale": scale, "rotate": rotate, "reference": reference, "names": names}
         return plan_canvas(cameras, directions, max_stretch=max_stretch, **how)
-    called = [f"picture {k + 1}" for k in range(len(cameras))] if names is None else list(names)
+    called = [f"image {k + 1}" for k in range(len(cameras))] if names is None else list(names)
     lengths = np.linalg.norm(directions, axis=1)
     focal = lengths[:, 2] / lengths[:, 0] * [camera.half_diagonal for camera in cameras]
     resolution = scale * float(np.median(focal) if reference is None else focal[reference])
@@ -173,7 +173,7 @@ def _lay_out(
     rotate : float
         Degrees that the output is turned clockwise.
     names : sequence of str
-        What to call the pictures in messages.
+        What to call the images in messages.
     """
     for outline, name in zip(seen.outlines, names, strict=True):
         if projection.name != "sphere" and np.abs(outline[:, 1]).max() > projection.largest_latitude:
@@ -199,7 +199,7 @@ def _lay_out(
 
 
 def _outline(camera: Camera, matrix: FloatArray) -> FloatArray:
-    """Longitude and latitude (K, 2) of a picture's border, and of the pole that it shows with all longitudes."""
+    """Longitude and latitude (K, 2) of an image's border, and of the pole that it shows with all longitudes."""
     rays = to_directions(camera, matrix, camera.outline(_POINTS_PER_SIDE))
     ahead = matrix[:, 2]
     middle = math.atan2(ahead[0], ahead[2])
@@ -215,16 +215,16 @@ def _outline(camera: Camera, matrix: FloatArray) -> FloatArray:
 
 
 def _shows(camera: Camera, matrix: FloatArray, directions: FloatArray) -> BoolArray:
-    """Which directions (K, 3) a picture shows."""
+    """Which directions (K, 3) an image shows."""
     flat = project(directions @ np.asarray(np.linalg.inv(matrix), dtype=np.float64).T)
     points, (width, height) = camera.distort(camera.denormalize(flat)), camera.image_size
     return np.asarray(((points >= -0.5) & (points <= (width - 0.5, height - 0.5))).all(axis=1))
 
 
 def _gap_between(cameras: Sequence[Camera], directions: FloatArray) -> float | None:
-    """Middle of the widest range of longitudes that no picture shows at their middle latitude; None if there is none.
+    """Middle of the widest range of longitudes that no image shows at their middle latitude; None if there is none.
 
-    A full turn that is not quite closed has such a gap even where the corners of pictures meet above and below it.
+    A full turn that is not quite closed has such a gap even where the corners of images meet above and below it.
     """
     ahead = directions[:, :, 2]
     latitude = float(np.median(np.arctan2(ahead[:, 1], np.hypot(ahead[:, 0], ahead[:, 2]))))
@@ -259,7 +259,7 @@ def _widest_gap(low: FloatArray, high: FloatArray) -> float | None:
 
 
 def directions_on(canvas: Canvas, points: FloatArray) -> FloatArray:
-    """Directions (N, 3), of length 1, of canvas pixels (N, 2) of pictures taken by turning on the spot."""
+    """Directions (N, 3), of length 1, of canvas pixels (N, 2) of images taken by turning on the spot."""
     places = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(canvas.matrix).T
     parts = canvas.projection.directions(places[:, 0], places[:, 1])
     directions = np.stack(np.broadcast_arrays(*parts), axis=-1)
@@ -290,9 +290,9 @@ def center_of_view(canvas: Canvas) -> tuple[float, float]:
 
 
 def photo_sphere_xmp(canvas: Canvas) -> bytes:
-    """XMP packet (GPano) by which viewers recognize an equirectangular picture and turn it; empty for others.
+    """XMP packet (GPano) by which viewers recognize an equirectangular image and turn it; empty for others.
 
-    The metadata of Google's Photo Sphere, which also describes pictures that are only a part of the sphere.
+    The metadata of Google's Photo Sphere, which also describes images that are only a part of the sphere.
     """
     upright = canvas.matrix[0, 1] == 0.0 and canvas.matrix[1, 0] == 0.0
     if canvas.projection.name != "sphere" or not upright:

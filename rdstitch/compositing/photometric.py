@@ -1,12 +1,12 @@
-"""The photometric model: by what the samples of each picture are multiplied, so that all have one exposure.
+"""The photometric model: by what the samples of each image are multiplied, so that all have one exposure.
 
 Light ``L`` gives the sample ``v = full ((1 + b) L^(1/p) - b)``: sRGB above its toe for ``b`` = 0.055, any power law,
 and so also raw light, for ``b`` = 0. A factor on the light is then a factor ``q`` on ``v + b``, whatever the power, and
 
     log(v + b) = log q_i + a1 r² + a2 r⁴ + a3 r⁶ + f_i(u, v) + log(light of that point of the plane)
 
-is linear in all unknowns: ``q_i`` per picture and channel, the vignetting ``a`` of the lens over the distance r from
-the distortion centre, and a smooth field ``f_i`` per picture.
+is linear in all unknowns: ``q_i`` per image and channel, the vignetting ``a`` of the lens over the distance r from
+the distortion centre, and a smooth field ``f_i`` per image.
 """
 
 from collections.abc import Sequence
@@ -31,23 +31,23 @@ _DEPTHS = {"uint8": cv2.CV_8U, "uint16": cv2.CV_16U, "float32": cv2.CV_32F}
 
 @dataclass(frozen=True)
 class Exposure:
-    """What every picture's samples are multiplied by: ``v' = q (v + b) - b``.
+    """What every image's samples are multiplied by: ``v' = q (v + b) - b``.
 
     Attributes
     ----------
     offset : float
         ``b``, share of the full range.
     log_gain : ndarray of shape (N, C)
-        log of what picture i is brighter by than the average.
+        log of what image i is brighter by than the average.
     vignetting : ndarray of shape (3,)
         Coefficients of r², r⁴, r⁶ in log(v + b); r in half diagonals from the distortion centre.
     fields : ndarray of shape (N, B, B, C), or (N, 0, 0, C)
-        Smooth remainder on a grid over each picture (rows, columns), log of what the picture is brighter by there.
+        Smooth remainder on a grid over each image (rows, columns), log of what the image is brighter by there.
     knee : float
         Share of the full range from which brightened samples are compressed, so that full scale stays full scale and
         nothing else gets there; 1: they are clipped.
     rms_before, rms_after : float
-        Robust difference between overlapping pictures, share of the full range.
+        Robust difference between overlapping images, share of the full range.
     """
 
     offset: float
@@ -58,9 +58,9 @@ class Exposure:
     rms_before: float = 0.0
     rms_after: float = 0.0
 
-    def part(self, pictures: Sequence[int]) -> "Exposure":
-        """The same for some of the pictures."""
-        chosen = list(pictures)
+    def part(self, images: Sequence[int]) -> "Exposure":
+        """The same for some of the images."""
+        chosen = list(images)
         fields = self.fields[chosen] if self.fields.size else self.fields
         return replace(self, log_gain=self.log_gain[chosen], fields=fields)
 
@@ -75,7 +75,7 @@ class Exposure:
         return np.asarray(log, dtype=np.float64)
 
     def correct(self, index: int, geometry: Geometry, pixels: NDArray[Any]) -> NDArray[Any]:
-        """Resampled pixels (h, w, C) of picture ``index``, as if all were exposed alike.
+        """Resampled pixels (h, w, C) of image ``index``, as if all were exposed alike.
 
         In the type of the pixels. Each depends on nothing but itself: every box gives the same, bit for bit.
         """
@@ -134,7 +134,7 @@ class Exposure:
         camera = geometry.warp.camera
         width, height = camera.image_size
         points = geometry.lattice.nodes(geometry.box, _LATTICE).astype(np.float64)
-        # Outside the picture only mirrored content is corrected; the model must not run away there.
+        # Outside the image only mirrored content is corrected; the model must not run away there.
         points = np.clip(points, -0.5, (width - 0.5, height - 0.5))
         return np.exp(-self.smooth_part(index, camera, points)).astype(np.float32)
 
@@ -155,7 +155,7 @@ def squared_radius(camera: Camera, points: FloatArray) -> FloatArray:
 
 
 def bilinear_weights(camera: Camera, points: FloatArray, side: int) -> tuple[NDArray[np.intp], FloatArray]:
-    """Interpolation on a grid of ``side`` x ``side`` nodes over a picture: four nodes (..., 4) and their shares."""
+    """Interpolation on a grid of ``side`` x ``side`` nodes over an image: four nodes (..., 4) and their shares."""
     return nodes_around((np.asarray(points) + 0.5) / camera.image_size * (side - 1), (side, side))
 
 

@@ -32,14 +32,14 @@ class CompositePlan:
     ----------
     canvas_size : (int, int)
         pixels, before cropping.
-    pictures : int
+    images : int
     tile_size : int
         pixels.
     workers : int
         Tiles at one time.
     bands : int
     cache_bytes : int
-        For pictures held.
+        For images held.
     memory_bytes : int
         Estimate of all that the compositor holds at one time.
     output_bytes : int
@@ -49,7 +49,7 @@ class CompositePlan:
     """
 
     canvas_size: tuple[int, int]
-    pictures: int
+    images: int
     tile_size: int
     workers: int
     bands: int
@@ -73,7 +73,7 @@ def plan_composite(
     Parameters
     ----------
     channels, itemsize : int
-        Channels and bytes per sample of the pictures.
+        Channels and bytes per sample of the images.
     masked : bool
         Whether some have transparent parts, or else only those of which the canvas has the near part.
 
@@ -85,13 +85,13 @@ def plan_composite(
     bands = options.bands or usual_bands(cameras)
     limit = options.max_memory or default_memory()
     opacity = OPACITY_BYTES if masked or any(part is not None for part in canvas.near) else 0
-    picture = max(c.image_size[0] * c.image_size[1] for c in cameras) * (channels * itemsize + opacity)
-    # While a picture is decoded it is there twice, beside those in the cache.
+    image = max(c.image_size[0] * c.image_size[1] for c in cameras) * (channels * itemsize + opacity)
+    # While an image is decoded it is there twice, beside those in the cache.
     workers = options.workers or min(_MAX_WORKERS, processor_count())
     sides = _TILE_SIZES if options.tile_size is None else (options.tile_size,)
     choices = [(side, count) for side in sides for count in range(workers, 0, -1)]
     needs = {
-        choice: 2 * picture + _working_set(canvas, *choice, bands, options, channels, itemsize) for choice in choices
+        choice: 2 * image + _working_set(canvas, *choice, bands, options, channels, itemsize) for choice in choices
     }
     least = min(needs, key=lambda choice: needs[choice])
     if options.max_memory is not None and needs[least] > limit:
@@ -99,8 +99,8 @@ def plan_composite(
             f"{limit / 2**20:.0f} MB are too little: this canvas needs {needs[least] / 2**20:.0f} MB; "
             "raise --max-memory or use a smaller --scale"
         )
-    chosen = next((choice for choice in choices if needs[choice] + picture <= limit), least)
-    cache = max(picture, limit - needs[chosen])
+    chosen = next((choice for choice in choices if needs[choice] + image <= limit), least)
+    cache = max(image, limit - needs[chosen])
     width, height = canvas.size
     megapixels_in = sum(c.image_size[0] * c.image_size[1] for c in cameras) / 1e6
     return CompositePlan(
@@ -109,7 +109,7 @@ def plan_composite(
         *chosen,
         bands,
         cache,
-        needs[chosen] + min(cache, picture * len(cameras)),
+        needs[chosen] + min(cache, image * len(cameras)),
         width * height * (channels * itemsize + 1),
         _SECONDS_OUT * width * height / 1e6 + _SECONDS_IN * megapixels_in,
     )
@@ -121,7 +121,7 @@ def default_memory() -> int:
 
 
 def usual_bands(cameras: Sequence[Camera]) -> int:
-    """Bands that suit the smallest picture: the widest transition is a few per cent of its side."""
+    """Bands that suit the smallest image: the widest transition is a few per cent of its side."""
     side = min(min(c.image_size) for c in cameras)
     return int(np.clip(np.log2(max(side, 1)) - 4.5, 1, _MAX_BANDS))
 

@@ -1,4 +1,4 @@
-"""From what is decided on small pictures, exposure, seams and crop, to strips of the output at full size."""
+"""From what is decided on small images, exposure, seams and crop, to strips of the output at full size."""
 
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -11,15 +11,15 @@ from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.crop import coverage_map, crop_box, crop_rows
 from rdstitch.compositing.gain_compensation import estimate_exposure
-from rdstitch.compositing.image_cache import PictureCache
+from rdstitch.compositing.image_cache import ImageCache
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photometric import no_exposure
-from rdstitch.compositing.placed_picture import PlacedPicture
+from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.plan import CompositePlan, plan_composite
 from rdstitch.compositing.render import Renderer
 from rdstitch.compositing.seam_finder import find_seams
-from rdstitch.compositing.source_images import PictureReader
-from rdstitch.compositing.survey import survey_factor, survey_pictures
+from rdstitch.compositing.source_images import ImageReader
+from rdstitch.compositing.survey import survey_factor, survey_images
 from rdstitch.compositing.tiles import OutputStrip, ShareProgress, TiledOutput
 from rdstitch.compositing.warp import LATTICE_STEPS, plan_warps
 from rdstitch.errors import ArgumentError
@@ -27,7 +27,7 @@ from rdstitch.messages import Message
 from rdstitch.process_memory import return_freed_memory
 
 _PREPARATION = 0.25
-# Pictures that the survey reads at one time: what the tiles need is not there yet.
+# Images that the survey reads at one time: what the tiles need is not there yet.
 _READERS = 2
 
 
@@ -65,38 +65,38 @@ class Prepared:
 
 @contextmanager
 def prepare_composite(
-    pictures: Sequence[PlacedPicture],
+    images: Sequence[PlacedImage],
     canvas: Canvas,
     options: CompositeOptions | None = None,
     progress: ShareProgress | None = None,
 ) -> Iterator[Prepared]:
-    """Decide on exposure, seams and cropping, from a small version of each picture; see :func:`compose`.
+    """Decide on exposure, seams and cropping, from a small version of each image; see :func:`compose`.
 
-    Pictures are read ahead as long as it lasts.
+    Images are read ahead as long as it lasts.
     """
     options = options or CompositeOptions()
-    if len(pictures) != len(canvas.footprints):
-        raise ArgumentError(f"the canvas is for {len(canvas.footprints)} pictures, not for {len(pictures)}")
-    reader = PictureReader(pictures)
+    if len(images) != len(canvas.footprints):
+        raise ArgumentError(f"the canvas is for {len(canvas.footprints)} images, not for {len(images)}")
+    reader = ImageReader(images)
     channels, dtype = reader.samples
-    cameras = [picture.camera for picture in pictures]
+    cameras = [image.camera for image in images]
     plan = plan_composite(cameras, canvas, options, channels, dtype.itemsize, masked=reader.masked(0))
     if canvas.period is not None:
         canvas = canvas.widened(_wrap_margin(canvas, plan.bands))
-    warps = plan_warps(pictures, canvas)
-    cache = PictureCache(reader, [w.shrink for w in warps], plan.cache_bytes, ahead=plan.workers > 1)
+    warps = plan_warps(images, canvas)
+    cache = ImageCache(reader, [w.shrink for w in warps], plan.cache_bytes, ahead=plan.workers > 1)
     with closing(cache):
-        same = no_exposure(len(pictures), channels)
+        same = no_exposure(len(images), channels)
         renderer = Renderer(warps, cache, same, None, options, plan.bands, channels, dtype)
-        decided = _decided(renderer, reader, pictures, canvas, plan, _part_of(progress, 0.0, _PREPARATION))
+        decided = _decided(renderer, reader, images, canvas, plan, _part_of(progress, 0.0, _PREPARATION))
         return_freed_memory()
         yield decided
 
 
 def _decided(
     renderer: Renderer,
-    reader: PictureReader,
-    pictures: Sequence[PlacedPicture],
+    reader: ImageReader,
+    images: Sequence[PlacedImage],
     canvas: Canvas,
     plan: CompositePlan,
     progress: ShareProgress | None,
@@ -104,14 +104,14 @@ def _decided(
     """Decide for a renderer that has neither exposure nor seams yet."""
     options, warps, exposure = renderer.options, renderer.warps, renderer.exposure
     seams = survey = None
-    if len(pictures) > 1 and (options.exposure != "none" or options.seam != "none"):
+    if len(images) > 1 and (options.exposure != "none" or options.seam != "none"):
         surveyed = _part_of(progress, 0.0, 0.7)
-        survey = survey_pictures(reader, pictures, canvas, min(plan.workers, _READERS), surveyed)
+        survey = survey_images(reader, images, canvas, min(plan.workers, _READERS), surveyed)
         # The first tiles need most of them, however the seams run.
         topmost = [index for index, warp in enumerate(warps) if warp.box[1] < plan.tile_size]
-        renderer.pictures.prefetch(sorted(topmost, key=lambda index: warps[index].box))
+        renderer.images.prefetch(sorted(topmost, key=lambda index: warps[index].box))
         if options.exposure != "none":
-            exposure = estimate_exposure(survey, pictures, options.exposure)
+            exposure = estimate_exposure(survey, images, options.exposure)
         if options.seam != "none":
             seams = find_seams(survey, exposure, options.seam == "graphcut", _part_of(progress, 0.7, 1.0))
             if canvas.period is not None:
@@ -120,7 +120,7 @@ def _decided(
                 seams = replace(seams, softness=max(1, (1 << plan.bands) // (2 * seams.factor)))
     box, note = _unwidened(canvas), ""
     if options.crop == "auto":
-        covered, factor = coverage_map(pictures, canvas, survey)
+        covered, factor = coverage_map(images, canvas, survey)
         find = crop_box if box is None else partial(crop_rows, whole=box)
         found, note = find(covered, factor, canvas.size)
         box = found or box

@@ -1,4 +1,4 @@
-"""How directions become places of a flat picture: plane, cylinder, sphere, and Mercator's cylinder.
+"""How directions become places of a flat image: plane, cylinder, sphere, and Mercator's cylinder.
 
 Directions have x to the right, y down, z ahead. Longitude ``atan2(x, z)`` grows to the right, and latitude
 ``atan2(y, |x, z|)`` downwards. All but the plane show the longitude itself, so that a full turn is 2π wide; they agree
@@ -45,7 +45,7 @@ class Projection:
         return {"plane": 0.45, "cylinder": 0.42, "mercator": 0.47, "sphere": 0.5}[self.name] * np.pi
 
     def latitude_limit(self, max_stretch: float) -> float:
-        """Latitude, radians, up to which it stretches pictures no more than so many times, in no direction.
+        """Latitude, radians, up to which it stretches images no more than so many times, in no direction.
 
         The sphere has none: it stretches poles beyond all measure, and is there to show them.
         """

@@ -1,4 +1,4 @@
-"""One tile of the output: which pictures contribute where, and their samples blended."""
+"""One tile of the output: which images contribute where, and their samples blended."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.blender import MultibandBlender, margin, per_channel, rounding_constant
 from rdstitch.compositing.boxes import Box, Float32Array, aligned, bounds, cut, grown, intersection, without
-from rdstitch.compositing.image_cache import PictureCache
+from rdstitch.compositing.image_cache import ImageCache
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photometric import Exposure, full_scale
 from rdstitch.compositing.sampling import border_weight, reachable_part, read_part, sample, sample_opacity
@@ -22,16 +22,16 @@ from rdstitch.compositing.warp import Geometry, Warp, locate
 
 @dataclass(frozen=True)
 class Layer:
-    """One picture's weight on a part of the canvas.
+    """One image's weight on a part of the canvas.
 
     Attributes
     ----------
     index : int
-        Of the picture.
+        Of the image.
     box : (int, int, int, int)
         Part of the canvas: x0, y0, x1, y1, pixels, end exclusive.
     weight : ndarray of shape (h, w), float32
-        0 where the picture contributes nothing.
+        0 where the image contributes nothing.
     geometry : Geometry
         Of the same part.
     """
@@ -61,7 +61,7 @@ class Renderer:
     Attributes
     ----------
     warps : sequence of Warp
-    pictures : PictureCache
+    images : ImageCache
     exposure : Exposure
     seams : SeamMap or None
     options : CompositeOptions
@@ -69,11 +69,11 @@ class Renderer:
         Of the multi-band blending.
     channels : int
     dtype : dtype
-        Of the pictures' samples and of the output.
+        Of the images' samples and of the output.
     """
 
     warps: Sequence[Warp]
-    pictures: PictureCache
+    images: ImageCache
     exposure: Exposure
     seams: SeamMap | None
     options: CompositeOptions
@@ -102,19 +102,19 @@ class Renderer:
         return pixels, covered
 
     def requests(self, box: Box) -> Iterator[tuple[int, Box]]:
-        """Pictures that a tile takes samples from, and the part of each, but where the seam map misses a pixel."""
+        """Images that a tile takes samples from, and the part of each, but where the seam map misses a pixel."""
         blended = self.options.blend == "multiband"
         around = self._blend_support(box) if blended else box
         owned = {} if self.seams is None else self.seams.bounds(around)
         for index, warp in enumerate(self.warps):
             # Where nobody owns anything, masks decide who covers it.
-            anywhere = self.seams is None or (NO_OWNER in owned and self.pictures.masked(index))
+            anywhere = self.seams is None or (NO_OWNER in owned and self.images.masked(index))
             shown = intersection(warp.box, around if anywhere else owned.get(index, NOTHING))
             if shown is not None and (part := intersection(shown, around)) is not None:
                 yield index, reachable_part(warp, self._support_within(part, around))
 
     def part(self, box: Box, shares: int) -> tuple["Renderer", tuple[int, ...]]:
-        """What the tiles of a box need, which it gives the same samples; and the pictures that are left in it.
+        """What the tiles of a box need, which it gives the same samples; and the images that are left in it.
 
         It takes one of so many shares of the memory.
         """
@@ -123,14 +123,14 @@ class Renderer:
         part = replace(
             self,
             warps=[self.warps[index] for index in chosen],
-            pictures=self.pictures.part(chosen, self.pictures.limit // shares),
+            images=self.images.part(chosen, self.images.limit // shares),
             exposure=self.exposure.part(chosen),
             seams=None if self.seams is None else self.seams.part(around, chosen),
         )
         return part, tuple(chosen)
 
     def _contact_zone(self, layers: Sequence[Layer], box: Box) -> Box | None:
-        """The part of a box in which blending can mix pictures; elsewhere it would return the only one there."""
+        """The part of a box in which blending can mix images; elsewhere it would return the only one there."""
         supports = [self._blend_support(layer.box) for layer in layers]
         shared = [common for pair in combinations(supports, 2) if (common := intersection(*pair)) is not None]
         parts = [part for common in shared if (part := intersection(common, box)) is not None]
@@ -179,20 +179,20 @@ class Renderer:
         return np.clip(np.rint(values), 0, np.float32(full_scale(self.dtype))).astype(self.dtype)
 
     def _samples(self, layer: Layer, box: Box) -> NDArray[Any]:
-        """Resampled and exposure-corrected samples (h, w, C) of one picture; mirrored content outside of it."""
+        """Resampled and exposure-corrected samples (h, w, C) of one image; mirrored content outside of it."""
         geometry = layer.geometry.on(box)
-        picture = self.pictures.get(layer.index, read_part(geometry))
-        pixels = sample(picture, geometry, self.options.interpolation)
+        image = self.images.get(layer.index, read_part(geometry))
+        pixels = sample(image, geometry, self.options.interpolation)
         return self.exposure.correct(layer.index, geometry, pixels.reshape(*geometry.shape, self.channels))
 
     def _layers(self, box: Box) -> list[Layer]:
-        """Weights of all pictures that contribute to a box."""
+        """Weights of all images that contribute to a box."""
         if self.seams is None and self.options.blend != "none":
             return list(self._bordered(box))
         return self._owned(box)
 
     def _bordered(self, box: Box, wanted: NDArray[np.bool_] | None = None) -> Iterator[Layer]:
-        """Every picture that covers part of a box, or of what is wanted of it, with weights that fall to its border."""
+        """Every image that covers part of a box, or of what is wanted of it, with weights that fall to its border."""
         for index, warp in enumerate(self.warps):
             if (part := intersection(warp.box, box)) is None:
                 continue
@@ -208,7 +208,7 @@ class Renderer:
             yield Layer(index, shown, weight if opacity is None else weight * opacity, geometry)
 
     def _placed(self, index: int, part: Box, box: Box) -> Geometry:
-        """The geometry of a picture on its part of a box, with a lattice for all that blending can need of it there."""
+        """The geometry of an image on its part of a box, with a lattice for all that blending can need of it there."""
         return locate(self.warps[index], self._support_within(part, box)).on(part)
 
     def _support_within(self, part: Box, box: Box) -> Box:
@@ -216,15 +216,15 @@ class Renderer:
         return (intersection(self._blend_support(part), box) or part) if self.options.blend == "multiband" else part
 
     def _opacity(self, index: int, geometry: Geometry) -> Float32Array | None:
-        """Opacity of a picture that has a mask."""
-        if not self.pictures.masked(index):
+        """Opacity of an image that has a mask."""
+        if not self.images.masked(index):
             return None
-        return sample_opacity(self.pictures.get(index, read_part(geometry)), geometry)
+        return sample_opacity(self.images.get(index, read_part(geometry)), geometry)
 
     def _owned(self, box: Box) -> list[Layer]:
         """Layers where each pixel has one owner, or, for feathering along a seam, shares of its owners.
 
-        The owner is the picture with the largest share in the seam map among those that cover the pixel; where the map,
+        The owner is the image with the largest share in the seam map among those that cover the pixel; where the map,
         being coarse, has none of them, the one whose border is farthest.
         """
         shape = (box[3] - box[1], box[2] - box[0])
@@ -246,7 +246,7 @@ class Renderer:
         return soft + [_won(owner, box, layer) for layer in layers]
 
     def _shared(self, box: Box) -> Iterator[Layer]:
-        """Pictures that own part of a box in the seam map, with their shares where they cover it."""
+        """Images that own part of a box in the seam map, with their shares where they cover it."""
         for index in [] if self.seams is None else self.seams.owners(box):
             part = intersection(self.warps[index].box, box) if index != NO_OWNER else None
             if part is None or self.seams is None:
@@ -254,7 +254,7 @@ class Renderer:
             share = self.seams.share(index, part)
             if (shown := bounds(share, part)) is None:
                 continue
-            # Of many pictures that overlap each owns little of a tile; a view would hold the whole.
+            # Of many images that overlap each owns little of a tile; a view would hold the whole.
             share, geometry = cut(share, part, shown).copy(), self._placed(index, shown, box)
             if not geometry.filled:
                 share[~geometry.inside] = 0.0
@@ -265,7 +265,7 @@ class Renderer:
 
 
 def _claim(owner: NDArray[np.int32], best: Float32Array, box: Box, layer: Layer) -> None:
-    """Give a layer's picture the pixels where its weight is the largest so far."""
+    """Give a layer's image the pixels where its weight is the largest so far."""
     previous = cut(best, box, layer.box)
     better = layer.weight > previous
     np.copyto(previous, layer.weight, where=better)
@@ -273,9 +273,9 @@ def _claim(owner: NDArray[np.int32], best: Float32Array, box: Box, layer: Layer)
 
 
 def _won(owner: NDArray[np.int32], box: Box, layer: Layer) -> Layer:
-    """The layer with weight 1 where its picture owns the pixels, and 0 elsewhere."""
+    """The layer with weight 1 where its image owns the pixels, and 0 elsewhere."""
     owned = cut(owner, box, layer.box) == layer.index
-    # A picture may have a layer from the seam map and one for what the map left over: each gets its own pixels.
+    # An image may have a layer from the seam map and one for what the map left over: each gets its own pixels.
     owned &= layer.weight > 0
     return replace(layer, weight=owned.astype(np.float32))
 

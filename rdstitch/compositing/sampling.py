@@ -1,4 +1,4 @@
-"""Pixels and weights of one picture at the places that a warp gives."""
+"""Pixels and weights of one image at the places that a warp gives."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.compositing.masked_pixels import OPAQUE
-from rdstitch.compositing.source_images import KERNEL_MARGIN, LoadedPicture
+from rdstitch.compositing.source_images import KERNEL_MARGIN, LoadedImage
 from rdstitch.compositing.warp import Geometry, Warp, points_around
 
 INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos": cv2.INTER_LANCZOS4}
@@ -19,12 +19,12 @@ _MIN_WEIGHT = np.float32(1e-6)
 
 
 def read_part(geometry: Geometry) -> Box:
-    """The part of the picture that :func:`sample` takes pixels from."""
+    """The part of the image that :func:`sample` takes pixels from."""
     return _part_of(geometry.warp, *geometry.maps)
 
 
 def reachable_part(warp: Warp, box: Box) -> Box:
-    """The part of the picture that holds what :func:`read_part` gives for a box of the canvas and all boxes within."""
+    """The part of the image that holds what :func:`read_part` gives for a box of the canvas and all boxes within."""
     return _part_of(warp, *np.moveaxis(points_around(warp, box), -1, 0))
 
 
@@ -35,25 +35,25 @@ def _part_of(warp: Warp, map_x: Float32Array, map_y: Float32Array) -> Box:
 
 
 def border_weight(geometry: Geometry) -> Float32Array:
-    """1 at the picture's centre, falling to 0 at its border (measured in the picture) and outside."""
+    """1 at the image's centre, falling to 0 at its border (measured in the image) and outside."""
     (map_x, map_y), (width, height) = geometry.maps, geometry.warp.camera.image_size
     one, half = np.float32(1.0), np.float32(0.5)
     weight: Float32Array = (map_x + half) * np.float32(2.0 / width) - one
     weight = one - np.abs(weight, out=weight)
     down = (map_y + half) * np.float32(2.0 / height) - one
     weight *= one - np.abs(down, out=down)
-    # Never 0 inside: a border pixels that one picture alone covers must not get lost.
+    # Never 0 inside: a border pixels that one image alone covers must not get lost.
     np.maximum(weight, _MIN_WEIGHT, out=weight)
     weight[~geometry.inside] = 0.0
     return weight
 
 
-def sample(picture: LoadedPicture, geometry: Geometry, interpolation: str = "cubic") -> NDArray[Any]:
-    """Resample a picture; content is mirrored outside of it, so that filters find no edge there.
+def sample(image: LoadedImage, geometry: Geometry, interpolation: str = "cubic") -> NDArray[Any]:
+    """Resample an image; content is mirrored outside of it, so that filters find no edge there.
 
     Parameters
     ----------
-    picture : LoadedPicture
+    image : LoadedImage
         Prepared for ``geometry.warp.shrink``; it holds what :func:`read_part` gives.
     geometry : Geometry
         From :func:`locate`.
@@ -63,24 +63,24 @@ def sample(picture: LoadedPicture, geometry: Geometry, interpolation: str = "cub
     Returns
     -------
     ndarray of shape (h, w) or (h, w, C)
-        In the picture's sample type.
+        In the image's sample type.
     """
-    map_x, map_y = _mirrored(picture, geometry)
-    return _remap_from(picture.pixels, picture.origin, map_x, map_y, INTERPOLATION[interpolation])
+    map_x, map_y = _mirrored(image, geometry)
+    return _remap_from(image.pixels, image.origin, map_x, map_y, INTERPOLATION[interpolation])
 
 
-def sample_opacity(picture: LoadedPicture, geometry: Geometry) -> Float32Array | None:
-    """Opacity (h, w), 0 where the picture is masked out; None for a picture without a mask."""
-    if picture.opacity is None:
+def sample_opacity(image: LoadedImage, geometry: Geometry) -> Float32Array | None:
+    """Opacity (h, w), 0 where the image is masked out; None for an image without a mask."""
+    if image.opacity is None:
         return None
-    map_x, map_y = _mirrored(picture, geometry)
-    opacity = _remap_from(picture.opacity, picture.origin, map_x, map_y, cv2.INTER_LINEAR) * np.float32(1.0 / OPAQUE)
+    map_x, map_y = _mirrored(image, geometry)
+    opacity = _remap_from(image.opacity, image.origin, map_x, map_y, cv2.INTER_LINEAR) * np.float32(1.0 / OPAQUE)
     # The outer half of the last opaque pixel is outside.
-    return np.where(opacity >= np.float32(0.5 * picture.opacity_step), opacity, np.float32(0.0))
+    return np.where(opacity >= np.float32(0.5 * image.opacity_step), opacity, np.float32(0.0))
 
 
-def _mirrored(picture: LoadedPicture, geometry: Geometry) -> tuple[Float32Array, Float32Array]:
-    """Pixels of the (reduced) picture, all inside it."""
+def _mirrored(image: LoadedImage, geometry: Geometry) -> tuple[Float32Array, Float32Array]:
+    """Pixels of the (reduced) image, all inside it."""
     map_x, map_y = geometry.maps
     if not geometry.inside.all():
         # Mirroring rounds: what is inside keeps its coordinates, whatever else the box holds.
@@ -88,8 +88,8 @@ def _mirrored(picture: LoadedPicture, geometry: Geometry) -> tuple[Float32Array,
         for values, own in zip(mirrored, (map_x, map_y), strict=True):
             np.copyto(values, own, where=geometry.inside)
         map_x, map_y = mirrored
-    if picture.reduction > 1:
-        half, factor = np.float32(0.5), np.float32(picture.reduction)
+    if image.reduction > 1:
+        half, factor = np.float32(0.5), np.float32(image.reduction)
         map_x, map_y = ((m + half) / factor - half for m in (map_x, map_y))
     return map_x, map_y
 
@@ -104,7 +104,7 @@ def _mirrored_extent(values: Float32Array, length: int) -> tuple[int, int]:
 def _remap_from(
     pixels: NDArray[Any], origin: tuple[int, int], map_x: Float32Array, map_y: Float32Array, interpolation: int
 ) -> NDArray[Any]:
-    """``cv2.remap`` from a picture whose first pixel is at ``origin``; of a very long one, from a piece of it."""
+    """``cv2.remap`` from an image whose first pixel is at ``origin``; of a very long one, from a piece of it."""
     left, top = origin
     if max(pixels.shape[:2]) >= _TOO_LONG:
         x, y = (max(0, int(m.min()) - o - KERNEL_MARGIN) for m, o in zip((map_x, map_y), origin, strict=True))
@@ -129,7 +129,7 @@ def _remap(piece: NDArray[Any], map_x: Float32Array, map_y: Float32Array, interp
 
 
 def _mirror(values: Float32Array, length: int) -> Float32Array:
-    """Coordinates mirrored at the picture's borders; far outside, those of the border."""
+    """Coordinates mirrored at the image's borders; far outside, those of the border."""
     half, turn = np.float32(0.5), np.float32(2 * length)
     mirrored = values + half
     np.abs(mirrored, out=mirrored)

@@ -1,8 +1,8 @@
-"""Seams: which picture each pixel of the output comes from, decided on the reduced canvas.
+"""Seams: which image each pixel of the output comes from, decided on the reduced canvas.
 
-"voronoi": where the borders of two pictures are equally far, so that each picture gives its middle. "graphcut": round
-that line, within a band, along the path on which the two pictures differ least (Kwatra et al. 2003, with OpenCV's
-cut), so that what moved or stands out of the plane is taken from one of them whole. Pictures are added one after the
+"voronoi": where the borders of two images are equally far, so that each image gives its middle. "graphcut": round
+that line, within a band, along the path on which the two images differ least (Kwatra et al. 2003, with OpenCV's
+cut), so that what moved or stands out of the plane is taken from one of them whole. Images are added one after the
 other, so that memory is that of one label per pixel of the reduced canvas.
 """
 
@@ -22,7 +22,7 @@ from rdstitch.io.reduction import block_mean
 
 NO_OWNER = -1
 
-# Band in which a seam may wander: the new picture's share of both border weights.
+# Band in which a seam may wander: the new image's share of both border weights.
 _MIN_SHARE, _MAX_SHARE = 0.2, 0.8
 _AROUND_FREE = 2
 # What a difference of edges, a pixel, counts beside one of brightness, and the root of the largest cost of a pixel, in
@@ -40,7 +40,7 @@ class SeamMap:
     Attributes
     ----------
     labels : ndarray of shape (h, w), int32
-        Index of the picture, or -1 where there is none.
+        Index of the image, or -1 where there is none.
     factor : int
         Canvas pixels per reduced pixel, even or 1.
     softness : int
@@ -55,7 +55,7 @@ class SeamMap:
     origin: tuple[int, int] = (0, 0)
 
     def owners(self, box: Box) -> list[int]:
-        """Pictures that own anything on a box (canvas pixels), ascending; -1 first where a part has no owner."""
+        """Images that own anything on a box (canvas pixels), ascending; -1 first where a part has no owner."""
         return [int(owner) for owner in np.unique(self._window(box))]
 
     def bounds(self, box: Box) -> dict[int, Box]:
@@ -70,7 +70,7 @@ class SeamMap:
         return found
 
     def share(self, owner: int, box: Box) -> Float32Array:
-        """How much of each pixel of a box (canvas pixels) a picture owns: labels interpolated linearly, (h, w).
+        """How much of each pixel of a box (canvas pixels) an image owns: labels interpolated linearly, (h, w).
 
         Every value depends on the labels around it alone, bit for bit, whatever the box: sums of ones and of shares of
         an even number of pixels are exact.
@@ -96,16 +96,16 @@ class SeamMap:
         margin = (self.labels.shape[1] - turn) // 2
         return replace(self, labels=np.take(self.labels, np.arange(-margin, turn + margin) % turn + margin, axis=1))
 
-    def part(self, box: Box, pictures: Sequence[int]) -> "SeamMap":
-        """The map of a box (canvas pixels), of some of the pictures, numbered anew; nobody has what others own."""
+    def part(self, box: Box, images: Sequence[int]) -> "SeamMap":
+        """The map of a box (canvas pixels), of some of the images, numbered anew; nobody has what others own."""
         around = 1 + self.softness
         (left, right), (top, bottom) = (
             (max(0, start // self.factor - around - first), max(1, -(-stop // self.factor) + around - first))
             for start, stop, first in zip(box[:2], box[2:], self.origin, strict=True)
         )
         labels = self.labels[top:bottom, left:right]
-        number = np.full(max(int(labels.max(initial=0)), *pictures, 0) + 2, NO_OWNER, dtype=np.int32)
-        number[list(pictures)] = np.arange(len(pictures))
+        number = np.full(max(int(labels.max(initial=0)), *images, 0) + 2, NO_OWNER, dtype=np.int32)
+        number[list(images)] = np.arange(len(images))
         return replace(self, labels=number[labels], origin=(self.origin[0] + left, self.origin[1] + top))
 
     def _window(self, box: Box) -> NDArray[np.int32]:
@@ -167,7 +167,7 @@ def _cut(
     *,
     apart: bool,
 ) -> NDArray[np.bool_]:
-    """Where a new picture, with its share of both border weights, replaces what lies below it.
+    """Where a new image, with its share of both border weights, replaces what lies below it.
 
     ``apart``: in several places, one by one.
     """
@@ -190,7 +190,7 @@ def _cut(
 
 
 def _parts(free: NDArray[np.bool_]) -> list[tuple[slice, slice]]:
-    """Where cuts are free to run, column by column apart: a picture across the edge of a full turn has both ends."""
+    """Where cuts are free to run, column by column apart: an image across the edge of a full turn has both ends."""
     columns = np.flatnonzero(free.any(axis=0))
     groups = np.split(columns, np.flatnonzero(np.diff(columns) > 2 * _AROUND_FREE + 1) + 1)
     parts = []

@@ -1,4 +1,4 @@
-"""Pictures as the tiles need them: of one kind, smoothed for the output's resolution, whole or a part."""
+"""Images as the tiles need them: of one kind, smoothed for the output's resolution, whole or a part."""
 
 import math
 from collections.abc import Sequence
@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, encloses, intersection
 from rdstitch.compositing.masked_pixels import OPACITY_BYTES, filled, opacity
-from rdstitch.compositing.placed_picture import PlacedPicture
+from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.errors import InputError
-from rdstitch.io.read import Picture
+from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import block_mean, fitting_reduction, reduced_size
 
 NOTHING: Box = (0, 0, 0, 0)
 
 _OPAQUE_FROM = 128
-# A picture that gets smaller by less than this keeps its pixels as they are.
+# An image that gets smaller by less than this keeps its pixels as they are.
 _NEGLIGIBLE_SHRINK = 1.05
-# Room around a part of a picture for the kernel of the resampling, pixels.
+# Room around a part of an image for the kernel of the resampling, pixels.
 KERNEL_MARGIN = 8
 # Pixels read for one of the output, at least: a Gaussian needs nearly two to smooth them.
 _PIXELS_PER_OUTPUT_PIXEL = 1.9
@@ -34,23 +34,23 @@ _WORTH_CUTTING = 0.8
 
 
 @dataclass(frozen=True)
-class LoadedPicture:
-    """A picture ready to be resampled.
+class LoadedImage:
+    """An image ready to be resampled.
 
     Attributes
     ----------
     pixels : ndarray of shape (h, w) or (h, w, C)
         uint8, uint16 or float32; transparent pixels are filled from their nearest neighbours.
     opacity : ndarray of shape (h, w), uint16, or None
-        0 where the picture is masked out, else rising to OPAQUE with the distance from the mask.
+        0 where the image is masked out, else rising to OPAQUE with the distance from the mask.
     opacity_step : float
         Opacity of the last opaque pixel beside a transparent one, as a share of OPAQUE.
     reduction : int
-        The picture is smaller than the original by this factor.
+        The image is smaller than the original by this factor.
     part : (int, int, int, int) or None
         What can be resampled from it, pixels of the original; None for all of it. It holds more, for the kernel.
     origin : (int, int)
-        Where its first pixel lies in the whole reduced picture.
+        Where its first pixel lies in the whole reduced image.
     """
 
     pixels: NDArray[Any]
@@ -69,7 +69,7 @@ class LoadedPicture:
         """Whether a part of the original can be resampled from it."""
         return self.part is None or encloses(self.part, part)
 
-    def cut(self, part: Box, *, copy: bool = False) -> "LoadedPicture":
+    def cut(self, part: Box, *, copy: bool = False) -> "LoadedImage":
         """A part of the original, with what the kernel of the resampling needs around it, in memory of its own.
 
         The whole where the part is not much less, unless a copy is wanted: it would not be worth its time.
@@ -89,8 +89,8 @@ class LoadedPicture:
 
 
 @dataclass(frozen=True)
-class PictureOnDisk:
-    """A picture ready to be resampled, in a file.
+class ImageOnDisk:
+    """An image ready to be resampled, in a file.
 
     Attributes
     ----------
@@ -98,24 +98,24 @@ class PictureOnDisk:
         Its pixels, then its opacity, as they are in memory.
     arrays : sequence of (dtype, shape)
         Of these.
-    outline : LoadedPicture
+    outline : LoadedImage
         What else is known of it.
     """
 
     file: Path
     arrays: Sequence[tuple[np.dtype[Any], tuple[int, ...]]]
-    outline: LoadedPicture
+    outline: LoadedImage
 
     @classmethod
-    def write(cls, picture: LoadedPicture, file: Path) -> Self:
-        """Keep a picture in a file.
+    def write(cls, image: LoadedImage, file: Path) -> Self:
+        """Keep an image in a file.
 
         Raises
         ------
         OSError
             When it cannot be written.
         """
-        arrays = [picture.pixels] if picture.opacity is None else [picture.pixels, picture.opacity]
+        arrays = [image.pixels] if image.opacity is None else [image.pixels, image.opacity]
         try:
             with file.open("wb") as stream:
                 for array in arrays:
@@ -123,11 +123,11 @@ class PictureOnDisk:
         except OSError:
             file.unlink(missing_ok=True)
             raise
-        outline = replace(picture, pixels=picture.pixels[:0], opacity=None)
+        outline = replace(image, pixels=image.pixels[:0], opacity=None)
         return cls(file, [(array.dtype, array.shape) for array in arrays], outline)
 
-    def mapped(self) -> LoadedPicture:
-        """The picture, whose pixels are read from the file when they are used."""
+    def mapped(self) -> LoadedImage:
+        """The image, whose pixels are read from the file when they are used."""
         arrays, start = [], 0
         for dtype, shape in self.arrays:
             arrays.append(np.memmap(self.file, dtype, "r", start, shape))
@@ -140,21 +140,21 @@ class PictureOnDisk:
             self.file.unlink()
 
 
-def prepare_picture(picture: Picture, shrink: float, reduction: int = 1) -> LoadedPicture:
-    """Fill what is transparent, and smooth the picture to what an output that shrinks it can show.
+def prepare_image(image: DecodedImage, shrink: float, reduction: int = 1) -> LoadedImage:
+    """Fill what is transparent, and smooth the image to what an output that shrinks it can show.
 
     Parameters
     ----------
     shrink : float
         Original pixels per output pixel. From 4 on, whole blocks are averaged first; a Gaussian does the rest.
     reduction : int
-        What the picture was read smaller by.
+        What the image was read smaller by.
     """
-    pixels, opaque = picture.pixels, None
-    if picture.alpha is not None:
-        opaque = picture.alpha >= _OPAQUE_FROM
+    pixels, opaque = image.pixels, None
+    if image.alpha is not None:
+        opaque = image.alpha >= _OPAQUE_FROM
         pixels = filled(pixels, opaque)
-    del picture  # as large as all that is left of it
+    del image  # as large as all that is left of it
     # Blocks alone alias; a Gaussian on at least two pixels per output pixel does not.
     further = max(1, int(shrink / reduction / 2))
     if further > 1:
@@ -166,68 +166,68 @@ def prepare_picture(picture: Picture, shrink: float, reduction: int = 1) -> Load
         sigma = 0.5 * math.sqrt(rest**2 - 1.0)
         pixels = cv2.GaussianBlur(pixels, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
     if opaque is None:
-        return LoadedPicture(pixels, reduction=reduction)
-    return LoadedPicture(pixels, *opacity(opaque), reduction)
+        return LoadedImage(pixels, reduction=reduction)
+    return LoadedImage(pixels, *opacity(opaque), reduction)
 
 
-class PictureReader:
-    """Reads pictures, and sees to it that they are what was registered.
+class ImageReader:
+    """Reads images, and sees to it that they are what was registered.
 
     Parameters
     ----------
-    pictures : sequence of PlacedPicture
+    images : sequence of PlacedImage
         Each must have the size that its camera has.
     """
 
-    def __init__(self, pictures: Sequence[PlacedPicture]) -> None:
-        self._pictures = pictures
-        # Channels, sample type and name of the picture that was read first.
+    def __init__(self, images: Sequence[PlacedImage]) -> None:
+        self._images = images
+        # Channels, sample type and name of the image that was read first.
         self._samples: tuple[tuple[int, ...], np.dtype[Any], str] | None = None
         self._masked: dict[int, bool] = {}
 
-    def part(self, pictures: Sequence[int]) -> "PictureReader":
-        """A reader of some of the pictures, which knows of them what this one does."""
-        part = PictureReader([self._pictures[index] for index in pictures])
+    def part(self, images: Sequence[int]) -> "ImageReader":
+        """A reader of some of the images, which knows of them what this one does."""
+        part = ImageReader([self._images[index] for index in images])
         part._samples = self._samples
-        part._masked = {new: self._masked[old] for new, old in enumerate(pictures) if old in self._masked}
+        part._masked = {new: self._masked[old] for new, old in enumerate(images) if old in self._masked}
         return part
 
-    def prepared(self, index: int, shrink: float) -> LoadedPicture:
-        """Read picture ``index``, no larger than needed, for an output that shrinks it so much."""
+    def prepared(self, index: int, shrink: float) -> LoadedImage:
+        """Read image ``index``, no larger than needed, for an output that shrinks it so much."""
         reduction = self._reduction(index, shrink)
-        return prepare_picture(self(index, reduction), shrink, reduction)
+        return prepare_image(self(index, reduction), shrink, reduction)
 
     def nbytes(self, index: int, shrink: float) -> int:
-        """Memory that picture ``index`` takes at most when it is prepared for such an output, if it was read before."""
+        """Memory that image ``index`` takes at most when it is prepared for such an output, if it was read before."""
         channels, dtype = self.samples
-        width, height = reduced_size(self._pictures[index].camera.image_size, self._reduction(index, shrink))
+        width, height = reduced_size(self._images[index].camera.image_size, self._reduction(index, shrink))
         opacity = OPACITY_BYTES if self._masked.get(index, False) else 0
         return width * height * (channels * dtype.itemsize + opacity)
 
     def _reduction(self, index: int, shrink: float) -> int:
-        """What a picture is read smaller by for an output that shrinks it so much; a Gaussian does the rest."""
-        return 1 if self._pictures[index].preview is None else fitting_reduction(shrink / _PIXELS_PER_OUTPUT_PIXEL)
+        """What an image is read smaller by for an output that shrinks it so much; a Gaussian does the rest."""
+        return 1 if self._images[index].preview is None else fitting_reduction(shrink / _PIXELS_PER_OUTPUT_PIXEL)
 
-    def __call__(self, index: int, reduction: int = 1) -> Picture:
-        """Read picture ``index``; a grey picture among coloured ones becomes coloured.
+    def __call__(self, index: int, reduction: int = 1) -> DecodedImage:
+        """Read image ``index``; a grey image among coloured ones becomes coloured.
 
         Raises
         ------
         InputError
-            When it cannot be read, has another size than its camera, or samples unlike the first picture's.
+            When it cannot be read, has another size than its camera, or samples unlike the first image's.
         """
-        placed = self._pictures[index]
-        picture = placed.preview(reduction) if reduction > 1 and placed.preview is not None else placed.read()
-        height, width = picture.pixels.shape[:2]
+        placed = self._images[index]
+        image = placed.preview(reduction) if reduction > 1 and placed.preview is not None else placed.read()
+        height, width = image.pixels.shape[:2]
         wanted = reduced_size(placed.camera.image_size, reduction)
         if (width, height) != wanted:
             expected = "{} x {}".format(*wanted)
-            raise InputError(f"picture {index + 1} has {width} x {height} pixels, but its camera has {expected}")
-        called = placed.path or f"picture {index + 1}"
+            raise InputError(f"image {index + 1} has {width} x {height} pixels, but its camera has {expected}")
+        called = placed.path or f"image {index + 1}"
         if self._samples is None:
-            self._samples = picture.pixels.shape[2:], picture.pixels.dtype, Path(called).name
+            self._samples = image.pixels.shape[2:], image.pixels.dtype, Path(called).name
         channels, dtype, first = self._samples
-        pixels = picture.pixels
+        pixels = image.pixels
         if pixels.ndim == 2 and channels == (3,):
             pixels = np.repeat(pixels[..., None], 3, axis=2)
         elif pixels.shape[2:] == (3,) and channels == ():
@@ -235,21 +235,21 @@ class PictureReader:
         if (pixels.shape[2:], pixels.dtype) != (channels, dtype):
             own, other = _kind(pixels.shape[2:], pixels.dtype), _kind(channels, dtype)
             raise InputError(f"{called}: has {own}, but {first} has {other}; convert them to one kind")
-        self._masked[index] = picture.alpha is not None
-        return replace(picture, pixels=pixels)
+        self._masked[index] = image.alpha is not None
+        return replace(image, pixels=pixels)
 
     def masked(self, index: int) -> bool:
-        """Whether a picture has transparent parts; reads it when that is not known yet."""
+        """Whether an image has transparent parts; reads it when that is not known yet."""
         if index not in self._masked:
             self._read_small(index)
         return self._masked[index]
 
     def _read_small(self, index: int) -> None:
-        self(index, 1 if self._pictures[index].preview is None else _MAX_PREVIEW)
+        self(index, 1 if self._images[index].preview is None else _MAX_PREVIEW)
 
     @property
     def samples(self) -> tuple[int, np.dtype[Any]]:
-        """Number of channels and type of all pictures' samples; reads the first one when none has been read."""
+        """Number of channels and type of all images' samples; reads the first one when none has been read."""
         if self._samples is None:
             self._read_small(0)
         assert self._samples is not None

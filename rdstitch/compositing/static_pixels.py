@@ -1,7 +1,7 @@
 """What belongs to the camera and not to the plane: a black border, a robot's own body, a pasted banner or caption.
 
-It is at the same place in every picture. Black is seen at once. Texture that stays has the same corners in all
-pictures, whereas those of the plane are at other places in each. Edges do not count: a rail along the motion stays too.
+It is at the same place in every image. Black is seen at once. Texture that stays has the same corners in all
+images, whereas those of the plane are at other places in each. Edges do not count: a rail along the motion stays too.
 Nor do even areas, but those beside them along the border belong to them: the band and the scale bar of a caption.
 """
 
@@ -14,31 +14,31 @@ from numpy.typing import NDArray
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.io.reduction import mean_of_channels
 
-MIN_PICTURES = 4
+MIN_IMAGES = 4
 """Fewer may show the same by chance."""
 
 _BLACK = 0.02  # of the brightest sample, up to which a pixel is black
-_MIN_AREA = 0.005  # of the picture, for a region to count
-_MAX_AREA = 0.6  # of the picture: where more than this seems to stay, the pictures differ too little to say
-_STAYS = 0.5  # agreement of the corners of the pictures: 1 for what stays, about 0 for what moves
-_MIN_TEXTURE = 0.1  # of what is usual in the pictures, for corners to count
+_MIN_AREA = 0.005  # of the image, for a region to count
+_MAX_AREA = 0.6  # of the image: where more than this seems to stay, the images differ too little to say
+_STAYS = 0.5  # agreement of the corners of the images: 1 for what stays, about 0 for what moves
+_MIN_TEXTURE = 0.1  # of what is usual in the images, for corners to count
 _WINDOW = 0.05  # of the longer side, over which corners are compared
 
 
-def static_pixels(pictures: Sequence[NDArray[np.generic]]) -> BoolArray | None:
-    """Which pixels show what stays at its place in all pictures.
+def static_pixels(images: Sequence[NDArray[np.generic]]) -> BoolArray | None:
+    """Which pixels show what stays at its place in all images.
 
     Parameters
     ----------
-    pictures : sequence of ndarray of shape (h, w) or (h, w, C)
-        At least :data:`MIN_PICTURES` of one camera that moved between them, some hundred pixels wide.
+    images : sequence of ndarray of shape (h, w) or (h, w, C)
+        At least :data:`MIN_IMAGES` of one camera that moved between them, some hundred pixels wide.
 
     Returns
     -------
     ndarray of shape (h, w), bool, or None
         None where nothing stays, or so much that the camera hardly moved.
     """
-    grey = np.stack([_grey(picture) for picture in pictures])
+    grey = np.stack([_grey(image) for image in images])
     window = max(3, round(_WINDOW * max(grey.shape[1:])))
     dark = grey.max(axis=0) <= _BLACK * max(float(grey.max()), 1e-12)
     black = _regions(dark, at_border=True)
@@ -51,18 +51,18 @@ def static_pixels(pictures: Sequence[NDArray[np.generic]]) -> BoolArray | None:
     return static if _MIN_AREA < share < _MAX_AREA else None
 
 
-def _grey(picture: NDArray[np.generic]) -> NDArray[np.float32]:
-    return mean_of_channels(picture.astype(np.float32))
+def _grey(image: NDArray[np.generic]) -> NDArray[np.float32]:
+    return mean_of_channels(image.astype(np.float32))
 
 
 def _agreement(grey: NDArray[np.float32], window: int) -> FloatArray:
-    """How far the corners of different pictures agree, over a window, shape (h, w): 1 for what stays, else about 0."""
+    """How far the corners of different images agree, over a window, shape (h, w): 1 for what stays, else about 0."""
     own, total = np.zeros((3, *grey.shape[1:])), np.zeros((2, *grey.shape[1:]))
     for image in grey:
         slope = np.stack([cv2.Sobel(image, cv2.CV_64F, 1, 0), cv2.Sobel(image, cv2.CV_64F, 0, 1)])
         own += _tensor(slope)
         total += slope
-    # Products of the slopes of one picture with those of all others, against those with its own.
+    # Products of the slopes of one image with those of all others, against those with its own.
     others = (_tensor(total) - own) / (len(grey) - 1)
     corners, common = (_smaller_eigenvalue(tensor, window) for tensor in (own, others))
     agreement: FloatArray = common / np.maximum(corners, _MIN_TEXTURE * float(np.median(corners)) + 1e-12)
@@ -81,7 +81,7 @@ def _smaller_eigenvalue(tensor: FloatArray, window: int) -> FloatArray:
 
 
 def _with_captions(static: BoolArray, same: BoolArray, window: int) -> BoolArray:
-    """The same with what is ``same`` in all pictures in a strip along the border that is nearest to it.
+    """The same with what is ``same`` in all images in a strip along the border that is nearest to it.
 
     Only in pieces larger than any outside of such strips: of white paper, sameness says nothing.
     """

@@ -1,4 +1,4 @@
-"""All pictures on a reduced canvas: what exposure and seams are decided on."""
+"""All images on a reduced canvas: what exposure and seams are decided on."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,28 +11,28 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box, Float32Array, cut, intersection, overlapping_pairs
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.placed_picture import PlacedPicture
+from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.sampling import border_weight, sample, sample_opacity
-from rdstitch.compositing.source_images import PictureReader
+from rdstitch.compositing.source_images import ImageReader
 from rdstitch.compositing.warp import Geometry, Warp, locate, plan_warps
 
-_MAX_PICTURE = 600_000
+_MAX_IMAGE = 600_000
 _MAX_TOTAL = 16_000_000
 
 
 @dataclass(frozen=True)
 class SurveyTile:
-    """One picture on the reduced canvas.
+    """One image on the reduced canvas.
 
     Attributes
     ----------
     box : (int, int, int, int)
         On the reduced canvas.
     pixels : ndarray of shape (h, w, C)
-        In the picture's sample type.
+        In the image's sample type.
     inside : ndarray of shape (h, w), bool
     opacity : ndarray of shape (h, w), float32, or None
-        Of a picture with a mask.
+        Of an image with a mask.
     """
 
     box: Box
@@ -41,7 +41,7 @@ class SurveyTile:
     opacity: Float32Array | None = None
 
     def weight(self, geometry: Geometry) -> Float32Array:
-        """Falls from 1 at the picture's centre to 0 at its border, (h, w); not kept, since all would be half a survey.
+        """Falls from 1 at the image's centre to 0 at its border, (h, w); not kept, since all would be half a survey.
 
         ``geometry`` is where the box comes from.
         """
@@ -51,7 +51,7 @@ class SurveyTile:
 
 @dataclass(frozen=True)
 class Survey:
-    """All pictures, small.
+    """All images, small.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Survey:
     warps : tuple of Warp
         Onto the reduced canvas.
     tiles : tuple of SurveyTile or None
-        None for a picture that is nowhere opaque.
+        None for an image that is nowhere opaque.
     """
 
     factor: int
@@ -71,11 +71,11 @@ class Survey:
     tiles: tuple[SurveyTile | None, ...]
 
     def pairs(self) -> NDArray[np.intp]:
-        """Pairs (P, 2) of pictures that lie over each other; see :func:`overlapping_pairs`."""
+        """Pairs (P, 2) of images that lie over each other; see :func:`overlapping_pairs`."""
         return overlapping_pairs([None if tile is None else tile.box for tile in self.tiles])
 
     def overlap(self, i: int, j: int) -> tuple[SurveyTile, SurveyTile, Box, NDArray[np.bool_]]:
-        """The tiles of one of the pairs, the box that they have in common, and where both pictures show in it."""
+        """The tiles of one of the pairs, the box that they have in common, and where both images show in it."""
         a, b = self.tiles[i], self.tiles[j]
         assert a is not None
         assert b is not None
@@ -85,25 +85,25 @@ class Survey:
 
 
 def survey_factor(canvas: Canvas) -> int:
-    """Reduction at which all pictures together fit easily into memory, a power of two."""
+    """Reduction at which all images together fit easily into memory, a power of two."""
     areas = canvas.areas()
     factor = 1
-    while max(areas) > _MAX_PICTURE * factor**2 or sum(areas) > _MAX_TOTAL * factor**2:
+    while max(areas) > _MAX_IMAGE * factor**2 or sum(areas) > _MAX_TOTAL * factor**2:
         factor *= 2
     return factor
 
 
-def survey_pictures(
-    reader: PictureReader,
-    pictures: Sequence[PlacedPicture],
+def survey_images(
+    reader: ImageReader,
+    images: Sequence[PlacedImage],
     canvas: Canvas,
     workers: int = 1,
     progress: Callable[[float], None] | None = None,
 ) -> Survey:
-    """Read every picture once, ``workers`` at a time, and lay it, small, on the reduced canvas."""
+    """Read every image once, ``workers`` at a time, and lay it, small, on the reduced canvas."""
     factor = survey_factor(canvas)
     small = canvas.reduced(factor)
-    warps = tuple(plan_warps(pictures, small))
+    warps = tuple(plan_warps(images, small))
     tiles = []
     with ThreadPoolExecutor(workers) as pool:
         for tile in pool.map(partial(_survey_tile, reader), range(len(warps)), warps):
@@ -113,14 +113,14 @@ def survey_pictures(
     return Survey(factor, small, warps, tuple(tiles))
 
 
-def _survey_tile(reader: PictureReader, index: int, warp: Warp) -> SurveyTile | None:
-    """One picture, small."""
+def _survey_tile(reader: ImageReader, index: int, warp: Warp) -> SurveyTile | None:
+    """One image, small."""
     geometry = locate(warp, warp.box)
-    picture = reader.prepared(index, warp.shrink)
-    inside, opacity = geometry.inside, sample_opacity(picture, geometry)
+    image = reader.prepared(index, warp.shrink)
+    inside, opacity = geometry.inside, sample_opacity(image, geometry)
     if opacity is not None:
         inside = inside & (opacity > 0)
     if not inside.any():
         return None
-    pixels = sample(picture, geometry, "linear")
+    pixels = sample(image, geometry, "linear")
     return SurveyTile(warp.box, pixels.reshape(*inside.shape, -1), inside, opacity)

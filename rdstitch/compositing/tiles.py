@@ -51,7 +51,7 @@ class TiledOutput:
 
     @cached_property
     def _requested(self) -> RequestedParts:
-        """Which part of each picture the tiles take."""
+        """Which part of each image the tiles take."""
         rows = (
             [request for box in self._boxes(top) for request in self.renderer.requests(box)]
             for top in range(0, self.size[1], self.tile_size)
@@ -65,12 +65,12 @@ class TiledOutput:
         return [(x + k, y + top, x + min(k + side, width), y + bottom) for k in range(0, width, side)]
 
     def part(self, box: Box) -> tuple["TiledOutput", tuple[int, ...]]:
-        """A smaller part, one tile at a time, with nothing but the pictures that reach it; and which these are.
+        """A smaller part, one tile at a time, with nothing but the images that reach it; and which these are.
 
         As many are computed at one time as there are workers, and share the memory.
         """
-        renderer, pictures = self.renderer.part(box, self.workers)
-        return TiledOutput(renderer, box, self.tile_size, 1), pictures
+        renderer, images = self.renderer.part(box, self.workers)
+        return TiledOutput(renderer, box, self.tile_size, 1), images
 
     def strips(self, progress: ShareProgress | None = None) -> Generator[OutputStrip]:
         """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
@@ -101,12 +101,12 @@ class TiledOutput:
     def _start(self, top: int, run: Callable[..., Iterator[Any]]) -> tuple[OutputStrip, Iterator[Box]]:
         """Begin with a row of tiles, when all but one above are done: the strip they fill, and each once it is done."""
         row, x, boxes = top // self.tile_size, self.box[0], self._boxes(top)
-        # In alternating directions, so that the pictures used last are the ones needed next.
+        # In alternating directions, so that the images used last are the ones needed next.
         backwards = row % 2 == 1
-        pictures, warps = self.renderer.pictures, self.renderer.warps
+        images, warps = self.renderer.images, self.renderer.warps
         # The row above is not done yet.
-        pictures.expect(self._requested.from_row(row - 1))
-        pictures.prefetch(sorted(self._requested.on_row(row), key=lambda k: warps[k].box, reverse=backwards))
+        images.expect(self._requested.from_row(row - 1))
+        images.prefetch(sorted(self._requested.on_row(row), key=lambda k: warps[k].box, reverse=backwards))
         shape = boxes[0][3] - boxes[0][1], self.size[0]
         samples = np.zeros((*shape, self.renderer.channels), dtype=self.renderer.dtype)
         alpha = np.zeros(shape, dtype=np.uint8)

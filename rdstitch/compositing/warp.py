@@ -1,4 +1,4 @@
-"""One resampling from the original: canvas pixels → plane → undistorted → measured pixels of one picture.
+"""One resampling from the original: canvas pixels → plane → undistorted → measured pixels of one image.
 
 Coordinates are computed on a lattice of the canvas, and interpolated linearly between its nodes.
 """
@@ -16,7 +16,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box, Float32Array, encloses, grown, intersection
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.placed_picture import Displacement, PlacedPicture
+from rdstitch.compositing.placed_image import Displacement, PlacedImage
 from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.radial_homography import to_plane
 
@@ -24,7 +24,7 @@ LATTICE_STEPS = (32, 16, 8, 4, 2, 1)
 """Spacings of lattices, canvas pixels; all have the nodes of the first."""
 
 _NOWHERE = np.float32(-1e6)
-# Coordinates are computed on a lattice of the canvas and interpolated linearly, to this many pixels of the picture or,
+# Coordinates are computed on a lattice of the canvas and interpolated linearly, to this many pixels of the image or,
 # where that gets smaller, of the canvas. OpenCV rounds them to as many afterwards.
 _LATTICE_ERROR = 1.0 / 32.0
 
@@ -33,7 +33,7 @@ _PROBES = 16
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Pixels of a picture at the nodes of a lattice around a box of the canvas.
+    """Pixels of an image at the nodes of a lattice around a box of the canvas.
 
     It is anchored to the canvas: every node, and every pixel between them, is the same bit for bit in every box.
 
@@ -53,7 +53,7 @@ class Lattice:
 
     @classmethod
     def over(cls, box: Box, step: int, places: Callable[[FloatArray, FloatArray], FloatArray]) -> Self:
-        """Nodes by what maps x (1, n) and y (m, 1), canvas pixels, to pixels (m, n, 2) of a picture."""
+        """Nodes by what maps x (1, n) and y (m, 1), canvas pixels, to pixels (m, n, 2) of an image."""
         (x0, x1), (y0, y1) = _enclosing(box, LATTICE_STEPS[0])
         x, y = (np.arange(start, stop + 1, step, dtype=np.float64) for start, stop in ((x0, x1), (y0, y1)))
         return cls(box, step, _somewhere(places(x[None, :], y[:, None])))
@@ -121,7 +121,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class Warp:
-    """How the canvas is filled from one picture.
+    """How the canvas is filled from one image.
 
     Attributes
     ----------
@@ -130,11 +130,11 @@ class Warp:
         Canvas pixels, or the directions of a projection, to normalized undistorted coordinates; third coordinate
         positive in front of the camera.
     box : (int, int, int, int)
-        Where the picture can lie on the canvas: x0, y0, x1, y1, pixels, end exclusive.
+        Where the image can lie on the canvas: x0, y0, x1, y1, pixels, end exclusive.
     step : int
         Spacing of the coordinate lattice, canvas pixels.
     shrink : float
-        Picture pixels per canvas pixel (median over the picture); above 1 the picture gets smaller.
+        Image pixels per canvas pixel (median over the image); above 1 the image gets smaller.
     surface : Surface or None
         What gives directions to canvas pixels; None where the canvas is a plane.
     displacement : callable, optional
@@ -150,7 +150,7 @@ class Warp:
     displacement: Displacement | None = None
 
     def source_points(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Measured pixels (..., 2) of the picture at canvas pixels ``x``, ``y``; NaN where there are none."""
+        """Measured pixels (..., 2) of the image at canvas pixels ``x``, ``y``; NaN where there are none."""
         m = self.from_canvas
         if self.surface is None:
             z = m[2, 0] * x + m[2, 1] * y + m[2, 2]
@@ -167,7 +167,7 @@ class Warp:
         return points if self.displacement is None else points + self.displacement(points)
 
     def contains(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
-        """Which measured pixels lie in the picture; NaN does not."""
+        """Which measured pixels lie in the image; NaN does not."""
         width, height = self.camera.image_size
         within: NDArray[np.bool_] = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
         if (radius := self.camera.drawn_radius) < math.inf:
@@ -177,7 +177,7 @@ class Warp:
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Where the pixels of one box of the canvas come from in one picture; computed on demand.
+    """Where the pixels of one box of the canvas come from in one image; computed on demand.
 
     Attributes
     ----------
@@ -204,7 +204,7 @@ class Geometry:
 
     @cached_property
     def filled(self) -> bool:
-        """Whether the picture certainly covers the box: it holds all nodes of the lattice, with half a pixel around."""
+        """Whether the image certainly covers the box: it holds all nodes of the lattice, with half a pixel around."""
         points = self.lattice.nodes(self.box, self.lattice.step)
         limit = np.array(self.warp.camera.image_size, dtype=np.float32) - 1
         drawn = self.warp.camera.drawn_radius == math.inf or bool(self.warp.contains(*points.T).all())
@@ -212,7 +212,7 @@ class Geometry:
 
     @cached_property
     def inside(self) -> NDArray[np.bool_]:
-        """Which pixels (h, w) lie in the picture."""
+        """Which pixels (h, w) lie in the image."""
         return np.ones(self.shape, dtype=np.bool_) if self.filled else self.warp.contains(*self.maps)
 
     def on(self, box: Box) -> "Geometry":
@@ -225,7 +225,7 @@ class Geometry:
 def plan_warp(
     camera: Camera, homography: FloatArray, canvas: Canvas, index: int, displacement: Displacement | None = None
 ) -> Warp:
-    """Everything about the resampling of picture ``index`` that does not depend on the tile."""
+    """Everything about the resampling of image ``index`` that does not depend on the tile."""
     if canvas.projection != PLANE:
         surface = Surface(canvas.projection, np.asarray(np.linalg.inv(canvas.matrix), dtype=np.float64))
         from_directions = np.asarray(np.linalg.inv(homography), dtype=np.float64)
@@ -243,7 +243,7 @@ def plan_warp(
 
 
 def _measured(draft: Warp, probes: FloatArray, canvas: Canvas) -> Warp:
-    """The warp with its box, and with the spacing and the shrinkage at canvas pixels all over the picture."""
+    """The warp with its box, and with the spacing and the shrinkage at canvas pixels all over the image."""
     draft = replace(draft, shrink=_shrink(draft, probes))
     return replace(draft, box=_reached(draft, canvas), step=_lattice_step(draft, probes))
 
@@ -256,18 +256,18 @@ def _reached(warp: Warp, canvas: Canvas) -> Box:
     return intersection(grown(warp.box, int(np.ceil(moved)) + 1), (0, 0, *canvas.size)) or warp.box
 
 
-def plan_warps(pictures: Sequence[PlacedPicture], canvas: Canvas) -> list[Warp]:
-    """The warps of all pictures."""
-    return [plan_warp(p.camera, p.homography, canvas, k, p.displacement) for k, p in enumerate(pictures)]
+def plan_warps(images: Sequence[PlacedImage], canvas: Canvas) -> list[Warp]:
+    """The warps of all images."""
+    return [plan_warp(p.camera, p.homography, canvas, k, p.displacement) for k, p in enumerate(images)]
 
 
 def locate(warp: Warp, box: Box) -> Geometry:
-    """Where the pixels of a box come from, and which of them lie in the picture."""
+    """Where the pixels of a box come from, and which of them lie in the image."""
     return Geometry(warp, box, Lattice.over(box, warp.step, warp.source_points))
 
 
 def points_around(warp: Warp, box: Box) -> Float32Array:
-    """Pixels (K, 2) of the picture at the outermost nodes of the lattice over a box: no other node lies beyond."""
+    """Pixels (K, 2) of the image at the outermost nodes of the lattice over a box: no other node lies beyond."""
     (x0, x1), (y0, y1) = _enclosing(box, LATTICE_STEPS[0])
     x, y = (np.arange(start, stop + 1, warp.step, dtype=np.float64) for start, stop in ((x0, x1), (y0, y1)))
     left, top = np.full_like(y, x0), np.full_like(x, y0)
@@ -277,14 +277,14 @@ def points_around(warp: Warp, box: Box) -> Float32Array:
 
 
 def _somewhere(points: FloatArray) -> Float32Array:
-    """Places in a picture, far outside where there are none."""
+    """Places in an image, far outside where there are none."""
     there = points.astype(np.float32)
     there[~np.isfinite(there).all(axis=-1)] = _NOWHERE
     return there
 
 
 def _grid(camera: Camera) -> FloatArray:
-    """Measured pixels (K, 2) spread over a picture."""
+    """Measured pixels (K, 2) spread over an image."""
     width, height = camera.image_size
     grid = np.stack(np.meshgrid(np.linspace(0, width - 1, _PROBES), np.linspace(0, height - 1, _PROBES)), axis=-1)
     return grid.reshape(-1, 2)
@@ -308,7 +308,7 @@ def _lattice_step(warp: Warp, probes: FloatArray) -> int:
 
 
 def _shrink(warp: Warp, probes: FloatArray) -> float:
-    """Median over the picture of picture pixels per canvas pixel."""
+    """Median over the image of image pixels per canvas pixel."""
     offsets = np.array([(-0.5, 0.0), (0.5, 0.0), (0.0, -0.5), (0.0, 0.5)])
     around = probes[:, None] + offsets
     left, right, top, bottom = np.moveaxis(warp.source_points(around[..., 0], around[..., 1]), 1, 0)

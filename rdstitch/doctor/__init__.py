@@ -1,4 +1,4 @@
-"""What a run will meet, found out at a glance: pictures, lenses, sharpness, exposure, overlap, effort."""
+"""What a run will meet, found out at a glance: images, lenses, sharpness, exposure, overlap, effort."""
 
 from rdstitch.doctor.examine import Examination, examine
 

@@ -1,4 +1,4 @@
-"""The examination of a set of pictures, as data and in words; nothing is registered."""
+"""The examination of a set of images, as data and in words; nothing is registered."""
 
 import time
 from collections import Counter
@@ -13,7 +13,7 @@ from rdstitch.compositing.plan import default_memory
 from rdstitch.doctor.glance import Glance, glance_at, overlap_of
 from rdstitch.errors import InputError
 from rdstitch.features import FeatureOptions, Features, detect
-from rdstitch.inputs.find import found_pictures
+from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import ChannelOrder, Images, as_inputs
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.machine import processor_count
@@ -23,18 +23,18 @@ from rdstitch.progress import Progress, silent
 
 _GLANCE = FeatureOptions(max_features=500, work_megapixels=None)
 _MEGAPIXELS = 0.3  # of the versions that are examined
-_EXHAUSTIVE_UP_TO = 24  # pictures of which every pair is compared; of more, those up to three apart
+_EXHAUSTIVE_UP_TO = 24  # images of which every pair is compared; of more, those up to three apart
 _MAX_SEQUENCE_GAP = 3
 _BLURRED = 0.6  # of the median sharpness
 _DARK, _BURNT = 0.06, 0.05  # mean brightness; share of burnt-out pixels
 _MIN_OVERLAP = 0.3
 _ZOOMED = 1.03  # ratio of focal lengths by EXIF
 # Bytes, fitted to the sets of python -m tests.benchmarks.doctor: interpreter and libraries, detection in each thread,
-# features and matches of a picture, and of the compositor for each byte of the mosaic.
+# features and matches of an image, and of the compositor for each byte of the mosaic.
 _BASE_MEMORY, _DETECTION_MEMORY, _FEATURES_MEMORY, _COMPOSITE_SHARE = 130 * 2**20, 75 * 2**20, 3 * 2**19, 1.5
 # Of processor time, s: per pair matched and estimated, and per megapixel composited.
 _SECONDS_PAIR, _SECONDS_MEGAPIXEL = 0.1, 0.2
-_PAIRS_PER_PICTURE = 4
+_PAIRS_PER_IMAGE = 4
 
 
 @dataclass(frozen=True)
@@ -43,26 +43,26 @@ class Examination:
 
     Attributes
     ----------
-    pictures : int
+    images : int
         That can be read.
     unreadable : tuple of str
         Every other one, with the reason.
     sizes : tuple of (str, int)
-        "width x height" and how many pictures have it, commonest first.
+        "width x height" and how many images have it, commonest first.
     cameras : tuple of (str, int)
-        Make, model and serial number by EXIF, and how many pictures; "unknown" where it says nothing.
+        Make, model and serial number by EXIF, and how many images; "unknown" where it says nothing.
     focal : str
         What is known of the focal length.
     blurred, dark, burnt : tuple of str
-        Names of pictures that are much less sharp than the others, that are dark, and that are burnt out.
+        Names of images that are much less sharp than the others, that are dark, and that are burnt out.
     alone : tuple of str
-        Names of pictures that seem to overlap with no other one that was compared.
+        Names of images that seem to overlap with no other one that was compared.
     groups : int
-        Groups of pictures that seem to hang together.
+        Groups of images that seem to hang together.
     overlap : float or None
-        Median share of a picture that its best partner shows too; None where no pair was found.
+        Median share of an image that its best partner shows too; None where no pair was found.
     megapixels : float
-        Of all pictures together.
+        Of all images together.
     memory_bytes : int
         Expected at the peak of ``mosaic``, roughly.
     seconds : float
@@ -71,7 +71,7 @@ class Examination:
         What to change, most important first; empty where nothing is amiss.
     """
 
-    pictures: int
+    images: int
     unreadable: tuple[str, ...]
     sizes: tuple[tuple[str, int], ...]
     cameras: tuple[tuple[str, int], ...]
@@ -95,14 +95,14 @@ class Examination:
         """For people, one line for each thing, advice at the end."""
         overlap = "none found" if self.overlap is None else f"about {self.overlap:.0%} with the best partner"
         lines = [
-            f"pictures:   {self.pictures}" + (f", and {len(self.unreadable)} unreadable" if self.unreadable else ""),
+            f"images:   {self.images}" + (f", and {len(self.unreadable)} unreadable" if self.unreadable else ""),
             f"sizes:      {_counted(self.sizes)}",
             f"cameras:    {_counted(self.cameras)}",
             f"focal:      {self.focal}",
             f"sharpness:  {_few(self.blurred, 'blurred', 'nothing blurred')}",
             f"exposure:   {_few(self.dark, 'dark', 'nothing dark')}; "
             f"{_few(self.burnt, 'burnt out', 'nothing burnt out')}",
-            f"overlap:    {overlap}; {_few(self.alone, 'without a partner', 'every picture has a partner')}; "
+            f"overlap:    {overlap}; {_few(self.alone, 'without a partner', 'every image has a partner')}; "
             f"{self.groups} group" + "s" * (self.groups != 1),
             f"effort:     about {bytes_in_words(self.memory_bytes)} of memory, "
             f"{seconds_in_words(self.seconds)} for a mosaic",
@@ -138,7 +138,7 @@ def examine(
 ) -> Examination:
     """Find out at a glance what a run will meet.
 
-    Every picture is decoded once, small; neighbours are compared by a few features. It says what is likely, and decides
+    Every image is decoded once, small; neighbours are compared by a few features. It says what is likely, and decides
     nothing.
 
     Parameters
@@ -157,8 +157,8 @@ def examine(
     InputError
         When an input names nothing, or nothing can be read.
     """
-    with found_pictures(as_inputs(inputs, channel_order), every=every, topic=topic) as pictures:
-        sources, unread = read_sources(pictures.frames, skip_bad=True)
+    with found_images(as_inputs(inputs, channel_order), every=every, topic=topic) as images:
+        sources, unread = read_sources(images.frames, skip_bad=True)
         unreadable = [f"{message.images[0]}: {message.text}" for message in unread]
         found: dict[int, _Examined] = {}
         workers = processor_count()
@@ -178,9 +178,9 @@ def examine(
 def _examine_one(source: Source) -> _Examined:
     began = time.thread_time()
     reduction = max(1, round(np.sqrt(np.prod(source.camera.image_size) / (_MEGAPIXELS * 1e6))))
-    picture = source.read(reduction)
-    features = detect(picture.pixels, _GLANCE, picture.alpha)
-    return _Examined(glance_at(picture), features, time.thread_time() - began)
+    image = source.read(reduction)
+    features = detect(image.pixels, _GLANCE, image.alpha)
+    return _Examined(glance_at(image), features, time.thread_time() - began)
 
 
 def _conclude(
@@ -226,7 +226,7 @@ def _conclude(
 
 
 def _overlaps(features: Sequence[Features]) -> dict[tuple[int, int], float]:
-    """Share of overlap of the pairs that are compared: all of a few pictures, neighbours of many."""
+    """Share of overlap of the pairs that are compared: all of a few images, neighbours of many."""
     count = len(features)
     reach = count if count <= _EXHAUSTIVE_UP_TO else _MAX_SEQUENCE_GAP
     pairs = [(i, j) for i in range(count) for j in range(i + 1, min(i + reach + 1, count))]
@@ -253,7 +253,7 @@ def _focal(sources: Sequence[Source]) -> tuple[str, bool]:
     pixels = [s.metadata.focal_px for s in sources if s.metadata.focal_px is not None]
     low, high = min(pixels), max(pixels)
     text = f"{low:.0f} pixels" if not zoomed else f"{low:.0f} to {high:.0f} pixels"
-    return f"{text} by EXIF in {len(known)} of {len(sources)} pictures", zoomed
+    return f"{text} by EXIF in {len(known)} of {len(sources)} images", zoomed
 
 
 def _memory(sources: Sequence[Source], overlap: float, workers: int) -> int:
@@ -264,18 +264,18 @@ def _memory(sources: Sequence[Source], overlap: float, workers: int) -> int:
 
 
 def _mosaic_share(overlap: float) -> float:
-    """Size of the mosaic in sizes of all pictures together, roughly."""
+    """Size of the mosaic in sizes of all images together, roughly."""
     return 1.0 - overlap / 2.0
 
 
 def _seconds(sources: Sequence[Source], examined: Sequence[_Examined], overlap: float, workers: int) -> float:
     """From the time that the glance took: features of larger versions, pairs, and the composite."""
-    working = FeatureOptions().for_pictures(len(sources)).limits[1] or np.inf
+    working = FeatureOptions().for_images(len(sources)).limits[1] or np.inf
     detecting = sum(
         item.seconds * min(working, np.prod(source.metadata.size) / 1e6) / _MEGAPIXELS
         for source, item in zip(sources, examined, strict=True)
     )
-    pairs = min(_PAIRS_PER_PICTURE * len(sources), len(sources) * (len(sources) - 1) / 2)
+    pairs = min(_PAIRS_PER_IMAGE * len(sources), len(sources) * (len(sources) - 1) / 2)
     composite = sum(np.prod(source.metadata.size) for source in sources) / 1e6 * _mosaic_share(overlap)
     total = detecting + _SECONDS_PAIR * pairs + _SECONDS_MEGAPIXEL * composite
     return float(total / workers)
@@ -284,30 +284,30 @@ def _seconds(sources: Sequence[Source], examined: Sequence[_Examined], overlap: 
 def _advice(found: Examination, zoomed: bool) -> list[str]:
     """What to change, most important first."""
     advice = []
-    if found.pictures < 2:
-        advice.append("stitching needs two pictures or more; name another one")
+    if found.images < 2:
+        advice.append("stitching needs two images or more; name another one")
     elif found.overlap is None:
-        advice.append("no overlap was found: take pictures that overlap by a half, of something with texture")
+        advice.append("no overlap was found: take images that overlap by a half, of something with texture")
     if len(found.cameras) > 1:
-        advice.append(f"the pictures come from {len(found.cameras)} cameras: stitch those of each on their own")
+        advice.append(f"the images come from {len(found.cameras)} cameras: stitch those of each on their own")
     if zoomed:
-        advice.append("the lens was zoomed between the pictures: stitch those of one zoom on their own")
+        advice.append("the lens was zoomed between the images: stitch those of one zoom on their own")
     if found.unreadable:
         advice.append(
             f"{len(found.unreadable)} file{'s' * (len(found.unreadable) != 1)} cannot be read: {found.unreadable[0]}"
         )
     if found.overlap is not None and found.overlap < _MIN_OVERLAP:
-        advice.append(f"pictures overlap by about {found.overlap:.0%} only: take more pictures, a third is the least")
+        advice.append(f"images overlap by about {found.overlap:.0%} only: take more images, a third is the least")
     if found.overlap is not None and found.alone:
         advice.append(f"no overlap with a neighbour was seen, and may lead to being left out: {shortened(found.alone)}")
     elif found.groups > 1:
         advice.append(
-            f"at a glance the pictures fall into {found.groups} groups: if so, only the largest becomes the mosaic"
+            f"at a glance the images fall into {found.groups} groups: if so, only the largest becomes the mosaic"
         )
     if found.blurred:
         advice.append(
-            f"leave blurred pictures out if their neighbours overlap without them: {', '.join(found.blurred[:3])}"
+            f"leave blurred images out if their neighbours overlap without them: {', '.join(found.blurred[:3])}"
         )
     if found.dark or found.burnt:
-        advice.append("dark or burnt-out pictures have few features: fix the exposure if you can take them again")
+        advice.append("dark or burnt-out images have few features: fix the exposure if you can take them again")
     return advice

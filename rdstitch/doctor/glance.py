@@ -1,4 +1,4 @@
-"""One look at each picture and at pairs of them, on small versions: sharpness, exposure, overlap."""
+"""One look at each image and at pairs of them, on small versions: sharpness, exposure, overlap."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.features import Features, match
-from rdstitch.io.read import Picture
+from rdstitch.io.read import DecodedImage
 
 _SAMPLES = 200  # minimal samples of a pair
 _THRESHOLD = 0.05  # of the diagonal: error of a similarity that stands for distortion and perspective
@@ -18,12 +18,12 @@ _GRID = 24  # points a side by which an overlap is measured
 
 @dataclass(frozen=True)
 class Glance:
-    """What one picture shows at a glance.
+    """What one image shows at a glance.
 
     Attributes
     ----------
     sharpness : float
-        Contrast of the finest detail over that of twice as coarse detail; a picture without detail has 0.
+        Contrast of the finest detail over that of twice as coarse detail; an image without detail has 0.
     brightness : float
         Mean of the samples, 0 to 1.
     clipped : float
@@ -35,13 +35,13 @@ class Glance:
     clipped: float
 
 
-def glance_at(picture: Picture) -> Glance:
-    """Sharpness and exposure of a picture."""
-    samples = picture.pixels
+def glance_at(image: DecodedImage) -> Glance:
+    """Sharpness and exposure of an image."""
+    samples = image.pixels
     full = float(np.iinfo(samples.dtype).max) if samples.dtype.kind == "u" else float(max(samples.max(), 1e-12))
     grey = samples if samples.ndim == 2 else samples[..., : min(3, samples.shape[2])].mean(axis=2)
     grey = np.ascontiguousarray(grey, dtype=np.float32) / np.float32(full)
-    seen = np.ones(grey.shape, dtype=bool) if picture.alpha is None else picture.alpha > 0
+    seen = np.ones(grey.shape, dtype=bool) if image.alpha is None else image.alpha > 0
     if not seen.any():
         return Glance(0.0, 0.0, 0.0)
     coarse = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
@@ -52,7 +52,7 @@ def glance_at(picture: Picture) -> Glance:
 
 
 def overlap_of(features1: Features, features2: Features) -> float:
-    """Share of the first picture that the second one shows, by the similarity that most matches support; 0 for none.
+    """Share of the first image that the second one shows, by the similarity that most matches support; 0 for none.
 
     Parameters
     ----------

@@ -17,15 +17,15 @@ from rdstitch.executors.processes import ProcessExecutor
 __all__ = ["LOCAL", "DaskExecutor", "ProcessExecutor", "in_order", "open_executor"]
 
 _PROCESSES_FROM = 60
-"""Pictures from which on it pays to start worker processes: each takes a second to begin with, and a picture a third of
+"""Images from which on it pays to start worker processes: each takes a second to begin with, and an image a third of
 one, so that the start is at most a twentieth of the work. Threads share the interpreter, which matching and estimation
 keep busy."""
 
 _MAX_PENDING = 256  # tasks that have been submitted and whose results were not taken: enough for that many workers
 
 
-def open_executor(workers: int, pictures: int, *, scheduler: str | None = None, store: Path | None = None) -> Executor:
-    """The executor for a set of so many pictures, to be used in a ``with`` block.
+def open_executor(workers: int, images: int, *, scheduler: str | None = None, store: Path | None = None) -> Executor:
+    """The executor for a set of so many images, to be used in a ``with`` block.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def open_executor(workers: int, pictures: int, *, scheduler: str | None = None, 
     """
     if scheduler is not None:
         return DaskExecutor(scheduler, workers, store)
-    if workers > 1 and pictures >= _PROCESSES_FROM and sys.executable:
+    if workers > 1 and images >= _PROCESSES_FROM and sys.executable:
         return ProcessExecutor(workers)
     return ThreadPoolExecutor(workers)
 

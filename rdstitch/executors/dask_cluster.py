@@ -1,4 +1,4 @@
-"""A Dask cluster as an executor: tasks travel through its scheduler, pictures and features do not."""
+"""A Dask cluster as an executor: tasks travel through its scheduler, images and features do not."""
 
 import contextlib
 import logging

@@ -127,12 +127,12 @@ class Georeference:
         return "".join(f"{number:.10f}\n" for number in numbers), self.crs.well_known_text() + "\n"
 
 
-def world_file_paths(picture: str | Path) -> tuple[Path, ...]:
-    """The world file, and the coordinate system as .prj, of a picture; none where its own format has a place for both.
+def world_file_paths(image: str | Path) -> tuple[Path, ...]:
+    """The world file, and the coordinate system as .prj, of an image; none where its own format has a place for both.
 
-    A Deep Zoom picture has none either: nothing that shows it would read them.
+    A Deep Zoom image has none either: nothing that shows it would read them.
     """
-    file = Path(picture)
+    file = Path(image)
     kind = file.suffix.lower()
     if kind in (".tif", ".tiff", ".dzi"):
         return ()

@@ -42,7 +42,7 @@ def path_as_svg(path: Trajectory) -> str:
     width, height = extent * unit + 2 * _MARGIN
     line = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
     step = max(1, len(path) // _ARROWS)
-    # The camera turns by -φ when the picture of the plane turns by φ; its top edge points to -y.
+    # The camera turns by -φ when the image of the plane turns by φ; its top edge points to -y.
     heading = np.stack([-np.sin(path.yaw), -np.cos(path.yaw)], axis=1) * 0.5 * _MARGIN
     arrows = "".join(
         f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{x + dx:.1f}" y2="{y + dy:.1f}" marker-end="url(#tip)"/>'

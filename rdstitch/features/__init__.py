@@ -1,11 +1,11 @@
-"""Features of pictures, and their matches."""
+"""Features of images, and their matches."""
 
 from rdstitch.features.detect import detect, detect_view
 from rdstitch.features.keypoints import Correspondences, Features, PackedFeatures
 from rdstitch.features.learned import LightGlue
 from rdstitch.features.match import Matcher, match, match_near, match_overlap
 from rdstitch.features.options import KINDS, FeatureOptions
-from rdstitch.features.picture import View
+from rdstitch.features.prepared_image import View
 
 __all__ = [
     "KINDS",

@@ -4,34 +4,34 @@ import cv2
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.features.picture import PreparedPicture
+from rdstitch.features.prepared_image import PreparedImage
 
 _SIGMA = 1.5  # pixels, of the smoothing
 _WINDOW = 9  # pixels on a side, in which there is no stronger one
 _CLEARANCE = 5.0  # pixels from what is masked
 _MOST = 4000  # the strongest
-_MIN_STRENGTH = 0.02  # of the strongest of the picture: it has a seventh of the contrast
+_MIN_STRENGTH = 0.02  # of the strongest of the image: it has a seventh of the contrast
 _MIN_BALANCE = 0.1  # of the larger curvature that the smaller one has: edges have less
 _STEPS, _FARTHEST = 5, 1.5  # of Newton's method, and pixels that it may lead in all
 _FLAT = 1e-6  # grey levels² per pixel⁴: a product of curvatures that is none
 
 
-def find_crossings(picture: PreparedPicture) -> FloatArray:
-    """Crossings in a picture.
+def find_crossings(image: PreparedImage) -> FloatArray:
+    """Crossings in an image.
 
-    Around the crossing of two straight edges the picture looks the same when it is turned by 180 degrees, at any
+    Around the crossing of two straight edges the image looks the same when it is turned by 180 degrees, at any
     perspective: smoothing does not move it, whereas it moves the middle of a blob.
 
     Parameters
     ----------
-    picture : PreparedPicture
+    image : PreparedImage
 
     Returns
     -------
     ndarray of shape (N, 2)
-        Pixels of the full-size picture.
+        Pixels of the full-size image.
     """
-    smooth = cv2.GaussianBlur(picture.grey.astype(np.float32), (0, 0), _SIGMA)
+    smooth = cv2.GaussianBlur(image.grey.astype(np.float32), (0, 0), _SIGMA)
     xx, xy, yy = (cv2.Sobel(smooth, cv2.CV_32F, *order, scale=0.25) for order in ((2, 0), (1, 1), (0, 2)))
     strength = xy * xy
     strength -= xx * yy
@@ -51,5 +51,5 @@ def find_crossings(picture: PreparedPicture) -> FloatArray:
         step = np.column_stack([c * gx - b * gy, a * gy - b * gx]) / np.minimum(a * c - b * b, -_FLAT)[:, None]
         points = np.clip(points - step, start - 2.0 * _FARTHEST, start + 2.0 * _FARTHEST)
     near = np.linalg.norm(points - start, axis=1) < _FARTHEST
-    found = points[near & picture.covers(points, np.full(len(points), _CLEARANCE))]
-    return picture.to_full_size(found)
+    found = points[near & image.covers(points, np.full(len(points), _CLEARANCE))]
+    return image.to_full_size(found)

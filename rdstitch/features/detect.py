@@ -12,21 +12,21 @@ from rdstitch.features.keypoints import Features
 from rdstitch.features.learned import AlikedDetection
 from rdstitch.features.opencv import OpenCVDetection
 from rdstitch.features.options import CLOSER, FeatureOptions
-from rdstitch.features.picture import CLIP_LIMIT, Mask, PixelArray, PreparedPicture, View, prepare
+from rdstitch.features.prepared_image import CLIP_LIMIT, Mask, PixelArray, PreparedImage, View, prepare
 from rdstitch.features.sift_tiles import LARGE, SiftTilesDetection
 from rdstitch.features.surf.descriptor import SurfDetection
 from rdstitch.opencv_state import one_opencv_thread
 
-_MIN_KEYPOINT_SHARE = 0.5  # of the keypoints wanted: where a reduced picture shows fewer, a larger one is used
+_MIN_KEYPOINT_SHARE = 0.5  # of the keypoints wanted: where a reduced image shows fewer, a larger one is used
 _LASTING = 0.5  # share of the keypoints that must be seen at less contrast, too; of fewer, contrast is what is missing
 
 
 class Detection(Protocol):
-    """Keypoints of one picture, not yet described; always in the same order for the same picture."""
+    """Keypoints of one image, not yet described; always in the same order for the same image."""
 
     @property
     def points(self) -> FloatArray:
-        """Places, pixels of the picture, (N, 2)."""
+        """Places, pixels of the image, (N, 2)."""
         ...
 
     @property
@@ -45,7 +45,7 @@ class Detection(Protocol):
 
 
 def find(grey: NDArray[np.uint8], options: FeatureOptions) -> Detection:
-    """Find the keypoints of a picture by the detector that the options name."""
+    """Find the keypoints of an image by the detector that the options name."""
     if options.kind == "surf":
         return SurfDetection.find(grey, options)
     if options.kind == "aliked":
@@ -61,11 +61,11 @@ def strongest(response: FloatArray, count: int) -> NDArray[np.intp]:
 
 
 def spread(points: FloatArray, response: FloatArray, count: int, cell: float) -> NDArray[np.intp]:
-    """Indices of ``count`` keypoints that are spread over the picture, strongest first.
+    """Indices of ``count`` keypoints that are spread over the image, strongest first.
 
     The cells of a grid take turns, each giving its strongest keypoint that is left, until ``count`` are
     taken: no cell gets more than another that still has some. The corners, where the distortion is seen, thus
-    keep what they have however strong the middle of the picture is.
+    keep what they have however strong the middle of the image is.
 
     Parameters
     ----------
@@ -90,11 +90,11 @@ def spread(points: FloatArray, response: FloatArray, count: int, cell: float) ->
 
 
 ViewLoader = Callable[[float | None], View]
-"""Loads one picture when it is called with the 10⁶ pixels that are needed of it; None: all. More pixels may come."""
+"""Loads one image when it is called with the 10⁶ pixels that are needed of it; None: all. More pixels may come."""
 
 
 def detect(image: PixelArray, options: FeatureOptions | None = None, mask: Mask | None = None) -> Features:
-    """Detect and describe the features of one picture.
+    """Detect and describe the features of one image.
 
     Parameters
     ----------
@@ -107,19 +107,19 @@ def detect(image: PixelArray, options: FeatureOptions | None = None, mask: Mask 
     Returns
     -------
     Features
-        Points in pixels of ``image``, strongest first; none for a blank picture. The same for the same picture,
+        Points in pixels of ``image``, strongest first; none for a blank image. The same for the same image,
         whatever the number of threads.
 
     Raises
     ------
     ArgumentError
-        When the picture or the mask has the wrong shape or type, or when this OpenCV lacks the detector.
+        When the image or the mask has the wrong shape or type, or when this OpenCV lacks the detector.
     """
     return _detect(lambda _: View(image, mask), options or FeatureOptions())
 
 
 def detect_view(source: ViewLoader, options: FeatureOptions) -> Features:
-    """As :func:`detect`, in one thread, for a picture that is loaded as large as it is needed.
+    """As :func:`detect`, in one thread, for an image that is loaded as large as it is needed.
 
     Parameters
     ----------
@@ -138,41 +138,41 @@ def detect_view(source: ViewLoader, options: FeatureOptions) -> Features:
 
 
 def _detect(source: ViewLoader, options: FeatureOptions) -> Features:
-    """The same for a picture that is loaded as large as it is needed."""
+    """The same for an image that is loaded as large as it is needed."""
     most, megapixels = options.limits
-    picture, detection, usable = _look(source, options, megapixels)
+    image, detection, usable = _look(source, options, megapixels)
     shown, few = len(usable), len(usable) < _MIN_KEYPOINT_SHARE * most
-    faint = few and len(_usable(picture, _find_at_less_contrast(picture, options))) <= _LASTING * shown
-    if megapixels is not None and picture.reduced and few:
-        picture, detection, usable = _look(source, options, CLOSER * megapixels)
+    faint = few and len(_usable(image, _find_at_less_contrast(image, options))) <= _LASTING * shown
+    if megapixels is not None and image.reduced and few:
+        image, detection, usable = _look(source, options, CLOSER * megapixels)
     points, response = detection.points[usable], detection.response[usable]
     if options.spread:
-        cell = options.spread_cell * float(np.hypot(*picture.grey.shape))
+        cell = options.spread_cell * float(np.hypot(*image.grey.shape))
         chosen = spread(points, response, most, cell)
     else:
         chosen = strongest(response, most)
     features = detection.describe(usable[chosen])
     # Some detectors return them in an order of their own.
     features = features.take(strongest(features.response, len(features)))
-    scale = features.scale * float(np.sqrt(picture.factor.prod()))
-    points = picture.to_full_size(features.points)
-    return replace(features, points=points, scale=scale, image_size=picture.full_size, shown=shown, faint=faint)
+    scale = features.scale * float(np.sqrt(image.factor.prod()))
+    points = image.to_full_size(features.points)
+    return replace(features, points=points, scale=scale, image_size=image.full_size, shown=shown, faint=faint)
 
 
 def _look(
     source: ViewLoader, options: FeatureOptions, megapixels: float | None
-) -> tuple[PreparedPicture, Detection, NDArray[np.intp]]:
-    """The picture at most so large, what is found in it, and which of that may count."""
-    picture = prepare(source(megapixels), megapixels, stretch=options.stretch, equalize=bool(options.equalize))
-    detection = find(picture.grey, options)
-    return picture, detection, _usable(picture, detection)
+) -> tuple[PreparedImage, Detection, NDArray[np.intp]]:
+    """The image at most so large, what is found in it, and which of that may count."""
+    image = prepare(source(megapixels), megapixels, stretch=options.stretch, equalize=bool(options.equalize))
+    detection = find(image.grey, options)
+    return image, detection, _usable(image, detection)
 
 
-def _usable(picture: PreparedPicture, detection: Detection) -> NDArray[np.intp]:
+def _usable(image: PreparedImage, detection: Detection) -> NDArray[np.intp]:
     """Which keypoints keep clear of the mask."""
-    return np.flatnonzero(picture.covers(detection.points, detection.scale / 2))
+    return np.flatnonzero(image.covers(detection.points, detection.scale / 2))
 
 
-def _find_at_less_contrast(picture: PreparedPicture, options: FeatureOptions) -> Detection:
+def _find_at_less_contrast(image: PreparedImage, options: FeatureOptions) -> Detection:
     """What is found where differences of grey levels are divided by what equalization multiplies them by at most."""
-    return find(np.rint(picture.grey / CLIP_LIMIT).astype(np.uint8), options)
+    return find(np.rint(image.grey / CLIP_LIMIT).astype(np.uint8), options)

@@ -1,4 +1,4 @@
-"""What detection and matching hand on: keypoints and descriptors of a picture, and points of two that show the same."""
+"""What detection and matching hand on: keypoints and descriptors of an image, and points of two that show the same."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,17 +19,17 @@ _MAX_HALF = 60000.0  # half precision ends a little above
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Keypoints of one picture with their descriptors, the strongest first.
+    """Keypoints of one image with their descriptors, the strongest first.
 
     Attributes
     ----------
     points : ndarray of shape (N, 2), float64
-        Keypoints ``(u, v)``, pixels of the full-size picture, whatever size they were detected at.
+        Keypoints ``(u, v)``, pixels of the full-size image, whatever size they were detected at.
     descriptors : ndarray of shape (N, D), float32 or uint8
         Numbers that are compared by their Euclidean distance (float32), or bits, eight to a byte, that are
         compared by the Hamming distance (uint8).
     scale : ndarray of shape (N,), float64
-        Diameter of the keypoint (OpenCV's ``size``), pixels of the full-size picture.
+        Diameter of the keypoint (OpenCV's ``size``), pixels of the full-size image.
     angle : ndarray of shape (N,), float64
         Orientation, radians in [0, 2π), from u towards v; 0 where the kind has none.
     response : ndarray of shape (N,), float64
@@ -40,9 +40,9 @@ class Features:
     kind : str
         What detected and described them; features of different kinds cannot be compared.
     image_size : (int, int), optional
-        Width and height of the picture, pixels.
+        Width and height of the image, pixels.
     shown : int, optional
-        Keypoints that the picture shows at its working size, before any were chosen, or a larger picture was used for
+        Keypoints that the image shows at its working size, before any were chosen, or a larger image was used for
         want of them; None where that is not known.
     faint : bool
         Whether these are few, and most of them only just strong enough: they are not seen at the contrast divided by
@@ -120,7 +120,7 @@ class PackedFeatures:
 
     @classmethod
     def pack(cls, features: Features) -> Self:
-        """Pack the features of a picture."""
+        """Pack the features of an image."""
         bare = replace(features, descriptors=np.zeros((len(features), 0), dtype=features.descriptors.dtype))
         return cls(bare, _smallest(features.descriptors), features.binary)
 
@@ -146,14 +146,14 @@ def _smallest(descriptors: Descriptors) -> NDArray[Any]:
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """Points of two pictures that show the same, the most distinctive match first (PROSAC's order).
+    """Points of two images that show the same, the most distinctive match first (PROSAC's order).
 
     Attributes
     ----------
     indices : ndarray of shape (M, 2), intp
-        Indices into the features of picture 1 and picture 2.
+        Indices into the features of image 1 and image 2.
     points1, points2 : ndarray of shape (M, 2), float64
-        pixels of the full-size pictures.
+        pixels of the full-size images.
     ratio : ndarray of shape (M,), float64
         Distance to the match over distance to the second-best, the worse of both directions; in [0, 1],
         ascending.
@@ -177,7 +177,7 @@ class Correspondences:
 
     @classmethod
     def of(cls, features1: Features, features2: Features, indices: NDArray[np.intp], ratio: FloatArray) -> Self:
-        """Correspondences between the features of two pictures."""
+        """Correspondences between the features of two images."""
         return cls(indices, features1.points[indices[:, 0]], features2.points[indices[:, 1]], ratio)
 
     def take(self, index: NDArray[np.intp]) -> Self:

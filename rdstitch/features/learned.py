@@ -25,7 +25,7 @@ from rdstitch.opencv_state import silent_opencv
 
 @dataclass(frozen=True, eq=False)
 class AlikedDetection:
-    """Keypoints of a picture by ALIKED, which describes all of them at once."""
+    """Keypoints of an image by ALIKED, which describes all of them at once."""
 
     points: FloatArray
     response: FloatArray
@@ -33,7 +33,7 @@ class AlikedDetection:
 
     @classmethod
     def find(cls, grey: NDArray[np.uint8], options: FeatureOptions) -> Self:
-        """Run the network on a picture.
+        """Run the network on an image.
 
         Raises
         ------
@@ -72,7 +72,7 @@ class AlikedDetection:
 
 
 class LightGlue:
-    """Matches learned features by a network that sees all keypoints of both pictures at once.
+    """Matches learned features by a network that sees all keypoints of both images at once.
 
     Parameters
     ----------
@@ -100,19 +100,19 @@ class LightGlue:
         return _loaded_once, (self._model, self._min_score)
 
     def match(self, features1: Features, features2: Features) -> Correspondences:
-        """Match the features of two pictures, the most certain first.
+        """Match the features of two images, the most certain first.
 
         Where the matcher by distances gives the ratio of distances, this one gives one minus its confidence.
 
         Raises
         ------
         ArgumentError
-            When the features do not know the size of their pictures.
+            When the features do not know the size of their images.
         InputError
             When the network is not LightGlue for these features.
         """
         if features1.image_size is None or features2.image_size is None:
-            raise ArgumentError("LightGlue needs to know the sizes of the pictures")
+            raise ArgumentError("LightGlue needs to know the sizes of the images")
         if len(features1) == 0 or len(features2) == 0:
             return Correspondences.of(features1, features2, np.zeros((0, 2), np.intp), np.zeros(0))
         try:

@@ -1,4 +1,4 @@
-"""Matching, exactly, by distances of descriptors: everywhere, where two pictures overlap, or near known places.
+"""Matching, exactly, by distances of descriptors: everywhere, where two images overlap, or near known places.
 
 A match is a mutual nearest neighbour that passes the ratio test. Where the place to look is known, matches are more and
 surer, above all of textures that repeat.
@@ -17,14 +17,14 @@ from rdstitch.features.nearest import compare, mutual_nearest
 from rdstitch.scipy_parts import distance, spatial
 
 Matcher = Callable[[Features, Features], Correspondences]
-"""What matches the features of two pictures: :func:`match`, or a network's."""
+"""What matches the features of two images: :func:`match`, or a network's."""
 
 _DEFAULT_RATIO = 0.85
 _BLOCK_BYTES = 2**21  # two threads have room for it in the caches; the products of smaller ones take longer
 _USUAL = 0.95  # share of the known matches' distances that a new match may not exceed
 _MIN_MATCHES, _MAX_MATCHES = 50, 300  # matches that an overlap takes at least, and that are used at most
-_SUPPORTING_NEIGHBOURS = 6  # other matches that a right one has near it, in both pictures
-_NEIGHBOURHOOD = 0.2  # how near, diagonals of a picture
+_SUPPORTING_NEIGHBOURS = 6  # other matches that a right one has near it, in both images
+_NEIGHBOURHOOD = 0.2  # how near, diagonals of an image
 _STRAY = 8  # matches without such company that chance explains; more may be of a part with little texture
 _MIN_REACH, _REACH = 0.12, 2.0  # how far an overlap goes on beside a match: diagonals, times the way to its company
 _CELLS = 24  # a side, by which places are distinguished
@@ -33,10 +33,10 @@ _CELLS = 24  # a side, by which places are distinguished
 def match(
     features1: Features, features2: Features, ratio: float | None = None, block_bytes: int = _BLOCK_BYTES
 ) -> Correspondences:
-    """Match the features of two pictures.
+    """Match the features of two images.
 
     A match is the nearest neighbour in both directions, and in both directions nearer than ``ratio`` times the
-    second nearest. Exchanging the pictures exchanges the columns of the result. A tie for the nearest is no
+    second nearest. Exchanging the images exchanges the columns of the result. A tie for the nearest is no
     match. Keypoints at one location (SIFT's several orientations) count as one, and give one match at most.
 
     Parameters
@@ -103,7 +103,7 @@ def match_near(
     features1, features2 : Features
         Of the same kind. Where they have signs of the Laplacian, only equal signs match.
     expected : ndarray of shape (N1, 2)
-        Where the features of picture 1 should be in picture 2, pixels; NaN where nowhere.
+        Where the features of image 1 should be in image 2, pixels; NaN where nowhere.
     radius : float
         How far from there is searched, pixels.
     known : ndarray of shape (K, 2), intp
@@ -179,11 +179,11 @@ def _ratios_within(group: NDArray[np.intp], distance: FloatArray) -> FloatArray:
 
 
 Part = NDArray[np.intp]
-"""Indices of the features in one part of a picture, ascending."""
+"""Indices of the features in one part of an image, ascending."""
 
 
 def overlapping(features1: Features, features2: Features, matches: Correspondences) -> tuple[Part, Part] | None:
-    """The features of two pictures that lie where these overlap, generously.
+    """The features of two images that lie where these overlap, generously.
 
     An overlap is what lies around the matches, twice as far as these are apart there: where texture is poor and matches
     are few, it goes on for longer.
@@ -215,7 +215,7 @@ def overlapping(features1: Features, features2: Features, matches: Correspondenc
 def match_overlap(
     matcher: Matcher, features1: Features, features2: Features, matches: Correspondences
 ) -> Correspondences:
-    """Match the features of two pictures where a few ``matches`` show an overlap; everywhere if they do not."""
+    """Match the features of two images where a few ``matches`` show an overlap; everywhere if they do not."""
     parts = overlapping(features1, features2, matches)
     if parts is None:
         return matcher(features1, features2)
@@ -225,7 +225,7 @@ def match_overlap(
 
 
 def _around(features: Features, size: tuple[int, int], points: FloatArray, reach: FloatArray) -> Part:
-    """The features in the cells of a picture whose centre is within reach of one of the points."""
+    """The features in the cells of an image whose centre is within reach of one of the points."""
     middle = (np.arange(_CELLS) + 0.5) / _CELLS
     centres = np.stack(np.meshgrid(middle * size[0], middle * size[1]), axis=-1).reshape(-1, 2)
     covered = np.any(_distances(centres, points, size) < reach, axis=1)
@@ -234,6 +234,6 @@ def _around(features: Features, size: tuple[int, int], points: FloatArray, reach
 
 
 def _distances(points: FloatArray, others: FloatArray, size: tuple[int, int]) -> FloatArray:
-    """Between all points (N, 2) and all others (M, 2), diagonals of the picture, (N, M)."""
+    """Between all points (N, 2) and all others (M, 2), diagonals of the image, (N, M)."""
     diagonal = np.hypot(*size)
     return distance.cdist(points / diagonal, others / diagonal)

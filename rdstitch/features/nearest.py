@@ -20,7 +20,7 @@ _MAX_NORM = 1024.0
 
 
 class DescriptorSimilarity(Protocol):
-    """Compares descriptors of picture 1 with all descriptors of picture 2."""
+    """Compares descriptors of image 1 with all descriptors of image 2."""
 
     lowest: float
     """Less than any similarity."""
@@ -30,7 +30,7 @@ class DescriptorSimilarity(Protocol):
     """Memory that one similarity takes while it is made."""
 
     def block(self, rows: NDArray[np.intp]) -> NDArray[Any]:
-        """Similarities of some descriptors of picture 1 to all of picture 2, shape (len(rows), count 2).
+        """Similarities of some descriptors of image 1 to all of image 2, shape (len(rows), count 2).
 
         Valid until the next call, which overwrites them.
         """
@@ -62,7 +62,7 @@ class Euclidean:
 
     @classmethod
     def of(cls, descriptors1: NDArray[np.float32], descriptors2: NDArray[np.float32]) -> Self:
-        """Of the descriptors of two pictures."""
+        """Of the descriptors of two images."""
         both = descriptors1, descriptors2
         largest = float(np.sqrt(max(np.einsum("ij,ij->i", v, v).max(initial=0.0) for v in both)))
         # A power of two, so that integers stay integers.
@@ -103,7 +103,7 @@ class Hamming:
 
     @classmethod
     def of(cls, descriptors1: NDArray[np.uint8], descriptors2: NDArray[np.uint8]) -> Self:
-        """Of the descriptors of two pictures."""
+        """Of the descriptors of two images."""
         # Equal bits of a and b are the ones of a ^ ~b, and of ~a ^ b.
         return cls(_words(descriptors1), ~_words(descriptors2))
 
@@ -233,7 +233,7 @@ def mutual_nearest(
 
 @dataclass(frozen=True)
 class _TwoBest:
-    """Of each location of picture 1 the nearest one in picture 2, and how alike they are; shapes (L,).
+    """Of each location of image 1 the nearest one in image 2, and how alike they are; shapes (L,).
 
     ``second`` is how alike the best other pair is that either of the two is in: where that is less than ``best``, the
     two are each other's nearest.
@@ -256,7 +256,7 @@ def _two_best(similarity: DescriptorSimilarity, one: Locations, two: Locations, 
     """Both directions from one pass over the similarities; the descriptors are in the orders of the locations."""
     nearest = np.empty(len(one), dtype=np.intp)
     best, second = np.empty((2, len(one)), similarity.dtype)
-    # Of each location of picture 2, the most alike of those whose nearest it is not.
+    # Of each location of image 2, the most alike of those whose nearest it is not.
     others = np.full(len(two), similarity.lowest, similarity.dtype)
     for here in one.blocks(block_bytes // (similarity.bytes_each * len(two.order))):
         layers = one.places(here)
@@ -272,7 +272,7 @@ def _two_best(similarity: DescriptorSimilarity, one: Locations, two: Locations, 
 
 
 def _rivals(nearest: NDArray[np.intp], best: NDArray[Any], lowest: float) -> NDArray[Any]:
-    """How alike another location of picture 1 is that has the same nearest, (L,).
+    """How alike another location of image 1 is that has the same nearest, (L,).
 
     Of the most alike of these that is the best of the others; of the rest one that is no less alike than themselves.
     """

@@ -18,14 +18,14 @@ Grey = NDArray[np.uint8]
 
 _ROOTSIFT_NORM = 512.0
 # Side in pixels below which some detectors raise, and none finds a thing.
-_MIN_PICTURE = 16
-# Bytes, measured of SIFT: differences of Gaussians of a picture of four times the pixels, and of its halves.
+_MIN_IMAGE = 16
+# Bytes, measured of SIFT: differences of Gaussians of an image of four times the pixels, and of its halves.
 _SCRATCH_OF_A_PIXEL = 230
 
 
 @dataclass(frozen=True, eq=False)
 class OpenCVDetection:
-    """Keypoints that an OpenCV detector found in a picture."""
+    """Keypoints that an OpenCV detector found in an image."""
 
     detector: Any
     grey: Grey
@@ -40,7 +40,7 @@ class OpenCVDetection:
         """Find keypoints; see :func:`create_detector` for errors."""
         detector = create_detector(options)
         with scratch_memory(_SCRATCH_OF_A_PIXEL * grey.size):
-            keypoints = detector.detect(grey, None) if min(grey.shape) >= _MIN_PICTURE else ()
+            keypoints = detector.detect(grey, None) if min(grey.shape) >= _MIN_IMAGE else ()
         table = _table(keypoints, "size", "angle", "octave", "response")
         # OpenCV promises no order: sort, so that the choice among equals is the same everywhere.
         order = np.lexsort(table.T)
@@ -110,7 +110,7 @@ def create_detector(options: FeatureOptions) -> Any:
             # Without the precise upscale all points are a quarter of a pixel off.
             return cv2.SIFT.create(nfeatures=0, contrastThreshold=options.sift_contrast, enable_precise_upscale=True)
         if kind == "orb":
-            # Many more than wanted, because ORB keeps the strongest of the whole picture and we spread them.
+            # Many more than wanted, because ORB keeps the strongest of the whole image and we spread them.
             return cv2.ORB.create(nfeatures=8 * options.limits[0], fastThreshold=options.orb_fast_threshold)
         name = f"{kind.upper()}_create"
         # OpenCV 5 moved these to xfeatures2d.
@@ -137,6 +137,6 @@ def _strength(kind: str, response: FloatArray, size: FloatArray) -> FloatArray:
     """By which keypoints are chosen.
 
     For SIFT contrast times size: by contrast alone the choice is mostly tiny ones, which drown in noise. On real pairs
-    of pictures the product gives a fifth to a half more inliers, among other detectors it does not help.
+    of images the product gives a fifth to a half more inliers, among other detectors it does not help.
     """
     return response * size if kind in ("sift", "rootsift") else response

@@ -8,15 +8,15 @@ from rdstitch.errors import ArgumentError
 
 KINDS = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk", "aliked")
 WORK_MEGAPIXELS = 0.6
-"""10⁶ pixels to which pictures of a large set are halved unless it is said otherwise."""
+"""10⁶ pixels to which images of a large set are halved unless it is said otherwise."""
 MAX_FEATURES = 2000
-"""Keypoints kept per picture of a large set unless it is said otherwise."""
+"""Keypoints kept per image of a large set unless it is said otherwise."""
 CLOSER = 4.0
 """Times as many pixels are used where the working size shows too little."""
 
-_BUDGET = 8  # pictures of a large set whose pixels and keypoints fewer pictures may share among them
+_BUDGET = 8  # images of a large set whose pixels and keypoints fewer images may share among them
 _MAX_PIXELS, _MAX_FEATURES = 4.0, 2.0
-"""Times as many pixels, and keypoints, that a picture of a small set gets at most: keypoints beyond the strongest 4,000
+"""Times as many pixels, and keypoints, that an image of a small set gets at most: keypoints beyond the strongest 4,000
 made λ of single pairs of a flight less certain, not more."""
 
 
@@ -29,21 +29,21 @@ class FeatureOptions:
     kind : str
         "rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk" or "aliked".
     max_features : int, optional
-        Keypoints kept per picture; None: 2,000, and more where there are few pictures, see :meth:`for_pictures`.
+        Keypoints kept per image; None: 2,000, and more where there are few images, see :meth:`for_images`.
     work_megapixels : float or "auto", optional
-        Pictures are halved until they have no more megapixels than this before features are detected; None: never;
-        "auto": 0.6, and more where there are few pictures.
+        Images are halved until they have no more megapixels than this before features are detected; None: never;
+        "auto": 0.6, and more where there are few images.
     spread : bool
-        Keep the strongest of each cell of a grid in turn, rather than the strongest of the picture.
+        Keep the strongest of each cell of a grid in turn, rather than the strongest of the image.
     spread_cell : float
-        Side of a cell of that grid, fraction of the picture's diagonal.
+        Side of a cell of that grid, fraction of the image's diagonal.
     stretch : (float, float), optional
-        Grey levels that become 0 and 255; None: those of the set where its pictures have more than 8 bits, see
+        Grey levels that become 0 and 255; None: those of the set where its images have more than 8 bits, see
         :mod:`rdstitch.pipeline.detect_features`, else none.
     equalize : bool, optional
-        Equalize local contrast before detection; None: of a set whose pictures show too little otherwise.
+        Equalize local contrast before detection; None: of a set whose images show too little otherwise.
     sift_contrast : float
-        SIFT's contrast threshold; 0.04 is OpenCV's, too high for hazy pictures.
+        SIFT's contrast threshold; 0.04 is OpenCV's, too high for hazy images.
     surf_threshold : float
         Determinant of the Hessian, grey levels², from which on a blob counts.
     surf_octaves : int
@@ -53,7 +53,7 @@ class FeatureOptions:
     surf_extended : bool
         Descriptors of 128 numbers instead of 64.
     surf_upright : bool
-        No orientation: for pictures that are turned by less than about 15°.
+        No orientation: for images that are turned by less than about 15°.
     surf_refine : bool
         Place blobs by Gaussian derivatives; False: by box filters alone, as the paper does.
     orb_fast_threshold : int
@@ -65,7 +65,7 @@ class FeatureOptions:
     aliked_model : path, optional
         ONNX file of the network of "aliked".
     aliked_size : int
-        Side of the square picture that the network takes, pixels.
+        Side of the square image that the network takes, pixels.
 
     Raises
     ------
@@ -112,11 +112,11 @@ class FeatureOptions:
         if not 0 < self.spread_cell <= 1:
             raise ArgumentError(f"spread_cell must be in (0, 1], not {self.spread_cell}")
 
-    def for_pictures(self, count: int) -> Self:
-        """The same with numbers for what was left open, which depend on how many pictures there are.
+    def for_images(self, count: int) -> Self:
+        """The same with numbers for what was left open, which depend on how many images there are.
 
         A pair takes a second anyway, and all that is known of its lens comes from its own keypoints; hundreds of
-        pictures have enough together. Fewer than eight pictures share what eight would have, up to four times as many
+        images have enough together. Fewer than eight images share what eight would have, up to four times as many
         pixels and twice as many keypoints each.
         """
         share = max(_BUDGET / max(count, 1), 1.0)
@@ -130,8 +130,8 @@ class FeatureOptions:
 
     @property
     def limits(self) -> tuple[int, float | None]:
-        """Keypoints of a picture, and its megapixels when they are detected; of many pictures where that is open."""
-        found = self.for_pictures(_BUDGET)
+        """Keypoints of an image, and its megapixels when they are detected; of many images where that is open."""
+        found = self.for_images(_BUDGET)
         assert found.max_features is not None
         assert found.work_megapixels != "auto"
         return found.max_features, found.work_megapixels

@@ -1,7 +1,7 @@
-"""SIFT of a large picture in tiles, in bounded memory: its finest octave has four times the picture's pixels.
+"""SIFT of a large image in tiles, in bounded memory: its finest octave has four times the image's pixels.
 
 The two finest octaves, most of the memory and most of the keypoints, are found in overlapping tiles, where they are
-what they would be in the whole; the coarser ones are those of the picture at half its size, and so on.
+what they would be in the whole; the coarser ones are those of the image at half its size, and so on.
 """
 
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ from rdstitch.features.opencv import Grey, OpenCVDetection
 from rdstitch.features.options import FeatureOptions
 
 LARGE = 1_250_000
-"""Pixels from which on a picture is taken in tiles: a whole one takes 230 bytes a pixel."""
+"""Pixels from which on an image is taken in tiles: a whole one takes 230 bytes a pixel."""
 
 _SIDE = 640  # pixels of a tile without its overlap, at most
 # How far the descriptors of the two finest octaves reach, pixels: sigma of 4, times 3 a cell, 2.5 cells, diagonally,
@@ -36,9 +36,9 @@ class _Part:
     ----------
     detection : OpenCVDetection
     corner : ndarray of shape (2,)
-        Of the tile, pixels of the reduced picture that it is cut from.
+        Of the tile, pixels of the reduced image that it is cut from.
     factor : ndarray of shape (2,)
-        Pixels of the picture itself for one of the reduced one, horizontally and vertically.
+        Pixels of the image itself for one of the reduced one, horizontally and vertically.
     """
 
     detection: OpenCVDetection
@@ -47,16 +47,16 @@ class _Part:
 
     @property
     def points(self) -> FloatArray:
-        """Places in the whole picture, pixels."""
+        """Places in the whole image, pixels."""
         return self._in_whole(self.detection.points)
 
     @property
     def enlargement(self) -> float:
-        """Pixels of the picture itself for one of the reduced one, in the mean of both directions."""
+        """Pixels of the image itself for one of the reduced one, in the mean of both directions."""
         return float(np.sqrt(self.factor.prod()))
 
     def describe(self, chosen: NDArray[np.intp]) -> Features:
-        """Features in pixels of the whole picture."""
+        """Features in pixels of the whole image."""
         found = self.detection.describe(chosen)
         return replace(
             found,
@@ -71,18 +71,18 @@ class _Part:
 
 @dataclass(frozen=True, eq=False)
 class SiftTilesDetection:
-    """Keypoints of a picture, found in parts of it."""
+    """Keypoints of an image, found in parts of it."""
 
     parts: tuple[_Part, ...]
 
     @classmethod
     def find(cls, grey: Grey, options: FeatureOptions) -> Self:
-        """Find the keypoints of a picture by SIFT."""
+        """Find the keypoints of an image by SIFT."""
         return cls(tuple(_parts(grey, options)))
 
     @property
     def points(self) -> FloatArray:
-        """Places, pixels of the picture, (N, 2)."""
+        """Places, pixels of the image, (N, 2)."""
         return np.concatenate([part.points for part in self.parts])
 
     @property
@@ -92,7 +92,7 @@ class SiftTilesDetection:
 
     @property
     def response(self) -> FloatArray:
-        """Strengths, (N,): contrast times diameter, as of a picture that is taken whole."""
+        """Strengths, (N,): contrast times diameter, as of an image that is taken whole."""
         return np.concatenate([part.enlargement * part.detection.response for part in self.parts])
 
     def describe(self, chosen: NDArray[np.intp]) -> Features:
@@ -106,7 +106,7 @@ class SiftTilesDetection:
 
 
 def _parts(grey: Grey, options: FeatureOptions) -> Iterator[_Part]:
-    """The finest octaves in tiles of the picture, and of its halves while these are large; then the rest."""
+    """The finest octaves in tiles of the image, and of its halves while these are large; then the rest."""
     whole = np.array(grey.shape[::-1])
     octaves = [_UPSAMPLED, _FIRST]
     while True:
@@ -123,7 +123,7 @@ def _parts(grey: Grey, options: FeatureOptions) -> Iterator[_Part]:
 
 
 def _tiles(grey: Grey, factor: FloatArray, octaves: list[int], options: FeatureOptions) -> Iterator[_Part]:
-    """What a picture shows in some octaves, tile by tile."""
+    """What an image shows in some octaves, tile by tile."""
     for y in _intervals(grey.shape[0]):
         for x in _intervals(grey.shape[1]):
             found = OpenCVDetection.find(grey[y.seen, x.seen], options)
@@ -133,7 +133,7 @@ def _tiles(grey: Grey, factor: FloatArray, octaves: list[int], options: FeatureO
 
 @dataclass(frozen=True)
 class _Interval:
-    """What a tile sees of a side of the picture, and which of that is its own: infinite at the picture's border."""
+    """What a tile sees of a side of the image, and which of that is its own: infinite at the image's border."""
 
     seen: slice
     start: float

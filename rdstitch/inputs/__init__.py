@@ -1,1 +1,1 @@
-"""Pictures, masks and attitudes: what the user named, made ready for the stages."""
+"""Images, masks and attitudes: what the user named, made ready for the stages."""

@@ -10,8 +10,8 @@ from typing import IO
 import cv2
 
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.inputs.find import is_rdstitch_output, natural_key, pictures_in
-from rdstitch.inputs.frame import Frame, Named, array_as_picture
+from rdstitch.inputs.find import images_in, is_rdstitch_output, natural_key
+from rdstitch.inputs.frame import Frame, Named, array_as_image
 from rdstitch.io.video import VIDEO_SUFFIXES, opened_capture, write_frame
 
 _POLL_SECONDS = 0.2  # seconds between two looks at a folder
@@ -32,7 +32,7 @@ class Arrivals:
         A folder, a video, the index of a camera, or what else OpenCV opens as a stream ("rtsp://…", "/dev/video0"); "-"
         for names on ``names``.
     names : text stream, optional
-        Names of pictures, one a line, for "-".
+        Names of images, one a line, for "-".
     every : int
         Of a video, camera or stream, every n-th frame.
     idle : float or None
@@ -101,12 +101,12 @@ class Arrivals:
         return self._of_names() if self._kind == "names" else self._of_capture()
 
     def _of_folder(self, folder: Path) -> Iterator[Frame]:
-        """New pictures of a folder, in natural order as far as they come at the same time."""
+        """New images of a folder, in natural order as far as they come at the same time."""
         states: dict[Path, tuple[int, int]] = {}
         last = time.monotonic()
         while True:
             complete, waiting = [], False
-            for path in pictures_in(folder):
+            for path in images_in(folder):
                 read_at = self._not_whole.get(path)
                 if path in self._done and read_at is None:
                     continue
@@ -135,7 +135,7 @@ class Arrivals:
                 time.sleep(_POLL_SECONDS)
 
     def _of_names(self) -> Iterator[Frame]:
-        """The pictures whose names are read, by a thread that may wait for them."""
+        """The images whose names are read, by a thread that may wait for them."""
         assert self._names is not None
         read: queue.Queue[str | None] = queue.Queue(_MAX_PENDING)
         threading.Thread(target=_read_lines, args=(self._names, read), daemon=True).start()
@@ -175,7 +175,7 @@ class Arrivals:
                     name = f"{stem}_{number:06d}.png"
                     if live:
                         self._seen.append(Frame(write_frame(self._frames_folder() / name, pixels), number, stamp))
-                    yield Frame(Path(name), number, stamp, array_as_picture(name, pixels, "bgr"))
+                    yield Frame(Path(name), number, stamp, array_as_image(name, pixels, "bgr"))
                 number += 1
 
     def _is_over(self, last: float) -> bool:

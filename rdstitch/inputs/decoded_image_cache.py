@@ -1,15 +1,15 @@
-"""Pictures kept between stages that look at them one after the other, as many as fit."""
+"""Images kept between stages that look at them one after the other, as many as fit."""
 
 from collections.abc import Hashable
 from threading import Lock
 
-from rdstitch.io.read import Picture
+from rdstitch.io.read import DecodedImage
 
 _CAPACITY = 32 * 2**20
 
 
 class DecodedImageCache:
-    """Keeps pictures until they are taken; those for which there is no room are not kept.
+    """Keeps images until they are taken; those for which there is no room are not kept.
 
     It saves time and never changes a result.
 
@@ -21,28 +21,28 @@ class DecodedImageCache:
 
     def __init__(self, room: int = _CAPACITY) -> None:
         self._room = room
-        self._held: dict[Hashable, Picture] = {}
+        self._held: dict[Hashable, DecodedImage] = {}
         self._lock = Lock()
 
-    def put(self, key: Hashable, picture: Picture) -> None:
-        """Keep a picture if there is room for it."""
+    def put(self, key: Hashable, image: DecodedImage) -> None:
+        """Keep an image if there is room for it."""
         with self._lock:
-            if key not in self._held and picture.nbytes <= self._room:
-                self._room -= picture.nbytes
-                self._held[key] = picture
+            if key not in self._held and image.nbytes <= self._room:
+                self._room -= image.nbytes
+                self._held[key] = image
 
-    def take(self, key: Hashable) -> Picture | None:
-        """Have a picture back, if it was kept."""
+    def take(self, key: Hashable) -> DecodedImage | None:
+        """Have an image back, if it was kept."""
         with self._lock:
-            picture = self._held.pop(key, None)
-            if picture is not None:
-                self._room += picture.nbytes
-            return picture
+            image = self._held.pop(key, None)
+            if image is not None:
+                self._room += image.nbytes
+            return image
 
     def clear(self) -> None:
         """Let go of all that is left."""
         with self._lock:
-            self._room += sum(picture.nbytes for picture in self._held.values())
+            self._room += sum(image.nbytes for image in self._held.values())
             self._held.clear()
 
     def __reduce__(self) -> tuple[type["DecodedImageCache"], tuple[int]]:

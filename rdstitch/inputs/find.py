@@ -23,14 +23,14 @@ from rdstitch.messages import Message, names_of, shortened
 from rdstitch.records import MAX_FILE, read_text
 
 _MAX_PATTERN = 4096  # characters: longer names no file has, and compiling a pattern takes the square of its length
-PICTURE_SUFFIXES = frozenset(
+IMAGE_SUFFIXES = frozenset(
     [".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".bmp", ".tga", ".jp2", ".ppm", ".pgm", ".pnm", ".gif"]
 )
-"""What counts as a picture in a folder; a file that is named is tried whatever it is called."""
+"""What counts as an image in a folder; a file that is named is tried whatever it is called."""
 
 
 @dataclass(frozen=True)
-class FoundPictures:
+class FoundImages:
     """What the user's arguments stand for.
 
     Attributes
@@ -38,7 +38,7 @@ class FoundPictures:
     frames : list of Frame
         In natural order within a folder or pattern.
     outputs : list of Path
-        Pictures in folders and patterns that rdstitch wrote, by the sidecars beside them, and that are no input.
+        Images in folders and patterns that rdstitch wrote, by the sidecars beside them, and that are no input.
     containers : tuple of Path
         The ``@list`` files, videos and bags that frames come from.
     notes : tuple of Message
@@ -73,10 +73,10 @@ class FoundPictures:
 
 
 @contextmanager
-def found_pictures(
+def found_images(
     arguments: Iterable[Named], *, output: str | Path | None = None, every: int | None = None, topic: str | None = None
-) -> Iterator[FoundPictures]:
-    """The pictures of :func:`find_pictures`, of videos too, whose frames exist only inside the block."""
+) -> Iterator[FoundImages]:
+    """The images of :func:`find_images`, of videos too, whose frames exist only inside the block."""
     with ExitStack() as stack:
 
         @cache
@@ -84,26 +84,26 @@ def found_pictures(
             return stack.enter_context(temporary_folder())
 
         exclude = [] if output is None else [output]
-        yield find_pictures(arguments, exclude=exclude, frames_folder=frames_folder, every=every, topic=topic)
+        yield find_images(arguments, exclude=exclude, frames_folder=frames_folder, every=every, topic=topic)
 
 
-def find_pictures(
+def find_images(
     arguments: Iterable[Named],
     *,
     exclude: Iterable[str | Path] = (),
     frames_folder: Callable[[], Path] | None = None,
     every: int | None = None,
     topic: str | None = None,
-) -> FoundPictures:
+) -> FoundImages:
     """The frames that the arguments stand for.
 
     Parameters
     ----------
     arguments : iterable of path or Frame
-        Each a picture file, a folder, a pattern (``*``, ``?``, ``[...]``), ``@FILE`` with one argument a line or
+        Each an image file, a folder, a pattern (``*``, ``?``, ``[...]``), ``@FILE`` with one argument a line or
         separated by NUL, a video file, a ROS bag, or a frame, which stays as it is.
     exclude : iterable of path
-        Files that are no input, such as the output, where rdstitch wrote them. Any other picture stays: its user must
+        Files that are no input, such as the output, where rdstitch wrote them. Any other image stays: its user must
         hear that it would be written over.
     frames_folder : callable, optional
         Gives the folder where frames of videos are written, losslessly; without it a video is refused.
@@ -131,7 +131,7 @@ def find_pictures(
         found = list(stills)
     for frame, named in ((frame, named) for item, named in found for frame in _frames_of(item)):
         is_output = (
-            frame.picture is None
+            frame.image is None
             and not is_url(frame.path)
             and (is_rdstitch_output(frame.path) or frame.path.name in interrupted(frame.path.parent))
         )
@@ -142,8 +142,8 @@ def find_pictures(
         else:
             frames.append(frame)
     if outputs and not frames:
-        raise InputError(f"{outputs[0].parent}: there are no pictures but those that rdstitch wrote")
-    return FoundPictures(frames, outputs, tuple(containers), tuple(notes))
+        raise InputError(f"{outputs[0].parent}: there are no images but those that rdstitch wrote")
+    return FoundImages(frames, outputs, tuple(containers), tuple(notes))
 
 
 def _entry(path: Path) -> Path:
@@ -181,7 +181,7 @@ def _expand(
             if text.startswith("@"):
                 file = Path(text[1:])
                 if file in lists:
-                    raise InputError(f"{file}: the list of pictures names itself")
+                    raise InputError(f"{file}: the list of images names itself")
                 containers.append(file)
                 # Another program may write the list while we read it: @<(find ...) in a shell.
                 names = names_in(read_text(file, regular=False))
@@ -192,14 +192,14 @@ def _expand(
                 yield Frame(path), True
         elif is_bag(path):
             if frames_folder is None:
-                raise InputError(f"{path}: a ROS bag is no picture here; use 'rdstitch mosaic'")
+                raise InputError(f"{path}: a ROS bag is no image here; use 'rdstitch mosaic'")
             containers += path.iterdir() if path.is_dir() else [path]
             yield _Clip(path, partial(_frames_of_bag, path, frames_folder, every, topic, notes)), True
         elif path.is_dir():
             yield from ((Frame(found), False) for found in _in_folder(path, notes))
         elif path.suffix.lower() in VIDEO_SUFFIXES:
             if frames_folder is None:
-                raise InputError(f"{path}: a video is no picture here; use 'rdstitch mosaic' or extract its frames")
+                raise InputError(f"{path}: a video is no image here; use 'rdstitch mosaic' or extract its frames")
             containers.append(path)
             yield _Clip(path, partial(_frames_of_video, path, frames_folder, every, notes)), True
         else:
@@ -213,8 +213,8 @@ class _Clip:
     path: Path
     extract: Callable[[], list[Frame]]
 
-    def among(self, pictures: int) -> Message:
-        """Why it is not used beside pictures.
+    def among(self, images: int) -> Message:
+        """Why it is not used beside images.
 
         Raises
         ------
@@ -222,9 +222,9 @@ class _Clip:
             When these are too few to be what was meant.
         """
         remedy = "give it alone, or --every N to use every N-th of its frames too"
-        if pictures < 2:
-            raise InputError(f"{self.path}: is a video beside one picture; {remedy}")
-        return Message(f"is a video among pictures, and was not used; {remedy}", (str(self.path),))
+        if images < 2:
+            raise InputError(f"{self.path}: is a video beside one image; {remedy}")
+        return Message(f"is a video among images, and was not used; {remedy}", (str(self.path),))
 
 
 def _frames_of(item: Frame | _Clip) -> list[Frame]:
@@ -246,21 +246,21 @@ def _frames_of_video(path: Path, folder: Callable[[], Path], every: int | None, 
 
 
 def _at_url(url: str) -> Iterator[tuple[Frame, bool]]:
-    """The picture, or the pictures of the folder or pattern, that a URL names."""
+    """The image, or the images of the folder or pattern, that a URL names."""
     path = Path(url)
     pattern = glob.has_magic(path.name)
-    if not pattern and path.suffix.lower() in PICTURE_SUFFIXES:
+    if not pattern and path.suffix.lower() in IMAGE_SUFFIXES:
         yield Frame(path), True
         return
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        raise InputError(f"{path}: only pictures are read from other machines; download the video first")
+        raise InputError(f"{path}: only images are read from other machines; download the video first")
     try:
         found = sorted(map(Path, remote_names(url)), key=natural_key)
     except OSError as error:
         raise InputError(f"{path}: {error}") from error
-    found = [name for name in found if name.suffix.lower() in PICTURE_SUFFIXES | HEIF_SUFFIXES]
+    found = [name for name in found if name.suffix.lower() in IMAGE_SUFFIXES | HEIF_SUFFIXES]
     if not found:
-        raise InputError(f"{path}: there are no pictures at this address")
+        raise InputError(f"{path}: there are no images at this address")
     yield from ((Frame(name), False) for name in found)
 
 
@@ -278,8 +278,8 @@ def names_in(text: str) -> list[str]:
     return [name for name in names if name]
 
 
-def pictures_in(folder: Path) -> list[Path]:
-    """The pictures of a folder in natural order, and those that nobody here can read: who reads them will say so.
+def images_in(folder: Path) -> list[Path]:
+    """The images of a folder in natural order, and those that nobody here can read: who reads them will say so.
 
     Raises
     ------
@@ -290,8 +290,8 @@ def pictures_in(folder: Path) -> list[Path]:
         entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
     except OSError as error:
         raise InputError(f"{folder}: cannot read the folder: {error.strerror}") from error
-    found = [path for path in entries if path.suffix.lower() in PICTURE_SUFFIXES]
-    # Many cameras write a raw file beside each picture, and phones that export JPEG leave the HEIC there.
+    found = [path for path in entries if path.suffix.lower() in IMAGE_SUFFIXES]
+    # Many cameras write a raw file beside each image, and phones that export JPEG leave the HEIC there.
     stems = {path.stem for path in found}
     found += [
         path for path in entries if path.suffix.lower() in HEIF_SUFFIXES | RAW_SUFFIXES and path.stem not in stems
@@ -300,27 +300,27 @@ def pictures_in(folder: Path) -> list[Path]:
 
 
 def _in_folder(folder: Path, notes: list[Message]) -> list[Path]:
-    """The same; a folder without pictures is an error, and what else is in it a note."""
-    found = pictures_in(folder)
+    """The same; a folder without images is an error, and what else is in it a note."""
+    found = images_in(folder)
     others = sorted({path for path in folder.iterdir() if not path.name.startswith(".")} - set(found), key=natural_key)
     if not found:
-        raise InputError(f"{folder}: there are no pictures in this folder{_elsewhere(others)}")
+        raise InputError(f"{folder}: there are no images in this folder{_elsewhere(others)}")
     if others:
-        text = f"{folder}: not taken for pictures: {shortened([path.name for path in others])}"
+        text = f"{folder}: not taken for images: {shortened([path.name for path in others])}"
         notes.append(Message(text, severity="detail"))
     return found
 
 
-def _has_pictures(folder: Path) -> bool:
+def _has_images(folder: Path) -> bool:
     try:
-        return bool(pictures_in(folder))
+        return bool(images_in(folder))
     except InputError:
         return False
 
 
 def _elsewhere(others: Sequence[Path]) -> str:
-    """Where the pictures may be, if a folder has none."""
-    within = [str(path) for path in others if path.is_dir() and _has_pictures(path)]
+    """Where the images may be, if a folder has none."""
+    within = [str(path) for path in others if path.is_dir() and _has_images(path)]
     videos = [str(path) for path in others if path.suffix.lower() in VIDEO_SUFFIXES]
     if within:
         return f", but in the folders within it; name those: {shortened(within)}"
@@ -338,7 +338,7 @@ def _matching(pattern: str) -> list[Path]:
 
 
 def is_rdstitch_output(path: Path) -> bool:
-    """Whether rdstitch wrote this picture: the sidecar beside it says so, and means this one."""
+    """Whether rdstitch wrote this image: the sidecar beside it says so, and means this one."""
     try:
         record = json.loads(read_limited(path.with_name(path.name + ".json"), MAX_FILE))
         own = record["format"] == "rdstitch sidecar"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rdstitch.errors import ArgumentError
 from rdstitch.io.metadata import Metadata, metadata_of
-from rdstitch.io.read import Picture, as_picture, from_pillow
+from rdstitch.io.read import DecodedImage, as_image, from_pillow
 
 ChannelOrder = Literal["bgr", "rgb"]
 """Order of the colour channels of arrays that come in and go out: OpenCV's, or everybody else's."""
@@ -31,14 +31,14 @@ class Frame:
         Its number in the video, bag or list of arrays that it comes from, from 0.
     timestamp : float or None
         When it was taken, s, where its video or bag knows that.
-    picture : Picture or None
+    image : DecodedImage or None
         The image itself where it is no file.
     """
 
     path: Path
     number: int | None = None
     timestamp: float | None = None
-    picture: Picture | None = None
+    image: DecodedImage | None = None
 
 
 Image = str | os.PathLike[str] | NDArray[Any] | PIL.Image.Image
@@ -89,7 +89,7 @@ def in_order(samples: NDArray[Any], channel_order: ChannelOrder) -> NDArray[Any]
 
 def files_of(frames: Iterable[Frame]) -> list[Path]:
     """The files among the frames, which must not be overwritten."""
-    return [frame.path for frame in frames if frame.picture is None]
+    return [frame.path for frame in frames if frame.image is None]
 
 
 def _as_input(item: Any, index: int, channel_order: ChannelOrder) -> Named:
@@ -101,17 +101,17 @@ def _as_input(item: Any, index: int, channel_order: ChannelOrder) -> Named:
         )
     name = f"image_{index:04d}"
     if isinstance(item, PIL.Image.Image):
-        return Frame(Path(name), index, picture=as_picture(Path(name), *from_pillow(item), metadata_of(item)))
+        return Frame(Path(name), index, image=as_image(Path(name), *from_pillow(item), metadata_of(item)))
     if not isinstance(item, np.ndarray):
         kind, remedy = type(item).__name__, "convert it by numpy.asarray"
         if type(item).__module__.partition(".")[0] == "torch":
             kind = "a tensor of torch"
             remedy = 'of shape (C, H, W) in RGB, give tensor.permute(1, 2, 0).numpy(force=True) and channel_order="rgb"'
         raise ArgumentError(f"image {index}: expected a path, a NumPy array or a Pillow image, not {kind}; {remedy}")
-    return Frame(Path(name), index, picture=array_as_picture(name, item, channel_order))
+    return Frame(Path(name), index, image=array_as_image(name, item, channel_order))
 
 
-def array_as_picture(name: str, array: NDArray[Any], channel_order: ChannelOrder) -> Picture:
+def array_as_image(name: str, array: NDArray[Any], channel_order: ChannelOrder) -> DecodedImage:
     """An array as the readers of files give it: in RGB order, alpha apart, and a copy, since buffers are reused."""
     if array.ndim not in (2, 3) or array.size == 0:
         raise ArgumentError(f"{name}: expected an array of shape (H, W) or (H, W, C), not {array.shape}")
@@ -124,4 +124,4 @@ def array_as_picture(name: str, array: NDArray[Any], channel_order: ChannelOrder
         samples = samples[..., 0]
     samples = in_order(np.array(samples, dtype=np.float32 if array.dtype.kind == "f" else array.dtype), channel_order)
     metadata = Metadata((array.shape[1], array.shape[0]), bit_depth=8 * array.dtype.itemsize)
-    return as_picture(Path(name), samples, None if alpha is None else alpha.copy(), metadata)
+    return as_image(Path(name), samples, None if alpha is None else alpha.copy(), metadata)

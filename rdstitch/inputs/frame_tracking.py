@@ -19,7 +19,7 @@ _WINDOW = (15, 15)  # pixels, in which a corner is found again
 _MIN_CORNERS = 12  # corners that a motion is believed by
 _AGREEING = 0.4  # share of the corners that must agree
 _ERROR = 0.02  # of a motion, in sides: lenses and tilts are not affine
-_STILL, _MOVED = 0.5, 3.0  # pixels: what stays in the picture, such as a robot's body, and what moves with the ground
+_STILL, _MOVED = 0.5, 3.0  # pixels: what stays in the image, such as a robot's body, and what moves with the ground
 _WORN = 0.5  # share of the corners, or of the side that they have come, after which new ones are taken
 _GRID = 16  # points a side by which areas are measured
 
@@ -80,22 +80,20 @@ def tracked(frames: Iterable[NDArray[np.uint8]]) -> FramePlaces:
 class _Corners:
     """Corners of one frame, followed through the next ones."""
 
-    def __init__(self, picture: NDArray[np.uint8], place: FloatArray) -> None:
-        found = cv2.goodFeaturesToTrack(picture, _CORNERS, _QUALITY, _APART)
+    def __init__(self, image: NDArray[np.uint8], place: FloatArray) -> None:
+        found = cv2.goodFeaturesToTrack(image, _CORNERS, _QUALITY, _APART)
         self._from = np.empty((0, 1, 2), dtype=np.float32) if found is None else found
-        self._at, self._last, self._count = self._from, picture, len(self._from)
+        self._at, self._last, self._count = self._from, image, len(self._from)
         self.place = place
         self.worn = False
 
-    def follow(self, picture: NDArray[np.uint8]) -> FloatArray | None:
+    def follow(self, image: NDArray[np.uint8]) -> FloatArray | None:
         """The motion (3, 3) from the frame of the corners to the next one; None where it is not known."""
-        if picture.shape != self._last.shape or len(self._at) < _MIN_CORNERS:
+        if image.shape != self._last.shape or len(self._at) < _MIN_CORNERS:
             return None
-        at, status, _ = cv2.calcOpticalFlowPyrLK(
-            self._last, picture, self._at, np.empty_like(self._at), winSize=_WINDOW
-        )
-        self._last = picture
-        inside = (at >= 0.0).all(axis=(1, 2)) & (at[:, 0] < picture.shape[::-1]).all(axis=1)
+        at, status, _ = cv2.calcOpticalFlowPyrLK(self._last, image, self._at, np.empty_like(self._at), winSize=_WINDOW)
+        self._last = image
+        inside = (at >= 0.0).all(axis=(1, 2)) & (at[:, 0] < image.shape[::-1]).all(axis=1)
         kept = (status[:, 0] > 0) & inside
         self._from, self._at = self._from[kept], at[kept]
         way = np.linalg.norm(self._at - self._from, axis=2)[:, 0]
@@ -104,7 +102,7 @@ class _Corners:
             ground = way > _STILL
         if ground.sum() < _MIN_CORNERS:
             return None
-        side = max(picture.shape)
+        side = max(image.shape)
         motion, agree = cv2.estimateAffine2D(
             self._from[ground], self._at[ground], method=cv2.RANSAC, ransacReprojThreshold=_ERROR * side
         )

@@ -8,7 +8,7 @@ from threading import Lock
 
 from rdstitch.errors import InputError
 from rdstitch.file_access import is_url, open_regular, remote_status
-from rdstitch.io.read import Picture
+from rdstitch.io.read import DecodedImage
 from rdstitch.messages import Message
 
 _BLOCK_BYTES = 2**20
@@ -26,7 +26,7 @@ class InputGuard:
     Parameters
     ----------
     strict : bool
-        Refuse a damaged picture, rather than warn of it.
+        Refuse a damaged image, rather than warn of it.
     """
 
     def __init__(self, strict: bool = False) -> None:
@@ -57,17 +57,17 @@ class InputGuard:
         if _stamp(path) != before:
             raise InputError(f"{path}: is being written to; run again when that has ended")
 
-    def check(self, path: Path, picture: Picture) -> None:
-        """Take note of a picture that may be damaged.
+    def check(self, path: Path, image: DecodedImage) -> None:
+        """Take note of an image that may be damaged.
 
         Raises
         ------
         InputError
-            When damaged pictures are refused.
+            When damaged images are refused.
         """
-        if not picture.damage:
+        if not image.damage:
             return
-        reason = f"is damaged, and parts of it may be wrong ({picture.damage}); copy it again from its source"
+        reason = f"is damaged, and parts of it may be wrong ({image.damage}); copy it again from its source"
         if self._strict:
             raise InputError(f"{path}: {reason}")
         self._damaged[path] = reason

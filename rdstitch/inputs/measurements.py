@@ -1,4 +1,4 @@
-"""What was measured of each picture besides: tilt, place and time, by the picture's metadata or a table."""
+"""What was measured of each image besides: tilt, place and time, by the image's metadata or a table."""
 
 import csv
 import math
@@ -18,11 +18,11 @@ from rdstitch.planar_motion import tilt_from_normal, turned_tilt
 from rdstitch.records import read_text
 
 XMP = "xmp"
-"""The value of ``attitude`` that stands for the pictures' own XMP."""
+"""The value of ``attitude`` that stands for the images' own XMP."""
 
 _TILT_COLUMNS = ("name", "psi", "theta")
-_MAX_NAMED = 3  # pictures in a message
-_MAX_TILT = math.radians(80.0)  # beyond, hardly a picture shows ground, and more likely angles mean something else
+_MAX_NAMED = 3  # images in a message
+_MAX_TILT = math.radians(80.0)  # beyond, hardly an image shows ground, and more likely angles mean something else
 _EARTH = 6_371_000.0  # m
 _TIME_COLUMNS = ("name", "timestamp")
 
@@ -33,23 +33,23 @@ def with_attitudes(sources: Sequence[Source], wanted: str | Path | None) -> list
     Parameters
     ----------
     wanted : str, path or None
-        The text :data:`XMP`: what drones write into pictures, see :mod:`rdstitch.io.attitude`; the plane is then taken
-        to be level. Or a CSV file with a header that names the columns ``name`` (of the picture's file), ``psi`` and
+        The text :data:`XMP`: what drones write into images, see :mod:`rdstitch.io.attitude`; the plane is then taken
+        to be level. Or a CSV file with a header that names the columns ``name`` (of the image's file), ``psi`` and
         ``theta``, degrees; others are ignored.
 
     Raises
     ------
     InputError
-        When the file cannot be read, is no such table, or has no line for a picture; when a picture's XMP has no
+        When the file cannot be read, is no such table, or has no line for an image; when an image's XMP has no
         attitude of the camera, or one that is far from looking down.
     """
     if wanted is None:
         return list(sources)
-    attitudes = _of_pictures(sources) if wanted == XMP else _of_table(sources, wanted)
+    attitudes = _of_images(sources) if wanted == XMP else _of_table(sources, wanted)
     return [replace(source, attitude=attitude) for source, attitude in zip(sources, attitudes, strict=True)]
 
 
-def _of_pictures(sources: Sequence[Source]) -> list[tuple[float, float]]:
+def _of_images(sources: Sequence[Source]) -> list[tuple[float, float]]:
     """(ψ, θ), radians, of each source by its XMP."""
     tilts, lacking = [], []
     for source in sources:
@@ -110,7 +110,7 @@ def _read_rows(file: str | Path) -> dict[str, tuple[float, float]]:
 
 
 def positions_of(sources: Sequence[Source]) -> FloatArray:
-    """Metres east and north (N, 2) of the median of the pictures' GPS positions; NaN where unknown."""
+    """Metres east and north (N, 2) of the median of the images' GPS positions; NaN where unknown."""
     known = [source.metadata.gps for source in sources]
     degrees = [(np.nan, np.nan) if gps is None else (gps.latitude, gps.longitude) for gps in known]
     latitude, longitude = np.radians(np.array(degrees, dtype=np.float64).reshape(-1, 2)).T
@@ -135,13 +135,13 @@ def timestamps_of(sources: Sequence[Source], file: str | Path | None = None) -> 
     ----------
     file : path, optional
         CSV with a header that names the columns ``name`` and ``timestamp``; or lines ``TIMESTAMP NAME`` as in the lists
-        of the TUM benchmark; or one time a line, the n-th for the n-th picture or frame of the video, as KITTI's
+        of the TUM benchmark; or one time a line, the n-th for the n-th image or frame of the video, as KITTI's
         ``times.txt``. Lines that begin with ``#`` are ignored.
 
     Raises
     ------
     InputError
-        When the file cannot be read, or has no time for a picture.
+        When the file cannot be read, or has no time for an image.
     """
     if file is None:
         return np.array([_own_time(source) for source in sources])
@@ -165,7 +165,7 @@ def _state_of(file: str | Path) -> tuple[int, int]:
 
 @lru_cache(maxsize=1)  # frames that are followed ask one after the other
 def _read_times(file: str | Path, state: tuple[int, int]) -> list[float] | dict[str, float]:
-    """The times in order, or by the names of the pictures."""
+    """The times in order, or by the names of the images."""
     lines = [line.strip() for line in read_text(file).splitlines()]
     lines = [line for line in lines if line and not line.startswith("#")]
     if lines and all(_is_number(line) for line in lines):
@@ -180,10 +180,10 @@ def _own_time(source: Source) -> float:
 
 
 def _by_number(sources: Sequence[Source], times: Sequence[float], file: str | Path) -> FloatArray:
-    """One time for each picture in order, or for each frame of the video that pictures were taken from."""
+    """One time for each image in order, or for each frame of the video that images were taken from."""
     numbers = [source.number(position) for position, source in enumerate(sources)]
     if max(numbers) >= len(times):
-        raise InputError(f"{file}: has {len(times)} times, but picture or frame {max(numbers)} (from 0) needs one")
+        raise InputError(f"{file}: has {len(times)} times, but image or frame {max(numbers)} (from 0) needs one")
     return np.array([times[number] for number in numbers])
 
 

@@ -1,4 +1,4 @@
-"""Images of a ROS bag, of version 1 or 2, as picture files with time stamps; no ROS is needed, only ``rosbags``."""
+"""Images of a ROS bag, of version 1 or 2, as image files with time stamps; no ROS is needed, only ``rosbags``."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

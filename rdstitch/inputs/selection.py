@@ -1,4 +1,4 @@
-"""Which of the pictures that were named are used (the user's --exclude and --include-only), and which part of each."""
+"""Which of the images that were named are used (the user's --exclude and --include-only), and which part of each."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -7,14 +7,14 @@ from pathlib import Path
 
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.file_access import canonical_name
-from rdstitch.inputs.find import PICTURE_SUFFIXES
+from rdstitch.inputs.find import IMAGE_SUFFIXES
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.source import Source
 from rdstitch.io.mask import mask_frame
 
 
 def selected(frames: Sequence[Frame], exclude: Sequence[str], include_only: Sequence[str]) -> list[Frame]:
-    """The pictures that ``include_only`` names, all if it names none, without those that ``exclude`` names.
+    """The images that ``include_only`` names, all if it names none, without those that ``exclude`` names.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ def selected(frames: Sequence[Frame], exclude: Sequence[str], include_only: Sequ
     Raises
     ------
     ArgumentError
-        When one of them fits no picture: it is misspelt.
+        When one of them fits no image: it is misspelt.
     """
     for option, patterns in (("exclude", exclude), ("include-only", include_only)):
         for pattern in patterns:
@@ -45,7 +45,7 @@ def _names(frames: Sequence[Frame]) -> str:
 
 
 def is_selected(frame: Frame, exclude: Sequence[str], include_only: Sequence[str]) -> bool:
-    """Whether a picture is used; see :func:`selected`."""
+    """Whether an image is used; see :func:`selected`."""
     included = not include_only or any(_fits(frame, pattern) for pattern in include_only)
     return included and not any(_fits(frame, pattern) for pattern in exclude)
 
@@ -62,14 +62,14 @@ def with_masks(sources: Sequence[Source], masks: str | Path | None) -> list[Sour
     Parameters
     ----------
     masks : path or None
-        A picture: the mask of all pictures, such as of a camera that sees its own vehicle. Or a folder with a mask for
-        each picture, or for some, of the picture's name; the suffix may differ.
+        An image: the mask of all images, such as of a camera that sees its own vehicle. Or a folder with a mask for
+        each image, or for some, of the image's name; the suffix may differ.
 
     Raises
     ------
     InputError
-        When there is no such file or folder, nothing in the folder is the mask of a picture, or a mask has another
-        shape than its picture.
+        When there is no such file or folder, nothing in the folder is the mask of an image, or a mask has another
+        shape than its image.
     """
     if masks is None:
         return list(sources)
@@ -83,24 +83,24 @@ def with_masks(sources: Sequence[Source], masks: str | Path | None) -> list[Sour
         mask, frame = by_stem.get(canonical_name(source.path.stem)), None
         if mask is not None:
             if mask.resolve() == source.path.resolve():
-                raise InputError(f"{mask}: is the picture itself, not its mask; masks lie in another folder")
+                raise InputError(f"{mask}: is the image itself, not its mask; masks lie in another folder")
             metadata = source.metadata
             frame = mask_frame(mask, source.path, metadata.size, metadata.orientation, of_camera=not several)
         masked.append(replace(source, mask=mask, mask_frame=frame))
     if sources and all(source.mask is None for source in masked):
-        raise InputError(f"{path}: none of the masks has the name of a picture, such as {sources[0].path.stem}.png")
+        raise InputError(f"{path}: none of the masks has the name of an image, such as {sources[0].path.stem}.png")
     return masked
 
 
 def _by_stem(folder: Path) -> Mapping[str, Path]:
     """The masks in a folder, by their names before the suffix."""
     try:
-        files = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES)
+        files = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
     except OSError as error:
         raise InputError(f"{folder}: cannot read the folder: {error.strerror}") from error
     masks: dict[str, Path] = {}
     for path in files:
         other = masks.setdefault(canonical_name(path.stem), path)
         if other != path:
-            raise InputError(f"{path}: {other.name} is a mask for the same picture; remove one of them")
+            raise InputError(f"{path}: {other.name} is a mask for the same image; remove one of them")
     return masks

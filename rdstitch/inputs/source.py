@@ -1,4 +1,4 @@
-"""The input pictures: which files, what their headers say, and the camera each was taken with."""
+"""The input images: which files, what their headers say, and the camera each was taken with."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -12,14 +12,14 @@ from rdstitch.cache import Cache
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError, InputError, LimitError, RdstitchError
 from rdstitch.features.options import WORK_MEGAPIXELS
-from rdstitch.features.picture import View, halving
+from rdstitch.features.prepared_image import View, halving
 from rdstitch.file_access import canonical_name, held_in_memory, is_url
 from rdstitch.inputs.decoded_image_cache import DecodedImageCache
 from rdstitch.inputs.frame import Frame, Named
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.io.mask import read_mask
 from rdstitch.io.metadata import Metadata, read_metadata
-from rdstitch.io.read import Picture, read_image, reduced
+from rdstitch.io.read import DecodedImage, read_image, reduced
 from rdstitch.io.reduction import block_minimum, fitting_reduction, reduced_size
 from rdstitch.messages import Message, left_out
 from rdstitch.orientation import inverse, turned_size
@@ -31,7 +31,7 @@ _HELD_UPRIGHT = 6
 
 @dataclass(frozen=True)
 class Source:
-    """One input picture; its pixels are read when they are needed.
+    """One input image; its pixels are read when they are needed.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Source:
     camera : Camera
         What is known of the camera before registration: size, centre, focal length, and λ where it was given.
     mask : Path or None
-        Picture that is dark where this one does not count.
+        Image that is dark where this one does not count.
     mask_frame : int or None
         How it is turned, see :func:`rdstitch.io.mask.mask_frame`.
     attitude : (float, float) or None
@@ -85,24 +85,24 @@ class Source:
     def with_absolute_paths(self) -> Self:
         """The same by names that hold in workers elsewhere too, where relative ones begin at other folders."""
         mask = None if self.mask is None else self.mask.absolute()
-        named = is_url(self.path) or (self.frame is not None and self.frame.picture is not None)
+        named = is_url(self.path) or (self.frame is not None and self.frame.image is not None)
         return replace(self, path=self.path if named else self.path.absolute(), mask=mask)
 
     def content(self, cache: Cache) -> str:
         """Hash of what the image is made from, for keys of the cache; for one of this run alone its name will do."""
-        if self.frame is None or self.frame.picture is None or cache.temporary is not None:
+        if self.frame is None or self.frame.image is None or cache.temporary is not None:
             return cache.file(self.path)
-        return cache.digest((self.frame.picture.pixels, self.frame.picture.alpha))
+        return cache.digest((self.frame.image.pixels, self.frame.image.alpha))
 
     def mask_content(self, cache: Cache) -> tuple[str, int | None]:
         """The same of its mask."""
         return cache.file(self.mask), self.mask_frame
 
     def reduction(self, megapixels: float | None) -> int:
-        """By how much it can be read smaller and has no fewer pixels than a picture halved to so many 10⁶ pixels."""
+        """By how much it can be read smaller and has no fewer pixels than an image halved to so many 10⁶ pixels."""
         return 1 if megapixels is None else fitting_reduction(halving(self.camera.image_size, megapixels))
 
-    def read(self, reduction: int = 1, *, keep: bool = False) -> Picture:
+    def read(self, reduction: int = 1, *, keep: bool = False) -> DecodedImage:
         """The pixels, of blocks of so many pixels a side; what the mask excludes is transparent.
 
         Parameters
@@ -120,36 +120,36 @@ class Source:
         if reduction % usual:
             return self._load(reduction)
         key = (self.path, self.mask, self.mask_frame)
-        picture = self.decoded_images.take(key) or self._load(usual)
+        image = self.decoded_images.take(key) or self._load(usual)
         if keep:
-            self.decoded_images.put(key, picture)
-        return reduced(picture, reduction // usual)
+            self.decoded_images.put(key, image)
+        return reduced(image, reduction // usual)
 
     def view(self, megapixels: float | None) -> View:
         """What detection at so many 10⁶ pixels needs of it; it is kept for the stages that read it again."""
         reduction = self.reduction(megapixels)
-        picture = self.read(reduction, keep=True)
-        return View(picture.pixels, picture.alpha, reduction, self.camera.image_size)
+        image = self.read(reduction, keep=True)
+        return View(image.pixels, image.alpha, reduction, self.camera.image_size)
 
-    def _load(self, reduction: int) -> Picture:
+    def _load(self, reduction: int) -> DecodedImage:
         """The pixels from the file, masked."""
-        array = None if self.frame is None else self.frame.picture
+        array = None if self.frame is None else self.frame.image
         if array is None:
             with held_in_memory(self.path), self.guard.reading(self.path):
-                picture = read_image(self.path, reduction, self.metadata)
+                image = read_image(self.path, reduction, self.metadata)
         else:
-            picture = reduced(array, reduction)
-        self.guard.check(self.path, picture)
+            image = reduced(array, reduction)
+        self.guard.check(self.path, image)
         expected = self.camera.image_size
-        if picture.pixels.shape[1::-1] != reduced_size(expected, reduction):
+        if image.pixels.shape[1::-1] != reduced_size(expected, reduction):
             now, before = ("{} x {}".format(*size) for size in (read_metadata(self.path).size, expected))
             raise InputError(f"{self.path}: has {now} pixels now, but had {before} before; run again")
         if self.mask is None:
-            return picture
+            return image
         alpha = block_minimum(read_mask(self.mask, expected, self.mask_frame), reduction)
-        if picture.alpha is not None:
-            alpha = np.minimum(alpha, picture.alpha)
-        return replace(picture, alpha=alpha)
+        if image.alpha is not None:
+            alpha = np.minimum(alpha, image.alpha)
+        return replace(image, alpha=alpha)
 
 
 def read_sources(
@@ -162,12 +162,12 @@ def read_sources(
     guard: InputGuard | None = None,
     max_memory: int | None = None,
 ) -> tuple[list[Source], list[Message]]:
-    """Read the headers of the pictures; a file named twice counts once.
+    """Read the headers of the images; a file named twice counts once.
 
     Parameters
     ----------
     camera : Camera, optional
-        Known camera; adapted to the size of each picture.
+        Known camera; adapted to the size of each image.
     focal : float, optional
         Known focal length, pixels.
     distortion : float, optional
@@ -177,14 +177,14 @@ def read_sources(
     guard : InputGuard, optional
         What notices changes of the files, and damage.
     max_memory : int or None
-        Bytes that a picture may take while it is decoded.
+        Bytes that an image may take while it is decoded.
 
     Raises
     ------
     InputError
         When a file cannot be read.
     LimitError
-        When a picture needs more memory.
+        When an image needs more memory.
     """
     guard = guard or InputGuard()
     sources: list[Source] = []
@@ -196,7 +196,7 @@ def read_sources(
         path = frame.path
         try:
             key = path.resolve()
-            metadata = read_metadata(path) if frame.picture is None else frame.picture.metadata
+            metadata = read_metadata(path) if frame.image is None else frame.image.metadata
             _check_memory(path, metadata, max_memory)
         except (InputError, LimitError, OSError, RuntimeError) as error:
             reason = error if isinstance(error, RdstitchError) else InputError(f"{path}: cannot be read: {error}")
@@ -204,7 +204,7 @@ def read_sources(
                 raise reason from error
             unread.append(left_out(path, str(reason).removeprefix(f"{path}: ")))
             continue
-        if frame.picture is not None or key not in seen:
+        if frame.image is not None or key not in seen:
             seen.add(key)
             known = _camera(metadata, camera, focal, distortion)
             sources.append(Source(path, metadata, known, frame=frame, decoded_images=decoded_images, guard=guard))
@@ -212,18 +212,18 @@ def read_sources(
 
 
 def _check_memory(path: Path, metadata: Metadata, max_memory: int | None) -> None:
-    """Refuse a picture before it is decoded: it is then there twice, as the compositor also reckons."""
+    """Refuse an image before it is decoded: it is then there twice, as the compositor also reckons."""
     width, height = metadata.size
     need = 2 * width * height * metadata.channels * -(-metadata.bit_depth // 8)
     if max_memory is not None and need > max_memory:
         raise LimitError(
             f"{path}: {width} x {height} pixels need {need / 2**20:.0f} MB to be decoded, and --max-memory allows "
-            f"{max_memory / 2**20:.0f} MB; raise it, or make the picture smaller"
+            f"{max_memory / 2**20:.0f} MB; raise it, or make the image smaller"
         )
 
 
 def _camera(metadata: Metadata, camera: Camera | None, focal: float | None, distortion: float | None) -> Camera:
-    """The best that is known of one picture's camera: what the user says, then EXIF; the guess comes later."""
+    """The best that is known of one image's camera: what the user says, then EXIF; the guess comes later."""
     found = Camera(metadata.size) if camera is None else _fitted(camera, metadata)
     if focal is not None:
         found = found.with_focal(focal, "option")
@@ -235,9 +235,9 @@ def _camera(metadata: Metadata, camera: Camera | None, focal: float | None, dist
 
 
 def _fitted(camera: Camera, metadata: Metadata) -> Camera:
-    """A known camera for an upright picture: it belongs to the frame, stored or upright, whose shape it has.
+    """A known camera for an upright image: it belongs to the frame, stored or upright, whose shape it has.
 
-    Where the picture is turned by a quarter and no tag says which way, as cameras are that are held upright.
+    Where the image is turned by a quarter and no tag says which way, as cameras are that are held upright.
     """
     upright, orientation = metadata.size, metadata.orientation
     for turning in (orientation, 1, _HELD_UPRIGHT):
@@ -246,5 +246,5 @@ def _fitted(camera: Camera, metadata: Metadata) -> Camera:
             return camera.resized(size).turned(turning)
     raise ArgumentError(
         f"the camera file is for {camera.image_size[0]} x {camera.image_size[1]} pixels; "
-        f"a picture of {upright[0]} x {upright[1]} pixels was cropped or comes from another camera"
+        f"an image of {upright[0]} x {upright[1]} pixels was cropped or comes from another camera"
     )

@@ -1,18 +1,18 @@
-"""Files in and out: pictures with their metadata, sidecars, and nothing half-written."""
+"""Files in and out: images with their metadata, sidecars, and nothing half-written."""
 
 from rdstitch.io.atomic import check_output
 from rdstitch.io.attitude import Attitude
 from rdstitch.io.layout import Layout
 from rdstitch.io.metadata import GpsPosition, Metadata, read_metadata
-from rdstitch.io.read import Picture, read_image
+from rdstitch.io.read import DecodedImage, read_image
 from rdstitch.io.write import check_format, check_size, write_image, write_strips
 
 __all__ = [
     "Attitude",
+    "DecodedImage",
     "GpsPosition",
     "Layout",
     "Metadata",
-    "Picture",
     "check_format",
     "check_output",
     "check_size",

@@ -11,14 +11,14 @@ from rdstitch.file_access import local_file
 from rdstitch.io.deepzoom import check_tiles_folder, tiles_folder
 from rdstitch.io.outputs import Outputs, naming
 
-PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".dzi")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".dzi")
 
 
 def check_output(
     path: str | Path,
     overwrite: bool = False,
     inputs: Iterable[str | Path] = (),
-    suffixes: Iterable[str] = PICTURE_SUFFIXES,
+    suffixes: Iterable[str] = IMAGE_SUFFIXES,
 ) -> Path:
     """Find out before long work whether a file can be written; nothing is created.
 

@@ -8,7 +8,7 @@ source        properties                            the camera looks            
 ============= ===================================== ============================================ =================
 dji-gimbal    GimbalYawDegree, GimbalPitchDegree, … ahead                                        pitch -90
 parrot-camera CameraYawDegree, CameraPitchDegree, … ahead                                        pitch -90
-pix4d-camera  Camera:Yaw, Camera:Pitch, Camera:Roll below, the top of its picture points ahead   pitch 0, roll 0
+pix4d-camera  Camera:Yaw, Camera:Pitch, Camera:Roll below, the top of its image points ahead   pitch 0, roll 0
 ============= ===================================== ============================================ =================
 
 The last, defined by Pix4D, is what senseFly and Parrot's Sequoia write. What tells the attitude of the drone alone, or
@@ -72,7 +72,7 @@ class Attitude:
 
     @property
     def nadir(self) -> tuple[float, float, float]:
-        """Unit vector straight down, in the camera's axes: right, towards the bottom of its picture, ahead."""
+        """Unit vector straight down, in the camera's axes: right, towards the bottom of its image, ahead."""
         pitch, roll = math.radians(self.pitch), math.radians(self.roll)
         # Down in the body's axes: the last row of Rz(yaw) Ry(pitch) Rx(roll), in which yaw is no matter.
         ahead = -math.sin(pitch)

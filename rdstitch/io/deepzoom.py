@@ -1,6 +1,6 @@
-"""Deep Zoom (``.dzi``) from strips: JPEG tiles of every size of a picture, for viewers in the browser.
+"""Deep Zoom (``.dzi``) from strips: JPEG tiles of every size of an image, for viewers in the browser.
 
-A picture's levels, each half as large as the next, are cut into tiles while the strips pass; memory is that of a few
+An image's levels, each half as large as the next, are cut into tiles while the strips pass; memory is that of a few
 strips. Beside ``name.dzi``, which tells the size, the folder ``name_files`` holds ``LEVEL/COLUMN_ROW.jpg``.
 """
 
@@ -22,7 +22,7 @@ from rdstitch.io.read import read_image
 from rdstitch.io.reduction import halved, reduced_size
 
 MAX_TILE_PROFILE = 2**16
-"""Bytes of a colour profile that is written into every tile; the larger ones of RGB pictures have 60 kB."""
+"""Bytes of a colour profile that is written into every tile; the larger ones of RGB images have 60 kB."""
 
 TILE, OVERLAP = 254, 1
 """Side of the tiles and how far they reach into their neighbours, pixels."""
@@ -69,7 +69,7 @@ def holds_only_tiles(folder: Path) -> bool:
 
 
 def write_deep_zoom(description: Path, folder: Path, layout: Layout, strips: Iterable[Strip]) -> None:
-    """Write the description and the tiles of a picture; transparency becomes the background, 16 bits become 8.
+    """Write the description and the tiles of an image; transparency becomes the background, 16 bits become 8.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def write_deep_zoom(description: Path, folder: Path, layout: Layout, strips: Ite
 
 
 def read_deep_zoom(path: Path, size: tuple[int, int], side: int) -> NDArray[np.uint8]:
-    """Read the smallest level whose longer side has ``side`` pixels, or else the largest, of a picture of ``size``.
+    """Read the smallest level whose longer side has ``side`` pixels, or else the largest, of an image of ``size``.
 
     Raises
     ------
@@ -132,7 +132,7 @@ def _levels(folder: Path, layout: Layout) -> "_Level":
 
 @dataclass
 class _Level:
-    """One size of the picture, which is cut into tiles as its rows come.
+    """One size of the image, which is cut into tiles as its rows come.
 
     Parameters
     ----------

@@ -53,25 +53,25 @@ def _jpeg(layout: Layout, samples: NDArray[np.generic], alpha: NDArray[np.uint8]
     """One strip as a JPEG file of its own, with a restart marker after each row of blocks."""
     eight = as_eight_bit(samples)
     if layout.channels == 1:
-        block, picture = _BLOCK_GREY, eight[..., 0].copy()
+        block, image = _BLOCK_GREY, eight[..., 0].copy()
     else:
-        block, picture = _BLOCK_COLOUR, np.asarray(cv2.cvtColor(eight, cv2.COLOR_RGB2BGR))
+        block, image = _BLOCK_COLOUR, np.asarray(cv2.cvtColor(eight, cv2.COLOR_RGB2BGR))
     if alpha is not None and not alpha.all():
-        picture = _on_background(picture, alpha, layout.background)
+        image = _on_background(image, alpha, layout.background)
     options = [
         *(cv2.IMWRITE_JPEG_QUALITY, layout.quality),
         *(cv2.IMWRITE_JPEG_RST_INTERVAL, -(-layout.size[0] // block)),
         *(cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420),
     ]
-    done, data = cv2.imencode(".jpg", picture, options)
+    done, data = cv2.imencode(".jpg", image, options)
     if not done:
         raise LimitError(f"{layout.size[0]} x {layout.size[1]} pixels cannot be encoded as JPEG; write a .tif")
     return np.asarray(data, dtype=np.uint8).tobytes()
 
 
-def _on_background(picture: NDArray[np.uint8], alpha: NDArray[np.uint8], background: int) -> NDArray[np.uint8]:
-    """A picture (h, w) or (h, w, 3), grey where alpha is 0."""
-    shown = cv2.bitwise_and(picture, picture, mask=alpha)
+def _on_background(image: NDArray[np.uint8], alpha: NDArray[np.uint8], background: int) -> NDArray[np.uint8]:
+    """An image (h, w) or (h, w, 3), grey where alpha is 0."""
+    shown = cv2.bitwise_and(image, image, mask=alpha)
     if background:
         shown[alpha == 0] = background
     return np.asarray(shown, dtype=np.uint8)
@@ -87,7 +87,7 @@ def _header_and_scan(data: bytes) -> tuple[bytes, memoryview]:
 
 
 def _with_height(head: bytes, height: int) -> bytes:
-    """The header with the height of the whole picture instead of the first strip's."""
+    """The header with the height of the whole image instead of the first strip's."""
     position = 2
     while head[position + 1] != _START_OF_FRAME:
         position += 2 + struct.unpack_from(">H", head, position + 2)[0]

@@ -1,4 +1,4 @@
-"""What is written: a picture that comes in strips, from top to bottom."""
+"""What is written: an image that comes in strips, from top to bottom."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -20,7 +20,7 @@ STRIP_ROWS = 256
 
 @dataclass(frozen=True)
 class Layout:
-    """The form of a picture that comes in strips.
+    """The form of an image that comes in strips.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Layout:
     def __post_init__(self) -> None:
         if min(self.size) < 1 or self.channels < 1:
             raise ArgumentError(
-                f"a picture of {self.size[0]} x {self.size[1]} pixels and {self.channels} channels is empty"
+                f"an image of {self.size[0]} x {self.size[1]} pixels and {self.channels} channels is empty"
             )
         if self.dtype not in (np.uint8, np.uint16, np.float32):
             raise ArgumentError(f"pixels must be uint8, uint16 or float32, not {self.dtype}")

@@ -1,4 +1,4 @@
-"""Masks: pictures that say which part of another picture counts."""
+"""Masks: images that say which part of another image counts."""
 
 from pathlib import Path
 
@@ -14,23 +14,23 @@ _OPAQUE = 255
 
 
 def mask_frame(
-    path: str | Path, picture: str | Path, size: tuple[int, int], orientation: int = 1, *, of_camera: bool = False
+    path: str | Path, image: str | Path, size: tuple[int, int], orientation: int = 1, *, of_camera: bool = False
 ) -> int | None:
-    """Find out from its header whether, and in which frame, a mask fits to a picture.
+    """Find out from its header whether, and in which frame, a mask fits to an image.
 
-    What the camera sees in every picture belongs to the stored frame, as its lens does; the mask of one picture is as
+    What the camera sees in every image belongs to the stored frame, as its lens does; the mask of one image is as
     that looks. Where a mask fits in one of the two only, it belongs there.
 
     Parameters
     ----------
-    path, picture : path
-        The mask, and the picture that it is for.
+    path, image : path
+        The mask, and the image that it is for.
     size : (int, int)
-        Width and height of the picture, upright, pixels.
+        Width and height of the image, upright, pixels.
     orientation : int
-        EXIF orientation of the picture.
+        EXIF orientation of the image.
     of_camera : bool
-        Whether it is the mask of all pictures.
+        Whether it is the mask of all images.
 
     Returns
     -------
@@ -40,7 +40,7 @@ def mask_frame(
     Raises
     ------
     InputError
-        When the mask cannot be read, or has another shape than the picture; the text names it.
+        When the mask cannot be read, or has another shape than the image; the text names it.
     """
     own, (width, height) = read_metadata(path), size
     stored = turned_size(turned_size(own.size, inverse(own.orientation)), orientation)
@@ -50,13 +50,13 @@ def mask_frame(
         if abs(width * h - height * w) <= max(width, height, w, h):
             return frame
     raise InputError(
-        f"{path}: a mask of {own.size[0]} x {own.size[1]} pixels does not fit on {picture}, which has "
-        f"{width} x {height} pixels; a mask has its picture's size, or another size of the same shape"
+        f"{path}: a mask of {own.size[0]} x {own.size[1]} pixels does not fit on {image}, which has "
+        f"{width} x {height} pixels; a mask has its image's size, or another size of the same shape"
     )
 
 
 def read_mask(path: str | Path, size: tuple[int, int], frame: int | None = None) -> NDArray[np.uint8]:
-    """Read a mask as alpha for a picture.
+    """Read a mask as alpha for an image.
 
     What is darker than half of the mask's brightest value is excluded, so that masks of 0 and 1, masks of 0 and 255,
     and lossily compressed ones all mean what they show. What is transparent in the mask is excluded, too.
@@ -71,7 +71,7 @@ def read_mask(path: str | Path, size: tuple[int, int], frame: int | None = None)
     Returns
     -------
     ndarray of shape (height, width), uint8
-        255 where the picture counts, 0 where it is excluded.
+        255 where the image counts, 0 where it is excluded.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a picture file says about itself: size, lens, place, attitude, camera; read without decoding pixels."""
+"""What an image file says about itself: size, lens, place, attitude, camera; read without decoding pixels."""
 
 import math
 import struct
@@ -16,7 +16,7 @@ from rdstitch.camera import is_focal_length
 from rdstitch.file_access import open_regular
 from rdstitch.io.attitude import Attitude, finite, read_attitude, xmp_number, xmp_text
 from rdstitch.io.colour import ink_transform
-from rdstitch.io.opening import check_megapixels, check_readable, decoding, has_late_metadata, opened_picture
+from rdstitch.io.opening import check_megapixels, check_readable, decoding, has_late_metadata, opened_image
 from rdstitch.io.optional_readers import is_raw, raw_exif, raw_size
 from rdstitch.orientation import turned_size, turning_matrix
 
@@ -26,7 +26,7 @@ _BIT_DEPTHS = {"1": 1, "I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
 _EXPOSURE_TAGS = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings)
 
 MAX_PROFILE = 2**20 - 2**10
-"""Bytes of a colour profile: PNG readers, such as Pillow's, refuse pictures whose profile takes a megabyte."""
+"""Bytes of a colour profile: PNG readers, such as Pillow's, refuse images whose profile takes a megabyte."""
 
 _EXIF_OF_PNG = {"exif", "Raw profile type exif"}
 _COLOUR_SPACE = slice(16, 20)  # of a profile's header
@@ -51,7 +51,7 @@ class GpsPosition:
 
 @dataclass(frozen=True)
 class Metadata:
-    """Everything known of a picture file beside its pixels.
+    """Everything known of an image file beside its pixels.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ class Metadata:
 
     @property
     def nadir(self) -> tuple[float, float, float] | None:
-        """Unit vector straight down from the camera: to the right, to the bottom of the picture as read, and ahead."""
+        """Unit vector straight down from the camera: to the right, to the bottom of the image as read, and ahead."""
         if self.attitude is None:
             return None
         *direction, z = self.attitude.nadir
@@ -115,21 +115,21 @@ class Metadata:
         return x, y, z
 
     def in_another_size(self) -> Self:
-        """Of the same picture at the same scale but cut or extended: of what film it would be that of is not true."""
+        """Of the same image at the same scale but cut or extended: of what film it would be that of is not true."""
         return replace(self, exif=_edited(self.exif, _without_equivalent))
 
     def of_composite(self) -> Self:
-        """Of a picture made from several: no lens, exposure or place of one of them is true of it."""
+        """Of an image made from several: no lens, exposure or place of one of them is true of it."""
         return replace(self, exif=_edited(self.exif, _who_and_when))
 
 
 def read_metadata(path: str | Path) -> Metadata:
-    """Read a picture file's header; no pixel is decoded.
+    """Read an image file's header; no pixel is decoded.
 
     Raises
     ------
     InputError
-        When the file is missing, unreadable, or no picture.
+        When the file is missing, unreadable, or no image.
     """
     file = Path(path)
     check_readable(file)
@@ -137,7 +137,7 @@ def read_metadata(path: str | Path) -> Metadata:
         if is_raw(file):
             return _raw_metadata(file)
         try:
-            with opened_picture(file) as image:
+            with opened_image(file) as image:
                 if image.format == "PNG" and not _EXIF_OF_PNG & image.info.keys() and not has_late_metadata(file):
                     image.info["exif"] = b""  # so that Pillow does not decode the pixels in search of it
                 return metadata_of(image)
@@ -155,7 +155,7 @@ def read_metadata(path: str | Path) -> Metadata:
 def _raw_metadata(file: Path) -> Metadata:
     """Metadata of a raw file, which is read upright."""
     size = raw_size(file)
-    # A small picture carries the tags; its focal length is in its own pixels.
+    # A small image carries the tags; its focal length is in its own pixels.
     header = Image.new("L", (max(1, size[0] // _HEADER), max(1, size[1] // _HEADER)))
     header.info["exif"] = raw_exif(file).tobytes()
     found = metadata_of(header)
@@ -164,7 +164,7 @@ def _raw_metadata(file: Path) -> Metadata:
 
 
 def metadata_of(image: Image.Image) -> Metadata:
-    """Metadata of a picture that Pillow has opened."""
+    """Metadata of an image that Pillow has opened."""
     # First, since looking for EXIF at the end of a PNG file decodes it, and Pillow then forgets.
     bit_depth = _bit_depth(image)
     exif = image.getexif()
@@ -262,7 +262,7 @@ def _focal_px(
     resolution = finite(photo.get(ExifTags.Base.FocalPlaneXResolution))
     unit = _MM_PER_RESOLUTION_UNIT.get(photo.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
     if focal and resolution and unit and focal > 0 and resolution > 0:
-        # The resolution counts pixels of the original; a resized picture keeps the tag.
+        # The resolution counts pixels of the original; a resized image keeps the tag.
         original = finite(photo.get(_PIXEL_WIDTH)) or size[0]
         focal_px = focal * resolution / unit * size[0] / original
         if is_focal_length(focal_px, size):
@@ -274,7 +274,7 @@ def _focal_px(
 
 
 def _timestamp(photo: Mapping[int, Any]) -> float | None:
-    """Seconds since 1970 by the EXIF tags of when the picture was taken."""
+    """Seconds since 1970 by the EXIF tags of when the image was taken."""
     text, zone = _text(photo.get(ExifTags.Base.DateTimeOriginal)), _text(photo.get(ExifTags.Base.OffsetTimeOriginal))
     fraction = _text(photo.get(ExifTags.Base.SubsecTimeOriginal))
     for zoned in (f"{text}{zone or '+00:00'}", f"{text}+00:00"):
@@ -311,7 +311,7 @@ def _degrees(value: Any, negative: bool) -> float | None:
 def _clean_exif(exif: Image.Exif, width: int) -> bytes:
     """EXIF for the output: what orientation, size and maker note said is no longer true of it.
 
-    The resolution of the focal plane counts pixels of the size that EXIF says; ``width`` is that of the picture.
+    The resolution of the focal plane counts pixels of the size that EXIF says; ``width`` is that of the image.
     """
     if not len(exif):
         return b""

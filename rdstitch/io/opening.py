@@ -1,4 +1,4 @@
-"""Opening picture files: only the formats below, only regular files, and nothing of them decoded yet.
+"""Opening image files: only the formats below, only regular files, and nothing of them decoded yet.
 
 Failures of the decoders end as one InputError. Their warnings and log messages go where those of any library go: the
 process that this runs in decides what becomes of them, since Python's filters and handlers belong to all its threads.
@@ -77,7 +77,7 @@ _PNG_METADATA = (b"eXIf", b"tEXt", b"zTXt", b"iTXt")
 
 
 def check_readable(path: Path) -> None:
-    """Refuse what cannot be a picture file, before a decoder blocks or stumbles on it.
+    """Refuse what cannot be an image file, before a decoder blocks or stumbles on it.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def check_readable(path: Path) -> None:
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}; check the name") from error
     if stat.S_ISDIR(status.st_mode):
-        raise InputError(f"{path}: is a folder, not a picture; name the pictures in it")
+        raise InputError(f"{path}: is a folder, not an image; name the images in it")
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path}: is not a regular file; copy it to one first")
     if status.st_size == 0:
@@ -130,7 +130,7 @@ def _check_remote(path: Path) -> None:
     except OSError as error:
         raise InputError(f"{path}: {error}") from error
     if is_folder:
-        raise InputError(f"{path}: is a folder, not a picture; name the pictures in it")
+        raise InputError(f"{path}: is a folder, not an image; name the images in it")
     if size == 0:
         raise InputError(f"{path}: is empty (0 bytes); copy it again from its source")
 
@@ -149,12 +149,12 @@ def decoding(path: Path) -> Iterator[None]:
             raise InputError(f"{path}: too large to read into memory; make it smaller first") from error
         reason = " ".join(str(error).split()) or type(error).__name__
         reason = reason.replace(f"'{path}'", "the file")
-        raise InputError(f"{path}: not a picture that can be read, or damaged ({reason[:160]})") from error
+        raise InputError(f"{path}: not an image that can be read, or damaged ({reason[:160]})") from error
 
 
 @contextmanager
-def opened_picture(file: Path) -> Iterator[ImageFile.ImageFile]:
-    """A picture whose header has been read.
+def opened_image(file: Path) -> Iterator[ImageFile.ImageFile]:
+    """An image whose header has been read.
 
     Raises
     ------
@@ -189,7 +189,7 @@ def has_late_metadata(file: Path) -> bool:
 
 
 def check_megapixels(file: Path, size: tuple[int, int]) -> None:
-    """Refuse what claims to be larger than any camera's picture.
+    """Refuse what claims to be larger than any camera's image.
 
     Raises
     ------
@@ -215,4 +215,4 @@ def _factory(file: Path, stream: BinaryIO) -> Callable[[IO[bytes], str], ImageFi
         return avif_factory(file) if beginning[8:12] in (b"avif", b"avis") else heif_factory(file)
     if file.suffix.lower() == ".tga":  # has no magic
         return TgaImagePlugin.TgaImageFile
-    raise InputError(f"{file}: is no picture in a format that is read here: {_NAMES}")
+    raise InputError(f"{file}: is no image in a format that is read here: {_NAMES}")

@@ -1,4 +1,4 @@
-"""Pictures that only optional packages read: HEIC of phones (``pillow-heif``), raw files of cameras (``rawpy``)."""
+"""Images that only optional packages read: HEIC of phones (``pillow-heif``), raw files of cameras (``rawpy``)."""
 
 import struct
 from collections.abc import Callable, Iterator

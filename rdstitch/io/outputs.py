@@ -1,9 +1,9 @@
 """The files of one result: written aside, then published together, so that all are new, or all are as they were.
 
-A picture, its tiles, its world file, its pages and its sidecar belong together. Each is written into a hidden folder
+An image, its tiles, its world file, its pages and its sidecar belong together. Each is written into a hidden folder
 beside its place; when all are complete, they take their places one after the other, in the order in which they were
 staged. When one of them cannot, those before it go back. A process that is killed within these milliseconds leaves some
-old and some new: the sidecar, which is staged last, names size and digest of its picture, so that a reader sees it.
+old and some new: the sidecar, which is staged last, names size and digest of its image, so that a reader sees it.
 """
 
 import errno
@@ -100,7 +100,7 @@ class Outputs:
             staged.write_bytes(data)
 
     def attempt(self, path: str | Path, stage: Callable[[], None]) -> list[Message]:
-        """Stage what belongs beside a picture, whose failure must not cost the picture: a warning, where it fails."""
+        """Stage what belongs beside an image, whose failure must not cost the image: a warning, where it fails."""
         count = len(self._items)
         try:
             stage()

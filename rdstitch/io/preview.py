@@ -1,4 +1,4 @@
-"""Small versions of pictures, for pages and notebooks."""
+"""Small versions of images, for pages and notebooks."""
 
 import io
 from pathlib import Path
@@ -17,14 +17,14 @@ _OVERVIEW_FROM = 60_000_000  # pixels; of larger TIFF files an overview is read
 
 
 def read_preview(path: Path, size: tuple[int, int], side: int) -> tuple[NDArray[Any], NDArray[np.uint8] | None]:
-    """Samples and alpha of a picture that rdstitch wrote, at least ``side`` pixels long where it is that large.
+    """Samples and alpha of an image that rdstitch wrote, at least ``side`` pixels long where it is that large.
 
     Parameters
     ----------
     size : (int, int)
-        Width and height of the picture, pixels.
+        Width and height of the image, pixels.
     side : int
-        Of pictures that are stored in several sizes, the smallest that is no shorter is read.
+        Of images that are stored in several sizes, the smallest that is no shorter is read.
     """
     suffix = path.suffix.lower()
     if suffix == ".dzi":
@@ -33,18 +33,18 @@ def read_preview(path: Path, size: tuple[int, int], side: int) -> tuple[NDArray[
         return _overview(path, side), None
     if suffix in (".jpg", ".jpeg"):
         # Of any size: none of it is decoded larger than needed.
-        with JpegImagePlugin.JpegImageFile(path) as image:
-            image.draft(None, (side, side))
-            return np.asarray(image), None
-    picture = read_image(path)
-    return picture.pixels, picture.alpha
+        with JpegImagePlugin.JpegImageFile(path) as jpeg:
+            jpeg.draft(None, (side, side))
+            return np.asarray(jpeg), None
+    image = read_image(path)
+    return image.pixels, image.alpha
 
 
 def encode_preview(
     pixels: NDArray[Any], side: int, alpha: NDArray[np.uint8] | None = None, kind: Literal["JPEG", "PNG"] = "JPEG"
 ) -> bytes:
-    """A picture of any sample type as a small file, its longer side at most ``side`` pixels."""
-    # Far too large pictures are thinned out before they are smoothed.
+    """An image of any sample type as a small file, its longer side at most ``side`` pixels."""
+    # Far too large images are thinned out before they are smoothed.
     step = max(1, max(pixels.shape[:2]) // (4 * side))
     image = Image.fromarray(_as_bytes(pixels[::step, ::step]))
     if alpha is not None:

@@ -1,4 +1,4 @@
-"""Reading a picture: any common file to an array in RGB order, upright, with its alpha and metadata."""
+"""Reading an image: any common file to an array in RGB order, upright, with its alpha and metadata."""
 
 import math
 import re
@@ -19,7 +19,7 @@ from rdstitch.errors import InputError
 from rdstitch.file_access import open_regular
 from rdstitch.io.colour import srgb_of_lab, without_inks
 from rdstitch.io.metadata import Metadata, metadata_of, read_metadata
-from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, opened_picture
+from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, opened_image
 from rdstitch.io.optional_readers import is_raw, read_raw
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
 from rdstitch.opencv_state import silent_opencv
@@ -27,9 +27,9 @@ from rdstitch.orientation import turned
 
 _END_OF_IMAGE = b"\xff\xd9"
 _PADDING = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
-_MIN_JPEG_SIDE = 8  # pixels a side; below, different reductions give pictures of the same size
+_MIN_JPEG_SIDE = 8  # pixels a side; below, different reductions give images of the same size
 _OPAQUE = 255
-# A page of a TIFF file that masks the picture, and how many pages are looked at for one.
+# A page of a TIFF file that masks the image, and how many pages are looked at for one.
 _MASK, _MASK_WITHIN = 4, 40
 
 _LAB = (tifffile.PHOTOMETRIC.CIELAB, tifffile.PHOTOMETRIC.ICCLAB)
@@ -51,7 +51,7 @@ def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) 
     Parameters
     ----------
     size : (int, int)
-        Width and height of the whole picture, pixels.
+        Width and height of the whole image, pixels.
     factor : int
         1, 2, 4 or 8; so many pixels a side become one.
 
@@ -88,15 +88,15 @@ Pixels = NDArray[Any]
 
 
 @dataclass(frozen=True)
-class Picture:
-    """One picture in memory.
+class DecodedImage:
+    """One image in memory.
 
     Attributes
     ----------
     pixels : ndarray of shape (height, width) or (height, width, channels)
         uint8, uint16 or float32. Colour is in RGB order, never BGR. The EXIF orientation has been applied.
     alpha : ndarray of shape (height, width), uint8, or None
-        255 where the picture is opaque, 0 where it says nothing; None when it is opaque everywhere.
+        255 where the image is opaque, 0 where it says nothing; None when it is opaque everywhere.
     metadata : Metadata
     damage : str
         Why some of the pixels may be wrong: the complaint of a decoder that went on nevertheless. Empty without one.
@@ -113,11 +113,11 @@ class Picture:
         return self.pixels.nbytes + (0 if self.alpha is None else self.alpha.nbytes)
 
 
-def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None = None) -> Picture:
-    """Read a picture file.
+def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None = None) -> DecodedImage:
+    """Read an image file.
 
     JPEG, PNG, TIFF, WebP and whatever else Pillow reads, with 8 or 16 bit or floating-point samples; with optional
-    packages also HEIC, and raw files, which become 16-bit sRGB. Of an animated or multi-page file the first picture
+    packages also HEIC, and raw files, which become 16-bit sRGB. Of an animated or multi-page file the first image
     counts. CMYK (by its profile), CIELAB and palette colours become RGB. NaN or infinite samples of a floating-point
     file become transparent zeros.
 
@@ -126,7 +126,7 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
     path
     reduction : int
         Blocks of so many pixels a side become one pixel, the last ones of what is there of them. The metadata stay
-        those of the whole picture. JPEG files are decoded at 1/2, 1/4 or 1/8 of the size, in a fraction of the time.
+        those of the whole image. JPEG files are decoded at 1/2, 1/4 or 1/8 of the size, in a fraction of the time.
     metadata : Metadata, optional
         What :func:`read_metadata` has found in the file, which is not looked for again: of a small JPEG file that takes
         as long as its pixels.
@@ -134,7 +134,7 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
     Raises
     ------
     InputError
-        When the file is missing, unreadable, no picture, or damaged; the text names the file.
+        When the file is missing, unreadable, no image, or damaged; the text names the file.
     """
     file = Path(path)
     check_readable(file)
@@ -142,34 +142,34 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
         with open_regular(file) as stream:
             magic = stream.read(len(PNG_MAGIC))
         if is_raw(file):
-            return reduced(as_picture(file, read_raw(file), None, metadata or read_metadata(file)), reduction)
+            return reduced(as_image(file, read_raw(file), None, metadata or read_metadata(file)), reduction)
         if magic[:4] in TIFF_MAGIC:
-            return reduced(as_picture(file, *_read_tiff(file), metadata or read_metadata(file)), reduction)
-        with opened_picture(file) as image:
-            metadata = metadata or metadata_of(image)
-            if magic == PNG_MAGIC and metadata.bit_depth == 16 and image.mode not in _GREY_16:
+            return reduced(as_image(file, *_read_tiff(file), metadata or read_metadata(file)), reduction)
+        with opened_image(file) as opened:
+            metadata = metadata or metadata_of(opened)
+            if magic == PNG_MAGIC and metadata.bit_depth == 16 and opened.mode not in _GREY_16:
                 samples, alpha = _split(_read_16_bit_png(file))
             else:
-                factor = _decoders_share(image, metadata, reduction)
-                found, damage = _from_jpeg(file, image, factor)
-                samples, alpha = from_pillow(image, factor) if found is None else (found, None)
-                picture = replace(as_picture(file, samples, alpha, metadata), damage=damage)
-                return reduced(picture, reduction // factor)
-        return reduced(as_picture(file, samples, alpha, metadata), reduction)
+                factor = _decoders_share(opened, metadata, reduction)
+                found, damage = _from_jpeg(file, opened, factor)
+                samples, alpha = from_pillow(opened, factor) if found is None else (found, None)
+                image = replace(as_image(file, samples, alpha, metadata), damage=damage)
+                return reduced(image, reduction // factor)
+        return reduced(as_image(file, samples, alpha, metadata), reduction)
 
 
-def reduced(picture: Picture, factor: int) -> Picture:
+def reduced(image: DecodedImage, factor: int) -> DecodedImage:
     """Blocks of ``factor`` pixels a side become one pixel, transparent where any of them is; the metadata stay."""
     if factor == 1:
-        return picture
-    alpha = None if picture.alpha is None else block_minimum(picture.alpha, factor)
-    return replace(picture, pixels=block_mean(picture.pixels, factor), alpha=alpha)
+        return image
+    alpha = None if image.alpha is None else block_minimum(image.alpha, factor)
+    return replace(image, pixels=block_mean(image.pixels, factor), alpha=alpha)
 
 
 def _decoders_share(image: Image.Image, metadata: Metadata, reduction: int) -> int:
-    """By how much of a reduction the decoder can make the picture smaller; 1 for nothing."""
+    """By how much of a reduction the decoder can make the image smaller; 1 for nothing."""
     factor = math.gcd(reduction, _MAX_DECODED_REDUCTION)
-    # Blocks begin at the stored picture's first pixel; in one that is to be mirrored they must end at its last.
+    # Blocks begin at the stored image's first pixel; in one that is to be mirrored they must end at its last.
     crosswise = metadata.orientation != 1 and any(n % factor for n in image.size)
     return 1 if image.format not in _JPEG or min(image.size) < factor or crosswise else factor
 
@@ -203,7 +203,7 @@ def from_pillow(image: Image.Image, factor: int = 1) -> tuple[Pixels, Pixels | N
 
 
 def _samples(image: Image.Image) -> Pixels:
-    """The samples of a picture, taken in pieces: Pillow's own conversion holds them three times."""
+    """The samples of an image, taken in pieces: Pillow's own conversion holds them three times."""
     image.load()
     width, height = image.size
     first = np.asarray(image.crop((0, 0, width, min(_ROWS_AT_A_TIME, height))))
@@ -247,7 +247,7 @@ def _decode_with_opencv(data: bytes) -> Pixels:
     if samples is None:
         raise ValueError("the decoder gives up")
     if samples.ndim == 3 and samples.shape[2] in (3, 4):
-        # In pieces, since a large picture must not be there twice.
+        # In pieces, since a large image must not be there twice.
         for top in range(0, len(samples), _ROWS_AT_A_TIME):
             rows = samples[top : top + _ROWS_AT_A_TIME]
             rows[..., :3] = rows[..., 2::-1].copy()
@@ -280,7 +280,7 @@ def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
         masks = (other for other in others if other.subfiletype == _MASK and other.shape == size)
         mask = next((other.asarray() for other in masks), None)
     if samples is None and kind == tifffile.PHOTOMETRIC.SEPARATED:
-        with opened_picture(file) as image:
+        with opened_image(file) as image:
             return from_pillow(image)
     if samples is None:
         with open_regular(file) as stream:
@@ -304,8 +304,8 @@ def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
     return samples, mask
 
 
-def as_picture(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Metadata) -> Picture:
-    """A picture from samples as stored: upright, in one of the three sample types, contiguous, and without NaN.
+def as_image(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Metadata) -> DecodedImage:
+    """An image from samples as stored: upright, in one of the three sample types, contiguous, and without NaN.
 
     Parameters
     ----------
@@ -314,7 +314,7 @@ def as_picture(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Meta
     samples : ndarray of shape (h, w) or (h, w, C)
         Colour in RGB order.
     alpha : ndarray of shape (h, w), or None
-        Of any sample type; full where the picture is opaque.
+        Of any sample type; full where the image is opaque.
 
     Raises
     ------
@@ -336,7 +336,7 @@ def as_picture(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Meta
         opaque = None
     if opaque is not None:
         opaque = np.ascontiguousarray(turned(opaque, metadata.orientation))
-    return Picture(np.ascontiguousarray(turned(samples, metadata.orientation)), opaque, metadata)
+    return DecodedImage(np.ascontiguousarray(turned(samples, metadata.orientation)), opaque, metadata)
 
 
 def _as_uint8(alpha: Pixels) -> NDArray[np.uint8]:

@@ -1,4 +1,4 @@
-"""Pictures made smaller by a whole factor: a pixel of the small one stands for a whole block of the large one."""
+"""Images made smaller by a whole factor: a pixel of the small one stands for a whole block of the large one."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ def fitting_reduction(shrink: float) -> int:
 
 
 def reduced_size(size: tuple[int, int], factor: int) -> tuple[int, int]:
-    """Width and height, pixels, of a picture that is reduced by ``factor``; the last block need not be whole."""
+    """Width and height, pixels, of an image that is reduced by ``factor``; the last block need not be whole."""
     return -(-size[0] // factor), -(-size[1] // factor)
 
 

@@ -1,11 +1,11 @@
 """TIFF from strips: compressed, BigTIFF where needed, with overviews of half the size again and again.
 
-Pictures are tiled, but for grey ones of 8 bits with alpha: OpenCV (4.11 to 5.0) reads tiles of two samples as stripes,
+Images are tiled, but for grey ones of 8 bits with alpha: OpenCV (4.11 to 5.0) reads tiles of two samples as stripes,
 and strips of them rightly. Deeper grey samples with alpha are something that Pillow does not read and OpenCV reduces to
 8 bits; their transparency is a mask on a page of its own, as GDAL writes it, and every program reads the first page.
 
 Overviews are made while the strips pass, and wait in temporary files beside the output until their turn; memory is that
-of one strip, whatever the size of the picture.
+of one strip, whatever the size of the image.
 """
 
 import tempfile
@@ -27,7 +27,7 @@ from rdstitch.io.reduction import halved
 _TILE = 256
 _REDUCED, _MASK = 1, 4  # kinds of pages (NewSubfileType)
 _STRIP = 64  # rows
-# Smaller pictures need no overview.
+# Smaller images need no overview.
 _MIN_OVERVIEW = 256
 # Rows that are reduced at a time, even.
 _HALVED_ROWS = 32
@@ -41,7 +41,7 @@ ExtraTag = tuple[int, int, int, Any, bool]
 
 
 def write_tiff(path: Path, layout: Layout, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag] = ()) -> None:
-    """Write a TIFF file whose first page is the picture and whose other pages are its overviews.
+    """Write a TIFF file whose first page is the image and whose other pages are its overviews.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def _without_alpha(strips: Iterable[NDArray[Any]], mask: list[bytes]) -> Iterato
 
 
 def _write_mask(tiff: tifffile.TiffWriter, size: tuple[int, int], tiles: list[bytes], kind: int) -> None:
-    """Write the page that says where the page before it has a picture."""
+    """Write the page that says where the page before it has an image."""
     tiff.write(
         iter(tiles),
         shape=size[::-1],
@@ -194,7 +194,7 @@ def _reread(spill: IO[bytes], size: tuple[int, int], layout: Layout) -> Iterator
 
 
 def _copied_tags(metadata: Metadata) -> Iterator[ExtraTag]:
-    """XMP, and tags of the first picture's EXIF that stay true of a mosaic."""
+    """XMP, and tags of the first image's EXIF that stay true of a mosaic."""
     if metadata.xmp:
         yield _XMP, 1, len(metadata.xmp), metadata.xmp, True
     if metadata.exif:

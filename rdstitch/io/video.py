@@ -1,4 +1,4 @@
-"""Frames of a video, as picture files."""
+"""Frames of a video, as image files."""
 
 import os
 from collections.abc import Callable, Iterator

@@ -1,7 +1,7 @@
-"""Writing a picture: JPEG, PNG, TIFF, WebP or Deep Zoom by the suffix, whole or not at all, with profile and EXIF.
+"""Writing an image: JPEG, PNG, TIFF, WebP or Deep Zoom by the suffix, whole or not at all, with profile and EXIF.
 
-A picture may come as an array or in strips from top to bottom; strips need only the memory of one of them, except for
-WebP. The same picture gives the same bytes either way.
+An image may come as an array or in strips from top to bottom; strips need only the memory of one of them, except for
+WebP. The same image gives the same bytes either way.
 """
 
 import io
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.errors import ArgumentError, LimitError, OutputError
-from rdstitch.io.atomic import PICTURE_SUFFIXES
+from rdstitch.io.atomic import IMAGE_SUFFIXES
 from rdstitch.io.deepzoom import check_tiles_folder, tiles_folder, write_deep_zoom
 from rdstitch.io.encoding import jpeg_pieces, png_pieces
 from rdstitch.io.fingerprint import Fingerprint, fingerprint
@@ -45,7 +45,7 @@ def write_image(
     background: int = 0,
     overwrite: bool = True,
 ) -> None:
-    """Write a picture; the format follows the suffix.
+    """Write an image; the format follows the suffix.
 
     The same input gives the same bytes. JPEG has no transparency and 8 bits: what is transparent becomes
     ``background``, 16 bits are rounded to 8.
@@ -57,7 +57,7 @@ def write_image(
     pixels : ndarray of shape (H, W) or (H, W, C), uint8, uint16 or float32
         Colour in RGB order. Floating-point samples and other than one or three channels need TIFF.
     alpha : ndarray of shape (H, W), uint8, optional
-        255 where the picture is opaque.
+        255 where the image is opaque.
     metadata : Metadata, optional
         Colour profile, EXIF and resolution to keep.
     quality : int
@@ -72,7 +72,7 @@ def write_image(
     ArgumentError
         When the arrays do not fit together.
     LimitError
-        When the picture is too large for the format; the text names one that holds it.
+        When the image is too large for the format; the text names one that holds it.
     OutputError
         When the format cannot hold such samples, or the file system refuses; nothing is left behind.
     """
@@ -94,7 +94,7 @@ def write_strips(
     *,
     outputs: Outputs | None = None,
 ) -> Fingerprint:
-    """Write a picture that comes in strips; see :func:`write_image`.
+    """Write an image that comes in strips; see :func:`write_image`.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def write_strips(
     extra_tags
         Further tags of a TIFF file.
     outputs : Outputs, optional
-        Where the picture is staged, to be published with what belongs to it; without, it replaces what is there.
+        Where the image is staged, to be published with what belongs to it; without, it replaces what is there.
 
     Returns
     -------
@@ -151,7 +151,7 @@ def _write_file(
 
 
 def check_format(path: str | Path, layout: Layout) -> None:
-    """Find out before long work whether the format of ``path`` can hold a picture.
+    """Find out before long work whether the format of ``path`` can hold an image.
 
     Raises
     ------
@@ -159,8 +159,8 @@ def check_format(path: str | Path, layout: Layout) -> None:
         The text names a format that can.
     """
     suffix = Path(path).suffix.lower()
-    if suffix not in PICTURE_SUFFIXES:
-        raise OutputError(f"{path}: unknown file type '{suffix}'; use one of {' '.join(PICTURE_SUFFIXES)}")
+    if suffix not in IMAGE_SUFFIXES:
+        raise OutputError(f"{path}: unknown file type '{suffix}'; use one of {' '.join(IMAGE_SUFFIXES)}")
     if suffix in _TIFF:
         return
     if layout.channels not in (1, 3):
@@ -171,7 +171,7 @@ def check_format(path: str | Path, layout: Layout) -> None:
 
 
 def check_size(path: str | Path, size: tuple[int, int]) -> None:
-    """Refuse a picture of ``size`` (width, height) that the format of ``path`` cannot hold.
+    """Refuse an image of ``size`` (width, height) that the format of ``path`` cannot hold.
 
     Raises
     ------
@@ -188,7 +188,7 @@ def check_size(path: str | Path, size: tuple[int, int]) -> None:
 
 
 def check_memory(path: str | Path, size: tuple[int, int], max_memory: int | None) -> None:
-    """Refuse a picture that the format of ``path`` needs whole in memory, where that is limited.
+    """Refuse an image that the format of ``path`` needs whole in memory, where that is limited.
 
     Raises
     ------
@@ -211,7 +211,7 @@ def _strips_of(samples: NDArray[Any], alpha: NDArray[np.uint8] | None) -> Iterat
 
 
 def _webp(layout: Layout, strips: Iterable[Strip]) -> bytes:
-    """WebP file in memory: the encoder takes the picture whole; see :data:`_WEBP_BYTES_PER_PIXEL`."""
+    """WebP file in memory: the encoder takes the image whole; see :data:`_WEBP_BYTES_PER_PIXEL`."""
     width, height = layout.size
     samples = np.empty((height, width, 3 + layout.transparent), dtype=np.uint8)
     top = 0

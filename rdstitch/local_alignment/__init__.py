@@ -1,4 +1,4 @@
-"""Local alignment: a smooth residual warp per picture, where the ground is not quite a plane."""
+"""Local alignment: a smooth residual warp per image, where the ground is not quite a plane."""
 
 from rdstitch.local_alignment.estimate import (
     MAX_CELLS,

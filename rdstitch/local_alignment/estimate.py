@@ -1,4 +1,4 @@
-"""Whether pictures are aligned locally, and how: decided by matches that are held out of the fit."""
+"""Whether images are aligned locally, and how: decided by matches that are held out of the fit."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.fit import PlaneFields, Stiffness, fit_fields
-from rdstitch.local_alignment.matches import Match, PicturesOnPlane, PlaneMatches, place_matches
+from rdstitch.local_alignment.matches import ImagesOnPlane, Match, PlaneMatches, place_matches
 
 LocalAlignmentMode = Literal["auto", "off"] | int
 
@@ -22,7 +22,7 @@ _HELD_OUT = 5  # every fifth match
 # Share by which held-out residuals must get smaller for local alignment to be worth while, and for freer fields.
 _WORTHWHILE, _BETTER = 0.15, 0.03
 _MIN_MATCHES = 100
-# Of thousands of pictures, fields are fitted to a part: each match takes about 600 bytes meanwhile.
+# Of thousands of images, fields are fitted to a part: each match takes about 600 bytes meanwhile.
 _MAX_MATCHES = 250_000
 # Correlation of the residuals of neighbouring matches below which no smooth field is worth while: one that brings the
 # median down by 15 % takes away a quarter of the variance, and that quarter neighbours would have in common.
@@ -32,7 +32,7 @@ _OUTLYING = 3.0  # medians beyond which a residual counts no more than there
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Residuals of matches that took no part in a fit, pixels of the median picture: median and 95 %."""
+    """Residuals of matches that took no part in a fit, pixels of the median image: median and 95 %."""
 
     median: float
     percentile95: float
@@ -51,11 +51,11 @@ class LocalAlignment:
     Attributes
     ----------
     fields : tuple of DisplacementField
-        One a picture; empty where pictures are not aligned locally.
+        One an image; empty where images are not aligned locally.
     reason : str
         Why they are, or are not.
     cells : int
-        Of the grid along the longer side of a picture; 0 without fields.
+        Of the grid along the longer side of an image; 0 without fields.
     before, after : HeldOut or None
         Residuals of held-out matches without and with fields; None where nothing was tried.
     """
@@ -68,14 +68,14 @@ class LocalAlignment:
 
 
 def no_local_alignment(reason: str) -> LocalAlignment:
-    """Pictures stay where the alignment puts them."""
+    """Images stay where the alignment puts them."""
     return LocalAlignment((), reason)
 
 
 def align_locally(
     matches: Sequence[Match], cameras: Sequence[Camera], homographies: FloatArray, choice: LocalAlignmentMode = "auto"
 ) -> LocalAlignment:
-    """Smooth displacement fields that bring matches of overlapping pictures together.
+    """Smooth displacement fields that bring matches of overlapping images together.
 
     Parameters
     ----------
@@ -85,36 +85,36 @@ def align_locally(
         Undistorted coordinates, in half diagonals, to the plane.
     choice : "auto", "off" or int
         "auto": only where matches that are held out of the fit come nearer by 15 % or more. A number: always, with so
-        many cells along the longer side of a picture.
+        many cells along the longer side of an image.
     """
     if choice == "off":
         return no_local_alignment("switched off")
-    pictures = PicturesOnPlane.of(cameras, homographies)
-    # Pair by pair, again and again: together, the matches of thousands of pictures are what takes memory.
-    lengths = [np.linalg.norm(pair.residual, axis=1) for pair in place_matches(matches, pictures)]
+    images = ImagesOnPlane.of(cameras, homographies)
+    # Pair by pair, again and again: together, the matches of thousands of images are what takes memory.
+    lengths = [np.linalg.norm(pair.residual, axis=1) for pair in place_matches(matches, images)]
     count = sum(map(len, lengths))
     if count < _MIN_MATCHES:
         return no_local_alignment("there are too few matches")
     if choice == "auto":
         most = _OUTLYING * float(np.median(np.concatenate(lengths)))
-        if (agreement := _agreement_of_neighbours(place_matches(matches, pictures), most)) < _MIN_AGREEMENT:
+        if (agreement := _agreement_of_neighbours(place_matches(matches, images), most)) < _MIN_AGREEMENT:
             return no_local_alignment(
                 f"not worth while; residuals of neighbouring matches agree by {agreement:.0%} only"
             )
     share = min(1.0, _MAX_MATCHES / count)
-    placed = PlaneMatches.join(pair.thinned(share) for pair in place_matches(matches, pictures))
+    placed = PlaneMatches.join(pair.thinned(share) for pair in place_matches(matches, images))
     cells = _CELLS if choice == "auto" else choice
     held_out = np.arange(len(placed)) % _HELD_OUT == 0
-    start, before, after = _choose(placed.take(~held_out), placed.take(held_out), pictures, cells)
+    start, before, after = _choose(placed.take(~held_out), placed.take(held_out), images, cells)
     text = f"matches held out of the fit: {before.median:.2f} pixels apart without, {after.median:.2f} pixels with it"
     if choice == "auto" and after.median > (1.0 - _WORTHWHILE) * before.median:
         return LocalAlignment((), f"not worth while; {text}", 0, before, after)
-    fields = fit_fields(placed, pictures, start.stiffness, start).of_pictures()
+    fields = fit_fields(placed, images, start.stiffness, start).of_images()
     return LocalAlignment(fields, text, cells, before, after)
 
 
 def _agreement_of_neighbours(pairs: Iterable[PlaneMatches], most: float) -> float:
-    """Correlation of the residuals of each match and the nearest one of the same pair of pictures, in [-1, 1].
+    """Correlation of the residuals of each match and the nearest one of the same pair of images, in [-1, 1].
 
     Residuals that are longer than ``most`` count as if they were so long.
     """
@@ -128,13 +128,13 @@ def _agreement_of_neighbours(pairs: Iterable[PlaneMatches], most: float) -> floa
 
 
 def _choose(
-    fitted: PlaneMatches, held_out: PlaneMatches, pictures: PicturesOnPlane, cells: int
+    fitted: PlaneMatches, held_out: PlaneMatches, images: ImagesOnPlane, cells: int
 ) -> tuple[PlaneFields, HeldOut, HeldOut]:
     """The fields that held-out matches like best, and the residuals of these without and with them."""
     tried: list[PlaneFields] = []
     for slope in reversed(_SLOPES):
         # What is far from the plane is found by the freest; the stiffer ones start from there.
-        tried.append(fit_fields(fitted, pictures, Stiffness(cells, slope), tried[-1] if tried else None))
+        tried.append(fit_fields(fitted, images, Stiffness(cells, slope), tried[-1] if tried else None))
     stiffest, *freer = [(fields, HeldOut.of(fields.explain(held_out)[0])) for fields in reversed(tried)]
     best, after = stiffest
     for fields, found in freer:

@@ -1,4 +1,4 @@
-"""A smooth displacement field over one picture: a bicubic spline through displacements on a coarse grid."""
+"""A smooth displacement field over one image: a bicubic spline through displacements on a coarse grid."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,14 +23,14 @@ _PROBES = 4  # of the steepness, along a side of a cell
 
 @dataclass(frozen=True, eq=False)
 class DisplacementField:
-    """Displacements of one picture.
+    """Displacements of one image.
 
     What the alignment expects at the measured pixels ``q`` is at ``q + field(q)``.
 
     Attributes
     ----------
     image_size : (int, int)
-        Width and height of the picture, pixels.
+        Width and height of the image, pixels.
     values : ndarray of shape (m, n, 2)
         Displacement, pixels, at nodes spread evenly from the first to the last pixel of each row and column, m rows
         of n.
@@ -53,13 +53,13 @@ class DisplacementField:
         return cls(image_size, np.round(values, _DECIMALS) + 0.0)
 
     def __call__(self, points: FloatArray) -> FloatArray:
-        """Displacement (..., 2) at measured pixels (..., 2), also beside the picture; far out as there, 0 at NaN."""
+        """Displacement (..., 2) at measured pixels (..., 2), also beside the image; far out as there, 0 at NaN."""
         place = np.moveaxis(self._grid_coordinates(points), -1, 0)[::-1] + _APRON
         return np.stack([ndimage.map_coordinates(c, place, order=3, mode="mirror", prefilter=False)
                          for c in self._coefficients], axis=-1)  # fmt: skip
 
     def resized(self, image_size: tuple[int, int]) -> "DisplacementField":
-        """The same for a picture of another size that shows the same."""
+        """The same for an image of another size that shows the same."""
         ratio = np.array(image_size, dtype=np.float64) / self.image_size
         return DisplacementField(image_size, self.values * ratio)
 
@@ -70,7 +70,7 @@ class DisplacementField:
 
     @cached_property
     def steepest(self) -> float:
-        """Largest change of the displacement per pixel in any direction; below 1 the picture does not fold."""
+        """Largest change of the displacement per pixel in any direction; below 1 the image does not fold."""
         rows, columns = (_PROBES * (n - 1) + 1 for n in self.values.shape[:2])
         moved = self(node_points(self.image_size, (rows, columns))).reshape(rows, columns, 2)
         spacing = (np.array(self.image_size) - 1.0) / (columns - 1, rows - 1)

@@ -1,10 +1,10 @@
-"""Displacements on the plane, one regularised field per picture, by robust sparse least squares over all pictures.
+"""Displacements on the plane, one regularised field per image, by robust sparse least squares over all images.
 
-A match of the pictures i and j that the alignment puts ``r`` apart on the plane is explained by
+A match of the images i and j that the alignment puts ``r`` apart on the plane is explained by
 ``d_i(e_i) - d_j(e_j)``, where ``e`` is the pixel at which the alignment expects what is at the measured one: fields say
 for each place of the output where its content is, so ``e`` is found anew from round to round. Fields rise and bend
 little, and vanish where nothing supports them; that alone fixes what the matches leave open, a displacement of all
-pictures together, at zero. Both coordinates have the same normal equations.
+images together, at zero. Both coordinates have the same normal equations.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.local_alignment.field import DisplacementField, bilinear, grid_shape, node_points
-from rdstitch.local_alignment.matches import PicturesOnPlane, PlaneMatches
+from rdstitch.local_alignment.matches import ImagesOnPlane, PlaneMatches
 from rdstitch.scipy_parts import sparse, sparse_linalg
 
 # Residuals are trusted up to about this many times their median, or their noise where relief makes them larger, but at
@@ -28,18 +28,18 @@ _ROBUST, _MIN_SCALE = 2.0, 0.3
 _WIDEST, _SHARPENED, _SHARP_ROUNDS = 95.0, 0.5, 2
 # Of the residual of the normal equations, and the most iterations, of which a tenth is usual.
 _TOLERANCE, _MAX_ITERATIONS = 1e-4, 2000
-# A field vanishes over about this share of a picture where nothing supports it.
+# A field vanishes over about this share of an image where nothing supports it.
 _FADE = 0.2
-# Fixed-point iterations from where a picture shows something to where the alignment expects it; each leaves the
+# Fixed-point iterations from where an image shows something to where the alignment expects it; each leaves the
 # gradient's share of the error.
 _STEPS = 6
-# Limit of the displacement's change per pixel: half of what would fold a picture.
+# Limit of the displacement's change per pixel: half of what would fold an image.
 _MAX_GRADIENT = 0.5
-# A residual leads from the second picture to the first.
+# A residual leads from the second image to the first.
 _SIGNS = np.array([1.0, -1.0])
 
 Shapes = tuple[tuple[int, int], ...]
-"""Rows and columns of the grid of each picture."""
+"""Rows and columns of the grid of each image."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Stiffness:
     Attributes
     ----------
     cells : int
-        Of the grid, along the longer side of a picture.
+        Of the grid, along the longer side of an image.
     slope : float
         Change of the displacement per pixel that is as likely as a residual of one robust scale.
     """
@@ -60,19 +60,19 @@ class Stiffness:
 
 @dataclass(frozen=True, eq=False)
 class PlaneFields:
-    """Displacement of each picture on the plane, at the nodes of its grid.
+    """Displacement of each image on the plane, at the nodes of its grid.
 
     Attributes
     ----------
-    pictures : PicturesOnPlane
+    images : ImagesOnPlane
     stiffness : Stiffness
     shapes : tuple of (int, int)
-        Rows and columns of nodes of each picture.
+        Rows and columns of nodes of each image.
     values : tuple of ndarray of shape (m n, 2)
-        Pixels of the median picture.
+        Pixels of the median image.
     """
 
-    pictures: PicturesOnPlane
+    images: ImagesOnPlane
     stiffness: Stiffness
     shapes: Shapes
     values: tuple[FloatArray, ...]
@@ -81,18 +81,18 @@ class PlaneFields:
         """What they leave over at matches, (M, 2), and pixels (2 M, 2) where the alignment expects these."""
         values, expected = np.concatenate(self.values), matches.points.reshape(-1, 2)
         for _ in range(_STEPS):
-            design = _design(matches, expected, self.pictures.cameras, self.shapes)
-            expected = _expected(matches, self.pictures, design, values)
+            design = _design(matches, expected, self.images.cameras, self.shapes)
+            expected = _expected(matches, self.images, design, values)
         return matches.residual - design @ values, expected
 
-    def of_pictures(self) -> tuple[DisplacementField, ...]:
-        """The displacements in measured pixels of each picture, limited so that nothing folds."""
+    def of_images(self) -> tuple[DisplacementField, ...]:
+        """The displacements in measured pixels of each image, limited so that nothing folds."""
         done = []
         for k, (shape, values) in enumerate(zip(self.shapes, self.values, strict=True)):
-            size = self.pictures.cameras[k].image_size
+            size = self.images.cameras[k].image_size
             points = node_points(size, shape)
             with np.errstate(invalid="ignore"):
-                shown = self.pictures.from_plane(k, self.pictures.to_plane(k, points) + values)
+                shown = self.images.from_plane(k, self.images.to_plane(k, points) + values)
             found = np.where(np.isfinite(shown), shown - points, 0.0).reshape(*shape, 2)
             field = DisplacementField.of(size, found)
             if field.steepest > _MAX_GRADIENT:
@@ -102,15 +102,15 @@ class PlaneFields:
 
 
 def fit_fields(
-    matches: PlaneMatches, pictures: PicturesOnPlane, stiffness: Stiffness, start: PlaneFields | None = None
+    matches: PlaneMatches, images: ImagesOnPlane, stiffness: Stiffness, start: PlaneFields | None = None
 ) -> PlaneFields:
-    """Fields of all pictures, by reweighted least squares.
+    """Fields of all images, by reweighted least squares.
 
     They start from fields that were fitted to much the same matches, or, without these, by graduated non-convexity
     (Blake and Zisserman, 1987): the first rounds trust all that may be right, so that the fields reach what is far from
     the plane.
     """
-    cameras = pictures.cameras
+    cameras = images.cameras
     shapes = tuple(grid_shape(camera.image_size, stiffness.cells) for camera in cameras)
     priors = [_smoothness(shape, camera.image_size, stiffness) for shape, camera in zip(shapes, cameras, strict=True)]
     prior = sparse.block_diag(priors, format="csr")
@@ -130,9 +130,9 @@ def fit_fields(
         design = _design(matches, expected, cameras, shapes)
         solution = _solve(design, weight, prior, matches.residual, solution)
         left = matches.residual - design @ solution
-        expected = _expected(matches, pictures, design, solution)
+        expected = _expected(matches, images, design, solution)
         scale *= _SHARPENED
-    return PlaneFields(pictures, stiffness, shapes, tuple(np.split(solution, _first_nodes(shapes)[1:-1])))
+    return PlaneFields(images, stiffness, shapes, tuple(np.split(solution, _first_nodes(shapes)[1:-1])))
 
 
 def _solve(
@@ -156,26 +156,26 @@ def _solve(
 
 
 def _expected(
-    matches: PlaneMatches, pictures: PicturesOnPlane, design: "sparse.csr_array", values: FloatArray
+    matches: PlaneMatches, images: ImagesOnPlane, design: "sparse.csr_array", values: FloatArray
 ) -> FloatArray:
-    """Pixels (2 M, 2) at which the alignment expects matches, in pictures that are displaced by ``values`` at nodes."""
+    """Pixels (2 M, 2) at which the alignment expects matches, in images that are displaced by ``values`` at nodes."""
     sides = sparse.csr_array(
         (design.data, design.indices, np.arange(0, design.nnz + 1, 4, dtype=np.int32)),
         shape=(2 * len(matches), len(values)),
     )
     moved = (sides @ values).reshape(-1, 2, 2) * _SIGNS[:, None]
     places, expected = (matches.places - moved).reshape(-1, 2), matches.points.reshape(-1, 2).copy()
-    for k, chosen in matches.of_picture:
-        found = pictures.from_plane(k, places[chosen])
+    for k, chosen in matches.of_image:
+        found = images.from_plane(k, places[chosen])
         expected[chosen] = np.where(np.isfinite(found), found, expected[chosen])
     return expected
 
 
 def _design(matches: PlaneMatches, pixels: FloatArray, cameras: Sequence[Camera], shapes: Shapes) -> "sparse.csr_array":
-    """What all nodes do to the residuals of matches at pixels (2 M, 2): four in either picture, shape (M, nodes)."""
+    """What all nodes do to the residuals of matches at pixels (2 M, 2): four in either image, shape (M, nodes)."""
     first = _first_nodes(shapes)
     columns, entries = np.empty((len(pixels), 4), dtype=np.int32), np.empty((len(pixels), 4))
-    for k, chosen in matches.of_picture:
+    for k, chosen in matches.of_image:
         nodes, entries[chosen] = bilinear(pixels[chosen], cameras[k].image_size, shapes[k])
         columns[chosen] = first[k] + nodes
     entries *= np.tile(_SIGNS, len(matches))[:, None]
@@ -184,13 +184,13 @@ def _design(matches: PlaneMatches, pixels: FloatArray, cameras: Sequence[Camera]
 
 
 def _first_nodes(shapes: Shapes) -> NDArray[np.intp]:
-    """Number of the first node of each picture, and of all nodes."""
+    """Number of the first node of each image, and of all nodes."""
     return np.concatenate([[0], np.cumsum([rows * columns for rows, columns in shapes])])
 
 
 @lru_cache(maxsize=8)
 def _smoothness(shape: tuple[int, int], image_size: tuple[int, int], stiffness: Stiffness) -> "sparse.csr_array":
-    """Precision of one picture's nodes, for residuals in units of their robust scale: a membrane and a thin plate."""
+    """Precision of one image's nodes, for residuals in units of their robust scale: a membrane and a thin plate."""
     rows, columns = shape
     spacing, fade = max(image_size) / stiffness.cells, _FADE * max(image_size)
     total: Any = sparse.eye_array(rows * columns) * (spacing / fade) ** 2

@@ -1,4 +1,4 @@
-"""Matches of overlapping pictures on the common plane, and what the alignment leaves over at each of them."""
+"""Matches of overlapping images on the common plane, and what the alignment leaves over at each of them."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from rdstitch.camera import Camera
 from rdstitch.radial_homography import from_plane, to_plane
 from rdstitch.scipy_parts import spatial
 
-# Matches that the alignment expects farther away than this share of the picture's diagonal are taken to be wrong; where
+# Matches that the alignment expects farther away than this share of the image's diagonal are taken to be wrong; where
 # the ground rises by a tenth of the camera's height, and the alignment is that of the valleys, right ones are nearly as
 # far apart.
 _SEARCH_RADIUS = 0.15
@@ -23,7 +23,7 @@ _MIN_MATCHES = 8
 
 @dataclass(frozen=True)
 class Match:
-    """Putative matches of one pair of pictures: measured pixels (N, 2) of either."""
+    """Putative matches of one pair of images: measured pixels (N, 2) of either."""
 
     image1: int
     image2: int
@@ -32,16 +32,16 @@ class Match:
 
 
 @dataclass(frozen=True, eq=False)
-class PicturesOnPlane:
-    """Where the alignment puts the pictures; places on the plane are in pixels of the median picture.
+class ImagesOnPlane:
+    """Where the alignment puts the images; places on the plane are in pixels of the median image.
 
     Attributes
     ----------
     cameras : sequence of Camera
     homographies : ndarray of shape (N, 3, 3)
-        Normalized undistorted coordinates of each picture to the plane.
+        Normalized undistorted coordinates of each image to the plane.
     scale : float
-        Pixels of the median picture per unit of the plane, at the pictures' centres; NaN if it shows none of them.
+        Pixels of the median image per unit of the plane, at the images' centres; NaN if it shows none of them.
     """
 
     cameras: Sequence[Camera]
@@ -50,7 +50,7 @@ class PicturesOnPlane:
 
     @classmethod
     def of(cls, cameras: Sequence[Camera], homographies: FloatArray) -> Self:
-        """With the scale of the median picture."""
+        """With the scale of the median image."""
         steps = np.array([(0.5, 0.0), (0.0, 0.5), (-0.5, 0.0), (0.0, -0.5)])
         areas = []
         for camera, matrix in zip(cameras, homographies, strict=True):
@@ -64,22 +64,22 @@ class PicturesOnPlane:
         return self.scale * to_plane(self.cameras[image], self.homographies[image], points)
 
     def from_plane(self, image: int, places: FloatArray) -> FloatArray:
-        """Measured pixels (M, 2) of places (M, 2); NaN where the picture cannot show them."""
+        """Measured pixels (M, 2) of places (M, 2); NaN where the image cannot show them."""
         return from_plane(self.cameras[image], self.homographies[image], places / self.scale)
 
 
 @dataclass(frozen=True, eq=False)
 class PlaneMatches:
-    """Matches of one pair of pictures, or of many, one pair after the other.
+    """Matches of one pair of images, or of many, one pair after the other.
 
     Attributes
     ----------
     images : ndarray of shape (M, 2)
-        The two pictures of each match.
+        The two images of each match.
     points : ndarray of shape (M, 2, 2)
         Measured pixels in either.
     places : ndarray of shape (M, 2, 2)
-        Where the alignment puts either on the plane, pixels of the median picture.
+        Where the alignment puts either on the plane, pixels of the median image.
     """
 
     images: NDArray[np.intp]
@@ -97,19 +97,19 @@ class PlaneMatches:
 
     @cached_property
     def residual(self) -> FloatArray:
-        """From where the second picture puts them to where the first does, (M, 2)."""
+        """From where the second image puts them to where the first does, (M, 2)."""
         return np.asarray(self.places[:, 0] - self.places[:, 1])
 
     @cached_property
-    def of_picture(self) -> tuple[tuple[int, NDArray[np.intp]], ...]:
-        """Every picture with matches, and which of the 2 M places are in it."""
+    def of_image(self) -> tuple[tuple[int, NDArray[np.intp]], ...]:
+        """Every image with matches, and which of the 2 M places are in it."""
         order = np.argsort(self.images.ravel(), kind="stable")
-        pictures, first = np.unique(self.images.ravel()[order], return_index=True)
-        return tuple(zip(pictures.tolist(), np.split(order, first[1:]), strict=True))
+        images, first = np.unique(self.images.ravel()[order], return_index=True)
+        return tuple(zip(images.tolist(), np.split(order, first[1:]), strict=True))
 
     @cached_property
     def neighbours(self) -> NDArray[np.intp]:
-        """For each match the nearest other one of the same pair of pictures; itself where there is none."""
+        """For each match the nearest other one of the same pair of images; itself where there is none."""
         new_pair = (self.images[1:] != self.images[:-1]).any(axis=1)
         first = np.concatenate([[0], np.flatnonzero(new_pair) + 1, [len(self)]])
         found = np.empty(len(self), dtype=np.intp)
@@ -134,15 +134,15 @@ class PlaneMatches:
         return PlaneMatches(self.images[chosen], self.points[chosen], self.places[chosen])
 
 
-def place_matches(matches: Iterable[Match], pictures: PicturesOnPlane) -> Iterator[PlaneMatches]:
+def place_matches(matches: Iterable[Match], images: ImagesOnPlane) -> Iterator[PlaneMatches]:
     """For each pair, matches that lie near each other on the plane: inliers of the alignment, and a little farther off.
 
     Pairs that have hardly any are left out.
     """
     for match in matches:
         pair, measured = (match.image1, match.image2), np.stack([match.points1, match.points2], axis=1)
-        placed = np.stack([pictures.to_plane(k, measured[:, part]) for part, k in enumerate(pair)], axis=1)
-        radius = _SEARCH_RADIUS * min(2.0 * pictures.cameras[k].half_diagonal for k in pair)
+        placed = np.stack([images.to_plane(k, measured[:, part]) for part, k in enumerate(pair)], axis=1)
+        radius = _SEARCH_RADIUS * min(2.0 * images.cameras[k].half_diagonal for k in pair)
         near = np.linalg.norm(placed[:, 0] - placed[:, 1], axis=1) < radius
         if (count := int(near.sum())) >= _MIN_MATCHES:
             yield PlaneMatches(np.tile(np.array(pair), (count, 1)), measured[near], placed[near])

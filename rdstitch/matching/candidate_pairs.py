@@ -1,7 +1,7 @@
-"""Which pairs of pictures to match, so that the cost does not grow with the square of their number.
+"""Which pairs of images to match, so that the cost does not grow with the square of their number.
 
-Up to :data:`EXHAUSTIVE_UP_TO` pictures every pair is compared. Beyond, pictures that follow one another, that were
-taken near each other, and that look alike. Of these, each picture is registered with those that matter for its place;
+Up to :data:`EXHAUSTIVE_UP_TO` images every pair is compared. Beyond, images that follow one another, that were
+taken near each other, and that look alike. Of these, each image is registered with those that matter for its place;
 and once poses are known, with those that the poses put beside it and that close a loop.
 """
 
@@ -19,18 +19,18 @@ from rdstitch.radial_homography import to_plane
 from rdstitch.scipy_parts import sparse, spatial
 
 EXHAUSTIVE_UP_TO = 30
-"""Number of pictures up to which every pair is tried."""
+"""Number of images up to which every pair is tried."""
 
 CANDIDATES = 15
-"""Other pictures that one is compared with, in the mean: the sides and corners of a survey's frame, twice over."""
+"""Other images that one is compared with, in the mean: the sides and corners of a survey's frame, twice over."""
 
-_SEQUENCE_NEIGHBOURS = 3  # pictures after each one that are tried
-_RETRIEVED = 4  # pictures most like each one that are tried, whatever the others are like
-_NEAREST = 8  # pictures taken nearest to each one that are tried
-_NEIGHBOURS = 10  # nearest pictures in the plane that are considered for each one
+_SEQUENCE_NEIGHBOURS = 3  # images after each one that are tried
+_RETRIEVED = 4  # images most like each one that are tried, whatever the others are like
+_NEAREST = 8  # images taken nearest to each one that are tried
+_NEIGHBOURS = 10  # nearest images in the plane that are considered for each one
 _MIN_OVERLAP = 0.15  # share of the smaller footprint
-_PARTNERS = 6  # pairs of a picture that its place is found by; those that others choose come on top
-_CELLS_PER_SIDE = 4  # cells of a picture, a side, that its partners are to cover
+_PARTNERS = 6  # pairs of an image that its place is found by; those that others choose come on top
+_CELLS_PER_SIDE = 4  # cells of an image, a side, that its partners are to cover
 
 Pairs = list[tuple[int, int]]
 
@@ -54,17 +54,17 @@ class PointsOfTwo(Protocol):
 def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None = None) -> Pairs:
     """Pairs (i, j), i < j, to try before anything is known of the poses.
 
-    Beyond :data:`EXHAUSTIVE_UP_TO` pictures, they are at most :data:`CANDIDATES` a picture in the mean, unless
-    positions ask for more: pictures that follow one another where the order means something, those that were taken
-    nearest to each other, a few that each picture is most alike to, and those that are most alike of all.
+    Beyond :data:`EXHAUSTIVE_UP_TO` images, they are at most :data:`CANDIDATES` an image in the mean, unless
+    positions ask for more: images that follow one another where the order means something, those that were taken
+    nearest to each other, a few that each image is most alike to, and those that are most alike of all.
 
     Parameters
     ----------
     features : FeatureStore
-        Of the pictures, in the order in which the pictures were taken, if there is one.
+        Of the images, in the order in which the images were taken, if there is one.
     seed : int
     positions : ndarray of shape (N, 2) or (N, 3), optional
-        Where each picture was taken, in any unit; NaN where that is not known.
+        Where each image was taken, in any unit; NaN where that is not known.
     """
     count = len(features)
     if count <= EXHAUSTIVE_UP_TO:
@@ -80,7 +80,7 @@ def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None 
 
 
 def _alike_to_each(alike: Similarity, known: set[int]) -> set[tuple[int, int]]:
-    """Pairs of each picture with those most like it; in a sequence with those before and after which there are less.
+    """Pairs of each image with those most like it; in a sequence with those before and after which there are less.
 
     Neighbours in the sequence would otherwise hide the places where it crosses itself.
     """
@@ -102,7 +102,7 @@ def _most_alike(alike: Similarity, chosen: set[tuple[int, int]], total: int) -> 
 
 
 def _nearest_positions(positions: FloatArray) -> set[tuple[int, int]]:
-    """Pairs of pictures that were taken nearest to each other."""
+    """Pairs of images that were taken nearest to each other."""
     known = np.flatnonzero(np.isfinite(positions).all(axis=1))
     if len(known) < 2:
         return set()
@@ -153,7 +153,7 @@ def neighbours(cameras: Sequence[Camera], homographies: FloatArray, tried: set[t
     ----------
     cameras : sequence of Camera
     homographies : ndarray of shape (N, 3, 3)
-        From undistorted normalized coordinates of each picture to the plane; NaN for pictures without a pose.
+        From undistorted normalized coordinates of each image to the plane; NaN for images without a pose.
     tried : set of (int, int)
         Pairs (i, j), i < j.
     """
@@ -185,7 +185,7 @@ def neighbours(cameras: Sequence[Camera], homographies: FloatArray, tried: set[t
 
 
 def _footprint(camera: Camera, homography: FloatArray) -> FloatArray:
-    """Lower and upper bounds (2, 2) of a picture in the plane; NaN where the horizon crosses it."""
+    """Lower and upper bounds (2, 2) of an image in the plane; NaN where the horizon crosses it."""
     plane = to_plane(camera, homography, camera.outline(8))
     return np.stack([plane.min(axis=0), plane.max(axis=0)])
 

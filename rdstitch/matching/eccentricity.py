@@ -31,21 +31,21 @@ def blob_radii(features: Features) -> FloatArray:
 
 
 def eccentricity(transfer: Callable[[FloatArray], FloatArray], points: FloatArray, radii: FloatArray) -> FloatArray:
-    """How far the middles of discs lie from their centres in the other picture.
+    """How far the middles of discs lie from their centres in the other image.
 
     Parameters
     ----------
     transfer : callable
-        Takes points (M, 2) of the one picture, pixels, to points of the other; NaN where that does not see them.
+        Takes points (M, 2) of the one image, pixels, to points of the other; NaN where that does not see them.
     points : ndarray of shape (N, 2)
-        Centres of the discs in the one picture, pixels.
+        Centres of the discs in the one image, pixels.
     radii : ndarray of shape (N,)
         Their radii, pixels.
 
     Returns
     -------
     ndarray of shape (N, 2)
-        Pixels of the other picture; NaN where that does not see the whole disc.
+        Pixels of the other image; NaN where that does not see the whole disc.
     """
     outline = points[:, None] + radii[:, None, None] * _CIRCLE
     seen = transfer(outline.reshape(-1, 2)).reshape(outline.shape) - transfer(points)[:, None]

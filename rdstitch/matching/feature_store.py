@@ -18,22 +18,22 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class StoredFeatures:
-    """Features of one picture, read when they are needed.
+    """Features of one image, read when they are needed.
 
     Attributes
     ----------
     stored : Stored of PackedFeatures
-        In pixels of the size of the picture.
+        In pixels of the size of the image.
     count : int
         Number of features that are stored.
     image_size : (int, int), optional
-        Width and height of the picture in whose pixels they are wanted; None: as they are stored.
+        Width and height of the image in whose pixels they are wanted; None: as they are stored.
     chosen : ndarray of shape (N,), intp, optional
         Those that are wanted, in their order; None: all.
     most : int, optional
         Only so many of these, the first ones.
     shown : int
-        Keypoints that the picture shows at its working size, see :class:`rdstitch.features.Features`.
+        Keypoints that the image shows at its working size, see :class:`rdstitch.features.Features`.
     faint : bool
         Whether these are few and weak.
     """
@@ -88,7 +88,7 @@ class StoredFeatures:
 
 @dataclass(frozen=True, eq=False)
 class FeatureStore(Sequence[Features]):
-    """Features of the pictures of a set; an item is read when it is asked for.
+    """Features of the images of a set; an item is read when it is asked for.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class FeatureStore(Sequence[Features]):
         return cls(tuple(map(StoredFeatures.of, features)))
 
     def __len__(self) -> int:
-        """Number of pictures."""
+        """Number of images."""
         return len(self.items)
 
     @overload
@@ -113,21 +113,21 @@ class FeatureStore(Sequence[Features]):
     def __getitem__(self, index: slice) -> "FeatureStore": ...
 
     def __getitem__(self, index: int | slice) -> "Features | FeatureStore":
-        """The features of a picture, or of some of them."""
+        """The features of an image, or of some of them."""
         return FeatureStore(self.items[index]) if isinstance(index, slice) else self.items[index].load()
 
     @property
     def counts(self) -> NDArray[np.intp]:
-        """Number of features of each picture, (N,); nothing is read for it."""
+        """Number of features of each image, (N,); nothing is read for it."""
         return np.array([len(item) for item in self.items], dtype=np.intp)
 
     def at_sizes(self, sizes: Sequence[Size]) -> Self:
-        """The same in pixels of the pictures at other sizes, (width, height) of each."""
+        """The same in pixels of the images at other sizes, (width, height) of each."""
         resized = (replace(item, image_size=size) for item, size in zip(self.items, sizes, strict=True))
         return replace(self, items=tuple(resized))
 
     def strongest(self, most: int) -> Self:
-        """At most so many of each picture."""
+        """At most so many of each image."""
         return replace(self, items=tuple(item.strongest(most) for item in self.items))
 
 
@@ -141,7 +141,7 @@ class StoredMatches:
     count : int
         Number of matches.
     sizes : ((int, int), (int, int), (int, int), (int, int)), optional
-        Width and height of the two pictures in whose pixels they are stored, and of those in whose they are wanted.
+        Width and height of the two images in whose pixels they are stored, and of those in whose they are wanted.
     """
 
     stored: Stored[Correspondences]
@@ -159,7 +159,7 @@ class StoredMatches:
 
     @property
     def points1(self) -> FloatArray:
-        """Places of the matches in the first picture, pixels, (M, 2); read every time."""
+        """Places of the matches in the first image, pixels, (M, 2); read every time."""
         return self.load().points1
 
     @property
@@ -178,7 +178,7 @@ class StoredMatches:
         )
 
     def resized(self, before: tuple[Size, Size], after: tuple[Size, Size]) -> Self:
-        """The same in pixels of pictures of another size."""
+        """The same in pixels of images of another size."""
         return replace(self, sizes=(*before, *after))
 
     def key(self, cache: Cache) -> str:
@@ -187,7 +187,7 @@ class StoredMatches:
 
 
 def _at_size(features: Features, size: Size) -> Features:
-    """Features in pixels of the picture at another size."""
+    """Features in pixels of the image at another size."""
     before = features.image_size
     assert before is not None
     factor = Camera(size).half_diagonal / Camera(before).half_diagonal
@@ -197,5 +197,5 @@ def _at_size(features: Features, size: Size) -> Features:
 
 
 def _moved(points: FloatArray, before: Size, after: Size) -> FloatArray:
-    """Points (N, 2) of one size in pixels of another: the same in half diagonals from the centre of the picture."""
+    """Points (N, 2) of one size in pixels of another: the same in half diagonals from the centre of the image."""
     return Camera(after).denormalize(Camera(before).normalize(points))

@@ -1,4 +1,4 @@
-"""What pairs see of λ, each on its own and for each of its two pictures: the votes on which lens took which picture."""
+"""What pairs see of λ, each on its own and for each of its two images: the votes on which lens took which image."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ _MAX_DISTANCE = 10.0  # thresholds from where one λ puts them, within which cor
 _MAX_MATCHES = 250  # matches of a pair that are used
 _MIN_STD = 2e-4  # λ; no pair knows it better than that the division model holds
 _MIN_INLIERS = 30  # of a pair that votes: three times the parameters of a homography and two λ
-_COMMON_STD = 0.05  # λ; by so much relief and lenses of another kind change what a pair sees, of both pictures alike
-_MAX_COHERENCE = 0.5  # correlation of neighbours' errors: more is depth, for which λ of either picture takes the blame
+_COMMON_STD = 0.05  # λ; by so much relief and lenses of another kind change what a pair sees, of both images alike
+_MAX_COHERENCE = 0.5  # correlation of neighbours' errors: more is depth, for which λ of either image takes the blame
 _ROUNDS = 6
 _PAIRS_AT_ONCE = 64
 
@@ -30,9 +30,9 @@ class Votes:
     Attributes
     ----------
     image1, image2 : ndarray of shape (L,), intp
-        The pictures of each pair.
+        The images of each pair.
     distortion : ndarray of shape (L, 2)
-        λ of its first and of its second picture, half-diagonal frame.
+        λ of its first and of its second image, half-diagonal frame.
     covariance : ndarray of shape (L, 2, 2)
     """
 
@@ -74,12 +74,12 @@ class Votes:
 
     @property
     def differences(self) -> tuple[FloatArray, FloatArray]:
-        """λ of the second picture of each pair less that of the first, and its standard deviation, both (L,)."""
+        """λ of the second image of each pair less that of the first, and its standard deviation, both (L,)."""
         sign = np.array([-1.0, 1.0])
         return self.distortion @ sign, np.sqrt(sign @ self.covariance @ sign + 2.0 * _MIN_STD**2)
 
     def which(self, second: BoolArray) -> IntArray:
-        """From which lens, 0 or 1, the two pictures of each pair come, shape (L, 2)."""
+        """From which lens, 0 or 1, the two images of each pair come, shape (L, 2)."""
         return np.stack([second[self.image1], second[self.image2]], axis=1).astype(np.intp)
 
     def fitted(self, which: IntArray, lenses: FloatArray) -> FloatArray:
@@ -88,7 +88,7 @@ class Votes:
         Parameters
         ----------
         which : ndarray of shape (L, 2), intp
-            The lens of each picture of each pair.
+            The lens of each image of each pair.
         lenses : ndarray of shape (K,)
             λ to start from; that of a lens without votes stays.
         """
@@ -112,7 +112,7 @@ class Votes:
 
 
 def _votes(pairs: Sequence[PairRegistration], threshold: float) -> list[OwnLenses]:
-    """λ of both pictures of each pair, from what lies not too far from where one λ puts it."""
+    """λ of both images of each pair, from what lies not too far from where one λ puts it."""
     found: list[OwnLenses] = []
     for start in range(0, len(pairs), _PAIRS_AT_ONCE):
         block = pairs[start : start + _PAIRS_AT_ONCE]

@@ -1,4 +1,4 @@
-"""What the adjustment is given: a link, the correspondences of two pictures that agree with one relation."""
+"""What the adjustment is given: a link, the correspondences of two images that agree with one relation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,14 +14,14 @@ from rdstitch.radial_homography import RadialHomography
 
 @dataclass(frozen=True)
 class Link:
-    """Two pictures that overlap.
+    """Two images that overlap.
 
     Attributes
     ----------
     image1, image2 : int
-        Indices of the pictures.
+        Indices of the images.
     points1, points2 : ndarray of shape (M, 2)
-        Where the inliers of the pair were measured, pixels of the one and of the other picture.
+        Where the inliers of the pair were measured, pixels of the one and of the other image.
     relation : RadialHomography
         The pair's own estimate, from ``image1`` to ``image2``.
     count : int, optional
@@ -38,18 +38,18 @@ class Link:
     def __post_init__(self) -> None:
         """Check that the parts fit together."""
         if self.image1 == self.image2:
-            raise ArgumentError(f"picture {self.image1} cannot be linked with itself")
+            raise ArgumentError(f"image {self.image1} cannot be linked with itself")
         if self.points1.shape != self.points2.shape or self.points1.ndim != 2 or self.points1.shape[1] != 2:
             raise ArgumentError(f"expected points (M, 2), not {self.points1.shape} and {self.points2.shape}")
         if not self.relation:
-            raise ArgumentError(f"pictures {self.image1} and {self.image2}: a failed fit makes no link")
+            raise ArgumentError(f"images {self.image1} and {self.image2}: a failed fit makes no link")
 
     def __len__(self) -> int:
         """Number of inliers."""
         return len(self.points1) if self.count is None else self.count
 
     def reversed(self) -> Self:
-        """The same correspondences, from the second picture to the first."""
+        """The same correspondences, from the second image to the first."""
         own = self.relation
         back: FloatArray = np.linalg.inv(own.homography).astype(np.float64)
         relation = replace(
@@ -76,11 +76,11 @@ class Link:
 
 
 def in_alternate_directions(links: Sequence[Link]) -> list[Link]:
-    """The links, every other one of those along a sequence from its later picture to its earlier one.
+    """The links, every other one of those along a sequence from its later image to its earlier one.
 
     Both ends of a correspondence have errors, but the derivatives of its transfer are taken at one (errors in
-    variables). Where errors are as large as those of relief, the fit is a little off for it, depending on which picture
+    variables). Where errors are as large as those of relief, the fit is a little off for it, depending on which image
     is transferred. All in one direction, that adds up: strips over slopes went downhill.
     """
-    # The parity of the middle alternates along a sequence, whether neighbours are linked or pictures farther apart.
+    # The parity of the middle alternates along a sequence, whether neighbours are linked or images farther apart.
     return [link.reversed() if (link.image1 + link.image2) // 2 % 2 else link for link in links]

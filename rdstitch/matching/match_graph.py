@@ -1,4 +1,4 @@
-"""The match graph: pictures as nodes, links as edges; its connected parts, spanning tree and centre."""
+"""The match graph: images as nodes, links as edges; its connected parts, spanning tree and centre."""
 
 from dataclasses import dataclass
 
@@ -10,9 +10,9 @@ from rdstitch.scipy_parts import csgraph, sparse
 
 
 def connected_components(count: int, image1: ArrayLike, image2: ArrayLike) -> list[list[int]]:
-    """Groups of the ``count`` pictures that the links connect, largest first, each ascending.
+    """Groups of the ``count`` images that the links connect, largest first, each ascending.
 
-    Groups of the same size are ordered by their first picture.
+    Groups of the same size are ordered by their first image.
     """
     edges = _graph(count, image1, image2, np.ones(np.size(image1)))
     number, label = csgraph.connected_components(edges, directed=False)
@@ -22,7 +22,7 @@ def connected_components(count: int, image1: ArrayLike, image2: ArrayLike) -> li
 
 @dataclass(frozen=True)
 class SpanningTree:
-    """A tree over a connected graph, as the steps that reach one picture after the other from the root.
+    """A tree over a connected graph, as the steps that reach one image after the other from the root.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class SpanningTree:
     link : ndarray of shape (N - 1,), intp
         The link of each step.
     parent, child : ndarray of shape (N - 1,), intp
-        Where the step starts, and the picture that it reaches.
+        Where the step starts, and the image that it reaches.
     """
 
     root: int
@@ -39,7 +39,7 @@ class SpanningTree:
     child: IntArray
 
     def chained(self, homographies: FloatArray, image1: NDArray[np.intp], root_matrix: FloatArray) -> FloatArray:
-        """Plane-to-picture homographies (N, 3, 3) by chaining those of the links (L, 3, 3) from the root's."""
+        """Plane-to-image homographies (N, 3, 3) by chaining those of the links (L, 3, 3) from the root's."""
         matrices = np.empty((len(self.link) + 1, 3, 3))
         matrices[self.root] = root_matrix
         inverse = np.linalg.inv(homographies)
@@ -69,7 +69,7 @@ def _graph(count: int, image1: ArrayLike, image2: ArrayLike, value: FloatArray) 
 def spanning_tree(
     count: int, image1: IntArray, image2: IntArray, weight: FloatArray, root: int | None = None
 ) -> SpanningTree:
-    """The spanning tree of largest total weight over ``count`` connected pictures.
+    """The spanning tree of largest total weight over ``count`` connected images.
 
     Parameters
     ----------
@@ -78,8 +78,8 @@ def spanning_tree(
     weight : ndarray of shape (L,)
         How much each link can be relied on.
     root : int, optional
-        The centre of the tree, from where the farthest picture is the fewest steps away, if not given; of two, the one
-        whose links weigh more, so that the numbers of the pictures do not decide.
+        The centre of the tree, from where the farthest image is the fewest steps away, if not given; of two, the one
+        whose links weigh more, so that the numbers of the images do not decide.
     """
     tree = spanning_forest(count, image1, image2, weight)
     number = _graph(count, image1[tree], image2[tree], tree.astype(np.float64) + 1.0)

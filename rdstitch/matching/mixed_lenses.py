@@ -1,7 +1,7 @@
-"""Which pictures come from which lens, where those of two lenses or two zoom settings are mixed.
+"""Which images come from which lens, where those of two lenses or two zoom settings are mixed.
 
-A pair of pictures sees λ of both of them, each on its own: the same one where they come from one lens. So a division of
-the pictures into two lenses predicts what every pair sees.
+A pair of images sees λ of both of them, each on its own: the same one where they come from one lens. So a division of
+the images into two lenses predicts what every pair sees.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,25 +20,25 @@ _STARTS = 5  # divisions that are begun with
 _ROUNDS = 6
 _MOVES = 12
 _MIN_GAP = 0.01  # λ; what is nearer is one lens that one λ does not quite describe
-_MIN_GAP_PX = 4.0  # the same at a corner, pixels; with one λ, pictures are off by a tenth of that, rows of them by half
+_MIN_GAP_PX = 4.0  # the same at a corner, pixels; with one λ, images are off by a tenth of that, rows of them by half
 _MAX_MEAN_RESIDUAL = 1.25  # standard deviations that a vote, two numbers, is off on average; less is luck
 # How many times better two lenses must explain the votes of pairs of both: at least, and times one over their number.
 _MIN_GAIN, _GAIN_OF_FEW = 4.0, 2.8
-_MIN_MARGIN = 5.0  # standard deviations by which votes must tell of which of the two lenses a picture is
+_MIN_MARGIN = 5.0  # standard deviations by which votes must tell of which of the two lenses an image is
 
 
 @dataclass(frozen=True)
 class TwoLenses:
-    """Pictures of two lenses.
+    """Images of two lenses.
 
     Attributes
     ----------
     second : ndarray of shape (N,), bool
-        Which pictures come from the second one: the fewer.
+        Which images come from the second one: the fewer.
     distortion : (float, float)
         λ of both, half-diagonal frame.
     certain : bool
-        Whether it is clear which pictures belong together, and a pair of them can be stitched.
+        Whether it is clear which images belong together, and a pair of them can be stitched.
     """
 
     second: BoolArray
@@ -47,7 +47,7 @@ class TwoLenses:
 
 
 def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
-    """The division of pictures into two lenses that the votes support; None where one lens will do.
+    """The division of images into two lenses that the votes support; None where one lens will do.
 
     Relief and lenses that one λ does not describe scatter the votes by many times their standard deviations, and a few
     scattered votes can always be divided somehow. Two lenses must therefore explain what pairs of both see far better
@@ -56,7 +56,7 @@ def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
     Parameters
     ----------
     cameras : sequence of Camera
-        One a picture; only their sizes are used.
+        One an image; only their sizes are used.
     votes : Votes
     """
     if not len(votes):
@@ -72,7 +72,7 @@ def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
     seen = np.isin(np.arange(count), [votes.image1, votes.image2])
     if 2 * second[seen].sum() > seen.sum():
         second, lenses = ~second, lenses[::-1]
-    second &= seen  # of a picture without votes nothing is known that would tell it from most others
+    second &= seen  # of an image without votes nothing is known that would tell it from most others
     which = votes.which(second)
     between = which[:, 0] != which[:, 1]
     number, missed = int(between.sum()), votes.mahalanobis_residuals(lenses[which])
@@ -86,13 +86,13 @@ def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
 
 @dataclass(frozen=True)
 class SeparatedLenses:
-    """Pairs of the pictures of one lens.
+    """Pairs of the images of one lens.
 
     Attributes
     ----------
     pairs : list of PairRegistration
     left_out : mapping of int to str
-        Why a picture was left out, by its index.
+        Why an image was left out, by its index.
     mixed : TwoLenses or None
         Both lenses, where there are two.
     """
@@ -102,19 +102,19 @@ class SeparatedLenses:
     mixed: TwoLenses | None
 
     def of_one_lens(self, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-        """The pairs of pictures that were not left out."""
+        """The pairs of images that were not left out."""
         return [pair for pair in pairs if not {*pair} & self.left_out.keys()]
 
 
 def separate_lenses(
     cameras: Sequence[Camera], pairs: list[PairRegistration], threshold: float, known_distortion: float | None
 ) -> SeparatedLenses:
-    """Leave out the pictures of the lens that took fewer; none where one lens will do, λ is known, or in doubt.
+    """Leave out the images of the lens that took fewer; none where one lens will do, λ is known, or in doubt.
 
     Parameters
     ----------
     cameras : sequence of Camera
-        One a picture.
+        One an image.
     pairs : list of PairRegistration
     threshold : float
         Largest transfer error of an inlier, pixels.
@@ -128,14 +128,14 @@ def separate_lenses(
 
 
 def _of_the_other_lens(mixed: TwoLenses, pairs: Sequence[PairRegistration]) -> dict[int, str]:
-    """Pictures of the lens that took fewer, or has fewer matches, with why they are left out; none if in doubt."""
+    """Images of the lens that took fewer, or has fewer matches, with why they are left out; none if in doubt."""
     if not mixed.certain:
         return {}
     linked = [pair for pair in pairs if pair.relation]
     sizes = []
     for second in (False, True):
         own = [pair for pair in linked if mixed.second[[pair.image1, pair.image2]].tolist() == [second] * 2]
-        members = {picture for pair in own for picture in (pair.image1, pair.image2)}
+        members = {image for pair in own for image in (pair.image1, pair.image2)}
         sizes.append((len(members), sum(int(pair.relation.inliers.sum()) for pair in own)))
     kept = sizes[1] > sizes[0]
     there, here = mixed.distortion[not kept], mixed.distortion[kept]
@@ -152,8 +152,8 @@ def _guesses(count: int, votes: Votes) -> list[tuple[BoolArray, FloatArray]]:
     held = spanning_forest(count, votes.image1, votes.image2, -std)
     alike = held[np.abs(difference[held]) < _DIFFERENT_SIGMA * std[held]]
     group = np.empty(count, dtype=np.intp)
-    for number, pictures in enumerate(connected_components(count, votes.image1[alike], votes.image2[alike])):
-        group[pictures] = number
+    for number, images in enumerate(connected_components(count, votes.image1[alike], votes.image2[alike])):
+        group[images] = number
     start = np.full(group.max() + 1, np.median(votes.distortion))
     own = votes.fitted(group[np.stack([votes.image1, votes.image2], axis=1)], start)
     levels = np.sort(own)
@@ -162,7 +162,7 @@ def _guesses(count: int, votes: Votes) -> list[tuple[BoolArray, FloatArray]]:
 
 
 def _divide(count: int, votes: Votes, second: BoolArray, lenses: FloatArray) -> tuple[BoolArray, FloatArray]:
-    """Pictures and λ of two lenses, in turn, from a first guess of which pictures are of the second one."""
+    """Images and λ of two lenses, in turn, from a first guess of which images are of the second one."""
     for _ in range(_ROUNDS):
         lenses = votes.fitted(votes.which(second), lenses)
         improved = _improved_division(count, votes, second, lenses)
@@ -173,7 +173,7 @@ def _divide(count: int, votes: Votes, second: BoolArray, lenses: FloatArray) -> 
 
 
 def _improved_division(count: int, votes: Votes, second: BoolArray, lenses: FloatArray) -> BoolArray:
-    """The division after moving those pictures to the other lens by which the votes gain most, some at a time."""
+    """The division after moving those images to the other lens by which the votes gain most, some at a time."""
     for _ in range(_MOVES):
         margin = _margins(count, votes, second, lenses)
         if margin.min() >= -1e-9:
@@ -183,16 +183,16 @@ def _improved_division(count: int, votes: Votes, second: BoolArray, lenses: Floa
 
 
 def _margins(count: int, votes: Votes, second: BoolArray, lenses: FloatArray) -> FloatArray:
-    """By how much more the votes were missed if a picture came from the other lens, for each picture (N,)."""
+    """By how much more the votes were missed if an image came from the other lens, for each image (N,)."""
     which = votes.which(second)
     missed = votes.mahalanobis_residuals(lenses[which])
-    return _per_picture(
+    return _per_image(
         count, votes, *(votes.mahalanobis_residuals(lenses[which ^ other]) - missed for other in np.eye(2, dtype=int))
     )
 
 
-def _per_picture(count: int, votes: Votes, of_first: FloatArray, of_last: FloatArray) -> FloatArray:
-    """What the votes say of their first and second pictures, added up, shape (N,)."""
+def _per_image(count: int, votes: Votes, of_first: FloatArray, of_last: FloatArray) -> FloatArray:
+    """What the votes say of their first and second images, added up, shape (N,)."""
     total: FloatArray = np.zeros(count)
     np.add.at(total, votes.image1, of_first)
     np.add.at(total, votes.image2, of_last)

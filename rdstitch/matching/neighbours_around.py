@@ -1,4 +1,4 @@
-"""Pairs of pictures taken from one centre that show a part of each other."""
+"""Pairs of images taken from one centre that show a part of each other."""
 
 from collections.abc import Sequence
 
@@ -8,10 +8,10 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera, border_of
 
 _MIN_OVERLAP = 0.15
-"""Share of the picture of which more is seen in the other."""
+"""Share of the image of which more is seen in the other."""
 
 _PLACES = 7
-"""Places along each side of a picture that are looked up in others."""
+"""Places along each side of an image that are looked up in others."""
 
 
 def neighbours_around(
@@ -23,7 +23,7 @@ def neighbours_around(
     ----------
     cameras : sequence of Camera
     directions : ndarray of shape (N, 3, 3)
-        From undistorted normalized coordinates of each picture to directions; NaN for pictures without a pose.
+        From undistorted normalized coordinates of each image to directions; NaN for images without a pose.
     tried : set of (int, int)
         Pairs (i, j), i < j.
     """
@@ -32,7 +32,7 @@ def neighbours_around(
     back = {k: np.linalg.inv(directions[k]) for k in known}
     axes = directions[known, :, 2] / np.linalg.norm(directions[known, :, 2], axis=1, keepdims=True)
     reach = np.array([_reach(cameras[k], directions[k], axis) for k, axis in zip(known, axes, strict=True)])
-    # Only cones around the optical axes that meet: of many pictures all round, few of the pairs.
+    # Only cones around the optical axes that meet: of many images all round, few of the pairs.
     near = (
         (i, known[position])
         for first, i in enumerate(known)
@@ -48,7 +48,7 @@ def neighbours_around(
 
 
 def _rays(camera: Camera, matrix: FloatArray) -> FloatArray:
-    """Directions (K, 3) of a grid of places in a picture."""
+    """Directions (K, 3) of a grid of places in an image."""
     width, height = camera.image_size
     share = (np.arange(_PLACES) + 0.5) / _PLACES
     places = np.stack(np.meshgrid(share * width - 0.5, share * height - 0.5), axis=-1).reshape(-1, 2)
@@ -58,7 +58,7 @@ def _rays(camera: Camera, matrix: FloatArray) -> FloatArray:
 
 
 def _reach(camera: Camera, matrix: FloatArray, axis: FloatArray) -> float:
-    """Largest angle, radians, between the optical axis and what a picture shows."""
+    """Largest angle, radians, between the optical axis and what an image shows."""
     flat = camera.normalize(camera.undistort(border_of(camera.image_size, _PLACES)))
     if not np.isfinite(flat).all():
         return np.pi
@@ -73,7 +73,7 @@ def _angles(directions: FloatArray, axis: FloatArray) -> FloatArray:
 
 
 def _share_seen(rays: FloatArray, camera: Camera, back: FloatArray) -> float:
-    """Share of directions (K, 3) that a picture shows; ``back`` leads to its undistorted normalized coordinates."""
+    """Share of directions (K, 3) that an image shows; ``back`` leads to its undistorted normalized coordinates."""
     x, y, z = back @ rays.T
     flat = np.stack([x, y], axis=1) / np.where(z > 0.0, z, np.nan)[:, None]
     u, v = camera.distort(camera.denormalize(flat)).T

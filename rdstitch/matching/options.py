@@ -1,4 +1,4 @@
-"""How pictures are matched and pairs are estimated."""
+"""How images are matched and pairs are estimated."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +28,7 @@ class PairOptions:
 class MatchingOptions:
     """How the pairs of a whole set are matched and estimated."""
 
-    pair: PairOptions = PairOptions()  # its λ is that of all pictures, where it is known
+    pair: PairOptions = PairOptions()  # its λ is that of all images, where it is known
     ratio: float | None = None  # largest ratio of distances of a match; None: what suits the features
     lightglue_model: str | Path | None = None  # ONNX file of a network that matches the features instead
     workers: int = 1  # pairs matched at the same time

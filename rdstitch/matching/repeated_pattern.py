@@ -1,9 +1,9 @@
-"""Matches between pictures of a pattern that repeats itself: a chessboard, tiles, a board of tags.
+"""Matches between images of a pattern that repeats itself: a chessboard, tiles, a board of tags.
 
 There each keypoint looks like many, so that no match is distinctive. But each of its likely partners says how the whole
-picture would be turned, scaled and moved, by the places, scales and orientations of the two keypoints alone; the motion
+image would be turned, scaled and moved, by the places, scales and orientations of the two keypoints alone; the motion
 that most keypoints have a partner for is right, or off by whole periods of the pattern. That is as good for the lens:
-a board that is shifted by a square is as flat as before. It is not for the places of the pictures.
+a board that is shifted by a square is as flat as before. It is not for the places of the images.
 """
 
 import numpy as np
@@ -13,16 +13,16 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.features import Correspondences, Features
 
 MIN_REPETITION = 0.1
-"""Of :func:`repetition`: pictures with more may show a repeated pattern. Boards have 0.15 to 0.8, flights up to
+"""Of :func:`repetition`: images with more may show a repeated pattern. Boards have 0.15 to 0.8, flights up to
 0.01, but up to 0.6 over a car park or mown grass."""
 
-_SIMILAR_DISTANCE = 0.45  # of the median distance between descriptors of a picture: nearer ones look the same
+_SIMILAR_DISTANCE = 0.45  # of the median distance between descriptors of an image: nearer ones look the same
 _MIN_REPETITIONS = 4  # keypoints elsewhere that look the same, of one that repeats itself
 _MAX_KEYPOINTS = 1000  # keypoints that are looked at for that
 _PARTNERS = 6  # likely partners of each keypoint
 _HYPOTHESES = 400  # motions that are tried, each by one keypoint and one partner
 _REFINED = 4  # of them, the best, that are refined
-_MAX_SCALE = 2.5  # of one picture in the other
+_MAX_SCALE = 2.5  # of one image in the other
 _TURN, _LOG_SCALE = 0.5, 0.5  # radians, and logarithm, by which one keypoint's motion may differ from another's
 _NEAR, _FAR, _SPREAD = 0.01, 0.06, 0.12  # half diagonals: error beside the keypoint, at most, and its growth
 _TOLERANCES = (0.05, 0.035, 0.025, 0.02, 0.015, 0.015)  # half diagonals, of the rounds of refinement
@@ -31,7 +31,7 @@ _MIN_MATCHES = 20
 
 
 def repetition(features: Features) -> float:
-    """Share of the keypoints that look like at least four others elsewhere in the picture, in [0, 1]."""
+    """Share of the keypoints that look like at least four others elsewhere in the image, in [0, 1]."""
     strongest = features.take(np.arange(min(len(features), _MAX_KEYPOINTS)))
     if features.binary or len(strongest) <= _MIN_REPETITIONS:
         return 0.0
@@ -44,7 +44,7 @@ def repetition(features: Features) -> float:
 
 
 def match_pattern(features1: Features, features2: Features) -> Correspondences:
-    """Matches by the motion of the whole picture that most keypoints have a likely partner for.
+    """Matches by the motion of the whole image that most keypoints have a likely partner for.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def _squared_distances(features1: Features, features2: Features) -> NDArray[np.f
 
 
 def _partners(features1: Features, features2: Features) -> tuple[IntArray, IntArray, FloatArray]:
-    """Keypoints of the first picture, each with its likely partners in the second, and how unlike they are."""
+    """Keypoints of the first image, each with its likely partners in the second, and how unlike they are."""
     squared = _squared_distances(features1, features2)
     nearest = np.argpartition(squared, _PARTNERS, axis=1)[:, :_PARTNERS]
     distance = np.sqrt(np.take_along_axis(squared, nearest, axis=1).astype(np.float64)).ravel()

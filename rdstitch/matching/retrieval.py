@@ -1,9 +1,9 @@
-"""Which pictures look alike: a vocabulary of the folder's own descriptors, and words in common.
+"""Which images look alike: a vocabulary of the folder's own descriptors, and words in common.
 
-Every descriptor is replaced by the nearest of up to 65,536 words, learned from a sample of the pictures' descriptors as
-a tree of two levels (Nistér and Stewénius 2006). Two pictures are alike as far as they share words, rare ones above all
-(TF-IDF; Sivic and Zisserman 2003). The cost grows with the number of pictures; only a product of sparse matrices with
-their square, of which 10,000 pictures take seconds.
+Every descriptor is replaced by the nearest of up to 65,536 words, learned from a sample of the images' descriptors as
+a tree of two levels (Nistér and Stewénius 2006). Two images are alike as far as they share words, rare ones above all
+(TF-IDF; Sivic and Zisserman 2003). The cost grows with the number of images; only a product of sparse matrices with
+their square, of which 10,000 images take seconds.
 """
 
 from dataclasses import dataclass
@@ -17,24 +17,22 @@ from rdstitch.features import Features
 from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.scipy_parts import sparse
 
-_FEATURES_PER_IMAGE = 1000  # strongest features that describe a picture
+_FEATURES_PER_IMAGE = 1000  # strongest features that describe an image
 _DESCRIPTORS_PER_WORD = 16  # few enough that a word is rare, enough that one place on the ground is one word
 _MAX_WORDS = 65_536
 _MIN_DESCRIPTORS = 640  # fewer are no vocabulary
 _TRAINING_PER_WORD = 5  # descriptors that words are learned from
 _TRAINING_PER_BRANCH = 50
 _ROUNDS = 3  # of Lloyd's algorithm
-_SHORTLIST = 40  # most similar pictures of each that are considered further
-_SHARED_NEIGHBOURS = 10  # most similar pictures of each that two pictures may have in common
+_SHORTLIST = 40  # most similar images of each that are considered further
+_SHARED_NEIGHBOURS = 10  # most similar images of each that two images may have in common
 _SHARED_NEIGHBOUR_WEIGHT = 1.0  # weight of having all neighbours in common, in units of the usual best similarity
-_SEQUENCE_RANK = (
-    0.75  # share of the other pictures that are less alike than the next one where the order means something
-)
+_SEQUENCE_RANK = 0.75  # share of the other images that are less alike than the next one where the order means something
 _ONE_SIGMA = 0.16  # quantile of a normal distribution one standard deviation below its median
-_SIGNIFICANT_SIGMA = 5.0  # standard deviations above the median of all pictures
-_MIN_SEQUENTIAL_SHARE = 0.5  # share of the pictures of which that is true of the next one; a quarter by chance
+_SIGNIFICANT_SIGMA = 5.0  # standard deviations above the median of all images
+_MIN_SEQUENTIAL_SHARE = 0.5  # share of the images of which that is true of the next one; a quarter by chance
 _BLOCK = 8192  # descriptors assigned at a time
-_ROWS = 256  # pictures compared with all others at a time
+_ROWS = 256  # images compared with all others at a time
 
 _LARGEST = 65504.0  # in half precision
 
@@ -44,19 +42,19 @@ Descriptors = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True)
 class Similarity:
-    """How alike N pictures are, as far as they are.
+    """How alike N images are, as far as they are.
 
     Attributes
     ----------
     scores : sparse array of shape (N, N)
-        Symmetric; larger is more alike, and what any two pictures have in common counts nothing.
+        Symmetric; larger is more alike, and what any two images have in common counts nothing.
     most_alike : ndarray of shape (N, K), intp
-        The K other pictures that are most alike to each, the most alike first.
+        The K other images that are most alike to each, the most alike first.
     peak : ndarray of shape (N, K), bool
-        Whether such a picture is more alike than chance makes it, and more than the one before it and the one after it
+        Whether such an image is more alike than chance makes it, and more than the one before it and the one after it
         in the sequence.
     ordered : bool
-        Whether pictures that follow one another are alike, so that their order means something.
+        Whether images that follow one another are alike, so that their order means something.
     """
 
     scores: "sparse.csr_array"
@@ -111,12 +109,12 @@ class Vocabulary:
 
 
 def similarity(features: FeatureStore, seed: int) -> Similarity | None:
-    """How alike the pictures are whose features these are; None where they show too little to say.
+    """How alike the images are whose features these are; None where they show too little to say.
 
     Parameters
     ----------
     features : FeatureStore
-        One a picture, in the order in which the pictures were taken, if there is one; read twice, one at a time.
+        One an image, in the order in which the images were taken, if there is one; read twice, one at a time.
     seed : int
     """
     weights = _weighted_words(features, seed)
@@ -124,7 +122,7 @@ def similarity(features: FeatureStore, seed: int) -> Similarity | None:
 
 
 def _weighted_words(features: FeatureStore, seed: int) -> "sparse.csr_array | None":
-    """The words of each picture, as unit vectors (N, words); zero for pictures without features."""
+    """The words of each image, as unit vectors (N, words); zero for images without features."""
     counts = np.minimum(features.counts, _FEATURES_PER_IMAGE)
     total = int(counts.sum())
     if total < _MIN_DESCRIPTORS:
@@ -147,7 +145,7 @@ def _weighted_words(features: FeatureStore, seed: int) -> "sparse.csr_array | No
 
 
 def _training(features: FeatureStore, parts: list[IntArray], starts: IntArray) -> NDArray[np.float16]:
-    """The descriptors that words are learned from, by their places among those of all pictures.
+    """The descriptors that words are learned from, by their places among those of all images.
 
     Half precision loses nothing of descriptors as they are stored, and single precision would be the largest array of a
     run.
@@ -163,13 +161,13 @@ def _training(features: FeatureStore, parts: list[IntArray], starts: IntArray) -
 
 
 def _describing(features: Features) -> Array32:
-    """The descriptors that stand for a picture."""
+    """The descriptors that stand for an image."""
     descriptors = features.descriptors[:_FEATURES_PER_IMAGE]
     return (np.unpackbits(descriptors.astype(np.uint8), axis=1) if features.binary else descriptors).astype(np.float32)
 
 
 def _compare(weights: "sparse.csr_array") -> Similarity:
-    """Compare all pictures with one another, some rows of the matrix at a time."""
+    """Compare all images with one another, some rows of the matrix at a time."""
     count = weights.shape[0]
     kept = min(_SHORTLIST, count - 1)
     best, values = np.empty((count, kept), dtype=np.intp), np.empty((count, kept))
@@ -180,7 +178,7 @@ def _compare(weights: "sparse.csr_array") -> Similarity:
         rows = np.arange(first, min(first + _ROWS, count))
         alike = np.asarray((weights[rows] @ across).todense(), dtype=np.float64)
         low, usual[rows], high = np.quantile(alike, (_ONE_SIGMA, 0.5, _SEQUENCE_RANK), axis=1)
-        spread[rows] = usual[rows] - low  # the other half has the pictures that are truly alike
+        spread[rows] = usual[rows] - low  # the other half has the images that are truly alike
         following = alike[np.arange(len(rows)), np.minimum(rows + 1, count - 1)]
         next_one[rows] = following > high
         alike[np.arange(len(rows)), rows] = -1.0
@@ -197,7 +195,7 @@ def _compare(weights: "sparse.csr_array") -> Similarity:
 
 
 def _with_shared_neighbours(best: IntArray, excess: FloatArray) -> "sparse.csr_array":
-    """Similarities (N, N), raised where pictures are alike to the same others."""
+    """Similarities (N, N), raised where images are alike to the same others."""
     own = _symmetric(best, excess)
     neighbours = _unit_rows(_symmetric(best[:, :_SHARED_NEIGHBOURS], excess[:, :_SHARED_NEIGHBOURS]))
     return sparse.csr_array(own + _SHARED_NEIGHBOUR_WEIGHT * float(np.mean(excess[:, 0])) * (neighbours @ neighbours.T))

@@ -1,6 +1,6 @@
 """Matches that relief moves: right ones that a pair's plane does not explain.
 
-Over rough ground a pair of pictures has many planes, and two-view estimation takes the one that explains the most: a
+Over rough ground a pair of images has many planes, and two-view estimation takes the one that explains the most: a
 valley floor, one flank of a ridge. The next pair takes another one, and no camera fits them all. What lies off the
 plane continues it, though: parallax changes from place to place as the ground does, and a match agrees with the
 matches around it. Wrong matches do not, and what stands on the plane or moves on its own ends with a step.
@@ -21,7 +21,7 @@ _NEIGHBOURS = 6
 """Matches around one that it may continue: as many as a point has on average in a triangulation of the plane."""
 
 _STEEPEST = 0.2
-"""Pixels by which parallax changes from one pixel to the next: ground that climbs by 30 degrees, in two pictures that
+"""Pixels by which parallax changes from one pixel to the next: ground that climbs by 30 degrees, in two images that
 are apart by a third of the camera's height."""
 
 _ROUGH = 0.5

@@ -1,7 +1,7 @@
-"""What is static in the pictures while the plane moves: a robot's own body, a background, dirt on the lens, a date.
+"""What is static in the images while the plane moves: a robot's own body, a background, dirt on the lens, a date.
 
 Matches between such things agree that nothing moved. Where they outnumber the matches of the plane, a pair looks as if
-the camera stood still; pictures far apart, which share nothing else, always do. Without them, the pairs show how the
+the camera stood still; images far apart, which share nothing else, always do. Without them, the pairs show how the
 plane moved.
 """
 
@@ -16,8 +16,8 @@ from rdstitch.matching.static_places import StaticPlaces
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.scipy_parts import spatial
 
-_MIN_PICTURES, _MIN_SHARE = 3, 0.5
-"""Pictures, in number and as a share, that pairs which move must connect: two could agree by chance."""
+_MIN_IMAGES, _MIN_SHARE = 3, 0.5
+"""Images, in number and as a share, that pairs which move must connect: two could agree by chance."""
 
 _MAX_STATIC_MOTION = 1.0 / 3.0
 """Motion of a static match at most, in thresholds: its two keypoints are localised to better than that."""
@@ -49,7 +49,7 @@ def has_static_background(pairs: Sequence[PairRegistration], threshold: float) -
 
 
 def moving_features(features: FeatureStore, pairs: Sequence[PairRegistration], threshold: float) -> FeatureStore:
-    """The features of each picture without those that have a static match."""
+    """The features of each image without those that have a static match."""
     moving = [np.ones(len(found), dtype=np.bool_) for found in features.items]
     for pair in pairs:
         static = pair.correspondences.indices[_static_matches(pair, threshold)]
@@ -93,17 +93,17 @@ def _is_overlaid(pair: PairRegistration, threshold: float) -> bool:
 
 
 def moving_images(pairs: Sequence[PairRegistration], count: int, threshold: float) -> int:
-    """How many of the ``count`` pictures pairs that move connect, at the most."""
+    """How many of the ``count`` images pairs that move connect, at the most."""
     linked = [pair for pair in pairs if pair.relation and not is_static_pair(pair, threshold)]
     return len(connected_components(count, [pair.image1 for pair in linked], [pair.image2 for pair in linked])[0])
 
 
 def show_motion(pairs: Sequence[PairRegistration], count: int, threshold: float) -> bool:
-    """Whether pairs that do move connect a good part of the ``count`` pictures, so that this is no chance."""
-    return moving_images(pairs, count, threshold) >= max(_MIN_PICTURES, _MIN_SHARE * count)
+    """Whether pairs that do move connect a good part of the ``count`` images, so that this is no chance."""
+    return moving_images(pairs, count, threshold) >= max(_MIN_IMAGES, _MIN_SHARE * count)
 
 
 def _moved(pair: PairRegistration) -> FloatArray:
-    """How far each match moved in the picture, pixels."""
+    """How far each match moved in the image, pixels."""
     moved: FloatArray = np.linalg.norm(pair.correspondences.points2 - pair.correspondences.points1, axis=1)
     return moved

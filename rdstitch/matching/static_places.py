@@ -1,4 +1,4 @@
-"""Where several pairs of pictures have static matches, and the matches of other pairs that lie elsewhere or move."""
+"""Where several pairs of images have static matches, and the matches of other pairs that lie elsewhere or move."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ class StaticPlaces:
     """Where several pairs have static matches.
 
     A feature there that is matched otherwise at first is left by
-    :func:`rdstitch.matching.static_background.moving_features`, and then finds what is static in other pictures.
+    :func:`rdstitch.matching.static_background.moving_features`, and then finds what is static in other images.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Registration of pairs: match the features of two pictures, estimate homography and λ together.
+"""Registration of pairs: match the features of two images, estimate homography and λ together.
 
 The tasks of both stages are batches of pairs, for any :class:`concurrent.futures.Executor`: they take names of features
 and matches, which lie in the cache of the run, and give names back.
@@ -47,7 +47,7 @@ class PairRegistration:
     Attributes
     ----------
     image1, image2 : int
-        Indices of the pictures.
+        Indices of the images.
     matches : StoredMatches
         The putative matches, on disk.
     relation : RadialHomography
@@ -60,7 +60,7 @@ class PairRegistration:
     relation: RadialHomography
 
     def __repr__(self) -> str:
-        """One line: its pictures and their relation."""
+        """One line: its images and their relation."""
         return f"<PairRegistration {self.image1}, {self.image2}: {self.relation!r}>"
 
     @property
@@ -82,12 +82,12 @@ class MatchingTask:
     Attributes
     ----------
     features : sequence of (StoredFeatures, StoredFeatures)
-        Of the two pictures of each pair.
+        Of the two images of each pair.
     known : sequence of StoredMatches or None
-        Some matches of each pair, where they are known: they show where the pictures overlap, and only there the rest
+        Some matches of each pair, where they are known: they show where the images overlap, and only there the rest
         is looked for.
     matcher : callable
-        Matches the features of two pictures.
+        Matches the features of two images.
     how : tuple
         What stands for the matcher in the inputs of results.
     cache : Cache
@@ -102,7 +102,7 @@ class MatchingTask:
 
 def match_pairs(task: MatchingTask) -> list[StoredMatches]:
     """Match the features of every pair of a task."""
-    # Pairs that follow one another have a picture in common.
+    # Pairs that follow one another have an image in common.
     load = lru_cache(maxsize=2)(StoredFeatures.load)
     pairs = zip(task.features, task.known, strict=True)
     return [_match_pair(one, two, known, task, load) for (one, two), known in pairs]
@@ -138,12 +138,12 @@ class EstimationTask:
     Attributes
     ----------
     cameras : sequence of (Camera, Camera)
-        Of the two pictures of each pair; of their lens only the centre and the focal length are used, unless
+        Of the two images of each pair; of their lens only the centre and the focal length are used, unless
         ``options.distortion``.
     matches : sequence of StoredMatches
         Of each pair.
     tilts : sequence of ((float, float) or None, (float, float) or None)
-        Known tilts (ψ, θ), radians, of the two pictures of each pair; None where unknown.
+        Known tilts (ψ, θ), radians, of the two images of each pair; None where unknown.
     options : PairOptions
     cache : Cache
     static : StaticPlaces, optional

@@ -1,4 +1,4 @@
-"""Pairs of pictures through all rounds: matched once, estimated alone, then with what the others know."""
+"""Pairs of images through all rounds: matched once, estimated alone, then with what the others know."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -39,13 +39,13 @@ from rdstitch.progress import Progress
 
 Transfer = Callable[[int, int, FloatArray], FloatArray]
 
-_PRESCREEN_FEATURES = 1000  # strongest features of a picture, by which pairs are prescreened
-_MIN_PRESCREEN_MATCHES = 8  # matches among these; pictures that share nothing have three to six by chance
-_MIN_RELATIVE_MATCHES = 0.05  # share of the matches that a picture has with the one most like it; less adds nothing
-_SUFFICIENT_MATCHES = 200  # of a picture with all others, from which on it needs no more
+_PRESCREEN_FEATURES = 1000  # strongest features of an image, by which pairs are prescreened
+_MIN_PRESCREEN_MATCHES = 8  # matches among these; images that share nothing have three to six by chance
+_MIN_RELATIVE_MATCHES = 0.05  # share of the matches that an image has with the one most like it; less adds nothing
+_SUFFICIENT_MATCHES = 200  # of an image with all others, from which on it needs no more
 _FEW_INLIERS = 50  # of a pair of a repeated pattern, which shows hundreds of keypoints
 _MIN_INLIER_RATIO = 0.7  # of such matches that agree: right pairs have 0.8 to 1, lattices that hardly match half
-_SAMPLED = 5  # pictures that are looked at for a repeated pattern
+_SAMPLED = 5  # images that are looked at for a repeated pattern
 _SEARCH_RADIUS = 3.0  # thresholds around the place where a match is expected
 
 
@@ -67,7 +67,7 @@ class Pairing:
     store : Cache
         Of what need not be in memory all the time.
     tilts : sequence of (float, float), optional
-        (ψ, θ), radians, of each picture, where they are known exactly.
+        (ψ, θ), radians, of each image, where they are known exactly.
     static : StaticPlaces, optional
         Where static matches are no evidence.
     """
@@ -89,7 +89,7 @@ class Pairing:
         A pair that is passed over may overlap nevertheless, by little: its place then follows from the others.
         """
         strongest = replace(self, features=self.features.strongest(_PRESCREEN_FEATURES))
-        shared = dict(zip(pairs, strongest._match(pairs, "comparing pictures"), strict=True))
+        shared = dict(zip(pairs, strongest._match(pairs, "comparing images"), strict=True))
         most = np.zeros(len(self.features), dtype=np.intp)
         for pair, matches in shared.items():
             most[[*pair]] = np.maximum(most[[*pair]], len(matches))
@@ -108,7 +108,7 @@ class Pairing:
     ) -> list[PairRegistration]:
         """Match and estimate pairs (i, j), with λ free, or as the user or the other pairs say.
 
-        Where matches of the prescreening are given, only the parts in which the pictures overlap are matched.
+        Where matches of the prescreening are given, only the parts in which the images overlap are matched.
         """
         chosen = list(pairs)
         if not chosen:
@@ -125,9 +125,9 @@ class Pairing:
         return pairs if any(pair.relation for pair in pairs) else self.estimate(candidates)
 
     def remove_static_background(self, pairs: list[PairRegistration], candidates: Sequence[Pair] = ()) -> "MovingPairs":
-        """Where a part of the pictures is static, the pairing and pairs of what moves; the same again where none is.
+        """Where a part of the images is static, the pairing and pairs of what moves; the same again where none is.
 
-        What the pictures have in common was static then, so that it says nothing of which of the candidate pairs
+        What the images have in common was static then, so that it says nothing of which of the candidate pairs
         matter: all of them are compared.
         """
         threshold = self.options.pair.threshold
@@ -148,7 +148,7 @@ class Pairing:
         return MovingPairs(moving, again, found=True)
 
     def match_repeated_patterns(self, pairs: list[PairRegistration]) -> list[PairRegistration]:
-        """Where the pictures show a repeated pattern, match again the pairs that failed or hold by little.
+        """Where the images show a repeated pattern, match again the pairs that failed or hold by little.
 
         They may be off by whole periods of the pattern then; see :mod:`rdstitch.matching.repeated_pattern`.
         """
@@ -167,7 +167,7 @@ class Pairing:
 
     @cached_property
     def shows_repeated_pattern(self) -> bool:
-        """Whether keypoints of most of the pictures look like others elsewhere in the same picture."""
+        """Whether keypoints of most of the images look like others elsewhere in the same image."""
         if self.options.lightglue_model is not None:
             return False
         sampled = np.unique(np.linspace(0, len(self.features) - 1, _SAMPLED).astype(np.intp)).tolist()
@@ -202,7 +202,7 @@ class Pairing:
     def guided_rematch(
         self, pairs: list[PairRegistration], support: Mapping[Pair, int], transfer: Transfer
     ) -> dict[int, PairRegistration]:
-        """Match the pairs of weakly supported pictures again, only near where the alignment expects the matches.
+        """Match the pairs of weakly supported images again, only near where the alignment expects the matches.
 
         Parameters
         ----------
@@ -210,7 +210,7 @@ class Pairing:
         support : mapping of (int, int) to int
             Number of inliers of every pair that the alignment uses.
         transfer : callable
-            Takes two pictures and points (N, 2) of the first, pixels, to points of the second, pixels.
+            Takes two images and points (N, 2) of the first, pixels, to points of the second, pixels.
 
         Returns
         -------
@@ -304,8 +304,8 @@ class Pairing:
         model = self.options.lightglue_model
         return self.options.ratio, None if model is None else self.cache.file(model)
 
-    def _tilt(self, picture: int) -> tuple[float, float] | None:
-        return None if self.tilts is None else self.tilts[picture]
+    def _tilt(self, image: int) -> tuple[float, float] | None:
+        return None if self.tilts is None else self.tilts[image]
 
     def _pair_options(self, distortion: float | None) -> PairOptions:
         pair = self.options.pair
@@ -314,12 +314,12 @@ class Pairing:
 
 @dataclass(frozen=True)
 class MovingPairs:
-    """Pairs of what moves in the pictures.
+    """Pairs of what moves in the images.
 
     Attributes
     ----------
     pairing : Pairing
-        With the features that do not rest in the pictures.
+        With the features that do not rest in the images.
     pairs : list of PairRegistration
     found : bool
         Whether there was a static background, and it was removed.

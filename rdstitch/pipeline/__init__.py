@@ -1,4 +1,4 @@
-"""The recipes that make a picture, a camera or a trajectory out of pictures."""
+"""The recipes that make an image, a camera or a trajectory out of images."""
 
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply

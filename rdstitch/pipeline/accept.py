@@ -30,14 +30,14 @@ larger sets something has been seen to move otherwise, or the failure is one of 
 
 @dataclass(frozen=True)
 class _Offenders:
-    """What one round leaves out: pictures, and links without which other pictures may fall off.
+    """What one round leaves out: images, and links without which other images may fall off.
 
     Attributes
     ----------
     reasons : mapping of int to Message
-        What is wrong with a picture, by its index.
+        What is wrong with an image, by its index.
     links : mapping of (int, int) to Message
-        What is wrong with a pair of pictures.
+        What is wrong with a pair of images.
     """
 
     reasons: Mapping[int, Message]
@@ -67,13 +67,13 @@ def accept(
     Parameters
     ----------
     registration : Registration
-        In pixels of the working size; the result is in those of the pictures.
+        In pixels of the working size; the result is in those of the images.
     executor : concurrent.futures.Executor
-        Where pictures are compared.
+        Where images are compared.
     metric : bool
         Metric poses are needed, also of what remains.
     lens_only : bool
-        Only the lens is wanted, so that doubts about the places of pictures do not matter.
+        Only the lens is wanted, so that doubts about the places of images do not matter.
     prefer_turn : bool
         As for :func:`rdstitch.pipeline.register.register`.
 
@@ -82,7 +82,7 @@ def accept(
     RefusedError
         When nothing trustworthy remains, unless ``options.force``: then everything is kept.
     PartialResultError
-        When a picture is left out, under ``options.strict``.
+        When an image is left out, under ``options.strict``.
     """
     cache = Cache(options.cache)
     layout_matters = not (lens_only or metric)
@@ -112,7 +112,7 @@ def accept(
             worst = _worst(current, found)
             left |= worst
             shrunk = _without(registration, left, aligner) if worst else None
-            # Where as many pictures fail as pass, nobody can say which of them are right.
+            # Where as many images fail as pass, nobody can say which of them are right.
             if shrunk is None or shrunk.alignment.used.sum() <= len(left.reasons):
                 raise RefusedError(at_full_size(first))
             current, found = shrunk, checked(shrunk)
@@ -125,9 +125,9 @@ def accept(
 
 
 def _without_damage(registration: Registration, aligner: Aligner) -> Registration | None:
-    """Without pictures of damaged files; None where none is used, or too few others are left.
+    """Without images of damaged files; None where none is used, or too few others are left.
 
-    Flipped bits shift a part of a picture: by a few pixels, that looks as if the camera had tilted, and all tilt then;
+    Flipped bits shift a part of an image: by a few pixels, that looks as if the camera had tilted, and all tilt then;
     by more, as if something moved.
     """
     used = registration.alignment.used
@@ -148,7 +148,7 @@ def _is_simpler(model: str, former: str) -> bool:
 
 
 def _plane_of_most(registration: Registration, threshold: float, aligner: Aligner) -> Registration | None:
-    """Of two motions in the pictures that which may fill most of them; None where that is not to be seen."""
+    """Of two motions in the images that which may fill most of them; None where that is not to be seen."""
     if registration.static_background:
         return None
     pairs = planes_of_pairs(registration, threshold)
@@ -170,12 +170,12 @@ def _may_be_another_plane(found: Iterable[Message]) -> bool:
 
 
 def _concerns_all(found: Iterable[Message]) -> bool:
-    """Whether something fails that no picture or pair is to blame for, so that leaving one out would only hide it."""
+    """Whether something fails that no image or pair is to blame for, so that leaving one out would only hide it."""
     return any(message.severity == "failure" and len(message.images) > 2 for message in found)
 
 
 def _worst(registration: Registration, found: Iterable[Message]) -> _Offenders:
-    """The worst pictures, no two of them linked, since a bad picture spoils its neighbours; else the failing pairs."""
+    """The worst images, no two of them linked, since a bad image spoils its neighbours; else the failing pairs."""
     index = {str(source.path): k for k, source in enumerate(registration.sources)}
     failures = [message for message in found if message.severity == "failure"]
     single = {index[m.images[0]]: m for m in failures if len(m.images) == 1}
@@ -185,15 +185,15 @@ def _worst(registration: Registration, found: Iterable[Message]) -> _Offenders:
     used = [fit for fit in registration.alignment.links if fit.used]
     fit_share = agreement(used, len(registration.sources))
     chosen: dict[int, Message] = {}
-    for picture in sorted(single, key=lambda k: (fit_share[k], k)):
-        linked = {fit.image1 + fit.image2 - picture for fit in used if picture in (fit.image1, fit.image2)}
+    for image in sorted(single, key=lambda k: (fit_share[k], k)):
+        linked = {fit.image1 + fit.image2 - image for fit in used if image in (fit.image1, fit.image2)}
         if not linked & chosen.keys():
-            chosen[picture] = single[picture]
+            chosen[image] = single[image]
     return _Offenders(chosen, {})
 
 
 def agreement(links: Sequence[LinkFit], count: int) -> np.ndarray:
-    """Share of the matches of each picture that agree with the whole, shape (N,); 1 without any."""
+    """Share of the matches of each image that agree with the whole, shape (N,); 1 without any."""
     given, kept = np.zeros(count), np.zeros(count)
     for fit in links:
         given[[fit.image1, fit.image2]] += fit.count
@@ -202,7 +202,7 @@ def agreement(links: Sequence[LinkFit], count: int) -> np.ndarray:
 
 
 def _held_by(registration: Registration, offenders: _Offenders) -> dict[int, set[int]]:
-    """The pictures left out that each other picture is linked with."""
+    """The images left out that each other image is linked with."""
     held: dict[int, set[int]] = {}
     for fit in registration.alignment.links:
         for own, other in ((fit.image1, fit.image2), (fit.image2, fit.image1)):
@@ -230,16 +230,16 @@ def _without(registration: Registration, offenders: _Offenders, aligner: Aligner
     reasons = dict(offenders.reasons)
     for pair, message in offenders.links.items():
         reasons.update({k: message for k in pair if not used[k]})
-    for picture, others in _held_by(registration, offenders).items():
+    for image, others in _held_by(registration, offenders).items():
         named_others = ", ".join(names_of(aligner.paths[k] for k in sorted(others)))
-        reasons.setdefault(picture, Message(f"hangs on {named_others}, which was left out; add pictures around it"))
+        reasons.setdefault(image, Message(f"hangs on {named_others}, which was left out; add images around it"))
     return _aligned_anew(registration, aligned, aligner.paths, reasons)
 
 
 def _aligned_anew(
     registration: Registration, aligned: AlignedPairs, paths: Sequence[str], reasons: Mapping[int, Message]
 ) -> Registration:
-    """The registration with another alignment, and why pictures are not in it."""
+    """The registration with another alignment, and why images are not in it."""
     known = {message.images: message for message in registration.left_out}
     unaligned = np.flatnonzero(~aligned.alignment.used).tolist()
     explained = zip(unaligned, explain_unaligned(aligned.alignment, paths, registration.keypoints), strict=True)
@@ -258,5 +258,5 @@ def scale_uncertainty(alignment: Alignment) -> list[Message]:
     if not alignment.length_std > _MAX_SCALE_UNCERTAINTY:
         return []
     off = f"all lengths may be off together by {alignment.length_std:.0%}"
-    text = f"{off}: the pictures hardly show the focal length; give --focal"
+    text = f"{off}: the images hardly show the focal length; give --focal"
     return [Message(text, code="focal-unknown")]

@@ -53,8 +53,8 @@ def impossible_estimates_fail() -> Iterator[None]:
         yield
     except ImpossibleCameraError as error:
         raise RegistrationError(
-            f"no reliable result: the pictures agree best on a lens that cannot be ({error}); "
-            "give the lens with --camera or --lambda, or take pictures that overlap more"
+            f"no reliable result: the images agree best on a lens that cannot be ({error}); "
+            "give the lens with --camera or --lambda, or take images that overlap more"
         ) from error
 
 
@@ -65,7 +65,7 @@ class AlignedPairs:
     Attributes
     ----------
     pairs : tuple of PairRegistration
-        Every pair that was compared, in the order of the pictures.
+        Every pair that was compared, in the order of the images.
     alignment : Alignment
     rough : bool
         Whether the inliers that it was made from are those over rough ground.
@@ -78,12 +78,12 @@ class AlignedPairs:
 
 @dataclass(frozen=True)
 class Aligner:
-    """What the alignment of a set of pictures needs besides their pairs.
+    """What the alignment of a set of images needs besides their pairs.
 
     Attributes
     ----------
     paths : tuple of str
-        Of the pictures, for messages.
+        Of the images, for messages.
     cameras : tuple of Camera
         Of the size that features are detected at.
     options : AlignmentOptions
@@ -93,7 +93,7 @@ class Aligner:
     needs_poses : bool
         Whether every alignment must have metric poses, see :meth:`metric`.
     orientations : tuple of int
-        By which quarter turns of EXIF (1, 3, 6, 8) the pictures became upright; ``options`` are of the stored ones.
+        By which quarter turns of EXIF (1, 3, 6, 8) the images became upright; ``options`` are of the stored ones.
         All upright as they are if empty.
     """
 
@@ -115,15 +115,15 @@ class Aligner:
         prefer_turn: bool = False,
         layout_matters: bool = True,
     ) -> Self:
-        """From what the user decided, and what the pictures and their headers say; see :class:`AlignmentOptions`.
+        """From what the user decided, and what the images and their headers say; see :class:`AlignmentOptions`.
 
         Raises
         ------
         ArgumentError
-            When the reference picture is none of the pictures.
+            When the reference image is none of the images.
         """
         paths = tuple(str(source.path) for source in sources)
-        megapixels = options.features.for_pictures(len(sources)).limits[1]
+        megapixels = options.features.for_images(len(sources)).limits[1]
         cameras = tuple(at_working_size(source.camera.with_focal(), megapixels) for source in sources)
         orientations = tuple(quarter_turn(source.metadata.orientation) for source in sources)
         decided = replace(alignment_options(sources, options), prefer_turn=prefer_turn, layout_matters=layout_matters)
@@ -135,16 +135,16 @@ class Aligner:
 
     @property
     def exact_tilts(self) -> list[tuple[float, float]] | None:
-        """(ψ, θ), radians, of each upright picture, where they are known exactly; None where not."""
+        """(ψ, θ), radians, of each upright image, where they are known exactly; None where not."""
         tilts = self.options.exact_tilts(len(self.cameras))
         if not tilts:
             return tilts
         return [(psi, theta) for psi, theta in turned_tilts(np.array(tilts), self._turns).tolist()]
 
     def align(self, pairs: Sequence[PairRegistration], former: Alignment | None = None) -> AlignedPairs:
-        """Align the pictures by the pairs that were registered; from an earlier run where the cache has it.
+        """Align the images by the pairs that were registered; from an earlier run where the cache has it.
 
-        A ``former`` alignment of other pairs of the pictures is where the new one starts, if these agree with it.
+        A ``former`` alignment of other pairs of the images is where the new one starts, if these agree with it.
 
         Raises
         ------
@@ -210,7 +210,7 @@ class Aligner:
 
 
 def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candidates: Sequence[Pair]) -> AlignedPairs:
-    """Register pictures that the poses put beside each other, and the candidate pairs of pictures without a pose."""
+    """Register images that the poses put beside each other, and the candidate pairs of images without a pose."""
     for _ in range(_CLOSURE_ROUNDS):
         pairs, alignment = aligned.pairs, aligned.alignment
         tried = {(pair.image1, pair.image2) for pair in pairs}
@@ -226,7 +226,7 @@ def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candi
 
 
 def rematch_weak_pairs(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs) -> AlignedPairs:
-    """Match pairs of weakly supported pictures again, only near where the alignment expects the matches.
+    """Match pairs of weakly supported images again, only near where the alignment expects the matches.
 
     Where the lens has more than λ, the inliers of all pairs, these among them, are selected again with it: pairs on
     their own have one λ, with which matches at the corners of such a lens are outliers, and relief is not. They are
@@ -255,7 +255,7 @@ def _same_lens(former: Camera, found: Camera) -> bool:
 
 
 def alignment_options(sources: Sequence[Source], options: StitchOptions) -> AlignmentOptions:
-    """What is decided or known beforehand of pictures as the camera stored them.
+    """What is decided or known beforehand of images as the camera stored them.
 
     Measured attitudes that are not exact leave the mount's tilt open.
     """
@@ -291,16 +291,16 @@ def _reference(sources: Sequence[Source], name: str | None) -> int | None:
     for index, source in enumerate(sources):
         if canonical_name(name) in (source.name, canonical_name(source.path)):
             return index
-    raise ArgumentError(f"the reference picture {name!r} is not among the input pictures")
+    raise ArgumentError(f"the reference image {name!r} is not among the input images")
 
 
 def _no_overlap(paths: Sequence[str], pairs: Sequence[PairRegistration]) -> str:
     """Why no pair was registered, by the example of the pair with the most matches."""
     if not pairs:
-        return "no two pictures could be compared"
+        return "no two images could be compared"
     best = max(pairs, key=lambda pair: len(pair.matches))
     first, second = names_of([paths[best.image1], paths[best.image2]])
     return (
-        f"no two pictures overlap: of the likeliest pair, {first} and {second}, {best.relation.reason}; "
-        "take pictures that overlap by a third or more"
+        f"no two images overlap: of the likeliest pair, {first} and {second}, {best.relation.reason}; "
+        "take images that overlap by a third or more"
     )

@@ -14,7 +14,7 @@ from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, InputError, OutputError, PartialResultError
 from rdstitch.file_access import canonical_name, canonical_text
-from rdstitch.inputs.find import found_pictures
+from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import ChannelOrder, Frame, Images, as_inputs, files_of
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import with_masks
@@ -26,11 +26,11 @@ from rdstitch.local_alignment import DisplacementField
 from rdstitch.messages import Message, told_once
 from rdstitch.messages import left_out as left_out_message
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.compose import Composed, compose_pictures, plainly_viewed, write_page
+from rdstitch.pipeline.compose import Composed, compose_images, plainly_viewed, write_page
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.recomposition import Recomposition, applied_sidecar
 from rdstitch.progress import Progress, silent
-from rdstitch.sidecar.read import SavedRegistration, mismatch_with_picture, read_sidecar
+from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
 
 MatchBy = Literal["auto", "name", "order"]
 _MATCHES = ("auto", "name", "order")
@@ -53,34 +53,34 @@ def apply(
     channel_order: ChannelOrder = "bgr",
     progress: Progress = silent,
 ) -> Recomposition:
-    """Compose pictures by a registration that was found before; nothing is estimated.
+    """Compose images by a registration that was found before; nothing is estimated.
 
     Parameters
     ----------
     sidecar : path
-        What :func:`rdstitch.pano` or :func:`rdstitch.mosaic` wrote beside its picture.
+        What :func:`rdstitch.pano` or :func:`rdstitch.mosaic` wrote beside its image.
     images : path, ndarray, or iterable of them
-        The same pictures, or others that were taken by the same lens from the same places: other bands, other sizes of
+        The same images, or others that were taken by the same lens from the same places: other bands, other sizes of
         the same shape, masks. Whatever :func:`rdstitch.mosaic` takes.
     output : path, optional
-        Picture to write, with a sidecar of its own beside it; without it the picture is in the result.
+        Image to write, with a sidecar of its own beside it; without it the image is in the result.
     composite : CompositeOptions, optional
         Those of the sidecar if not given.
     match : str
-        Which picture takes whose place. "name": the one of the same file name, or of the same name before the suffix.
+        Which image takes whose place. "name": the one of the same file name, or of the same name before the suffix.
         "order": the one at the same position of equally many. "auto": by name, or by order where no name is the same.
     mask : path, optional
-        Picture, or folder of them, that is dark where the pictures do not count.
+        Image, or folder of them, that is dark where the images do not count.
     every : int, optional
         Look among every n-th frame of videos and ROS bags; None: among those that show new ground.
     topic : str, optional
         Of the images in ROS bags; None: the only one.
     workers : int
-        Pictures worked on at the same time; 0: as many as there are cores.
+        Images worked on at the same time; 0: as many as there are cores.
     overwrite : bool
         Replace existing outputs.
     strict : bool
-        Fail when a picture that the registration used is missing or cannot be read.
+        Fail when an image that the registration used is missing or cannot be read.
     dry_run : bool
         Only plan; nothing is written.
     channel_order : str
@@ -89,13 +89,13 @@ def apply(
     Returns
     -------
     Recomposition
-        The picture, or what was written, with the pictures left out and what else the user should know.
+        The image, or what was written, with the images left out and what else the user should know.
     progress : callable
 
     Raises
     ------
     InputError
-        When the sidecar is none, or the pictures do not fit to it.
+        When the sidecar is none, or the images do not fit to it.
     RdstitchError
         See the tree in :mod:`rdstitch.errors`.
     """
@@ -103,18 +103,18 @@ def apply(
         raise ArgumentError(f"unknown way to match {match!r}; choose one of {', '.join(_MATCHES)}")
     saved = read_sidecar(sidecar)
     options = composite or saved.composite
-    doubts = [Message(mismatch)] if (mismatch := mismatch_with_picture(saved)) else []
+    doubts = [Message(mismatch)] if (mismatch := mismatch_with_image(saved)) else []
     if strict and doubts:
         raise InputError(doubts[0].text)
     given = as_inputs(images, channel_order)
-    with found_pictures(given, output=output, every=every, topic=topic) as found, Outputs(overwrite) as outputs:
+    with found_images(given, output=output, every=every, topic=topic) as found, Outputs(overwrite) as outputs:
         if output is not None:
             _check_outputs(Path(output), overwrite, found.files, saved.path)
         chosen, matched = _match(saved, found.frames, match)
         guard = InputGuard(strict)
         sources, left_out = _sources(saved, chosen, guard, options.max_memory)
         used = _used(saved, sources, left_out, mask, strict=strict)
-        composed = compose_pictures(
+        composed = compose_images(
             _placed(saved, used),
             output,
             options,
@@ -144,7 +144,7 @@ def apply(
 
 
 def _written(result: Recomposition, composed: Composed, used: Sequence[Source], outputs: Outputs) -> Recomposition:
-    """The result, with the page and the sidecar written, if the picture went to a file."""
+    """The result, with the page and the sidecar written, if the image went to a file."""
     if (output := result.output) is None:
         return result
     page = partial(plainly_viewed, composed.canvas, [source.name for source in used])
@@ -154,11 +154,11 @@ def _written(result: Recomposition, composed: Composed, used: Sequence[Source], 
 
 
 def _placed(saved: SavedRegistration, used: Mapping[int, Source]) -> PlacedImages:
-    """The pictures at the places that the sidecar has for them."""
+    """The images at the places that the sidecar has for them."""
     return PlacedImages(
         list(used.values()),
         [source.camera for source in used.values()],
-        np.array([saved.pictures[index].to_plane for index in used], dtype=np.float64),
+        np.array([saved.images[index].to_plane for index in used], dtype=np.float64),
         list(used).index(saved.reference) if saved.reference in used else None,
         [_displacement(saved, index, source) for index, source in used.items()],
         saved.turned,
@@ -174,24 +174,24 @@ def _used(
     *,
     strict: bool,
 ) -> dict[int, Source]:
-    """The pictures of the output, with their masks, by their number in the registration; at least one, or all."""
+    """The images of the output, with their masks, by their number in the registration; at least one, or all."""
     if strict and left_out:
         raise PartialResultError("; ".join(map(str, told_once(left_out.values()))))
     used = {index: source for index, source in enumerate(sources) if source is not None}
     if not used:
         first = next(iter(left_out.values()))
-        raise InputError(f"{saved.path}: none of its pictures can be used; {first.images[0]}: {first.text}")
+        raise InputError(f"{saved.path}: none of its images can be used; {first.images[0]}: {first.text}")
     return dict(zip(used, with_masks(list(used.values()), mask), strict=True))
 
 
 def _displacement(saved: SavedRegistration, index: int, source: Source) -> DisplacementField | None:
-    """The displacement of a picture of the registration for the one that takes its place."""
-    field = saved.pictures[index].displacement
+    """The displacement of an image of the registration for the one that takes its place."""
+    field = saved.images[index].displacement
     return None if field is None else field.resized(source.camera.image_size)
 
 
 def _check_outputs(output: Path, overwrite: bool, inputs: Sequence[Path], sidecar: Path) -> None:
-    """Find out before long work whether the picture and its sidecar can be written."""
+    """Find out before long work whether the image and its sidecar can be written."""
     beside = Path(f"{output}.json")
     if beside.exists() and beside.samefile(sidecar):
         raise OutputError(f"{output}: its sidecar is the one that is applied; choose another name")
@@ -200,40 +200,39 @@ def _check_outputs(output: Path, overwrite: bool, inputs: Sequence[Path], sideca
 
 
 def _match(saved: SavedRegistration, frames: Sequence[Frame], match: MatchBy) -> tuple[list[Frame | None], str]:
-    """For each picture of the registration the frame that takes its place, and by what it was found."""
+    """For each image of the registration the frame that takes its place, and by what it was found."""
     # Arrays have no names of their own.
-    if match != "order" and any(frame.picture is None for frame in frames):
+    if match != "order" and any(frame.image is None for frame in frames):
         for part in ("name", "stem"):
             chosen = _by_name(saved, frames, attrgetter(part))
             if any(frame is not None for frame in chosen):
                 return chosen, "name"
     if match == "name":
-        wanted = next(picture.name for picture in saved.pictures if picture.to_plane is not None)
-        raise InputError(f"{saved.path}: none of the given pictures has a name that is in it, such as {wanted}")
+        wanted = next(image.name for image in saved.images if image.to_plane is not None)
+        raise InputError(f"{saved.path}: none of the given images has a name that is in it, such as {wanted}")
     return list(_by_order(saved, frames)), "order"
 
 
 def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[Path], str]) -> list[Frame | None]:
     given = [canonical_name(key(frame.path)) for frame in frames]
     files, counts = dict(zip(given, frames, strict=True)), Counter(given)
-    names = [None if p.to_plane is None else canonical_text(key(Path(p.name))) for p in saved.pictures]
+    names = [None if p.to_plane is None else canonical_text(key(Path(p.name))) for p in saved.images]
     for name, count in Counter(names).items():
         if name is not None and name in files and (count > 1 or counts[name] > 1):
-            raise InputError(f"{saved.path}: several pictures are called {name}; give all in the old order and say so")
+            raise InputError(f"{saved.path}: several images are called {name}; give all in the old order and say so")
     return [None if name is None else files.get(name) for name in names]
 
 
 def _by_order(saved: SavedRegistration, frames: Sequence[Frame]) -> Sequence[Frame]:
-    if any(picture.camera is None for picture in saved.pictures):
+    if any(image.camera is None for image in saved.images):
         raise InputError(
-            f"{saved.path}: has pictures that could not be read, so that the order is lost; give pictures of the same "
-            "names"
+            f"{saved.path}: has images that could not be read, so that the order is lost; give images of the same names"
         )
-    if len(frames) != len(saved.pictures):
+    if len(frames) != len(saved.images):
         for path in files_of(frames):
             check_readable(path)
         raise InputError(
-            f"{saved.path}: has {len(saved.pictures)} pictures, but {len(frames)} others were given; give pictures of "
+            f"{saved.path}: has {len(saved.images)} images, but {len(frames)} others were given; give images of "
             "the same names, or equally many"
         )
     return frames
@@ -242,28 +241,28 @@ def _by_order(saved: SavedRegistration, frames: Sequence[Frame]) -> Sequence[Fra
 def _sources(
     saved: SavedRegistration, chosen: Sequence[Frame | None], guard: InputGuard, max_memory: int | None
 ) -> tuple[list[Source | None], dict[int, Message]]:
-    """The pictures with their cameras, and why which of those used then is not among them."""
+    """The images with their cameras, and why which of those used then is not among them."""
     sources: list[Source | None] = []
     left_out: dict[int, Message] = {}
-    for index, (picture, frame) in enumerate(zip(saved.pictures, chosen, strict=True)):
+    for index, (image, frame) in enumerate(zip(saved.images, chosen, strict=True)):
         sources.append(None)
-        if picture.camera is None or picture.to_plane is None:
+        if image.camera is None or image.to_plane is None:
             continue
         if frame is None:
-            left_out[index] = left_out_message(picture.path, "is not among the given pictures")
+            left_out[index] = left_out_message(image.path, "is not among the given images")
             continue
         found, unread = read_sources([frame], skip_bad=True, guard=guard, max_memory=max_memory)
         if unread:
             left_out[index] = unread[0]
         else:
-            sources[-1] = replace(found[0], camera=_resized(picture.camera, found[0]))
+            sources[-1] = replace(found[0], camera=_resized(image.camera, found[0]))
     return sources, left_out
 
 
 def _resized(camera: Camera, source: Source) -> Camera:
-    """The registered camera for a picture that shows the same at perhaps another size."""
+    """The registered camera for an image that shows the same at perhaps another size."""
     (w1, h1), (w2, h2) = camera.image_size, source.metadata.size
-    # Sizes are whole pixels, so that the shape may differ by one pixel of the picture.
+    # Sizes are whole pixels, so that the shape may differ by one pixel of the image.
     if abs(w1 * h2 - h1 * w2) > max(w1, h1):
         raise InputError(
             f"{source.path}: has {w2} x {h2} pixels, which is not the shape of the {w1} x {h1} that were registered"

@@ -1,4 +1,4 @@
-"""The last stage of every picture: from registered pictures to pixels, in memory or in a file with a page beside it."""
+"""The last stage of every image: from registered images to pixels, in memory or in a file with a page beside it."""
 
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -41,22 +41,22 @@ from rdstitch.process_memory import return_freed_memory
 from rdstitch.progress import Progress
 from rdstitch.stitch_result import StitchResult
 from rdstitch.stored import Stored
-from rdstitch.viewer import ViewedPicture, viewer_page, viewer_path
+from rdstitch.viewer import ViewedImage, viewer_page, viewer_path
 
-# Reduction of a picture of which only the kind of its samples is wanted.
+# Reduction of an image of which only the kind of its samples is wanted.
 _PROBE_REDUCTION = 8
 
 
 @dataclass(frozen=True)
 class Composed:
-    """Pictures put together, or the plan of doing so.
+    """Images put together, or the plan of doing so.
 
     Attributes
     ----------
     canvas : Canvas
-        Where the pictures lie in the output.
+        Where the images lie in the output.
     composite : Composite or None
-        The picture; None where it went to a file, or was only planned.
+        The image; None where it went to a file, or was only planned.
     plan : CompositePlan or None
         Of a dry run.
     messages : tuple of Message
@@ -64,7 +64,7 @@ class Composed:
     fingerprint : Fingerprint or None
         Size and digest of the file.
     written : FileComposite or None
-        The picture in its file.
+        The image in its file.
     place : Georeference or None
         Of the canvas.
     place_reason : str
@@ -81,7 +81,7 @@ class Composed:
     place_reason: str = ""
 
 
-def compose_pictures(
+def compose_images(
     placed: PlacedImages,
     output: str | Path | None,
     options: CompositeOptions,
@@ -93,13 +93,13 @@ def compose_pictures(
     elsewhere: BlockRunner | None = None,
     dry_run: bool = False,
 ) -> Composed:
-    """Plan the canvas, see whether a file can hold it, and put the pictures on it.
+    """Plan the canvas, see whether a file can hold it, and put the images on it.
 
     Parameters
     ----------
     output : path or None
-        File that the picture is written to, a strip at a time, with colour profile and EXIF of the first picture, and
-        with its place on the Earth where three pictures have a GPS position; without it the picture is made in memory.
+        File that the image is written to, a strip at a time, with colour profile and EXIF of the first image, and
+        with its place on the Earth where three images have a GPS position; without it the image is made in memory.
     overwrite : bool
         Replace an existing world file.
     outputs : Outputs
@@ -123,7 +123,7 @@ def compose_pictures(
         check_size(output, canvas.size)
         check_memory(output, canvas.size, options.max_memory)
     options = replace(options, workers=threads)
-    pictures = placed.pictures(canvas.near)
+    images = placed.images(canvas.near)
     if dry_run:
         planned = _planned(placed, canvas, options)
         return Composed(canvas, plan=planned, messages=tuple(notes), place=place, place_reason=reason)
@@ -132,7 +132,7 @@ def compose_pictures(
         progress("compositing", round(100 * share), 100)
 
     if output is None:
-        composite = compose(pictures, canvas, options, report, elsewhere)
+        composite = compose(images, canvas, options, report, elsewhere)
         return Composed(
             composite.canvas,
             composite,
@@ -146,7 +146,7 @@ def compose_pictures(
         return [] if there is None else there.tiff_tags()
 
     file = OutputFile(output, placed.sources[0].metadata.of_composite(), tags, outputs)
-    written = compose_to_file(file, pictures, canvas, options, report, elsewhere)
+    written = compose_to_file(file, images, canvas, options, report, elsewhere)
     place = moved(place, canvas, written.canvas)
     beside = []
     if place is not None and world_files:
@@ -170,7 +170,7 @@ def compose_pictures(
 
 def _planned(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) -> CompositePlan:
     """What compositing would take."""
-    preview = placed.pictures(canvas.near)[0].preview
+    preview = placed.images(canvas.near)[0].preview
     assert preview is not None
     probe = preview(_PROBE_REDUCTION)
     channels = 1 if probe.pixels.ndim == 2 else probe.pixels.shape[2]
@@ -179,11 +179,11 @@ def _planned(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) ->
 
 
 def _masked(placed: PlacedImages) -> list[Message]:
-    """What was left out of every picture."""
+    """What was left out of every image."""
     if placed.static is None:
         return []
     share = float(placed.static.mean())
-    return [Message(f"{share:.0%} of every picture is black, or stays where it is, in all of them, and was masked")]
+    return [Message(f"{share:.0%} of every image is black, or stays where it is, in all of them, and was masked")]
 
 
 def _files_beside(output: str | Path | None, placed: PlacedImages, overwrite: bool) -> tuple[Path, ...]:
@@ -208,7 +208,7 @@ def _write_world_files(outputs: Outputs, paths: Sequence[Path], place: Georefere
 
 
 def _profile_lost(source: Source, output: Path) -> list[Message]:
-    """Why the output lacks the colour profile of the picture whose metadata it has."""
+    """Why the output lacks the colour profile of the image whose metadata it has."""
     lost, size = source.metadata.profile_lost, len(source.metadata.icc_profile)
     if output.suffix.lower() == ".dzi" and size > MAX_TILE_PROFILE:
         lost = f"its colour profile of {size / 1e3:.0f} kB is too large to be in every tile"
@@ -216,13 +216,13 @@ def _profile_lost(source: Source, output: Path) -> list[Message]:
 
 
 def _profiles_differ(sources: Sequence[Source]) -> list[Message]:
-    """Which pictures have other colours than those of the output, whose profile is the first picture's."""
+    """Which images have other colours than those of the output, whose profile is the first image's."""
     spaces = [colour_space(source.metadata.icc_profile) for source in sources]
     others = [str(source.path) for source, space in zip(sources, spaces, strict=True) if space != spaces[0]]
     if not others:
         return []
     what = f"another colour profile than {sources[0].name}, whose the output has"
-    who = "has" if len(others) == 1 else f"{len(others)} of the pictures ({shortened(names_of(others))}) have"
+    who = "has" if len(others) == 1 else f"{len(others)} of the images ({shortened(names_of(others))}) have"
     text = f"{who} {what}: their colours are off; convert them to one colour space first"
     return [Message(text, tuple(others), code="colour-profiles")]
 
@@ -235,7 +235,7 @@ class BlockTask:
     ----------
     block : Block
     sources : tuple of Source
-        Its pictures.
+        Its images.
     store : Cache
         Where its strips go.
     """
@@ -251,7 +251,7 @@ def blocks_on(executor: Executor, sources: Sequence[Source], folder: Path | None
     Parameters
     ----------
     sources : sequence of Source
-        The pictures of the composite.
+        The images of the composite.
     folder : Path or None
         What all machines see by the same name, for the strips; None where there is one machine.
     """
@@ -260,7 +260,7 @@ def blocks_on(executor: Executor, sources: Sequence[Source], folder: Path | None
 
     def run(blocks: Iterable[Block]) -> Generator[list[Stored[BlockStrip]]]:
         store = Cache.for_this_run(folder)
-        tasks = (BlockTask(block, tuple(sources[k] for k in block.pictures), store) for block in blocks)
+        tasks = (BlockTask(block, tuple(sources[k] for k in block.images), store) for block in blocks)
         with closing(in_order(executor, compose_block, tasks)) as done:
             for strips, notes in done:
                 sources[0].guard.learn(notes)
@@ -279,7 +279,7 @@ def compose_block(task: BlockTask) -> tuple[list[Stored[BlockStrip]], GuardNotes
 
 
 def write_page(
-    outputs: Outputs, output: str | Path, composed: Composed, pictures: Callable[[], Sequence[ViewedPicture]]
+    outputs: Outputs, output: str | Path, composed: Composed, images: Callable[[], Sequence[ViewedImage]]
 ) -> list[Message]:
     """Write the page of a ``.dzi`` output; others have none. A warning, where it cannot be written."""
     page, written = viewer_path(output), composed.written
@@ -287,20 +287,20 @@ def write_page(
         return []
 
     def stage() -> None:
-        text = viewer_page(output, composed.canvas.size, pictures(), written.seams, written.origin)
+        text = viewer_page(output, composed.canvas.size, images(), written.seams, written.origin)
         # Names of files need not be UTF-8.
         outputs.write(page, text.encode("utf-8", "backslashreplace"))
 
     return outputs.attempt(page, stage)
 
 
-def plainly_viewed(canvas: Canvas, names: Sequence[str]) -> list[ViewedPicture]:
-    """The pictures on a canvas, of which nothing was estimated."""
-    return [ViewedPicture(name, outlines, ()) for name, outlines in zip(names, canvas.outlines, strict=True)]
+def plainly_viewed(canvas: Canvas, names: Sequence[str]) -> list[ViewedImage]:
+    """The images on a canvas, of which nothing was estimated."""
+    return [ViewedImage(name, outlines, ()) for name, outlines in zip(names, canvas.outlines, strict=True)]
 
 
-def viewed_pictures(result: StitchResult) -> list[ViewedPicture]:
-    """The pictures of a result with what was found of each."""
+def viewed_images(result: StitchResult) -> list[ViewedImage]:
+    """The images of a result with what was found of each."""
     alignment, registration = result.registration.alignment, result.registration
     names = [source.name for source in registration.sources]
     viewed = []
@@ -324,5 +324,5 @@ def viewed_pictures(result: StitchResult) -> list[ViewedPicture]:
             ]
         if index == alignment.reference:
             facts.append(("reference", "yes"))
-        viewed.append(ViewedPicture(names[index], outlines, tuple(facts)))
+        viewed.append(ViewedImage(names[index], outlines, tuple(facts)))
     return viewed

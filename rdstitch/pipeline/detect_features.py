@@ -1,7 +1,7 @@
-"""Stage: features of all pictures by the same rendering in 8 bits, equalized where the set shows little contrast.
+"""Stage: features of all images by the same rendering in 8 bits, equalized where the set shows little contrast.
 
-Pictures of more than 8 bits are stretched alike, so that they register as their common rendering in 8 bits does. Where
-half of the pictures show few features for their size (haze, the sea bed, concrete, snow), all are detected again, after
+Images of more than 8 bits are stretched alike, so that they register as their common rendering in 8 bits does. Where
+half of the images show few features for their size (haze, the sea bed, concrete, snow), all are detected again, after
 a stretch and with local contrast equalized. Where fewer do, or show few for the set (a cloud), they alone are.
 """
 
@@ -18,32 +18,32 @@ from rdstitch.errors import InputError
 from rdstitch.executors import in_order
 from rdstitch.features import FeatureOptions, Features, PackedFeatures, detect, detect_view
 from rdstitch.features.options import CLOSER
-from rdstitch.features.picture import Stretch, common_stretch, halving, usual_stretch
+from rdstitch.features.prepared_image import Stretch, common_stretch, halving, usual_stretch
 from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
 from rdstitch.matching.feature_store import FeatureStore, StoredFeatures
 from rdstitch.process_memory import reuse_freed_memory
 from rdstitch.progress import Progress
 
-_MIN_BATCHES = 16  # batches that pictures are at least divided into, so that a few keep several workers busy
-_PICTURES_AT_ONCE = 8  # pictures of a task at the most
+_MIN_BATCHES = 16  # batches that images are at least divided into, so that a few keep several workers busy
+_IMAGES_AT_ONCE = 8  # images of a task at the most
 _USUAL_DENSITY = 2000
-"""Features per 10⁶ pixels that pictures of usual contrast show at least; flights show 10,000 to 15,000."""
+"""Features per 10⁶ pixels that images of usual contrast show at least; flights show 10,000 to 15,000."""
 
 _LOW_SHARE = 0.5
-"""Of those, or of the features wanted if these are fewer: where half of the pictures show less, contrast is low."""
+"""Of those, or of the features wanted if these are fewer: where half of the images show less, contrast is low."""
 
 
 @dataclass(frozen=True)
 class DetectedFeatures:
-    """Features of N pictures.
+    """Features of N images.
 
     Attributes
     ----------
     features : FeatureStore
-        In pixels of the pictures; a damaged picture has none.
+        In pixels of the images; a damaged image has none.
     damaged : mapping of int to str
-        Why the pixels of a picture could not be read, by its index.
+        Why the pixels of an image could not be read, by its index.
     """
 
     features: FeatureStore
@@ -52,7 +52,7 @@ class DetectedFeatures:
 
 @dataclass(frozen=True)
 class DetectionTask:
-    """Pictures whose features are to be detected together."""
+    """Images whose features are to be detected together."""
 
     sources: Sequence[Source]
     options: FeatureOptions
@@ -68,22 +68,22 @@ def detect_features(
     skip_bad: bool,
     progress: Progress,
 ) -> DetectedFeatures:
-    """Detect the features of every picture, several pictures at a time.
+    """Detect the features of every image, several images at a time.
 
     Parameters
     ----------
     store : Cache
         Where the features lie.
     skip_bad : bool
-        Go on without damaged pictures instead of raising.
+        Go on without damaged images instead of raising.
 
     Raises
     ------
     InputError
-        When the pixels of a picture cannot be read, unless ``skip_bad``.
+        When the pixels of an image cannot be read, unless ``skip_bad``.
     """
     results: list[StoredFeatures | InputError] = []
-    size = min(_PICTURES_AT_ONCE, -(-len(sources) // _MIN_BATCHES))
+    size = min(_IMAGES_AT_ONCE, -(-len(sources) // _MIN_BATCHES))
     tasks = (DetectionTask(sources[start : start + size], options, store) for start in range(0, len(sources), size))
     for found, notes in in_order(executor, detect_batch, tasks):
         sources[0].guard.learn(notes)
@@ -104,7 +104,7 @@ def detect_features(
 
 
 def detect_batch(task: DetectionTask) -> tuple[list[StoredFeatures | InputError], GuardNotes]:
-    """The features of each picture of a task, or why it cannot be read; and what was noticed of the files."""
+    """The features of each image of a task, or why it cannot be read; and what was noticed of the files."""
     found: list[StoredFeatures | InputError] = []
     for source in task.sources:
         try:
@@ -115,12 +115,12 @@ def detect_batch(task: DetectionTask) -> tuple[list[StoredFeatures | InputError]
 
 
 def _detected(source: Source, task: DetectionTask) -> StoredFeatures:
-    """The features of a picture, from an earlier run where the store has them."""
+    """The features of an image, from an earlier run where the store has them."""
     store, options = task.store, task.options
     network = store.file(options.aliked_model)
     # What stands for its content, whatever the file is called.
     wanted = replace(options, aliked_model="") if network else options
-    # Megapixels matter by what a picture is halved to; they vary with the number of pictures.
+    # Megapixels matter by what an image is halved to; they vary with the number of images.
     size, megapixels = source.camera.image_size, options.limits[1]
     halvings = None if megapixels is None else (halving(size, megapixels), halving(size, CLOSER * megapixels))
     wanted = replace(wanted, work_megapixels=None)
@@ -137,28 +137,28 @@ def _detected(source: Source, task: DetectionTask) -> StoredFeatures:
 
 
 def _are_of(source: Source, features: Features) -> bool:
-    """Whether features may be those of a picture: all lie in it."""
+    """Whether features may be those of an image: all lie in it."""
     size = source.camera.image_size
     within = (features.points >= -0.5) & (features.points <= np.array(size) - 0.5)
     return features.image_size == size and bool(within.all()) and bool(np.isfinite(features.descriptors).all())
 
 
 def _no_features(options: FeatureOptions, source: Source) -> Features:
-    """Features of the same kind as those of the other pictures, but none of them."""
+    """Features of the same kind as those of the other images, but none of them."""
     return replace(detect(np.zeros((1, 1), dtype=np.uint8), options), image_size=source.camera.image_size)
 
 
 @dataclass(frozen=True)
 class DetectionByContrast:
-    """Features, and how the pictures were rendered for detection.
+    """Features, and how the images were rendered for detection.
 
     Attributes
     ----------
     detected : DetectedFeatures
     stretch : (float, float) or None
-        Grey levels that became 0 and 255 in all pictures; None where they are those of 8 bits.
+        Grey levels that became 0 and 255 in all images; None where they are those of 8 bits.
     equalized : tuple of int
-        The pictures whose local contrast was equalized because they showed too little otherwise.
+        The images whose local contrast was equalized because they showed too little otherwise.
     """
 
     detected: DetectedFeatures
@@ -175,14 +175,14 @@ def detect_by_contrast(
     skip_bad: bool,
     progress: Progress,
 ) -> DetectionByContrast:
-    """Detect the features of all pictures, if necessary once more; see :func:`detect_features`."""
+    """Detect the features of all images, if necessary once more; see :func:`detect_features`."""
     reuse_freed_memory()
     detect = partial(detect_features, executor=executor, store=store, skip_bad=skip_bad, progress=progress)
     depths = {source.metadata.bit_depth > 8 for source in sources}
     stretch = options.stretch or (_stretch_of(sources, options, executor, store) if depths == {True} else None)
     options = replace(options, stretch=stretch)
     detected = detect(sources, options)
-    # Samples of two kinds have no grey levels in common: each picture is stretched on its own.
+    # Samples of two kinds have no grey levels in common: each image is stretched on its own.
     poor = [] if options.equalize is not None or len(depths) > 1 else _show_little(sources, detected, options)
     all_of_them = tuple(range(len(sources)))
     if not poor:
@@ -200,7 +200,7 @@ def detect_by_contrast(
 
 
 def _show_little(sources: Sequence[Source], detected: DetectedFeatures, options: FeatureOptions) -> list[int]:
-    """The pictures that show few features for their size, or for what the set shows, for want of contrast.
+    """The images that show few features for their size, or for what the set shows, for want of contrast.
 
     Counted are those of the working size: that there are more pixels, in which more is found, is no contrast. A board
     of black and white squares shows few, but strong ones; equalization would only add the noise of what is plain.
@@ -217,12 +217,12 @@ def _show_little(sources: Sequence[Source], detected: DetectedFeatures, options:
 
 
 def _shown(features: Sequence[StoredFeatures]) -> IntArray:
-    """Keypoints that each picture shows at its working size, (N,)."""
+    """Keypoints that each image shows at its working size, (N,)."""
     return np.array([item.shown for item in features], dtype=np.intp)
 
 
 def _stretch_of(sources: Sequence[Source], options: FeatureOptions, executor: Executor, store: Cache) -> Stretch | None:
-    """The stretch that suits all pictures together."""
+    """The stretch that suits all images together."""
     tasks = (_StretchTask(source, options.limits[1], store) for source in sources)
     found = []
     for stretch, notes in in_order(executor, _stretch_of_one, tasks):
@@ -233,7 +233,7 @@ def _stretch_of(sources: Sequence[Source], options: FeatureOptions, executor: Ex
 
 @dataclass(frozen=True)
 class _StretchTask:
-    """A picture whose own stretch is wanted, at so many 10⁶ pixels."""
+    """An image whose own stretch is wanted, at so many 10⁶ pixels."""
 
     source: Source
     megapixels: float | None
@@ -241,7 +241,7 @@ class _StretchTask:
 
 
 def _stretch_of_one(task: _StretchTask) -> tuple[Stretch | None, GuardNotes]:
-    """The stretch of a picture, None for one that cannot be read; and what was noticed of its file."""
+    """The stretch of an image, None for one that cannot be read; and what was noticed of its file."""
     source, store = task.source, task.store
 
     def compute() -> Stretch | None:

@@ -13,7 +13,7 @@ from rdstitch.camera import Camera
 from rdstitch.errors import InputError
 from rdstitch.export.trajectory_files import TrajectoryFrame, in_frame
 from rdstitch.features import FeatureOptions, Features, detect_view, match
-from rdstitch.features.picture import PreparedPicture, prepare
+from rdstitch.features.prepared_image import PreparedImage, prepare
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.selection import is_selected, with_masks
@@ -123,7 +123,7 @@ def follow(
     """Register frames as they arrive, against the last keyframes.
 
     Poses are for watching: loops are closed, and every pair is used, only when all frames are registered together
-    afterwards, by :func:`rdstitch.mosaic` or :func:`rdstitch.trajectory`. Features are fewer and from smaller pictures
+    afterwards, by :func:`rdstitch.mosaic` or :func:`rdstitch.trajectory`. Features are fewer and from smaller images
     than there. Memory does not grow with the number of frames.
 
     Parameters
@@ -135,7 +135,7 @@ def follow(
         Whether a frame that could not be read whole will come again, so that it need not be reported yet; see
         :meth:`rdstitch.inputs.arrivals.Arrivals.comes_again`.
     preview : path, optional
-        Picture to write of what has been seen so far; JPEG or PNG.
+        Image to write of what has been seen so far; JPEG or PNG.
     refresh : float
         Seconds between two versions of it at least.
 
@@ -157,17 +157,17 @@ def follow(
         number = unread.pop(arrived.path, -1)
         number = next(numbers) if number < 0 else number
         frame = arrived if arrived.number is not None else replace(arrived, number=number)
-        source, picture, reason = _read(frame, options, features)
-        if (picture is None or (source is not None and source.guard.messages)) and comes_again(arrived):
+        source, image, reason = _read(frame, options, features)
+        if (image is None or (source is not None and source.guard.messages)) and comes_again(arrived):
             unread[arrived.path] = number
             continue
         label = FollowedFrame(frame.path.name, frame.number or 0, math.nan, None, reason, printed)
-        if source is None or picture is None:
+        if source is None or image is None:
             yield label
             continue
         label = replace(label, name=source.name, timestamp=printed.timestamp(source))
         camera = at_working_size(source.camera, features.limits[1])
-        results = tracker.add(partial(_features, source, features, camera), camera, picture)
+        results = tracker.add(partial(_features, source, features, camera), camera, image)
         labels[results[-1].number] = label
         for result in results:
             known = labels[result.number]
@@ -192,8 +192,8 @@ class _Sketch:
     def add(self, source: Source, result: Tracked) -> None:
         """Paint a keyframe; write the file when that is due."""
         if result.keyframe and result.placement is not None:
-            picture = source.read(source.reduction(_PREVIEW_MEGAPIXELS))
-            self._preview.paint(picture.pixels, result.placement)
+            image = source.read(source.reduction(_PREVIEW_MEGAPIXELS))
+            self._preview.paint(image.pixels, result.placement)
             self._changed = True
         if time.monotonic() - self._written >= self._refresh:
             self.write()
@@ -206,7 +206,7 @@ class _Sketch:
 
 
 def _live_features(options: FeatureOptions) -> FeatureOptions:
-    """Fewer features, from smaller pictures."""
+    """Fewer features, from smaller images."""
     most, megapixels = options.limits
     return replace(
         options,
@@ -217,7 +217,7 @@ def _live_features(options: FeatureOptions) -> FeatureOptions:
 
 def _read(
     frame: Frame, options: StitchOptions, features: FeatureOptions
-) -> tuple[Source | None, PreparedPicture | None, str]:
+) -> tuple[Source | None, PreparedImage | None, str]:
     """The frame as a source, and as it is tracked; or why it is not."""
     sources, unread = read_frames([frame], options, skip_bad=True)
     if not sources:

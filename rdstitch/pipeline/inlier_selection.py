@@ -1,4 +1,4 @@
-"""Inliers of pairs, selected by what an alignment of all pictures expects."""
+"""Inliers of pairs, selected by what an alignment of all images expects."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -43,7 +43,7 @@ def reselect_inliers(
     threshold : float
         Distance up to which a match can be an inlier, pixels; it is less where the inliers scatter less.
     radii : sequence of ndarray of shape (N,)
-        Of the features of each picture, pixels; see :func:`rdstitch.matching.eccentricity.blob_radii`.
+        Of the features of each image, pixels; see :func:`rdstitch.matching.eccentricity.blob_radii`.
     store : Cache
         Of what need not be in memory all the time.
 

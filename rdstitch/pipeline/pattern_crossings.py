@@ -12,7 +12,7 @@ from rdstitch.errors import RegistrationError
 from rdstitch.features import Correspondences
 from rdstitch.features.crossings import find_crossings
 from rdstitch.features.options import CLOSER, WORK_MEGAPIXELS
-from rdstitch.features.picture import Stretch, prepare
+from rdstitch.features.prepared_image import Stretch, prepare
 from rdstitch.inputs.source import Source
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import PairRegistration
@@ -25,7 +25,7 @@ _MEGAPIXELS = WORK_MEGAPIXELS * CLOSER
 _ROUNDS = 2  # of matching, the second one with the lens that the first one has found
 _MIN_MATCHES = 12  # of a pair; of fewer its keypoints stay
 _MIN_PLACES = 0.5  # of those in which a pair's keypoints lie, that its crossings must cover
-_MIN_USED = 0.8  # of the pictures that were aligned by keypoints
+_MIN_USED = 0.8  # of the images that were aligned by keypoints
 _MAX_ERROR = 0.5  # of the error of keypoints that crossings must leave; saddles of other ground have as much
 
 
@@ -37,7 +37,7 @@ def match_crossings(
     stretch: Stretch | None,
     workers: int,
 ) -> tuple[AlignedPairs, dict[int, str]]:
-    """Align pictures of a repeated pattern again by the crossings of its edges, where it has any.
+    """Align images of a repeated pattern again by the crossings of its edges, where it has any.
 
     The keypoints of a chessboard are the middles of its squares, which perspective and lens move by up to pixels, and
     places near their corners, which depend on the scale. Of rendered boards through a fisheye of 140 degrees, corners
@@ -50,18 +50,18 @@ def match_crossings(
     stretch : (float, float) or None
         Grey levels of black and white, see :class:`rdstitch.registration.Registration`.
     workers : int
-        Pictures that are read at the same time.
+        Images that are read at the same time.
 
     Returns
     -------
     AlignedPairs
     dict of int to str
-        Why pictures have no place any more: none, as in :func:`settle_repeated_pattern`, whose place this takes.
+        Why images have no place any more: none, as in :func:`settle_repeated_pattern`, whose place this takes.
 
     Raises
     ------
     InputError
-        When a picture can no longer be read.
+        When an image can no longer be read.
     """
     if not pairing.shows_repeated_pattern:
         return aligned, {}
@@ -75,7 +75,7 @@ def match_crossings(
     by_crossings = aligned
     for _ in range(_ROUNDS):
         alignment = by_crossings.alignment
-        # Pictures that keypoints did not place may be placed by the crossings of others.
+        # Images that keypoints did not place may be placed by the crossings of others.
         new = [k for k in np.flatnonzero(alignment.used).tolist() if k not in crossings]
         with ThreadPoolExecutor(workers) as pool:
             crossings.update(zip(new, pool.map(crossings_of, new), strict=True))
@@ -104,7 +104,7 @@ def _matched(
     Parameters
     ----------
     crossings : mapping of int to ndarray of shape (N, 2)
-        Of each picture, pixels.
+        Of each image, pixels.
     threshold : float
         Pixels between a crossing and where it is expected.
     """

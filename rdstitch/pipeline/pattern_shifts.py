@@ -1,4 +1,4 @@
-"""Stage: pictures of a repeated pattern that were put together some periods away go where what is unique agrees."""
+"""Stage: images of a repeated pattern that were put together some periods away go where what is unique agrees."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,16 +12,16 @@ from rdstitch.matching.two_view import PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.radial_homography import RadialHomography, from_plane, to_plane
-from rdstitch.verification.overlap_check import placed_picture
+from rdstitch.verification.overlap_check import placed_image
 from rdstitch.verification.photometric_agreement import COMPARED_SIDE
 from rdstitch.verification.self_similarity import ambiguous_pairs
 from rdstitch.verification.unique_places import unique_shifts
 
-_MAX_PICTURES = 2**27 // (2 * COMPARED_SIDE**2 * np.dtype(np.float32).itemsize)
-"""Pictures whose drawings and departures fit into 128 MB at once; of more, a repeated pattern is refused as before."""
+_MAX_IMAGES = 2**27 // (2 * COMPARED_SIDE**2 * np.dtype(np.float32).itemsize)
+"""Images whose drawings and departures fit into 128 MB at once; of more, a repeated pattern is refused as before."""
 
-_PAIRS_OF_A_PICTURE = 6  # pairs that are compared, by picture on average: those taken one soon after the other first
-_MIN_PLACED = 0.5  # of the pictures, that must find their place; of fewer nobody is helped
+_PAIRS_OF_AN_IMAGE = 6  # pairs that are compared, by image on average: those taken one soon after the other first
+_MIN_PLACED = 0.5  # of the images, that must find their place; of fewer nobody is helped
 _UNDECIDED = "shows a repeated pattern, and nothing unique in it decides where it lies"
 
 
@@ -33,9 +33,9 @@ def settle_repeated_pattern(
     stretch: tuple[float, float] | None,
     workers: int,
 ) -> tuple[AlignedPairs, dict[int, str]]:
-    """Move pictures of a repeated pattern by whole periods, to where dirt, marks and objects in them agree.
+    """Move images of a repeated pattern by whole periods, to where dirt, marks and objects in them agree.
 
-    Matches of such pictures agree as well some periods away, above all where the pictures share the most. Pairs that
+    Matches of such images agree as well some periods away, above all where the images share the most. Pairs that
     look as much alike elsewhere, and of which nothing unique decides where they lie, are taken for unregistered then,
     so that no place rests on them; those that look alike here alone stay as they are, marked parking beside a meadow
     for one. Where too few are left, or the plane is not metric, everything stays as it was: the checks judge that.
@@ -45,26 +45,26 @@ def settle_repeated_pattern(
     stretch : (float, float) or None
         Grey levels of black and white, see :class:`rdstitch.registration.Registration`.
     workers : int
-        Pictures that are read and compared at the same time.
+        Images that are read and compared at the same time.
 
     Returns
     -------
     AlignedPairs
     dict of int to str
-        Why pictures have no place any more, by their index.
+        Why images have no place any more, by their index.
 
     Raises
     ------
     InputError
-        When a picture can no longer be read.
+        When an image can no longer be read.
     """
     alignment = aligned.alignment
-    if alignment.poses is None or len(sources) > _MAX_PICTURES or not pairing.shows_repeated_pattern:
+    if alignment.poses is None or len(sources) > _MAX_IMAGES or not pairing.shows_repeated_pattern:
         return aligned, {}
     used = [pair for pair in aligned.pairs if pair.relation and alignment.used[[pair.image1, pair.image2]].all()]
-    compared = sorted(used, key=lambda pair: pair.image2 - pair.image1)[: _PAIRS_OF_A_PICTURE * len(sources)]
+    compared = sorted(used, key=lambda pair: pair.image2 - pair.image1)[: _PAIRS_OF_AN_IMAGE * len(sources)]
     shown = {
-        k: placed_picture(sources[k], alignment.cameras[k], alignment.homographies[k], stretch)
+        k: placed_image(sources[k], alignment.cameras[k], alignment.homographies[k], stretch)
         for k in np.flatnonzero(alignment.used).tolist()
     }
     doubtful = ambiguous_pairs(shown, [(pair.image1, pair.image2) for pair in compared], workers)

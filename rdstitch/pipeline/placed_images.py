@@ -1,4 +1,4 @@
-"""Registered pictures, ready to be composited: aligned locally, without what is static, on a canvas."""
+"""Registered images, ready to be composited: aligned locally, without what is static, on a canvas."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -13,28 +13,28 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
 from rdstitch.compositing.near_part import NearPart
-from rdstitch.compositing.placed_picture import Displacement, PlacedPicture, place_pictures
-from rdstitch.compositing.static_pixels import MIN_PICTURES, static_pixels
+from rdstitch.compositing.placed_image import Displacement, PlacedImage, place_images
+from rdstitch.compositing.static_pixels import MIN_IMAGES, static_pixels
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference
 from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import GpsPosition
-from rdstitch.io.read import Picture
+from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import fitting_reduction
 from rdstitch.local_alignment import LocalAlignment, LocalAlignmentMode, Match, align_locally, no_local_alignment
 from rdstitch.registration import Registration
 
 _COMPARED, _COMPARED_SIDE = 8, 400
-"""Pictures, and pixels of their longer side, that are compared to find what is static in them."""
+"""Images, and pixels of their longer side, that are compared to find what is static in them."""
 
 
 def align_registration_locally(registration: Registration, choice: LocalAlignmentMode) -> LocalAlignment:
-    """Displacement fields of the pictures that are used, in their order, from the matches of all their pairs.
+    """Displacement fields of the images that are used, in their order, from the matches of all their pairs.
 
     Parameters
     ----------
     registration : Registration
-        In pixels of the pictures.
+        In pixels of the images.
     choice : "auto", "off" or int
         See :func:`rdstitch.local_alignment.align_locally`.
     """
@@ -58,18 +58,18 @@ def align_registration_locally(registration: Registration, choice: LocalAlignmen
 
 @dataclass(frozen=True)
 class PlacedImages:
-    """The pictures that are used, and where they belong.
+    """The images that are used, and where they belong.
 
     Attributes
     ----------
     sources : sequence of Source
     cameras : sequence of Camera
     homographies : ndarray of shape (N, 3, 3)
-        Normalized undistorted coordinates of each picture to the plane, or to directions.
+        Normalized undistorted coordinates of each image to the plane, or to directions.
     reference : int or None
-        Picture whose resolution the output has; None for the median one's.
+        Image whose resolution the output has; None for the median one's.
     displacements : sequence of callables or None, optional
-        What local alignment adds to the measured pixels of each picture.
+        What local alignment adds to the measured pixels of each image.
     turned : bool
         Whether the camera turned on the spot, so that the homographies lead to directions, not to a plane.
     place : Georeference or None
@@ -100,12 +100,12 @@ class PlacedImages:
 
     @cached_property
     def static(self) -> NDArray[np.bool_] | None:
-        """What shows no plane but the camera's own parts, or nothing, in all pictures; None where nothing does.
+        """What shows no plane but the camera's own parts, or nothing, in all images; None where nothing does.
 
-        A few pictures of the commonest size are compared, reduced; those of other sizes count as a whole.
+        A few images of the commonest size are compared, reduced; those of other sizes count as a whole.
         """
         size, count = Counter(camera.image_size for camera in self.cameras).most_common(1)[0]
-        if count < MIN_PICTURES:
+        if count < MIN_IMAGES:
             return None
         alike = [s for s, camera in zip(self.sources, self.cameras, strict=True) if camera.image_size == size]
         chosen = np.linspace(0, count - 1, min(count, _COMPARED)).astype(np.intp).tolist()
@@ -114,12 +114,12 @@ class PlacedImages:
 
     @property
     def positions(self) -> list[GpsPosition | None]:
-        """Where each picture was taken; a camera that turned on the spot was at one place, and shows no plane."""
+        """Where each image was taken; a camera that turned on the spot was at one place, and shows no plane."""
         return [None if self.turned else source.metadata.gps for source in self.sources]
 
-    def pictures(self, near: Sequence[NearPart | None]) -> list[PlacedPicture]:
+    def images(self, near: Sequence[NearPart | None]) -> list[PlacedImage]:
         """As the compositor takes them, with only the near parts of those that are not drawn whole."""
-        read: list[Callable[..., Picture]] = [
+        read: list[Callable[..., DecodedImage]] = [
             source.read if part is None else partial(_read_near, source.read, part)
             for source, part in zip(self.sources, near or [None] * len(self.sources), strict=True)
         ]
@@ -129,7 +129,7 @@ class PlacedImages:
                 partial(_read_moving, reader, self.static) if camera.image_size == common else reader
                 for reader, camera in zip(read, self.cameras, strict=True)
             ]
-        return place_pictures(
+        return place_images(
             read,
             self.cameras,
             self.homographies,
@@ -140,32 +140,32 @@ class PlacedImages:
         )
 
 
-def _read_moving(read: Callable[..., Picture], static: NDArray[np.bool_], reduction: int = 1) -> Picture:
-    """A picture, whole or reduced, without what is static."""
-    picture = read(reduction)
-    height, width = picture.pixels.shape[:2]
+def _read_moving(read: Callable[..., DecodedImage], static: NDArray[np.bool_], reduction: int = 1) -> DecodedImage:
+    """An image, whole or reduced, without what is static."""
+    image = read(reduction)
+    height, width = image.pixels.shape[:2]
     rows, columns = np.arange(height) * static.shape[0] // height, np.arange(width) * static.shape[1] // width
-    alpha = np.full((height, width), 255, dtype=np.uint8) if picture.alpha is None else picture.alpha
-    return replace(picture, alpha=np.where(static[np.ix_(rows, columns)], np.uint8(0), alpha))
+    alpha = np.full((height, width), 255, dtype=np.uint8) if image.alpha is None else image.alpha
+    return replace(image, alpha=np.where(static[np.ix_(rows, columns)], np.uint8(0), alpha))
 
 
-def _read_near(read: Callable[..., Picture], part: NearPart, reduction: int = 1) -> Picture:
-    """A picture, whole or reduced, of which only its near part is drawn."""
+def _read_near(read: Callable[..., DecodedImage], part: NearPart, reduction: int = 1) -> DecodedImage:
+    """An image, whole or reduced, of which only its near part is drawn."""
     return part.masked(read(reduction))
 
 
 def plan(placed: PlacedImages, options: CompositeOptions) -> Canvas:
-    """The canvas of the pictures, no larger than ``options.max_size``."""
+    """The canvas of the images, no larger than ``options.max_size``."""
     canvas = _plan(placed, options, options.scale)
     if options.max_size is None or max(canvas.size) <= options.max_size:
         return canvas
-    # The canvas has whole pixels around the pictures, and a full turn a multiple of some: these may be too many.
+    # The canvas has whole pixels around the images, and a full turn a multiple of some: these may be too many.
     spare = 1 if canvas.period is None else max(32, options.max_size // 128)
     return _plan(placed, options, options.scale * (options.max_size - spare) / max(canvas.size))
 
 
 def _plan(placed: PlacedImages, options: CompositeOptions, scale: float) -> Canvas:
-    """The canvas on a plane, or, of pictures taken by turning on the spot, in a projection."""
+    """The canvas on a plane, or, of images taken by turning on the spot, in a projection."""
     how: dict[str, Any] = {
         "scale": scale,
         "rotate": options.rotate,
@@ -177,7 +177,7 @@ def _plan(placed: PlacedImages, options: CompositeOptions, scale: float) -> Canv
         return plan_panorama(placed.cameras, placed.homographies, projection=options.projection, **how)
     if options.projection not in ("auto", "plane"):
         raise ArgumentError(
-            f"the {options.projection} projection is for pictures taken by turning on the spot; these were not, "
+            f"the {options.projection} projection is for images taken by turning on the spot; these were not, "
             "leave out --projection"
         )
     return plan_canvas(placed.cameras, placed.homographies, **how)

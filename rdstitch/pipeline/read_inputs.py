@@ -1,4 +1,4 @@
-"""From frames and options to the pictures that are registered."""
+"""From frames and options to the images that are registered."""
 
 from collections.abc import Sequence
 
@@ -20,7 +20,7 @@ def in_lasting_order(frames: Sequence[Frame]) -> Sequence[Frame]:
 
     Of more images, and of arrays, the order says which follow which.
     """
-    if len(frames) > EXHAUSTIVE_UP_TO or any(frame.picture is not None for frame in frames):
+    if len(frames) > EXHAUSTIVE_UP_TO or any(frame.image is not None for frame in frames):
         return frames
     return sorted(frames, key=lambda frame: (natural_key(frame.path), frame.number or 0))
 
@@ -28,7 +28,7 @@ def in_lasting_order(frames: Sequence[Frame]) -> Sequence[Frame]:
 def read_frames(
     frames: Sequence[Frame], options: StitchOptions, *, skip_bad: bool
 ) -> tuple[list[Source], list[Message]]:
-    """The pictures of frames, with what options say of their camera; and why others cannot be read."""
+    """The images of frames, with what options say of their camera; and why others cannot be read."""
     return read_sources(
         frames,
         camera=options.camera,
@@ -43,14 +43,14 @@ def read_frames(
 def read_inputs(
     frames: Sequence[Frame], options: StitchOptions, *, skip_bad: bool
 ) -> tuple[list[Source], list[Message]]:
-    """The pictures that options leave, with masks and attitudes; and why others cannot be read.
+    """The images that options leave, with masks and attitudes; and why others cannot be read.
 
     Raises
     ------
     ArgumentError, InputError, LimitError
         See :func:`rdstitch.inputs.source.read_sources`; also when fewer than two are left.
     """
-    # Before the first large picture is freed.
+    # Before the first large image is freed.
     return_freed_memory()
     chosen = selected(frames, options.exclude, options.include_only)
     sources, unread = read_frames(chosen, options, skip_bad=skip_bad)

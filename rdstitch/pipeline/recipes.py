@@ -12,7 +12,7 @@ from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.camera_files import CAMERA_SUFFIXES, camera_file_text
 from rdstitch.errors import RegistrationError
 from rdstitch.export.trajectory_files import WRITERS, TrajectoryFrame, frame_of, has_times, path_as_svg
-from rdstitch.inputs.find import found_pictures
+from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import Images, as_inputs
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.source import Source
@@ -22,7 +22,7 @@ from rdstitch.messages import Message, told_once
 from rdstitch.options import StitchOptions
 from rdstitch.orientation import quarter_turn
 from rdstitch.pipeline.accept import accept, scale_uncertainty
-from rdstitch.pipeline.compose import blocks_on, compose_pictures, viewed_pictures, write_page
+from rdstitch.pipeline.compose import blocks_on, compose_images, viewed_images, write_page
 from rdstitch.pipeline.map_canvas import check_map
 from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally
 from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs
@@ -36,7 +36,7 @@ from rdstitch.stitch_result import StitchResult
 TrajectoryFormat = Literal["csv", "tum", "kitti"]
 
 _NO_TIMES = Message(
-    "not every picture has a time stamp: numbers of frames stand for them; give --timestamps", code="no-time-stamps"
+    "not every image has a time stamp: numbers of frames stand for them; give --timestamps", code="no-time-stamps"
 )
 
 
@@ -49,14 +49,14 @@ def pano(
     progress: Progress = silent,
     beside: Callable[[Outputs, StitchResult], None] | None = None,
 ) -> StitchResult:
-    """Stitch a few pictures that overlap, in any order, in the frame of one of them.
+    """Stitch a few images that overlap, in any order, in the frame of one of them.
 
     Parameters
     ----------
     inputs : path, ndarray, or iterable of them
-        Two or more pictures; every one must be readable. What :func:`mosaic` takes.
+        Two or more images; every one must be readable. What :func:`mosaic` takes.
     output : path, optional
-        Picture to write, with the sidecar beside it; without it nothing is written, and the picture is
+        Image to write, with the sidecar beside it; without it nothing is written, and the image is
         ``result.image``.
     options : StitchOptions, optional
     every : int, optional
@@ -64,12 +64,12 @@ def pano(
     progress : callable
         Called with the name of a stage, the number of steps done, and their total.
     beside : callable, optional
-        Called with the outputs and the result, to stage further files that are published together with the picture.
+        Called with the outputs and the result, to stage further files that are published together with the image.
 
     Returns
     -------
     StitchResult
-        The picture or its file, with everything that was estimated.
+        The image or its file, with everything that was estimated.
 
     Raises
     ------
@@ -100,8 +100,8 @@ def mosaic(
     Parameters
     ----------
     inputs : path, ndarray, or iterable of them
-        Folders, pictures, patterns, ``@list`` files, videos, and arrays of shape (H, W) or (H, W, C), whose channels
-        are in the order of ``options.channel_order``; see :func:`rdstitch.inputs.frame.as_inputs`. Pictures that cannot
+        Folders, images, patterns, ``@list`` files, videos, and arrays of shape (H, W) or (H, W, C), whose channels
+        are in the order of ``options.channel_order``; see :func:`rdstitch.inputs.frame.as_inputs`. Images that cannot
         be read are left out by name.
     output : path, optional
         As for :func:`pano`.
@@ -111,7 +111,7 @@ def mosaic(
     Returns
     -------
     StitchResult
-        The picture or its file, with everything that was estimated.
+        The image or its file, with everything that was estimated.
 
     Raises
     ------
@@ -139,9 +139,9 @@ def _stitch(
     *,
     pano: bool,
 ) -> StitchResult:
-    """The stages of :func:`mosaic`, and, where every picture must be readable and one gives the plane, :func:`pano`."""
+    """The stages of :func:`mosaic`, and, where every image must be readable and one gives the plane, :func:`pano`."""
     given = as_inputs(inputs, options.channel_order)
-    with found_pictures(given, output=output, every=every, topic=options.topic) as found:
+    with found_images(given, output=output, every=every, topic=options.topic) as found:
         _check_outputs(output, options, found.files)
         sources, unread = read_inputs(in_lasting_order(found.frames), options, skip_bad=not pano)
         check_map(sources, options.composite)
@@ -159,7 +159,7 @@ def calibrate(
     progress: Progress = silent,
     beside: Callable[[Outputs, Registration], None] | None = None,
 ) -> Registration:
-    """Find the lens from pictures of a plane; the camera is ``result.camera``.
+    """Find the lens from images of a plane; the camera is ``result.camera``.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def calibrate(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = options or StitchOptions()
-    with found_pictures(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as found:
+    with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as found:
         _check_outputs(None, options, found.files)
         sources, unread = read_inputs(found.frames, options, skip_bad=True)
         with options.executor(len(sources)) as executor:
@@ -216,7 +216,7 @@ def trajectory(
     layout : str
         "csv", "tum" or "kitti"; see :mod:`rdstitch.export.trajectory_files`.
     timestamps : path, optional
-        File of the time stamps of the pictures; see :func:`rdstitch.inputs.measurements.timestamps_of`. Without it,
+        File of the time stamps of the images; see :func:`rdstitch.inputs.measurements.timestamps_of`. Without it,
         they are those of the video, the bag, or EXIF.
     plot : path, optional
         SVG file to draw the path to.
@@ -232,7 +232,7 @@ def trajectory(
         The path, and the registration that it comes from.
     """
     options = options or StitchOptions()
-    with found_pictures(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as found:
+    with found_images(as_inputs(inputs, options.channel_order), every=every, topic=options.topic) as found:
         files = [file for file in (output, plot) if file is not None]
         for file in files:
             read = [*found.files, *options.files, *([] if timestamps is None else [timestamps])]
@@ -244,7 +244,7 @@ def trajectory(
             known = [*unread, *found.messages]
             registration = _accepted(sources, known, options, executor, progress, skip_bad=True, metric=True)
     registration = _finished(registration).with_messages(scale_uncertainty(registration.alignment))
-    # Of the camera itself, whatever EXIF says of how its pictures are looked at.
+    # Of the camera itself, whatever EXIF says of how its images are looked at.
     back = stored([quarter_turn(source.metadata.orientation) for source in registration.sources])
     path = Trajectory.from_alignment(turned_alignment(registration.alignment, back, None), height)
     path = path.labelled([s.name for s in sources], [s.number(k) for k, s in enumerate(sources)], times)
@@ -306,13 +306,13 @@ def _composite(
 ) -> StitchResult:
     """Compose into memory, or into a file that is published with all that belongs to it.
 
-    ``frontal`` takes the undistorted reference picture for the plane.
+    ``frontal`` takes the undistorted reference image for the plane.
     """
     registration = on_whole_pixels(with_frontal_reference(registration, options, always=frontal))
     local = align_registration_locally(registration, options.local_alignment)
     placed = PlacedImages.of(registration, local.fields or None)
     with Outputs(options.overwrite) as outputs:
-        composed = compose_pictures(
+        composed = compose_images(
             placed,
             output,
             options.composite,
@@ -326,7 +326,7 @@ def _composite(
         result = StitchResult(
             _finished(registration).with_messages(composed.messages),
             composed.canvas,
-            options.for_pictures(len(registration.sources)),
+            options.for_images(len(registration.sources)),
             None if output is None else Path(output),
             composed.composite,
             composed.plan,
@@ -338,7 +338,7 @@ def _composite(
         if not options.dry_run:
             failed = outputs.attempt(options.save_camera or "", partial(_save_camera, registration, options, outputs))
             if output is not None:
-                failed += write_page(outputs, output, composed, partial(viewed_pictures, result))
+                failed += write_page(outputs, output, composed, partial(viewed_images, result))
             result = replace(result, registration=result.registration.with_messages(failed))
             if beside is not None:
                 beside(outputs, result)
@@ -349,7 +349,7 @@ def _composite(
 
 
 def _finished(registration: Registration) -> Registration:
-    """Pictures kept for stages that will not come are let go; what the decoders found wrong, in any stage, is added."""
+    """Images kept for stages that will not come are let go; what the decoders found wrong, in any stage, is added."""
     for source in registration.sources:
         source.decoded_images.clear()
     return registration.with_messages(registration.sources[0].guard.messages)  # all have one guard

@@ -28,23 +28,23 @@ from rdstitch.stitch_result import OutputImage
 
 @dataclass(frozen=True, repr=False)
 class Recomposition(OutputImage):
-    """A picture made from a saved registration.
+    """An image made from a saved registration.
 
     Attributes
     ----------
     saved : SavedRegistration
     sources : tuple of Source or None
-        For each picture of the registration the one that took its place, with its camera; None where there is none.
+        For each image of the registration the one that took its place, with its camera; None where there is none.
     matched : str
         "name" or "order".
     left_out : dict of int to Message
-        Pictures that the registration used and that are not in the output, by their number, with the reason.
+        Images that the registration used and that are not in the output, by their number, with the reason.
     canvas : Canvas
     composite_options : CompositeOptions
     output : Path or None
-        File that the picture was written to.
+        File that the image was written to.
     composite : Composite or None
-        The picture itself; None where it went to a file, or was only planned.
+        The image itself; None where it went to a file, or was only planned.
     plan : CompositePlan or None
         Of a dry run.
     messages : tuple of Message
@@ -79,14 +79,14 @@ class Recomposition(OutputImage):
 
     @property
     def summary(self) -> str:
-        """What was made, and of how many pictures, in one line."""
+        """What was made, and of how many images, in one line."""
         name, (width, height) = "" if self.output is None else f"{self.output}: ", self.canvas.size
         used = sum(source is not None for source in self.sources)
-        return f"{name}{width} x {height} pixels, {used} of {used + len(self.left_out)} pictures"
+        return f"{name}{width} x {height} pixels, {used} of {used + len(self.left_out)} images"
 
 
 def applied_sidecar(result: Recomposition) -> dict[str, Any]:
-    """The sidecar of a recomposed picture: what was estimated then, of the pictures that are in it now.
+    """The sidecar of a recomposed image: what was estimated then, of the images that are in it now.
 
     It can be applied like any other. Pairs are those of the sidecar that was applied, and stay there.
     """
@@ -95,7 +95,7 @@ def applied_sidecar(result: Recomposition) -> dict[str, Any]:
     reference = next(
         (index for index in (result.saved.reference, *range(len(entries))) if entries[index]["used"]), None
     )
-    assert reference is not None, "a picture without any picture in it is never written"
+    assert reference is not None, "an image without any image in it is never written"
     source = result.sources[reference]
     assert source is not None
     camera = source.camera
@@ -128,11 +128,11 @@ def applied_sidecar(result: Recomposition) -> dict[str, Any]:
 
 
 def _image(result: Recomposition, index: int, entry: dict[str, Any]) -> dict[str, Any]:
-    """One picture's entry, brought up to date."""
-    source, picture = result.sources[index], result.saved.pictures[index]
-    if source is None or picture.to_plane is None:
-        reason = result.left_out[index].text if index in result.left_out else picture.reason
-        lens = {} if picture.camera is None else lens_fields(picture.camera)
+    """One image's entry, brought up to date."""
+    source, image = result.sources[index], result.saved.images[index]
+    if source is None or image.to_plane is None:
+        reason = result.left_out[index].text if index in result.left_out else image.reason
+        lens = {} if image.camera is None else lens_fields(image.camera)
         return {**entry, **lens, "used": False, "reason": reason, "to_plane": None, "to_output": None, "pose": None}
     return {
         **entry,
@@ -140,7 +140,7 @@ def _image(result: Recomposition, index: int, entry: dict[str, Any]) -> dict[str
         "path": str(source.path),
         "size": source.camera.image_size,
         **lens_fields(source.camera),
-        "to_output": to_output(result.canvas, picture.to_plane),
+        "to_output": to_output(result.canvas, image.to_plane),
     }
 
 

@@ -29,7 +29,7 @@ from rdstitch.progress import Progress, silent
 from rdstitch.registration import Registration
 
 _STATIC_BACKGROUND = Message(
-    "a part of what the pictures show stays where it is in them (a vehicle's body, a background, dirt, a date); "
+    "a part of what the images show stays where it is in them (a vehicle's body, a background, dirt, a date); "
     "only what moves was registered",
     code="static-background",
 )
@@ -47,11 +47,11 @@ def register(
     prefer_turn: bool = False,
     progress: Progress = silent,
 ) -> Registration:
-    """Detect features, register pairs, and align all pictures as one.
+    """Detect features, register pairs, and align all images as one.
 
     Pairs that fail alone are tried again with the λ that the others agree on, which then takes only two or four points.
-    Once there are poses, pictures that these put beside each other are tried too (loop closures), and every pair of a
-    picture that found no place. Where the pictures come from two lenses, those of one are aligned. All pixels in the
+    Once there are poses, images that these put beside each other are tried too (loop closures), and every pair of an
+    image that found no place. Where the images come from two lenses, those of one are aligned. All pixels in the
     result are those of the size that features are detected at, see :mod:`rdstitch.pipeline.working_size`.
 
     Parameters
@@ -59,20 +59,20 @@ def register(
     executor : concurrent.futures.Executor
         Where features are detected and pairs are registered; see :func:`rdstitch.executors.open_executor`.
     skip_bad : bool
-        Leave out damaged pictures instead of raising.
+        Leave out damaged images instead of raising.
     metric : bool
         Metric poses are needed, so that the freest model is that of planar motion with small tilts.
     lens_only : bool
-        Only the lens is wanted, so that pictures of a repeated pattern may be off by whole periods of it.
+        Only the lens is wanted, so that images of a repeated pattern may be off by whole periods of it.
     prefer_turn : bool
         A turn on the spot is taken where a plane explains the images as well.
 
     Raises
     ------
     RegistrationError
-        When no two pictures overlap.
+        When no two images overlap.
     """
-    options = options.for_pictures(len(sources))
+    options = options.for_images(len(sources))
     cache = Cache.at(options.cache)
     layout_matters = not (lens_only or metric)
     aligner = Aligner.of(sources, options, cache, prefer_turn=prefer_turn, layout_matters=layout_matters)
@@ -123,10 +123,10 @@ def register(
 
 
 def with_frontal_reference(registration: Registration, options: StitchOptions, *, always: bool) -> Registration:
-    """The same registration with an undistorted picture as its plane; directions of a turn on the spot stay.
+    """The same registration with an undistorted image as its plane; directions of a turn on the spot stay.
 
-    That is the reference picture, unless another one crosses its horizon and nobody named it: then one that, if
-    possible, no picture crosses the horizon of.
+    That is the reference image, unless another one crosses its horizon and nobody named it: then one that, if
+    possible, no image crosses the horizon of.
 
     Parameters
     ----------
@@ -150,12 +150,12 @@ def _matcher(options: StitchOptions) -> Matcher:
 
 
 def _low_contrast(equalized: Sequence[int], alignment: Alignment, paths: Sequence[str]) -> list[Message]:
-    """That local contrast was equalized, and in which of the pictures aligned, unless in all pictures."""
+    """That local contrast was equalized, and in which of the images aligned, unless in all images."""
     everywhere = len(equalized) == len(paths)
     images = () if everywhere else tuple(paths[k] for k in equalized if alignment.used[k])
     if not (everywhere or images):
         return []
-    several = f"{len(images)} of the pictures ({shortened(names_of(images))})" if images else "the pictures"
+    several = f"{len(images)} of the images ({shortened(names_of(images))})" if images else "the images"
     who = "shows" if len(images) == 1 else f"{several} show"
     text = f"{who} little contrast: features were found after equalizing it locally"
     return [Message(text, images, "detail", code="low-contrast")]
@@ -164,7 +164,7 @@ def _low_contrast(equalized: Sequence[int], alignment: Alignment, paths: Sequenc
 def _left_out(
     alignment: Alignment, paths: Sequence[str], keypoints: Sequence[int], reasons: Mapping[int, str]
 ) -> list[Message]:
-    """Why pictures are not in the alignment, which is known beforehand of those that never reached it."""
+    """Why images are not in the alignment, which is known beforehand of those that never reached it."""
     return [
         message if index not in reasons else left_out(paths[index], reasons[index])
         for index, message in zip(

@@ -1,4 +1,4 @@
-"""Undistorting single pictures with a known lens."""
+"""Undistorting single images with a known lens."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.compositing import Canvas, Composite, CompositeOptions, PlacedPicture, compose
+from rdstitch.compositing import Canvas, Composite, CompositeOptions, PlacedImage, compose
 from rdstitch.errors import ArgumentError, OutputError
-from rdstitch.inputs.find import found_pictures
+from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import ChannelOrder, Images, as_inputs, in_order
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
-from rdstitch.io.atomic import PICTURE_SUFFIXES, check_outputs
-from rdstitch.io.read import Picture
+from rdstitch.io.atomic import IMAGE_SUFFIXES, check_outputs
+from rdstitch.io.read import DecodedImage
 from rdstitch.io.write import write_image
 from rdstitch.messages import Message, ignored
 from rdstitch.progress import Progress, silent
@@ -78,7 +78,7 @@ def undistort(
     warn: Callable[[Message], None] = ignored,
     progress: Progress = silent,
 ) -> list[Path] | list[NDArray[Any]]:
-    """Undistort pictures, each into a file of the same name in a folder, or into an array.
+    """Undistort images, each into a file of the same name in a folder, or into an array.
 
     Parameters
     ----------
@@ -88,12 +88,12 @@ def undistort(
     folder : path, optional
         Made if it does not exist. Without it, nothing is written.
     camera : Camera, optional
-        The lens; adapted to the size of each picture.
+        The lens; adapted to the size of each image.
     distortion : float, optional
         λ in the half-diagonal frame, instead of a camera.
     view : str
-        "same": size and scale at the centre stay. "all": everything that the picture shows, at that scale. "valid":
-        the largest upright rectangle around the centre that the picture covers, at that scale.
+        "same": size and scale at the centre stay. "all": everything that the image shows, at that scale. "valid":
+        the largest upright rectangle around the centre that the image covers, at that scale.
     image_format : str, optional
         "jpg", "png", "tif" or "webp": of all files written. Without it each has that of its input, or, where that
         cannot be written (HEIC, raw, BMP, …), is a PNG file.
@@ -103,13 +103,13 @@ def undistort(
     channel_order : str
         Of arrays that come in or go out: "bgr" or "rgb".
     warn : callable
-        Called with each thing that the user should know: pictures not taken as input, and damaged ones.
+        Called with each thing that the user should know: images not taken as input, and damaged ones.
     progress : callable
 
     Returns
     -------
     list of Path, or of ndarray
-        The files written; without a folder the pictures, (H, W) or (H, W, C), 0 where there is nothing to show.
+        The files written; without a folder the images, (H, W) or (H, W, C), 0 where there is nothing to show.
     """
     if (camera is None) == (distortion is None):
         raise ArgumentError("give either a camera or a distortion")
@@ -118,23 +118,23 @@ def undistort(
     if image_format is not None and image_format not in get_args(ImageFormat):
         raise ArgumentError(f"unknown format {image_format!r}; choose {', '.join(get_args(ImageFormat))}")
     given = as_inputs(inputs, channel_order)
-    with found_pictures(given, every=1, topic=topic) as found:
+    with found_images(given, every=1, topic=topic) as found:
         guard = InputGuard()
         sources, _ = read_sources(found.frames, camera=camera, distortion=distortion, skip_bad=False, guard=guard)
         for message in found.messages:
             warn(message)
         if folder is None:
-            pictures = [in_order(_undistorted(source, view).pixels, channel_order) for source in sources]
+            images = [in_order(_undistorted(source, view).pixels, channel_order) for source in sources]
             for message in guard.messages:
                 warn(message)
-            return pictures
+            return images
         outputs = _outputs(sources, Path(folder), image_format)
         with _existing(Path(folder)):
             check_outputs(outputs, overwrite, found.files)
             for done, (source, output) in enumerate(zip(sources, outputs, strict=True), start=1):
-                picture = _undistorted(source, view)
+                image = _undistorted(source, view)
                 metadata = source.metadata if view == "same" else source.metadata.in_another_size()
-                write_image(output, picture.pixels, picture.alpha, metadata=metadata, overwrite=overwrite)
+                write_image(output, image.pixels, image.alpha, metadata=metadata, overwrite=overwrite)
                 progress("undistorting", done, len(sources))
         for message in guard.messages:
             warn(message)
@@ -144,8 +144,8 @@ def undistort(
 def _undistorted(source: Source, view: Framing) -> Composite:
     plain = CompositeOptions(exposure="none", seam="none", blend="none")
     canvas = undistorted_canvas(source.camera, view)
-    read: Callable[[], Picture] = source.read
-    return compose([PlacedPicture(read, source.camera, np.eye(3))], canvas, plain)
+    read: Callable[[], DecodedImage] = source.read
+    return compose([PlacedImage(read, source.camera, np.eye(3))], canvas, plain)
 
 
 @contextmanager
@@ -170,13 +170,13 @@ def _outputs(sources: Sequence[Source], folder: Path, image_format: ImageFormat 
     outputs = [folder / _output_name(source, image_format) for source in sources]
     twice = [path for path, count in Counter(outputs).items() if count > 1]
     if twice:
-        raise OutputError(f"{min(twice)}: two of the pictures have this name; undistort them into different folders")
+        raise OutputError(f"{min(twice)}: two of the images have this name; undistort them into different folders")
     return outputs
 
 
 def _output_name(source: Source, image_format: ImageFormat | None) -> str:
-    in_memory = source.frame is not None and source.frame.picture is not None
-    if image_format is None and not in_memory and source.path.suffix.lower() in PICTURE_SUFFIXES:
+    in_memory = source.frame is not None and source.frame.image is not None
+    if image_format is None and not in_memory and source.path.suffix.lower() in IMAGE_SUFFIXES:
         return source.path.name
     stem = source.path.name if in_memory else source.path.stem
     return f"{stem}.{image_format or ('png' if _fits_png(source) else 'tif')}"
@@ -184,14 +184,14 @@ def _output_name(source: Source, image_format: ImageFormat | None) -> str:
 
 def _fits_png(source: Source) -> bool:
     """Whether PNG holds its samples; of the files that cannot be written in their own format, it holds all."""
-    if source.frame is None or source.frame.picture is None:
+    if source.frame is None or source.frame.image is None:
         return True
-    pixels = source.frame.picture.pixels
+    pixels = source.frame.image.pixels
     return pixels.dtype != np.float32 and (pixels.ndim == 2 or pixels.shape[2] == 3)
 
 
 def undistorted_canvas(camera: Camera, view: Framing) -> Canvas:
-    """Where the undistorted picture lies in the output, at the scale that it has at its distortion centre."""
+    """Where the undistorted image lies in the output, at the scale that it has at its distortion centre."""
     outline = camera.undistort(camera.outline(_POINTS_PER_SIDE))
     if view == "same":
         low, high = np.full(2, -0.5), np.array(camera.image_size) - 0.5
@@ -208,7 +208,7 @@ def undistorted_canvas(camera: Camera, view: Framing) -> Canvas:
 
 
 def _inner_rectangle(outline: FloatArray, camera: Camera) -> tuple[FloatArray, FloatArray]:
-    """Largest of the rectangles of the picture's aspect ratio within the undistorted outline, about the centre."""
+    """Largest of the rectangles of the image's aspect ratio within the undistorted outline, about the centre."""
     half = np.array(camera.image_size) / 2.0
     middle = (np.array(camera.image_size) - 1.0) / 2.0
     # A rectangle reaches an outline point where the larger of its relative coordinates is the scale.

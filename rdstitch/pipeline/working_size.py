@@ -1,7 +1,7 @@
 """Everything between detection and result is measured in pixels of the size that features are detected at.
 
-How well a feature is localised, and so every threshold in pixels, belongs to the size at which it was detected. A
-picture of 12 megapixels that is halved twice before detection has four times the error in its own pixels. λ, poses and
+How well a feature is localised, and so every threshold in pixels, belongs to the size at which it was detected. An
+image of 12 megapixels that is halved twice before detection has four times the error in its own pixels. λ, poses and
 homographies are in half diagonals, which are the same at every size; only pixels change.
 """
 
@@ -9,20 +9,20 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from rdstitch.camera import Camera
-from rdstitch.features.picture import halving
+from rdstitch.features.prepared_image import halving
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.registration import Registration
 
 
 def at_working_size(camera: Camera, megapixels: float | None) -> Camera:
-    """A camera for its picture halved until it has at most so many 10⁶ pixels; the same for None."""
+    """A camera for its image halved until it has at most so many 10⁶ pixels; the same for None."""
     factor = 1 if megapixels is None else halving(camera.image_size, megapixels)
     width, height = camera.image_size
     return camera.resized((-(-width // factor), -(-height // factor)))
 
 
 def at_full_size(registration: Registration) -> Registration:
-    """A registration with cameras and matches in pixels of the pictures themselves; errors stay as they are."""
+    """A registration with cameras and matches in pixels of the images themselves; errors stay as they are."""
     full = [source.camera for source in registration.sources]
     working = registration.alignment.cameras
     if all(a.image_size == b.image_size for a, b in zip(full, working, strict=True)):

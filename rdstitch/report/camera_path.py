@@ -1,4 +1,4 @@
-"""Where the camera was, or, if it only turned, where it looked: outlines of its pictures by longitude and latitude."""
+"""Where the camera was, or, if it only turned, where it looked: outlines of its images by longitude and latitude."""
 
 import math
 
@@ -21,19 +21,19 @@ def path_over_plane(registration: Registration) -> str:
     if registration.alignment.on_sphere:
         return view_directions(registration)
     if registration.alignment.poses is None:
-        return section("Trajectory", "The general model has a homography for each picture, but no poses.")
+        return section("Trajectory", "The general model has a homography for each image, but no poses.")
     path = Trajectory.from_alignment(registration.alignment)
     length = float(np.linalg.norm(np.diff(path.position, axis=0), axis=1).sum())
     return section(
         "Trajectory",
-        f"{len(path)} positions in the order of the pictures, {length:.2f} heights of the first one long; the green "
-        "dot is the first, arrows point to the upper side of the picture.",
+        f"{len(path)} positions in the order of the images, {length:.2f} heights of the first one long; the green "
+        "dot is the first, arrows point to the upper side of the image.",
         path_as_svg(path),
     )
 
 
 def view_directions(registration: Registration) -> str:
-    """The sphere around the camera, laid out by longitude and latitude, with the outline of every picture on it."""
+    """The sphere around the camera, laid out by longitude and latitude, with the outline of every image on it."""
     alignment = registration.alignment
     used = np.flatnonzero(alignment.used).tolist()
     view = seen_directions([alignment.cameras[k] for k in used], alignment.homographies[used])
@@ -58,8 +58,8 @@ def view_directions(registration: Registration) -> str:
     focal = "" if registration.camera.focal is None else f" The focal length is {registration.camera.focal:.1f} pixels."
     return section(
         "Directions",
-        f"The camera turned on the spot. Its {len(used)} pictures show {across:.0f} x {down:.0f} degrees around it; "
-        f"the line in the middle is the horizon, the red dot the reference picture.{focal}",
+        f"The camera turned on the spot. Its {len(used)} images show {across:.0f} x {down:.0f} degrees around it; "
+        f"the line in the middle is the horizon, the red dot the reference image.{focal}",
         drawing(_WIDTH, height, parts, "directions"),
     )
 

@@ -1,4 +1,4 @@
-"""What several sections draw: where pictures and matches lie, and small pictures, as data addresses."""
+"""What several sections draw: where images and matches lie, and small images, as data addresses."""
 
 import base64
 from pathlib import Path
@@ -23,24 +23,24 @@ _POINTS_PER_SIDE = 16
 
 
 def footprint(registration: Registration, index: int) -> FloatArray:
-    """Outline (K, 2) of a picture on the plane; where the camera only turned, longitude and latitude, radians."""
+    """Outline (K, 2) of an image on the plane; where the camera only turned, longitude and latitude, radians."""
     camera = registration.alignment.cameras[index]
     return _on_plane(registration, index, camera.outline(_POINTS_PER_SIDE))
 
 
 def middle(registration: Registration, index: int) -> FloatArray:
-    """Centre (2,) of a picture, as :func:`footprint`."""
+    """Centre (2,) of an image, as :func:`footprint`."""
     width, height = registration.alignment.cameras[index].image_size
     return _on_plane(registration, index, np.array([[(width - 1) / 2, (height - 1) / 2]])).reshape(2)
 
 
 def pairs_of(registration: Registration) -> dict[tuple[int, int], PairRegistration]:
-    """The pairs by their pictures."""
+    """The pairs by their images."""
     return {(pair.image1, pair.image2): pair for pair in registration.pairs}
 
 
 def residuals(registration: Registration, fit: LinkFit) -> tuple[FloatArray, FloatArray]:
-    """Where the matches of a link are in the second picture, and how far from there the alignment puts them, pixels.
+    """Where the matches of a link are in the second image, and how far from there the alignment puts them, pixels.
 
     Matches that the pair itself takes for wrong are left out, and those that miss by more than four times the link's
     error.
@@ -58,14 +58,14 @@ def _on_plane(registration: Registration, index: int, points: FloatArray) -> Flo
     if not registration.alignment.on_sphere:
         return to_plane(camera, matrix, points)
     places = Projection("sphere").project(to_directions(camera, matrix, points))
-    # Longitudes of one picture have no jump.
+    # Longitudes of one image have no jump.
     own = np.arctan2(matrix[0, 2], matrix[2, 2])
     places[:, 0] = own + np.mod(places[:, 0] - own + np.pi, 2.0 * np.pi) - np.pi
     return places
 
 
 def of_source(source: Source, side: int) -> str | None:
-    """A thumbnail of an input picture; None where it is gone, as frames of videos are."""
+    """A thumbnail of an input image; None where it is gone, as frames of videos are."""
     try:
         reduction = fitting_reduction(max(source.camera.image_size) / (2 * side))
         return data_address(source.read(reduction).pixels, side)
@@ -87,5 +87,5 @@ def of_mosaic(result: StitchResult, side: int, staged: Path | None = None) -> st
 
 
 def data_address(pixels: NDArray[Any], side: int) -> str:
-    """A picture of any sample type as JPEG inside a ``data:`` address, its longer side at most ``side`` pixels."""
+    """An image of any sample type as JPEG inside a ``data:`` address, its longer side at most ``side`` pixels."""
     return "data:image/jpeg;base64," + base64.b64encode(encode_preview(pixels, side)).decode("ascii")

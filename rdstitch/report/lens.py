@@ -20,20 +20,20 @@ _WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 720.0, 320.0, 60.0, 44.0, 24.0
 _BARS = 40.0  # height of the drawing that the numbers of matches have
 _SAMPLES = 200
 _BINS = 48
-_CELLS = (16, 12)  # of the picture, to say how much of it has matches
+_CELLS = (16, 12)  # of the image, to say how much of it has matches
 _BAND = 2.0  # standard deviations on either side
 _VOTES_HEIGHT, _VOTES_LEFT, _VOTES_BOTTOM, _VOTES_TOP = 280.0, 50.0, 40.0, 20.0
 _TICKS = 6
 
 
 def grid(registration: Registration) -> str:
-    """Straight lines as the lens bends them, and the picture's rows and columns as undistortion straightens them."""
+    """Straight lines as the lens bends them, and the image's rows and columns as undistortion straightens them."""
     camera = registration.upright_camera
     reference = registration.sources[registration.alignment.reference]
     return section(
         "Lens",
         f"Left: {reference.name}, and straight lines of the scene as the lens bends them. Right: rows and columns of "
-        "the picture after undistortion; the red frame is the picture before.",
+        "the image after undistortion; the red frame is the image before.",
         element("div", _before(camera, of_source(reference, int(_GRID_WIDTH))) + _after(camera), class_="beside"),
     )
 
@@ -46,13 +46,13 @@ def _lines(low: FloatArray, high: FloatArray) -> list[FloatArray]:
     return columns + [np.column_stack([along[0], np.full(_POINTS_OF_LINE, y)]) for y in across[1]]
 
 
-def _before(camera: Camera, picture: str | None) -> str:
+def _before(camera: Camera, image: str | None) -> str:
     width, height = camera.image_size
     scale = _GRID_WIDTH / width
     outline = camera.undistort(camera.outline(16))
     bent = [camera.distort(line) for line in _lines(outline.min(axis=0), outline.max(axis=0))]
     shown = [np.where(_inside(line, camera)[:, None], line, np.nan) for line in bent]
-    back = "" if picture is None else element("image", href=picture, width=_GRID_WIDTH, height=height * scale)
+    back = "" if image is None else element("image", href=image, width=_GRID_WIDTH, height=height * scale)
     parts = [back, *(path((line + 0.5) * scale, stroke=YELLOW, stroke_width=1.4) for line in shown)]
     return drawing(_GRID_WIDTH, height * scale, parts, "a grid of straight lines as measured")
 
@@ -91,7 +91,7 @@ def lens_curve(registration: Registration) -> str:
 
 
 def _places(registration: Registration) -> FloatArray:
-    """Where the matches that agree with the alignment are, pixels of pictures of the reference's size, (N, 2)."""
+    """Where the matches that agree with the alignment are, pixels of images of the reference's size, (N, 2)."""
     alignment, camera = registration.alignment, registration.upright_camera
     found = [np.empty((0, 2))]
     for fit in alignment.links:
@@ -110,7 +110,7 @@ def _counts(camera: Camera, places: FloatArray, farthest: float) -> FloatArray:
 
 
 def _support(camera: Camera, places: FloatArray, farthest: float) -> str:
-    """Where in the picture there are matches, one sentence."""
+    """Where in the image there are matches, one sentence."""
     if not len(places):
         return "No match supports it."
     across, down = _CELLS
@@ -120,7 +120,7 @@ def _support(camera: Camera, places: FloatArray, farthest: float) -> str:
     reach = float(np.quantile(np.linalg.norm(camera.normalize(places), axis=1), 0.99)) / farthest
     corners = ("top left", (0, 0)), ("top right", (0, -1)), ("bottom left", (-1, 0)), ("bottom right", (-1, -1))
     bare = [name for name, place in corners if not seen[place]]
-    text = f"{len(places)} matches lie in {seen.mean():.0%} of the picture, up to {reach:.0%} of the way to its corner."
+    text = f"{len(places)} matches lie in {seen.mean():.0%} of the image, up to {reach:.0%} of the way to its corner."
     return text + (f" None lie in the corner {', '.join(bare)}: there the lens is extrapolated." if bare else "")
 
 
@@ -175,7 +175,7 @@ def votes(registration: Registration) -> str:
     return section(
         "Votes on λ",
         f"λ of {counted(consensus.votes, 'pair')}, weighted by the inverse of its variance ({consensus.reason}, "
-        f"scatter {consensus.scatter:.4f}). The red line is λ after the adjustment of all pictures, grey ticks "
+        f"scatter {consensus.scatter:.4f}). The red line is λ after the adjustment of all images, grey ticks "
         "single pairs.",
         _histogram(registration, consensus, [r.distortion for r in relations if math.isfinite(r.distortion_std)]),
     )

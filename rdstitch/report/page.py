@@ -53,7 +53,7 @@ def write_report(
     command : str
         The command line that made the result, if any.
     outputs : Outputs, optional
-        Where the report is staged, to be published with the picture; without, it replaces what is there.
+        Where the report is staged, to be published with the image; without, it replaces what is there.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def report_page(
     command: str = "",
     staged: Path | None = None,
 ) -> str:
-    """The report as HTML; see :func:`write_report`. ``staged`` is the picture's file until it is published."""
+    """The report as HTML; see :func:`write_report`. ``staged`` is the image's file until it is published."""
     stitched = result if isinstance(result, StitchResult) else None
     registration = result.registration if isinstance(result, StitchResult) else result
     title = "rdstitch report" if stitched is None or stitched.output is None else stitched.output.name

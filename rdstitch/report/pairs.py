@@ -1,4 +1,4 @@
-"""The pairs: over the outlines of the pictures, the best and the worst one, and what the model leaves over."""
+"""The pairs: over the outlines of the images, the best and the worst one, and what the model leaves over."""
 
 from html import escape
 from typing import Any
@@ -13,16 +13,16 @@ from rdstitch.report.svg import BLUE, GREEN, GREY, RED, counted, drawing, elemen
 
 _GRAPH_SIDE, _GRAPH_MARGIN = 900.0, 20.0
 _LINE_HEIGHT = 11.0  # height of a name
-_PICTURE_WIDTH, _PICTURE_GAP = 440.0, 10.0
+_IMAGE_WIDTH, _IMAGE_GAP = 440.0, 10.0
 _MAX_LINES = 150
-_FADED = 0.6  # opacity of the pictures, so that lines can be seen on them
+_FADED = 0.6  # opacity of the images, so that lines can be seen on them
 _MAP_WIDTH, _COLUMNS = 640.0, 16
 _MIN_MATCHES = 4  # matches in a cell that make a mean
 _ARROW = 0.9  # of a cell's width, for the largest mean
 
 
 def match_graph(registration: Registration) -> str:
-    """Outlines of all pictures, and a line for each pair: thick where there are many matches, red where errors are."""
+    """Outlines of all images, and a line for each pair: thick where there are many matches, red where errors are."""
     alignment = registration.alignment
     used = np.flatnonzero(alignment.used)
     outlines = {int(k): footprint(registration, int(k)) for k in used}
@@ -46,16 +46,16 @@ def match_graph(registration: Registration) -> str:
         fill = RED if index == alignment.reference else GREY
         parts.append(element("circle", cx=float(x), cy=float(y), r=4, fill=fill))
         name = registration.sources[index].name
-        # A name that would lie on another one is left out; the picture's own line has it as its title.
+        # A name that would lie on another one is left out; the image's own line has it as its title.
         box = (float(x) + 6, float(y) - 6, 5.6 * len(name))
         if not any(_overlap(box, other) for other in named):
             named.append(box)
             parts.append(label(box[0], box[1], name, font_size=10))
     return section(
         "Match graph",
-        f"{counted(len(links), 'pair')} over the outlines of {counted(len(used), 'picture')}. Thicker lines have more "
+        f"{counted(len(links), 'pair')} over the outlines of {counted(len(used), 'image')}. Thicker lines have more "
         "matches; green ones "
-        "fit well into the whole, red ones badly. The red dot is the reference picture.",
+        "fit well into the whole, red ones badly. The red dot is the reference image.",
         drawing(width, height, parts, "match graph"),
     )
 
@@ -93,16 +93,16 @@ def _pair(registration: Registration, title: str, fit: LinkFit) -> str:
     pair = pairs_of(registration)[fit.image1, fit.image2]
     sources = [registration.sources[k] for k in (fit.image1, fit.image2)]
     sizes = [registration.alignment.cameras[k].image_size for k in (fit.image1, fit.image2)]
-    scales = [_PICTURE_WIDTH / width for width, _ in sizes]
-    lefts = [0.0, _PICTURE_WIDTH + _PICTURE_GAP]
+    scales = [_IMAGE_WIDTH / width for width, _ in sizes]
+    lefts = [0.0, _IMAGE_WIDTH + _IMAGE_GAP]
     parts = []
     for source, (_, height), scale, left in zip(sources, sizes, scales, lefts, strict=True):
-        place: dict[str, Any] = {"x": left, "width": _PICTURE_WIDTH, "height": height * scale}
-        picture = of_source(source, int(_PICTURE_WIDTH))
+        place: dict[str, Any] = {"x": left, "width": _IMAGE_WIDTH, "height": height * scale}
+        image = of_source(source, int(_IMAGE_WIDTH))
         parts.append(
             element("rect", fill="#ddd", **place)
-            if picture is None
-            else element("image", href=picture, opacity=_FADED, **place)
+            if image is None
+            else element("image", href=image, opacity=_FADED, **place)
         )
     ends = [
         (points + 0.5) * scale + (left, 0.0)
@@ -117,7 +117,7 @@ def _pair(registration: Registration, title: str, fit: LinkFit) -> str:
     names = " and ".join(source.name for source in sources)
     agree = f"{fit.inliers} of {int(inliers.sum())} inliers agree with the whole, rms {fit.rms:.2f} pixels"
     text = f"{title}: {names}; {agree}"
-    return element("h3", escape(text)) + drawing(2 * _PICTURE_WIDTH + _PICTURE_GAP, tall, parts, text)
+    return element("h3", escape(text)) + drawing(2 * _IMAGE_WIDTH + _IMAGE_GAP, tall, parts, text)
 
 
 def _match_lines(starts: FloatArray, stops: FloatArray, colour: str, opacity: float) -> list[str]:
@@ -128,13 +128,13 @@ def _match_lines(starts: FloatArray, stops: FloatArray, colour: str, opacity: fl
 
 
 def residual_map(registration: Registration) -> str:
-    """Errors of all pairs over the area of the picture: rms as grey, mean as an arrow."""
+    """Errors of all pairs over the area of the image: rms as grey, mean as an arrow."""
     alignment = registration.alignment
     found = [residuals(registration, fit) for fit in alignment.links if fit.used and fit.rms > 0.0]
     cameras = [alignment.cameras[fit.image2] for fit in alignment.links if fit.used and fit.rms > 0.0]
     if not found:
         return section("Residuals", "There are none.")
-    # Pictures of several sizes are laid over one another.
+    # Images of several sizes are laid over one another.
     places = np.concatenate([(p + 0.5) / camera.image_size for (p, _), camera in zip(found, cameras, strict=True)])
     off = np.concatenate([residual for _, residual in found])
     width, height = registration.upright_camera.image_size
@@ -146,7 +146,7 @@ def residual_map(registration: Registration) -> str:
     rms = np.sqrt(np.bincount(cell, (off**2).sum(axis=1), cells) / np.maximum(count, 1))
     enough = count >= _MIN_MATCHES
     if not enough.any():
-        return section("Residuals", f"There are too few matches ({len(off)}) to draw them over the picture.")
+        return section("Residuals", f"There are too few matches ({len(off)}) to draw them over the image.")
     side, darkest = _MAP_WIDTH / _COLUMNS, float(rms[enough].max())
     longest = max(float(np.linalg.norm(mean[enough], axis=1).max()), 1e-9)
     parts = [
@@ -168,7 +168,7 @@ def residual_map(registration: Registration) -> str:
     parts.append(label(0.0, tall + 16, text))
     return section(
         "Residuals",
-        f"{len(off)} inliers of all pairs over the area of the picture. Arrows that follow a pattern tell of something "
+        f"{len(off)} inliers of all pairs over the area of the image. Arrows that follow a pattern tell of something "
         "that the model does not describe: relief, a rolling shutter, a lens that one λ is not enough for.",
-        drawing(_MAP_WIDTH, tall + 22, parts, "residuals over the picture"),
+        drawing(_MAP_WIDTH, tall + 22, parts, "residuals over the image"),
     )

@@ -26,7 +26,7 @@ def summary(registration: Registration, result: StitchResult | None) -> str:
     rows = [
         ("λ (half diagonal)", _lambda(registration)),
         ("λ per px²", f"{camera.distortion_px:.4e}"),
-        ("pictures", f"{int(alignment.used.sum())} of {len(alignment.used) + _unread(registration)}"),
+        ("images", f"{int(alignment.used.sum())} of {len(alignment.used) + _unread(registration)}"),
         ("pairs", f"{sum(fit.used for fit in alignment.links)} used of {len(registration.pairs)} compared"),
         ("error", f"{alignment.rms:.3f} pixels rms of all inliers"),
         ("motion", _motion(alignment.model, alignment.model_reason)),
@@ -44,10 +44,10 @@ def summary(registration: Registration, result: StitchResult | None) -> str:
 
 
 def notices(registration: Registration) -> str:
-    """Warnings, and pictures that were left out, each with the reason."""
+    """Warnings, and images that were left out, each with the reason."""
     warnings = [message.clause for message in (*registration.warnings, *registration.notes)]
     return section(
-        "Warnings and left-out pictures",
+        "Warnings and left-out images",
         "",
         _bullets("What to look at", warnings, "No warnings."),
         _left_out(registration),
@@ -55,15 +55,15 @@ def notices(registration: Registration) -> str:
 
 
 def _left_out(registration: Registration) -> str:
-    """Small versions of the pictures that are not in the result, each with the reason."""
+    """Small versions of the images that are not in the result, each with the reason."""
     if not registration.left_out:
-        return element("p", "Every picture is in the result.")
+        return element("p", "Every image is in the result.")
     sources = {str(source.path): source for source in registration.sources}
     shown = []
     for message in registration.left_out:
         source = sources.get(message.images[0])
-        picture = None if source is None else of_source(source, _THUMBNAIL)
-        drawn = "" if picture is None else element("img", src=picture, alt="")
+        image = None if source is None else of_source(source, _THUMBNAIL)
+        drawn = "" if image is None else element("img", src=image, alt="")
         caption = element("figcaption", escape(f"{message.images[0]}: {message.text}"))
         shown.append(element("figure", drawn + caption))
     return element("h3", "Left out") + element("div", "".join(shown), class_="thumbnails")

@@ -7,7 +7,7 @@ from rdstitch.robust.measurements import Measurements
 
 _SINGULAR = 1e-13  # eigenvalue of the correlation matrix of the parameters
 _CELLS_PER_HALF_DIAGONAL = 5.0
-_CELLS_PER_SIDE = 64  # more than a picture has, wherever its distortion centre is
+_CELLS_PER_SIDE = 64  # more than an image has, wherever its distortion centre is
 
 
 def covariances(information: FloatArray, influence: FloatArray, noise: FloatArray, data: Measurements) -> FloatArray:

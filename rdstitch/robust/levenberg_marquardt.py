@@ -9,7 +9,7 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 
 MIN_GAIN = 1e-5
-"""Expected relative fall of the loss of all pictures that is worth another step: a hundredth of the noise."""
+"""Expected relative fall of the loss of all images that is worth another step: a hundredth of the noise."""
 
 PAIR_GAIN, ROUGH_GAIN = 1e-4, 1e-3
 """The same of a pair, which has fewer matches; and where another descent goes on from there."""

@@ -22,7 +22,7 @@ _MAX_CHANCE = 1e-4
 
 
 def places(points1: FloatArray, points2: FloatArray, image_size: tuple[int, int]) -> int:
-    """In how many cells of a grid the matches (N, 2), pixels, lie, in the picture in which these are fewer."""
+    """In how many cells of a grid the matches (N, 2), pixels, lie, in the image in which these are fewer."""
     cell = float(np.hypot(*image_size)) / _CELLS_PER_DIAGONAL
     return min(len(np.unique(numbered_cells(points / cell))) for points in (points1, points2))
 
@@ -40,7 +40,7 @@ def rejection_reason(
     """Why the inliers could be chance, or None.
 
     Two tests. Are there more inliers than wrong matches would give by chance? A wrong match lies within
-    the threshold with a probability of a disc's share of the picture. And do they lie in enough different places?
+    the threshold with a probability of a disc's share of the image. And do they lie in enough different places?
     Neighbouring matches go wrong together, on a moving object or on a repeated pattern, and count once.
 
     Parameters
@@ -49,7 +49,7 @@ def rejection_reason(
         Measured points, pixels.
     inliers : ndarray of shape (N,), bool
     image_size : (int, int)
-        Of picture 2, pixels.
+        Of image 2, pixels.
     threshold : float
         pixels.
     """

@@ -1,1 +1,1 @@
-"""The sidecar: everything estimated, as JSON beside the picture."""
+"""The sidecar: everything estimated, as JSON beside the image."""

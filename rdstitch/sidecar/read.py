@@ -24,22 +24,22 @@ from rdstitch.sidecar.write import VERSION
 
 
 @dataclass(frozen=True)
-class SavedPicture:
-    """One picture of a saved registration.
+class SavedImage:
+    """One image of a saved registration.
 
     Attributes
     ----------
     name, path : str
         As they were then.
     camera : Camera or None
-        With everything that was estimated; None where the picture could not be read.
+        With everything that was estimated; None where the image could not be read.
     to_plane : ndarray of shape (3, 3), or None
-        From undistorted coordinates, in half diagonals from the distortion centre, to the plane; None where the picture
+        From undistorted coordinates, in half diagonals from the distortion centre, to the plane; None where the image
         was left out.
     reason : str
         Why it was left out; empty where it was used.
     displacement : DisplacementField or None
-        What local alignment found; None where the picture was not aligned locally.
+        What local alignment found; None where the image was not aligned locally.
     """
 
     name: str
@@ -58,15 +58,15 @@ class SavedRegistration:
     ----------
     path : Path
         Of the sidecar.
-    pictures : tuple of SavedPicture
+    images : tuple of SavedImage
     reference : int
-        The picture whose resolution the output has.
+        The image whose resolution the output has.
     distortion : float
         λ in the half-diagonal frame.
     turned : bool
         Whether the camera turned on the spot, so that ``to_plane`` leads to directions.
     composite : CompositeOptions
-        What the picture was composited with.
+        What the image was composited with.
     place : Georeference or None
         Of the plane, where the output was georeferenced.
     content : dict
@@ -74,7 +74,7 @@ class SavedRegistration:
     """
 
     path: Path
-    pictures: tuple[SavedPicture, ...]
+    images: tuple[SavedImage, ...]
     reference: int
     distortion: float
     turned: bool
@@ -98,11 +98,11 @@ def read_sidecar(path: str | Path) -> SavedRegistration:
         version.fail(f"this rdstitch reads versions 1 to {VERSION} of sidecars, not {version.value}")
     record["verdict"].fields()
     _check_output(record["output"])
-    pictures = tuple(_picture(item) for item in record["images"].items())
+    images = tuple(_image(item) for item in record["images"].items())
     return SavedRegistration(
         Path(path),
-        pictures,
-        _reference(record["reference"], pictures),
+        images,
+        _reference(record["reference"], images),
         record["lambda"].number(),
         record["model"].text() == "rotation",
         _as_laid_out(_composite_options(record["options"]["composite"]), record),
@@ -111,24 +111,22 @@ def read_sidecar(path: str | Path) -> SavedRegistration:
     )
 
 
-def mismatch_with_picture(saved: SavedRegistration) -> str:
-    """Why the picture beside a sidecar is not the one that it was written with; empty where it is, or is not there."""
+def mismatch_with_image(saved: SavedRegistration) -> str:
+    """Why the image beside a sidecar is not the one that it was written with; empty where it is, or is not there."""
     output = saved.content["output"]
     if output.get("sha256") is None or output.get("file") is None:
         return ""
-    picture = saved.path.with_name(output["file"])
-    tiles = tiles_folder(picture) if picture.suffix.lower() == ".dzi" else None
+    image = saved.path.with_name(output["file"])
+    tiles = tiles_folder(image) if image.suffix.lower() == ".dzi" else None
     try:
-        same = fingerprint(picture, tiles) == Fingerprint(output.get("bytes"), output["sha256"])
+        same = fingerprint(image, tiles) == Fingerprint(output.get("bytes"), output["sha256"])
     except OSError:
         return ""
-    return (
-        "" if same else f"{picture}: is not the picture that {saved.path.name} was written with; one of them is newer"
-    )
+    return "" if same else f"{image}: is not the image that {saved.path.name} was written with; one of them is newer"
 
 
 def _check_output(record: Record) -> None:
-    """What tells which picture the sidecar belongs to; versions before had no size and digest."""
+    """What tells which image the sidecar belongs to; versions before had no size and digest."""
     if (name := record.get("file")) is not None and Path(name.text()).name != name.value:
         name.expected("the name of a file in the same folder")
     if (size := record.get("bytes")) is not None:
@@ -166,18 +164,18 @@ def _place(output: Record) -> Georeference | None:
     return place.after(np.linalg.inv(from_plane).astype(np.float64))
 
 
-def _picture(record: Record) -> SavedPicture:
+def _image(record: Record) -> SavedImage:
     name, path, used = record["name"].text(), record["path"].text(), record["used"].flag()
     camera = None
     if record.get("size") is not None:
         source = record.get("focal_source")
         camera = read_lens(record, record["size"].size(), None if source is None else source.choice(FOCAL_LOG_STD))
     if used and camera is None:
-        record["size"].expected("width and height of a picture that was used")
+        record["size"].expected("width and height of an image that was used")
     to_plane = record["to_plane"].matrix() if used else None
     field = record.get("displacement")
     moved = None if field is None or not used or camera is None else _displacement(field, camera)
-    return SavedPicture(name, path, camera, to_plane, record["reason"].text(), moved)
+    return SavedImage(name, path, camera, to_plane, record["reason"].text(), moved)
 
 
 def _displacement(record: Record, camera: Camera) -> DisplacementField:
@@ -195,11 +193,11 @@ def _two(record: Record) -> list[Record]:
     return items
 
 
-def _reference(record: Record, pictures: Sequence[SavedPicture]) -> int:
+def _reference(record: Record, images: Sequence[SavedImage]) -> int:
     name = record.text()
-    found = [index for index, picture in enumerate(pictures) if picture.name == name and picture.to_plane is not None]
+    found = [index for index, image in enumerate(images) if image.name == name and image.to_plane is not None]
     if not found:
-        record.fail(f"there is no used picture {name!r}")
+        record.fail(f"there is no used image {name!r}")
     return found[0]
 
 

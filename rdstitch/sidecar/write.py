@@ -1,4 +1,4 @@
-"""The sidecar: everything that was estimated, as JSON beside the picture."""
+"""The sidecar: everything that was estimated, as JSON beside the image."""
 
 import dataclasses
 import math
@@ -28,9 +28,9 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
     """The sidecar's content; every number that does not exist is null.
 
     ``lambda`` is for half the image diagonal. ``images[].to_plane`` maps undistorted, half-diagonal-normalized
-    coordinates of a picture to the plane, or to directions where the camera turned on the spot,
+    coordinates of an image to the plane, or to directions where the camera turned on the spot,
     ``output.plane_to_output`` places of the plane, or of the projection, to pixels of the output;
-    ``images[].to_output`` is the product, on a plane; ``pairs[].homography`` maps coordinates of the first picture
+    ``images[].to_output`` is the product, on a plane; ``pairs[].homography`` maps coordinates of the first image
     to those of the second. All fields are described in docs/sidecar.md.
     """
     registration, alignment = result.registration, result.registration.alignment
@@ -148,7 +148,7 @@ def identity_fields(output: Path | None, written: Fingerprint | None) -> dict[st
 
 
 def _local_alignment(local: LocalAlignment) -> dict[str, Any]:
-    """What local alignment found, beside the displacements, which are with their pictures."""
+    """What local alignment found, beside the displacements, which are with their images."""
     return {
         "used": bool(local.fields),
         "reason": local.reason,
@@ -158,7 +158,7 @@ def _local_alignment(local: LocalAlignment) -> dict[str, Any]:
 
 
 def displacement(field: DisplacementField | None) -> dict[str, Any] | None:
-    """Displacement of one picture: columns and rows of its grid, and pixels at its nodes, row by row."""
+    """Displacement of one image: columns and rows of its grid, and pixels at its nodes, row by row."""
     if field is None:
         return None
     rows, columns, _ = field.values.shape
@@ -166,7 +166,7 @@ def displacement(field: DisplacementField | None) -> dict[str, Any] | None:
 
 
 def lens_fields(camera: Camera) -> dict[str, Any]:
-    """What of a picture's camera depends on the size of the picture, and λ with it."""
+    """What of an image's camera depends on the size of the image, and λ with it."""
     return {
         "center_px": camera.center,
         "lambda": camera.nearest_distortion,

@@ -1,6 +1,6 @@
 """Batches of samples: blocks that stay in cache, with the batch axis last.
 
-Inside a solver the points of both pictures are one array of shape (2, 2, k, b): coordinate, picture, point, sample.
+Inside a solver the points of both images are one array of shape (2, 2, k, b): coordinate, image, point, sample.
 """
 
 from collections.abc import Callable
@@ -40,7 +40,7 @@ def solve_in_blocks(solve: BlockSolver, x1: ArrayLike, x2: ArrayLike, count: int
     solve : callable
         Takes the points of a block, (2, 2, count, b), and the place of the block's samples in the batch, (b,).
     x1, x2 : array_like of shape (B, count, 2) or (count, 2)
-        Normalized points of picture 1 and picture 2.
+        Normalized points of image 1 and image 2.
     count : int
         Points in a sample.
     block_size : int

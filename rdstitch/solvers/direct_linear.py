@@ -6,7 +6,7 @@ from rdstitch.arrays import FloatArray
 
 
 def direct_linear(x1: FloatArray, x2: FloatArray) -> FloatArray:
-    """Homography (3, 3) between undistorted points (N, 2) of two pictures, positive in front of the camera."""
+    """Homography (3, 3) between undistorted points (N, 2) of two images, positive in front of the camera."""
     lifted = np.column_stack([x1, np.ones(len(x1))])
     zero = np.zeros_like(lifted)
     first = np.concatenate([lifted, zero, -x2[:, :1] * lifted], axis=1)

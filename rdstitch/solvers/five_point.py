@@ -22,7 +22,7 @@ def five_point(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, floa
     """Any homography, and λ, from five points; needs no focal length.
 
     For fixed λ four points give the homography (:mod:`rdstitch.solvers.homography`). The third row of the direct linear
-    transformation of point 5, ``x̂_5 (H p_5)_y = ŷ_5 (H p_5)_x``, does not contain the lifted coordinate of picture 2:
+    transformation of point 5, ``x̂_5 (H p_5)_y = ŷ_5 (H p_5)_x``, does not contain the lifted coordinate of image 2:
 
     ``Σ_i β_i α_j α_k γ_i (x̂_5 ŷ_i - ŷ_5 x̂_i) = 0``, ``γ_i = det(p_5, p_j, p_k)``,
 
@@ -31,7 +31,7 @@ def five_point(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, floa
     Parameters
     ----------
     x1, x2 : array_like of shape (B, 5, 2) or (5, 2)
-        Normalized points of picture 1 and picture 2.
+        Normalized points of image 1 and image 2.
     distortion_range : (float, float)
         Range of λ, in the frame of the points, to search.
 

@@ -20,7 +20,7 @@ def five_point_qep(
 ) -> Solutions:
     """Any homography, and λ, from five points by a quadratic eigenvalue problem (Fitzgibbon, CVPR 2001, §5).
 
-    The two rows per point of the direct linear transformation that contain the lifted coordinate of picture 2 are
+    The two rows per point of the direct linear transformation that contain the lifted coordinate of image 2 are
     quadratic in λ, ``(D_0 + λ D_1 + λ² D_2) h = 0``, 10 equations for 9 entries of H. The pseudoinverse of the matrix
     at one λ outside the range makes them square, and linearization gives an 18 x 18 eigenvalue problem for
     ``1 / (λ - that λ)``.
@@ -30,7 +30,7 @@ def five_point_qep(
     Parameters
     ----------
     x1, x2 : array_like of shape (B, 5, 2) or (5, 2)
-        Normalized points of picture 1 and picture 2.
+        Normalized points of image 1 and image 2.
     distortion_range : (float, float)
         Range of λ, in the frame of the points, to search.
 
@@ -71,7 +71,7 @@ def _dlt_rows(x1: FloatArray, x2: FloatArray) -> tuple[FloatArray, FloatArray, F
     slope[..., 2] = np.einsum("bki,bki->bk", x1, x1)
     radius2 = np.einsum("bki,bki->bk", x2, x2)[..., None]
     rows = np.zeros((3, len(x1), 2, 5, 3, 3))
-    # Third coordinate 1 + λ r̂² of picture 2 times p: for row 0 against H's row 0, for row 1 against its row 1.
+    # Third coordinate 1 + λ r̂² of image 2 times p: for row 0 against H's row 0, for row 1 against its row 1.
     for row in (0, 1):
         rows[0, :, row, :, row] = constant
         rows[1, :, row, :, row] = slope + radius2 * constant

@@ -32,7 +32,7 @@ def four_point(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, floa
     Parameters
     ----------
     x1, x2 : array_like of shape (B, 4, 2) or (4, 2)
-        Focal-normalized points of picture 1 and picture 2.
+        Focal-normalized points of image 1 and image 2.
     distortion_range : (float, float)
         Range of λ (focal-normalized) to search.
 
@@ -131,12 +131,12 @@ class SexticEquation(SampleArrays):
     """``tr(adj H)³ = det(H) tr(H)³`` without its common factor ``(α_0 α_1 α_2 α_3)²``: of degree 16 in λ.
 
     ``α_0 α_1 α_2 α_3 G³ = β_0 β_1 β_2 β_3 F³`` with ``F = Σ β_i α_j α_k det(p̂_i, p_j, p_k) = tr H`` and G the same
-    with the pictures exchanged.
+    with the images exchanged.
 
     Attributes
     ----------
     linear : ndarray of shape (2, 2, 7, b)
-        Constants and slopes; for each picture its α, and the determinants of F (picture 1) or G; sample.
+        Constants and slopes; for each image its α, and the determinants of F (image 1) or G; sample.
     """
 
     linear: FloatArray

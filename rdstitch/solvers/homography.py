@@ -1,7 +1,7 @@
 """The homography through four points, in closed form, as a function of λ.
 
 With lifted points ``p(λ) = (x, y, 1 + λ r²)`` let ``α_0 = det(p_1, p_2, p_3)``, and ``α_i`` the same with point i
-replaced by point 4; ``β`` likewise in picture 2. Each is linear in λ (:mod:`rdstitch.solvers.lines`). Then
+replaced by point 4; ``β`` likewise in image 2. Each is linear in λ (:mod:`rdstitch.solvers.lines`). Then
 
 ``H(λ) = Σ_i β_i α_j α_k p̂_i (p_j × p_k)'``
 

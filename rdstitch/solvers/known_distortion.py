@@ -17,11 +17,11 @@ def two_point_rigid(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike, tilt: A
     Parameters
     ----------
     x1, x2 : array_like of shape (B, 2, 2) or (2, 2)
-        Focal-normalized points of picture 1 and picture 2.
+        Focal-normalized points of image 1 and image 2.
     distortion : array_like of shape () or (B,)
         λ, focal-normalized.
     tilt : array_like of shape (2,), (2, 2) or (B, 2, 2)
-        (ψ, θ) of the camera, radians; or one such pair a picture; or one a sample and picture.
+        (ψ, θ) of the camera, radians; or one such pair an image; or one a sample and image.
 
     Returns
     -------
@@ -49,7 +49,7 @@ def four_point_dlt(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike) -> Solut
     Parameters
     ----------
     x1, x2 : array_like of shape (B, 4, 2) or (4, 2)
-        Normalized points of picture 1 and picture 2.
+        Normalized points of image 1 and image 2.
     distortion : array_like of shape () or (B,)
         λ in the frame of the points.
 

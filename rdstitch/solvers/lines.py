@@ -1,6 +1,6 @@
 """Lines through pairs of lifted points, and determinants of three: what all equations in λ are made of.
 
-Inside a solver the points of both pictures have shape (2, 2, k, b): coordinate, picture, point, sample.
+Inside a solver the points of both images have shape (2, 2, k, b): coordinate, image, point, sample.
 
 Two coordinates of a lifted point ``p(λ) = (x, y, 1 + λ r²)`` do not depend on λ. So the line ``p_j × p_k`` is linear in
 λ, its third coordinate constant; ``p_i · (p_j × p_k) = det(p_i, p_j, p_k)`` is linear in λ too.
@@ -18,12 +18,12 @@ _RING = [1, 2, 0, 1]
 
 @dataclass(frozen=True)
 class Lines(SampleArrays):
-    """Lines in both pictures.
+    """Lines in both images.
 
     Attributes
     ----------
     constant : ndarray of shape (3, 2, L, b)
-        Coordinate, picture, line, sample.
+        Coordinate, image, line, sample.
     slope : ndarray of shape (2, 2, L, b)
         Derivative by λ of the first two coordinates.
     """

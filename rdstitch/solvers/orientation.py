@@ -2,7 +2,7 @@
 
 In front of the camera the determinant of three lifted points (:mod:`rdstitch.solvers.lines`) has the sign of the
 triangle's orientation in the plane, whatever the tilt. A camera that stays on its side of the plane never mirrors a
-triangle: the determinants of both pictures have the same sign.
+triangle: the determinants of both images have the same sign.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from rdstitch.arrays import FloatArray
 def oriented_samples(
     triangles: FloatArray, low: FloatArray, high: FloatArray
 ) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
-    """Samples whose triangles can have equal orientations in both pictures, and ranges of λ narrowed accordingly.
+    """Samples whose triangles can have equal orientations in both images, and ranges of λ narrowed accordingly.
 
     Between the zeros of the determinants no sign changes, so that the middle of each piece tells for all of it. Most
     samples with a wrong match have no such piece, and need no further work.

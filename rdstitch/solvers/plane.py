@@ -1,6 +1,6 @@
 """The plane as cameras of known tilt see it: plane coordinates, distances, and motions in the plane.
 
-Inside a solver the points of both pictures have shape (2, 2, k, b): coordinate, picture, point, sample. With the tilt's
+Inside a solver the points of both images have shape (2, 2, k, b): coordinate, image, point, sample. With the tilt's
 rotation R and the plane normal ``n = R e3``, a lifted point ``p(λ) = (x, y, 1 + λ r²)`` has the plane coordinates
 ``X = (R' p)_xy / (n · p)``. The vector between two points of the plane is
 ``X_i - X_j = J (R' (p_i × p_j))_xy / ((n · p_i)(n · p_j))``, J a quarter turn: both its numerator and the depths
@@ -28,19 +28,19 @@ _MIN_SEPARATION = 1e-9
 
 @dataclass(frozen=True)
 class TiltRotations(SampleArrays):
-    """Rotations of the two pictures' tilts.
+    """Rotations of the two images' tilts.
 
     Attributes
     ----------
     matrices : ndarray of shape (3, 3, 2, 1, 1), or (3, 3, 2, 1, b) when each sample has its own
-        Row, column, picture, any point, sample.
+        Row, column, image, any point, sample.
     """
 
     matrices: FloatArray
 
     @classmethod
     def from_tilt(cls, tilt: ArrayLike, count: int) -> Self:
-        """From one tilt (2,), one a picture (2, 2), or one a sample and picture (B, 2, 2).
+        """From one tilt (2,), one an image (2, 2), or one a sample and image (B, 2, 2).
 
         Raises
         ------
@@ -49,7 +49,7 @@ class TiltRotations(SampleArrays):
         """
         angles = np.asarray(tilt, dtype=np.float64)
         if angles.shape not in ((2,), (2, 2), (count, 2, 2)):
-            raise ArgumentError(f"tilt must be (psi, theta) or one such pair a picture, not of shape {angles.shape}")
+            raise ArgumentError(f"tilt must be (psi, theta) or one such pair an image, not of shape {angles.shape}")
         if not (np.abs(angles) < np.pi / 2).all():
             raise ArgumentError("tilt must be below a right angle")
         both = np.broadcast_to(angles, (*angles.shape[:-2], 2, 2)).reshape(-1, 2, 1, 2)
@@ -57,7 +57,7 @@ class TiltRotations(SampleArrays):
 
     @classmethod
     def from_normal(cls, normal: FloatArray) -> Self:
-        """The smallest rotations that turn e3 to normals (3, b) of length 1, the same for both pictures."""
+        """The smallest rotations that turn e3 to normals (3, b) of length 1, the same for both images."""
         x, y, z = normal
         first, second = x / (1.0 + z), y / (1.0 + z)
         rows = [[1.0 - first * x, -first * y, x], [-second * x, 1.0 - second * y, y], [-x, -y, z]]
@@ -82,7 +82,7 @@ def differences(lines: Lines, rotations: TiltRotations) -> FloatArray:
     Returns
     -------
     ndarray of shape (2, 2, 2, L, b)
-        Constant and slope in λ, coordinate, picture, line, sample.
+        Constant and slope in λ, coordinate, image, line, sample.
     """
     turn = rotations.matrices[:, :2]
     (c1, c2, c3), (s1, s2) = lines.constant, lines.slope

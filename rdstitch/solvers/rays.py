@@ -1,6 +1,6 @@
 """Rays of a camera that turns on the spot, and the rotation between two bundles of them.
 
-Inside a solver the points of both pictures have shape (2, 2, k, b): coordinate, picture, point, sample. With the lens
+Inside a solver the points of both images have shape (2, 2, k, b): coordinate, image, point, sample. With the lens
 gone a measured point is the ray ``r = (x, g z)``, ``z = 1 + λ |x|²`` and g the focal length. A rotation keeps the
 angles between rays, so that their tangents agree:
 
@@ -28,7 +28,7 @@ class RayPairs(SampleArrays):
     Attributes
     ----------
     dot, cross : ndarray of shape (2, P, b)
-        ``x_1 · x_2`` and ``(x_1 × x_2)²``; picture, pair, sample.
+        ``x_1 · x_2`` and ``(x_1 × x_2)²``; image, pair, sample.
     depth : ndarray of shape (2, 2, P, b)
         ``|x|²`` of the first and the second point: the slopes of their ``z``.
     across : ndarray of shape (2, 2, 2, P, b)
@@ -65,7 +65,7 @@ class RayPairs(SampleArrays):
         return value
 
     def same_side(self, distortion: FloatArray, focal2: FloatArray) -> BoolArray:
-        """Whether all angles, (b,), are acute or obtuse in both pictures alike, which tangents squared do not say."""
+        """Whether all angles, (b,), are acute or obtuse in both images alike, which tangents squared do not say."""
         dot = self.dot + focal2 * self.products(distortion)[0]
         return np.asarray((dot[0] * dot[1] > 0.0).all(axis=0))
 
@@ -83,7 +83,7 @@ def rays(points: FloatArray, distortion: FloatArray, focal: FloatArray | float =
 
 
 def rotation_of_two(bundle: FloatArray) -> FloatArray:
-    """Rotations (b, 3, 3) that turn the rays of picture 1 to those of picture 2 best, for unit rays (3, 2, 2, b).
+    """Rotations (b, 3, 3) that turn the rays of image 1 to those of image 2 best, for unit rays (3, 2, 2, b).
 
     For two rays the least-squares rotation (Kabsch) turns their bisector and their plane into each other.
     """
@@ -121,7 +121,7 @@ def turned_solutions(
     """Solutions from λ and focal lengths (b,) of points (2, 2, k, b); those that leave a point behind are left out."""
     bundle = rays(points, distortion, focal)
     rotation = rotate(bundle)
-    # In front of the camera of picture 2, whatever the errors of a sample that no rotation fits.
+    # In front of the camera of image 2, whatever the errors of a sample that no rotation fits.
     ahead = np.einsum("bj,jkb->kb", rotation[:, 2], bundle[:, 0])
     kept = np.flatnonzero((ahead > 0.0).all(axis=0) & np.isfinite(rotation).all(axis=(1, 2)))
     homography = with_focal(rotation[kept], focal[kept])

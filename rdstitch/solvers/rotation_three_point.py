@@ -40,7 +40,7 @@ def rotation_three_point(
     Parameters
     ----------
     x1, x2 : array_like of shape (B, 3, 2) or (3, 2)
-        Normalized points of picture 1 and picture 2, in any unit around the distortion centre.
+        Normalized points of image 1 and image 2, in any unit around the distortion centre.
     distortion_range : (float, float)
         Range of λ to search, in the frame of the points.
     focal_range : (float, float)
@@ -97,7 +97,7 @@ def cubics(pairs: RayPairs, distortion: FloatArray) -> tuple[Coefficients, Coeff
     d, c = pairs.dot.reshape(shape), pairs.cross.reshape(shape)
 
     def side(i: int, j: int) -> list[FloatArray]:
-        """``(d + g² z)²`` of picture i times ``c + g² e`` of picture j."""
+        """``(d + g² z)²`` of image i times ``c + g² e`` of image j."""
         return [
             d[i] * d[i] * c[j],
             d[i] * (2.0 * product[i] * c[j] + d[i] * length[j]),

@@ -31,7 +31,7 @@ def rotation_two_point(
     Parameters
     ----------
     x1, x2 : array_like of shape (B, 2, 2) or (2, 2)
-        Focal-normalized points of picture 1 and picture 2.
+        Focal-normalized points of image 1 and image 2.
     distortion_range : (float, float)
         Range of λ (focal-normalized) to search.
 

@@ -28,7 +28,7 @@ def rotation_two_point_focal(
     Parameters
     ----------
     x1, x2 : array_like of shape (B, 2, 2) or (2, 2)
-        Normalized points of picture 1 and picture 2, in any unit around the distortion centre.
+        Normalized points of image 1 and image 2, in any unit around the distortion centre.
     distortion : array_like of shape () or (B,)
         λ in the frame of the points.
     focal_range : (float, float)
@@ -72,7 +72,7 @@ class _AngleEquation(SampleArrays):
     Attributes
     ----------
     product, length, dot, cross : ndarray of shape (2, 1, b)
-        As in :class:`rdstitch.solvers.rays.RayPairs`; picture, pair, sample.
+        As in :class:`rdstitch.solvers.rays.RayPairs`; image, pair, sample.
     """
 
     product: FloatArray

@@ -47,7 +47,7 @@ def as_samples(x1: ArrayLike, x2: ArrayLike, count: int) -> tuple[FloatArray, Fl
     Parameters
     ----------
     x1, x2 : array_like of shape (B, count, 2) or (count, 2)
-        Normalized points of picture 1 and picture 2.
+        Normalized points of image 1 and image 2.
 
     Raises
     ------

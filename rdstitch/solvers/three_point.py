@@ -56,7 +56,7 @@ def three_point(
     A rigid motion keeps all three distances. With the plane normal ``n ~ (a, b, 1)``, depths ``w_i = n · p_i(λ)`` and
     ``p_i w_j - p_j w_i = n × (p_i × p_j)``, these are three equations in (a, b, λ):
 
-    ``log |n × (p_i × p_j)| - log w_i w_j`` is the same in both pictures.
+    ``log |n × (p_i × p_j)| - log w_i w_j`` is the same in both images.
 
     Newton's method on the logarithms, with steps limited in length, runs from all starts of all samples at once. It
     finds the solutions that the starts lead to, not provably all: from the default starts the true one in about 99 %
@@ -65,7 +65,7 @@ def three_point(
     Parameters
     ----------
     x1, x2 : array_like of shape (B, 3, 2) or (3, 2)
-        Focal-normalized points of picture 1 and picture 2.
+        Focal-normalized points of image 1 and image 2.
     distortion_range : (float, float)
         Range of λ (focal-normalized) to search.
     starts : array_like of shape (S, 3)
@@ -120,7 +120,7 @@ class DistanceSystem(SampleArrays):
     ----------
     rows : ndarray of shape (8, 2, 3, b)
         x, y, r² of each point, then constants of the three coordinates of the line opposite to it, and slopes of the
-        first two; picture, point, sample.
+        first two; image, point, sample.
     """
 
     rows: RealArray
@@ -151,7 +151,7 @@ class DistanceSystem(SampleArrays):
 
 
 def _between(length: RealArray, depth: RealArray) -> RealArray:
-    """Difference between the pictures of ``length - (sum of depth over the pair)``, from (2, 3, B) to (3, B)."""
+    """Difference between the images of ``length - (sum of depth over the pair)``, from (2, 3, B) to (3, B)."""
     difference: RealArray = depth[0] - depth[1]
     # The sum over a pair is the sum over all three points less the opposite one.
     difference -= difference.sum(axis=0)

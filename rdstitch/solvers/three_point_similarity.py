@@ -36,9 +36,9 @@ def three_point_similarity(
     Parameters
     ----------
     x1, x2 : array_like of shape (B, 3, 2) or (3, 2)
-        Focal-normalized points of picture 1 and picture 2.
+        Focal-normalized points of image 1 and image 2.
     tilt : array_like of shape (2,), (2, 2) or (B, 2, 2)
-        (ψ, θ) of the camera, radians; or one such pair a picture; or one a sample and picture.
+        (ψ, θ) of the camera, radians; or one such pair an image; or one a sample and image.
     distortion_range : (float, float)
         Range of λ (focal-normalized) to search.
 
@@ -78,7 +78,7 @@ class DistanceRatioEquation(SampleArrays):
     Attributes
     ----------
     linear : ndarray of shape (2, 6, 2, b)
-        Constants and slopes; the x of m_13 and m_12, their y, then w_2 and w_3; picture, sample.
+        Constants and slopes; the x of m_13 and m_12, their y, then w_2 and w_3; image, sample.
     """
 
     linear: FloatArray

@@ -34,9 +34,9 @@ def two_point(
     Parameters
     ----------
     x1, x2 : array_like of shape (B, 2, 2) or (2, 2)
-        Focal-normalized points of picture 1 and picture 2.
+        Focal-normalized points of image 1 and image 2.
     tilt : array_like of shape (2,), (2, 2) or (B, 2, 2)
-        (ψ, θ) of the camera, radians; or one such pair a picture; or one a sample and picture.
+        (ψ, θ) of the camera, radians; or one such pair an image; or one a sample and image.
     distortion_range : (float, float)
         Range of λ (focal-normalized) to search.
 
@@ -71,7 +71,7 @@ class DistanceEquation(SampleArrays):
     Attributes
     ----------
     linear : ndarray of shape (2, 4, 2, b)
-        Constants and slopes; m_x, m_y, w_1, w_2; picture, sample.
+        Constants and slopes; m_x, m_y, w_1, w_2; image, sample.
     """
 
     linear: FloatArray

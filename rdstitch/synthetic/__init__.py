@@ -28,8 +28,8 @@ from rdstitch.synthetic.relief import RELIEFS, Relief, boxes, hills, ridges
 from rdstitch.synthetic.rendering import Photometry, Sequence, sequence_over
 from rdstitch.synthetic.textures import (
     EndlessTexture,
+    ImageTexture,
     LinedTexture,
-    PictureTexture,
     Texture,
     blank,
     gradient,
@@ -43,11 +43,11 @@ __all__ = [
     "BrownLens",
     "EndlessTexture",
     "FisheyeLens",
+    "ImageTexture",
     "Instances",
     "Lens",
     "LinedTexture",
     "Photometry",
-    "PictureTexture",
     "PlanarInstances",
     "Poses",
     "Relief",

@@ -1,4 +1,4 @@
-"""Matches of one pair of pictures, with noise and outliers and their truth: for tests of robust estimation."""
+"""Matches of one pair of images, with noise and outliers and their truth: for tests of robust estimation."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from rdstitch.synthetic.instances import Instances, PlanarInstances, general_ins
 
 @dataclass(frozen=True)
 class SyntheticMatches:
-    """N matches between two pictures of a plane, some of them wrong.
+    """N matches between two images of a plane, some of them wrong.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ def correspondences(
     noise: float = 0.7,
     outliers: float = 0.3,
 ) -> SyntheticMatches:
-    """Random matches of two pictures of a plane.
+    """Random matches of two images of a plane.
 
     Parameters
     ----------
@@ -71,11 +71,11 @@ def correspondences(
     max_tilt : float
         Radians. ψ and θ are uniform in ± this; free motion tilts plane and camera by as much.
     overlap : float
-        Least share of picture 1 that picture 2 sees, roughly.
+        Least share of image 1 that image 2 sees, roughly.
     noise : float
-        Standard deviation in pixels of the normal noise on both pictures' points.
+        Standard deviation in pixels of the normal noise on both images' points.
     outliers : float
-        Share of wrong matches: points that lie anywhere in both pictures.
+        Share of wrong matches: points that lie anywhere in both images.
 
     Returns
     -------
@@ -127,7 +127,7 @@ def _instance(
     assert camera.focal is not None
     lam = camera.distortion_px * camera.focal**2
     field = (float(half_size[0]), float(half_size[1]))
-    # The longest motion is that which still leaves pictures of this field of view something in common.
+    # The longest motion is that which still leaves images of this field of view something in common.
     length = (0.1 * camera.half_diagonal / camera.focal, 1.5 * camera.half_diagonal / camera.focal)
     if motion == "homography":
         return general_instances(

@@ -16,7 +16,7 @@ from rdstitch.solvers.solutions import Solutions
 Range = tuple[float, float]
 IndexArray = NDArray[np.intp]
 
-# Half width and half height of a 4:3 picture in focal lengths. Its half diagonal is one focal length, so that
+# Half width and half height of a 4:3 image in focal lengths. Its half diagonal is one focal length, so that
 # λ has the same value in the focal-normalized and in the half-diagonal frame.
 HALF_SIZE = (0.8, 0.6)
 
@@ -27,12 +27,12 @@ _MAX_ROUNDS = 200
 
 @dataclass(frozen=True)
 class Instances:
-    """B instances of k correspondences between two pictures of a plane.
+    """B instances of k correspondences between two images of a plane.
 
     Attributes
     ----------
     x1, x2 : ndarray of shape (B, k, 2)
-        Measured (distorted, noisy) points of picture 1 and 2, focal-normalized.
+        Measured (distorted, noisy) points of image 1 and 2, focal-normalized.
     homography : ndarray of shape (B, 3, 3)
         ``p2(λ) ~ H p1(λ)`` with positive third coordinates.
     distortion : ndarray of shape (B,)
@@ -75,7 +75,7 @@ class PlanarInstances(Instances):
     Attributes
     ----------
     tilt, tilt2 : ndarray of shape (B, 2)
-        (ψ, θ) of picture 1 and picture 2, radians; the same unless separate tilts were requested.
+        (ψ, θ) of image 1 and image 2, radians; the same unless separate tilts were requested.
     yaw : ndarray of shape (B,)
         φ, radians.
     translation : ndarray of shape (B, 2)
@@ -126,21 +126,21 @@ def planar_instances(
     max_tilt : float
         ψ and θ are uniform in ± this many radians.
     separate_tilts : bool
-        Whether picture 2 has a tilt of its own.
+        Whether image 2 has a tilt of its own.
     yaw, translation, height : (float, float)
         Ranges of φ (radians), of the length of t (its direction is uniform) and of the second camera's height,
-        all uniform, but thinned where the pictures have too little in common.
+        all uniform, but thinned where the images have too little in common.
     half_size : (float, float)
-        Half width and half height of the pictures, focal lengths.
+        Half width and half height of the images, focal lengths.
     overlap : float
-        Least share of picture 1 that picture 2 sees, roughly; motions with less are drawn again.
+        Least share of image 1 that image 2 sees, roughly; motions with less are drawn again.
     noise : float
-        Standard deviation of the normal noise added to both pictures' points, focal lengths.
+        Standard deviation of the normal noise added to both images' points, focal lengths.
 
     Returns
     -------
     PlanarInstances
-        Points uniform over the part of picture 1 that is visible in picture 2 and well below the horizon.
+        Points uniform over the part of image 1 that is visible in image 2 and well below the horizon.
     """
     rng = np.random.default_rng(seed)
     lam = rng.uniform(*distortion, count)
@@ -220,11 +220,11 @@ def visible_points(
     overlap: float,
     draw: Callable[[IndexArray], FloatArray],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Points of picture 1 and where picture 2 sees them; motions without enough of them are drawn again."""
+    """Points of image 1 and where image 2 sees them; motions without enough of them are drawn again."""
     count, drawn = len(distortion), int(np.ceil(points / overlap))
     half = np.asarray(half_size)
     if np.min(1.0 + distortion * np.sum(half**2), initial=1.0) <= 0.0:
-        raise ArgumentError(f"a distortion of {np.min(distortion):g} folds the corners of pictures this large")
+        raise ArgumentError(f"a distortion of {np.min(distortion):g} folds the corners of images this large")
     x1, x2 = np.empty((count, points, 2)), np.empty((count, points, 2))
     h = np.empty((count, 3, 3))
     missing = np.arange(count)
@@ -244,7 +244,7 @@ def visible_points(
         x2[missing] = np.take_along_axis(seen, first, axis=1)
         h[missing] = motion
         missing = missing[~enough]
-    raise ArgumentError("these ranges give pictures that have too few points in common")
+    raise ArgumentError("these ranges give images that have too few points in common")
 
 
 def _steepness(points: FloatArray, distortion: FloatArray, normal: FloatArray) -> FloatArray:
@@ -309,7 +309,7 @@ def rotation_instances(
     focal : (float, float)
         Range of g, in the unit of the points.
     half_size : (float, float)
-        Half width and half height of the pictures, in the unit of the points.
+        Half width and half height of the images, in the unit of the points.
     """
     rng = np.random.default_rng(seed)
     lam = rng.uniform(*distortion, count)
@@ -323,7 +323,7 @@ def rotation_instances(
         rotation = _about(about, by) @ _about(np.tile([0.0, 0.0, 1.0], (len(which), 1)), turned)
         return np.asarray(rotation * (k[which][:, :, None] / k[which][:, None, :]))
 
-    # In front of picture 1 every ray counts, however oblique: there is no plane that it should meet.
+    # In front of image 1 every ray counts, however oblique: there is no plane that it should meet.
     ahead = np.tile([0.0, 0.0, 1.0], (count, 1))
     x1, x2, h = visible_points(rng, lam, ahead, points, half_size, overlap, draw)
     return RotationInstances(

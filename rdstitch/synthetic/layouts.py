@@ -1,7 +1,7 @@
 """Ready-made sequences of poses: pairs, grids, a robot's paths, a drone's survey.
 
 All lie anywhere on the plane, which :func:`rdstitch.synthetic.sequence_over` makes large enough. The height follows
-from ``texels_per_pixel``, the size of a pixel on the plane at the picture's centre. Overlaps are shares of what the
+from ``texels_per_pixel``, the size of a pixel on the plane at the image's centre. Overlaps are shares of what the
 lens sees of the plane along its middle row or column, so that a barrel lens takes longer steps.
 """
 
@@ -38,18 +38,18 @@ def pair_poses(
     tilt: Tilt = (0.0, 0.0),
     texels_per_pixel: float = 1.0,
 ) -> Poses:
-    """Two pictures.
+    """Two images.
 
     Parameters
     ----------
     overlap : float
-        Share of the extent along ``direction`` that both pictures show.
+        Share of the extent along ``direction`` that both images show.
     yaw : float
-        Of the second picture, radians.
+        Of the second image, radians.
     direction : float
         Where the camera goes, radians from the plane's X axis.
     scale : float
-        Height of the second picture in units of the first's.
+        Height of the second image in units of the first's.
     """
     along = np.array([np.cos(direction), np.sin(direction)])
     extent = np.min(_extent(lens, tilt, texels_per_pixel) / np.maximum(np.abs(along), 1e-12))
@@ -76,9 +76,9 @@ def grid_poses(
     overlap : float
         Of neighbours, along both axes.
     yaw : float
-        Each picture is turned by a random angle within ± this, radians.
+        Each image is turned by a random angle within ± this, radians.
     shift : float
-        Each picture is moved by a random share, within ± this, of the step to its neighbours.
+        Each image is moved by a random share, within ± this, of the step to its neighbours.
     seed : int
         Of yaw and shift.
     """
@@ -139,9 +139,9 @@ def drive_poses(
     forward : array_like of shape (N - 1,)
         Length of each step in units of the step that ``overlap`` allows; negative in reverse.
     overlap : float
-        Of consecutive pictures for a step of 1, along the picture's shorter side.
+        Of consecutive images for a step of 1, along the image's shorter side.
     heading : float
-        At the start, radians from the plane's X axis; the robot drives along its picture's u axis.
+        At the start, radians from the plane's X axis; the robot drives along its image's u axis.
     """
     turns, steps = np.asarray(turning, dtype=np.float64), np.asarray(forward, dtype=np.float64)
     length = (1.0 - overlap) * _extent(lens, tilt, texels_per_pixel).min()
@@ -172,9 +172,9 @@ def survey_poses(
     Parameters
     ----------
     count : int
-        Pictures; the last lane may be shorter.
+        Images; the last lane may be shorter.
     forward_overlap, side_overlap : float
-        Within a lane and between lanes. The drone flies towards the top of its picture.
+        Within a lane and between lanes. The drone flies towards the top of its image.
     there_and_back : bool
         Whether the drone turns round at the end of each lane; it flies back in reverse otherwise.
     height_jitter : float
@@ -232,7 +232,7 @@ def joined(*parts: Poses) -> Poses:
 
 
 def _extent(lens: Lens, tilt: Tilt, texels_per_pixel: float) -> FloatArray:
-    """Width and height in texels that a picture shows of the plane along its middle row and column."""
+    """Width and height in texels that an image shows of the plane along its middle row and column."""
     width, height = lens.image_size
     (cx, cy) = (width - 1) / 2, (height - 1) / 2
     ends = [(-0.5, cy), (width - 0.5, cy), (cx, -0.5), (cx, height - 0.5)]
@@ -240,7 +240,7 @@ def _extent(lens: Lens, tilt: Tilt, texels_per_pixel: float) -> FloatArray:
     left, right, top, bottom = texels_of_pixels(lens, pose.from_plane()[0], ends)
     extent = np.array([np.linalg.norm(right - left), np.linalg.norm(bottom - top)])
     if not np.isfinite(extent).all():
-        raise ArgumentError("the picture sees beyond the horizon or beyond its lens")
+        raise ArgumentError("the image sees beyond the horizon or beyond its lens")
     return extent
 
 

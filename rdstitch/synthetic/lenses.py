@@ -164,7 +164,7 @@ def best_division_model(lens: Lens) -> tuple[Camera, float]:
     camera : Camera
         With the focal length of the lens, from which the scale of the fit may differ.
     rms : float
-        Of the distances in the picture, pixels.
+        Of the distances in the image, pixels.
     """
     exact, _ = fit_lens(lens.distort, Camera(lens.image_size, center=lens.center, focal=focal_length(lens)))
     distortion, rms, _ = exact.one_parameter_fit()

@@ -1,4 +1,4 @@
-"""Pictures of a camera that is turned on the spot: the scene is a sphere of texture around it, and balls before it.
+"""Images of a camera that is turned on the spot: the scene is a sphere of texture around it, and balls before it.
 
 The scene has x to the right, y down and z ahead, like a camera that looks straight ahead. Its texture is laid out by
 longitude, which grows to the right, and latitude, which grows downwards, both in equal steps.
@@ -39,12 +39,12 @@ def camera_rotations(heading: ArrayLike, pitch: ArrayLike = 0.0, roll: ArrayLike
 def panorama_rotations(
     count: int, step: float, *, rows: int = 1, row_pitch: float = 0.5, jitter: float = 0.05, seed: int = 0
 ) -> FloatArray:
-    """Rotations (rows count, 3, 3) of pictures taken by hand, one row after the other.
+    """Rotations (rows count, 3, 3) of images taken by hand, one row after the other.
 
     Parameters
     ----------
     count : int
-        Pictures of a row.
+        Images of a row.
     step : float
         Between neighbours, radians.
     rows : int
@@ -84,7 +84,7 @@ class _Around:
 
 @dataclass(frozen=True)
 class TurningSequence(Sequence):
-    """Pictures of a camera that turns about its centre; made by :func:`turning_sequence`.
+    """Images of a camera that turns about its centre; made by :func:`turning_sequence`.
 
     Attributes
     ----------
@@ -102,13 +102,13 @@ class TurningSequence(Sequence):
     near: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
 
     def to_plane(self, index: int, points: ArrayLike) -> FloatArray:
-        """Measured pixels (..., 2) of one picture to texels of the sphere; NaN outside the lens."""
+        """Measured pixels (..., 2) of one image to texels of the sphere; NaN outside the lens."""
         rays = self.rays(index, points)
         if self.position[index].any():
             rays = _first_hit(self.position[index], rays, self.near)
         ahead = self.rotations[index][2]
         middle = np.arctan2(ahead[0], ahead[2])
-        # The longitude relative to the picture's centre has no jump within the picture.
+        # The longitude relative to the image's centre has no jump within the image.
         longitude = middle + np.mod(np.arctan2(rays[..., 0], rays[..., 2]) - middle + np.pi, 2 * np.pi) - np.pi
         latitude = np.arctan2(rays[..., 1], np.hypot(rays[..., 0], rays[..., 2]))
         width, height = self.texture.size[0] / 2, self.texture.size[1]
@@ -117,7 +117,7 @@ class TurningSequence(Sequence):
         return np.stack([x, y], axis=-1)
 
     def rays(self, index: int, points: ArrayLike) -> FloatArray:
-        """Directions (..., 3) in the scene of measured pixels (..., 2) of one picture, of length 1."""
+        """Directions (..., 3) in the scene of measured pixels (..., 2) of one image, of length 1."""
         pinhole = (self.lens.undistort(points) - np.asarray(self.lens.center)) / focal_length(self.lens)
         rays = np.concatenate([pinhole, np.ones((*pinhole.shape[:-1], 1))], axis=-1)
         rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -136,7 +136,7 @@ def turning_sequence(
     position: ArrayLike | None = None,
     near: ArrayLike = (),
 ) -> TurningSequence:
-    """Pictures that a camera takes of a sphere around it.
+    """Images that a camera takes of a sphere around it.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def turning_sequence(
     seed : int
         Of the texture and the noise.
     texels_per_pixel : float
-        Texels at the horizon for each pixel at the picture's centre.
+        Texels at the horizon for each pixel at the image's centre.
     channels : int
         1 for grey, 3 for RGB.
     position : array_like of shape (N, 3), optional

@@ -1,7 +1,7 @@
-"""Where the camera of a sequence is in each picture.
+"""Where the camera of a sequence is in each image.
 
 The plane's coordinates are the pixels of its texture ("texels"): X to the right, Y down, the centre of the top-left
-texel at (0, 0), as in a picture. The camera looks down on it: with the tilt ``R``, the yaw φ, the foot of the camera
+texel at (0, 0), as in an image. The camera looks down on it: with the tilt ``R``, the yaw φ, the foot of the camera
 ``(cx, cy)`` and its height ``h`` in texels, the ray of a plane point is ``p ~ R Rz(φ) (X - cx, Y - cy, h)``.
 """
 
@@ -21,7 +21,7 @@ from rdstitch.synthetic.lenses import Lens, focal_length
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses of N pictures.
+    """Poses of N images.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Poses:
 
     @classmethod
     def of(cls, position: ArrayLike, height: ArrayLike, yaw: ArrayLike = 0.0, tilt: ArrayLike = (0.0, 0.0)) -> Self:
-        """Poses at positions (N, 2); height, yaw and tilt may be shared by all pictures."""
+        """Poses at positions (N, 2); height, yaw and tilt may be shared by all images."""
         where = np.array(position, dtype=np.float64).reshape(-1, 2)
         n = len(where)
         return cls(
@@ -73,7 +73,7 @@ class Poses:
         return rotation_from_tilt(self.tilt) @ to_camera
 
     def motion(self, first: int, second: int) -> PlanarMotion:
-        """Planar motion between two pictures of the same tilt.
+        """Planar motion between two images of the same tilt.
 
         Raises
         ------
@@ -81,7 +81,7 @@ class Poses:
             When the tilts differ.
         """
         if not np.array_equal(self.tilt[first], self.tilt[second]):
-            raise ArgumentError(f"pictures {first} and {second} have different tilts: that is no planar motion")
+            raise ArgumentError(f"images {first} and {second} have different tilts: that is no planar motion")
         c, s = np.cos(self.yaw[first]), np.sin(self.yaw[first])
         shift = np.array([[c, -s], [s, c]]) @ (self.position[second] - self.position[first])
         tx, ty = shift / self.height[first]
@@ -93,7 +93,7 @@ class Poses:
     def shaken(
         self, *, seed: int, position: float = 0.0, height: float = 0.0, yaw: float = 0.0, tilt: float = 0.0
     ) -> Self:
-        """The same poses with independent uniform jitter on each picture.
+        """The same poses with independent uniform jitter on each image.
 
         Parameters
         ----------
@@ -122,7 +122,7 @@ class Poses:
 
 
 def plane_outline(lens: Lens, from_plane: FloatArray, points_per_side: int = 32) -> FloatArray:
-    """Outer border of a picture on the plane, texels, shape (4 points_per_side, 2); NaN beyond horizon and lens.
+    """Outer border of an image on the plane, texels, shape (4 points_per_side, 2); NaN beyond horizon and lens.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def texels_of_pixels(lens: Lens, from_plane: FloatArray, points: ArrayLike) -> F
 
 
 def pixels_of_texels(lens: Lens, from_plane: FloatArray, points: ArrayLike) -> FloatArray:
-    """Texels (N, 2) to measured pixels (..., N, 2), also outside the picture; NaN where the camera cannot see them."""
+    """Texels (N, 2) to measured pixels (..., N, 2), also outside the image; NaN where the camera cannot see them."""
     x = np.asarray(points, dtype=np.float64)
     homogeneous = np.concatenate([x, np.ones((*x.shape[:-1], 1))], axis=-1)
     pinhole = project(homogeneous @ np.swapaxes(from_plane, -2, -1))
@@ -148,22 +148,22 @@ def pixels_of_texels(lens: Lens, from_plane: FloatArray, points: ArrayLike) -> F
 
 
 def fit_to_plane(lens: Lens, poses: Poses, margin: int = 16) -> tuple[Poses, tuple[int, int]]:
-    """Move poses so that their pictures start ``margin`` texels inside the plane.
+    """Move poses so that their images start ``margin`` texels inside the plane.
 
     Returns
     -------
     poses : Poses
     size : (int, int)
-        Width and height in texels of the plane that holds all pictures with the margin on every side.
+        Width and height in texels of the plane that holds all images with the margin on every side.
 
     Raises
     ------
     ArgumentError
-        When a picture sees the horizon.
+        When an image sees the horizon.
     """
     outlines = plane_outline(lens, poses.from_plane())
     if np.isnan(outlines).any():
-        raise ArgumentError("a picture sees beyond the horizon or beyond its lens; no plane can fill it")
+        raise ArgumentError("an image sees beyond the horizon or beyond its lens; no plane can fill it")
     low = np.floor(outlines.min(axis=(0, 1))) - margin
     width, height = np.ceil(outlines.max(axis=(0, 1))) + margin - low + 1
     return poses.moved(-low), (int(width), int(height))

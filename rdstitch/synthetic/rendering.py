@@ -1,4 +1,4 @@
-"""Pictures of a textured plane, as a camera with known lens and pose sees it.
+"""Images of a textured plane, as a camera with known lens and pose sees it.
 
 Every output pixel is the mean of a grid of samples over its area, each traced through the lens to the plane and
 interpolated in the texture: as an ideal sensor does it, and without aliasing.
@@ -23,7 +23,7 @@ from rdstitch.synthetic.textures import LinearPixels, Texture
 
 _PIXELS_PER_STRIP = 400_000
 _MAX_SAMPLES_PER_SIDE = 6
-# A place that is in no picture, for rays that meet nothing.
+# A place that is in no image, for rays that meet nothing.
 _NOWHERE = -1e6
 # A ray that ends so far from a point, texels, does not see it.
 _HIDDEN = 0.5
@@ -33,12 +33,12 @@ _APRON = 3
 
 @dataclass(frozen=True)
 class Photometry:
-    """How light becomes a picture.
+    """How light becomes an image.
 
     Attributes
     ----------
     gain : float or ndarray of shape (N,)
-        Exposure, one for all pictures or one a picture.
+        Exposure, one for all images or one an image.
     vignetting : float
         Share of the light that is missing at the corners; it grows with the square of the radius.
     gamma : float
@@ -60,19 +60,19 @@ class Photometry:
 
     def __post_init__(self) -> None:
         if self.bits not in (8, 16):
-            raise ArgumentError(f"pictures have 8 or 16 bits, not {self.bits}")
+            raise ArgumentError(f"images have 8 or 16 bits, not {self.bits}")
 
 
 @dataclass(frozen=True)
 class Sequence:
-    """Pictures of a plane, rendered on demand, and their ground truth.
+    """Images of a plane, rendered on demand, and their ground truth.
 
     Attributes
     ----------
     texture : Texture
         The plane. Its coordinates, texels, are the plane's; see :mod:`rdstitch.synthetic.poses`.
     lens : Lens
-        Of all pictures; a :class:`rdstitch.camera.Camera` with a focal length, or another lens.
+        Of all images; a :class:`rdstitch.camera.Camera` with a focal length, or another lens.
     poses : Poses
     photometry : Photometry
     relief : Relief, optional
@@ -81,7 +81,7 @@ class Sequence:
         Of the noise.
     samples : int, optional
         Samples along each side of a pixel; if not given, as many as the texture needs, at least 2. With 1, large
-        pictures are rendered faster, and alias a little.
+        images are rendered faster, and alias a little.
     """
 
     texture: Texture
@@ -100,37 +100,37 @@ class Sequence:
         return self.poses.from_plane()
 
     def from_plane(self, index: int) -> FloatArray:
-        """Texels to focal-normalized undistorted points of one picture, shape (3, 3)."""
+        """Texels to focal-normalized undistorted points of one image, shape (3, 3)."""
         return np.asarray(self._from_plane[index])
 
     def to_plane(self, index: int, points: ArrayLike) -> FloatArray:
-        """Measured pixels (N, 2) of one picture to points of the plane, texels; NaN beyond the horizon or the lens."""
+        """Measured pixels (N, 2) of one image to points of the plane, texels; NaN beyond the horizon or the lens."""
         return texels_of_pixels(self.lens, self.from_plane(index), points)
 
     def to_ground(self, index: int, points: ArrayLike) -> FloatArray:
-        """Measured pixels (N, 2) of one picture to the texels that they show; :meth:`to_plane` on a plane."""
+        """Measured pixels (N, 2) of one image to the texels that they show; :meth:`to_plane` on a plane."""
         return self._on_ground(index, self.to_plane(index, points))
 
-    def ground_to_picture(self, index: int, points: ArrayLike) -> FloatArray:
-        """Points of the ground, texels (N, 2), to measured pixels of one picture; NaN where something hides them."""
+    def ground_to_image(self, index: int, points: ArrayLike) -> FloatArray:
+        """Points of the ground, texels (N, 2), to measured pixels of one image; NaN where something hides them."""
         ground = np.asarray(points, dtype=np.float64)
         if self.relief is None:
-            return self.to_picture(index, ground)
+            return self.to_image(index, ground)
         position, camera_height = self.poses.position[index], float(self.poses.height[index])
         share = 1.0 - self.relief.at(ground) / camera_height
         foot = position + (ground - position) / share[:, None]
         hidden = np.linalg.norm(self._on_ground(index, foot) - ground, axis=1) > _HIDDEN
-        return np.where(hidden[:, None], np.nan, self.to_picture(index, foot))
+        return np.where(hidden[:, None], np.nan, self.to_image(index, foot))
 
-    def to_picture(self, index: int, points: ArrayLike) -> FloatArray:
-        """Points of the plane, texels (N, 2), to measured pixels of one picture, also outside its border.
+    def to_image(self, index: int, points: ArrayLike) -> FloatArray:
+        """Points of the plane, texels (N, 2), to measured pixels of one image, also outside its border.
 
         NaN where it cannot see them. Relief does not matter: the points lie on the plane.
         """
         return pixels_of_texels(self.lens, self.from_plane(index), points)
 
     def frame(self, index: int) -> NDArray[Any]:
-        """Render one picture.
+        """Render one image.
 
         Returns
         -------
@@ -141,22 +141,22 @@ class Sequence:
         settings = self.photometry
         rng = np.random.default_rng((self.seed, index))
         full = 2**settings.bits - 1
-        picture = np.empty((height, width, self.texture.channels), dtype=np.uint8 if settings.bits == 8 else np.uint16)
+        image = np.empty((height, width, self.texture.channels), dtype=np.uint8 if settings.bits == 8 else np.uint16)
         rows = max(1, _PIXELS_PER_STRIP // width)
         for top in range(0, height, rows):
             bottom = min(top + rows, height)
             light = self._light(index, top, bottom)
             if settings.noise > 0.0:
                 light += settings.noise * rng.standard_normal(light.shape, dtype=np.float32)
-            np.rint(np.clip(light, 0.0, 1.0, out=light) * np.float32(full), out=picture[top:bottom], casting="unsafe")
-        return picture[:, :, 0] if picture.shape[2] == 1 else picture
+            np.rint(np.clip(light, 0.0, 1.0, out=light) * np.float32(full), out=image[top:bottom], casting="unsafe")
+        return image[:, :, 0] if image.shape[2] == 1 else image
 
     def frames(self) -> list[NDArray[Any]]:
-        """Render all pictures."""
+        """Render all images."""
         return [self.frame(index) for index in range(len(self))]
 
     def write(self, folder: str | Path, name: str = "frame_{:04d}.png") -> list[Path]:
-        """Render all pictures into a folder, one at a time.
+        """Render all images into a folder, one at a time.
 
         Parameters
         ----------
@@ -168,13 +168,13 @@ class Sequence:
         Raises
         ------
         OutputError
-            When a picture cannot be written.
+            When an image cannot be written.
         """
         paths = []
         for index in range(len(self)):
             path = Path(folder) / name.format(index)
-            picture = self.frame(index)
-            bgr = picture if picture.ndim == 2 else np.ascontiguousarray(picture[:, :, ::-1])
+            image = self.frame(index)
+            bgr = image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
             done, encoded = cv2.imencode(path.suffix, bgr)
             if not done:
                 raise OutputError(f"{path}: cannot be encoded")
@@ -186,7 +186,7 @@ class Sequence:
         return paths
 
     def reachable(self, scale: float = 1.0) -> NDArray[np.bool_]:
-        """Which texels any picture shows.
+        """Which texels any image shows.
 
         Parameters
         ----------
@@ -205,7 +205,7 @@ class Sequence:
         return mask.astype(np.bool_)
 
     def _light(self, index: int, top: int, bottom: int) -> LinearPixels:
-        """Rows ``top`` to ``bottom`` of a picture without noise: what falls on the sensor."""
+        """Rows ``top`` to ``bottom`` of an image without noise: what falls on the sensor."""
         settings = self.photometry
         width, height = self.lens.image_size
         # Blur needs the rows beyond the strip.
@@ -239,7 +239,7 @@ class Sequence:
         return np.divide(total, np.float32(count**2), out=total)
 
     def _on_ground(self, index: int, foot: FloatArray) -> FloatArray:
-        """Texels (..., 2) that rays of a picture show which would meet the plane at ``foot``."""
+        """Texels (..., 2) that rays of an image show which would meet the plane at ``foot``."""
         if self.relief is None:
             return foot
         return self.relief.seen_from(self.poses.position[index], float(self.poses.height[index]), foot)
@@ -283,7 +283,7 @@ def sequence_over(
     seed: int = 0,
     margin: int = 16,
 ) -> Sequence:
-    """Pictures of a plane that is made as large as they need it.
+    """Images of a plane that is made as large as they need it.
 
     Parameters
     ----------
@@ -295,12 +295,12 @@ def sequence_over(
     relief : Relief or callable, optional
         Heights, or what makes them for the size of the plane, such as ``lambda size: hills(size, 1, height=40.0)``.
     margin : int
-        Texels that are left around what the pictures show.
+        Texels that are left around what the images show.
 
     Raises
     ------
     ArgumentError
-        When a picture sees the horizon, or when a given texture is too small.
+        When an image sees the horizon, or when a given texture is too small.
     """
     moved, size = fit_to_plane(lens, poses, margin)
     settings = Photometry() if photometry is None else photometry
@@ -309,6 +309,6 @@ def sequence_over(
     else:
         texture, spare = plane, np.array(plane.size) - size
         if (spare < 0).any():
-            raise ArgumentError(f"the texture has {plane.size} texels, the pictures need {size}")
+            raise ArgumentError(f"the texture has {plane.size} texels, the images need {size}")
         moved = moved.moved(spare // 2)
     return Sequence(texture, lens, moved, settings, relief(texture.size) if callable(relief) else relief, seed)

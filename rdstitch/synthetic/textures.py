@@ -1,4 +1,4 @@
-"""Planes to look at: procedural textures of any size, hopeless ones, and any given picture.
+"""Planes to look at: procedural textures of any size, hopeless ones, and any given image.
 
 A texture answers for any rectangle of itself, so that a plane of a gigapixel need not be in memory. Values are grey
 levels or RGB in [0, 1].
@@ -24,7 +24,7 @@ _SUBPIXEL_BITS = 4
 
 
 class Texture(Protocol):
-    """A picture of the plane."""
+    """An image of the plane."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -39,8 +39,8 @@ class Texture(Protocol):
 
 
 @dataclass(frozen=True)
-class PictureTexture:
-    """A picture as texture.
+class ImageTexture:
+    """An image as texture.
 
     Attributes
     ----------
@@ -154,7 +154,7 @@ def ground(size: tuple[int, int], seed: int, channels: int = 3) -> Texture:
     Parameters
     ----------
     size : (int, int)
-        Width and height, texels. Up to 16 megapixels are held as one picture, larger ground is an
+        Width and height, texels. Up to 16 megapixels are held as one image, larger ground is an
         :class:`EndlessTexture`.
     seed : int
         Equal seeds give equal ground.
@@ -164,26 +164,26 @@ def ground(size: tuple[int, int], seed: int, channels: int = 3) -> Texture:
     if size[0] * size[1] > 16_000_000:
         return EndlessTexture(size, seed, channels)
     rng = np.random.default_rng(seed)
-    return PictureTexture(_grained(_dead_leaves(rng, size, channels, wrap=False), rng))
+    return ImageTexture(_grained(_dead_leaves(rng, size, channels, wrap=False), rng))
 
 
 def blank(size: tuple[int, int], level: float = 0.5, channels: int = 1) -> Texture:
     """No texture at all."""
-    return PictureTexture(np.full((size[1], size[0], channels), level, dtype=np.float32))
+    return ImageTexture(np.full((size[1], size[0], channels), level, dtype=np.float32))
 
 
 def gradient(size: tuple[int, int], channels: int = 1) -> Texture:
     """Smooth shading without a single corner: a sky, or a white wall."""
     x = np.linspace(0.2, 0.6, size[0], dtype=np.float32)
     y = np.linspace(0.0, 0.3, size[1], dtype=np.float32)
-    return PictureTexture(np.repeat((y[:, None] + x)[:, :, None], channels, axis=2))
+    return ImageTexture(np.repeat((y[:, None] + x)[:, :, None], channels, axis=2))
 
 
 def repeated(size: tuple[int, int], seed: int, period: int = 96, channels: int = 3) -> Texture:
     """One tile over and over: rich in corners, yet every match is ambiguous."""
     tile = _periodic_ground(period, (seed, period), channels)
     rows, columns = -(-size[1] // period), -(-size[0] // period)
-    return PictureTexture(np.tile(tile, (rows, columns, 1))[: size[1], : size[0]].copy())
+    return ImageTexture(np.tile(tile, (rows, columns, 1))[: size[1], : size[0]].copy())
 
 
 @lru_cache(maxsize=8)
@@ -198,7 +198,7 @@ def _periodic_ground(period: int, seed: tuple[int, int], channels: int) -> Linea
 def _dead_leaves(
     rng: np.random.Generator, size: tuple[int, int], channels: int, *, wrap: bool, cover: float = 3.0
 ) -> NDArray[np.uint8]:
-    """Overlapping patches that cover the picture ``cover`` times; with ``wrap``, also across its borders."""
+    """Overlapping patches that cover the image ``cover`` times; with ``wrap``, also across its borders."""
     width, height = size
     smallest, largest = 2.5, max(6.0, min(160.0, min(size) / 6.0))
     mean_area = np.pi * 2.0 * np.log(largest / smallest) / (smallest**-2 - largest**-2)
@@ -273,5 +273,5 @@ def _grained(patches: NDArray[np.uint8], rng: np.random.Generator, strength: flo
     white = rng.standard_normal((height, width), dtype=np.float32)
     grain = np.fft.irfft2(np.fft.rfft2(white) / frequency, s=(height, width))
     grain = (strength * grain / grain.std()).astype(np.float32)
-    picture: LinearPixels = patches.astype(np.float32) / np.float32(255.0) + grain[:, :, None]
-    return np.clip(picture, 0.0, 1.0, out=picture)
+    image: LinearPixels = patches.astype(np.float32) / np.float32(255.0) + grain[:, :, None]
+    return np.clip(image, 0.0, 1.0, out=image)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.features.picture import PreparedPicture
+from rdstitch.features.prepared_image import PreparedImage
 
 _CORNERS, _QUALITY, _SPACING = 200, 0.005, 0.02  # the spacing is in sides of the image
 _WINDOW, _LEVELS = (15, 15), 3
@@ -23,11 +23,11 @@ class CornerFlow:
     """Corners of the last keyframe, and where they are in the latest frame."""
 
     def __init__(self) -> None:
-        self._last: PreparedPicture | None = None
+        self._last: PreparedImage | None = None
         self._from = self._at = np.empty((0, 1, 2), dtype=np.float32)
         self._count = 0
 
-    def begin(self, keyframe: PreparedPicture | None) -> None:
+    def begin(self, keyframe: PreparedImage | None) -> None:
         """Take the corners of a keyframe; None: there are none to be followed."""
         self._last, self._count = keyframe, 0
         if keyframe is None:
@@ -37,7 +37,7 @@ class CornerFlow:
         self._from = self._at = corners[_usable(keyframe, corners)]
         self._count = len(self._from)
 
-    def follow(self, frame: PreparedPicture) -> tuple[FloatArray, FloatArray] | None:
+    def follow(self, frame: PreparedImage) -> tuple[FloatArray, FloatArray] | None:
         """Where corners of the keyframe were, and where they are in the next frame, (N, 2) each, pixels of ``grey``.
 
         None where too few of them can be followed.
@@ -70,7 +70,7 @@ def fitted_affine(there: FloatArray, here: FloatArray, threshold: float) -> tupl
     return np.asarray(motion, dtype=np.float64), inliers
 
 
-def _moved(before: PreparedPicture, after: PreparedPicture, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _moved(before: PreparedImage, after: PreparedImage, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where corners (N, 1, 2) of one frame are in another, and whether they were found there (N,)."""
     at, status, _ = cv2.calcOpticalFlowPyrLK(
         before.grey, after.grey, corners, np.empty_like(corners), winSize=_WINDOW, maxLevel=_LEVELS
@@ -78,7 +78,7 @@ def _moved(before: PreparedPicture, after: PreparedPicture, corners: np.ndarray)
     return np.asarray(at), np.asarray(status[:, 0] > 0)
 
 
-def _usable(frame: PreparedPicture, corners: np.ndarray) -> np.ndarray:
+def _usable(frame: PreparedImage, corners: np.ndarray) -> np.ndarray:
     """Which corners (N, 1, 2) lie in the frame and clear of its mask."""
     points = corners[:, 0].astype(np.float64)
     inside = (points >= 0.0).all(axis=1) & (points <= np.array(frame.grey.shape[::-1]) - 1.0).all(axis=1)

@@ -1,4 +1,4 @@
-"""Where one picture lies on the plane of the map, and similarities between the planes of two alignments."""
+"""Where one image lies on the plane of the map, and similarities between the planes of two alignments."""
 
 import math
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.radial_homography import to_plane
 
-_SAMPLES = 5  # points of a picture's outline, a side, by which two planes are brought together
+_SAMPLES = 5  # points of an image's outline, a side, by which two planes are brought together
 
 
 @dataclass(frozen=True)
@@ -36,14 +36,14 @@ class CameraPose:
 
 @dataclass(frozen=True)
 class Placement:
-    """A picture on the plane.
+    """An image on the plane.
 
     Attributes
     ----------
     camera : Camera
         With the λ that the homography belongs to.
     homography : ndarray of shape (3, 3)
-        From undistorted normalized coordinates of the picture to the plane.
+        From undistorted normalized coordinates of the image to the plane.
     focal : float or None
         Focal length in half diagonals; None where the model has none.
     """
@@ -53,7 +53,7 @@ class Placement:
     focal: float | None
 
     def to_plane(self, points: FloatArray) -> FloatArray:
-        """Where points (N, 2) of the picture, pixels, lie on the plane."""
+        """Where points (N, 2) of the image, pixels, lie on the plane."""
         return to_plane(self.camera, self.homography, points)
 
     @property
@@ -67,7 +67,7 @@ class Placement:
         columns = np.linalg.inv(self.homography) / np.array([[self.focal], [self.focal], [1.0]])
         columns /= math.copysign(float(np.linalg.norm(columns[:, :2]) / math.sqrt(2.0)), np.linalg.det(columns))
         first, second, last = columns.T
-        # The nearest rotation, since the homography of a picture on its own has none exactly.
+        # The nearest rotation, since the homography of an image on its own has none exactly.
         left, _, right = np.linalg.svd(np.column_stack([first, second, np.cross(first, second)]))
         rotation = left @ right
         x, y, height = rotation.T @ last * np.array([-1.0, -1.0, 1.0])
@@ -101,7 +101,7 @@ class PlaneSimilarity:
 
     @classmethod
     def between(cls, before: Sequence[Placement], after: Sequence[Placement]) -> Self:
-        """The one that brings the plane of some placements to that of other placements of the same pictures."""
+        """The one that brings the plane of some placements to that of other placements of the same images."""
         here, there = (
             np.concatenate([placed.to_plane(placed.camera.outline(_SAMPLES)) for placed in side])
             for side in (before, after)
@@ -116,5 +116,5 @@ class PlaneSimilarity:
         return np.array([[a.real, -a.imag, b.real], [a.imag, a.real, b.imag], [0.0, 0.0, 1.0]])
 
     def applied(self, placed: Placement) -> Placement:
-        """The same picture after the plane was moved."""
+        """The same image after the plane was moved."""
         return Placement(placed.camera, self.matrix @ placed.homography, placed.focal)

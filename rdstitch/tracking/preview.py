@@ -1,4 +1,4 @@
-"""A picture of what has been seen so far, painted frame by frame, of bounded size."""
+"""An image of what has been seen so far, painted frame by frame, of bounded size."""
 
 from typing import Any
 
@@ -72,7 +72,7 @@ class Preview:
         self._painted[box][shown] = 255
 
     def _make_room(self, outline: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Enlarge the picture so that an outline (K, 2) of the plane lies in it; its box in pixels."""
+        """Enlarge the image so that an outline (K, 2) of the plane lies in it; its box in pixels."""
         while True:
             low = np.floor(outline.min(axis=0) * self._scale).astype(np.intp)
             high = np.ceil(outline.max(axis=0) * self._scale).astype(np.intp) + 1
@@ -99,7 +99,7 @@ class Preview:
 
 
 def _moved(pixels: NDArray[np.uint8], shift: NDArray[np.intp], size: NDArray[np.intp]) -> NDArray[np.uint8]:
-    """A larger picture (of width and height ``size``) with the old one at some place of it."""
+    """A larger image (of width and height ``size``) with the old one at some place of it."""
     larger = np.zeros((size[1], size[0], *pixels.shape[2:]), dtype=np.uint8)
     height, width = pixels.shape[:2]
     if width and height:
@@ -108,7 +108,7 @@ def _moved(pixels: NDArray[np.uint8], shift: NDArray[np.intp], size: NDArray[np.
 
 
 def _as_rgb(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """Eight bits and three channels of any picture."""
+    """Eight bits and three channels of any image."""
     scaled = image
     if image.dtype != np.uint8:
         full = 65535.0 if image.dtype == np.uint16 else 1.0

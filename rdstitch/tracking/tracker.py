@@ -11,7 +11,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.errors import RegistrationError
 from rdstitch.features import Features, Matcher
-from rdstitch.features.picture import PreparedPicture
+from rdstitch.features.prepared_image import PreparedImage
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
 from rdstitch.matching.options import PairOptions
@@ -26,7 +26,7 @@ _SEARCHED = 12  # last keyframes among which a lost frame looks for its place
 _FIRST_ALIGNMENT = 5  # keyframes that the first alignment takes
 _GROWTH = 1.5  # from one alignment to the next, while λ is not known
 _ALIGNMENT_INTERVAL = 24  # keyframes from one alignment to the next afterwards
-_KNOWN_STD = 0.002  # of λ: a tenth of a pixel in the corner of a picture of 640 x 480 pixels, over half of it
+_KNOWN_STD = 0.002  # of λ: a tenth of a pixel in the corner of an image of 640 x 480 pixels, over half of it
 _MIN_KEYFRAMES_FOR_LENS = 12  # keyframes that λ is not known before
 _KEYFRAME_OVERLAP = 0.8  # share of a frame that its last keyframe shows, below which it becomes a keyframe
 _GRID = 8  # points a side by which that is measured
@@ -133,7 +133,7 @@ class Tracker:
         return {keyframe.number for keyframe in self._keyframes if keyframe.placement is None}
 
     def add(
-        self, features: Features | Callable[[], Features], camera: Camera, picture: PreparedPicture | None = None
+        self, features: Features | Callable[[], Features], camera: Camera, image: PreparedImage | None = None
     ) -> list[Tracked]:
         """Register the next frame; it comes last, after those before it that only now have found their place.
 
@@ -144,22 +144,22 @@ class Tracker:
             followed from frame to frame, do not place it, or it becomes a keyframe.
         camera : Camera
             Of the size that the features' points are measured at.
-        picture : PreparedPicture, optional
+        image : PreparedImage, optional
             The frame at that size, in which corners are followed; without it none are.
         """
         number, self._count = self._count, self._count + 1
-        if (followed := self._followed(number, camera, picture)) is not None:
+        if (followed := self._followed(number, camera, image)) is not None:
             return [followed]
         results = self._registered_frame(_Keyframe(number, camera, features() if callable(features) else features))
         if results[-1].keyframe:
-            self._flow.begin(picture)
+            self._flow.begin(image)
         return results
 
-    def _followed(self, number: int, camera: Camera, picture: PreparedPicture | None) -> Tracked | None:
+    def _followed(self, number: int, camera: Camera, image: PreparedImage | None) -> Tracked | None:
         """The frame placed by the corners of the last keyframe, where these show enough of it."""
-        matched = None if picture is None else self._flow.follow(picture)
+        matched = None if image is None else self._flow.follow(image)
         last = self._keyframes[-1] if self._keyframes else None
-        if matched is None or last is None or picture is None or picture.grey.shape[::-1] != camera.image_size:
+        if matched is None or last is None or image is None or image.grey.shape[::-1] != camera.image_size:
             return None
         frame = _Keyframe(number, camera, last.features)
         if last.placement is None and self.waits:

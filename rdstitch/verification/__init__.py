@@ -1,1 +1,1 @@
-"""Does a registration hold: do the pictures agree where it puts them, and could they lie elsewhere?"""
+"""Does a registration hold: do the images agree where it puts them, and could they lie elsewhere?"""

@@ -1,9 +1,9 @@
-"""Of two motions in the same pictures, which is the plane's?
+"""Of two motions in the same images, which is the plane's?
 
-How much of the overlaps looks alike does not say: what moves with the camera is seen by all pictures, and seen whole;
+How much of the overlaps looks alike does not say: what moves with the camera is seen by all images, and seen whole;
 the plane behind it is seen by neighbours, and hidden where they overlap. What tells is what contradicts a motion.
-Something that hardly moves is put over nearly all of the next picture, and most of that looks different: it fills less
-than half of the pictures, for certain. The plane is put over a part only, and may fill all that is not seen there.
+Something that hardly moves is put over nearly all of the next image, and most of that looks different: it fills less
+than half of the images, for certain. The plane is put over a part only, and may fill all that is not seen there.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,17 +21,17 @@ from rdstitch.radial_homography import RadialHomography, from_plane, to_plane
 from rdstitch.registration import Registration
 from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
 from rdstitch.scipy_parts import spatial
-from rdstitch.verification.overlap_check import placed_picture
-from rdstitch.verification.photometric_agreement import CELL, Agreement, ComparedCells, PlacedPicture, compare_cells
+from rdstitch.verification.overlap_check import placed_image
+from rdstitch.verification.photometric_agreement import CELL, Agreement, ComparedCells, ComparedImage, compare_cells
 
 Pair = tuple[int, int]
 
 FILLED_BY_A_PLANE = 0.5
-"""Share of the pictures that the plane fills at least: less is something in front of it."""
+"""Share of the images that the plane fills at least: less is something in front of it."""
 
 _MIN_HELD, _MIN_HELD_BY_PAIR = 0.3, 0.15
 """Share that looks alike of what the other motion does not explain, in all pairs together and in one. Planes reach 0.37
-to 1, and 0.18 to 1, where a vehicle hides most of what two pictures share of them too; chance reaches 0.07."""
+to 1, and 0.18 to 1, where a vehicle hides most of what two images share of them too; chance reaches 0.07."""
 
 _MIN_CELLS = 8
 """Cells, below which there is too little to see."""
@@ -40,13 +40,13 @@ _NEIGHBOURS, _MIN_NEIGHBOURS = 5, 2
 """Cells around a place, and how many of them look alike at least where a motion holds, or may hold."""
 
 _REACH = 2.0 * CELL
-"""Pixels of the compared pictures that these may be away."""
+"""Pixels of the compared images that these may be away."""
 
 MIN_INLIERS = 12
 """Inliers of a motion: four define its homography, and eight more by chance have not been seen."""
 
-_PICTURES_AT_ONCE = 64
-"""Pictures that are kept while pairs are compared, 1 MB each."""
+_IMAGES_AT_ONCE = 64
+"""Images that are kept while pairs are compared, 1 MB each."""
 
 
 @dataclass(frozen=True)
@@ -56,14 +56,14 @@ class Cells(ComparedCells):
     Attributes
     ----------
     centers_in_first : ndarray of shape (N, 2)
-        Where the motion puts the cells that were compared, pixels of the first picture as it is compared.
+        Where the motion puts the cells that were compared, pixels of the first image as it is compared.
     """
 
     centers_in_first: FloatArray
 
     @classmethod
-    def of(cls, first: PlacedPicture, second: PlacedPicture) -> Self:
-        """Compare two pictures where they are put."""
+    def of(cls, first: ComparedImage, second: ComparedImage) -> Self:
+        """Compare two images where they are put."""
         cells = compare_cells(first, second)
         there = from_plane(first.camera, first.homography, to_plane(second.camera, second.homography, cells.centers))
         seen = np.isfinite(there).all(axis=1)
@@ -76,12 +76,12 @@ class Cells(ComparedCells):
 
     @property
     def fill_a_plane(self) -> bool:
-        """Whether nothing shows that the motion fills less than half of the pictures."""
+        """Whether nothing shows that the motion fills less than half of the images."""
         return fills_at_most([self]) >= FILLED_BY_A_PLANE
 
 
 class _Held:
-    """Where in each picture a motion holds, by what was compared in any pair."""
+    """Where in each image a motion holds, by what was compared in any pair."""
 
     def __init__(self, compared: Iterable[tuple[Pair, Cells]]) -> None:
         found: dict[int, list[tuple[FloatArray, BoolArray]]] = {}
@@ -92,22 +92,22 @@ class _Held:
         # One more, for places that have fewer neighbours.
         self._held = {k: np.concatenate([*(held for _, held in own), [False]]) for k, own in found.items()}
 
-    def _around(self, picture: int, points: FloatArray) -> BoolArray:
-        """Around which of some points (N, 2) of a picture enough of the cells look alike."""
-        if picture not in self._places or not len(points):
+    def _around(self, image: int, points: FloatArray) -> BoolArray:
+        """Around which of some points (N, 2) of an image enough of the cells look alike."""
+        if image not in self._places or not len(points):
             return np.zeros(len(points), dtype=np.bool_)
-        nearest = np.arange(1, min(_NEIGHBOURS, self._places[picture].n) + 1)
-        _, cells = self._places[picture].query(points, k=nearest, distance_upper_bound=_REACH)
-        return np.asarray(self._held[picture][cells].sum(axis=1) >= _MIN_NEIGHBOURS)
+        nearest = np.arange(1, min(_NEIGHBOURS, self._places[image].n) + 1)
+        _, cells = self._places[image].query(points, k=nearest, distance_upper_bound=_REACH)
+        return np.asarray(self._held[image][cells].sum(axis=1) >= _MIN_NEIGHBOURS)
 
     def outside(self, pair: Pair, cells: Cells) -> Agreement:
-        """How much of a pair looks alike by another motion, where this one holds in neither of its pictures."""
+        """How much of a pair looks alike by another motion, where this one holds in neither of its images."""
         explained = self._around(pair[0], cells.centers_in_first) | self._around(pair[1], cells.centers)
         return Agreement(int((~explained).sum()), int((cells.confirming & ~explained).sum()))
 
 
 def fills_at_most(compared: Iterable[Cells]) -> float:
-    """Share of the pictures of some pairs that is not seen to contradict a motion, in [0, 1]."""
+    """Share of the images of some pairs that is not seen to contradict a motion, in [0, 1]."""
     cells = list(compared)
     return 1.0 - sum(own.contradicting for own in cells) / max(sum(own.in_all for own in cells), 1)
 
@@ -126,13 +126,13 @@ class Contest:
     Attributes
     ----------
     fills_at_most : float
-        Share of the pictures that is not seen to contradict the alignment, in [0, 1].
+        Share of the images that is not seen to contradict the alignment, in [0, 1].
     rival_fills_at_most : float
         The same of what moves otherwise; 1 where nothing does.
     outside : mapping of (int, int) to Agreement
-        Of every pair that was compared: how much looks alike where nothing moves otherwise in either picture.
+        Of every pair that was compared: how much looks alike where nothing moves otherwise in either image.
     doubtful : frozenset of (int, int)
-        Pairs that what moves otherwise may hold together: what was aligned fills less than half of the pictures, or
+        Pairs that what moves otherwise may hold together: what was aligned fills less than half of the images, or
         hardly anything looks alike where nothing moves otherwise.
     """
 
@@ -148,12 +148,12 @@ class Contest:
 
     @property
     def won(self) -> bool:
-        """Whether what was aligned is the plane: it may be, and the rival fills less than half of the pictures."""
+        """Whether what was aligned is the plane: it may be, and the rival fills less than half of the images."""
         return not self.lost and self.held >= _MIN_HELD and self.rival_fills_at_most < FILLED_BY_A_PLANE
 
     @property
     def lost(self) -> bool:
-        """Whether what was aligned is not the plane: it fills less than half of the pictures."""
+        """Whether what was aligned is not the plane: it fills less than half of the images."""
         return self.fills_at_most < FILLED_BY_A_PLANE
 
 
@@ -171,11 +171,11 @@ def contest(registration: Registration, pairs: Sequence[Pair], rivals: Mapping[P
     Raises
     ------
     InputError
-        When a picture can no longer be read.
+        When an image can no longer be read.
     """
-    pictures = _Pictures(registration)
-    own = {pair: pictures.aligned(pair, registration.alignment) for pair in pairs}
-    others = {pair: pictures.moved(pair, rivals[pair]) for pair in pairs if pair in rivals}
+    images = _Images(registration)
+    own = {pair: images.aligned(pair, registration.alignment) for pair in pairs}
+    others = {pair: images.moved(pair, rivals[pair]) for pair in pairs if pair in rivals}
     held = _Held(others.items())
     outside = {pair: held.outside(pair, cells) for pair, cells in own.items()}
     doubtful = {pair for pair, cells in own.items() if not _may_be_the_plane(cells, outside[pair])}
@@ -188,7 +188,7 @@ def _may_be_the_plane(cells: Cells, outside: Agreement) -> bool:
 
 
 def planes_of_pairs(registration: Registration, threshold: float, seed: int = 0) -> list[PairRegistration] | None:
-    """Every pair by that of its two motions which may fill more than half of its pictures.
+    """Every pair by that of its two motions which may fill more than half of its images.
 
     Each pair decides for itself: where two motions are about as strong, some pairs were registered by one and some by
     the other, and no alignment holds both.
@@ -208,17 +208,17 @@ def planes_of_pairs(registration: Registration, threshold: float, seed: int = 0)
     Raises
     ------
     InputError
-        When a picture can no longer be read.
+        When an image can no longer be read.
     """
     pairs = [pair for pair in registration.pairs if pair.relation]
-    pictures, alignment = _Pictures(registration), registration.alignment
+    images, alignment = _Images(registration), registration.alignment
     limits = RansacOptions(threshold, seed=seed)
     known = alignment.distortion if alignment.distortion_std == 0.0 else None
-    first = _strongest_motions(pictures, pairs, {}, EstimationOptions("auto", known, limits))
+    first = _strongest_motions(images, pairs, {}, EstimationOptions("auto", known, limits))
     if all(motion.cells.fill_a_plane for motion in first.values()):
         return None
     lens = float(np.median([motion.relation.distortion for motion in first.values()]))
-    second = _strongest_motions(pictures, pairs, first, EstimationOptions("auto", lens, limits))
+    second = _strongest_motions(images, pairs, first, EstimationOptions("auto", lens, limits))
     motions = [(pair, motion) for found in (first, second) for pair, motion in found.items()]
     held = _Held((pair, motion.cells) for pair, motion in motions if not motion.cells.fill_a_plane)
     planes: dict[Pair, _Motion] = {}
@@ -249,20 +249,20 @@ def _moving(pair: PairRegistration, motion: _Motion | None) -> PairRegistration:
     return replace(pair, relation=RadialHomography.failed(reason, own.camera, own.camera2, len(own.inliers)))
 
 
-class _Pictures:
-    """The pictures of a registration, small, as pairs of them are compared."""
+class _Images:
+    """The images of a registration, small, as pairs of them are compared."""
 
     def __init__(self, registration: Registration) -> None:
-        @lru_cache(_PICTURES_AT_ONCE)
-        def read(k: int) -> PlacedPicture:
+        @lru_cache(_IMAGES_AT_ONCE)
+        def read(k: int) -> ComparedImage:
             camera = registration.alignment.cameras[k]
-            return placed_picture(registration.sources[k], camera, np.eye(3), registration.stretch)
+            return placed_image(registration.sources[k], camera, np.eye(3), registration.stretch)
 
         self._read = read
 
-    def _placed(self, k: int, camera: Camera, homography: FloatArray) -> PlacedPicture:
-        picture = self._read(k)
-        return replace(picture, camera=camera.resized(picture.camera.image_size), homography=homography)
+    def _placed(self, k: int, camera: Camera, homography: FloatArray) -> ComparedImage:
+        image = self._read(k)
+        return replace(image, camera=camera.resized(image.camera.image_size), homography=homography)
 
     def aligned(self, pair: Pair, alignment: Alignment) -> Cells:
         """As an alignment puts two of them."""
@@ -275,7 +275,7 @@ class _Pictures:
 
 
 def _strongest_motions(
-    pictures: _Pictures, pairs: Sequence[PairRegistration], former: Mapping[Pair, _Motion], how: EstimationOptions
+    images: _Images, pairs: Sequence[PairRegistration], former: Mapping[Pair, _Motion], how: EstimationOptions
 ) -> dict[Pair, _Motion]:
     """Of each pair the motion that most of the matches agree on, of those that a former one does not explain."""
     result = {}
@@ -290,7 +290,7 @@ def _strongest_motions(
         for k, motion in zip(tried, found, strict=True):
             if motion and int(motion.inliers.sum()) >= MIN_INLIERS:
                 inliers = np.isin(np.arange(len(batch[k].matches)), rests[k][motion.inliers])
-                result[places[k]] = _Motion(replace(motion, inliers=inliers), pictures.moved(places[k], motion))
+                result[places[k]] = _Motion(replace(motion, inliers=inliers), images.moved(places[k], motion))
     return result
 
 

@@ -1,4 +1,4 @@
-"""What may be wrong with the pictures themselves, as far as their headers and masks show."""
+"""What may be wrong with the images themselves, as far as their headers and masks show."""
 
 from collections.abc import Sequence
 
@@ -10,21 +10,21 @@ _FOCAL_SPREAD = 1.03
 
 
 def doubtful_inputs(sources: Sequence[Source]) -> list[Message]:
-    """Warnings on pictures of several cameras or zoom settings, and on pictures without a mask among others."""
+    """Warnings on images of several cameras or zoom settings, and on images without a mask among others."""
     return [*_several_cameras(sources), *_unmasked(sources)]
 
 
 def _unmasked(sources: Sequence[Source]) -> list[Message]:
-    """Pictures without a mask among others that have one: perhaps a name is misspelt."""
+    """Images without a mask among others that have one: perhaps a name is misspelt."""
     without = [source for source in sources if source.mask is None]
     if not 0 < len(without) < len(sources):
         return []
-    text = f"{len(without)} of {len(sources)} pictures have no mask: {shortened([source.name for source in without])}"
+    text = f"{len(without)} of {len(sources)} images have no mask: {shortened([source.name for source in without])}"
     return [Message(text)]
 
 
 def _several_cameras(sources: Sequence[Source]) -> list[Message]:
-    """Pictures whose headers say that they come from another camera, or were zoomed."""
+    """Images whose headers say that they come from another camera, or were zoomed."""
     known = [source for source in sources if source.metadata.model or source.metadata.serial]
     bodies: dict[str, list[str]] = {}
     for source in known:
@@ -33,14 +33,14 @@ def _several_cameras(sources: Sequence[Source]) -> list[Message]:
     if len(bodies) > 1:
         commonest = sorted(bodies.items(), key=lambda body: -len(body[1]))[:MAX_NAMED]
         listed = "; ".join(f"{body} ({len(names)}: {shortened(names)})" for body, names in commonest)
-        text = f"the pictures come from {len(bodies)} cameras: {listed}; stitch those of each on their own"
+        text = f"the images come from {len(bodies)} cameras: {listed}; stitch those of each on their own"
         return [Message(text, code="mixed-lenses")]
     focal = {s.name: s.metadata.focal_px / max(s.metadata.size) for s in known if s.metadata.focal_px is not None}
     if focal and max(focal.values()) > _FOCAL_SPREAD * min(focal.values()):
         near, far = min(focal, key=lambda name: focal[name]), max(focal, key=lambda name: focal[name])
         return [
             Message(
-                f"the lens was zoomed between the pictures, by up to {focal[far] / focal[near]:.2f} "
+                f"the lens was zoomed between the images, by up to {focal[far] / focal[near]:.2f} "
                 f"(between {near} and {far}); stitch those of one zoom on their own",
                 code="mixed-lenses",
             )

@@ -1,4 +1,4 @@
-"""Pictures and pairs whose matches do not agree with the whole, and the likeliest reason, by what the pairs show."""
+"""Images and pairs whose matches do not agree with the whole, and the likeliest reason, by what the pairs show."""
 
 from collections.abc import Sequence
 
@@ -14,14 +14,14 @@ from rdstitch.registration import Registration
 Pair = tuple[int, int]
 
 _MIN_INLIERS = 0.5  # share of a pair's own inliers that agree with the whole
-# The same over all pairs of a picture; right ones have been seen to have 83 % even with relief, others 52 %.
-_MIN_MATCHES_PER_PICTURE = 0.6
+# The same over all pairs of an image; right ones have been seen to have 83 % even with relief, others 52 %.
+_MIN_MATCHES_PER_IMAGE = 0.6
 
 _FEW = 40
-"""Matches: pairs of pictures of nothing in common have been seen to have up to 33 that fit one motion."""
+"""Matches: pairs of images of nothing in common have been seen to have up to 33 that fit one motion."""
 
 _OBLIQUE = 9.0
-"""Times as large as elsewhere in a picture what another one sees in one scale: three times as long and as wide."""
+"""Times as large as elsewhere in an image what another one sees in one scale: three times as long and as wide."""
 
 _OTHER_LENS = 0.05
 """By how much λ differs at least between lenses; that of pairs scatters over trees and houses."""
@@ -43,13 +43,13 @@ def disagreeing_pairs(registration: Registration) -> dict[Pair, Message]:
     return result
 
 
-def misfitting_pictures(registration: Registration, links: Sequence[LinkFit]) -> list[Message]:
-    """Pictures of whose matches too many do not fit into the whole, over all these links."""
+def misfitting_images(registration: Registration, links: Sequence[LinkFit]) -> list[Message]:
+    """Images of whose matches too many do not fit into the whole, over all these links."""
     result = []
     for k, source in enumerate(registration.sources):
         own = [fit for fit in links if k in (fit.image1, fit.image2)]
         given, kept = sum(fit.count for fit in own), sum(fit.inliers for fit in own)
-        if kept < _MIN_MATCHES_PER_PICTURE * given:
+        if kept < _MIN_MATCHES_PER_IMAGE * given:
             reason = _few_features(registration, (k,)) or _reason(registration, own)
             text = f"only {kept} of {given} of its matches agree with the whole; {reason}"
             result.append(Message(text, (str(source.path),), "failure"))
@@ -64,9 +64,9 @@ def agreement_of_all(used: Sequence[LinkFit]) -> list[Message]:
     return [Message(f"only {kept} of {given} matches of the pairs agree with the whole", (), "failure")]
 
 
-def _few_features(registration: Registration, pictures: Sequence[int]) -> str:
-    """Which of some pictures have few features to be matched by; empty for none."""
-    found = [(k, few_features(registration.keypoints, k)) for k in pictures]
+def _few_features(registration: Registration, images: Sequence[int]) -> str:
+    """Which of some images have few features to be matched by; empty for none."""
+    found = [(k, few_features(registration.keypoints, k)) for k in images]
     return ", ".join(f"{registration.sources[k].name} has {few}" for k, few in found if few)
 
 
@@ -74,7 +74,7 @@ def _reason(registration: Registration, links: Sequence[LinkFit]) -> str:
     """Why the matches of some links agree with each other only, as a question to the user."""
     if sum(fit.count for fit in links) < _FEW:
         return "too few to place it: little overlap, or none?"
-    own = {(fit.image1, fit.image2) for fit in links if fit.inliers < _MIN_MATCHES_PER_PICTURE * fit.count}
+    own = {(fit.image1, fit.image2) for fit in links if fit.inliers < _MIN_MATCHES_PER_IMAGE * fit.count}
     relations = [pair.relation for pair in registration.pairs if (pair.image1, pair.image2) in own]
     if not registration.alignment.on_sphere and any(map(_is_oblique, relations)):
         return "taken much more obliquely than the others, or the horizon in view?"
@@ -84,7 +84,7 @@ def _reason(registration: Registration, links: Sequence[LinkFit]) -> str:
 
 
 def _is_oblique(relation: RadialHomography) -> bool:
-    """Whether one of two pictures, seen by the other, reaches the horizon, or far away."""
+    """Whether one of two images, seen by the other, reaches the horizon, or far away."""
     both = ((relation.camera, relation.homography), (relation.camera2, np.linalg.inv(relation.homography)))
     for camera, homography in both:
         depth = lift(camera.normalize(camera.outline(8)), camera.distortion, camera.higher) @ homography[2]

@@ -1,4 +1,4 @@
-"""A second opinion on a registration: do the pictures look alike where it puts them together?"""
+"""A second opinion on a registration: do the images look alike where it puts them together?"""
 
 import functools
 from collections.abc import Mapping, Sequence
@@ -21,8 +21,8 @@ from rdstitch.registration import Registration
 from rdstitch.verification.photometric_agreement import (
     COMPARED_SIDE,
     Agreement,
+    ComparedImage,
     Parallax,
-    PlacedPicture,
     as_compared,
     overlap_agreement,
 )
@@ -58,7 +58,7 @@ class CheckedLink:
 
     @property
     def pair(self) -> tuple[int, int]:
-        """Its pictures."""
+        """Its images."""
         return self.fit.image1, self.fit.image2
 
 
@@ -69,9 +69,9 @@ class OverlapTask:
     Attributes
     ----------
     links : sequence of (LinkFit, float)
-        With the scale that the two pictures are drawn at, pixels a unit of the plane.
+        With the scale that the two images are drawn at, pixels a unit of the plane.
     sources : mapping of int to Source
-        The pictures of these links.
+        The images of these links.
     cameras : mapping of int to Camera
     homographies : mapping of int to ndarray of shape (3, 3)
     stretch : (float, float) or None
@@ -95,7 +95,7 @@ class OverlapTask:
 
 
 def check_overlaps(registration: Registration, executor: Executor, cache: Cache = NO_CACHE) -> list[CheckedLink]:
-    """Compare the pictures of every used link, or of those that the fewest others confirm.
+    """Compare the images of every used link, or of those that the fewest others confirm.
 
     Parameters
     ----------
@@ -107,14 +107,14 @@ def check_overlaps(registration: Registration, executor: Executor, cache: Cache 
     Raises
     ------
     InputError
-        When a picture can no longer be read.
+        When an image can no longer be read.
     """
     alignment = registration.alignment
     chosen = _least_confirmed([fit for fit in alignment.links if fit.used])
-    pictures = sorted(set(chain.from_iterable((fit.image1, fit.image2) for fit in chosen)))
+    images = sorted(set(chain.from_iterable((fit.image1, fit.image2) for fit in chosen)))
     placed = [
         (k, source.content(cache), source.mask_content(cache), alignment.cameras[k], alignment.homographies[k])
-        for k, source in ((k, registration.sources[k]) for k in pictures)
+        for k, source in ((k, registration.sources[k]) for k in images)
     ]
 
     parallax = _parallax(registration, chosen)
@@ -159,7 +159,7 @@ def _parallax(registration: Registration, chosen: Sequence[LinkFit]) -> dict[tup
 def _tasks(
     registration: Registration, chosen: Sequence[LinkFit], parallax: Mapping[tuple[int, int], Parallax]
 ) -> list[OverlapTask]:
-    """Batches of links that follow one another, which have pictures in common."""
+    """Batches of links that follow one another, which have images in common."""
     alignment = registration.alignment
     scales = [1.0] * len(chosen)
     if not alignment.on_sphere:
@@ -184,9 +184,9 @@ def _tasks(
 
 
 def compare_overlaps(task: OverlapTask) -> tuple[list[CheckedLink], GuardNotes]:
-    """Read the pictures of a task, and compare those of each link; and what was noticed of the files."""
+    """Read the images of a task, and compare those of each link; and what was noticed of the files."""
     placed = {
-        k: placed_picture(source, task.cameras[k], task.homographies[k], task.stretch)
+        k: placed_image(source, task.cameras[k], task.homographies[k], task.stretch)
         for k, source in task.sources.items()
     }
 
@@ -211,21 +211,21 @@ def compare_overlaps(task: OverlapTask) -> tuple[list[CheckedLink], GuardNotes]:
     return checked, sources[0].guard.notes_on([source.path for source in sources])
 
 
-def placed_picture(
+def placed_image(
     source: Source, camera: Camera, homography: FloatArray, stretch: tuple[float, float] | None
-) -> PlacedPicture:
-    """Read a picture small, and put it where an alignment has it.
+) -> ComparedImage:
+    """Read an image small, and put it where an alignment has it.
 
     Raises
     ------
     InputError
         When it can no longer be read.
     """
-    picture = source.read(fitting_reduction(max(source.camera.image_size) / COMPARED_SIDE), keep=True)
-    return PlacedPicture.of(picture, camera, homography, stretch)
+    image = source.read(fitting_reduction(max(source.camera.image_size) / COMPARED_SIDE), keep=True)
+    return ComparedImage.of(image, camera, homography, stretch)
 
 
-def _by_what_is_unique(placed: Mapping[int, PlacedPicture], checked: Sequence[CheckedLink]) -> list[CheckedLink]:
+def _by_what_is_unique(placed: Mapping[int, ComparedImage], checked: Sequence[CheckedLink]) -> list[CheckedLink]:
     """The same links; those that are ambiguous but for something unique are known to be."""
     shifts = unique_shifts(placed, [link.pair for link in checked if link.ambiguity.ambiguous])
 
@@ -237,10 +237,10 @@ def _by_what_is_unique(placed: Mapping[int, PlacedPicture], checked: Sequence[Ch
     return [replace(link, unique=link.pair in shifts and lies_here(link)) for link in checked]
 
 
-def _compare_around(fit: LinkFit, first: PlacedPicture, second: PlacedPicture) -> CheckedLink:
-    """No plane shows all pictures of a turn; one between the two shows both, and stretches what both show the least.
+def _compare_around(fit: LinkFit, first: ComparedImage, second: ComparedImage) -> CheckedLink:
+    """No plane shows all images of a turn; one between the two shows both, and stretches what both show the least.
 
-    What both show has the pixels there that the middle of a picture has on a plane that it sees straight on.
+    What both show has the pixels there that the middle of an image has on a plane that it sees straight on.
     """
     both = np.stack([first.homography, second.homography])
     intrinsics = np.linalg.norm(both, axis=1)
@@ -252,7 +252,7 @@ def _compare_around(fit: LinkFit, first: PlacedPicture, second: PlacedPicture) -
 
 
 def _scales(fitting: Sequence[float]) -> list[float]:
-    """The scales that fit, but few different ones, so that a picture is drawn once and not for every link."""
+    """The scales that fit, but few different ones, so that an image is drawn once and not for every link."""
     middle = np.median(fitting)
     return [float(middle * 2.0 ** np.rint(np.log2(scale / middle))) for scale in fitting]
 

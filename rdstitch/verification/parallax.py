@@ -17,7 +17,7 @@ from rdstitch.matching.two_view import PairRegistration
 from rdstitch.messages import Message, names_of
 
 _MIN_ERROR, _MAX_ERROR = 0.002, 0.15
-"""Of a picture's diagonal: between what noise does and what only wrong matches do."""
+"""Of an image's diagonal: between what noise does and what only wrong matches do."""
 
 _MIN_MATCHES = 12
 _MIN_SHARE = 0.05
@@ -27,14 +27,14 @@ _MIN_CONSISTENCY = 0.6
 """Share of the matches that are off that must be off along one translation."""
 
 _TOLERANCE = 0.00125
-"""Of a picture's diagonal: distance from the great circle up to which a match is on it."""
+"""Of an image's diagonal: distance from the great circle up to which a match is on it."""
 
 _SAMPLES = 200
 
 
 @dataclass(frozen=True)
 class Parallax:
-    """How far a pair of pictures is from a turn on the spot.
+    """How far a pair of images is from a turn on the spot.
 
     Attributes
     ----------

@@ -1,6 +1,6 @@
-"""Do two pictures show the same where they overlap? Asked of the pixels, not of the features that registered them.
+"""Do two images show the same where they overlap? Asked of the pixels, not of the features that registered them.
 
-One picture is resampled as the other's lens would have seen it. In each small cell of the overlap that has texture,
+One image is resampled as the other's lens would have seen it. In each small cell of the overlap that has texture,
 the place where the two correlate best is searched around where the registration says it is. Where the registration is
 right nearly all cells find it there; elsewhere they find it anywhere. Over rough ground that place is moved by the
 parallax of the matches around it.
@@ -19,14 +19,14 @@ from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.warp import Lattice
-from rdstitch.io.read import Picture
+from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import fitting_reduction, mean_of_channels, reduced_size
 from rdstitch.radial_homography import from_plane, to_plane
 from rdstitch.scipy_parts import spatial
 
 Grey = NDArray[np.float32]
 
-COMPARED_SIDE = 512  # pixels of the longer side of the pictures that are compared
+COMPARED_SIDE = 512  # pixels of the longer side of the images that are compared
 CELL = 24  # pixels
 _SEARCH_RADIUS = 8  # pixels
 _MIN_TEXTURE = 0.012  # standard deviation in a cell, of full range
@@ -45,7 +45,7 @@ class Agreement:
     Attributes
     ----------
     cells : int
-        Cells with texture in both pictures.
+        Cells with texture in both images.
     confirming : int
         Cells that correlate best, and well, where the registration says.
     """
@@ -61,16 +61,16 @@ class Agreement:
 
 @dataclass(frozen=True)
 class ComparedCells:
-    """Cells with texture in both pictures of an overlap, and what each of them says.
+    """Cells with texture in both images of an overlap, and what each of them says.
 
     Attributes
     ----------
     centers : ndarray of shape (N, 2)
-        Where the registration puts them, pixels of the second picture as it is compared.
+        Where the registration puts them, pixels of the second image as it is compared.
     confirming : ndarray of shape (N,), bool
         Which correlate best, and well, where the registration says.
     in_all : int
-        Cells with texture in the whole of the second picture.
+        Cells with texture in the whole of the second image.
     """
 
     centers: FloatArray
@@ -90,7 +90,7 @@ class Parallax:
     Attributes
     ----------
     places : ndarray of shape (M, 2)
-        Expected, pixels of the second picture.
+        Expected, pixels of the second image.
     shifts : ndarray of shape (M, 2)
         From there to where they were found, pixels.
     """
@@ -99,7 +99,7 @@ class Parallax:
     shifts: FloatArray
 
     def resized(self, camera: Camera, other: Camera) -> Self:
-        """The same in pixels of another size of the second picture."""
+        """The same in pixels of another size of the second image."""
         scale = other.half_diagonal / camera.half_diagonal
         return replace(self, places=other.denormalize(camera.normalize(self.places)), shifts=scale * self.shifts)
 
@@ -111,8 +111,8 @@ class Parallax:
 
 
 @dataclass(frozen=True)
-class PlacedPicture:
-    """A registered picture as it is compared.
+class ComparedImage:
+    """A registered image as it is compared.
 
     Attributes
     ----------
@@ -130,14 +130,14 @@ class PlacedPicture:
 
     @classmethod
     def of(
-        cls, picture: Picture, camera: Camera, homography: FloatArray, stretch: tuple[float, float] | None = None
+        cls, image: DecodedImage, camera: Camera, homography: FloatArray, stretch: tuple[float, float] | None = None
     ) -> Self:
-        """A picture with its camera and its place, made small; ``stretch`` are the grey levels of black and white."""
-        grey = _reduced_grey(picture, stretch)
+        """An image with its camera and its place, made small; ``stretch`` are the grey levels of black and white."""
+        grey = _reduced_grey(image, stretch)
         return cls(grey, camera.resized((grey.shape[1], grey.shape[0])), homography)
 
     def sampled(self, plane: Callable[[FloatArray], FloatArray], box: Box) -> Grey:
-        """The picture where ``plane``, (M, 2) to (M, 2), puts pixels of the plane; NaN outside the picture."""
+        """The image where ``plane``, (M, 2) to (M, 2), puts pixels of the plane; NaN outside the image."""
 
         def places(x: FloatArray, y: FloatArray) -> FloatArray:
             grid = np.stack(np.broadcast_arrays(x, y), axis=-1)
@@ -151,19 +151,19 @@ class PlacedPicture:
 
 
 def as_compared(camera: Camera) -> Camera:
-    """The camera of a picture as it is compared, for one that is read no larger than that asks for."""
+    """The camera of an image as it is compared, for one that is read no larger than that asks for."""
     read = reduced_size(camera.image_size, fitting_reduction(max(camera.image_size) / COMPARED_SIDE))
     return camera.resized(_compared_size(read))
 
 
 def _compared_size(size: tuple[int, int]) -> tuple[int, int]:
-    """Width and height that a picture is made smaller to."""
+    """Width and height that an image is made smaller to."""
     factor = min(1.0, COMPARED_SIDE / max(size))
     return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
 
 
-def _reduced_grey(picture: Picture, stretch: tuple[float, float] | None) -> Grey:
-    pixels = picture.pixels
+def _reduced_grey(image: DecodedImage, stretch: tuple[float, float] | None) -> Grey:
+    pixels = image.pixels
     full = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind == "u" else max(float(pixels.max()), 1e-12)
     if stretch is not None:  # black may be anywhere: only differences of grey levels are compared
         full = max(stretch[1] - stretch[0], 1e-12)
@@ -171,22 +171,22 @@ def _reduced_grey(picture: Picture, stretch: tuple[float, float] | None) -> Grey
     size = _compared_size((width, height))
     small = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.float32) / np.float32(full)
     grey = mean_of_channels(small)
-    if picture.alpha is not None:
-        grey[cv2.resize(picture.alpha, size, interpolation=cv2.INTER_AREA) < _OPAQUE] = np.nan
+    if image.alpha is not None:
+        grey[cv2.resize(image.alpha, size, interpolation=cv2.INTER_AREA) < _OPAQUE] = np.nan
     return grey
 
 
-def overlap_agreement(first: PlacedPicture, second: PlacedPicture, parallax: Parallax | None = None) -> Agreement:
-    """Compare two registered pictures where they overlap, where the ground is rough by what moves its places."""
+def overlap_agreement(first: ComparedImage, second: ComparedImage, parallax: Parallax | None = None) -> Agreement:
+    """Compare two registered images where they overlap, where the ground is rough by what moves its places."""
     return compare_cells(first, second, parallax, _MAX_CELLS).agreement
 
 
 def compare_cells(
-    first: PlacedPicture, second: PlacedPicture, parallax: Parallax | None = None, most: int | None = None
+    first: ComparedImage, second: ComparedImage, parallax: Parallax | None = None, most: int | None = None
 ) -> ComparedCells:
     """The cells of an overlap one by one, or about ``most`` of them; see :func:`overlap_agreement`."""
     height, width = second.grey.shape
-    # The first picture as the second one's lens would have seen it.
+    # The first image as the second one's lens would have seen it.
     seen = first.sampled(partial(to_plane, second.camera, second.homography), (0, 0, width, height))
     margin = CELL // 2 + _SEARCH_RADIUS
     rows, columns = (np.arange(margin, n - margin + 1, CELL) for n in (height, width))
@@ -208,13 +208,13 @@ def compare_cells(
     return ComparedCells(centers, np.array(confirming, dtype=np.bool_), in_all)
 
 
-def _cells(picture: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:
+def _cells(image: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:
     """Cells (N, side, side) with these top-left pixels (N, 2), row and column, and so much around them."""
     side = CELL + 2 * margin
     if not len(corners):
         return np.zeros((0, side, side), dtype=np.float32)
     top, left = (corners - margin).T
-    cells: Grey = np.lib.stride_tricks.sliding_window_view(picture, (side, side))[top, left]
+    cells: Grey = np.lib.stride_tricks.sliding_window_view(image, (side, side))[top, left]
     return cells
 
 

@@ -10,7 +10,7 @@ from rdstitch.verification.rival_motion import RivalMotion, is_apart
 from rdstitch.verification.self_similarity import Ambiguity
 
 _SAME_SHIFT = 0.05
-"""Share of the longer side of a picture by which two shifts differ that are the same: matches show theirs where they
+"""Share of the longer side of an image by which two shifts differ that are the same: matches show theirs where they
 are, pixels in the mean of all that they cover."""
 
 
@@ -20,7 +20,7 @@ def compare_with_rivals(
     """The alignment and what moves otherwise, compared with the pixels.
 
     Only where the latter is a motion of its own and covers a good part; or where what was aligned fills less than half
-    of the pictures, and something else moves in any of them. None otherwise.
+    of the images, and something else moves in any of them. None otherwise.
     """
     apart = is_apart(rivals)
     far = any(rival.relation is not None and rival.is_far for rival in rivals)
@@ -34,7 +34,7 @@ def compare_with_rivals(
 def outside_rivals(
     checked: Sequence[CheckedLink], rivals: Sequence[RivalMotion], compared: Contest | None
 ) -> Sequence[CheckedLink]:
-    """The same links by what their pictures show where nothing moves otherwise, if that is seen to be the smaller part.
+    """The same links by what their images show where nothing moves otherwise, if that is seen to be the smaller part.
 
     A pair that fits as well where its rival puts it shows no repeated pattern, but the rival.
     """

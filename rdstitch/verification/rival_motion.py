@@ -1,4 +1,4 @@
-"""Does something in the pictures move otherwise than the plane that was registered?
+"""Does something in the images move otherwise than the plane that was registered?
 
 A vehicle ahead, a part of the robot, or a second plane has matches that agree with each other and not with the
 alignment. Relief and chance have few of them, spread over nothing; a rival covers an area of its own. What decides
@@ -24,13 +24,13 @@ _FAR = 3.0
 """Thresholds beyond which a match disagrees with the alignment: nearer, relief and the lens may be to blame."""
 
 _CELLS = 16
-"""Cells along the longer side of a picture, by which area is counted."""
+"""Cells along the longer side of an image, by which area is counted."""
 
 _MIN_DISAGREEMENT = 0.02
-"""Of a picture's diagonal: relief moves what stands on the plane by less."""
+"""Of an image's diagonal: relief moves what stands on the plane by less."""
 
 _MIN_APART = 0.05
-"""Of a picture's diagonal: the tops of trees and houses reach 0.02 to 0.03, vehicles 0.25 to 0.5."""
+"""Of an image's diagonal: the tops of trees and houses reach 0.02 to 0.03, vehicles 0.25 to 0.5."""
 
 _MIN_SHARE = 0.1
 """Of the area that has either motion. Flights over trees and houses reach 0.08, vehicles over a tenth 0.09 to 0.5
@@ -44,18 +44,18 @@ _CLEAR_AGREEMENT = 0.55
 
 MIN_AGREEMENT = 0.4
 """Share of the overlaps that must look alike where there is a rival, unless that is seen to be the smaller one. The
-plane fills what two pictures share of it, but for the rival: 0.2 to 0.9 in the same sets; a vehicle, where it was
+plane fills what two images share of it, but for the rival: 0.2 to 0.9 in the same sets; a vehicle, where it was
 registered instead, 0.15 to 0.36."""
 
 
 @dataclass(frozen=True)
 class RivalMotion:
-    """What moves otherwise in one pair of pictures.
+    """What moves otherwise in one pair of images.
 
     Attributes
     ----------
     image1, image2 : int
-        Indices of the pictures.
+        Indices of the images.
     area : int
         Cells of ``image1`` in which the rival has inliers and the plane has none.
     plane_area : int
@@ -83,7 +83,7 @@ class RivalMotion:
 
     @property
     def is_far(self) -> bool:
-        """Whether it moves by more than tree tops do, as far as its pictures are known."""
+        """Whether it moves by more than tree tops do, as far as its images are known."""
         return self.relation is None or self.disagreement > _MIN_APART * 2.0 * self.relation.camera.half_diagonal
 
 
@@ -104,7 +104,7 @@ def find_rival_motions(
     Returns
     -------
     list of RivalMotion
-        One for every pair of overlapping, aligned pictures; its area is 0 where there is no rival.
+        One for every pair of overlapping, aligned images; its area is 0 where there is no rival.
     """
     aligned = [pair for pair in pairs if alignment.used[pair.image1] and alignment.used[pair.image2]]
     rivals, limits = list[RivalMotion](), RansacOptions(threshold, seed=seed)
@@ -112,7 +112,7 @@ def find_rival_motions(
         rests = [_Rest(alignment, pair, threshold) for pair in batch]
         rests = [rest for rest in rests if rest.agreeing.any()]
         tried = [rest for rest in rests if len(rest.unexplained) >= MIN_INLIERS]
-        # All pictures have one lens.
+        # All images have one lens.
         how = EstimationOptions("auto", alignment.cameras[aligned[0].image1].nearest_distortion, limits)
         relations = estimate_radial_homographies([rest.matches for rest in tried], how)
         found = {rest.images: rest.rival(relation) for rest, relation in zip(tried, relations, strict=True)}
@@ -127,7 +127,7 @@ def rival_share(rivals: Sequence[RivalMotion]) -> float:
 
 
 def is_apart(rivals: Sequence[RivalMotion]) -> bool:
-    """Whether what moves otherwise covers a good part of the pictures, and moves by more than tree tops do."""
+    """Whether what moves otherwise covers a good part of the images, and moves by more than tree tops do."""
     if rival_share(rivals) < _MIN_SHARE:
         return False
     return max(rivals, key=lambda rival: rival.area).is_far
@@ -146,10 +146,10 @@ def rival_messages(
     Parameters
     ----------
     paths : sequence of str
-        Of the pictures.
+        Of the images.
     rivals : sequence of RivalMotion
     agreement : float
-        Share of the overlaps, [0, 1], that looks alike where the alignment puts the pictures; NaN where unknown.
+        Share of the overlaps, [0, 1], that looks alike where the alignment puts the images; NaN where unknown.
     compared : Contest, optional
         What the pixels say of both motions, where they were compared.
     lens_only : bool
@@ -163,7 +163,7 @@ def rival_messages(
     first, second = names_of(images)
     u, v = worst.center
     what = (
-        f"{share:.0%} of what the pictures have in common moves otherwise than the rest, most of it around "
+        f"{share:.0%} of what the images have in common moves otherwise than the rest, most of it around "
         f"({u:.0f}, {v:.0f}) of {first} when compared with {second}, by {worst.disagreement:.0f} pixels"
     )
     clear = agreement >= _CLEAR_AGREEMENT or (share < _CONTESTED_SHARE and not agreement < MIN_AGREEMENT)
@@ -172,7 +172,7 @@ def rival_messages(
     if lens_only or clear:
         more = f"; what was stitched fills {agreement:.0%} of the overlaps" if share >= _CONTESTED_SHARE else ""
         return [Message(f"{what} (a vehicle, a second plane?){more}; a mask keeps it out", images, code="rival-motion")]
-    # It concerns all pictures: without the one that shows it best, the rival would only be harder to see.
+    # It concerns all images: without the one that shows it best, the rival would only be harder to see.
     shown = sorted({k for rival in rivals for k in (rival.image1, rival.image2)})
     text = f"{what}, and it is not clear which of the two is the plane; mask what does not belong to it"
     return [Message(text, tuple(paths[k] for k in shown), "failure", "rival-motion")]
@@ -233,6 +233,6 @@ class _Rest:
 
 
 def _cells(points: FloatArray, camera: Camera) -> set[tuple[int, int]]:
-    """The cells of a grid over the picture that points (N, 2), pixels, lie in."""
+    """The cells of a grid over the image that points (N, 2), pixels, lie in."""
     column, row = np.floor(points / (max(camera.image_size) / _CELLS)).astype(np.int64).T
     return set(zip(column.tolist(), row.tolist(), strict=True))

@@ -1,6 +1,6 @@
-"""Would two pictures look as much alike somewhere else? On a repeated pattern they do, and no registration can know.
+"""Would two images look as much alike somewhere else? On a repeated pattern they do, and no registration can know.
 
-Both pictures are drawn on the plane, and correlated at every shift at once (masked normalized cross-correlation,
+Both images are drawn on the plane, and correlated at every shift at once (masked normalized cross-correlation,
 Padfield 2012). Where the plane is metric a shift by a period of the pattern is as good as the right one.
 """
 
@@ -15,22 +15,22 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.radial_homography import to_plane
-from rdstitch.verification.photometric_agreement import Grey, PlacedPicture
+from rdstitch.verification.photometric_agreement import ComparedImage, Grey
 
-MAX_SIDE = 256  # pixels of the pictures that are compared
-_MAX_PX = 4  # times the sides of a picture that its outline on the plane may have
+MAX_SIDE = 256  # pixels of the images that are compared
+_MAX_PX = 4  # times the sides of an image that its outline on the plane may have
 _COARSEST = 8.0  # pixels, standard deviation of the blur that brightness is measured by
 _MIN_SHIFT = 14  # pixels: shifts that are none
 SLACK = 3  # pixels by which the registration may be off
 _MIN_NORM = 1e-4  # of the largest: where fewer pixels overlap, rounding decides
 _MIN_SHARE = 0.5  # of the overlap that a shift must keep
-_MIN_CORRELATION = 0.5  # correlation from which on two pictures look alike
-_COMPARABLE_CORRELATION = 0.9  # of the correlation here; a repeated pattern reaches 0.97, other pictures seldom 0.5
+_MIN_CORRELATION = 0.5  # correlation from which on two images look alike
+_COMPARABLE_CORRELATION = 0.9  # of the correlation here; a repeated pattern reaches 0.97, other images seldom 0.5
 
 
 @dataclass(frozen=True)
 class Ambiguity:
-    """How well two pictures fit where they were put, and elsewhere.
+    """How well two images fit where they were put, and elsewhere.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Ambiguity:
         Correlation where the registration says, and the best at any other shift that keeps half of the overlap or
         more; 0 where nothing can be compared.
     shift : float
-        Length of that shift, as a share of the longer side of a picture.
+        Length of that shift, as a share of the longer side of an image.
     """
 
     here: float
@@ -47,18 +47,18 @@ class Ambiguity:
 
     @property
     def ambiguous(self) -> bool:
-        """Whether the pictures fit elsewhere as well as here."""
+        """Whether the images fit elsewhere as well as here."""
         return self.elsewhere > max(_MIN_CORRELATION, _COMPARABLE_CORRELATION * self.here)
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A picture drawn on the plane, without its brightness.
+    """An image drawn on the plane, without its brightness.
 
     Attributes
     ----------
     pixels : ndarray of shape (h, w), float32
-        NaN where the picture is not.
+        NaN where the image is not.
     origin : ndarray of shape (2,)
         Where their first pixel lies, pixels of the plane.
     """
@@ -68,7 +68,7 @@ class Drawing:
 
 
 def drawing_scale(camera: Camera, homography: FloatArray, longest_side: int = MAX_SIDE) -> float:
-    """Pixels per unit of the plane at which the middle of a picture keeps its size, made small."""
+    """Pixels per unit of the plane at which the middle of an image keeps its size, made small."""
     width, height = camera.image_size
     around = np.array([[width / 2 + dx, height / 2 + dy] for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1))])
     left, right, top, bottom = to_plane(camera, homography, around)
@@ -77,9 +77,9 @@ def drawing_scale(camera: Camera, homography: FloatArray, longest_side: int = MA
     return float(min(1.0, longest_side / max(height, width)) / np.sqrt(area))
 
 
-def draw(picture: PlacedPicture, scale: float, longest_side: int = MAX_SIDE) -> Drawing:
-    """Draw a picture on the plane with so many pixels a unit; ``longest_side`` is that of :func:`drawing_scale`."""
-    outline = to_plane(picture.camera, picture.homography, picture.camera.outline(16)) * scale
+def draw(image: ComparedImage, scale: float, longest_side: int = MAX_SIDE) -> Drawing:
+    """Draw an image on the plane with so many pixels a unit; ``longest_side`` is that of :func:`drawing_scale`."""
+    outline = to_plane(image.camera, image.homography, image.camera.outline(16)) * scale
     if not np.isfinite(outline).any():  # all of it behind the horizon
         return Drawing(np.full((1, 1), np.nan, dtype=np.float32), np.zeros(2))
     middle = np.nanmedian(outline, axis=0)
@@ -89,19 +89,19 @@ def draw(picture: PlacedPicture, scale: float, longest_side: int = MAX_SIDE) -> 
     )
     origin = np.floor(low)
     width, height = np.maximum(np.ceil(high - origin).astype(int), 1).tolist()
-    # The picture is smaller on the plane than it is: without a blur it would alias.
-    factor = max(1.0, max(picture.grey.shape) / longest_side)
+    # The image is smaller on the plane than it is: without a blur it would alias.
+    factor = max(1.0, max(image.grey.shape) / longest_side)
     if factor > 1.05:
-        blurred = np.asarray(cv2.GaussianBlur(picture.grey, (0, 0), 0.5 * factor), dtype=np.float32)
-        picture = replace(picture, grey=blurred)
-    drawn = picture.sampled(lambda px: (px + origin) / scale, (0, 0, width, height))
+        blurred = np.asarray(cv2.GaussianBlur(image.grey, (0, 0), 0.5 * factor), dtype=np.float32)
+        image = replace(image, grey=blurred)
+    drawn = image.sampled(lambda px: (px + origin) / scale, (0, 0, width, height))
     return Drawing(_without_brightness(drawn), origin)
 
 
 def placement_ambiguity(first: Drawing, second: Drawing) -> Ambiguity:
-    """Compare two pictures, drawn at the same scale, at all shifts on the plane."""
+    """Compare two images, drawn at the same scale, at all shifts on the plane."""
     overlaps = Overlaps.of(first.pixels, second.pixels)
-    # Position of the first picture within the second: rows and columns count from -(size - 1) of the first.
+    # Position of the first image within the second: rows and columns count from -(size - 1) of the first.
     rows, columns = (np.arange(n) - (m - 1) for n, m in zip(overlaps.area.shape, first.pixels.shape, strict=True))
     offset = np.rint(first.origin - second.origin).astype(int)
     down, right = (rows - offset[1]).astype(np.float32), (columns - offset[0]).astype(np.float32)
@@ -123,15 +123,15 @@ def placement_ambiguity(first: Drawing, second: Drawing) -> Ambiguity:
 
 
 def ambiguous_pairs(
-    placed: Mapping[int, PlacedPicture], pairs: Sequence[tuple[int, int]], workers: int = 1
+    placed: Mapping[int, ComparedImage], pairs: Sequence[tuple[int, int]], workers: int = 1
 ) -> list[tuple[int, int]]:
-    """The pairs of pictures that look as much alike elsewhere, drawn at one scale by ``workers`` threads."""
-    pictures = sorted({k for pair in pairs for k in pair})
-    if not pictures:
+    """The pairs of images that look as much alike elsewhere, drawn at one scale by ``workers`` threads."""
+    images = sorted({k for pair in pairs for k in pair})
+    if not images:
         return []
-    scale = float(np.median([drawing_scale(placed[k].camera, placed[k].homography) for k in pictures]))
+    scale = float(np.median([drawing_scale(placed[k].camera, placed[k].homography) for k in images]))
     with ThreadPoolExecutor(workers) as pool:
-        drawings = dict(zip(pictures, pool.map(lambda k: draw(placed[k], scale), pictures), strict=True))
+        drawings = dict(zip(images, pool.map(lambda k: draw(placed[k], scale), images), strict=True))
         found = pool.map(lambda pair: placement_ambiguity(drawings[pair[0]], drawings[pair[1]]).ambiguous, pairs)
         return [pair for pair, ambiguous in zip(pairs, found, strict=True) if ambiguous]
 
@@ -145,22 +145,22 @@ def _box_around(chosen: NDArray[np.bool_], margin: int) -> tuple[slice, slice]:
     return ranges[0], ranges[1]
 
 
-def _without_brightness(picture: Grey) -> Grey:
-    """What is finer than a blur, where the picture is."""
-    seen = np.isfinite(picture)
+def _without_brightness(image: Grey) -> Grey:
+    """What is finer than a blur, where the image is."""
+    seen = np.isfinite(image)
     weight = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), _COARSEST)
-    coarse = cv2.GaussianBlur(np.where(seen, picture, np.float32(0)), (0, 0), _COARSEST) / np.maximum(weight, 1e-6)
-    return np.where(seen, picture - coarse, np.float32(np.nan)).astype(np.float32)
+    coarse = cv2.GaussianBlur(np.where(seen, image, np.float32(0)), (0, 0), _COARSEST) / np.maximum(weight, 1e-6)
+    return np.where(seen, image - coarse, np.float32(np.nan)).astype(np.float32)
 
 
 @dataclass(frozen=True)
 class Overlaps:
-    """Sums over the overlap of two pictures, the first at every position in the second, shape (h, w) each.
+    """Sums over the overlap of two images, the first at every position in the second, shape (h, w) each.
 
     Attributes
     ----------
     products, squares1, squares2 : ndarray
-        Of the values of both pictures, and of either.
+        Of the values of both images, and of either.
     area : ndarray
         Number of pixels.
     """
@@ -192,10 +192,10 @@ class Overlaps:
         return correlation
 
 
-def _spectra(picture: Grey, height: int, width: int) -> list[Grey]:
+def _spectra(image: Grey, height: int, width: int) -> list[Grey]:
     """Of the values, their squares, and where there are any, in OpenCV's packed format."""
-    seen = np.isfinite(picture)
-    values = np.where(seen, picture, np.float32(0.0))
+    seen = np.isfinite(image)
+    values = np.where(seen, image, np.float32(0.0))
     shape = (cv2.getOptimalDFTSize(height), cv2.getOptimalDFTSize(width))
     spectra: list[Grey] = []
     for part in (values, values * values, seen):

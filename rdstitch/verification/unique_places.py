@@ -1,7 +1,7 @@
-"""What is unique in a repeated pattern (dirt on tiles, a mark, one object) decides where its pictures lie.
+"""What is unique in a repeated pattern (dirt on tiles, a mark, one object) decides where its images lie.
 
-Each picture is compared with itself, shifted by the periods of its own pattern: where it departs from their median,
-something is there once. Two pictures are then compared by these departures alone, at every shift by which the pattern
+Each image is compared with itself, shifted by the periods of its own pattern: where it departs from their median,
+something is there once. Two images are then compared by these departures alone, at every shift by which the pattern
 fits. At the right one, those in the overlap are at the same places in both; at a wrong one, stains lie on clean tiles.
 """
 
@@ -14,15 +14,15 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.radial_homography import from_plane, to_plane
-from rdstitch.verification.photometric_agreement import COMPARED_SIDE, Grey, PlacedPicture
+from rdstitch.verification.photometric_agreement import COMPARED_SIDE, ComparedImage, Grey
 from rdstitch.verification.self_similarity import Drawing, Overlaps, draw, drawing_scale
 
 _MIN_SHIFT = 10  # pixels: a shorter shift is no period that could be told from the peak itself
 _PERIODIC = 0.4  # correlation from which on a shift is a period
-_OWN_OVERLAP, _OVERLAP = 0.15, 0.05  # of a picture, that a shift must keep; of two, of the most that one keeps
-_MIN_PERIODS, _MAX_PERIODS = 4, 16  # shifts that a picture is compared with itself at
+_OWN_OVERLAP, _OVERLAP = 0.15, 0.05  # of an image, that a shift must keep; of two, of the most that one keeps
+_MIN_PERIODS, _MAX_PERIODS = 4, 16  # shifts that an image is compared with itself at
 _MIN_COPIES = 3  # other copies of a place, of which the median is clean though one of them has dirt
-_MARGIN = 6  # pixels at the border of a picture, where brightness cannot be removed well
+_MARGIN = 6  # pixels at the border of an image, where brightness cannot be removed well
 _DEPARTS, _MOST = 5.0, 25.0  # spreads of the copies: less is no departure, more counts as this
 _MIN_MATCHED = 400.0  # squared spreads times pixels: a stain of sixteen pixels, five spreads beyond what is none
 _MIN_SHARE = 0.8  # of the departures in the overlap that must be the same; right ones have 0.87 to 0.99
@@ -31,12 +31,12 @@ _MIN_LEAD = 3.0  # of what is matched here, over what is matched at any other sh
 
 @dataclass(frozen=True)
 class UniqueShift:
-    """The shift of one picture's drawing within another's at which what is unique in both agrees best.
+    """The shift of one image's drawing within another's at which what is unique in both agrees best.
 
     Attributes
     ----------
     shift : ndarray of shape (2,)
-        (x, y) by which the first picture must be moved on the plane, pixels of the drawings or units of the plane.
+        (x, y) by which the first image must be moved on the plane, pixels of the drawings or units of the plane.
     matched : float
         What is unique in both and the same, in squared spreads of the pattern times pixels, times ``share``.
     share : float
@@ -52,33 +52,33 @@ class UniqueShift:
 
     @property
     def decides(self) -> bool:
-        """Whether the pictures lie here and nowhere else."""
+        """Whether the images lie here and nowhere else."""
         clear = self.matched >= max(_MIN_MATCHED, _MIN_LEAD * self.rival)
         return clear and self.share >= _MIN_SHARE
 
 
 def unique_shifts(
-    placed: Mapping[int, PlacedPicture], pairs: Sequence[tuple[int, int]], workers: int = 1
+    placed: Mapping[int, ComparedImage], pairs: Sequence[tuple[int, int]], workers: int = 1
 ) -> dict[tuple[int, int], UniqueShift]:
-    """By how much the first picture of each pair must be moved for what is unique in both to agree.
+    """By how much the first image of each pair must be moved for what is unique in both to agree.
 
     Parameters
     ----------
-    placed : mapping of int to PlacedPicture
-        The pictures, on a plane where a period of the pattern is the same shift everywhere (a metric or an affine one).
+    placed : mapping of int to ComparedImage
+        The images, on a plane where a period of the pattern is the same shift everywhere (a metric or an affine one).
     pairs : sequence of (int, int)
     workers : int
-        Pictures that are compared at the same time.
+        Images that are compared at the same time.
 
     Returns
     -------
     dict of (int, int) to UniqueShift
         Of the pairs of which that decides, in units of the plane.
     """
-    pictures = sorted({k for pair in pairs for k in pair})
-    if not pictures:
+    images = sorted({k for pair in pairs for k in pair})
+    if not images:
         return {}
-    scale = float(np.median([drawing_scale(placed[k].camera, placed[k].homography, COMPARED_SIDE) for k in pictures]))
+    scale = float(np.median([drawing_scale(placed[k].camera, placed[k].homography, COMPARED_SIDE) for k in images]))
 
     def prepare(k: int) -> tuple[Drawing, Grey | None]:
         drawing = draw(placed[k], scale, COMPARED_SIDE)
@@ -95,18 +95,18 @@ def unique_shifts(
         return replace(found, shift=shift) if _moves(placed[pair[0]], placed[pair[1]], shift) else None
 
     with ThreadPoolExecutor(workers) as pool:
-        prepared = dict(zip(pictures, pool.map(prepare, pictures), strict=True))
+        prepared = dict(zip(images, pool.map(prepare, images), strict=True))
         compared = zip(pairs, pool.map(compare, pairs), strict=True)
         return {pair: found for pair, found in compared if found is not None}
 
 
 def departures(pixels: Grey) -> Grey | None:
-    """How far each pixel (h, w) of a drawing departs from the picture's own pattern, in spreads of its copies.
+    """How far each pixel (h, w) of a drawing departs from the image's own pattern, in spreads of its copies.
 
     Returns
     -------
     ndarray of shape (h, w), float32, or None
-        0 where it does not; NaN where nothing is known. None for a picture that shows too few periods.
+        0 where it does not; NaN where nothing is known. None for an image that shows too few periods.
     """
     found = _peaks(Overlaps.of(pixels, pixels), pixels, np.zeros(2), _OWN_OVERLAP)
     periods = found.shift[np.hypot(*found.shift.T) > _MIN_SHIFT]
@@ -183,7 +183,7 @@ def _vertex(before: Grey, here: Grey, after: Grey) -> FloatArray:
 
 
 def _shifted(pixels: Grey, shift: FloatArray) -> Grey:
-    """A picture moved by (x, y); NaN where it is not."""
+    """An image moved by (x, y); NaN where it is not."""
     matrix = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]]])
     size = pixels.shape[1], pixels.shape[0]
     return np.asarray(
@@ -201,8 +201,8 @@ def _median(copies: Grey, count: IntArray) -> Grey:
     return np.asarray(0.5 * (low + np.where(np.isfinite(high), high, low)), dtype=np.float32)
 
 
-def _moves(first: PlacedPicture, second: PlacedPicture, shift: FloatArray) -> bool:
-    """Whether a shift on the plane moves the second picture over the first: dust on the lens is where it was."""
+def _moves(first: ComparedImage, second: ComparedImage, shift: FloatArray) -> bool:
+    """Whether a shift on the plane moves the second image over the first: dust on the lens is where it was."""
     height, width = first.grey.shape
     middle = np.array([[width / 2.0, height / 2.0]])
     seen = from_plane(second.camera, second.homography, to_plane(first.camera, first.homography, middle) + shift)

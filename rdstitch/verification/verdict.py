@@ -15,7 +15,7 @@ from rdstitch.messages import Message, Severity, names_of, shortened
 from rdstitch.registration import Registration
 from rdstitch.verification.competing_motions import Contest
 from rdstitch.verification.input_doubts import doubtful_inputs
-from rdstitch.verification.misfits import agreement_of_all, disagreeing_pairs, misfitting_pictures
+from rdstitch.verification.misfits import agreement_of_all, disagreeing_pairs, misfitting_images
 from rdstitch.verification.overlap_check import CheckedLink, check_overlaps, share_alike
 from rdstitch.verification.parallax import find_parallax, parallax_messages
 from rdstitch.verification.rival_check import compare_with_rivals, outside_rivals
@@ -25,10 +25,10 @@ from rdstitch.verification.rules import Situation, spoken
 Pair = tuple[int, int]
 
 _MAX_RMS = 1.0  # of the whole, in thresholds
-_MAX_RMS_OF_RELIEF = 3.0  # the same where the pictures look alike
-_MAX_RELIEF = 0.02  # of a picture's diagonal: the same where relief explains them, and most of the overlaps look alike
+_MAX_RMS_OF_RELIEF = 3.0  # the same where the images look alike
+_MAX_RELIEF = 0.02  # of an image's diagonal: the same where relief explains them, and most of the overlaps look alike
 _MAX_AMBIGUITY = 0.4  # share of the pairs that may fit elsewhere: more is a pattern all over
-# Of the cells of an overlap that agree: chance lets up to 7 % do so, and right registrations of difficult pictures
+# Of the cells of an overlap that agree: chance lets up to 7 % do so, and right registrations of difficult images
 # (low sun, parallax, blur) have been seen to have 20 %.
 _MIN_AGREEMENT, _DOUBTFUL_AGREEMENT = 0.10, 0.15
 _USUAL_AGREEMENT, _CLEAR_AGREEMENT = 0.25, 0.5
@@ -61,8 +61,8 @@ def judge(
 ) -> tuple[Message, ...]:
     """Check an alignment against the pairs that it was made from, and against the pixels.
 
-    What makes the places of pictures doubtful, a repeated pattern for one, leaves the lens as it is: a board shifted by
-    a square is as straight as before. And pictures that mostly show what rests in them keep some matches of that,
+    What makes the places of images doubtful, a repeated pattern for one, leaves the lens as it is: a board shifted by
+    a square is as straight as before. And images that mostly show what rests in them keep some matches of that,
     which agree with nothing, and look alike anywhere but where the moving plane puts them.
 
     Parameters
@@ -71,16 +71,16 @@ def judge(
     threshold : float
         Largest transfer error of an inlier of a pair, pixels.
     executor : concurrent.futures.Executor, optional
-        Where pictures are compared; None: in one thread.
+        Where images are compared; None: in one thread.
     cache : Cache
     lens_only : bool
-        Only the lens is wanted, so that doubts about the places of pictures do not make the result fail, and are
+        Only the lens is wanted, so that doubts about the places of images do not make the result fail, and are
         not reported where a repeated pattern explains them.
 
     Returns
     -------
     tuple of Message
-        Failures, with the pictures that they concern where that is clear, and warnings; none for a good result.
+        Failures, with the images that they concern where that is clear, and warnings; none for a good result.
     """
     alignment = registration.alignment
     paths = [str(source.path) for source in registration.sources]
@@ -91,10 +91,10 @@ def judge(
     geometric = [
         *_mixed(paths, registration),
         *agreement_of_all(used),
-        *([] if resting else misfitting_pictures(registration, agreeing)),
+        *([] if resting else misfitting_images(registration, agreeing)),
         *([] if resting else (disagreeing[pair] for pair in _decisive(disagreeing, used, len(paths)))),
     ]
-    if geometric:  # what the pixels say of pictures that may be left out need not be known
+    if geometric:  # what the pixels say of images that may be left out need not be known
         return tuple(geometric)
     with nullcontext(executor) if executor is not None else ThreadPoolExecutor(1) as where:
         checked = [] if resting else check_overlaps(registration, where, cache)
@@ -105,7 +105,7 @@ def judge(
     ambiguous = _ambiguous(paths, seen)
     if lens_only:  # it is the same a period of the pattern further on, and what rests has a message of its own
         rivals = [] if resting else [rival for rival in rivals if (rival.image1, rival.image2) not in ambiguous]
-    # What two pictures share of a plane looks alike; where something else moves, it may be that which holds them.
+    # What two images share of a plane looks alike; where something else moves, it may be that which holds them.
     undecided = is_apart(rivals) and not (compared and (compared.won or compared.lost))
     least = MIN_AGREEMENT if undecided else _MIN_AGREEMENT
     suspicions = {**disagreeing, **_unlike(paths, seen, least), **_of_the_rival(paths, checked, compared), **ambiguous}
@@ -140,7 +140,7 @@ def _error_of_the_whole(alignment: Alignment, threshold: float, checked: Sequenc
     rms = alignment.rms
     if rms <= _MAX_RMS * threshold:
         return []
-    text = f"the pictures disagree by {rms:.1f} pixels, more than the threshold of {threshold:g} pixels"
+    text = f"the images disagree by {rms:.1f} pixels, more than the threshold of {threshold:g} pixels"
     relief, alike = alignment.relief, _usual_agreement(checked)
     largest = _MAX_RELIEF * 2.0 * max(camera.half_diagonal for camera in alignment.cameras)
     # Without what neighbours have in common, errors are those of a plane.
@@ -153,7 +153,7 @@ def _error_of_the_whole(alignment: Alignment, threshold: float, checked: Sequenc
 
 
 def _relief(paths: Sequence[str], alignment: Alignment) -> list[Message]:
-    """Errors that neighbouring matches have in common, and the pair of pictures where they are largest."""
+    """Errors that neighbouring matches have in common, and the pair of images where they are largest."""
     if not alignment.relief.found:
         return []
     worst = max((fit for fit in alignment.links if fit.used), key=lambda fit: fit.rms)
@@ -164,7 +164,7 @@ def _relief(paths: Sequence[str], alignment: Alignment) -> list[Message]:
 
 
 def _shape(paths: Sequence[str], alignment: Alignment) -> list[Message]:
-    """A shape of the whole that the overlaps do not hold, and the picture that may be off the most."""
+    """A shape of the whole that the overlaps do not hold, and the image that may be off the most."""
     shape = alignment.shape
     if shape is None:
         return []
@@ -188,7 +188,7 @@ def _shape(paths: Sequence[str], alignment: Alignment) -> list[Message]:
 
 
 def _usual_agreement(checked: Sequence[CheckedLink]) -> float:
-    """How much alike pictures look where most pairs put them, [0, 1]; 0 where there is nothing to see."""
+    """How much alike images look where most pairs put them, [0, 1]; 0 where there is nothing to see."""
     shares = [link.agreement.share for link in checked if link.agreement.cells >= _MIN_CELLS]
     return float(np.median(shares)) if shares else 0.0
 
@@ -222,7 +222,7 @@ def _outvoted(
 
 
 def _mixed(paths: Sequence[str], registration: Registration) -> list[Message]:
-    """Two lenses whose pictures were not separated: it is not clear which are whose, or each has one picture only."""
+    """Two lenses whose images were not separated: it is not clear which are whose, or each has one image only."""
     mixed = registration.mixed
     if mixed is None or mixed.certain:
         return []
@@ -236,35 +236,35 @@ def _mixed(paths: Sequence[str], registration: Registration) -> list[Message]:
 
 
 def _two_left(paths: Sequence[str], registration: Registration) -> list[Message]:
-    """A warning where a third picture, taken for one of another lens, is all that told a curved wall from a plane."""
+    """A warning where a third image, taken for one of another lens, is all that told a curved wall from a plane."""
     used = registration.alignment.used
     if registration.mixed is None or used.sum() != 2:
         return []
     kept = tuple(path for path, own in zip(paths, used, strict=True) if own)
     text = (
-        f"{' and '.join(names_of(kept))} fit without the pictures of another lens, as any two do; if all are of one "
-        "lens, the scene is no plane, and these are off in the whole; add pictures of this lens"
+        f"{' and '.join(names_of(kept))} fit without the images of another lens, as any two do; if all are of one "
+        "lens, the scene is no plane, and these are off in the whole; add images of this lens"
     )
     return [Message(text, kept, code="mixed-lenses")]
 
 
 def _decisive(suspicions: Mapping[Pair, Message], used: Sequence[LinkFit], count: int) -> list[Pair]:
-    """The suspicious pairs without which the pictures fall apart; those of the others are held by better ones."""
+    """The suspicious pairs without which the images fall apart; those of the others are held by better ones."""
     sound = [fit for fit in used if (fit.image1, fit.image2) not in suspicions]
     parts = connected_components(count, [fit.image1 for fit in sound], [fit.image2 for fit in sound])
-    part = {picture: number for number, pictures in enumerate(parts) for picture in pictures}
+    part = {image: number for number, images in enumerate(parts) for image in images}
     return [(i, j) for i, j in suspicions if part[i] != part[j]]
 
 
 def _of_pair(paths: Sequence[str], link: LinkFit, text: str, severity: Severity = "failure") -> Message:
-    """A message on two pictures; ``text`` follows their names."""
+    """A message on two images; ``text`` follows their names."""
     both = paths[link.image1], paths[link.image2]
     code = "doubtful-seam" if severity == "warning" else ""
     return Message(f"{' and '.join(names_of(both))}{text}", both, severity, code)
 
 
 def _unlike(paths: Sequence[str], checked: Sequence[CheckedLink], least: float) -> dict[Pair, Message]:
-    """Pictures that were put together and do not look alike there."""
+    """Images that were put together and do not look alike there."""
     return {
         link.pair: _of_pair(
             paths,
@@ -280,7 +280,7 @@ def _unlike(paths: Sequence[str], checked: Sequence[CheckedLink], least: float) 
 def _of_the_rival(
     paths: Sequence[str], checked: Sequence[CheckedLink], compared: Contest | None
 ) -> dict[Pair, Message]:
-    """Pictures that may be held together by what moves otherwise than the plane; none where that holds all of them."""
+    """Images that may be held together by what moves otherwise than the plane; none where that holds all of them."""
     doubtful = frozenset[Pair]() if compared is None or compared.lost else compared.doubtful
     return {
         link.pair: _of_pair(
@@ -292,13 +292,13 @@ def _of_the_rival(
 
 
 def _ambiguous(paths: Sequence[str], checked: Sequence[CheckedLink]) -> dict[Pair, Message]:
-    """Pictures of a repeated pattern, of which nobody can say by how many periods they are apart."""
+    """Images of a repeated pattern, of which nobody can say by how many periods they are apart."""
     return {
         link.pair: _of_pair(
             paths,
             link.fit,
-            f" fit as well elsewhere, {link.ambiguity.shift:.0%} of a picture away (a repeated pattern?); "
-            "take pictures that share something unique",
+            f" fit as well elsewhere, {link.ambiguity.shift:.0%} of an image away (a repeated pattern?); "
+            "take images that share something unique",
         )
         for link in checked
         if link.ambiguity.ambiguous and not link.unique
@@ -314,14 +314,14 @@ def _settled(paths: Sequence[str], checked: Sequence[CheckedLink]) -> list[Messa
     images = (paths[least.fit.image1], paths[least.fit.image2])
     first, second = names_of(images)
     text = (
-        "the pictures show a repeated pattern; what is unique in them (dirt, a mark, an object) decided where they "
+        "the images show a repeated pattern; what is unique in them (dirt, a mark, an object) decided where they "
         f"lie; look at the seams, that between {first} and {second} first"
     )
     return [Message(text, images, code="repeated-pattern")]
 
 
 def _little_alike(paths: Sequence[str], checked: Sequence[CheckedLink]) -> list[Message]:
-    """Pictures that look less alike than most where they are put together."""
+    """Images that look less alike than most where they are put together."""
     return [
         _of_pair(
             paths,

@@ -1,5 +1,5 @@
-"""A page to look at a Deep Zoom picture: zoom and pan, outlines and names of the pictures, seams, what was found."""
+"""A page to look at a Deep Zoom image: zoom and pan, outlines and names of the images, seams, what was found."""
 
-from rdstitch.viewer.page import ViewedPicture, viewer_page, viewer_path
+from rdstitch.viewer.page import ViewedImage, viewer_page, viewer_path
 
-__all__ = ["ViewedPicture", "viewer_page", "viewer_path"]
+__all__ = ["ViewedImage", "viewer_page", "viewer_path"]

@@ -22,7 +22,7 @@ _COLOUR = (0, 229, 255)
 _CORNERS = 64  # of an outline, at most
 
 
-def seam_picture(
+def seam_image(
     seams: SeamMap, origin: tuple[int, int], size: tuple[int, int]
 ) -> tuple[bytes, tuple[float, float, float, float]]:
     """Seams as PNG, and the box (x, y, width, height) that it fills, pixels of the mosaic from its corner.
@@ -40,7 +40,7 @@ def seam_picture(
     for axis in (0, 1):
         first = (slice(None, -1), slice(None)) if axis == 0 else (slice(None), slice(None, -1))
         second = (slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))
-        # Where a picture ends at nothing there is no seam.
+        # Where an image ends at nothing there is no seam.
         meets[first] |= (labels[first] != labels[second]) & (labels[first] >= 0) & (labels[second] >= 0)
     samples = np.zeros((*labels.shape, 4), dtype=np.uint8)
     samples[meets] = (*_COLOUR, 255)
@@ -51,8 +51,8 @@ def seam_picture(
 
 
 @dataclass(frozen=True)
-class ViewedPicture:
-    """What the page says of a picture.
+class ViewedImage:
+    """What the page says of an image.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class ViewedPicture:
     outlines : sequence of ndarray of shape (K, 2)
         At each of its places; pixels of the mosaic, centre of the top-left one at (0, 0).
     facts : tuple of (str, str)
-        What is shown when the picture is clicked.
+        What is shown when the image is clicked.
     """
 
     name: str
@@ -77,7 +77,7 @@ def viewer_path(output: str | Path) -> Path | None:
 def viewer_page(
     output: str | Path,
     size: tuple[int, int],
-    pictures: Sequence[ViewedPicture],
+    images: Sequence[ViewedImage],
     seams: SeamMap | None = None,
     origin: tuple[int, int] = (0, 0),
 ) -> str:
@@ -106,10 +106,10 @@ def viewer_page(
                 "Size": {"Width": str(size[0]), "Height": str(size[1])},
             }
         },
-        "pictures": [_described(picture) for picture in pictures],
+        "images": [_described(image) for image in images],
     }
     if seams is not None:
-        shown, box = seam_picture(seams, origin, size)
+        shown, box = seam_image(seams, origin, size)
         data["seams"] = "data:image/png;base64," + base64.b64encode(shown).decode("ascii")
         data["seamsBox"] = box
     title = escape(output.name)
@@ -134,14 +134,14 @@ def viewer_page(
     )
 
 
-def _described(picture: ViewedPicture) -> dict[str, Any]:
+def _described(image: ViewedImage) -> dict[str, Any]:
     """For the script, which counts pixels from the corner of the first one."""
-    outlines = [outline[:: max(1, len(outline) // _CORNERS)] + 0.5 for outline in picture.outlines]
+    outlines = [outline[:: max(1, len(outline) // _CORNERS)] + 0.5 for outline in image.outlines]
     return {
-        "name": picture.name.encode("utf-8", "backslashreplace").decode("utf-8"),
+        "name": image.name.encode("utf-8", "backslashreplace").decode("utf-8"),
         "outlines": [np.round(outline, 1).tolist() for outline in outlines],
         "centers": [np.round(outline.mean(axis=0), 1).tolist() for outline in outlines],
-        "facts": [list(fact) for fact in picture.facts],
+        "facts": [list(fact) for fact in image.facts],
     }
 
 

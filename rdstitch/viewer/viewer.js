@@ -19,12 +19,12 @@ if (data.seams) make("image", seams, { href: data.seams, x: data.seamsBox[0], y:
 make("rect", make("clipPath", drawing, { id: "mosaic" }), { width, height });
 const outlines = make("g", drawing, { "clip-path": "url(#mosaic)" });
 const names = document.getElementById("names");
-const pictures = data.pictures.map((picture) => ({
-  ...picture,
-  // A picture across the edge of a full turn has two places; its name is at the one that shows more of it.
-  path: make("path", outlines, { d: picture.outlines.map((line) => "M" + line.join("L") + "Z").join("") }),
-  center: picture.centers.reduce((a, b) => (Math.abs(a[0] - width / 2) < Math.abs(b[0] - width / 2) ? a : b)),
-  label: names.appendChild(Object.assign(document.createElement("span"), { textContent: picture.name })),
+const images = data.images.map((image) => ({
+  ...image,
+  // An image across the edge of a full turn has two places; its name is at the one that shows more of it.
+  path: make("path", outlines, { d: image.outlines.map((line) => "M" + line.join("L") + "Z").join("") }),
+  center: image.centers.reduce((a, b) => (Math.abs(a[0] - width / 2) < Math.abs(b[0] - width / 2) ? a : b)),
+  label: names.appendChild(Object.assign(document.createElement("span"), { textContent: image.name })),
 }));
 
 // Pixels of the mosaic to pixels of the page: one unit of the viewport is the width of the mosaic.
@@ -33,7 +33,7 @@ const place = () => {
   const origin = at(0, 0), scale = (at(width, 0).x - origin.x) / width;
   drawing.setAttribute("transform", `translate(${origin.x},${origin.y}) scale(${scale})`);
   const taken = [];
-  for (const { label, center } of pictures) {
+  for (const { label, center } of images) {
     const x = origin.x + center[0] * scale, y = origin.y + center[1] * scale;
     label.style.left = `${x}px`; label.style.top = `${y}px`;
     const half = label.textContent.length * 3.6 + 6;
@@ -52,7 +52,7 @@ const inside = ([x, y], outline) => outline.reduce((odd, [x1, y1], k) => {
 }, false);
 const facts = document.getElementById("facts");
 const show = (chosen) => {
-  for (const picture of pictures) picture.path.classList.toggle("chosen", picture === chosen);
+  for (const image of images) image.path.classList.toggle("chosen", image === chosen);
   facts.replaceChildren();
   if (!chosen) return;
   facts.appendChild(Object.assign(document.createElement("h2"), { textContent: chosen.name }));
@@ -68,8 +68,8 @@ viewer.addHandler("canvas-click", (event) => {
   const point = viewer.viewport.pointFromPixel(event.position);
   const at = [point.x * width, point.y * width];
   const distance = ({ centers }) => Math.min(...centers.map(([x, y]) => Math.hypot(x - at[0], y - at[1])));
-  // Of several pictures that show a place, the one whose centre is nearest.
-  show(pictures.filter((p) => p.outlines.some((line) => inside(at, line))).sort((a, b) => distance(a) - distance(b))[0]);
+  // Of several images that show a place, the one whose centre is nearest.
+  show(images.filter((p) => p.outlines.some((line) => inside(at, line))).sort((a, b) => distance(a) - distance(b))[0]);
 });
 const toggle = (id, node) => {
   const box = document.getElementById(id);

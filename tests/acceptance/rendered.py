@@ -1,4 +1,4 @@
-"""What the rendered sets share: registration against the truth, and the picture against the true plane."""
+"""What the rendered sets share: registration against the truth, and the image against the true plane."""
 
 from functools import partial
 from pathlib import Path
@@ -21,8 +21,8 @@ def geometry(sequence: Sequence, result: StitchResult, model: str) -> AlignmentE
     return alignment_error(sequence, places, model=model)
 
 
-def picture(sequence: Sequence, output: Path, model: str) -> PlaneComparison:
-    """The written picture against what the pictures could see of the true plane, up to one transform."""
+def image(sequence: Sequence, output: Path, model: str) -> PlaneComparison:
+    """The written image against what the images could see of the true plane, up to one transform."""
     found = read_image(output)
     assert found.alpha is not None
     shown = np.dstack([found.pixels, found.alpha])

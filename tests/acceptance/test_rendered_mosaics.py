@@ -9,7 +9,7 @@ import pytest
 import rdstitch
 from rdstitch.camera import Camera
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
-from tests.acceptance.rendered import geometry, picture
+from tests.acceptance.rendered import geometry, image
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def test_mosaic(name: str, tmp_path: Path) -> None:
     error = geometry(sequence, result, "similarity")
     assert error.median < view.median
     assert error.percentile95 < view.percentile95
-    seen = picture(sequence, output, "similarity")
+    seen = image(sequence, output, "similarity")
     assert seen.median < view.median
     assert seen.percentile95 < view.percentile95
     assert seen.coverage >= 0.97

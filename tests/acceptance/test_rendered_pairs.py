@@ -1,4 +1,4 @@
-"""Two pictures with little overlap and strong distortion, no setting given: λ, and the stitched plane."""
+"""Two images with little overlap and strong distortion, no setting given: λ, and the stitched plane."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ import pytest
 import rdstitch
 from rdstitch.camera import Camera
 from rdstitch.synthetic import Photometry, ground, pair_poses, sequence_over
-from tests.acceptance.rendered import geometry, picture
+from tests.acceptance.rendered import geometry, image
 from tests.sampled import sampled
 
 
@@ -24,6 +24,6 @@ def test_pair(distortion: float, seed: int, tmp_path: Path) -> None:
     result = rdstitch.pano(sequence.write(tmp_path), output)
     assert abs(result.registration.alignment.distortion - distortion) <= 0.02
     assert geometry(sequence, result, "homography").median < 1.0
-    seen = picture(sequence, output, "homography")
+    seen = image(sequence, output, "homography")
     assert seen.median < 1.0
     assert seen.coverage > 0.97

@@ -30,7 +30,7 @@ def test_hills_do_not_move_the_distortion_centre() -> None:
 
 @pytest.mark.slow
 def test_a_strip_does_not_go_downhill() -> None:
-    """With all pairs from the earlier picture to the later one, heights fall by a quarter: off by 3.1 per cent."""
+    """With all pairs from the earlier image to the later one, heights fall by a quarter: off by 3.1 per cent."""
     item = strip("slopes", 0.1, 3, 40)
     found = align(item.cameras, item.links, AlignmentOptions())
     assert found.used.all()
@@ -50,7 +50,7 @@ def test_heights_do_not_bend_a_strip(kind: str, height: float, seed: int) -> Non
 
 
 @pytest.mark.parametrize("kind", ["buildings", "slopes"])
-def test_of_two_pictures_a_tilt_may_look_like_relief(kind: str) -> None:
+def test_of_two_images_a_tilt_may_look_like_relief(kind: str) -> None:
     """Tilts that differ by 2.5 degrees pass for hills; by those of the same tilt λ is off by 5.1 and 4.5 deviations."""
     item = strip(kind, 0.02, 7, 40).window(38, 2)
     found = align(item.cameras, item.links, AlignmentOptions())

@@ -1,16 +1,16 @@
 """Brightness of a composite measured: python -m tests.benchmarks.brightness SIDECAR FOLDER [--exposure CHOICE ...].
 
-Pictures are put together by a sidecar, so that only the compositing is looked at. Printed for every choice of
-``--exposure``, and for the pictures as they are:
+Images are put together by a sidecar, so that only the compositing is looked at. Printed for every choice of
+``--exposure``, and for the images as they are:
 
 gain
-    Smallest and largest factor between a picture's mean and what it has in the composite.
+    Smallest and largest factor between an image's mean and what it has in the composite.
 saturated
-    Share of px with a channel at full scale, per cent: in all pictures, and in the composite.
+    Share of px with a channel at full scale, per cent: in all images, and in the composite.
 median
-    Grey level, 0-255, over all pictures, as they are and corrected.
+    Grey level, 0-255, over all images, as they are and corrected.
 seam
-    Difference of the two pictures on either side of the seams, both low-passed over 2 % of a picture's width, so that
+    Difference of the two images on either side of the seams, both low-passed over 2 % of an image's width, so that
     light counts and detail does not: mean and 95 %, grey levels.
 """
 
@@ -23,11 +23,11 @@ import numpy as np
 from rdstitch.compositing import CompositeOptions, plan_canvas
 from rdstitch.compositing.boxes import Float32Array
 from rdstitch.compositing.photometric import full_scale
-from rdstitch.compositing.placed_picture import place_pictures
+from rdstitch.compositing.placed_image import place_images
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.seam_finder import NO_OWNER, SeamMap
-from rdstitch.compositing.source_images import PictureReader
-from rdstitch.compositing.survey import Survey, survey_pictures
+from rdstitch.compositing.source_images import ImageReader
+from rdstitch.compositing.survey import Survey, survey_images
 from rdstitch.compositing.warp import locate
 from rdstitch.inputs.source import read_sources
 from rdstitch.sidecar.read import read_sidecar
@@ -73,22 +73,22 @@ def main() -> None:
     parser.add_argument("--exposure", nargs="+", choices=CHOICES, default=CHOICES)
     arguments = parser.parse_args()
     saved = read_sidecar(arguments.sidecar)
-    used = [picture for picture in saved.pictures if picture.to_plane is not None]
+    used = [image for image in saved.images if image.to_plane is not None]
     sources, _ = read_sources(
-        [arguments.folder / picture.name for picture in used], camera=None, focal=None, distortion=None, skip_bad=False
+        [arguments.folder / image.name for image in used], camera=None, focal=None, distortion=None, skip_bad=False
     )
-    cameras = [picture.camera for picture in used if picture.camera is not None]
-    matrices = np.array([picture.to_plane for picture in used])
+    cameras = [image.camera for image in used if image.camera is not None]
+    matrices = np.array([image.to_plane for image in used])
     canvas, read = plan_canvas(cameras, matrices), [source.read for source in sources]
-    pictures = place_pictures(read, cameras, matrices, preview=read)
-    survey = survey_pictures(PictureReader(pictures), pictures, canvas, 2)
+    images = place_images(read, cameras, matrices, preview=read)
+    survey = survey_images(ImageReader(images), images, canvas, 2)
     tiles = [tile for tile in survey.tiles if tile is not None]
     full = full_scale(tiles[0].pixels.dtype)
     inputs = np.concatenate([tile.pixels[tile.inside].astype(np.float32) for tile in tiles])
     print(f"{'':10} {'gain':>13} {'saturated %':>13} {'median':>13} {'seam mean':>10} {'95 %':>6}")
     for choice in arguments.exposure:
         options = CompositeOptions(exposure=choice)
-        with prepare_composite(pictures, canvas, options) as ready:
+        with prepare_composite(images, canvas, options) as ready:
             corrected = [
                 ready.renderer.exposure.correct(k, locate(survey.warps[k], tile.box), tile.pixels).astype(np.float32)
                 for k, tile in enumerate(survey.tiles)

@@ -24,7 +24,7 @@ _FREE = np.arange(5) == 0  # λ alone
 def linearize(
     start: Any, x1: Any, x2: Any, scale2: Any, homographies: Any, distortion: float, width: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Gram matrices and gradients by H and λ (10 entries), and squared whitened errors, of pictures of one size."""
+    """Gram matrices and gradients by H and λ (10 entries), and squared whitened errors, of images of one size."""
     count = len(start) - 1
     gram, gradient, squared = np.zeros((count, 10, 10)), np.zeros((count, 10)), np.empty(len(x1))
     # Written out, since products of small matrices are calls of a library also where they are compiled.

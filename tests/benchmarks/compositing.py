@@ -1,12 +1,12 @@
 """Compositing measured: python -m tests.benchmarks.compositing [mosaic] [gigapixel] [--megapixels N].
 
 mosaic
-    12 rendered colour pictures of 11 Mpx, as JPEG files: rdstitch's compositing alone with the true homographies, the
+    12 rendered colour images of 11 Mpx, as JPEG files: rdstitch's compositing alone with the true homographies, the
     whole of ``rdstitch mosaic``, OpenCV's Stitcher in SCANS mode and, where it is installed beside ``--peer-python``,
     ``stitch --affine`` of the package stitching, each a process of its own, with output as ``.jpg`` and as ``.tif``.
     Printed are processor and wall time, their ratio to those of SCANS for the same format, and peak memory.
 gigapixel
-    Mosaics of pictures that are made on the fly, a quarter of ``--megapixels`` and all of it: time per output px,
+    Mosaics of images that are made on the fly, a quarter of ``--megapixels`` and all of it: time per output px,
     peak memory, and what tifffile sees in the file.
 
 Every figure is of one run in a process of its own; the machine's other work shows in wall time, hardly in the rest.
@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.compositing import CompositeOptions, OutputFile, compose_to_file, place_pictures, plan_canvas
-from rdstitch.io import Metadata, Picture, read_image
+from rdstitch.compositing import CompositeOptions, OutputFile, compose_to_file, place_images, plan_canvas
+from rdstitch.io import DecodedImage, Metadata, read_image
 from rdstitch.synthetic import Photometry, grid_poses, ground, sequence_over
 
 LENS = Camera((3880, 2850), distortion=-0.03, focal=3100.0)
@@ -80,7 +80,7 @@ def _run(sender: Any, task: Callable[..., Any], arguments: tuple[Any, ...]) -> N
 
 
 def render(folder: Path) -> FloatArray:
-    """Twelve pictures as JPEG files; returns their true homographies to the plane."""
+    """Twelve images as JPEG files; returns their true homographies to the plane."""
     poses = grid_poses(LENS, COLUMNS, ROWS, overlap=OVERLAP, yaw=0.05, shift=0.04, seed=1)
     photometry = Photometry(gain=np.linspace(0.85, 1.15, len(poses)), vignetting=0.25, noise=0.008)
     plane = partial(ground, seed=2)
@@ -98,8 +98,8 @@ def composite_files(paths: list[Path], homographies: FloatArray, output: Path, *
     cameras = [LENS] * len(paths)
     sources = [partial(read_image, path) for path in paths]
     canvas = plan_canvas(cameras, homographies)
-    pictures = place_pictures(sources, cameras, homographies, preview=sources)
-    done = compose_to_file(OutputFile(output), pictures, canvas, CompositeOptions(**options))
+    images = place_images(sources, cameras, homographies, preview=sources)
+    done = compose_to_file(OutputFile(output), images, canvas, CompositeOptions(**options))
     return done.canvas.size
 
 
@@ -114,11 +114,11 @@ def whole_run(paths: list[Path], output: Path) -> str:
 PEER = """
 import sys, cv2
 stitcher = cv2.Stitcher.create(cv2.Stitcher_SCANS)
-status, picture = stitcher.stitch([cv2.imread(path) for path in sys.argv[2:]])
+status, image = stitcher.stitch([cv2.imread(path) for path in sys.argv[2:]])
 if status:
     sys.exit(f"failed with status {status}")
-cv2.imwrite(sys.argv[1], picture)
-print(f"OpenCV {cv2.__version__}: {picture.shape[1]} x {picture.shape[0]} px", end="")
+cv2.imwrite(sys.argv[1], image)
+print(f"OpenCV {cv2.__version__}: {image.shape[1]} x {image.shape[0]} px", end="")
 """
 
 
@@ -137,12 +137,12 @@ def stitch_affine(command: Path, paths: list[Path], output: Path) -> str:
 
 
 def section_mosaic(peer_python: str) -> None:
-    """12 pictures of 11 Mpx."""
+    """12 images of 11 Mpx."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         homographies = render(folder)
         paths = sorted(folder.glob("*.jpg"))
-        print(f"12 pictures of {LENS.image_size[0]} x {LENS.image_size[1]}")
+        print(f"12 images of {LENS.image_size[0]} x {LENS.image_size[1]}")
         print(HEAD)
         stitching = Path(peer_python).with_name("stitch")
         for kind in (".jpg", ".tif"):
@@ -157,14 +157,14 @@ def section_mosaic(peer_python: str) -> None:
             print(ours.row(f"rdstitch, compositing alone, {kind}", peer), "{} x {} px".format(*ours.result))
 
 
-def made_frame(index: int, tile: NDArray[np.uint8]) -> Picture:
-    """A picture without rendering: shifted texture, so that reading costs next to nothing."""
+def made_frame(index: int, tile: NDArray[np.uint8]) -> DecodedImage:
+    """An image without rendering: shifted texture, so that reading costs next to nothing."""
     frame = np.roll(tile, (37 * index, 61 * index), axis=(0, 1))
-    return Picture(frame, None, Metadata((frame.shape[1], frame.shape[0])))
+    return DecodedImage(frame, None, Metadata((frame.shape[1], frame.shape[0])))
 
 
 def flight(megapixels: float, size: tuple[int, int], overlap: float) -> tuple[list[Camera], FloatArray]:
-    """A square block of pictures side by side that covers so many megapixels, slightly turned and tilted."""
+    """A square block of images side by side that covers so many megapixels, slightly turned and tilted."""
     lens = Camera(size, distortion=-0.03)
     step = (1.0 - overlap) * np.array(size) / lens.half_diagonal
     columns, rows = (max(1, round((megapixels * 1e6) ** 0.5 / ((1.0 - overlap) * n))) for n in size)
@@ -181,7 +181,7 @@ def flight(megapixels: float, size: tuple[int, int], overlap: float) -> tuple[li
 
 
 def composite_flight(megapixels: float, channels: int, output: Path, options: dict[str, Any]) -> dict[str, Any]:
-    """A mosaic of made pictures."""
+    """A mosaic of made images."""
     size = (4000, 3000)
     cameras, matrices = flight(megapixels, size, overlap=0.25)
     rng = np.random.default_rng(1)
@@ -189,9 +189,9 @@ def composite_flight(megapixels: float, channels: int, output: Path, options: di
     tile = np.asarray(cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
     canvas = plan_canvas(cameras, matrices)
     sources = [partial(made_frame, index, tile) for index in range(len(cameras))]
-    pictures = place_pictures(sources, cameras, matrices)
-    done = compose_to_file(OutputFile(output), pictures, canvas, CompositeOptions(**options))
-    return {"pictures": len(cameras), "size": done.canvas.size, "coverage": done.coverage}
+    images = place_images(sources, cameras, matrices)
+    done = compose_to_file(OutputFile(output), images, canvas, CompositeOptions(**options))
+    return {"images": len(cameras), "size": done.canvas.size, "coverage": done.coverage}
 
 
 def section_gigapixel(megapixels: float, channels: int) -> None:
@@ -208,9 +208,7 @@ def section_gigapixel(megapixels: float, channels: int) -> None:
                 corner = page.asarray() if width * height < 1e8 else None
                 seen = f"{page.shape} {page.dtype}, bigtiff {tiff.is_bigtiff}, {len(tiff.pages)} levels"
                 assert corner is None or corner.shape[:2] == (height, width)
-            print(
-                f"{cost.result['pictures']} pictures of 12 Mpx -> {width} x {height} = {width * height / 1e6:.0f} Mpx"
-            )
+            print(f"{cost.result['images']} images of 12 Mpx -> {width} x {height} = {width * height / 1e6:.0f} Mpx")
             print(
                 f"    wall {cost.wall:.0f} s, processor {cost.processor:.0f} s ({1000 * rates[-1]:.0f} ms/Mpx), "
                 f"peak {cost.peak:.0f} MB, file {output.stat().st_size / 2**20:.0f} MB: {seen}"
@@ -223,7 +221,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sections", nargs="*", choices=["mosaic", "gigapixel", []], default=["mosaic", "gigapixel"])
     parser.add_argument("--megapixels", type=float, default=1000.0, help="output of the gigapixel section")
-    parser.add_argument("--channels", type=int, choices=[1, 3], default=3, help="of its pictures")
+    parser.add_argument("--channels", type=int, choices=[1, 3], default=3, help="of its images")
     parser.add_argument(
         "--peer-python", default=sys.executable, help="interpreter whose OpenCV stitches; 5.0.0 fails, 4 does not"
     )

@@ -1,11 +1,11 @@
 """Is λ's standard deviation honest? ``python -m tests.benchmarks.coverage FOLDER=λ... [--windows N] [--sizes 2 4 8]``.
 
-Windows of pictures that follow one another, at random places of folders whose λ is known, are calibrated each on its
+Windows of images that follow one another, at random places of folders whose λ is known, are calibrated each on its
 own. Printed are λ of each, its standard deviation and error in standard deviations, and in the end the share within
 three and the median. ``python -m tests.benchmarks.relief`` prints the same for rendered ground, flat and rough.
 
-λ is that of the one-parameter lens nearest over the whole picture. A λ fitted to the corners of a chessboard, which do
-not reach the corners of the picture, is another one: of a GoPro -0.545 there and -0.594 in the whole.
+λ is that of the one-parameter lens nearest over the whole image. A λ fitted to the corners of a chessboard, which do
+not reach the corners of the image, is another one: of a GoPro -0.545 there and -0.594 in the whole.
 """
 
 import argparse

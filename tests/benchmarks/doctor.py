@@ -19,7 +19,7 @@ from rdstitch.synthetic import Photometry, grid_poses, ground, sequence_over
 from tests.benchmarks.peak_memory import peak_memory
 
 _RENDERED = ((640, 480, 4, 3), (1280, 960, 4, 3), (1280, 960, 8, 5), (2400, 1800, 4, 3))
-"""Width, height, and pictures of a grid."""
+"""Width, height, and images of a grid."""
 
 
 def measured(folder: Path, output: Path) -> tuple[float, float]:
@@ -45,7 +45,7 @@ def compare(name: str, folder: Path, output: Path) -> None:
     seconds, megabytes = measured(folder, output)
     wanted = expected.seconds * (os.cpu_count() or 1)
     print(
-        f"{name:24s}{expected.pictures:5d}{wanted:9.0f}{seconds:9.1f}{wanted / seconds:8.2f}"
+        f"{name:24s}{expected.images:5d}{wanted:9.0f}{seconds:9.1f}{wanted / seconds:8.2f}"
         f"{expected.memory_bytes / 2**20:9.0f}{megabytes:9.0f}{expected.memory_bytes / 2**20 / megabytes:8.2f}",
         flush=True,
     )

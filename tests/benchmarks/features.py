@@ -1,12 +1,12 @@
-"""Kinds of features compared on warps of a picture: python -m tests.benchmarks.features [PICTURE | FOLDER …].
+"""Kinds of features compared on warps of an image: python -m tests.benchmarks.features [IMAGE | FOLDER …].
 
-A picture (by default the CC0 photo among the development pictures, else synthetic ground) is rendered at 1600 x 1200
-before and after known homographies, with noise. A folder holds pictures img1 … img6 and homographies H1to2p … H1to6p,
+An image (by default the CC0 photo among the development images, else synthetic ground) is rendered at 1600 x 1200
+before and after known homographies, with noise. A folder holds images img1 … img6 and homographies H1to2p … H1to6p,
 as the Oxford sets of Mikolajczyk and Schmid do.
 
-Printed are means over the warps: keypoints per picture; repeatability (share of the keypoints of picture 1 within
-picture 2 that have one within 3 px there); matches within 1 and 3 px of the truth, and the share of the latter;
-median error of those; CPU time relative to cv2's SIFT with its defaults in the same run; memory that the first picture
+Printed are means over the warps: keypoints per image; repeatability (share of the keypoints of image 1 within
+image 2 that have one within 3 px there); matches within 1 and 3 px of the truth, and the share of the latter;
+median error of those; CPU time relative to cv2's SIFT with its defaults in the same run; memory that the first image
 adds at its peak.
 """
 
@@ -49,7 +49,7 @@ Grey = NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two pictures and the homography from the first to the second."""
+    """Two images and the homography from the first to the second."""
 
     name: str
     first: Grey
@@ -57,12 +57,12 @@ class Pair:
     homography: FloatArray
 
 
-def rendered(picture: Grey) -> Iterator[Pair]:
-    """Warps of a picture: rotations, scales, tilts."""
+def rendered(image: Grey) -> Iterator[Pair]:
+    """Warps of an image: rotations, scales, tilts."""
     width, height = SIZE
-    # The picture is shown at half its resolution: as sharp as cameras are, and with a margin to turn into view.
-    shrink = max(0.5, width / picture.shape[1], height / picture.shape[0])
-    small = cv2.resize(picture, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    # The image is shown at half its resolution: as sharp as cameras are, and with a margin to turn into view.
+    shrink = max(0.5, width / image.shape[1], height / image.shape[0])
+    small = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
     margin = (np.array([small.shape[1], small.shape[0]]) - SIZE) / 2
     crop = np.array([[1, 0, -margin[0]], [0, 1, -margin[1]], [0, 0, 1]])
     rng = np.random.default_rng(0)
@@ -99,10 +99,10 @@ def measured(folder: Path) -> Iterator[Pair]:
 
 
 def read(path: Path) -> Grey:
-    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if picture is None:
-        raise SystemExit(f"{path}: cannot read the picture")
-    return np.asarray(picture, np.uint8)
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise SystemExit(f"{path}: cannot read the image")
+    return np.asarray(image, np.uint8)
 
 
 def transfer(homography: FloatArray, points: FloatArray) -> FloatArray:
@@ -130,11 +130,11 @@ def judge(pair: Pair, one: Features, two: Features) -> tuple[float, ...]:
 
 
 def drawn(points: FloatArray, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """A picture that is True where a point is."""
-    picture = np.zeros((size[1], size[0]), dtype=bool)
+    """An image that is True where a point is."""
+    image = np.zeros((size[1], size[0]), dtype=bool)
     u, v = np.clip(np.rint(points), 0, np.array(size) - 1).astype(int).T
-    picture[v, u] = True
-    return picture
+    image[v, u] = True
+    return image
 
 
 def cpu_time(work: object, *arguments: object) -> float:
@@ -149,7 +149,7 @@ def cpu_time(work: object, *arguments: object) -> float:
 
 def peak_memory(job: tuple[Grey, FeatureOptions | None]) -> float:
     """Memory that detection adds at its peak, MB; in a process of its own. Without options: cv2's SIFT."""
-    picture, options = job
+    image, options = job
     cv2.setNumThreads(1)
     detect(np.zeros((64, 64), np.uint8), FeatureOptions(kind="surf"))  # what imports and tables take
     # Linux forgets the peak so far when told to; elsewhere smaller peaks than that of the imports read as 0.
@@ -157,9 +157,9 @@ def peak_memory(job: tuple[Grey, FeatureOptions | None]) -> float:
         Path("/proc/self/clear_refs").write_text("5")
     before = peak()
     if options is None:
-        cv2.SIFT.create().detectAndCompute(picture, None)
+        cv2.SIFT.create().detectAndCompute(image, None)
     else:
-        detect(picture, options)
+        detect(image, options)
     return peak() - before
 
 
@@ -173,7 +173,7 @@ def peak() -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("inputs", nargs="*", type=Path, metavar="PICTURE|FOLDER")
+    parser.add_argument("inputs", nargs="*", type=Path, metavar="IMAGE|FOLDER")
     inputs = parser.parse_args().inputs
     cv2.setNumThreads(1)
     if not inputs and not PHOTO.exists():
@@ -183,12 +183,12 @@ def main() -> None:
         pairs = [
             pair for path in inputs or [PHOTO] for pair in (measured(path) if path.is_dir() else rendered(read(path)))
         ]
-    picture = pairs[0].first
+    image = pairs[0].first
     with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
-        memory = pool.map(peak_memory, [(picture, None), *((picture, options) for options in ROWS.values())], 1)
-    sift = cpu_time(cv2.SIFT.create().detectAndCompute, picture, None)
+        memory = pool.map(peak_memory, [(image, None), *((image, options) for options in ROWS.values())], 1)
+    sift = cpu_time(cv2.SIFT.create().detectAndCompute, image, None)
     print(
-        f"{len(pairs)} pairs, first picture {picture.shape[1]} x {picture.shape[0]}; cv2's SIFT with its defaults: "
+        f"{len(pairs)} pairs, first image {image.shape[1]} x {image.shape[0]}; cv2's SIFT with its defaults: "
         f"{sift:.2f} s, {memory[0]:.0f} MB\n"
     )
     print("| features | keypoints | repeatability | 1 px | 3 px | precision | error px | CPU time | MB |")
@@ -201,7 +201,7 @@ def main() -> None:
             if id(pair.first) not in firsts:
                 firsts[id(pair.first)] = detect(pair.first, options)
             scores.append(judge(pair, firsts[id(pair.first)], detect(pair.second, options)))
-        seconds = cpu_time(detect, picture, options)
+        seconds = cpu_time(detect, image, options)
         count, repeatability, one, three, precision, error = np.mean(scores, axis=0)
         print(
             f"| {name} | {count:.0f} | {repeatability:.2f} | {one:.0f} | {three:.0f} | {precision:.3f} | {error:.2f} "

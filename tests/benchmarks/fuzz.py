@@ -42,7 +42,7 @@ from rdstitch.camera import Camera
 from rdstitch.camera_files import load_camera
 from rdstitch.errors import RdstitchError
 from rdstitch.features import Features
-from rdstitch.inputs.find import find_pictures
+from rdstitch.inputs.find import find_images
 from rdstitch.inputs.measurements import with_attitudes
 from rdstitch.inputs.source import Source
 from rdstitch.io import packing, read_image, read_metadata, write_image
@@ -52,12 +52,12 @@ from rdstitch.io.metadata import Metadata, metadata_of
 from rdstitch.sidecar.read import read_sidecar
 from tests.damage import damaged
 from tests.property.test_camera_file_reading import TEXTS as CAMERA_FILES
-from tests.property.test_picture_reading import FILES as PICTURES
+from tests.property.test_image_reading import FILES as IMAGES
 from tests.property.test_sidecar_reading import GOOD as SIDECAR
 
 _SECONDS = 5  # a read that takes longer hangs
 _MEMORY = 6 * 2**30  # bytes; a read that needs more is a bomb
-_LARGEST = 2_000_000  # px of a picture that is decoded: fields that claim more cost nothing to say
+_LARGEST = 2_000_000  # px of an image that is decoded: fields that claim more cost nothing to say
 
 
 @dataclass(frozen=True)
@@ -83,11 +83,11 @@ def _tiff(samples: Any, **options: Any) -> bytes:
     return stream.getvalue()
 
 
-def _pictures() -> tuple[bytes, ...]:
+def _images() -> tuple[bytes, ...]:
     rng = np.random.default_rng(6)
     deep = rng.integers(0, 65536, (20, 30, 3), dtype=np.uint16)
     return (
-        *PICTURES.values(),
+        *IMAGES.values(),
         *(_encoded("JPEG", mode, progressive=True) for mode in ("L", "CMYK")),
         *(_encoded("PNG", mode) for mode in ("1", "P", "LA", "RGBA", "I;16")),
         *(_encoded("TIFF", "RGB", compression=name) for name in ("packbits", "tiff_lzw", "jpeg")),
@@ -100,7 +100,7 @@ def _pictures() -> tuple[bytes, ...]:
     )
 
 
-def _picture(file: Path) -> Any:
+def _image(file: Path) -> Any:
     metadata = read_metadata(file)
     return read_image(file) if metadata.size[0] * metadata.size[1] < _LARGEST else metadata
 
@@ -112,7 +112,7 @@ def _mask(file: Path) -> Any:
 
 def _exif_blocks() -> tuple[bytes, ...]:
     """EXIF with every tag that is read, and with the orientation as text and as a float."""
-    whole = Image.open(io.BytesIO(PICTURES["jpg"])).getexif().tobytes()
+    whole = Image.open(io.BytesIO(IMAGES["jpg"])).getexif().tobytes()
     head = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01"
     text, number = b"\x02\0\x02\0\0\x006\0\0\0", b"\x0b\0\x01\0\0\0\0\0\xc0\x40"
     return (whole, *(head + value + bytes(4) for value in (text, number)))
@@ -138,17 +138,17 @@ def _entry(file: Path) -> Any:
 
 
 def _xmp(file: Path) -> Any:
-    """The file's content as the XMP block of a picture."""
+    """The file's content as the XMP block of an image."""
     image = Image.new("L", (40, 30))
     image.info["xmp"] = file.read_bytes()
     return _by_name(file, partial(metadata_of, image))
 
 
 def _exif(file: Path) -> Any:
-    """The file's content as the EXIF block of a picture, which is read, and kept for the output."""
-    picture = file.parent / "a.png"
-    Image.new("L", (40, 30)).save(picture, exif=file.read_bytes())
-    metadata = read_metadata(picture)
+    """The file's content as the EXIF block of an image, which is read, and kept for the output."""
+    image = file.parent / "a.png"
+    Image.new("L", (40, 30)).save(image, exif=file.read_bytes())
+    metadata = read_metadata(image)
     write_image(file.parent / "b.png", np.zeros((30, 40), np.uint8), metadata=metadata)
     return read_metadata(file.parent / "b.png")
 
@@ -181,7 +181,7 @@ def _configuration(file: Path) -> Any:
 
 def _list(file: Path) -> Any:
     # What is named in the list is complained about by that name.
-    return _by_name(file, partial(find_pictures, [f"@{file}"]))
+    return _by_name(file, partial(find_images, [f"@{file}"]))
 
 
 def _by_name(file: Path, read: Callable[[], Any]) -> Any:
@@ -193,9 +193,9 @@ def _by_name(file: Path, read: Callable[[], Any]) -> Any:
 
 
 def is_rdstitch_output(file: Path) -> Any:
-    """A folder with one picture beside which this file lies as its sidecar."""
-    (file.parent / "a.png").write_bytes(PICTURES["png"])
-    return find_pictures([file.parent])
+    """A folder with one image beside which this file lies as its sidecar."""
+    (file.parent / "a.png").write_bytes(IMAGES["png"])
+    return find_images([file.parent])
 
 
 _CONFIGURATIONS = (
@@ -221,8 +221,8 @@ PARSERS = (
     Parser("cache entry", _entries(), _entry),
     Parser("attitude table", _TABLES, _attitudes),
     Parser("list", _LISTS, _list),
-    Parser("sidecar beside a picture", (json.dumps(SIDECAR).encode(),), is_rdstitch_output, "a.png.json"),
-    Parser("picture", _pictures(), _picture),
+    Parser("sidecar beside an image", (json.dumps(SIDECAR).encode(),), is_rdstitch_output, "a.png.json"),
+    Parser("image", _images(), _image),
     Parser("xmp", _XMP_BLOCKS, _xmp),
     Parser("exif", _exif_blocks(), _exif),
     Parser("deep zoom folder", _TILE_NAMES, _tiles),

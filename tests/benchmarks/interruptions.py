@@ -55,7 +55,7 @@ def run(log: Path, arguments: list[str], seconds: float | None = None) -> float:
 
 
 def totals(log: Path, unit: str) -> dict[str, float]:
-    """How many detections of pictures, and matchings and estimations of pairs, were begun; or what they took."""
+    """How many detections of images, and matchings and estimations of pairs, were begun; or what they took."""
     found: dict[str, float] = {}
     for line in log.read_text(encoding="ascii").splitlines():
         name, amount, own = line.split()

@@ -1,7 +1,7 @@
 """How well few coefficients describe fisheyes and Brown lenses: ``python -m tests.benchmarks.lens_models``.
 
-Printed are rms and largest distance in measured pixels over a picture of 1000 x 750, up to the scale of the undistorted
-picture. ``division k``: ``x_u = x_d / (1 + c1 r² + … + ck r^2k)``; ``rational``: with ``1 + a r²`` above two of those;
+Printed are rms and largest distance in measured pixels over an image of 1000 x 750, up to the scale of the undistorted
+image. ``division k``: ``x_u = x_d / (1 + c1 r² + … + ck r^2k)``; ``rational``: with ``1 + a r²`` above two of those;
 ``angle k``: Kannala and Brandt's ``r = f (θ + k1 θ³ + …)`` with the focal length and k coefficients.
 """
 

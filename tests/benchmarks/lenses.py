@@ -1,7 +1,7 @@
 """Rendered sets through fisheyes, Brown lenses and one-parameter lenses: ``python -m tests.benchmarks.lenses``.
 
 For each set the lens that was chosen, λ, and the distance from the true plane after the best similarity, pixels of the
-pictures: with the ladder of lenses, and with λ alone. At the end, for each kind of lens, the share of the sets in which
+images: with the ladder of lenses, and with λ alone. At the end, for each kind of lens, the share of the sets in which
 the ladder stopped at its first rung, the medians over the sets, and the worst set.
 
 "random fisheye", "random Brown" and "random one parameter" are another lens in each set, all but the last with a centre
@@ -99,7 +99,7 @@ def measure(name: str, seed: int, chosen: LensName, files: list[Path], sequence:
     error = _error(sequence, found)
     print(
         f"{name:20s} {seed:3d} {chosen:9s} {found.lens:16s} λ {found.distortion:+.4f} ± "
-        f"{found.distortion_std:.4f}  {found.model:10s} {int(found.used.sum())} pictures  "
+        f"{found.distortion_std:.4f}  {found.model:10s} {int(found.used.sum())} images  "
         f"median {error.median:.3f}  95 % {error.percentile95:.3f}  largest {error.max:.3f}  "
         f"{time.process_time() - start:.0f} s",
         flush=True,
@@ -130,7 +130,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="sets of each kind of lens")
     parser.add_argument("--first", type=int, default=0, help="seed of the first set")
     parser.add_argument("--lens", action="append", help="auto, division, …; both of these if not given")
-    parser.add_argument("--width", type=int, default=640, help="of the pictures, pixels; their height is 3/4 of it")
+    parser.add_argument("--width", type=int, default=640, help="of the images, pixels; their height is 3/4 of it")
     given = parser.parse_args()
     size = (given.width, given.width * 3 // 4)
     results: dict[tuple[str, str], list[Figures]] = {}

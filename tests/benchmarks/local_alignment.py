@@ -5,20 +5,20 @@ over a plane, rendered, registered by the whole pipeline, and put together with 
 Printed are medians over the sets:
 
 median, 95 %
-    How far two pictures are apart on the ground where a seam divides them, pixels, without and with.
+    How far two images are apart on the ground where a seam divides them, pixels, without and with.
 over 1
     Share of the seams' length along which they are farther apart than 1 pixel, per cent, without and with; and along
     seams that avoid the true displacements ("ideal"): no seam finder can do much better between walls and what they
     hide.
 line
-    How much a line that is straight on the ground bends within one picture as it is put into the output, pixels, root
+    How much a line that is straight on the ground bends within one image as it is put into the output, pixels, root
     mean square, without and with: what is mended must be more than what is bent.
 worse
     Sets in which the median or the 95 % across the seams grew by more than 5 % and 0.05 pixels.
 share
     Processor time of local alignment by that of the registration, per cent.
 
-``--folders`` prints for real pictures how far matches that are held out of the fit are apart, without and with.
+``--folders`` prints for real images how far matches that are held out of the fit are apart, without and with.
 """
 
 import argparse
@@ -35,11 +35,11 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas
 from rdstitch.compositing.photometric import no_exposure
-from rdstitch.compositing.placed_picture import PlacedPicture, place_pictures
+from rdstitch.compositing.placed_image import PlacedImage, place_images
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.seam_finder import NO_OWNER, SeamMap, find_seams
-from rdstitch.compositing.source_images import PictureReader
-from rdstitch.compositing.survey import survey_pictures
+from rdstitch.compositing.source_images import ImageReader
+from rdstitch.compositing.survey import survey_images
 from rdstitch.errors import RdstitchError
 from rdstitch.executors import open_executor
 from rdstitch.inputs.source import read_sources
@@ -60,7 +60,7 @@ _BRIGHTNESS_PER_PIXEL = 0.02  # of displacement, where seams avoid that
 
 @dataclass(frozen=True)
 class Apart:
-    """Distances on the ground of the two pictures on either side of the seams, pixels."""
+    """Distances on the ground of the two images on either side of the seams, pixels."""
 
     median: float
     percentile95: float
@@ -68,7 +68,7 @@ class Apart:
 
     @classmethod
     def of(cls, distances: FloatArray) -> Self:
-        """From all of them; where one of the pictures sees no ground counts not."""
+        """From all of them; where one of the images sees no ground counts not."""
         found = distances[np.isfinite(distances)]
         return cls(float(np.median(found)), float(np.percentile(found, 95)), float(np.mean(found > 1.0)))
 
@@ -90,9 +90,9 @@ class Figures:
         return any(b > max(1.05 * a, a + 0.05) for a, b in zip(off, on, strict=True))
 
 
-def sequence(kind: str, height: float, seed: int, pictures: int) -> Sequence:
+def sequence(kind: str, height: float, seed: int, images: int) -> Sequence:
     """A small flight over rough ground."""
-    poses = survey_poses(LENS, pictures, forward_overlap=0.6, side_overlap=0.5, attitude_jitter=0.02, seed=seed)
+    poses = survey_poses(LENS, images, forward_overlap=0.6, side_overlap=0.5, attitude_jitter=0.02, seed=seed)
     relief = None if kind == "flat" else lambda size: RELIEFS[kind](size, seed, height=height * 520.0)
     return sequence_over(
         lambda size: ground(size, seed, 1), LENS, poses, relief=relief, seed=seed, photometry=Photometry(noise=0.01)
@@ -108,7 +108,7 @@ def across_seams(truth: Sequence, registration: Registration, local: LocalAlignm
     cameras, matrices = [alignment.cameras[k] for k in used], alignment.homographies[used]
     canvas, read = plan_canvas(cameras, matrices), [source.read for source in sources]
     fields = list(local.fields) or None
-    placed = place_pictures(read, cameras, matrices, preview=read, displacement=fields)
+    placed = place_images(read, cameras, matrices, preview=read, displacement=fields)
     with prepare_composite(placed, canvas, CompositeOptions()) as ready:
         seams, warps = ready.renderer.seams, ready.renderer.warps
     if ideal:
@@ -129,9 +129,9 @@ def across_seams(truth: Sequence, registration: Registration, local: LocalAlignm
     return Apart.of(np.concatenate(distances))
 
 
-def _ideal_seams(truth: Sequence, used: NDArray[np.intp], placed: list[PlacedPicture], canvas: Canvas) -> SeamMap:
-    """Seams between pictures that show, in place of brightness, which place on the ground each pixel sees."""
-    survey = survey_pictures(PictureReader(placed), placed, canvas)
+def _ideal_seams(truth: Sequence, used: NDArray[np.intp], placed: list[PlacedImage], canvas: Canvas) -> SeamMap:
+    """Seams between images that show, in place of brightness, which place on the ground each pixel sees."""
+    survey = survey_images(ImageReader(placed), placed, canvas)
     tiles = []
     for number, tile, warp in zip(used, survey.tiles, survey.warps, strict=True):
         assert tile is not None
@@ -153,7 +153,7 @@ def line_bend(truth: Sequence, registration: Registration, local: LocalAlignment
         ends = truth.to_ground(int(k), rng.uniform((40, 40), (599, 439), (2 * _LINES, 2))).reshape(-1, 2, 2)
         share = np.linspace(0.0, 1.0, _POINTS)[:, None]
         for start, end in ends:
-            pixels = truth.ground_to_picture(int(k), start + share * (end - start))
+            pixels = truth.ground_to_image(int(k), start + share * (end - start))
             aligned = pixels
             for _ in range(10 if local.fields else 0):
                 aligned = pixels - local.fields[position](aligned)
@@ -165,9 +165,9 @@ def line_bend(truth: Sequence, registration: Registration, local: LocalAlignment
     return float(np.sqrt(np.mean(squares))) if squares else np.nan
 
 
-def measure(kind: str, height: float, seed: int, pictures: int) -> Figures:
+def measure(kind: str, height: float, seed: int, images: int) -> Figures:
     """One set through the pipeline."""
-    truth = sequence(kind, height, seed, pictures)
+    truth = sequence(kind, height, seed, images)
     with tempfile.TemporaryDirectory() as folder:
         registration, local, share = aligned(truth.write(folder))
         off = no_local_alignment("off")
@@ -190,10 +190,10 @@ def aligned(paths: list[Path]) -> tuple[Registration, LocalAlignment, float]:
 
 
 def held_out(folder: Path) -> str:
-    """A line on real pictures: how far matches that are held out of the fit are apart, without and with."""
+    """A line on real images: how far matches that are held out of the fit are apart, without and with."""
     names = (path for path in sorted(folder.iterdir()) if path.suffix.lower() in (".jpg", ".jpeg", ".png", ".tif"))
     registration, local, share = aligned(list(names))
-    used = f"{folder.name}: {registration.alignment.used.sum()} pictures"
+    used = f"{folder.name}: {registration.alignment.used.sum()} images"
     if local.before is None or local.after is None:
         return f"{used}, {local.reason}"
     apart = (f"{held.median:.2f}, {held.percentile95:.2f}" for held in (local.before, local.after))
@@ -224,9 +224,9 @@ def main() -> None:
     parser.add_argument("kinds", nargs="*", default=["flat", *RELIEFS], help="flat, bumps, buildings, slopes")
     parser.add_argument("--sets", type=int, default=3)
     parser.add_argument("--first", type=int, default=1, help="seed of the first set")
-    parser.add_argument("--pictures", type=int, default=6)
+    parser.add_argument("--images", type=int, default=6)
     parser.add_argument("--heights", type=float, nargs="*", default=HEIGHTS, help="shares of the camera's height")
-    parser.add_argument("--folders", type=Path, nargs="*", help="of real pictures: matches held out of the fit instead")
+    parser.add_argument("--folders", type=Path, nargs="*", help="of real images: matches held out of the fit instead")
     arguments = parser.parse_args()
     if arguments.folders:
         for folder in arguments.folders:
@@ -241,7 +241,7 @@ def main() -> None:
         rows[name] = []
         for seed in range(arguments.first, arguments.first + arguments.sets):
             try:
-                rows[name].append(measure(kind, height, seed, arguments.pictures))
+                rows[name].append(measure(kind, height, seed, arguments.images))
             except RdstitchError as error:
                 print(f"{name}, set {seed}: {error}")
             print(table({f"{name}, to {seed}": rows[name]}), flush=True)

@@ -24,8 +24,8 @@ def features(descriptors: Descriptors) -> Features:
     return Features(points, descriptors, zeros + 1, zeros, zeros, None, "benchmark")
 
 
-def pictures(kind: str, count: int) -> tuple[Features, Features]:
-    """Descriptors of two pictures: half of them show the same."""
+def images(kind: str, count: int) -> tuple[Features, Features]:
+    """Descriptors of two images: half of them show the same."""
     rng = np.random.default_rng(0)
     half = np.arange(count)[:, None] < count // 2
     if kind == "sift":
@@ -71,7 +71,7 @@ def main() -> None:
     print("| descriptors | matches | identical | cv2.BFMatcher s | rdstitch s | ratio | peak MB |")
     print("| --- | --: | --- | --: | --: | --: | --: |")
     for kind in ("sift", "orb", "brisk"):
-        one, two = pictures(kind, count)
+        one, two = images(kind, count)
         expected, slow = timed(lambda one=one, two=two: brute_force(one, two), 1)  # type: ignore[misc]
         found, fast = timed(lambda one=one, two=two: match(one, two, RATIO), 3)  # type: ignore[misc]
         identical = expected == {(int(i), int(j)) for i, j in found.indices}

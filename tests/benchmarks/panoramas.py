@@ -1,8 +1,8 @@
 """Panoramas by rotation, measured: ``python -m tests.benchmarks.panoramas [NAME …]``.
 
 Rendered sets of a camera that turns on the spot, with known rotations, λ and focal length. Errors are those of
-directions, in pixels of the pictures, after the best rotation of the whole; "closes" is the largest error of the
-transfer between neighbours, all the way round. OpenCV's stitcher runs on the same pictures, with one thread, several
+directions, in pixels of the images, after the best rotation of the whole; "closes" is the largest error of the
+transfer between neighbours, all the way round. OpenCV's stitcher runs on the same images, with one thread, several
 times: what it finds, and its time, depend on its random numbers. Its times are printed in ascending order, and how many
 times its median rdstitch takes. All are processor times of registration, checks and compositing.
 """
@@ -24,7 +24,7 @@ from rdstitch.synthetic import Photometry, TurningSequence, panorama_rotations, 
 
 Pixels = NDArray[np.uint8]
 SIZE, FOCAL = (640, 480), 554.0
-# Pictures of a row, degrees between them, rows, λ.
+# Images of a row, degrees between them, rows, λ.
 SETS: dict[str, tuple[int, float, int, float]] = {
     "3": (3, 25.0, 1, -0.2),
     "6": (6, 25.0, 1, -0.2),
@@ -44,7 +44,7 @@ def rendered(name: str) -> TurningSequence:
 
 
 def direction_errors(truth: TurningSequence, found: Alignment) -> FloatArray:
-    """Distances, pixels, between measured points and where the found camera sees what is there, over all pictures."""
+    """Distances, pixels, between measured points and where the found camera sees what is there, over all images."""
     width, height = SIZE
     grid = np.stack(np.meshgrid(np.linspace(0, width - 1, 15), np.linspace(0, height - 1, 11)), axis=-1).reshape(-1, 2)
     used = np.flatnonzero(found.used)
@@ -65,7 +65,7 @@ def direction_errors(truth: TurningSequence, found: Alignment) -> FloatArray:
 
 
 def closing_error(truth: TurningSequence, found: Alignment) -> float:
-    """Largest error of the transfer of a picture's centre to its neighbour, pixels; the last one's is the first."""
+    """Largest error of the transfer of an image's centre to its neighbour, pixels; the last one's is the first."""
     middle = np.array([[(SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2]])
     k = np.diag([FOCAL, FOCAL, 1.0])
     worst, count = 0.0, len(truth)
@@ -78,14 +78,14 @@ def closing_error(truth: TurningSequence, found: Alignment) -> float:
     return worst
 
 
-def stitched_by_opencv(pictures: list[Pixels], seeds: int) -> tuple[list[int], list[float]]:
-    """Pictures used by OpenCV's stitcher, 0 where it fails, and its processor times, s, with several seeds."""
+def stitched_by_opencv(images: list[Pixels], seeds: int) -> tuple[list[int], list[float]]:
+    """Images used by OpenCV's stitcher, 0 where it fails, and its processor times, s, with several seeds."""
     used, seconds = [], []
     for seed in range(seeds):
         cv2.setRNGSeed(seed)
         stitcher = cv2.Stitcher.create(cv2.Stitcher_PANORAMA)
         start = time.process_time()
-        status, _ = stitcher.stitch(pictures)
+        status, _ = stitcher.stitch(images)
         seconds.append(time.process_time() - start)
         used.append(0 if status else len(stitcher.component()))
     return used, sorted(seconds)
@@ -107,7 +107,7 @@ def main() -> None:
             start = time.process_time()
             found = pano(paths, Path(folder) / "out.jpg", StitchOptions(workers=1)).registration.alignment
             seconds = time.process_time() - start
-            pictures = [np.asarray(cv2.imread(str(path)), np.uint8) for path in paths]
+            images = [np.asarray(cv2.imread(str(path)), np.uint8) for path in paths]
         focal = (found.focal or np.nan) * np.hypot(*SIZE) / 2
         print(
             f"{name:12s}{found.used.sum():4d}/{len(truth):<3d}{found.distortion - SETS[name][3]:10.5f}"
@@ -116,7 +116,7 @@ def main() -> None:
             end="  ",
             flush=True,
         )
-        used, peer = stitched_by_opencv(pictures, given.seeds)
+        used, peer = stitched_by_opencv(images, given.seeds)
         times = " ".join(f"{t:.1f}" for t in peer)
         print(f"{seconds / np.median(peer):5.2f}: {min(used)} to {max(used)} used, {times}", flush=True)
 

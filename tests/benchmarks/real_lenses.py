@@ -3,15 +3,15 @@
 Every folder is calibrated as a user would do it, without knowledge of what it shows; ``../shared/data`` has them.
 
 Chessboards are judged by their corners, which the estimation does not use: the root mean square distance of the corners
-of rows and columns from straight lines, and from a grid with one homography a board, both in pixels of the picture;
+of rows and columns from straight lines, and from a grid with one homography a board, both in pixels of the image;
 beside it the same for OpenCV's rational model (``calibrateCamera``), fitted to these very corners. "λ there" is the
 one-parameter lens nearest to ours at the radii of the corners, which is what a fit of one λ to them finds; the λ before
-is that over the whole picture, beyond the corners of most boards.
+is that over the whole image, beyond the corners of most boards.
 
-Flights are judged by the maker's fisheye polynomial, where a picture carries it in its XMP: points all over the picture
+Flights are judged by the maker's fisheye polynomial, where an image carries it in its XMP: points all over the image
 are undistorted by both lenses, and ours brought onto the maker's by the best similarity, or by the best homography
-(no picture of a plane shows either: a homography of the undistorted pictures is a change of the poses). Distances are
-in undistorted pixels, whose scale is that of the picture at the maker's principal point.
+(no image of a plane shows either: a homography of the undistorted images is a change of the poses). Distances are
+in undistorted pixels, whose scale is that of the image at the maker's principal point.
 """
 
 import argparse
@@ -53,21 +53,21 @@ Undistort = Callable[[FloatArray], FloatArray]
 
 
 def files_of(folder: Path) -> list[Path]:
-    """The pictures of a folder."""
+    """The images of a folder."""
     return sorted(file for file in folder.iterdir() if file.suffix.lower() in _SUFFIXES)
 
 
-def maker_undistort(picture: Path) -> Undistort:
-    """The lens that a picture's XMP gives as Pix4D writes it, pixels to undistorted pixels.
+def maker_undistort(image: Path) -> Undistort:
+    """The lens that an image's XMP gives as Pix4D writes it, pixels to undistorted pixels.
 
     A ray at θ from the axis is measured ``F ρ(t)`` from the principal point, with t = 2 θ / π and ρ the polynomial.
     """
-    text = picture.read_bytes()
+    text = image.read_bytes()
 
     def numbers(name: str) -> list[float]:
         found = re.search(rb'Camera:%s="([^"]*)"' % name.encode(), text)
         if found is None:
-            raise ValueError(f"{picture} has no {name}")
+            raise ValueError(f"{image} has no {name}")
         return [float(number) for number in found[1].split(b",")]
 
     center = np.array(numbers("PrincipalPoint")) / _PIXEL_MM
@@ -87,7 +87,7 @@ def maker_undistort(picture: Path) -> Undistort:
 
 
 def differences(camera: Camera, truth: Undistort) -> dict[str, tuple[float, float]]:
-    """Rms and largest distance of undistorted points over the picture, after the best similarity and homography."""
+    """Rms and largest distance of undistorted points over the image, after the best similarity and homography."""
     u, v = (np.linspace(-0.5, side - 0.5, _GRID) for side in camera.image_size)
     points = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     ours, theirs = camera.undistort(points), truth(points)
@@ -127,13 +127,13 @@ def rational_undistort(grids: FloatArray, size: tuple[int, int]) -> Undistort:
 
 
 def off_lines(grids: FloatArray, undistort: Undistort) -> float:
-    """Rms distance of corners from the lines of their rows and columns, to first order in pixels of the picture."""
+    """Rms distance of corners from the lines of their rows and columns, to first order in pixels of the image."""
     flat, by_point = undistort(grids), _slope(grids, undistort)
     squared = []
     for own, slope in ((flat, by_point), (flat.swapaxes(1, 2), by_point.swapaxes(1, 2))):
         for line, change in zip(own.reshape(-1, *own.shape[2:]), slope.reshape(-1, *slope.shape[2:]), strict=True):
             weight = np.ones(len(line))
-            for _ in range(3):  # distances in the picture count, not those in the undistorted one
+            for _ in range(3):  # distances in the image count, not those in the undistorted one
                 middle = weight @ line / weight.sum()
                 normal = np.linalg.svd(np.sqrt(weight)[:, None] * (line - middle), full_matrices=False)[2][-1]
                 weight = 1.0 / np.sum((normal @ change) ** 2, axis=-1)
@@ -142,7 +142,7 @@ def off_lines(grids: FloatArray, undistort: Undistort) -> float:
 
 
 def off_grid(grids: FloatArray, undistort: Undistort) -> float:
-    """Rms distance of corners from a grid, one homography a board, to first order in pixels of the picture."""
+    """Rms distance of corners from a grid, one homography a board, to first order in pixels of the image."""
     rows, columns = grids.shape[1:3]
     plane = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(np.float64)
     squared = []

@@ -2,7 +2,7 @@
 
 Processor time of pairs, beside homlib's estimators in the same run, and of whole mosaics by stage, beside OpenCV and
 the package stitching where they are installed (``--peer-python``: a Python that has it). ``--folder`` adds one's own
-pictures. Times depend on the machine: only those of one run compare.
+images. Times depend on the machine: only those of one run compare.
 """
 
 import argparse
@@ -127,7 +127,7 @@ def print_mosaic(name: str, folder: Path, sequence: Sequence | None = None) -> N
     alignment, pairs = result.registration.alignment, result.registration.pairs
     used, count = int(alignment.used.sum()), len(alignment.used)
     line = _times(name, seconds, count, result.canvas.size)
-    line += f"  λ {alignment.distortion:+.5f}  {used}/{count} pictures  {len(pairs)} pairs"
+    line += f"  λ {alignment.distortion:+.5f}  {used}/{count} images  {len(pairs)} pairs"
     if sequence is not None:
         error = geometry(sequence, result, "similarity")
         line += f"  error {error.median:.3f}, 95 % {error.percentile95:.3f} px"
@@ -135,15 +135,15 @@ def print_mosaic(name: str, folder: Path, sequence: Sequence | None = None) -> N
     print("    " + ", ".join(f"{stage} {taken:.1f}" for stage, taken in stages.spent.items() if taken > 0.05))
 
 
-def _times(name: str, seconds: float, pictures: int, size: tuple[int, int]) -> str:
-    """Processor time of the whole, of a picture, and of a megapixel of output; others leave pictures out."""
+def _times(name: str, seconds: float, images: int, size: tuple[int, int]) -> str:
+    """Processor time of the whole, of an image, and of a megapixel of output; others leave images out."""
     megapixels = size[0] * size[1] / 1e6
     each = f"{seconds / megapixels:9.2f}" if megapixels else f"{'-':>9s}"
-    return f"{name:34s}{seconds:8.1f}{seconds / pictures:10.3f}{each}"
+    return f"{name:34s}{seconds:8.1f}{seconds / images:10.3f}{each}"
 
 
 def print_peers(files: list[Path], peer_python: str | None) -> None:
-    """Processor time of other stitchers on the same pictures, whatever comes of it."""
+    """Processor time of other stitchers on the same images, whatever comes of it."""
     stitchers, notes = installed_stitchers(peer_python)
     for stitcher in stitchers:
         if stitcher.name in _COMPARED:
@@ -162,12 +162,12 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=100, help="pairs of each kind; 0: none")
     parser.add_argument("--frames", type=int, default=80, help="frames of 480 x 360 along a path; 0: none")
     parser.add_argument("--views", action=argparse.BooleanOptionalAction, default=True, help="12 views of 640 x 480")
-    parser.add_argument("--folder", type=Path, action="append", default=[], help="pictures to stitch besides")
+    parser.add_argument("--folder", type=Path, action="append", default=[], help="images to stitch besides")
     parser.add_argument("--peer-python", help="a Python that has the package stitching")
     given = parser.parse_args()
     if given.pairs:
         print_pairs(given.pairs)
-    print(f"\n{'processor time of mosaic, s':34s}{'whole':>8s}{'a picture':>10s}{'a Mpx':>9s}")
+    print(f"\n{'processor time of mosaic, s':34s}{'whole':>8s}{'an image':>10s}{'a Mpx':>9s}")
     with TemporaryDirectory() as folder:
         work: list[tuple[str, Path, Sequence | None]] = []
         if given.views:

@@ -1,17 +1,17 @@
-"""Strips over rough ground: ``python -m tests.benchmarks.relief [--sets N] [--pictures N]``.
+"""Strips over rough ground: ``python -m tests.benchmarks.relief [--sets N] [--images N]``.
 
-Every set is a strip of pictures by one camera over hills ("bumps"), buildings or ridges ("slopes") of 2, 5 or 10 % of
+Every set is a strip of images by one camera over hills ("bumps"), buildings or ridges ("slopes") of 2, 5 or 10 % of
 its height, or over a plane, as matches with 0.3 pixels of noise and 10 % outliers, through two-view estimation and
 alignment. Printed a row:
 
 one camera
     Sets in which a model of one camera was chosen, not free homographies.
 shape
-    Largest displacement of a picture's centre, after a similarity, per cent of the strip's length: median and largest.
+    Largest displacement of an image's centre, after a similarity, per cent of the strip's length: median and largest.
 relief
     Sets in which relief was noticed.
 λ
-    Of the strip and its windows of 2, 4 and 8 pictures: windows in which λ is called observable, the share of them with
+    Of the strip and its windows of 2, 4 and 8 images: windows in which λ is called observable, the share of them with
     ``|λ - truth| <= 3 σ``, and the median of ``|λ - truth| / σ`` and of σ.
 """
 
@@ -30,12 +30,12 @@ from tests.relief_strips import Strip, displacement, strip
 HEIGHTS = (0.02, 0.05, 0.1)
 
 
-def windows(item: Strip, pictures: int, seed: int) -> Iterator[tuple[int, Strip]]:
+def windows(item: Strip, images: int, seed: int) -> Iterator[tuple[int, Strip]]:
     """The whole, and two windows of each length."""
     rng = np.random.default_rng((seed, 3))
-    yield pictures, item
+    yield images, item
     for count in (2, 4, 8):
-        for first in rng.integers(0, pictures - count + 1, 2).tolist():
+        for first in rng.integers(0, images - count + 1, 2).tolist():
             yield count, item.window(first, count)
 
 
@@ -44,7 +44,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sets", type=int, default=2, help="of each row")
     parser.add_argument("--first", type=int, default=0, help="seed of the first set")
-    parser.add_argument("--pictures", type=int, default=40)
+    parser.add_argument("--images", type=int, default=40)
     parser.add_argument("--kind", choices=[*RELIEFS, "flat"], help="only this kind of ground")
     parser.add_argument("--height", type=float, choices=HEIGHTS, help="only this one")
     arguments = parser.parse_args()
@@ -55,12 +55,12 @@ def main() -> None:
             continue
         start, shapes, cameras, noticed, own = time.process_time(), [], 0, 0, dict[int, list[tuple[float, float]]]()
         for seed in range(arguments.first, arguments.first + arguments.sets):
-            item = strip(kind, height, seed, arguments.pictures)
-            for count, part in windows(item, arguments.pictures, seed):
+            item = strip(kind, height, seed, arguments.images)
+            for count, part in windows(item, arguments.images, seed):
                 found = _aligned(part)
                 if found is None:
                     continue
-                if count == arguments.pictures:
+                if count == arguments.images:
                     shapes.append(displacement(item, found))
                     cameras += found.model != "homography"
                     noticed += found.relief.found

@@ -43,7 +43,7 @@ def survey(count: int) -> Sequence:
 
 
 def frame_order(count: int, shuffled: bool) -> list[int]:
-    """Which frame of the survey the i-th picture of the folder is."""
+    """Which frame of the survey the i-th image of the folder is."""
     return np.random.default_rng(_SEED).permutation(count).tolist() if shuffled else list(range(count))
 
 
@@ -116,7 +116,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Cost and accuracy by the number of frames")
     parser.add_argument("counts", type=int, nargs="*", default=list(COUNTS), help="numbers of frames")
     parser.add_argument("--shuffled", action="store_true", help="frames in no order")
-    parser.add_argument("--register", action="store_true", help="registration only, no picture")
+    parser.add_argument("--register", action="store_true", help="registration only, no image")
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.folder is not None:

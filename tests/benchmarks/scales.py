@@ -1,8 +1,8 @@
 """The same folder at other sizes: ``python -m tests.benchmarks.scales FOLDER... [--calibrate]``.
 
 Every folder is registered as it is, at half its size and enlarged twice, as ``mosaic`` does, or ``calibrate``. Printed
-are the pictures used, λ and its standard deviation, and how far λ is from that of the folder as it is, in standard
-deviations of the less certain one. Pictures are handed on as arrays, so that their headers do not matter.
+are the images used, λ and its standard deviation, and how far λ is from that of the folder as it is, in standard
+deviations of the less certain one. Images are handed on as arrays, so that their headers do not matter.
 """
 
 import argparse
@@ -17,7 +17,7 @@ import numpy as np
 
 import rdstitch
 from rdstitch.errors import InputError, RdstitchError
-from rdstitch.features.picture import PixelArray
+from rdstitch.features.prepared_image import PixelArray
 from rdstitch.io.read import read_image
 
 SCALES = (1.0, 0.5, 2.0)
@@ -32,7 +32,7 @@ class Outcome:
     status : int
         Exit status of the command line.
     used : tuple of bool
-        Which pictures are in the result.
+        Which images are in the result.
     distortion, deviation : float
         λ and its standard deviation; NaN without a result.
     text : str
@@ -46,8 +46,8 @@ class Outcome:
     text: str
 
 
-def pictures_of(folder: Path) -> list[PixelArray]:
-    """The pictures of a folder, in the order of their names."""
+def images_of(folder: Path) -> list[PixelArray]:
+    """The images of a folder, in the order of their names."""
     found = []
     for file in sorted(folder.iterdir()):
         try:
@@ -57,22 +57,22 @@ def pictures_of(folder: Path) -> list[PixelArray]:
     return found
 
 
-def resized(picture: PixelArray, scale: float) -> PixelArray:
-    """A picture at another size."""
+def resized(image: PixelArray, scale: float) -> PixelArray:
+    """An image at another size."""
     how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
-    return picture if scale == 1.0 else np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=how))
+    return image if scale == 1.0 else np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=how))
 
 
-def outcome_of(pictures: Sequence[PixelArray], *, calibrate: bool) -> Outcome:
-    """Register pictures as the command line does."""
+def outcome_of(images: Sequence[PixelArray], *, calibrate: bool) -> Outcome:
+    """Register images as the command line does."""
     options = rdstitch.StitchOptions(workers=1, channel_order="rgb", dry_run=not calibrate)
     try:
         if calibrate:
-            registration = rdstitch.calibrate(pictures, options)
+            registration = rdstitch.calibrate(images, options)
         else:
-            registration = rdstitch.mosaic(pictures, None, options).registration
+            registration = rdstitch.mosaic(images, None, options).registration
     except RdstitchError as error:
-        return Outcome(error.exit_status, (False,) * len(pictures), math.nan, math.nan, str(error))
+        return Outcome(error.exit_status, (False,) * len(images), math.nan, math.nan, str(error))
     found = registration.alignment
     text = "; ".join(map(str, registration.messages))
     return Outcome(0, tuple(found.used.tolist()), found.distortion, found.distortion_std, text)
@@ -86,14 +86,14 @@ def main() -> None:
     parser.add_argument("--messages", action="store_true", help="print what the user would read, too")
     arguments = parser.parse_args()
     for folder in arguments.folders:
-        pictures, first = pictures_of(folder), None
+        images, first = images_of(folder), None
         for scale in SCALES:
             start = time.process_time()
-            found = outcome_of([resized(picture, scale) for picture in pictures], calibrate=arguments.calibrate)
+            found = outcome_of([resized(image, scale) for image in images], calibrate=arguments.calibrate)
             first = first or found
             away = abs(found.distortion - first.distortion) / max(found.deviation, first.deviation)
             print(
-                f"{folder.name} x{scale:g}: status {found.status}, {sum(found.used)} of {len(found.used)} pictures "
+                f"{folder.name} x{scale:g}: status {found.status}, {sum(found.used)} of {len(found.used)} images "
                 f"({sum(a != b for a, b in zip(found.used, first.used, strict=True))} others), "
                 f"λ = {found.distortion:.4f} ± {found.deviation:.4f} ({away:.1f} σ away), "
                 f"{time.process_time() - start:.0f} s",

@@ -51,7 +51,7 @@ def cases(seed: int, count: int, known_tilt: float) -> list[Case]:
     """Every solver, with its instances: λ in [-0.7, 0], unknown tilts up to 0.3 radians.
 
     Where the tilt is known it is up to ``known_tilt``, and the solver is told one for each sample; with 0, one for all,
-    as for the pictures of one camera.
+    as for the images of one camera.
     """
 
     def told(points: int, **options: Any) -> tuple[PlanarInstances, FloatArray]:

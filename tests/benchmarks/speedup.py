@@ -103,7 +103,7 @@ class Run:
 
 def measure(sources: list[Source], workers: int) -> dict[str, Cost]:
     """The stages of a registration that are made of tasks."""
-    options = StitchOptions(workers=workers).for_pictures(len(sources))
+    options = StitchOptions(workers=workers).for_images(len(sources))
     with ProcessExecutor(workers) as processes:
         # Libraries are loaded before the clock starts: a run does that once.
         for ready in [processes.submit(time.sleep, 0.5) for _ in range(workers)]:

@@ -1,10 +1,10 @@
 """What spreading keypoints does to λ: python -m tests.benchmarks.spreading [FOLDER LAMBDA] [--kinds K,…] [--sizes].
 
 Features are detected at full size with and without spreading, matched, and λ is estimated for every pair: on rendered
-pairs of known lens (dark and noisy towards the corners, as real ones are), or on consecutive pictures of a folder whose
+pairs of known lens (dark and noisy towards the corners, as real ones are), or on consecutive images of a folder whose
 λ is given. With --sizes they are spread, and detected at full and at half size.
 Printed for each way: pairs of which λ was estimated, the median number of inliers, median and root mean square of λ's
-error (errors above 0.2 count as 0.2), and the median share of inliers in the outer quarter of the picture.
+error (errors above 0.2 count as 0.2), and the median share of inliers in the outer quarter of the image.
 """
 
 import argparse
@@ -24,13 +24,13 @@ SIZE = (1000, 750)
 PAIRS = 10
 MAX_ERROR = 0.2
 
-Pictures = tuple[list[NDArray[np.uint8]], list[tuple[int, int]], list[float]]
+Images = tuple[list[NDArray[np.uint8]], list[tuple[int, int]], list[float]]
 
 
-def rendered() -> Pictures:
+def rendered() -> Images:
     """Pairs with 30 to 60 % overlap, λ from -0.4 to -0.1."""
     rng = np.random.default_rng(0)
-    pictures, distortions = [], []
+    images, distortions = [], []
     for index in range(PAIRS):
         distortion = float(rng.uniform(-0.4, -0.1))
         lens = Camera(SIZE, distortion, focal=float(rng.uniform(700, 1000)))
@@ -45,15 +45,15 @@ def rendered() -> Pictures:
         sequence = sequence_over(
             partial(ground, seed=index, channels=1), lens, poses, photometry=photometry, seed=index
         )
-        pictures += [np.asarray(frame, np.uint8) for frame in sequence.frames()]
+        images += [np.asarray(frame, np.uint8) for frame in sequence.frames()]
         distortions.append(distortion)
-    return pictures, [(2 * i, 2 * i + 1) for i in range(PAIRS)], distortions
+    return images, [(2 * i, 2 * i + 1) for i in range(PAIRS)], distortions
 
 
-def photographed(folder: Path, distortion: float) -> Pictures:
-    """Consecutive pictures of a folder."""
-    pictures = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted(folder.iterdir())]
-    read = [np.asarray(picture, np.uint8) for picture in pictures if picture is not None]
+def photographed(folder: Path, distortion: float) -> Images:
+    """Consecutive images of a folder."""
+    images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted(folder.iterdir())]
+    read = [np.asarray(image, np.uint8) for image in images if image is not None]
     pairs = [(i, i + 1) for i in range(len(read) - 1)]
     return read, pairs, [distortion] * len(pairs)
 
@@ -61,7 +61,7 @@ def photographed(folder: Path, distortion: float) -> Pictures:
 def errors(
     features: list[Features], pairs: list[tuple[int, int]], truth: list[float]
 ) -> Iterator[tuple[float, int, float]]:
-    """λ's error, inliers and their share in the outer quarter of the picture, of each pair that has a result."""
+    """λ's error, inliers and their share in the outer quarter of the image, of each pair that has a result."""
     for (i, j), distortion in zip(pairs, truth, strict=True):
         size = features[i].image_size
         assert size is not None
@@ -72,7 +72,7 @@ def errors(
         if result.ok:
             points = np.vstack([found.points1[result.inliers], found.points2[result.inliers]])
             radius = np.linalg.norm(points - (np.array(size) - 1) / 2, axis=1) / (np.hypot(*size) / 2)
-            # A quarter of a 4:3 picture lies beyond 0.76 half diagonals.
+            # A quarter of a 4:3 image lies beyond 0.76 half diagonals.
             yield abs(result.distortion - distortion), int(result.inliers.sum()), float((radius > 0.76).mean())
 
 
@@ -85,14 +85,14 @@ def main() -> None:
     arguments = parser.parse_args()
     kinds = arguments.kinds.split(",")
     if arguments.folder is None:
-        pictures, pairs, truth = rendered()
+        images, pairs, truth = rendered()
     else:
-        pictures, pairs, truth = photographed(arguments.folder, arguments.distortion)
+        images, pairs, truth = photographed(arguments.folder, arguments.distortion)
     choices = at_sizes(kinds) if arguments.sizes else with_and_without(kinds)
     print("| features | choice | pairs | inliers | median error of λ | rms | in the outer quarter |")
     print("| --- | --- | --: | --: | --: | --: | --: |")
     for choice, options in choices:
-        rows = list(errors([detect(picture, options) for picture in pictures], pairs, truth))
+        rows = list(errors([detect(image, options) for image in images], pairs, truth))
         error, inliers, outer = np.array(rows).reshape(-1, 3).T
         rms = np.sqrt(np.mean(np.minimum(error, MAX_ERROR) ** 2))
         print(
@@ -112,7 +112,7 @@ def with_and_without(kinds: list[str]) -> Iterator[tuple[str, FeatureOptions]]:
 
 
 def at_sizes(kinds: list[str]) -> Iterator[tuple[str, FeatureOptions]]:
-    """The pictures whole and halved, if they have 0.5 to 2 megapixels."""
+    """The images whole and halved, if they have 0.5 to 2 megapixels."""
     for kind in kinds:
         for choice, megapixels in (("halved", 0.5), ("full size", None)):
             yield choice, FeatureOptions(kind=kind, work_megapixels=megapixels, max_features=4000)

@@ -1,6 +1,6 @@
 """Is a turn on the spot told from a move over a plane? ``python -m tests.benchmarks.turn_or_plane [--sets 20]``.
 
-Half of the sets are turns, with and without parallax; half are pictures of a plane: pairs, chains and grids of a robot
+Half of the sets are turns, with and without parallax; half are images of a plane: pairs, chains and grids of a robot
 or a drone, and free poses as of a hand or a kite. One line for every set whose kind was not found, and the totals.
 """
 
@@ -29,7 +29,7 @@ BOTH = "a plane seen from one place would look the same"
 
 
 def turn(seed: int) -> Sequence:
-    """Two to six pictures of a camera that turns; every third one is held by hand, before things that are near."""
+    """Two to six images of a camera that turns; every third one is held by hand, before things that are near."""
     rng = np.random.default_rng((seed, 5))
     lens = Camera((400, 300), float(rng.uniform(-0.35, 0.05)), focal=float(rng.uniform(0.6, 1.4) * 400.0))
     assert lens.focal is not None
@@ -47,7 +47,7 @@ def turn(seed: int) -> Sequence:
 
 
 def plane(seed: int) -> Sequence:
-    """A set of :mod:`tests.trust_sets`, or pictures with tilts and heights of their own."""
+    """A set of :mod:`tests.trust_sets`, or images with tilts and heights of their own."""
     rng = np.random.default_rng((seed, 6))
     kind = str(rng.choice([*SOLVABLE, "free"]))
     if kind != "free":
@@ -84,10 +84,10 @@ def main() -> None:
         if turns:
             parallax[seed % 3 == 0][any(m.code == "parallax" for m in registration.messages)] += 1
         if found != turns:
-            text = f"{alignment.model}, {len(paths)} pictures, rms {alignment.rms:.2f}: {alignment.model_reason}"
+            text = f"{alignment.model}, {len(paths)} images, rms {alignment.rms:.2f}: {alignment.model_reason}"
             print(f"{seed} {'turn' if turns else 'plane'}: {text}", flush=True)
     print(
-        f"{right} of {wanted.sets} sets right, {both} more said that both explain the pictures, {refused} refused; "
+        f"{right} of {wanted.sets} sets right, {both} more said that both explain the images, {refused} refused; "
         f"parallax: {parallax[True][1]} of {sum(parallax[True])} turns by hand, {parallax[False][1]} of "
         f"{sum(parallax[False])} others; {(time.process_time() - start) / wanted.sets:.1f} s a set"
     )

@@ -105,9 +105,9 @@ def run(command: list[str]) -> tuple[int, str, float]:
 def stitch(folder: Path, output: Path, options: list[str], peer: str | None) -> Row:
     """Stitch one set."""
     files = sorted(str(file) for file in folder.iterdir() if file.suffix.lower() in _SUFFIXES)
-    picture = output / f"{folder.name}.jpg"
+    written = output / f"{folder.name}.jpg"
     program = ["timeout", str(_MAX_SECONDS), sys.executable, "-m", "rdstitch_cli"]
-    status, errors, seconds = run([*program, "mosaic", *files, "-o", str(picture), "--overwrite", *options])
+    status, errors, seconds = run([*program, "mosaic", *files, "-o", str(written), "--overwrite", *options])
     messages = tuple(line for line in errors.splitlines() if line.startswith("rdstitch:"))
     (output / f"{folder.name}.txt").write_text(errors)
     peer_seconds = math.nan
@@ -115,7 +115,7 @@ def stitch(folder: Path, output: Path, options: list[str], peer: str | None) -> 
         peer_seconds = run(
             ["timeout", str(_MAX_SECONDS), peer, *files, "--output", str(output / f"{folder.name}.peer.jpg")]
         )[2]
-    sidecar = Path(f"{picture}.json")
+    sidecar = Path(f"{written}.json")
     if status or not sidecar.exists():
         return Row(
             folder.name, status, 0, len(files), "", math.nan, math.nan, False, math.nan, seconds, messages, peer_seconds

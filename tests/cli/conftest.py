@@ -1,4 +1,4 @@
-"""Small rendered pictures, and the command line run in this process."""
+"""Small rendered images, and the command line run in this process."""
 
 import shutil
 from pathlib import Path
@@ -18,19 +18,19 @@ def sequence() -> Sequence:
 
 @pytest.fixture(scope="session")
 def frames(sequence: Sequence, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Three pictures of 400 x 300 px that overlap in a chain; never written to."""
+    """Three images of 400 x 300 px that overlap in a chain; never written to."""
     return sequence.write(tmp_path_factory.mktemp("frames"))
 
 
 @pytest.fixture(scope="session")
 def stranger(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A picture of other ground."""
+    """An image of other ground."""
     return flight(9, 1).write(tmp_path_factory.mktemp("stranger"), "stranger_{}.png")[0]
 
 
 @pytest.fixture
 def place(tmp_path: Path, frames: list[Path]) -> Path:
-    """A folder with two good pictures, ``a.png`` and ``b.png``."""
+    """A folder with two good images, ``a.png`` and ``b.png``."""
     for name, frame in zip("ab", frames[:2], strict=True):
         shutil.copy(frame, tmp_path / f"{name}.png")
     return tmp_path

@@ -1,4 +1,4 @@
-"""Files that are not what their names promise, each made from a good picture."""
+"""Files that are not what their names promise, each made from a good image."""
 
 import io
 import os
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 Make = Callable[[Path, Path], Path]
-"""Called with a good picture and a folder; gives the path of the bad file."""
+"""Called with a good image and a folder; gives the path of the bad file."""
 
 
 def _encoded(good: Path, kind: str, **options: Any) -> bytes:
@@ -36,7 +36,7 @@ def holding(name: str, data: bytes) -> Make:
 
 
 def cut(kind: str, share: float, suffix: str) -> Make:
-    """A picture of which only the first part is there."""
+    """An image of which only the first part is there."""
 
     def make(good: Path, folder: Path) -> Path:
         data = _encoded(good, kind)
@@ -48,7 +48,7 @@ def cut(kind: str, share: float, suffix: str) -> Make:
 
 
 def drawn(array: NDArray[Any], name: str = "drawn.png") -> Make:
-    """A picture of these samples."""
+    """An image of these samples."""
 
     def make(good: Path, folder: Path) -> Path:
         file = folder / name
@@ -67,7 +67,7 @@ def missing(good: Path, folder: Path) -> Path:
 
 
 def a_folder(good: Path, folder: Path) -> Path:
-    """A folder with the name of a picture."""
+    """A folder with the name of an image."""
     (folder / "folder.jpg").mkdir()
     return folder / "folder.jpg"
 
@@ -120,7 +120,7 @@ def damaged_tiff(good: Path, folder: Path) -> Path:
     return folder / "damaged.tif"
 
 
-_TEXT = b"This is not a picture.\n" * 40
+_TEXT = b"This is not an image.\n" * 40
 _NOISE = np.random.default_rng(1).integers(0, 256, 5000, dtype=np.uint8).tobytes()
 
 UNREADABLE: dict[str, Make] = {
@@ -140,7 +140,7 @@ UNREADABLE: dict[str, Make] = {
     "PNG header, then noise": holding("half.png", b"\x89PNG\r\n\x1a\n" + _NOISE),
     "JPEG header, then noise": holding("half.jpg", b"\xff\xd8\xff\xe0\x00\x10JFIF\0" + _NOISE),
     "TIFF header, then noise": holding("half.tif", b"II*\0\x08\0\0\0" + _NOISE),
-    "name with spaces": holding("a picture of nothing.jpg", _TEXT),
+    "name with spaces": holding("an image of nothing.jpg", _TEXT),
     "name with quotes": holding('it\'s "nothing".jpg', _TEXT),
     "name with a newline": holding("two\nlines.jpg", _TEXT),
     "name that is not UTF-8": holding(os.fsdecode(b"caf\xe9.jpg"), _TEXT),
@@ -171,7 +171,7 @@ UNUSABLE: dict[str, Make] = {
     "transparent everywhere": drawn(np.zeros((300, 400, 4), np.uint8)),
     "NaN everywhere": drawn(np.full((300, 400), np.nan, np.float32), "nan.tif"),
     "infinite everywhere": drawn(np.full((300, 400), np.inf, np.float32), "inf.tif"),
-    "stack of tiny pictures": drawn(np.zeros((3, 4, 5, 6, 7), dtype=np.uint8), "volume.tif"),
+    "stack of tiny images": drawn(np.zeros((3, 4, 5, 6, 7), dtype=np.uint8), "volume.tif"),
     "chessboard": drawn((np.indices((300, 400)) // 20).sum(0).astype(np.uint8) % 2 * np.uint8(255)),
 }
-"""Pictures that fit to nothing: status 4, and no output."""
+"""Images that fit to nothing: status 4, and no output."""

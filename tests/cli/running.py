@@ -1,4 +1,4 @@
-"""The command line, run in this process or as a stranger runs it, and small pictures to run it on."""
+"""The command line, run in this process or as a stranger runs it, and small images to run it on."""
 
 import json
 import os
@@ -37,12 +37,12 @@ main()
 
 DISTORTION = -0.2
 
-# Small pictures need no more, and every command of these tests takes a second less.
+# Small images need no more, and every command of these tests takes a second less.
 FAST = ("-j", "1", "--max-features", "600")
 
 _cache = tempfile.TemporaryDirectory(prefix="rdstitch-tests-")
 
-# For tests of what comes before and after registration: the same pictures are registered once in a process of tests.
+# For tests of what comes before and after registration: the same images are registered once in a process of tests.
 CACHE = ("--cache", _cache.name)
 CACHED = (*FAST, *CACHE)
 
@@ -79,7 +79,7 @@ Run = Callable[..., Outcome]
 
 
 def flight(seed: int, columns: int, rows: int = 1, distortion: float = DISTORTION, overlap: float = 0.5) -> Sequence:
-    """Small pictures of a textured plane."""
+    """Small images of a textured plane."""
     lens = Camera((400, 300), distortion=distortion, focal=380.0)
     poses = grid_poses(lens, columns, rows, overlap=overlap, yaw=0.1, shift=0.05, tilt=(0.05, -0.03), seed=seed)
     return sequence_over(partial(ground, seed=seed), lens, poses, photometry=Photometry(noise=0.01), seed=seed)
@@ -133,7 +133,7 @@ def check_sidecar(file: Path) -> None:
 
 
 def transfers(record: dict[str, Any]) -> Mapping[int, Callable[[FloatArray], FloatArray]]:
-    """By its sidecar: where each picture's measured px lie in the output, for the pictures that were used."""
+    """By its sidecar: where each image's measured px lie in the output, for the images that were used."""
     camera = record["camera"]
     found = {}
     for index, image in enumerate(record["images"]):

@@ -67,7 +67,7 @@ def test_an_impossible_estimate_is_no_wrong_usage(
     rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*arguments: Any, **options: Any) -> None:
-        raise ImpossibleCameraError("distortion -1.2 folds the picture")
+        raise ImpossibleCameraError("distortion -1.2 folds the image")
 
     monkeypatch.setattr(register, "separate_lenses", fail)
     done = rdstitch("pano", *frames[:2], "-o", tmp_path / "out.png", *CACHED)
@@ -92,7 +92,7 @@ def test_webp_obeys_the_memory_limit(rdstitch: Run, frames: list[Path], tmp_path
     assert not list(tmp_path.iterdir())
 
 
-def test_a_picture_larger_than_the_memory_limit(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+def test_an_image_larger_than_the_memory_limit(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     large = tmp_path / "large.png"
     Image.new("RGB", (6000, 5000)).save(large)
     done = rdstitch("pano", frames[0], large, "-o", tmp_path / "out.png", *CACHED, "--max-memory", "100M")

@@ -43,8 +43,8 @@ def _run(test: doctest.DocTest) -> None:
 
 
 @pytest.fixture
-def pictures(frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The pictures that the examples name, in the current folder."""
+def images(frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The images that the examples name, in the current folder."""
     (tmp_path / "flight").mkdir()
     for name, frame in zip(("left", "middle", "right"), frames, strict=True):
         shutil.copy(frame, tmp_path / f"{name}.png")
@@ -52,14 +52,14 @@ def pictures(frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.mark.usefixtures("pictures")
+@pytest.mark.usefixtures("images")
 def test_the_examples_run() -> None:
     test = doctest.DocTestParser().get_doctest(_code(), {}, "api.md", str(_DOCUMENT), 0)
     assert len(test.examples) > 40
     _run(test)
 
 
-@pytest.mark.usefixtures("pictures")
+@pytest.mark.usefixtures("images")
 @pytest.mark.parametrize("name", ["pano", "mosaic", "estimate_radial_homography"])
 def test_the_examples_of_help_run(name: str) -> None:
     function = getattr(rdstitch, name)
@@ -96,7 +96,7 @@ def test_help_describes_every_field(kind: type) -> None:
         assert [name for name in fields if len(names[name].splitlines()) < 2] == []
 
 
-@pytest.mark.usefixtures("pictures")
+@pytest.mark.usefixtures("images")
 def test_results_show_themselves_in_one_line() -> None:
     result = rdstitch.mosaic(["flight/"], options=rdstitch.StitchOptions(workers=1))
     registration = result.registration

@@ -28,20 +28,20 @@ def stitched(frames: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Pa
     return folder / "field.tif"
 
 
-def _sidecar(picture: Path) -> Path:
-    return picture.with_name(picture.name + ".json")
+def _sidecar(image: Path) -> Path:
+    return image.with_name(image.name + ".json")
 
 
 def _apply(rdstitch: Run, sidecar: Path, images: Path, output: Path, *options: str) -> Outcome:
     return rdstitch("apply", sidecar, "--images", images, "-o", output, "-j", "1", *options)
 
 
-def test_same_pictures_give_the_same_bytes(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
+def test_same_images_give_the_same_bytes(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
     output = tmp_path / "again.tif"
     done = _apply(rdstitch, _sidecar(stitched), frames[0].parent, output)
     assert (done.status, done.out, done.err) == (0, "", "")
     assert output.read_bytes() == stitched.read_bytes()
-    then, now = (json.loads(_sidecar(picture).read_text(encoding="utf-8")) for picture in (stitched, output))
+    then, now = (json.loads(_sidecar(image).read_text(encoding="utf-8")) for image in (stitched, output))
     assert now.pop("applied") == {"sidecar": str(_sidecar(stitched)), "matched": "name"}
     assert (now.pop("pairs"), now["output"].pop("file")) == ([], "again.tif")
     assert now == {key: value for key, value in then.items() if key != "pairs"} | {"output": now["output"]}
@@ -95,15 +95,15 @@ def _written(frames: list[Path], folder: Path, names: list[str], factor: float =
     """The frames under other names, in another size, or one band of them."""
     folder.mkdir()
     for frame, name in zip(frames, names, strict=True):
-        picture = cv2.imread(str(frame))
-        assert picture is not None
+        image = cv2.imread(str(frame))
+        assert image is not None
         if band is not None:
-            picture = picture[..., band]
-        assert cv2.imwrite(str(folder / name), cv2.resize(picture, None, fx=factor, fy=factor))
+            image = image[..., band]
+        assert cv2.imwrite(str(folder / name), cv2.resize(image, None, fx=factor, fy=factor))
     return folder
 
 
-def test_pictures_of_another_size(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
+def test_images_of_another_size(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
     # The same names before the suffix.
     large = _written(frames, tmp_path / "large", [frame.stem + ".bmp" for frame in frames], factor=2.0)
     done = _apply(rdstitch, _sidecar(stitched), large, tmp_path / "large.tif")
@@ -144,7 +144,7 @@ def test_another_band_in_order(rdstitch: Run, frames: list[Path], stitched: Path
     assert frames[0].name in refused.line
 
 
-def test_a_missing_picture_is_named(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
+def test_a_missing_image_is_named(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
     folder = tmp_path / "some"
     folder.mkdir()
     for frame in frames[:2]:
@@ -173,10 +173,10 @@ def test_what_does_not_fit_is_refused(rdstitch: Run, frames: list[Path], stitche
     done = _apply(rdstitch, sidecar, cut, tmp_path / "out.tif")
     assert (done.status, str(cut / frames[0].name) in done.line) == (3, True)
     shutil.copy(frames[0], cut / f"{frames[0].stem}.jpeg")
-    for picture in cut.glob("*.png"):
-        picture.rename(picture.with_suffix(".bmp"))
+    for image in cut.glob("*.png"):
+        image.rename(image.with_suffix(".bmp"))
     done = _apply(rdstitch, sidecar, cut, tmp_path / "out.tif")
-    assert (done.status, "several pictures" in done.line) == (3, True)
+    assert (done.status, "several images" in done.line) == (3, True)
     assert _apply(rdstitch, frames[0], frames[0].parent, tmp_path / "out.tif").status == 3
     assert not (tmp_path / "out.tif").exists()
 

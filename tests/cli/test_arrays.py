@@ -44,13 +44,13 @@ def test_arrays_give_what_their_files_give_and_nothing_is_written(
     assert [source.name for source in result.registration.sources] == ["image_0000", "image_0001", "image_0002"]
 
 
-def test_rgb_arrays_give_an_rgb_picture(arrays: list[NDArray[np.uint8]], of_files: rdstitch.StitchResult) -> None:
+def test_rgb_arrays_give_an_rgb_image(arrays: list[NDArray[np.uint8]], of_files: rdstitch.StitchResult) -> None:
     result = rdstitch.mosaic((array[..., ::-1] for array in arrays), options=_RGB)
     assert result.composite is not None
     np.testing.assert_array_equal(result.image, result.composite.pixels)
     means = [
-        picture[alpha > 0].mean(axis=0)
-        for picture, alpha in ((result.image, result.alpha), (of_files.image, of_files.alpha))
+        image[alpha > 0].mean(axis=0)
+        for image, alpha in ((result.image, result.alpha), (of_files.image, of_files.alpha))
     ]
     np.testing.assert_allclose(means[0], means[1][::-1], atol=2.0)
     assert np.ptp(means[0]) > 5.0  # or the test would pass with any order
@@ -61,16 +61,16 @@ def test_images_of_pillow_are_in_their_own_colours(frames: list[Path], of_files:
     for image, frame in zip(images, frames, strict=True):
         (found,) = as_inputs(image)
         assert isinstance(found, Frame)
-        assert found.picture is not None
-        np.testing.assert_array_equal(found.picture.pixels, rdstitch.io.read_image(frame).pixels)
+        assert found.image is not None
+        np.testing.assert_array_equal(found.image.pixels, rdstitch.io.read_image(frame).pixels)
     result = rdstitch.pano(images, options=_OPTIONS)
     np.testing.assert_array_equal(result.image, of_files.image)
     sideways = images[0].copy()
     sideways.getexif()[0x0112] = 6
     (turned,) = as_inputs(sideways)
     assert isinstance(turned, Frame)
-    assert turned.picture is not None
-    assert turned.picture.pixels.shape[:2] == sideways.size
+    assert turned.image is not None
+    assert turned.image.pixels.shape[:2] == sideways.size
 
 
 def test_tensors_are_refused_with_the_remedy() -> None:
@@ -162,18 +162,18 @@ def test_shapes_and_types(
 ) -> None:
     (frame,) = as_inputs(np.zeros(shape, dtype))
     assert isinstance(frame, Frame)
-    assert frame.picture is not None
-    assert frame.picture.pixels.shape == pixels
-    assert frame.picture.pixels.dtype == (np.float32 if dtype is np.float64 else dtype)
-    assert (None if frame.picture.alpha is None else frame.picture.alpha.shape) == alpha
-    assert frame.picture.metadata.size == (5, 4)
+    assert frame.image is not None
+    assert frame.image.pixels.shape == pixels
+    assert frame.image.pixels.dtype == (np.float32 if dtype is np.float64 else dtype)
+    assert (None if frame.image.alpha is None else frame.image.alpha.shape) == alpha
+    assert frame.image.metadata.size == (5, 4)
     assert len(as_inputs(np.zeros((3, 4, 5, 3), np.uint8))) == 3
 
 
 @pytest.mark.parametrize(
     "wrong", [[np.zeros((4, 5), np.int64)], [np.zeros((0, 5), np.uint8)], [np.zeros(5, np.uint8)], [3], 3, [b"a", None]]
 )
-def test_what_is_no_picture_is_named(wrong: Any) -> None:
+def test_what_is_no_image_is_named(wrong: Any) -> None:
     with pytest.raises(ArgumentError):
         rdstitch.pano(wrong)
 
@@ -181,7 +181,7 @@ def test_what_is_no_picture_is_named(wrong: Any) -> None:
 def test_what_a_notebook_shows(of_files: rdstitch.StitchResult) -> None:
     text = repr(of_files)
     assert len(text) < 120
-    assert "3 of 3 pictures, λ = -0.2" in text
+    assert "3 of 3 images, λ = -0.2" in text
     preview = of_files._repr_png_()
     assert preview is not None
     shown = cv2.imdecode(np.frombuffer(preview, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -192,7 +192,7 @@ def test_what_a_notebook_shows(of_files: rdstitch.StitchResult) -> None:
         [source.path for source in of_files.registration.sources], options=rdstitch.StitchOptions(dry_run=True)
     )
     assert planned._repr_png_() is None
-    with pytest.raises(ArgumentError, match="no picture in memory"):
+    with pytest.raises(ArgumentError, match="no image in memory"):
         _ = planned.image
 
 

@@ -1,4 +1,4 @@
-"""``--attitude``: a gimbal's or IMU's tilt of every picture, exact or nearly so, from a table or from XMP."""
+"""``--attitude``: a gimbal's or IMU's tilt of every image, exact or nearly so, from a table or from XMP."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from tests.sampled import sampled
 
 @pytest.fixture(scope="module")
 def windy() -> Sequence:
-    """A drone that tilts by another few degrees for each of six pictures."""
+    """A drone that tilts by another few degrees for each of six images."""
     lens = Camera((400, 300), -0.2, focal=380.0)
     poses = grid_poses(lens, 3, 2, overlap=0.5, yaw=0.1, seed=4).shaken(seed=5, tilt=np.radians(4.0))
     return sequence_over(
@@ -33,7 +33,7 @@ def _table(sequence: Sequence, paths: list[Path], error: float) -> str:
 
 
 def _with_xmp(sequence: Sequence, folder: Path, source: str) -> list[Path]:
-    """The pictures as JPEG files that tell the true attitudes in one maker's words."""
+    """The images as JPEG files that tell the true attitudes in one maker's words."""
     paths = []
     for index in range(len(sequence)):
         xmp = xmp_of(source, *euler_angles(source, sequence.from_plane(index)[:, :2], north=0.7))
@@ -79,7 +79,7 @@ def test_measured_tilts_and_poses_are_those_of_the_camera_whatever_exif_turns(wi
 
 
 @pytest.mark.parametrize(("source", "std"), sampled([("dji-gimbal", 0.0), ("pix4d-camera", np.radians(1.0))]))
-def test_drones_write_tilts_into_their_pictures(windy: Sequence, tmp_path: Path, source: str, std: float) -> None:
+def test_drones_write_tilts_into_their_images(windy: Sequence, tmp_path: Path, source: str, std: float) -> None:
     paths = _with_xmp(windy, tmp_path, source)
     lens = windy.lens
     assert isinstance(lens, Camera)
@@ -92,9 +92,7 @@ def test_drones_write_tilts_into_their_pictures(windy: Sequence, tmp_path: Path,
     assert np.degrees(np.abs(alignment.poses.tilt - windy.poses.tilt)).max() < (0.01 if std == 0.0 else 1.0)
 
 
-def test_pictures_without_attitude_are_named(
-    rdstitch: Run, windy: Sequence, frames: list[Path], tmp_path: Path
-) -> None:
+def test_images_without_attitude_are_named(rdstitch: Run, windy: Sequence, frames: list[Path], tmp_path: Path) -> None:
     paths = _with_xmp(windy, tmp_path, "parrot-camera")[:2]
     arguments = ("calibrate", "--attitude", "xmp", "-o", tmp_path / "camera.json", *CACHED)
     assert rdstitch(*arguments, *paths).status == 0
@@ -127,7 +125,7 @@ def test_a_file_may_be_named_like_the_word(
     assert "no column 'theta'" in done.line
 
 
-def test_pairs_get_one_tilt_a_picture(windy: Sequence, tmp_path: Path) -> None:
+def test_pairs_get_one_tilt_an_image(windy: Sequence, tmp_path: Path) -> None:
     paths = windy.write(tmp_path)[:2]
     (tmp_path / "imu.csv").write_text(_table(windy, paths, 0.0))
     lens = windy.lens

@@ -39,11 +39,11 @@ def environment(tmp_path: Path) -> dict[str, str]:
 
 @pytest.fixture
 def floors(tmp_path: Path, frames: list[Path]) -> Path:
-    """Two folders of pictures, and one that is of no use; names with spaces and quotes."""
-    for name, pictures in {"hall one": frames[:2], "it's two": frames[1:], "empty": []}.items():
+    """Two folders of images, and one that is of no use; names with spaces and quotes."""
+    for name, images in {"hall one": frames[:2], "it's two": frames[1:], "empty": []}.items():
         (tmp_path / "floors" / name).mkdir(parents=True)
-        for picture in pictures:
-            shutil.copy(picture, tmp_path / "floors" / name)
+        for image in images:
+            shutil.copy(image, tmp_path / "floors" / name)
     return tmp_path / "floors"
 
 
@@ -69,10 +69,10 @@ def test_mosaics_and_their_summary(environment: dict[str, str], floors: Path, tm
     assert _run(environment, "mosaics.sh", floors, out, needs=("find", "xargs")).returncode == 0
     assert {path.name: path.stat().st_mtime_ns for path in out.glob("*.tif")} == made
 
-    # A picture that is not the one that its sidecar names is neither kept in silence nor replaced.
+    # An image that is not the one that its sidecar names is neither kept in silence nor replaced.
     (out / "hall one.tif").write_bytes(b"half")
     done = _run(environment, "mosaics.sh", floors, out, needs=("find", "xargs", "sha256sum"))
-    assert (done.returncode, f"{out / 'hall one.tif'}: is not the picture" in done.stderr) == (1, True)
+    assert (done.returncode, f"{out / 'hall one.tif'}: is not the image" in done.stderr) == (1, True)
     assert (out / "hall one.tif").read_bytes() == b"half"
     for file in out.glob("hall one.tif*"):
         file.unlink()
@@ -81,7 +81,7 @@ def test_mosaics_and_their_summary(environment: dict[str, str], floors: Path, tm
     table = _run(environment, "summary.sh", out, needs=("find", "xargs", "jq"))
     assert (table.returncode, table.stderr) == (0, "")
     head, *rows = (line.split("\t") for line in table.stdout.splitlines())
-    assert [row[head.index("picture")] for row in rows] == sorted(made)
+    assert [row[head.index("image")] for row in rows] == sorted(made)
     assert [(row[head.index("used")], row[head.index("all")]) for row in rows] == [("2", "2")] * 2
     assert all(-0.3 < float(row[head.index("lambda")]) < -0.1 for row in rows)
 
@@ -94,7 +94,7 @@ def test_mosaics_and_their_summary(environment: dict[str, str], floors: Path, tm
     assert (again.returncode, again.stderr) == (0, "")
     Path(f"{made_band}.json").unlink()
     again = _run(environment, "bands.sh", out / "hall one.tif.json", tmp_path / "bands", floors / "hall one", needs=())
-    assert (again.returncode, f"{made_band}: is not the picture" in again.stderr) == (1, True)
+    assert (again.returncode, f"{made_band}: is not the image" in again.stderr) == (1, True)
 
 
 def test_mosaics_by_parallel(environment: dict[str, str], floors: Path, tmp_path: Path) -> None:
@@ -112,7 +112,7 @@ def test_undistorting_a_tree(environment: dict[str, str], floors: Path, tmp_path
     for _ in range(2):
         done = _run(environment, "undistort_all.sh", *arguments, needs=("find", "xargs", "realpath"))
         assert done.returncode == 0
-        assert all("2 pictures undistorted" in line for line in done.stderr.splitlines())
+        assert all("2 images undistorted" in line for line in done.stderr.splitlines())
         made = sorted(str(path.relative_to(tmp_path / place)) for path in (tmp_path / place).rglob("*.png"))
         assert made == originals
 
@@ -123,6 +123,6 @@ def test_undistorting_a_tree_tells_of_failures(environment: dict[str, str], floo
     arguments = (tmp_path / "camera.json", floors, tmp_path / "straight")
     done = _run(environment, "undistort_all.sh", *arguments[:2], floors, needs=("find", "xargs", "realpath"))
     assert (done.returncode, "choose another one" in done.stderr) == (1, True)
-    (floors / "empty" / "bad.png").write_bytes(b"no picture")
+    (floors / "empty" / "bad.png").write_bytes(b"no image")
     done = _run(environment, "undistort_all.sh", *arguments, needs=("find", "xargs", "realpath"))
     assert (done.returncode, "bad.png" in done.stderr) == (1, True)

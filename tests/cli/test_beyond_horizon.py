@@ -1,4 +1,4 @@
-"""Pictures of a circular fisheye of 190 degrees and more: masked beyond the horizon, never folded."""
+"""Images of a circular fisheye of 190 degrees and more: masked beyond the horizon, never folded."""
 
 from pathlib import Path
 
@@ -35,7 +35,7 @@ distortion_coefficients: !!opencv-matrix
 
 
 def _ground_points(points: np.ndarray, place: tuple[float, float, float]) -> np.ndarray:
-    """Texels (N, 2) of the ground at measured pixels (N, 2) of a picture; NaN beyond the horizon."""
+    """Texels (N, 2) of the ground at measured pixels (N, 2) of an image; NaN beyond the horizon."""
     x, y, turn = place
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     rays = (LENS.undistort(points) - LENS.center) / LENS.focal
@@ -51,8 +51,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for number, place in enumerate(PLACES):
         seen = np.nan_to_num(_ground_points(np.column_stack([u.ravel(), v.ravel()]), place), nan=-1.0)
         x, y = seen.reshape(*u.shape, 2).astype(np.float32).transpose(2, 0, 1)
-        picture = cv2.remap(texture * 255.0, x, y, cv2.INTER_LINEAR, borderValue=(90.0,))
-        cv2.imwrite(str(made / f"{number}.png"), picture.astype(np.uint8))
+        image = cv2.remap(texture * 255.0, x, y, cv2.INTER_LINEAR, borderValue=(90.0,))
+        cv2.imwrite(str(made / f"{number}.png"), image.astype(np.uint8))
     (made / "fisheye.yml").write_text(FILE, encoding="utf-8")
     return made
 
@@ -72,28 +72,28 @@ def test_the_camera_file_is_read_to_the_horizon(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("view", ["same", "all", "valid"])
-def test_undistorted_pictures_are_masked(rdstitch: Run, folder: Path, tmp_path: Path, view: str) -> None:
+def test_undistorted_images_are_masked(rdstitch: Run, folder: Path, tmp_path: Path, view: str) -> None:
     lens = ("--camera", folder / "fisheye.yml")
     assert rdstitch("undistort", folder / "0.png", "-o", tmp_path, *lens, "--view", view).status == 0
-    picture = cv2.imread(str(tmp_path / "0.png"), cv2.IMREAD_UNCHANGED)
-    assert picture is not None
+    image = cv2.imread(str(tmp_path / "0.png"), cv2.IMREAD_UNCHANGED)
+    assert image is not None
     if view == "all":
-        assert (picture[[0, 0, -1, -1], [0, -1, 0, -1], 3] == 0).all()
+        assert (image[[0, 0, -1, -1], [0, -1, 0, -1], 3] == 0).all()
         # A circle fills this share of its square.
-        assert picture[..., 3].mean() / 255.0 == pytest.approx(np.pi / 4.0, abs=0.05)
+        assert image[..., 3].mean() / 255.0 == pytest.approx(np.pi / 4.0, abs=0.05)
     else:
-        assert (picture[..., -1] > 0).all()
+        assert (image[..., -1] > 0).all()
 
 
 def test_a_mosaic_of_what_is_before_the_camera(rdstitch: Run, folder: Path, tmp_path: Path) -> None:
-    pictures = [folder / f"{number}.png" for number in range(3)]
+    images = [folder / f"{number}.png" for number in range(3)]
     lens = ("--camera", folder / "fisheye.yml")
-    assert rdstitch("pano", *pictures, "-o", tmp_path / "a.png", *lens, *CACHED).status == 0
-    picture = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
-    assert picture is not None
-    assert (picture[[0, 0, -1, -1], [0, -1, 0, -1], 3] == 0).all()
+    assert rdstitch("pano", *images, "-o", tmp_path / "a.png", *lens, *CACHED).status == 0
+    image = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    assert (image[[0, 0, -1, -1], [0, -1, 0, -1], 3] == 0).all()
     options = library.StitchOptions(camera=load_camera(folder / "fisheye.yml"))
-    found = library.pano(pictures, options=options).registration.alignment
+    found = library.pano(images, options=options).registration.alignment
     assert found.used.all()
     points = np.random.default_rng(1).uniform((60, 20), (340, 280), (300, 2))
     moved = found.transfer(0, 2, points)

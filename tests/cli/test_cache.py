@@ -22,7 +22,7 @@ from tests.sampled import sampled
 
 
 def _result(output: Path) -> tuple[bytes, dict[str, Any]]:
-    """The picture, and the sidecar apart from the options that say nothing of it."""
+    """The image, and the sidecar apart from the options that say nothing of it."""
     record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
     del record["options"]["cache"], record["options"]["overwrite"]
     return output.read_bytes(), record
@@ -76,14 +76,14 @@ def test_only_what_depends_on_a_changed_option_is_done_again(
         work.clear()
         assert rdstitch(*arguments, *options).status == 0
         assert set(work) == expected, options
-    # A picture that was copied is the same picture; one that was changed is another.
+    # An image that was copied is the same image; one that was changed is another.
     moved = [Path(shutil.copy(frame, tmp_path / f"moved_{frame.name}")) for frame in frames]
     work.clear()
     assert rdstitch("calibrate", *moved, "-o", tmp_path / "camera.json", *arguments[-2 - len(FAST) :]).status == 0
     assert work == ["align"]  # whose layout does not matter to a lens
 
 
-def test_a_picture_more_needs_only_its_own(
+def test_an_image_more_needs_only_its_own(
     rdstitch: Run, frames: list[Path], plain: tuple[bytes, dict[str, Any]], tmp_path: Path, work: list[str]
 ) -> None:
     cached = ("--cache", tmp_path / "cache", *FAST)
@@ -118,7 +118,7 @@ def test_damaged_entries_are_computed_again(
         assert [entry.read_bytes() for entry in entries] == contents
 
 
-def test_damaged_pictures_are_left_out_every_time(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+def test_damaged_images_are_left_out_every_time(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     bad = tmp_path / "bad.png"
     bad.write_bytes(frames[2].read_bytes()[:-3000])
     arguments = ("mosaic", *frames[:2], bad, "-o", tmp_path / "out.png", "--overwrite", *FAST)
@@ -179,7 +179,7 @@ def test_two_processes_share_a_cache(frames: list[Path], plain: tuple[bytes, dic
 
 
 @pytest.mark.slow
-def test_killed_runs_of_hundreds_of_pictures_repeat_little() -> None:
+def test_killed_runs_of_hundreds_of_images_repeat_little() -> None:
     shares, same = repeated(300, 10)
     assert same
     assert shares["all work"] < 0.1

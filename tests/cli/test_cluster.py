@@ -19,13 +19,13 @@ from tests.cli.running import FAST, Run, flight
 
 pytest.importorskip("distributed")
 
-_PICTURES = 8  # each a task
+_IMAGES = 8  # each a task
 
 
 @pytest.fixture(scope="module")
-def pictures(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def images(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """A strip."""
-    return flight(4, _PICTURES).write(tmp_path_factory.mktemp("strip"))
+    return flight(4, _IMAGES).write(tmp_path_factory.mktemp("strip"))
 
 
 @contextmanager
@@ -61,13 +61,13 @@ def _record(output: Path) -> dict[str, Any]:
 
 
 def test_a_cluster_gives_the_same_bytes_though_a_worker_dies(
-    pictures: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     features = rdstitch.FeatureOptions(max_features=600)
     here, there = tmp_path / "here" / "out.png", tmp_path / "there" / "out.png"
     here.parent.mkdir()
     there.parent.mkdir()
-    rdstitch.mosaic(pictures, here, rdstitch.StitchOptions(features=features, workers=1))
+    rdstitch.mosaic(images, here, rdstitch.StitchOptions(features=features, workers=1))
     monkeypatch.setattr(TiledOutput, "strips", lambda *_: pytest.fail("pixels are for the workers, in this process"))
     with _cluster(tmp_path, 2) as (address, workers):
         steps: list[tuple[str, int]] = []
@@ -78,20 +78,20 @@ def test_a_cluster_gives_the_same_bytes_though_a_worker_dies(
                 workers[0].kill()
 
         options = rdstitch.StitchOptions(features=features, cache=tmp_path / "store", scheduler=address)
-        rdstitch.mosaic(pictures, there, options, progress=kill_one)
+        rdstitch.mosaic(images, there, options, progress=kill_one)
         assert workers[0].wait(10) != 0
         assert workers[1].poll() is None
     assert there.read_bytes() == here.read_bytes()
     assert _record(there) == _record(here)
     assert not list((tmp_path / "store").glob("rdstitch-*")), "what the workers had composed is removed"
-    assert [done for stage, done in steps if stage == "detecting features"] == list(range(1, _PICTURES + 1))
+    assert [done for stage, done in steps if stage == "detecting features"] == list(range(1, _IMAGES + 1))
 
 
 @pytest.mark.slow
 def test_one_and_four_worker_processes_give_the_same_bytes(
-    pictures: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All work on pictures and pairs is in tasks: each kind of them was handed over."""
+    """All work on images and pairs is in tasks: each kind of them was handed over."""
     handed: set[str] = set()
 
     class Recording(ProcessExecutor):
@@ -105,7 +105,7 @@ def test_one_and_four_worker_processes_give_the_same_bytes(
         outputs.append(tmp_path / str(workers) / "out.png")
         outputs[-1].parent.mkdir()
         features = rdstitch.FeatureOptions(max_features=600)
-        rdstitch.mosaic(pictures, outputs[-1], rdstitch.StitchOptions(features=features, workers=workers))
+        rdstitch.mosaic(images, outputs[-1], rdstitch.StitchOptions(features=features, workers=workers))
     assert outputs[0].read_bytes() == outputs[1].read_bytes()
     assert _record(outputs[0]) == _record(outputs[1])
     assert handed == {"detect_batch", "match_pairs", "estimate_pairs", "compare_overlaps", "compose_block"}

@@ -46,10 +46,10 @@ WAYS: list[tuple[str, ...]] = [
 ]
 
 
-def test_every_way_makes_another_picture_of_the_same_place(
+def test_every_way_makes_another_image_of_the_same_place(
     rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path
 ) -> None:
-    pictures = []
+    images = []
     for number, way in enumerate(WAYS):
         output = tmp_path / f"{number}.png"
         done = rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--scale", "0.5", "-j", "1", *way)
@@ -57,21 +57,21 @@ def test_every_way_makes_another_picture_of_the_same_place(
         record = json.loads(output.with_name(output.name + ".json").read_text(encoding="utf-8"))
         used = record["options"]["composite"]
         assert {name: used[name.removeprefix("--")] for name in way[::2]} == dict(zip(way[::2], way[1::2], strict=True))
-        pictures.append(read_image(output).pixels.astype(int))
-    for number, picture in enumerate(pictures):
-        assert np.abs(picture - pictures[0]).mean() < 3
-        assert [k for k in range(number) if (pictures[k] == picture).all()] == []
+        images.append(read_image(output).pixels.astype(int))
+    for number, image in enumerate(images):
+        assert np.abs(image - images[0]).mean() < 3
+        assert [k for k in range(number) if (images[k] == image).all()] == []
 
 
 def test_crop_leaves_no_hole(rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path) -> None:
     output = tmp_path / "cropped.png"
     done = rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--crop", "--scale", "1")
     assert (done.status, done.err) == (0, "")
-    picture = read_image(output)
-    assert picture.alpha is None or (picture.alpha == 255).all()
+    image = read_image(output)
+    assert image.alpha is None or (image.alpha == 255).all()
 
 
-def test_background_is_what_no_picture_covers(rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path) -> None:
+def test_background_is_what_no_image_covers(rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path) -> None:
     output = tmp_path / "white.jpg"
     done = rdstitch("apply", sidecar, "--images", frames[0].parent, "-o", output, "--background", "255")
     assert done.status == 0
@@ -110,14 +110,14 @@ def test_dry_run_reports_and_writes_nothing(rdstitch: Run, frames: list[Path], t
     distortion, *plan = done.out.splitlines()
     float(distortion)
     told = dict(line.split(": ") for line in plan)
-    assert set(told) == {"pictures", "canvas", "output", "memory", "time"}
-    assert told["pictures"] == "3"
+    assert set(told) == {"images", "canvas", "output", "memory", "time"}
+    assert told["images"] == "3"
     assert rdstitch("mosaic", *frames, "-o", tmp_path / "a.png", *CACHED).status == 0
     height, width = read_image(tmp_path / "a.png").pixels.shape[:2]
     assert told["canvas"].startswith(f"{width} x {height} pixels")
 
 
-def test_file_and_memory_hold_the_same_picture(frames: list[Path], tmp_path: Path) -> None:
+def test_file_and_memory_hold_the_same_image(frames: list[Path], tmp_path: Path) -> None:
     options = StitchOptions(workers=1)
     held = mosaic(frames, None, options).composite
     assert held is not None
@@ -128,7 +128,7 @@ def test_file_and_memory_hold_the_same_picture(frames: list[Path], tmp_path: Pat
     np.testing.assert_array_equal(back.alpha, held.alpha)
 
 
-def test_deep_zoom_is_the_same_picture(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+def test_deep_zoom_is_the_same_image(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     output, report = tmp_path / "a.dzi", tmp_path / "report.html"
     command = ("mosaic", *frames, "-o", output, "--report", report, *CACHED)
     assert rdstitch(*command, "--dry-run").status == 0
@@ -159,7 +159,7 @@ def test_deep_zoom_is_replaced_only_on_request(
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
-def test_profile_and_exif_are_kept_and_the_picture_is_upright(
+def test_profile_and_exif_are_kept_and_the_image_is_upright(
     rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path, suffix: str
 ) -> None:
     profile, folder = bytes(range(256)) * 2, tmp_path / "turned"
@@ -170,11 +170,11 @@ def test_profile_and_exif_are_kept_and_the_picture_is_upright(
         with Image.open(frame) as image:
             turned = image.transpose(Image.Transpose.ROTATE_90)
         turned.save(folder / frame.name, exif=exif, icc_profile=profile)
-    pictures = {"upright": frames[0].parent, "turned": folder}
-    for name, images in pictures.items():
+    folders = {"upright": frames[0].parent, "turned": folder}
+    for name, images in folders.items():
         done = rdstitch("apply", sidecar, "--images", images, "-o", tmp_path / f"{name}.{suffix}", "--scale", "0.3")
         assert done.status == 0
-    upright, turned_output = (read_image(tmp_path / f"{name}.{suffix}") for name in pictures)
+    upright, turned_output = (read_image(tmp_path / f"{name}.{suffix}") for name in folders)
     np.testing.assert_array_equal(turned_output.pixels, upright.pixels)
     assert (upright.metadata.icc_profile, upright.metadata.make) == (b"", "")
     assert (turned_output.metadata.icc_profile, turned_output.metadata.make) == (profile, "Maker")

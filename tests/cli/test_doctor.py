@@ -19,12 +19,12 @@ from tests.cli.running import Run
 def test_nothing_is_amiss(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     done = rdstitch("doctor", frames[0].parent)
     assert (done.status, done.err) == (0, "")
-    assert "pictures:   3\n" in done.out
+    assert "images:   3\n" in done.out
     assert "400 x 300 (3)" in done.out
-    assert "every picture has a partner; 1 group" in done.out
+    assert "every image has a partner; 1 group" in done.out
     assert "none: go ahead" in done.out
     found = json.loads(rdstitch("doctor", *frames, "--json").out)
-    assert found["pictures"] == 3
+    assert found["images"] == 3
     assert 0.35 < found["overlap"] < 0.7  # rendered with a half
     assert found["seconds"] > 0
     assert found["memory_bytes"] > 2**20
@@ -39,9 +39,9 @@ def test_faults_are_found(frames: list[Path], stranger: Path, tmp_path: Path) ->
     cv2.imwrite(str(tmp_path / "blurred.png"), cv2.GaussianBlur(sharp, (0, 0), 3.0))
     cv2.imwrite(str(tmp_path / "burnt.png"), np.minimum(sharp * 3.0, 255).astype(np.uint8))
     cv2.imwrite(str(tmp_path / "dark.png"), sharp // 20)
-    (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8 no picture")
+    (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8 no image")
     found = examine(tmp_path)
-    assert found.pictures == 7
+    assert found.images == 7
     assert len(found.unreadable) == 1
     assert found.blurred == ("blurred.png",)
     assert found.burnt == ("burnt.png",)
@@ -50,7 +50,7 @@ def test_faults_are_found(frames: list[Path], stranger: Path, tmp_path: Path) ->
     assert not {frame.name for frame in frames} & set(found.alone)
     text = found.as_text()
     assert "broken.jpg" in text
-    assert "leave blurred pictures out" in text
+    assert "leave blurred images out" in text
 
 
 def test_zooms_and_cameras_are_told_apart(frames: list[Path], tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_zooms_and_cameras_are_told_apart(frames: list[Path], tmp_path: Path) ->
     assert any("zoomed" in item for item in found.advice)
 
 
-def test_pictures_that_have_nothing_in_common(frames: list[Path], stranger: Path, rdstitch: Run) -> None:
+def test_images_that_have_nothing_in_common(frames: list[Path], stranger: Path, rdstitch: Run) -> None:
     found = examine([frames[0], stranger])
     assert found.overlap is None
     assert found.groups == 2
@@ -77,10 +77,10 @@ def test_pictures_that_have_nothing_in_common(frames: list[Path], stranger: Path
 
 @pytest.mark.parametrize("single", [True, False])
 def test_arrays(frames: list[Path], single: bool) -> None:
-    pictures = [np.asarray(Image.open(frame)) for frame in frames]
-    found = examine(pictures[0] if single else pictures, channel_order="rgb")
-    assert found.pictures == (1 if single else 3)
-    assert ("needs two pictures" in " ".join(found.advice)) == single
+    images = [np.asarray(Image.open(frame)) for frame in frames]
+    found = examine(images[0] if single else images, channel_order="rgb")
+    assert found.images == (1 if single else 3)
+    assert ("needs two images" in " ".join(found.advice)) == single
 
 
 def test_what_cannot_be_read_is_named_once(rdstitch: Run, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from tests.cli.running import Run, transfers
 from tests.sampled import sampled
 
 PAIR = sorted((Path(__file__).resolve().parents[2] / "examples/data/garfield_red").glob("*.jpg"))
-# What is looked at is the registration; the picture may be small.
+# What is looked at is the registration; the image may be small.
 SMALL = ("--scale", "0.1", "--blend", "feather", "--seam", "voronoi", "-j", "1")
 
 
@@ -25,18 +25,18 @@ def stitched(rdstitch: Run, folder: Path, kind: str) -> dict[str, Any]:
     output = folder / f"{kind}.jpg"
     done = rdstitch("pano", *PAIR, "-o", output, "--features", kind, "--reference", PAIR[0].name, *SMALL)
     assert done.status == 0
-    assert all("[few-pictures]" in line for line in done.err.splitlines())
+    assert all("[few-images]" in line for line in done.err.splitlines())
     record: dict[str, Any] = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
     return record
 
 
 def overlap(record: dict[str, Any]) -> FloatArray:
-    """Where a grid over the second picture lies in the first one, px; NaN where it is outside."""
+    """Where a grid over the second image lies in the first one, px; NaN where it is outside."""
     camera = record["camera"]
     width, height = camera["image_size"]
     lens = camera_from_record(Record("sidecar", "camera", camera))
     u, v = np.meshgrid(np.linspace(0, width - 1, 40), np.linspace(0, height - 1, 30))
-    # The frame is that of the first picture: its undistorted px are only scaled and shifted.
+    # The frame is that of the first image: its undistorted px are only scaled and shifted.
     first = np.array(record["images"][0]["to_output"])
     first /= first[2, 2]
     flat = (transfers(record)[1](np.column_stack([u.ravel(), v.ravel()])) - first[:2, 2]) / first[0, 0]

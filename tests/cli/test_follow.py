@@ -23,20 +23,20 @@ from tests.cli.running import DISTORTION, FAST, Run, flight, start
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Nine pictures along a line."""
+    """Nine images along a line."""
     return flight(5, 9, overlap=0.6).write(tmp_path_factory.mktemp("drive"))
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Where the pictures arrive."""
+    """Where the images arrive."""
     made = tmp_path / "incoming"
     made.mkdir()
     return made
 
 
-def _written_as(picture: Path, file: Path) -> Path:
-    write_image(file, read_image(picture).pixels)
+def _written_as(image: Path, file: Path) -> Path:
+    write_image(file, read_image(image).pixels)
     return file
 
 
@@ -53,19 +53,19 @@ def _rest(process: "subprocess.Popen[bytes]") -> list[dict[str, Any]]:
     return [json.loads(line) for line in output.splitlines()]
 
 
-def test_a_growing_folder_gives_poses_at_once_and_then_the_same_picture(
+def test_a_growing_folder_gives_poses_at_once_and_then_the_same_image(
     rdstitch: Run, drive: list[Path], folder: Path, tmp_path: Path
 ) -> None:
     output, whole = tmp_path / "live.png", tmp_path / "whole.png"
     process = start("mosaic", folder, "-o", output, "--follow", "--idle", "4", "--refresh", "0.1", *FAST)
     lines = []
     arriving = drive[:6]
-    for picture in arriving:
-        shutil.copy(picture, folder)
-        # Each line comes before the next picture does.
+    for image in arriving:
+        shutil.copy(image, folder)
+        # Each line comes before the next image does.
         while (line := _line(process))["revised"]:
             lines.append(line)
-        assert line["name"] == picture.name
+        assert line["name"] == image.name
         lines.append(line)
     sketch = read_image(tmp_path / "live.preview.jpg")
     *_, last = _rest(process)
@@ -91,8 +91,8 @@ def test_a_growing_folder_gives_poses_at_once_and_then_the_same_picture(
 
 def test_an_interrupt_ends_with_what_has_arrived(drive: list[Path], folder: Path, tmp_path: Path) -> None:
     output = tmp_path / "path.csv"
-    for picture in drive[:5]:
-        shutil.copy(picture, folder)
+    for image in drive[:5]:
+        shutil.copy(image, folder)
     process = start("trajectory", folder, "-o", output, "--follow", *FAST)
     names: set[str] = set()
     while len(names) < 5:
@@ -108,12 +108,12 @@ def test_names_on_standard_input_are_taken_as_they_come(drive: list[Path], tmp_p
     output = tmp_path / "path.csv"
     process = start("trajectory", "-", "-o", output, "--follow", *FAST, stdin=subprocess.PIPE)
     assert process.stdin is not None
-    for picture in [*drive[:5], tmp_path / "missing.png"]:
-        process.stdin.write(f"{picture}\n".encode())
+    for image in [*drive[:5], tmp_path / "missing.png"]:
+        process.stdin.write(f"{image}\n".encode())
         process.stdin.flush()
         while (line := _line(process))["revised"]:
             pass
-        assert line["name"] == picture.name
+        assert line["name"] == image.name
     *_, last = _rest(process)
     assert process.returncode == 0
     assert last["used"] == 5
@@ -123,8 +123,8 @@ def test_names_on_standard_input_are_taken_as_they_come(drive: list[Path], tmp_p
 def test_lines_have_the_units_and_the_times_of_the_table(
     rdstitch: Run, drive: list[Path], folder: Path, tmp_path: Path, frame: str
 ) -> None:
-    for picture in drive:
-        shutil.copy(picture, folder)
+    for image in drive:
+        shutil.copy(image, folder)
     times = tmp_path / "times.csv"
     times.write_text("name,timestamp\n" + "".join(f"{p.name},{50 + k / 4}\n" for k, p in enumerate(drive)))
     output = tmp_path / "path.csv"
@@ -148,20 +148,20 @@ def test_lines_have_the_units_and_the_times_of_the_table(
 def test_a_frame_that_cannot_be_read_has_a_line_with_the_reason(
     rdstitch: Run, drive: list[Path], folder: Path, tmp_path: Path
 ) -> None:
-    for picture in drive[:3]:
-        shutil.copy(picture, folder)
-    (folder / "frame_0001.png").write_bytes(b"no picture")
+    for image in drive[:3]:
+        shutil.copy(image, folder)
+    (folder / "frame_0001.png").write_bytes(b"no image")
     outcome = rdstitch("trajectory", folder, "-o", tmp_path / "path.csv", "--follow", "--idle", "0.1", *FAST)
     lines = [json.loads(line) for line in outcome.out.splitlines()]
     assert [line["name"] for line in lines[:3]] == ["frame_0000.png", "frame_0002.png", "frame_0001.png"]
     assert lines[2]["frame"] == 1
-    assert "no picture" in lines[2]["reason"]
+    assert "no image" in lines[2]["reason"]
     assert lines[2]["x"] is None
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
 def test_a_file_whose_writer_pauses_is_read_when_it_is_whole(drive: list[Path], folder: Path, suffix: str) -> None:
-    whole = [_written_as(picture, folder.parent / f"{picture.stem}{suffix}").read_bytes() for picture in drive[:3]]
+    whole = [_written_as(image, folder.parent / f"{image.stem}{suffix}").read_bytes() for image in drive[:3]]
     arrivals = Arrivals(folder, frames_folder=Path, idle=2.0)
     frames = follow(arrivals, StitchOptions(workers=1), comes_again=arrivals.comes_again)
     (folder / f"a{suffix}").write_bytes(whole[0])
@@ -181,8 +181,8 @@ def test_a_file_whose_writer_pauses_is_read_when_it_is_whole(drive: list[Path], 
 
 
 def test_a_file_that_is_mended_after_it_was_reported_is_read(drive: list[Path], folder: Path) -> None:
-    for picture in drive[:2]:
-        shutil.copy(picture, folder)
+    for image in drive[:2]:
+        shutil.copy(image, folder)
     (bad := folder / "z.png").write_bytes(drive[2].read_bytes()[:9000])
     os.utime(bad, (0, 0))
     arrivals = Arrivals(folder, frames_folder=Path, idle=2.0)
@@ -214,18 +214,18 @@ def test_what_would_fail_at_the_end_fails_at_the_beginning(
     assert rdstitch("mosaic", tmp_path / "none", "-o", tmp_path / "other.png", "--follow").status == 3
     refused = rdstitch("mosaic", folder, "-o", tmp_path / "other.png", "--follow", "--idle", "0.05")
     assert refused.status == 3
-    assert "no pictures" in refused.line
+    assert "no images" in refused.line
 
 
-def test_a_picture_of_the_users_with_the_name_of_the_preview_stays(
+def test_an_image_of_the_users_with_the_name_of_the_preview_stays(
     rdstitch: Run, drive: list[Path], folder: Path, tmp_path: Path
 ) -> None:
     own = tmp_path / "out.preview.jpg"
-    own.write_bytes(b"a picture of the user's")
+    own.write_bytes(b"an image of the user's")
     refused = rdstitch("mosaic", folder, "-o", tmp_path / "out.png", "--follow", "--idle", "0.05")
     assert refused.status == 6
     assert own.name in refused.line
     # It may be replaced, but what was never replaced is not removed.
     forced = rdstitch("mosaic", folder, "-o", tmp_path / "out.png", "--follow", "--idle", "0.05", "--overwrite")
     assert forced.status == 3
-    assert own.read_bytes() == b"a picture of the user's"
+    assert own.read_bytes() == b"an image of the user's"

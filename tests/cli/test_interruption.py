@@ -19,17 +19,17 @@ from rdstitch.synthetic import ground
 from tests.cli.running import FAST, Outcome, Run, finished, start, state_of
 from tests.sampled import sampled
 
-_PICTURES = 64  # enough for worker processes
+_IMAGES = 64  # enough for worker processes
 
 
 @pytest.fixture
 def strip(tmp_path: Path) -> Path:
-    """Parts of one picture."""
+    """Parts of one image."""
     folder = tmp_path / "strip"
     folder.mkdir()
     width, height, step = 200, 150, 60
-    whole = ground((width + step * _PICTURES, height + 40), 5, 1).region(0, 0, width + step * _PICTURES, height + 40)
-    for index in range(_PICTURES):
+    whole = ground((width + step * _IMAGES, height + 40), 5, 1).region(0, 0, width + step * _IMAGES, height + 40)
+    for index in range(_IMAGES):
         part = whole[10 + 5 * (index % 5) :, step * index :][:height, :width]
         cv2.imwrite(str(folder / f"{index:02d}.png"), np.rint(part * 255.0).astype(np.uint8))
     return folder
@@ -60,7 +60,7 @@ def test_an_interrupted_run_ends_its_workers_and_can_be_continued(strip: Path, t
     assert done.line.endswith("interrupted; the same command goes on from the cache")
     assert not any(Path(f"/proc/{worker}").exists() for worker in workers)
     kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache" / "features").rglob("*") if path.is_file()}
-    assert len(kept) == _PICTURES
+    assert len(kept) == _IMAGES
     if continued:
         assert finished(start(*arguments)).status == 0
         assert {path: path.stat().st_mtime_ns for path in kept} == kept

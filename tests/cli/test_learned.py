@@ -17,7 +17,7 @@ from tests.sampled import sampled
 
 
 @pytest.mark.parametrize("matcher", sampled(["lightglue", "distances"]))
-def test_pictures_are_stitched_by_networks(rdstitch: Run, frames: list[Path], tmp_path: Path, matcher: str) -> None:
+def test_images_are_stitched_by_networks(rdstitch: Run, frames: list[Path], tmp_path: Path, matcher: str) -> None:
     aliked = save_aliked(tmp_path / "aliked.onnx")
     matching = ("--lightglue-model", save_lightglue(tmp_path / "glue.onnx")) if matcher == "lightglue" else ()
     output = tmp_path / "pano.png"
@@ -25,7 +25,7 @@ def test_pictures_are_stitched_by_networks(rdstitch: Run, frames: list[Path], tm
         "pano", *frames[:2], "-o", output, "--features", "aliked", "--aliked-model", aliked, *matching, *FAST
     )
     assert done.status == 0
-    assert all("[few-pictures]" in line for line in done.err.splitlines())
+    assert all("[few-images]" in line for line in done.err.splitlines())
     assert abs(float(done.out) - DISTORTION) < 0.01
     record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
     assert [image["features"] for image in record["images"]] == [KEYPOINTS, KEYPOINTS]

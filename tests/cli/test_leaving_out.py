@@ -1,4 +1,4 @@
-"""Pictures that fail a check are left out by name, and the rest is stitched."""
+"""Images that fail a check are left out by name, and the rest is stitched."""
 
 from pathlib import Path
 
@@ -11,19 +11,19 @@ from tests.cli.running import CACHED, DISTORTION, Run, flight
 
 @pytest.fixture
 def spoiled(tmp_path: Path) -> list[Path]:
-    """Five pictures in a row; the last shows other ground, but for a patch by which it is registered."""
+    """Five images in a row; the last shows other ground, but for a patch by which it is registered."""
     frames = flight(3, 5).write(tmp_path, "frame_{}.png")
     true = read_image(frames[4]).pixels
-    picture = flight(29, 5).frame(4).copy()
-    height, width = picture.shape[:2]
+    image = flight(29, 5).frame(4).copy()
+    height, width = image.shape[:2]
     patch = np.s_[height // 3 : height // 3 + 80, width // 8 : width // 8 + 80]
-    picture[patch] = true[patch]
-    write_image(frames[4], picture)
+    image[patch] = true[patch]
+    write_image(frames[4], image)
     return frames
 
 
 @pytest.mark.parametrize("strict", [False, True])
-def test_a_picture_that_fails_its_checks_is_left_out_by_name(
+def test_an_image_that_fails_its_checks_is_left_out_by_name(
     rdstitch: Run, spoiled: list[Path], tmp_path: Path, strict: bool
 ) -> None:
     extra = ("--strict",) if strict else ()
@@ -34,8 +34,8 @@ def test_a_picture_that_fails_its_checks_is_left_out_by_name(
     assert strict or abs(float(done.out) - DISTORTION) < 0.005
 
 
-def test_pictures_of_another_block_are_named_in_one_line(rdstitch: Run, tmp_path: Path) -> None:
+def test_images_of_another_block_are_named_in_one_line(rdstitch: Run, tmp_path: Path) -> None:
     own, others = flight(3, 3).write(tmp_path, "a{}.png"), flight(29, 2).write(tmp_path, "b{}.png")
     done = rdstitch("mosaic", *own, *others, "-o", tmp_path / "out.png", *CACHED)
     (line,) = [line for line in done.err.splitlines() if "left out" in line]
-    assert f"left out {others[0]}, {others[1].name}: in block 2 of 2, whose 2 pictures overlap with none" in line
+    assert f"left out {others[0]}, {others[1].name}: in block 2 of 2, whose 2 images overlap with none" in line

@@ -17,7 +17,7 @@ LEG = (255, 0, 255)
 
 @pytest.fixture
 def legs(frames: list[Path], tmp_path: Path) -> Path:
-    """The pictures, each with the same textured leg in it, which moves with the camera; the mask beside them."""
+    """The images, each with the same textured leg in it, which moves with the camera; the mask beside them."""
     folder = tmp_path / "legs"
     folder.mkdir()
     mask = np.full((300, 400), 255, np.uint8)
@@ -26,20 +26,20 @@ def legs(frames: list[Path], tmp_path: Path) -> Path:
     leg[:] = LEG
     leg[np.random.default_rng(0).random((300, 400)) < 0.2] = 0
     for path in frames:
-        picture = cv2.imread(str(path))
-        assert picture is not None
-        picture[mask == 0] = leg[mask == 0]
-        assert cv2.imwrite(str(folder / path.name), picture)
+        image = cv2.imread(str(path))
+        assert image is not None
+        image[mask == 0] = leg[mask == 0]
+        assert cv2.imwrite(str(folder / path.name), image)
     assert cv2.imwrite(str(tmp_path / "mask.png"), mask)
     return folder
 
 
 def leg_pixels(output: Path) -> int:
     """Number of px that have the leg's colour."""
-    picture = read_image(output)
-    assert picture.alpha is not None
-    away = np.abs(picture.pixels.astype(int) - LEG).max(axis=2)
-    return int(((away < 60) & (picture.alpha > 0)).sum())
+    image = read_image(output)
+    assert image.alpha is not None
+    away = np.abs(image.pixels.astype(int) - LEG).max(axis=2)
+    return int(((away < 60) & (image.alpha > 0)).sum())
 
 
 @pytest.mark.parametrize("command", ["mosaic", "pano"])
@@ -81,12 +81,12 @@ def test_masks_help_where_nothing_is_composited(
     assert abs(float(done.out) - DISTORTION) < 0.01
 
 
-def test_pictures_without_a_mask_are_reported(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+def test_images_without_a_mask_are_reported(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     (tmp_path / "masks").mkdir()
     assert cv2.imwrite(str(tmp_path / "masks" / f"{frames[0].stem}.bmp"), np.full((30, 40), 255, np.uint8))
     done = rdstitch("pano", *frames, "-o", tmp_path / "out.png", "--mask", tmp_path / "masks", *CACHED)
     assert done.status == 0
-    assert done.line.endswith(f"2 of 3 pictures have no mask: {frames[1].name}, {frames[2].name}")
+    assert done.line.endswith(f"2 of 3 images have no mask: {frames[1].name}, {frames[2].name}")
 
 
 def test_a_mask_that_does_not_fit_is_named(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
@@ -99,21 +99,21 @@ def test_a_mask_that_does_not_fit_is_named(rdstitch: Run, frames: list[Path], tm
     done = rdstitch(*arguments)
     assert done.status == 3
     assert f"{mask}: a mask of 30 x 40 pixels does not fit" in done.line
-    mask.write_bytes(b"no picture")
+    mask.write_bytes(b"no image")
     assert rdstitch(*arguments).status == 3
 
 
-def test_a_black_border_in_all_pictures_is_masked(rdstitch: Run, tmp_path: Path) -> None:
-    pictures = tmp_path / "pictures"
-    pictures.mkdir()
-    adverse_set("round border", 2).write(pictures)
-    done = rdstitch("mosaic", pictures, "-o", tmp_path / "out.png", *CACHED)
+def test_a_black_border_in_all_images_is_masked(rdstitch: Run, tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    adverse_set("round border", 2).write(images)
+    done = rdstitch("mosaic", images, "-o", tmp_path / "out.png", *CACHED)
     assert done.status == 0
-    assert "of every picture is black, or stays where it is" in done.err
+    assert "of every image is black, or stays where it is" in done.err
     found = read_image(tmp_path / "out.png")
     assert found.alpha is not None
     light = found.pixels.max(axis=2)
     assert (light[found.alpha > 0] < 8).mean() < 0.02
-    again = ("apply", tmp_path / "out.png.json", "--images", pictures, "-o", tmp_path / "again.png")
+    again = ("apply", tmp_path / "out.png.json", "--images", images, "-o", tmp_path / "again.png")
     assert rdstitch(*again).status == 0
     assert (tmp_path / "again.png").read_bytes() == (tmp_path / "out.png").read_bytes()

@@ -15,7 +15,7 @@ from tests.cli.running import CACHED, DISTORTION, Run, finished, start, transfer
 from tests.sampled import sampled
 
 
-def test_a_folder_becomes_one_rectified_picture(
+def test_a_folder_becomes_one_rectified_image(
     rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path
 ) -> None:
     done = rdstitch("mosaic", frames[0].parent, "-o", tmp_path / "mosaic.tif", *CACHED)
@@ -30,7 +30,7 @@ def test_a_folder_becomes_one_rectified_picture(
 
 
 @pytest.mark.parametrize("how", sampled(["nul", "list", "pattern", "files", "newlines"], 3))
-def test_every_way_to_name_pictures(frames: list[Path], tmp_path: Path, how: str) -> None:
+def test_every_way_to_name_images(frames: list[Path], tmp_path: Path, how: str) -> None:
     names, data = [str(path) for path in frames], None
     listing = tmp_path / "list.txt"
     listing.write_text("\n".join(names), encoding="utf-8")
@@ -43,7 +43,7 @@ def test_every_way_to_name_pictures(frames: list[Path], tmp_path: Path, how: str
     assert [image["name"] for image in record["images"]] == [path.name for path in frames]
 
 
-def test_an_unreadable_picture_is_left_out_by_name(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+def test_an_unreadable_image_is_left_out_by_name(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     folder = tmp_path / "folder"
     shutil.copytree(frames[0].parent, folder)
     broken = folder / "broken.png"
@@ -80,9 +80,9 @@ def test_a_camera_that_stands_still_for_a_while(rdstitch: Run, frames: list[Path
         lambda _, pairs: {},
         lambda _, pairs: dict.fromkeys(pair for pair in pairs if 2 not in pair),
     ],
-    ids=["everything looks promising", "nothing does", "one picture does not"],
+    ids=["everything looks promising", "nothing does", "one image does not"],
 )
-def test_every_picture_finds_its_place_whatever_the_prescreen_does(
+def test_every_image_finds_its_place_whatever_the_prescreen_does(
     rdstitch: Run,
     frames: list[Path],
     tmp_path: Path,

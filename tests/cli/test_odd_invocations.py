@@ -14,7 +14,7 @@ _CLOSED = "import os, sys; [os.close(n) for n in {}]; os.execv({!r}, [{!r}, '-c'
 
 @pytest.fixture
 def place(tmp_path: Path, frames: list[Path], monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with two good pictures ``a.png`` and ``b.png`` and, in ``more``, two again."""
+    """The current folder, with two good images ``a.png`` and ``b.png`` and, in ``more``, two again."""
     (tmp_path / "more").mkdir()
     for name, frame in zip("ab", frames[:2], strict=True):
         shutil.copy(frame, tmp_path / f"{name}.png")
@@ -70,7 +70,7 @@ def test_usage_errors_are_one_line(rdstitch: Run, place: Path, command: str, sta
     assert sorted(place.rglob("*")) == before
 
 
-def test_pictures_that_nobody_here_can_read_are_named(
+def test_images_that_nobody_here_can_read_are_named(
     rdstitch: Run, place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for package in ("pillow_heif", "rawpy"):
@@ -118,7 +118,7 @@ def test_a_current_folder_that_was_deleted(place: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "told"),
     [
-        ("@list.txt\n", "list.txt: the list of pictures names itself"),
+        ("@list.txt\n", "list.txt: the list of images names itself"),
         ("x" * 300, "File name too long"),
         ("a/" * 3000, "File name too long"),
         ("[ab].png\0missing\n.png", "missing .png: no such file"),
@@ -132,6 +132,6 @@ def test_odd_lists(rdstitch: Run, place: Path, content: str, told: str) -> None:
     assert told in done.line
 
 
-def test_a_file_beside_a_picture_that_is_no_sidecar(rdstitch: Run, place: Path) -> None:
+def test_a_file_beside_an_image_that_is_no_sidecar(rdstitch: Run, place: Path) -> None:
     (place / "more" / "frame_0000.png.json").write_text("[" * 100_000, encoding="utf-8")
     assert rdstitch("mosaic", "more", "-o", "out.png", *CACHED).status == 0

@@ -14,7 +14,7 @@ from rdstitch.synthetic import Sequence
 from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, start, transfers
 
 
-def test_writes_picture_sidecar_and_camera_and_prints_lambda(
+def test_writes_image_sidecar_and_camera_and_prints_lambda(
     rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path
 ) -> None:
     output, camera = tmp_path / "pano.png", tmp_path / "camera.json"
@@ -34,13 +34,13 @@ def test_writes_picture_sidecar_and_camera_and_prints_lambda(
     assert record["output"]["file"] == "pano.png"
     assert Camera.load(camera).distortion == pytest.approx(record["lambda"])
 
-    picture = read_image(output)
-    assert [*picture.pixels.shape[1::-1]] == record["output"]["size"]
-    assert picture.alpha is not None
+    written = read_image(output)
+    assert [*written.pixels.shape[1::-1]] == record["output"]["size"]
+    assert written.alpha is not None
     numbers = alignment_error(sequence, transfers(record), model="homography")
     assert numbers.median < 1.0
     seen = compare_with_plane(
-        picture.pixels, sequence.texture, model="homography", valid=picture.alpha > 0, start=numbers.transform
+        written.pixels, sequence.texture, model="homography", valid=written.alpha > 0, start=numbers.transform
     )
     assert seen.median < 1.0
 
@@ -53,7 +53,7 @@ def test_order_does_not_matter_and_reference_keeps_its_frame(rdstitch: Run, fram
     assert record["reference"] == frames[0].name
     matrix = np.array(next(i for i in record["images"] if i["name"] == frames[0].name)["to_output"])
     matrix /= matrix[2, 2]
-    # An undistorted picture is only scaled and shifted into its own frame.
+    # An undistorted image is only scaled and shifted into its own frame.
     np.testing.assert_allclose(
         matrix, [[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[0, 0], matrix[1, 2]], [0, 0, 1]], atol=1e-9
     )
@@ -70,7 +70,7 @@ def test_known_lens_is_kept(rdstitch: Run, frames: list[Path], tmp_path: Path, h
     assert record["lambda_std"] in (None, 0.0)
 
 
-def test_a_picture_without_overlap_is_named(rdstitch: Run, frames: list[Path], stranger: Path, tmp_path: Path) -> None:
+def test_an_image_without_overlap_is_named(rdstitch: Run, frames: list[Path], stranger: Path, tmp_path: Path) -> None:
     done = rdstitch("pano", *frames[:2], stranger, "-o", tmp_path / "pano.jpg", *CACHED)
     assert done.status == 0
     assert str(stranger) in done.line

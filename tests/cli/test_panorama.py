@@ -1,4 +1,4 @@
-"""Pictures taken by turning on the spot, from files to a panorama, through the command line."""
+"""Images taken by turning on the spot, from files to a panorama, through the command line."""
 
 import json
 import re
@@ -13,7 +13,7 @@ from rdstitch.alignment.model_family import MODELS
 from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions
 from rdstitch.pipeline import StitchOptions, pano
-from rdstitch.pipeline.compose import viewed_pictures
+from rdstitch.pipeline.compose import viewed_images
 from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, panorama_rotations, turning_sequence
 from rdstitch.synthetic.rendering import Photometry
 from rdstitch.viewer import viewer_page
@@ -32,7 +32,7 @@ def _written(count: int, step: float, folder: Path) -> tuple[TurningSequence, li
 
 @pytest.fixture(scope="module")
 def around(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Nine pictures that go all the way round; never written to."""
+    """Nine images that go all the way round; never written to."""
     return _written(9, 40.0, tmp_path_factory.mktemp("around"))[1]
 
 
@@ -51,8 +51,8 @@ def test_a_full_turn_becomes_a_sphere_that_viewers_turn(rdstitch: Run, around: l
     assert record["output"]["field_of_view_deg"][0] == pytest.approx(360.0)
     width, height = record["output"]["size"]
     assert abs(width - 2 * np.pi * 260.0) < 0.02 * width
-    with Image.open(output) as picture:
-        xmp = picture.info["xmp"].decode()
+    with Image.open(output) as written:
+        xmp = written.info["xmp"].decode()
     assert f'GPano:FullPanoWidthPixels="{width}"' in xmp
     assert f'GPano:CroppedAreaImageHeightPixels="{height}"' in xmp
     again = tmp_path / "again.jpg"
@@ -60,33 +60,33 @@ def test_a_full_turn_becomes_a_sphere_that_viewers_turn(rdstitch: Run, around: l
     assert again.read_bytes() == output.read_bytes()
     page = report.read_text(encoding="utf-8")
     assert "<h2>Directions</h2>" in page
-    assert "9 pictures show 360 x" in page
+    assert "9 images show 360 x" in page
 
 
-def test_outlines_are_where_the_pictures_are_at_both_ends_of_a_full_turn(around: list[Path], tmp_path: Path) -> None:
+def test_outlines_are_where_the_images_are_at_both_ends_of_a_full_turn(around: list[Path], tmp_path: Path) -> None:
     result = pano(around, tmp_path / "x.png", StitchOptions(features=FeatureOptions(max_features=600)))
     canvas, alignment = result.canvas, result.registration.alignment
     assert canvas.period is not None
-    page = viewer_page("x.dzi", canvas.size, viewed_pictures(result))
+    page = viewer_page("x.dzi", canvas.size, viewed_images(result))
     data = re.search(r'<script type="application/json" id="data">(.*?)</script>', page)
     assert data is not None
     shown = cv2.imread(str(tmp_path / "x.png"), cv2.IMREAD_GRAYSCALE)
     assert shown is not None
     patch = np.stack(np.meshgrid(np.arange(140, 180), np.arange(100, 140)), axis=-1).reshape(-1, 2)
     across = 0
-    for k, picture in enumerate(json.loads(data[1])["pictures"]):
+    for k, image in enumerate(json.loads(data[1])["images"]):
         camera, homography = alignment.cameras[k], alignment.homographies[k]
         border = canvas.place(camera, homography, camera.outline(64)) + 0.5
         seen = np.zeros(canvas.size[0], dtype=bool)
-        for outline in picture["outlines"]:
+        for outline in image["outlines"]:
             away = np.array(outline)[:, None] - border
             away[..., 0] -= np.rint(away[..., 0] / canvas.period) * canvas.period
             assert np.linalg.norm(away, axis=-1).min(axis=1).max() < 0.1
             left, right = np.array(outline)[:, 0].min(), np.array(outline)[:, 0].max()
             seen[max(0, int(left)) : max(0, int(right))] = True
-        assert seen.sum() == pytest.approx(np.ptp(np.array(picture["outlines"][0])[:, 0]), abs=3)
-        across += len(picture["outlines"]) == 2
-        # The mosaic shows the middle of the picture where the middle is said to be.
+        assert seen.sum() == pytest.approx(np.ptp(np.array(image["outlines"][0])[:, 0]), abs=3)
+        across += len(image["outlines"]) == 2
+        # The mosaic shows the middle of the image where the middle is said to be.
         x, y = canvas.place(camera, homography, patch).astype(np.float32).T
         there = cv2.remap(shown, x[None] % np.float32(canvas.period), y[None], cv2.INTER_LINEAR)
         own = cv2.imread(str(around[k]), cv2.IMREAD_GRAYSCALE)
@@ -104,7 +104,7 @@ def test_the_projection_is_the_users(rdstitch: Run, around: list[Path], tmp_path
     assert not record["output"]["wraps_around"]
 
 
-def test_pictures_of_a_plane_have_no_other_projection(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+def test_images_of_a_plane_have_no_other_projection(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     done = rdstitch("pano", *frames, "-o", tmp_path / "out.png", "--projection", "sphere", *CACHE)
     assert done.status == 2
     assert "--projection" in done.err
@@ -125,7 +125,7 @@ def test_a_turning_camera_has_no_path(rdstitch: Run, around: list[Path], tmp_pat
     assert "turned on the spot" in done.err
 
 
-# Three pictures through a camera that is held askew and points upwards: they alone do not tell what is level.
+# Three images through a camera that is held askew and points upwards: they alone do not tell what is level.
 _HEADINGS, _PITCH, _ROLL = np.radians([-30.0, 0.0, 30.0]), 0.3, 0.35
 
 
@@ -137,24 +137,24 @@ def _down(sequence: TurningSequence, paths: list[Path]) -> float:
     return float(np.degrees(np.arccos(np.clip(down[:, 1, 1], -1.0, 1.0))).max())
 
 
-def test_gravity_in_the_pictures_levels_them(tmp_path: Path) -> None:
+def test_gravity_in_the_images_levels_them(tmp_path: Path) -> None:
     rotations = camera_rotations(_HEADINGS, _PITCH, _ROLL)
     sequence = turning_sequence(LENS, rotations, seed=2, photometry=Photometry(noise=0.005))
     plain, with_xmp = [], []
     for index, rotation in enumerate(rotations):
         plain.append(tmp_path / f"plain_{index}.jpg")
         with_xmp.append(tmp_path / f"xmp_{index}.jpg")
-        picture = Image.fromarray(sequence.frame(index))
-        picture.save(plain[-1], quality=95)
+        image = Image.fromarray(sequence.frame(index))
+        image.save(plain[-1], quality=95)
         # Of level ground: X to the right, Y towards the camera's back, down below.
         xmp = xmp_of("dji-gimbal", *euler_angles("dji-gimbal", rotation @ [[1.0, 0.0], [0.0, 0.0], [0.0, -1.0]]))
-        picture.save(with_xmp[-1], quality=95, xmp=xmp.encode())
+        image.save(with_xmp[-1], quality=95, xmp=xmp.encode())
     assert _down(sequence, plain) > 5.0
     assert _down(sequence, with_xmp) < 0.5
 
 
 def test_orientation_in_exif_says_what_is_down(tmp_path: Path) -> None:
-    """A phone held upright stores its pictures lying on their side."""
+    """A phone held upright stores its images lying on their side."""
     rotations = camera_rotations(np.radians([-20.0, 0.0, 20.0]), 0.05, np.pi / 2)
     sequence = turning_sequence(LENS, rotations, seed=2, photometry=Photometry(noise=0.005))
     paths = []
@@ -165,7 +165,7 @@ def test_orientation_in_exif_says_what_is_down(tmp_path: Path) -> None:
         Image.fromarray(sequence.frame(index)).save(paths[-1], quality=95, exif=exif)
     result = pano(paths)
     assert result.registration.sources[0].camera.image_size == (240, 320)
-    axes = result.registration.alignment.homographies[:, :, 1]  # what is down in the pictures
+    axes = result.registration.alignment.homographies[:, :, 1]  # what is down in the images
     assert (axes[:, 1] > 0.95).all()
 
 
@@ -174,8 +174,8 @@ def test_deep_zoom_of_a_full_turn_is_joined_at_the_edge(rdstitch: Run, around: l
     assert rdstitch("pano", *around, "-o", plain, *CACHE).status == 0
     arguments = ("--images", around[0].parent, "-o", tiles, "--max-memory", "200M")
     assert rdstitch("apply", f"{plain}.json", *arguments).status == 0
-    with Image.open(plain) as picture:
-        whole = np.asarray(picture.convert("RGB")).astype(float)
+    with Image.open(plain) as image:
+        whole = np.asarray(image.convert("RGB")).astype(float)
     height, width = whole.shape[:2]
     levels = sorted((tmp_path / "around_files").iterdir(), key=lambda folder: int(folder.name))
     last = max(int(tile.stem.split("_")[0]) for tile in levels[-1].iterdir())
@@ -185,12 +185,12 @@ def test_deep_zoom_of_a_full_turn_is_joined_at_the_edge(rdstitch: Run, around: l
             ends.append(np.asarray(tile.convert("RGB")).astype(float)[:, side])
     rows = slice(60, 200)
     assert np.abs(ends[0] - ends[1])[rows].mean() < 1.5 * np.abs(np.diff(whole[60:200], axis=1)).mean()
-    # The same picture, but for the compression of the tiles.
+    # The same image, but for the compression of the tiles.
     assert np.abs(ends[0][rows] - whole[rows, 0]).mean() < 6.0
     assert (width, height) == tuple(json.loads((tmp_path / "around.dzi.json").read_text("utf-8"))["output"]["size"])
 
 
-def test_pictures_of_a_plane_are_what_they_are_without_a_turn_to_compete(
+def test_images_of_a_plane_are_what_they_are_without_a_turn_to_compete(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pair, options = sorted(_BUNDLED.glob("*.jpg")), StitchOptions(features=FeatureOptions(max_features=1000))

@@ -1,4 +1,4 @@
-"""A picture and all that belongs to it appear together: whatever fails, all is old, all is new, or nothing is there."""
+"""An image and all that belongs to it appear together: whatever fails, all is old, all is new, or nothing is there."""
 
 import json
 import shutil
@@ -18,7 +18,7 @@ from tests.sampled import sampled
 
 @pytest.fixture(scope="module")
 def located(frames: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of three pictures with positions, in ``flight``, and the sidecar of their mosaic, ``field.tif.json``."""
+    """A folder of three images with positions, in ``flight``, and the sidecar of their mosaic, ``field.tif.json``."""
     from rdstitch_cli.main import run
 
     folder = tmp_path_factory.mktemp("located")
@@ -92,7 +92,7 @@ def test_whatever_fails_every_single_time(
 @pytest.mark.parametrize(
     ("name", "overwrite"), sampled([("out.dzi", True), ("out.dzi", False), ("out.jpg", True), ("out.jpg", False)])
 )
-def test_the_report_is_published_with_the_picture(
+def test_the_report_is_published_with_the_image(
     rdstitch: Run, located: Path, tmp_path: Path, overwrite: bool, name: str
 ) -> None:
     out, cache = tmp_path / "out", tmp_path / "cache"
@@ -113,7 +113,7 @@ def test_the_report_is_published_with_the_picture(
         assert rdstitch(*arguments).status == 0
     assert disk.count >= 3
     assert "<h2>Mosaic</h2>" in (out / "why.html").read_text(encoding="utf-8")
-    assert "No picture was written" not in (out / "why.html").read_text(encoding="utf-8")
+    assert "No image was written" not in (out / "why.html").read_text(encoding="utf-8")
     for failing in range(disk.count):
         shutil.rmtree(out)
         out.mkdir()
@@ -161,7 +161,7 @@ def test_a_run_that_was_killed_while_it_published_can_be_run_again(
     assert {path.name for path in tmp_path.iterdir()} == names
 
 
-def test_the_next_run_gives_the_picture_of_a_killed_one_its_sidecar(
+def test_the_next_run_gives_the_image_of_a_killed_one_its_sidecar(
     rdstitch: Run, frames: list[Path], tmp_path: Path
 ) -> None:
     for frame in frames:
@@ -174,7 +174,7 @@ def test_the_next_run_gives_the_picture_of_a_killed_one_its_sidecar(
     assert (done.status, "rdstitch wrote them: out.png" in done.line) == (0, True)
     record = json.loads((tmp_path / "out.png.json").read_text(encoding="utf-8"))["output"]
     assert (record["sha256"], output.read_bytes()) == (sha256(made).hexdigest(), made)
-    # A picture of the user's that has taken the name since is no output.
+    # An image of the user's that has taken the name since is no output.
     (tmp_path / "out.png.json").unlink()
     output.unlink()
     assert finished(start("mosaic", tmp_path, "-o", output, *CACHED, program=program)).status == -9
@@ -204,25 +204,25 @@ def test_of_two_processes_one_succeeds(located: Path, tmp_path: Path) -> None:
 
 
 def test_the_sidecar_names_what_it_belongs_to(rdstitch: Run, located: Path, tmp_path: Path) -> None:
-    picture, sidecar = (Path(shutil.copy(located / name, tmp_path)) for name in ("field.tif", "field.tif.json"))
+    image, sidecar = (Path(shutil.copy(located / name, tmp_path)) for name in ("field.tif", "field.tif.json"))
     record = json.loads(sidecar.read_text(encoding="utf-8"))["output"]
-    assert record["sha256"] == sha256(picture.read_bytes()).hexdigest()
-    assert record["bytes"] == picture.stat().st_size
+    assert record["sha256"] == sha256(image.read_bytes()).hexdigest()
+    assert record["bytes"] == image.stat().st_size
     arguments = ("apply", sidecar, "--images", located / "flight", "--scale", "0.3", "-j", "1", "-o")
     assert "warning" not in rdstitch(*arguments, tmp_path / "same.jpg", "--strict").err
-    picture.write_bytes(picture.read_bytes()[:-1] + b"x")
+    image.write_bytes(image.read_bytes()[:-1] + b"x")
     done = rdstitch(*arguments, tmp_path / "other.jpg")
-    assert (done.status, f"{picture}: is not the picture that field.tif.json was written with" in done.err) == (
+    assert (done.status, f"{image}: is not the image that field.tif.json was written with" in done.err) == (
         0,
         True,
     )
     done = rdstitch(*arguments, tmp_path / "strict.jpg", "--strict")
-    assert (done.status, str(picture) in done.line) == (3, True)
-    picture.unlink()
+    assert (done.status, str(image) in done.line) == (3, True)
+    image.unlink()
     assert "warning" not in rdstitch(*arguments, tmp_path / "alone.jpg", "--strict").err
 
 
-def test_a_picture_beside_any_sidecar_does_not_vanish(rdstitch: Run, located: Path, tmp_path: Path) -> None:
+def test_an_image_beside_any_sidecar_does_not_vanish(rdstitch: Run, located: Path, tmp_path: Path) -> None:
     flight = tmp_path / "flight"
     shutil.copytree(located / "flight", flight)
     first = sorted(flight.iterdir())[0]
@@ -241,23 +241,23 @@ def test_a_picture_beside_any_sidecar_does_not_vanish(rdstitch: Run, located: Pa
     only.mkdir()
     for name in ("field.tif", "field.tif.json"):
         shutil.copy(located / name, only)
-    assert "no pictures but those that rdstitch wrote" in rdstitch("mosaic", only, "-o", tmp_path / "x.tif").line
+    assert "no images but those that rdstitch wrote" in rdstitch("mosaic", only, "-o", tmp_path / "x.tif").line
 
 
 def test_a_link_as_output(rdstitch: Run, located: Path, tmp_path: Path) -> None:
     (tmp_path / "disk").mkdir()
-    (tmp_path / "out.jpg").symlink_to("disk/picture.jpg")
+    (tmp_path / "out.jpg").symlink_to("disk/image.jpg")
     arguments = ("apply", located / "field.tif.json", "--images", located / "flight", "--scale", "0.3", "-j", "1")
     done = rdstitch(*arguments, "-o", tmp_path / "out.jpg", "--overwrite")
     assert (done.status, "link to nothing" in done.line) == (6, True)
-    (tmp_path / "disk" / "picture.jpg").write_bytes(b"old")
+    (tmp_path / "disk" / "image.jpg").write_bytes(b"old")
     assert rdstitch(*arguments, "-o", tmp_path / "out.jpg", "--overwrite").status == 0
     assert (tmp_path / "out.jpg").is_symlink()
-    assert read_image(tmp_path / "disk" / "picture.jpg").pixels.size > 0
+    assert read_image(tmp_path / "disk" / "image.jpg").pixels.size > 0
 
 
 @pytest.mark.parametrize("name", ["frame_0001.jpg", "../flight/frame_0001.jpg"])
-def test_a_picture_of_the_folder_is_never_replaced(rdstitch: Run, located: Path, tmp_path: Path, name: str) -> None:
+def test_an_image_of_the_folder_is_never_replaced(rdstitch: Run, located: Path, tmp_path: Path, name: str) -> None:
     """An output in the folder of the input is an earlier one only if rdstitch wrote it."""
     flight = tmp_path / "flight"
     shutil.copytree(located / "flight", flight)
@@ -271,11 +271,11 @@ def test_a_picture_of_the_folder_is_never_replaced(rdstitch: Run, located: Path,
     assert rdstitch("mosaic", flight, "-o", flight / "out.jpg", "--overwrite", *CACHED).status == 0
 
 
-def test_a_list_of_pictures_and_of_times_is_never_replaced(rdstitch: Run, located: Path, tmp_path: Path) -> None:
-    pictures = sorted((located / "flight").iterdir())
+def test_a_list_of_images_and_of_times_is_never_replaced(rdstitch: Run, located: Path, tmp_path: Path) -> None:
+    images = sorted((located / "flight").iterdir())
     names, times = tmp_path / "names.txt", tmp_path / "times.csv"
-    names.write_text("\n".join(map(str, pictures)))
-    times.write_text("".join(f"{picture.name},{k}\n" for k, picture in enumerate(pictures)))
+    names.write_text("\n".join(map(str, images)))
+    times.write_text("".join(f"{image.name},{k}\n" for k, image in enumerate(images)))
     for output in (names, times):
         before = output.read_bytes()
         arguments = ("trajectory", f"@{names}", "--timestamps", times, "-o", output, "--overwrite", *CACHED)
@@ -313,7 +313,7 @@ def test_what_an_option_names_to_be_read_is_never_replaced(rdstitch: Run, frames
         ("rdstitch.export.georeference.Georeference.world_file_texts", "field.jgw"),
     ],
 )
-def test_what_belongs_beside_a_picture_never_costs_the_picture(
+def test_what_belongs_beside_an_image_never_costs_the_image(
     made_by: str, name: str, rdstitch: Run, located: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object, **__: object) -> None:

@@ -28,9 +28,9 @@ from rdstitch.report.svg import counted
 from tests.cli.running import CACHED, Run
 
 _VOID = {"meta", "img"}
-_SECTIONS = ["Summary", "Warnings and left-out pictures", "Mosaic", "Match graph", "Votes on λ", "Lens", "Lens curve"]
+_SECTIONS = ["Summary", "Warnings and left-out images", "Mosaic", "Match graph", "Votes on λ", "Lens", "Lens curve"]
 _SECTIONS += ["Matches", "Residuals", "Local alignment", "Trajectory", "Timings", "Run"]
-_OF_PICTURES = ("Mosaic", "Local alignment")
+_OF_IMAGES = ("Mosaic", "Local alignment")
 
 
 class _Page(HTMLParser):
@@ -81,12 +81,12 @@ def _checked(text: str) -> _Page:
 
 @pytest.fixture(scope="module")
 def reported(frames: list[Path], stranger: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A report of a mosaic that left out a picture; never written to."""
+    """A report of a mosaic that left out an image; never written to."""
     from rdstitch_cli.main import run
 
     report = tmp_path_factory.mktemp("report") / "report.html"
-    pictures = [*map(str, frames), str(stranger)]
-    assert run(["mosaic", *pictures, "-o", str(report.with_name("out.png")), "--report", str(report), *CACHED]) == 0
+    images = [*map(str, frames), str(stranger)]
+    assert run(["mosaic", *images, "-o", str(report.with_name("out.png")), "--report", str(report), *CACHED]) == 0
     return report
 
 
@@ -98,14 +98,14 @@ def test_a_mosaic_has_every_section(reported: Path, stranger: Path, frames: list
     assert re.search(r"-0\.(19|20)\d+ ± 0\.0", page.text)
     for stage in ("detecting features", "matching", "registering pairs", "compositing"):
         assert re.search(rf"{stage} +\d+\.\d\d s", page.text)
-    # The picture left out; mosaic; the lens; two pairs of pictures.
+    # The image left out; mosaic; the lens; two pairs of images.
     assert (page.counts["img"], page.counts["image"]) == (1, 6)
     assert "command" in page.text
     assert "features.max_features = 600" in page.text  # of the options, what was chosen
     assert all(frame.name in page.text for frame in frames)
 
 
-def test_displacements_are_drawn_for_each_picture(frames: list[Path]) -> None:
+def test_displacements_are_drawn_for_each_image(frames: list[Path]) -> None:
     options = StitchOptions(workers=1, local_alignment=6)
     result = pano(frames[:2], options=options)
     drawn = report_page(result).split("<h2>Local alignment</h2>")[1].split("</section>")[0]
@@ -137,7 +137,7 @@ def test_calibrate_has_no_mosaic(rdstitch: Run, frames: list[Path], tmp_path: Pa
     report = tmp_path / "lens.html"
     done = rdstitch("calibrate", *frames, "-o", tmp_path / "camera.json", "--report", report, *CACHED)
     assert done.status == 0
-    headings = [heading for heading in _SECTIONS if heading not in _OF_PICTURES]
+    headings = [heading for heading in _SECTIONS if heading not in _OF_IMAGES]
     assert _checked(report.read_text(encoding="utf-8")).headings == headings
     again = rdstitch("calibrate", *frames, "-o", tmp_path / "b.json", "--report", report, *CACHED)
     assert (again.status, str(report) in again.line) == (6, True)
@@ -152,30 +152,30 @@ def test_calibrate_has_no_mosaic(rdstitch: Run, frames: list[Path], tmp_path: Pa
 def test_what_is_refused_is_shown(
     rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, output: str
 ) -> None:
-    found = (Message("the pictures <disagree>", severity="failure"), Message("look at that seam"))
+    found = (Message("the images <disagree>", severity="failure"), Message("look at that seam"))
     monkeypatch.setattr(accept, "judge", lambda *arguments, **options: found)
     report = tmp_path / "report.html"
     arguments = (command, *frames[:2], "-o", tmp_path / output, "--report", report, *CACHED)
     assert rdstitch(*arguments).status == 4
     assert not (tmp_path / output).exists()
     refused = _checked(report.read_text(encoding="utf-8"))
-    assert refused.headings == [heading for heading in _SECTIONS if heading not in _OF_PICTURES]
-    assert "Not to be relied on: the pictures <disagree>" in refused.text
+    assert refused.headings == [heading for heading in _SECTIONS if heading not in _OF_IMAGES]
+    assert "Not to be relied on: the images <disagree>" in refused.text
     assert "look at that seam" in refused.text
     assert rdstitch(*arguments, "--force", "--overwrite").status == 0
     forced = _checked(report.read_text(encoding="utf-8"))
     assert ("Mosaic" in forced.headings) == (command != "calibrate")
-    assert "the pictures <disagree>" in forced.text
+    assert "the images <disagree>" in forced.text
 
 
-def test_names_are_escaped_and_vanished_pictures_do_not_matter(frames: list[Path], tmp_path: Path) -> None:
+def test_names_are_escaped_and_vanished_images_do_not_matter(frames: list[Path], tmp_path: Path) -> None:
     names = ["<b>&\"bold'.png", "caf\udce9<.png"]
-    pictures = [tmp_path / name for name in names]
-    for frame, picture in zip(frames, pictures, strict=False):
-        shutil.copy(frame, picture)
-    registration = calibrate(pictures, StitchOptions(workers=1, distortion=-0.2))
-    for picture in pictures:
-        picture.unlink()
+    images = [tmp_path / name for name in names]
+    for frame, image in zip(frames, images, strict=False):
+        shutil.copy(frame, image)
+    registration = calibrate(images, StitchOptions(workers=1, distortion=-0.2))
+    for image in images:
+        image.unlink()
     write_report(tmp_path / "report.html", registration)
     page = _checked((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert names[0] in page.text
@@ -228,7 +228,7 @@ def test_a_browser_shows_it(reported: Path, tmp_path: Path) -> None:
     subprocess.run(command, capture_output=True, check=True, timeout=120)
     pixels = read_image(shot).pixels[..., :3].astype(int)
     assert pixels.shape[:2] == (5000, 1000)
-    # The mosaic, the pictures of the lens and of the matches: coloured stretches all down the page.
+    # The mosaic, the images of the lens and of the matches: coloured stretches all down the page.
     colourful = np.ptp(pixels, axis=2).mean(axis=1) > 4.0
     assert colourful[:2000].sum() > 200
     assert colourful[2000:].sum() > 300
@@ -251,7 +251,7 @@ def test_the_best_pair_has_many_matches(frames: list[Path]) -> None:
     assert "Best pair: " in shown
 
 
-def test_a_picture_larger_than_any_cameras_is_shown_or_said_to_be_too_large(
+def test_an_image_larger_than_any_cameras_is_shown_or_said_to_be_too_large(
     frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     result = pano(frames, options=StitchOptions(composite=CompositeOptions(scale=0.5)))

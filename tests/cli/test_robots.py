@@ -32,10 +32,10 @@ def video(frames: list[Path], tmp_path: Path) -> Path:
     if not writer.isOpened():
         pytest.skip("this OpenCV writes no videos")
     for frame in frames:
-        picture = cv2.imread(str(frame))
-        assert picture is not None
-        writer.write(picture)
-        writer.write(picture)
+        image = cv2.imread(str(frame))
+        assert image is not None
+        writer.write(image)
+        writer.write(image)
     writer.release()
     return file
 
@@ -169,12 +169,12 @@ def _write_bag(folder: Path, frames: list[Path], version: int, kind: str) -> Pat
 def _message(message: Any, header: Any, frame: Path, kind: str) -> Any:
     if kind == "compressed":
         return message(header=header, format="png", data=np.frombuffer(frame.read_bytes(), np.uint8))
-    picture = cv2.imread(str(frame))
-    assert picture is not None
+    image = cv2.imread(str(frame))
+    assert image is not None
     if kind == "rgb8":
-        picture = picture[..., ::-1]
-    height, width, _ = picture.shape
-    padded = np.pad(picture.reshape(height, -1), ((0, 0), (0, 4)))  # rows may be longer than their pixels
+        image = image[..., ::-1]
+    height, width, _ = image.shape
+    padded = np.pad(image.reshape(height, -1), ((0, 0), (0, 4)))  # rows may be longer than their pixels
     return message(
         header=header,
         height=height,

@@ -31,18 +31,18 @@ def _process(*arguments: str | Path, **environment: str) -> "subprocess.Complete
 def test_the_last_line_says_what_was_made(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     done = rdstitch("pano", *frames, "-o", tmp_path / "pano.png", *CACHED)
     width, height = read_image(tmp_path / "pano.png").pixels.shape[1::-1]
-    made = f"{tmp_path / 'pano.png'}: {width} x {height} pixels, 3 of 3 pictures, "
+    made = f"{tmp_path / 'pano.png'}: {width} x {height} pixels, 3 of 3 images, "
     assert done.made.startswith(made)
     assert re.fullmatch(r"λ = -0\.\d{4} ± 0\.\d{4}, \d+\.\d s", done.made[len(made) :])
     assert "pixels" not in done.out
     again = rdstitch("apply", tmp_path / "pano.png.json", "--images", frames[0].parent, "-o", tmp_path / "again.png")
-    assert f"again.png: {width} x {height} pixels, 3 of 3 pictures," in again.made
+    assert f"again.png: {width} x {height} pixels, 3 of 3 images," in again.made
     camera = rdstitch("calibrate", *frames, "-o", tmp_path / "camera.json", *CACHED)
-    assert re.search(r"camera\.json: 3 of 3 pictures, λ = -0\.\d{4} ±", camera.made)
+    assert re.search(r"camera\.json: 3 of 3 images, λ = -0\.\d{4} ±", camera.made)
     path = rdstitch("trajectory", *frames, "-o", tmp_path / "path.csv", *CACHED)
-    assert "path.csv: 3 of 3 pictures" in path.made
+    assert "path.csv: 3 of 3 images" in path.made
     straight = rdstitch("undistort", *frames, "-o", tmp_path / "straight", "--lambda", "-0.2")
-    assert "straight: 3 pictures undistorted" in straight.made
+    assert "straight: 3 images undistorted" in straight.made
 
 
 def test_nothing_is_said_when_quiet_or_nothing_was_made(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
@@ -139,6 +139,6 @@ def test_tilde_is_the_home_folder_where_no_shell_saw_it(
 def test_patterns_are_expanded_where_the_shell_leaves_them(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     pattern = str(frames[0].parent / "*.png")
     done = rdstitch("pano", pattern, "-o", tmp_path / "pano.png", *CACHED)
-    assert "3 of 3 pictures" in done.made
+    assert "3 of 3 images" in done.made
     assert rdstitch("undistort", pattern, "-o", tmp_path / "straight", "--lambda", "-0.2").status == 0
     assert len(list((tmp_path / "straight").iterdir())) == 3

@@ -39,9 +39,9 @@ def test_views(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
         done = rdstitch("undistort", frames[0], "--lambda", "-0.2", "-o", tmp_path / view, "--view", view)
         assert done.status == 0
         shown[view] = read_image(tmp_path / view / frames[0].name)
-    sizes = {view: np.array(picture.pixels.shape[:2]) for view, picture in shown.items()}
+    sizes = {view: np.array(image.pixels.shape[:2]) for view, image in shown.items()}
     assert sizes["same"].tolist() == [300, 400]
-    # Without its barrel distortion a picture is larger everywhere, and its corners reach out farthest.
+    # Without its barrel distortion an image is larger everywhere, and its corners reach out farthest.
     assert (sizes["same"] < sizes["valid"]).all()
     assert (sizes["valid"] < sizes["all"]).all()
     assert shown["valid"].alpha is None
@@ -65,17 +65,17 @@ def test_refuses_to_write_over_its_input(rdstitch: Run, tmp_path: Path, frames: 
     assert own.read_bytes() == frames[0].read_bytes()
 
 
-def test_own_outputs_and_damaged_pictures_are_named(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    pictures = tmp_path / "pictures"
-    pictures.mkdir()
+def test_own_outputs_and_damaged_images_are_named(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
     with Image.open(frames[0]) as image:
-        image.convert("RGB").save(pictures / "good.jpg", quality=95)
-        image.convert("RGB").save(pictures / "damaged.jpg", quality=95)
-    data = bytearray((pictures / "damaged.jpg").read_bytes())
+        image.convert("RGB").save(images / "good.jpg", quality=95)
+        image.convert("RGB").save(images / "damaged.jpg", quality=95)
+    data = bytearray((images / "damaged.jpg").read_bytes())
     data[len(data) // 2 : len(data) // 2 + 40] = bytes(range(100, 140))
-    (pictures / "damaged.jpg").write_bytes(bytes(data))
-    assert rdstitch("pano", *frames[:2], "-o", pictures / "mosaic.png", *FAST).status == 0
-    done = rdstitch("undistort", pictures, "--lambda", "-0.1", "-o", tmp_path / "straight")
+    (images / "damaged.jpg").write_bytes(bytes(data))
+    assert rdstitch("pano", *frames[:2], "-o", images / "mosaic.png", *FAST).status == 0
+    done = rdstitch("undistort", images, "--lambda", "-0.1", "-o", tmp_path / "straight")
     assert done.status == 0
     assert "mosaic.png" in done.err
     assert "damaged.jpg: is damaged" in done.err
@@ -115,7 +115,7 @@ def test_focal_lengths_in_what_is_written_are_true(rdstitch: Run, tmp_path: Path
         assert after.focal_px is None
 
 
-def test_a_mosaic_has_no_lens_and_no_place_of_one_picture(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+def test_a_mosaic_has_no_lens_and_no_place_of_one_image(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     with Image.open(_photograph(tmp_path / "tags.jpg")) as image:
         exif = image.getexif()
     paths = []
@@ -134,11 +134,11 @@ def test_formats_that_cannot_be_written_become_png(rdstitch: Run, frames: list[P
     suffixes = ("bmp", "gif", "ppm", "jp2", "tga", "JPEG")
     for suffix in suffixes:
         Image.open(frames[0]).convert("RGB").save(tmp_path / f"{suffix}.{suffix}")
-    pictures = [tmp_path / f"{suffix}.{suffix}" for suffix in suffixes]
-    assert rdstitch("undistort", *pictures, "--lambda", "-0.1", "-o", tmp_path / "out").status == 0
+    images = [tmp_path / f"{suffix}.{suffix}" for suffix in suffixes]
+    assert rdstitch("undistort", *images, "--lambda", "-0.1", "-o", tmp_path / "out").status == 0
     expected = ["JPEG.JPEG", *sorted(f"{suffix}.png" for suffix in suffixes[:-1])]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == expected
-    done = rdstitch("undistort", *pictures, "--lambda", "-0.1", "-o", tmp_path / "tif", "--format", "tif")
+    done = rdstitch("undistort", *images, "--lambda", "-0.1", "-o", tmp_path / "tif", "--format", "tif")
     assert done.status == 0
     assert {path.suffix for path in (tmp_path / "tif").iterdir()} == {".tif"}
 
@@ -156,7 +156,7 @@ def test_what_fails_leaves_no_folder(rdstitch: Run, frames: list[Path], tmp_path
         assert not (tmp_path / "a").exists()
 
 
-def test_a_camera_file_without_a_size_takes_it_from_the_pictures(
+def test_a_camera_file_without_a_size_takes_it_from_the_images(
     rdstitch: Run, frames: list[Path], tmp_path: Path
 ) -> None:
     camera = tmp_path / "camera.yml"

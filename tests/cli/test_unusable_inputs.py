@@ -18,7 +18,7 @@ from tests.cli.running import CACHED, Run, check_refused, finished, shown, start
 
 
 @pytest.mark.parametrize("make", UNREADABLE.values(), ids=UNREADABLE.keys())
-def test_unreadable_pictures(rdstitch: Run, place: Path, make: Make) -> None:
+def test_unreadable_images(rdstitch: Run, place: Path, make: Make) -> None:
     bad = make(place / "b.png", place)
     before = state_of(place)
     done = rdstitch("pano", "-o", place / "out.png", *CACHED, place / "a.png", bad)
@@ -27,7 +27,7 @@ def test_unreadable_pictures(rdstitch: Run, place: Path, make: Make) -> None:
 
 
 @pytest.mark.parametrize("make", UNUSABLE.values(), ids=UNUSABLE.keys())
-def test_pictures_that_fit_to_nothing(rdstitch: Run, place: Path, make: Make) -> None:
+def test_images_that_fit_to_nothing(rdstitch: Run, place: Path, make: Make) -> None:
     bad = make(place / "b.png", place)
     before = state_of(place)
     done = rdstitch("pano", place / "a.png", bad, "-o", place / "out.png", *CACHED)
@@ -55,19 +55,19 @@ def test_a_mosaic_leaves_them_out_by_name(rdstitch: Run, place: Path, kind: str)
     ],
 )
 def test_odd_names_work(place: Path, name: str) -> None:
-    picture, output = place / name, place / f"out {name}"
-    (place / "b.png").rename(picture)
-    done = finished(start("pano", place / "a.png", picture, "-o", output, *CACHED))
+    image, output = place / name, place / f"out {name}"
+    (place / "b.png").rename(image)
+    done = finished(start("pano", place / "a.png", image, "-o", output, *CACHED))
     assert (done.status, done.err) == (0, "")
     assert output.exists()
     record = json.loads(Path(f"{output}.json").read_text(encoding="utf-8"))
     assert len(record["images"]) == 2
 
 
-def test_one_picture_or_the_same_twice(rdstitch: Run, place: Path) -> None:
+def test_one_image_or_the_same_twice(rdstitch: Run, place: Path) -> None:
     (place / "link.png").symlink_to("a.png")
-    for pictures in (["a.png"], ["a.png", "a.png"], ["a.png", "link.png"]):
-        done = rdstitch("pano", *(place / name for name in pictures), "-o", place / "out.png", *CACHED)
+    for images in (["a.png"], ["a.png", "a.png"], ["a.png", "link.png"]):
+        done = rdstitch("pano", *(place / name for name in images), "-o", place / "out.png", *CACHED)
         assert done.status == 2
         assert "two different images" in done.line
 
@@ -81,7 +81,7 @@ def test_a_failure_names_what_could_not_be_read(rdstitch: Run, place: Path, stra
         arguments = (*arguments[:-1], place / "out.png")
     done = rdstitch(command, *arguments, *CACHED)
     assert done.status == 4
-    assert "no two pictures overlap" in done.line
+    assert "no two images overlap" in done.line
     assert "empty.png: is empty" in done.line
     assert "half.png: " in done.line
 
@@ -97,7 +97,7 @@ def test_no_overlap(rdstitch: Run, place: Path, stranger: Path) -> None:
 def test_inputs_that_name_nothing(rdstitch: Run, place: Path, name: str) -> None:
     (place / "empty").mkdir()
     (place / "nothing").mkdir()
-    (place / "nothing" / "notes.txt").write_text("no pictures", encoding="utf-8")
+    (place / "nothing" / "notes.txt").write_text("no images", encoding="utf-8")
     named = f"@{place / name}" if name.endswith(".txt") else str(place / name)
     check_refused(rdstitch("mosaic", named, "-o", place / "out.png", *CACHED), 3, place / name)
 
@@ -126,14 +126,14 @@ def test_camera_files_that_are_none(rdstitch: Run, place: Path, content: str) ->
     check_refused(done, 3, file)
 
 
-def test_a_picture_that_may_not_be_read(rdstitch: Run, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_image_that_may_not_be_read(rdstitch: Run, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     allowed = os.access
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "b.png" and allowed(path, mode))
     done = rdstitch("pano", place / "a.png", place / "b.png", "-o", place / "out.png", *CACHED)
     check_refused(done, 3, place / "b.png")
 
 
-def test_a_picture_vanishes_after_its_header_was_read(
+def test_an_image_vanishes_after_its_header_was_read(
     rdstitch: Run, place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def vanish(path: Path) -> Metadata:
@@ -149,7 +149,7 @@ def test_a_picture_vanishes_after_its_header_was_read(
 
 
 @pytest.mark.parametrize("change", ["vanishes", "shrinks"])
-def test_a_picture_changes_after_its_registration(
+def test_an_image_changes_after_its_registration(
     rdstitch: Run, place: Path, monkeypatch: pytest.MonkeyPatch, change: str
 ) -> None:
     def spoil(*arguments: Any, **options: Any) -> Any:

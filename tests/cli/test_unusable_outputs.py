@@ -106,7 +106,7 @@ def test_a_full_disk(place: Path, command: str) -> None:
     assert finished(start(*arguments)).status == 0
 
 
-def test_a_full_disk_keeps_the_old_picture(rdstitch: Run, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_keeps_the_old_image(rdstitch: Run, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (place / "out.png").write_bytes(b"old")
     before = state_of(place)
 

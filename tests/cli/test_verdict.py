@@ -36,24 +36,24 @@ def test_warnings_are_printed(
 def test_what_fails_is_written_with_force_only_and_then_reported(
     rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
-    _pretend(monkeypatch, Message("the pictures disagree", severity="failure"))
+    _pretend(monkeypatch, Message("the images disagree", severity="failure"))
     output = tmp_path / OUTPUTS[command]
     refused = rdstitch(command, *frames, "-o", output, *GIVEN)
     assert refused.status == 4
-    assert "the pictures disagree" in refused.line
+    assert "the images disagree" in refused.line
     assert not output.exists()
     forced = rdstitch(command, *frames, "-o", output, *GIVEN, "--force")
     assert forced.status == 0
-    assert forced.err.splitlines()[0] == "rdstitch: warning: not reliable: the pictures disagree"
+    assert forced.err.splitlines()[0] == "rdstitch: warning: not reliable: the images disagree"
     assert output.exists()
 
 
-def test_two_pictures_of_two_lenses_are_noticed(rdstitch: Run, tmp_path: Path) -> None:
+def test_two_images_of_two_lenses_are_noticed(rdstitch: Run, tmp_path: Path) -> None:
     sequence = flight(3, 2)
     assert isinstance(sequence.lens, Camera)
     other = replace(sequence, lens=replace(sequence.lens, distortion=-0.12))
-    pictures = [sequence.write(tmp_path, "own_{}.png")[0], other.write(tmp_path, "other_{}.png")[1]]
-    done = rdstitch("pano", *pictures, "-o", tmp_path / "out.png", *CACHED)
+    images = [sequence.write(tmp_path, "own_{}.png")[0], other.write(tmp_path, "other_{}.png")[1]]
+    done = rdstitch("pano", *images, "-o", tmp_path / "out.png", *CACHED)
     assert done.status == 4
     found = re.search(
         r"two lenses or zooms are mixed: (\w+\.png) \(λ about (-0\.\d+)\) and (\w+\.png) \((-0\.\d+)\)", done.line
@@ -64,21 +64,21 @@ def test_two_pictures_of_two_lenses_are_noticed(rdstitch: Run, tmp_path: Path) -
     assert not (tmp_path / "out.png").exists()
 
 
-def test_the_last_picture_through_another_lens_is_left_out(rdstitch: Run, tmp_path: Path) -> None:
+def test_the_last_image_through_another_lens_is_left_out(rdstitch: Run, tmp_path: Path) -> None:
     sequence = flight(3, 3)
     assert isinstance(sequence.lens, Camera)
     other = replace(sequence, lens=replace(sequence.lens, distortion=-0.12))
-    pictures = [*sequence.write(tmp_path, "own_{}.png")[:2], other.write(tmp_path, "other_{}.png")[2]]
-    done = rdstitch("mosaic", *pictures, "-o", tmp_path / "out.png", *CACHED)
+    images = [*sequence.write(tmp_path, "own_{}.png")[:2], other.write(tmp_path, "other_{}.png")[2]]
+    done = rdstitch("mosaic", *images, "-o", tmp_path / "out.png", *CACHED)
     assert done.status == 0
     warning, left_out = done.err.splitlines()
-    assert "own_0.png and own_1.png fit without the pictures of another lens" in warning
+    assert "own_0.png and own_1.png fit without the images of another lens" in warning
     assert "other_2.png: comes from another lens or zoom setting (λ about -0.1" in left_out
     assert abs(float(done.out) - DISTORTION) < 0.01
 
 
 @pytest.mark.parametrize("strict", [False, True])
-def test_pictures_of_two_lenses_are_parted(rdstitch: Run, frames: list[Path], tmp_path: Path, strict: bool) -> None:
+def test_images_of_two_lenses_are_parted(rdstitch: Run, frames: list[Path], tmp_path: Path, strict: bool) -> None:
     sequence = flight(3, 5)
     assert isinstance(sequence.lens, Camera)
     zoomed = replace(sequence, lens=replace(sequence.lens, distortion=-0.12))
@@ -101,11 +101,11 @@ def test_pictures_of_two_lenses_are_parted(rdstitch: Run, frames: list[Path], tm
         (
             ("One", "One", "One"),
             (28, 28, 35),
-            "was zoomed between the pictures, by up to 1.25 (between 0.jpg and 2.jpg)",
+            "was zoomed between the images, by up to 1.25 (between 0.jpg and 2.jpg)",
         ),
     ],
 )
-def test_pictures_of_several_cameras_are_reported(
+def test_images_of_several_cameras_are_reported(
     rdstitch: Run, frames: list[Path], tmp_path: Path, models: tuple[str], lengths: tuple[int], told: str
 ) -> None:
     for number, (frame, model, length) in enumerate(zip(frames, models, lengths, strict=True)):

@@ -16,13 +16,13 @@ def video(frames: list[Path], tmp_path: Path) -> Path:
 
 
 def _write(frames: list[Path], file: Path) -> Path:
-    pictures = [cv2.cvtColor(read_image(frame).pixels, cv2.COLOR_RGB2BGR) for frame in frames]
-    height, width = pictures[0].shape[:2]
+    images = [cv2.cvtColor(read_image(frame).pixels, cv2.COLOR_RGB2BGR) for frame in frames]
+    height, width = images[0].shape[:2]
     writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, (width, height))
     if not writer.isOpened():
         pytest.skip("this OpenCV writes no videos")
-    for picture in pictures:
-        writer.write(picture)
+    for image in images:
+        writer.write(image)
     writer.release()
     return file
 

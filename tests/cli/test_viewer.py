@@ -1,4 +1,4 @@
-"""The page beside a Deep Zoom picture, and what the project's wheel weighs with it."""
+"""The page beside a Deep Zoom image, and what the project's wheel weighs with it."""
 
 import io
 import json
@@ -14,7 +14,7 @@ import pytest
 
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.io import read_image
-from rdstitch.viewer.page import seam_picture
+from rdstitch.viewer.page import seam_image
 from tests.cli.running import CACHED, Run
 
 _ROOT = Path(__file__).parents[2]
@@ -35,18 +35,18 @@ def _data(page: Path) -> dict[str, Any]:
     return data
 
 
-def test_the_page_knows_the_pictures_and_needs_no_network(
+def test_the_page_knows_the_images_and_needs_no_network(
     rdstitch: Run, page: Path, frames: list[Path], tmp_path: Path
 ) -> None:
     data, text = _data(page), page.read_text(encoding="utf-8")
     record = json.loads((tmp_path / "x.dzi.json").read_text(encoding="utf-8"))
     assert data["size"] == record["output"]["size"]
-    assert [picture["name"] for picture in data["pictures"]] == [frame.name for frame in frames]
-    corners = np.concatenate([outline for picture in data["pictures"] for outline in picture["outlines"]])
+    assert [image["name"] for image in data["images"]] == [frame.name for frame in frames]
+    corners = np.concatenate([outline for image in data["images"] for outline in image["outlines"]])
     assert corners.min() >= -1
     assert (corners.max(axis=0) <= np.array(data["size"]) + 1).all()
-    assert dict(data["pictures"][1]["facts"])["size"] == "400 x 300 pixels"
-    assert frames[0].name in dict(data["pictures"][1]["facts"])["pairs"]
+    assert dict(data["images"][1]["facts"])["size"] == "400 x 300 pixels"
+    assert frames[0].name in dict(data["images"][1]["facts"])["pairs"]
     assert data["seams"].startswith("data:image/png;base64,")
     assert (tmp_path / data["tiles"]["Image"]["Url"] / "0" / "0_0.jpg").is_file()
     assert not re.search(r'(?:src|href)="https?:', text)
@@ -54,7 +54,7 @@ def test_the_page_knows_the_pictures_and_needs_no_network(
 
     again = rdstitch("apply", tmp_path / "x.dzi.json", "--images", frames[0].parent, "-o", tmp_path / "y.dzi")
     assert again.status == 0
-    assert len(_data(tmp_path / "y.html")["pictures"]) == 3
+    assert len(_data(tmp_path / "y.html")["images"]) == 3
 
 
 def test_a_page_that_exists_is_not_replaced_unasked(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
@@ -69,9 +69,9 @@ def test_in_a_browser(page: Path, tmp_path: Path) -> None:
     browser = next((found for name in _BROWSERS if (found := shutil.which(name))), None)
     if browser is None:
         pytest.skip("there is no Chromium")
-    # A click on the middle of the second picture, once the tiles are there.
+    # A click on the middle of the second image, once the tiles are there.
     click = """<script>viewer.addHandler("open", () => {
-      const [x, y] = pictures[1].center;
+      const [x, y] = images[1].center;
       const position = viewer.viewport.pixelFromPoint(new OpenSeadragon.Point(x / width, y / width));
       viewer.raiseEvent("canvas-click", { quick: true, position });
       document.title = `${svg.querySelectorAll("path").length} outlines`;
@@ -93,11 +93,11 @@ def test_in_a_browser(page: Path, tmp_path: Path) -> None:
 def test_seams_are_where_labels_change() -> None:
     labels = np.full((4, 6), -1, dtype=np.int32)
     labels[:3, :3], labels[:3, 3:5] = 0, 1
-    data, box = seam_picture(SeamMap(labels, 2), (2, 0), (10, 8))
+    data, box = seam_image(SeamMap(labels, 2), (2, 0), (10, 8))
     shown = read_shown(data)
     assert box == (0.0, 0.0, 10.0, 8.0)
     assert shown.shape == (4, 5)
-    assert np.argwhere(shown).tolist() == [[0, 1], [1, 1], [2, 1]]  # not where a picture ends at nothing
+    assert np.argwhere(shown).tolist() == [[0, 1], [1, 1], [2, 1]]  # not where an image ends at nothing
 
 
 def read_shown(data: bytes) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:

@@ -57,7 +57,7 @@ def test_units_of_distortion_agree(distortion: float, width: int, height: int) -
     np.testing.assert_allclose(camera.distortion_focal * (in_px / focal) ** 2, distortion, atol=1e-12)
 
 
-def test_a_resized_picture_shows_the_same_rays() -> None:
+def test_a_resized_image_shows_the_same_rays() -> None:
     camera = Camera((800, 600), -0.3, center=(410.0, 290.0), focal=700.0, focal_source="option")
     small = camera.resized((400, 300))
     corner = camera.undistort([-0.5, -0.5])
@@ -67,7 +67,7 @@ def test_a_resized_picture_shows_the_same_rays() -> None:
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_a_camera_turns_with_its_picture(orientation: int) -> None:
+def test_a_camera_turns_with_its_image(orientation: int) -> None:
     camera = Camera((800, 600), -0.3, center=(410.0, 290.0), tilt=(0.1, -0.05), tilt_std=(0.01, 0.02))
     upright = camera.turned(orientation)
     rows, columns = np.mgrid[0:600, 0:800].astype(float)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rdstitch.compositing import CompositeOptions
 from rdstitch.compositing.blender import MultibandBlender, margin, rounding_constant
 from rdstitch.compositing.boxes import aligned, grown
-from rdstitch.compositing.placed_picture import place_pictures
+from rdstitch.compositing.placed_image import place_images
 from rdstitch.compositing.preparation import Prepared, prepare_composite
 from rdstitch.local_alignment import DisplacementField
 from rdstitch.synthetic.rendering import Photometry
@@ -35,7 +35,7 @@ def _prepared(blend: str, seam: str, bits: int) -> tuple[Prepared, NDArray[Any],
     """A composite, and all of it as one tile."""
     scene = _scene(bits)
     options = CompositeOptions(blend=blend, seam=seam, max_memory=2**28)  # type: ignore[arg-type]
-    with prepare_composite(scene.pictures, scene.canvas, options) as ready:
+    with prepare_composite(scene.images, scene.canvas, options) as ready:
         return ready, *ready.renderer.tile((0, 0, *scene.canvas.size))
 
 
@@ -55,12 +55,12 @@ def test_any_box_is_a_part_of_the_whole(blend: str, seam: str, bits: int, data: 
 
 
 @pytest.mark.parametrize("seam", ["graphcut", "none"])
-def test_any_box_of_locally_aligned_pictures_is_a_part_of_the_whole(seam: str) -> None:
+def test_any_box_of_locally_aligned_images_is_a_part_of_the_whole(seam: str) -> None:
     scene, rng = _scene(8), np.random.default_rng(5)
     fields = [DisplacementField((240, 180), rng.normal(0.0, 1.5, (6, 8, 2))) for _ in scene.frames]
     options = CompositeOptions(seam=seam, max_memory=2**28)  # type: ignore[arg-type]
-    pictures = place_pictures(scene.sources, scene.cameras, scene.homographies, displacement=fields)
-    with prepare_composite(pictures, scene.canvas, options) as ready:
+    images = place_images(scene.sources, scene.cameras, scene.homographies, displacement=fields)
+    with prepare_composite(images, scene.canvas, options) as ready:
         whole, covered = ready.renderer.tile((0, 0, *scene.canvas.size))
         for x, y in ((3, 7), (130, 64), (200, 90)):
             pixels, inside = ready.renderer.tile((x, y, x + 61, y + 43))
@@ -76,7 +76,7 @@ def test_any_box_of_locally_aligned_pictures_is_a_part_of_the_whole(seam: str) -
 def test_strips_are_the_whole(workers: int) -> None:
     scene = _scene(8)
     options = CompositeOptions(tile_size=256, workers=workers)
-    with prepare_composite(scene.pictures, scene.canvas, options) as ready:
+    with prepare_composite(scene.images, scene.canvas, options) as ready:
         pixels, alpha = (np.concatenate(parts) for parts in zip(*ready.strips(), strict=True))
     _, whole, covered = _prepared("multiband", "graphcut", 8)
     np.testing.assert_array_equal(pixels, whole)
@@ -85,7 +85,7 @@ def test_strips_are_the_whole(workers: int) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(bands=st.integers(1, 4), seed=st.integers(0, 1000))
-def test_one_picture_is_not_changed_by_blending(bands: int, seed: int) -> None:
+def test_one_image_is_not_changed_by_blending(bands: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     constant = rounding_constant(255.0, True)
     box = aligned(grown((0, 0, 48, 32), margin(bands)), 1 << bands)
@@ -100,7 +100,7 @@ def test_one_picture_is_not_changed_by_blending(bands: int, seed: int) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(bands=st.integers(1, 4), seed=st.integers(0, 1000))
-def test_blend_lies_between_constant_pictures(bands: int, seed: int) -> None:
+def test_blend_lies_between_constant_images(bands: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     size = 16 << bands
     low, high = sorted(rng.uniform(0, 255, 2))

@@ -14,7 +14,7 @@ def _numbers(low: float, high: float) -> st.SearchStrategy[float]:
 
 
 def _relations(matrices: np.ndarray) -> np.ndarray:
-    """Every picture to the first, of determinant one."""
+    """Every image to the first, of determinant one."""
     h = matrices[:1] @ np.linalg.inv(matrices)
     return np.asarray(h / np.cbrt(np.linalg.det(h))[:, None, None])
 

@@ -56,7 +56,7 @@ def _reads_or_complains(content: bytes) -> None:
         complaint = ""
         try:
             saved = read_sidecar(file)
-            assert saved.pictures[saved.reference].to_plane is not None
+            assert saved.images[saved.reference].to_plane is not None
         except InputError as error:
             complaint = str(error)
         assert not complaint or str(file) in complaint
@@ -64,7 +64,7 @@ def _reads_or_complains(content: bytes) -> None:
 
 def test_a_good_one_is_read_whole(tmp_path: Path) -> None:
     saved = read_sidecar(_write(tmp_path, json.dumps(GOOD).encode()))
-    used, left_out, unread = saved.pictures
+    used, left_out, unread = saved.images
     assert (saved.reference, saved.distortion, saved.composite) == (0, -0.2, StitchOptions().composite)
     assert used.camera is not None
     assert (used.camera.image_size, used.camera.focal, used.camera.focal_source) == ((400, 300), 380.0, "exif")
@@ -113,7 +113,7 @@ def test_version_1_is_still_read(tmp_path: Path) -> None:
     for image in content["images"][:2]:
         del image["coefficients"]
         image["lambda2"] = 0.01
-    camera = read_sidecar(_write(tmp_path, json.dumps(content).encode())).pictures[0].camera
+    camera = read_sidecar(_write(tmp_path, json.dumps(content).encode())).images[0].camera
     assert camera is not None
     assert camera.coefficients == (-0.2, 0.01, 0.0)
 

@@ -66,7 +66,7 @@ def test_order_of_points_does_not_matter(seed: int, order: list[int]) -> None:
 
 @given(seeds)
 @statistical
-def test_pictures_may_be_exchanged(seed: int) -> None:
+def test_images_may_be_exchanged(seed: int) -> None:
     instances = planar_instances(BATCH, 3, seed=seed, separate_tilts=True, noise=NOISE)
     tilts = np.stack([instances.tilt, instances.tilt2], axis=1)
     for solver, count in ((solvers.two_point, 2), (solvers.three_point_similarity, 3)):
@@ -83,7 +83,7 @@ def test_pictures_may_be_exchanged(seed: int) -> None:
 
 @given(seeds, angles)
 @statistical
-def test_pictures_may_be_turned_together(seed: int, angle: float) -> None:
+def test_images_may_be_turned_together(seed: int, angle: float) -> None:
     instances = planar_instances(BATCH, 4, seed=seed, noise=NOISE)
     x1, x2 = instances.x1, instances.x2
     same(solvers.four_point(x1, x2), solvers.four_point(rotated(x1, angle), rotated(x2, angle)))
@@ -97,7 +97,7 @@ def test_pictures_may_be_turned_together(seed: int, angle: float) -> None:
 
 @given(seeds, st.floats(0.3, 3.0), angles, angles)
 @statistical
-def test_five_points_need_no_focal_length_and_no_upright_pictures(
+def test_five_points_need_no_focal_length_and_no_upright_images(
     seed: int, zoom: float, angle1: float, angle2: float
 ) -> None:
     instances = planar_instances(BATCH, 5, seed=seed, noise=NOISE)

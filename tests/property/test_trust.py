@@ -59,7 +59,7 @@ def test_a_vehicle_with_more_matches_than_the_plane_is_not_taken_for_it(seed: in
 @pytest.mark.parametrize(
     ("seed", "rotten"), sampled([(13079, "frame_0005.jpg"), (12095, "frame_0003.jpg"), (15000, "frame_0001.jpg")])
 )
-def test_a_damaged_picture_does_not_spoil_the_others(seed: int, rotten: str, tmp_path: Path) -> None:
+def test_a_damaged_image_does_not_spoil_the_others(seed: int, rotten: str, tmp_path: Path) -> None:
     judged = judge_set(trust_set(seed, "bit rot"), tmp_path)
     assert judged.status == 0, judged.text
     assert judged.right, judged

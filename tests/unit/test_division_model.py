@@ -50,7 +50,7 @@ def test_what_lies_beyond_the_domain_is_masked_and_never_folded(coefficients: tu
 
 
 @pytest.mark.parametrize("coefficients", [(1.2, 0.0, 0.0), (-0.4, 0.9, 0.0), (0.1, 0.1, 0.9)])
-def test_a_camera_that_folds_anywhere_in_the_picture_is_refused(coefficients: tuple[float, float, float]) -> None:
+def test_a_camera_that_folds_anywhere_in_the_image_is_refused(coefficients: tuple[float, float, float]) -> None:
     with pytest.raises(ArgumentError, match="folds"):
         Camera((640, 480), coefficients[0], coefficients[1], distortion3=coefficients[2])
 
@@ -66,7 +66,7 @@ def test_what_a_fisheye_sees_beyond_the_horizon_is_masked(coefficients: tuple[fl
     seen = np.isfinite(straight).all(axis=1)
     np.testing.assert_array_equal(seen, radius < horizon)
     np.testing.assert_allclose(camera.distort(straight[seen]), points[seen], atol=1e-6)
-    # What is drawn ends before, where the lens stretches too much, and nowhere beyond the picture.
+    # What is drawn ends before, where the lens stretches too much, and nowhere beyond the image.
     outline = camera.outline(16)
     border = np.linalg.norm(camera.normalize(outline), axis=1)
     assert (border < horizon).all()

@@ -1,4 +1,4 @@
-"""Pictures that URLs name."""
+"""Images that URLs name."""
 
 import sys
 from pathlib import Path
@@ -9,7 +9,7 @@ import pytest
 
 from rdstitch.errors import InputError, OutputError
 from rdstitch.file_access import is_url, url_of
-from rdstitch.inputs.find import find_pictures
+from rdstitch.inputs.find import find_images
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.atomic import check_output
 from rdstitch.io.metadata import read_metadata
@@ -21,14 +21,14 @@ fsspec = pytest.importorskip("fsspec")
 
 @pytest.fixture
 def flight(tmp_path: Path) -> str:
-    """The URL of a folder of three pictures, a list of them, and an empty file, in memory."""
+    """The URL of a folder of three images, a list of them, and an empty file, in memory."""
     system = fsspec.filesystem("memory")
     system.rm("/", recursive=True)
     for name in ("f10.png", "f9.jpg", "f2.tif"):
         samples = np.random.default_rng(len(name)).integers(0, 255, (40, 60, 3), dtype=np.uint8)
         write_image(tmp_path / name, samples)
         system.pipe(f"/flight/{name}", (tmp_path / name).read_bytes())
-    system.pipe("/flight/notes.txt", b"no picture")
+    system.pipe("/flight/notes.txt", b"no image")
     system.pipe("/other/empty.jpg", b"")
     return "memory://flight"
 
@@ -55,19 +55,19 @@ def test_names_of_this_machine_are_no_urls(name: str) -> None:
 
 def test_folder_and_pattern(flight: str) -> None:
     for named in (flight, f"{flight}/*"):
-        assert [frame.path.name for frame in find_pictures([named]).frames] == ["f2.tif", "f9.jpg", "f10.png"]
-    assert [frame.path.name for frame in find_pictures([f"{flight}/f?.*"]).frames] == ["f2.tif", "f9.jpg"]
+        assert [frame.path.name for frame in find_images([named]).frames] == ["f2.tif", "f9.jpg", "f10.png"]
+    assert [frame.path.name for frame in find_images([f"{flight}/f?.*"]).frames] == ["f2.tif", "f9.jpg"]
 
 
 @pytest.mark.parametrize("name", ["f10.png", "f9.jpg", "f2.tif"])
-def test_the_same_picture_as_from_disk(flight: str, tmp_path: Path, name: str) -> None:
+def test_the_same_image_as_from_disk(flight: str, tmp_path: Path, name: str) -> None:
     here, there = tmp_path / name, Path(f"{flight}/{name}")
     assert read_metadata(there) == read_metadata(here)
     assert np.array_equal(read_image(there).pixels, read_image(here).pixels)
     assert np.array_equal(read_image(there, 4).pixels, read_image(here, 4).pixels)
 
 
-def test_a_picture_is_fetched_once_each_time_it_is_read(flight: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_image_is_fetched_once_each_time_it_is_read(flight: str, monkeypatch: pytest.MonkeyPatch) -> None:
     source = _source(f"{flight}/f9.jpg")
     opened: list[str] = []
     system = type(fsspec.filesystem("memory"))
@@ -107,11 +107,11 @@ def test_what_cannot_be_read_says_why(flight: str, name: str, message: str) -> N
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("memory://nothing", "no pictures at this address"), ("memory://flight/a.mp4", "download the video first")],
+    [("memory://nothing", "no images at this address"), ("memory://flight/a.mp4", "download the video first")],
 )
 def test_addresses_of_nothing(flight: str, name: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        find_pictures([name])
+        find_images([name])
 
 
 def test_a_message_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -122,9 +122,9 @@ def test_a_message_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("scheme", ["file://", "local://", "simplecache::file://"])
 def test_what_is_read_by_a_url_of_this_machine_is_never_replaced(tmp_path: Path, scheme: str) -> None:
-    picture = tmp_path / "a picture.png"
-    picture.write_bytes(b"the user's")
-    for url in (f"{scheme}{picture}", Path(f"{scheme}{picture}")):
+    image = tmp_path / "an image.png"
+    image.write_bytes(b"the user's")
+    for url in (f"{scheme}{image}", Path(f"{scheme}{image}")):
         with pytest.raises(OutputError, match="is read as input"):
-            check_output(picture, True, [url])
-    check_output(picture, True, ["memory://a picture.png", "s3://bucket/a.png", "other.png"])
+            check_output(image, True, [url])
+    check_output(image, True, ["memory://an image.png", "s3://bucket/a.png", "other.png"])

@@ -3,7 +3,7 @@
 from rdstitch.messages import Message, left_out, told_once
 
 
-def test_pictures_left_out_for_one_reason_are_named_together() -> None:
+def test_images_left_out_for_one_reason_are_named_together() -> None:
     blurred, alone = Message("is blurred", ("b/1.jpg",)), "no overlap"
     first, last = left_out("a/1.jpg", alone), left_out("a/3.jpg", alone)
     told = told_once([blurred, first, left_out("a/2.jpg", "in block 2"), last, blurred, first])

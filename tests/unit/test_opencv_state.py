@@ -66,15 +66,15 @@ import numpy as np
 from rdstitch.features.detect import detect
 from rdstitch.opencv_state import one_opencv_thread
 
-picture = np.random.default_rng(0).integers(0, 255, (400, 600), dtype=np.uint8)
+image = np.random.default_rng(0).integers(0, 255, (400, 600), dtype=np.uint8)
 cv2.setNumThreads(4)
-cv2.GaussianBlur(np.tile(picture, (5, 5)).astype(np.float32), (0, 0), 3.0)
+cv2.GaussianBlur(np.tile(image, (5, 5)).astype(np.float32), (0, 0), 3.0)
 cv2.setNumThreads(int(sys.argv[1]))
 before = cv2.getNumThreads()
 if (child := os.fork()) == 0:
     with one_opencv_thread():
         inside = cv2.getNumThreads()
-        found = len(detect(picture).points)
+        found = len(detect(image).points)
     os._exit(0 if (inside, cv2.getNumThreads()) == (1, before) and found else 1)
 sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """

@@ -63,7 +63,7 @@ def test_arrays_that_are_made_again_and_again_do_not_come_from_the_system_each_t
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="pages of another system and C library")
-def test_what_each_picture_takes_is_reused_for_the_next() -> None:
+def test_what_each_image_takes_is_reused_for_the_next() -> None:
     command = [sys.executable, "-c", _AGAIN_AND_AGAIN, "many"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert int(done.stdout) < 20_000  # pages; the arrays of a round have 9,800

@@ -62,7 +62,7 @@ def test_a_point_behind_the_camera_is_nan() -> None:
     assert np.isnan(transfer_jacobian(horizon, -0.1, np.array([[-0.4, 0.0]])).by_homography).all()
 
 
-def test_whitening_has_the_covariance_of_noise_in_both_pictures() -> None:
+def test_whitening_has_the_covariance_of_noise_in_both_images() -> None:
     jacobian = np.random.default_rng(0).normal(size=(20, 2, 2))
     w = measurement_whitening(jacobian)
     covariance = (np.eye(2) + jacobian @ np.swapaxes(jacobian, 1, 2)) / 2

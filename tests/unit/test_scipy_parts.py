@@ -10,7 +10,7 @@ from scipy import sparse as real_sparse
 from rdstitch.scipy_parts import sparse, spatial
 from tests.cli.running import flight
 
-_UP_TO_THE_FIRST_PICTURE = """
+_UP_TO_THE_FIRST_IMAGE = """
 import sys
 from rdstitch.inputs import source
 from rdstitch_cli.main import run
@@ -32,11 +32,11 @@ _NOT_YET = ("scipy", "rdstitch.report", "rdstitch.doctor", "rdstitch.synthetic",
 
 
 @pytest.mark.parametrize("command", ["pano", "mosaic"])
-def test_up_to_the_first_picture_no_more_is_imported_than_it_takes(command: str, tmp_path: Path) -> None:
+def test_up_to_the_first_image_no_more_is_imported_than_it_takes(command: str, tmp_path: Path) -> None:
     frames = flight(2, 1).write(tmp_path)
     arguments = [command, *map(str, frames), "-o", str(tmp_path / "out.png"), "-j", "1"]
     done = subprocess.run(
-        [sys.executable, "-c", _UP_TO_THE_FIRST_PICTURE, *arguments], capture_output=True, text=True, check=True
+        [sys.executable, "-c", _UP_TO_THE_FIRST_IMAGE, *arguments], capture_output=True, text=True, check=True
     )
     imported = done.stdout.split()
     assert "rdstitch.pipeline.recipes" in imported

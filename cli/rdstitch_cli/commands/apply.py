@@ -22,14 +22,14 @@ Examples:
   rdstitch apply small.jpg.json --images originals/ -o large.tif --match name --strict
 """,
 )
-@click.argument("sidecar", type=options.PICTURE, metavar="SIDECAR")
+@click.argument("sidecar", type=options.IMAGE, metavar="SIDECAR")
 @click.option(
     "--images",
-    type=options.PICTURE,
+    type=options.IMAGE,
     required=True,
     multiple=True,
     metavar="INPUT",
-    help="Pictures to compose: what 'rdstitch mosaic' takes; may be given several times.",
+    help="Images to compose: what 'rdstitch mosaic' takes; may be given several times.",
 )
 @options.output
 @options.overwrite
@@ -40,7 +40,7 @@ Examples:
     type=click.Choice(["auto", "name", "order"]),
     default="auto",
     show_default=True,
-    help="How pictures find their places: by name (the suffix may differ), by order, or by order if no name fits.",
+    help="How images find their places: by name (the suffix may differ), by order, or by order if no name fits.",
 )
 @options.mask
 @options.compositing
@@ -62,10 +62,10 @@ def apply(
     reporter: Reporter,
     **compositing: Any,
 ) -> None:
-    """Compose pictures by the registration in a sidecar, without estimating anything.
+    """Compose images by the registration in a sidecar, without estimating anything.
 
-    The pictures are those that the sidecar was made from, or others taken by the same lens from the same places:
-    another band of the same flight, the originals of reduced pictures, masks. They may have another size of the same
+    The images are those that the sidecar was made from, or others taken by the same lens from the same places:
+    another band of the same flight, the originals of reduced images, masks. They may have another size of the same
     shape. Compositing options that are not given are those of the sidecar.
     """
     from rdstitch.messages import told_once
@@ -95,7 +95,7 @@ def apply(
     for missing in told_once(result.left_out.values()):
         reporter.warn(str(missing))
     if result.matched == "order" and match == "auto":
-        reporter.warn("no picture has a name of the sidecar; they were taken in order")
+        reporter.warn("no image has a name of the sidecar; they were taken in order")
     for message in result.messages:
         reporter.tell(message)
     if result.plan is not None:

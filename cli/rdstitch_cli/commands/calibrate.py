@@ -1,4 +1,4 @@
-"""``rdstitch calibrate``: the lens, from pictures of a plane."""
+"""``rdstitch calibrate``: the lens, from images of a plane."""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from rdstitch_cli.terminal import Reporter
 
 @click.command(
     cls=GroupedCommand,
-    short_help="The lens, from pictures of a plane.",
+    short_help="The lens, from images of a plane.",
     epilog="""\b
 Examples:
   rdstitch calibrate wall/ -o camera.json
@@ -25,7 +25,7 @@ Examples:
 @click.option(
     "-o",
     "--output",
-    type=options.PICTURE,
+    type=options.IMAGE,
     required=True,
     metavar="FILE",
     help="Camera file to write: .json, .yml and .fisheye.yml (OpenCV), .pto (Hugin), cameras.json (OpenDroneMap), "

@@ -1,4 +1,4 @@
-"""``rdstitch mosaic``: a folder of frames becomes one rectified picture."""
+"""``rdstitch mosaic``: a folder of frames becomes one rectified image."""
 
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @click.command(
     cls=GroupedCommand,
-    short_help="One rectified picture of a whole folder or video.",
+    short_help="One rectified image of a whole folder or video.",
     epilog="""\b
 Examples:
   rdstitch mosaic floor/ -o floor.tif
@@ -49,8 +49,8 @@ def mosaic(
 ) -> None:
     """Stitch a whole sequence over one plane, seen straight from above.
 
-    INPUT is a folder, a picture, a quoted pattern, @FILE with one input a line (or separated by NUL), - for such a
-    list on standard input, a video, or a ROS bag. Pictures that do not fit are left out and named on standard error.
+    INPUT is a folder, an image, a quoted pattern, @FILE with one input a line (or separated by NUL), - for such a
+    list on standard input, a video, or a ROS bag. Images that do not fit are left out and named on standard error.
     With --follow, frames are registered as they arrive.
     """
     from rdstitch.pipeline import mosaic as recipe

@@ -1,4 +1,4 @@
-"""``rdstitch pano``: a few overlapping pictures become one."""
+"""``rdstitch pano``: a few overlapping images become one."""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from rdstitch_cli.terminal import Reporter
 
 @click.command(
     cls=GroupedCommand,
-    short_help="One picture of a few that overlap.",
+    short_help="One image of a few that overlap.",
     epilog="""\b
 Examples:
   rdstitch pano left.jpg right.jpg -o pano.jpg
@@ -34,9 +34,9 @@ def pano(
     reporter: Reporter,
     **given: Any,
 ) -> None:
-    """Stitch two or more pictures that overlap, in any order.
+    """Stitch two or more images that overlap, in any order.
 
-    INPUT is what 'rdstitch mosaic' takes, but every picture must be readable. The picture goes to the output,
+    INPUT is what 'rdstitch mosaic' takes, but every image must be readable. The image goes to the output,
     everything estimated to the output's name with .json added, and λ to standard output.
     """
     from rdstitch.pipeline import pano as recipe

@@ -30,7 +30,7 @@ Examples:
 """,
 )
 @options.inputs
-@click.option("-o", "--output", type=options.PICTURE, required=True, metavar="FILE", help="File to write.")
+@click.option("-o", "--output", type=options.IMAGE, required=True, metavar="FILE", help="File to write.")
 @click.option(
     "--format",
     "layout",
@@ -56,12 +56,12 @@ Examples:
 )
 @click.option(
     "--timestamps",
-    type=options.PICTURE,
+    type=options.IMAGE,
     metavar="FILE",
-    help="Time stamps of the pictures: CSV name,timestamp, lines TIME NAME, or a time a line; "
+    help="Time stamps of the images: CSV name,timestamp, lines TIME NAME, or a time a line; "
     "otherwise those of the video, bag or EXIF.",
 )
-@click.option("--plot", type=options.PICTURE, metavar="FILE", help="Draw the path to FILE (SVG).")
+@click.option("--plot", type=options.IMAGE, metavar="FILE", help="Draw the path to FILE (SVG).")
 @options.overwrite
 @options.every_frame
 @options.topic
@@ -84,9 +84,9 @@ def trajectory(
     reporter: Reporter,
     **given: Any,
 ) -> None:
-    """Find where the camera was for each picture: x, y and yaw over the plane.
+    """Find where the camera was for each image: x, y and yaw over the plane.
 
-    INPUT is what 'rdstitch mosaic' takes. Positions are in units of the first picture's height above the plane, or in
+    INPUT is what 'rdstitch mosaic' takes. Positions are in units of the first image's height above the plane, or in
     metres when --height says how many those are; they are as good as the focal length (see --focal). With --follow,
     poses are printed as frames arrive.
     """

@@ -13,7 +13,7 @@ from rdstitch_cli.terminal import Reporter
 
 @click.command(
     cls=GroupedCommand,
-    short_help="Pictures with straight lines straight, by a known lens.",
+    short_help="Images with straight lines straight, by a known lens.",
     epilog="""\b
 Examples:
   rdstitch undistort frames/*.jpg --camera camera.json -o straight/
@@ -23,7 +23,7 @@ Examples:
 @options.inputs
 @options.lens
 @click.option(
-    "-o", "--output", type=options.PICTURE, required=True, metavar="DIR", help="Folder to write to; made if missing."
+    "-o", "--output", type=options.IMAGE, required=True, metavar="DIR", help="Folder to write to; made if missing."
 )
 @options.overwrite
 @options.topic
@@ -32,13 +32,13 @@ Examples:
     type=click.Choice(["same", "all", "valid"]),
     default="same",
     show_default=True,
-    help="What to show: the same scale and size as the picture, all of it, or only where it has no empty border.",
+    help="What to show: the same scale and size as the image, all of it, or only where it has no empty border.",
 )
 @click.option(
     "--format",
     "image_format",
     type=click.Choice(["jpg", "png", "tif", "webp"]),
-    help="Of the files written; that of each picture, or png where that cannot be written, if not given.",
+    help="Of the files written; that of each image, or png where that cannot be written, if not given.",
 )
 @options.verbosity
 def undistort(
@@ -52,7 +52,7 @@ def undistort(
     image_format: Literal["jpg", "png", "tif", "webp"] | None,
     reporter: Reporter,
 ) -> None:
-    """Undistort pictures with a known lens, each into a file of the same name in a folder.
+    """Undistort images with a known lens, each into a file of the same name in a folder.
 
     INPUT is what 'rdstitch mosaic' takes. The lens comes from a camera file, as 'rdstitch pano --save-camera' and
     'rdstitch calibrate' write it, or is given as λ for half the image diagonal.
@@ -75,5 +75,5 @@ def undistort(
         progress=reporter,
     )
     reporter.finish()
-    noun = "picture" if len(written) == 1 else "pictures"
+    noun = "image" if len(written) == 1 else "images"
     reporter.made(f"{output}: {len(written)} {noun} undistorted")

@@ -1,4 +1,4 @@
-"""What the figures share: instances, pictures and matches, contenders and peers, and the reports.
+"""What the figures share: instances, images and matches, contenders and peers, and the reports.
 
 Read the figure first, then what it imports from here.
 """

@@ -1,4 +1,4 @@
-"""Aerial surveys: rendered ones, and how the path of their pictures' centres drifts and bends."""
+"""Aerial surveys: rendered ones, and how the path of their images' centres drifts and bends."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ _CENTRE = np.array([0.0, 0.0, 1.0])
 
 
 def rendered_survey(count: int, size: tuple[int, int], distortion: float, seed: int) -> Sequence:
-    """Pictures of a drone that keeps its height and attitude, as the two-point solver asks for; a texel is a pixel."""
+    """Images of a drone that keeps its height and attitude, as the two-point solver asks for; a texel is a pixel."""
     lens = Camera(size, distortion, focal=1.1 * size[0], focal_source="option")
     poses = survey_poses(lens, count, forward_overlap=0.6, side_overlap=0.4, height_jitter=0.0, seed=seed)
     photometry = Photometry(vignetting=0.2, noise=0.01, blur=0.4)
@@ -22,18 +22,18 @@ def rendered_survey(count: int, size: tuple[int, int], distortion: float, seed: 
 
 
 def true_centres(sequence: Sequence) -> FloatArray:
-    """What each picture's centre shows, texels, shape (N, 2)."""
+    """What each image's centre shows, texels, shape (N, 2)."""
     centre = np.array([sequence.lens.center])
     return np.concatenate([sequence.to_plane(index, centre) for index in range(len(sequence))])
 
 
 def adjusted_centres(registration: Registration) -> FloatArray:
-    """Where the adjustment puts the pictures' distortion centres, shape (N, 2); NaN for pictures left out."""
+    """Where the adjustment puts the images' distortion centres, shape (N, 2); NaN for images left out."""
     return project(registration.alignment.homographies @ _CENTRE)
 
 
 def chained_centres(registration: Registration) -> FloatArray:
-    """The same by the homographies of consecutive pictures, one after the other, in the frame of the first picture.
+    """The same by the homographies of consecutive images, one after the other, in the frame of the first image.
 
     NaN from the first pair on that has none.
     """
@@ -71,6 +71,6 @@ def bend(truth: FloatArray, centres: FloatArray) -> float:
 
 
 def lanes(truth: FloatArray) -> list[FloatArray]:
-    """Indices of the pictures of each lane: lanes run along Y, the steps between them along X."""
+    """Indices of the images of each lane: lanes run along Y, the steps between them along X."""
     step = np.abs(np.diff(truth, axis=0))
     return np.split(np.arange(len(truth)), np.flatnonzero(step[:, 0] > step[:, 1]) + 1)

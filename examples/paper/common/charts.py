@@ -1,4 +1,4 @@
-"""Chessboards: seen by a camera, found in pictures, undistorted, laid on their grid, and drawn so."""
+"""Chessboards: seen by a camera, found in images, undistorted, laid on their grid, and drawn so."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -12,9 +12,9 @@ from examples.judging.fitting import apply
 from examples.paper.common.report import Pixels
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.compositing import Canvas, CompositeOptions, PlacedPicture, compose
+from rdstitch.compositing import Canvas, CompositeOptions, PlacedImage, compose
 from rdstitch.io.read import read_image
-from rdstitch.synthetic import PictureTexture, Poses, sequence_over
+from rdstitch.synthetic import ImageTexture, Poses, sequence_over
 from rdstitch.synthetic import Sequence as RenderedSequence
 
 _SQUARE = 80  # texels of a rendered chart
@@ -26,18 +26,18 @@ _AS_IT_IS = CompositeOptions(exposure="none", seam="none", blend="none", backgro
 
 
 def rendered_chart(camera: Camera, tilt: tuple[float, float], yaw: float) -> RenderedSequence:
-    """One picture of an endless chessboard; a texel is a pixel at the picture's centre."""
+    """One image of an endless chessboard; a texel is a pixel at the image's centre."""
     dark = np.indices((_SQUARES, _SQUARES)).sum(axis=0) % 2 == 0
     chart = np.kron(np.where(dark, _DARK, _LIGHT), np.ones((_SQUARE, _SQUARE))).astype(np.uint8)
     assert camera.focal is not None
-    return sequence_over(PictureTexture(chart), camera, Poses.of([(0.0, 0.0)], camera.focal, yaw, tilt))
+    return sequence_over(ImageTexture(chart), camera, Poses.of([(0.0, 0.0)], camera.focal, yaw, tilt))
 
 
 def seen_corners(sequence: RenderedSequence) -> tuple[FloatArray, FloatArray]:
-    """Corners of the rendered chart that the picture shows: measured px, and grid coordinates, both (N, 2)."""
+    """Corners of the rendered chart that the image shows: measured px, and grid coordinates, both (N, 2)."""
     steps = np.arange(1.0, _SQUARES)
     grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    points = sequence.to_picture(0, grid * _SQUARE - 0.5)
+    points = sequence.to_image(0, grid * _SQUARE - 0.5)
     limit = np.array(sequence.lens.image_size) - 1.0
     with np.errstate(invalid="ignore"):
         seen = ((points >= 0.0) & (points <= limit)).all(axis=1)
@@ -45,7 +45,7 @@ def seen_corners(sequence: RenderedSequence) -> tuple[FloatArray, FloatArray]:
 
 
 def find_boards(files: Sequence[Path], corners: tuple[int, int]) -> tuple[Camera, dict[Path, FloatArray]]:
-    """The corners (N, 2), px, of the board in every picture that shows all of it, and the camera of blank λ."""
+    """The corners (N, 2), px, of the board in every image that shows all of it, and the camera of blank λ."""
     boards, size = {}, (0, 0)
     for file in files:
         grey = np.asarray(read_image(file).pixels)
@@ -76,7 +76,7 @@ def undistorted(camera: Camera, points: FloatArray) -> FloatArray:
 
 
 def before_and_after(file: Path, camera: Camera, to_grid: FloatArray, size: tuple[float, float], px: float) -> Pixels:
-    """A picture beside itself, undistorted and rectified.
+    """An image beside itself, undistorted and rectified.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def before_and_after(file: Path, camera: Camera, to_grid: FloatArray, size: tupl
     width, height = (round(px * extent) for extent in size)
     frame = np.array([(0.0, 0.0), (width - 1.0, 0.0), (width - 1.0, height - 1.0), (0.0, height - 1.0)])
     canvas = Canvas((width, height), np.diag([px, px, 1.0]), (frame,))
-    after = compose([PlacedPicture(partial(read_image, file), camera, to_grid)], canvas, _AS_IT_IS)
+    after = compose([PlacedImage(partial(read_image, file), camera, to_grid)], canvas, _AS_IT_IS)
     pixels = np.where(after.alpha[..., None] > 0, _as_rgb(after.pixels), np.uint8(255))
     measured = _as_rgb(np.asarray(read_image(file).pixels))
     shape = (round(measured.shape[1] * height / measured.shape[0]), height)

@@ -15,7 +15,7 @@ HOMLIB: tuple[tuple[str, str, tuple[bool, ...]], ...] = (
     ("5 points, Fitzgibbon (homlib)", "estimate_fitzgibbon_cvpr_2001_two_sided_equal", ()),
     ("5 points, Wadenbäck (homlib)", "estimate_wadenback_3dv_2026_two_sided_equal", (False,)),
 )
-"""Solvers of homlib for one λ in both pictures: name, function, further arguments."""
+"""Solvers of homlib for one λ in both images: name, function, further arguments."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Contender:
     points : int
         Correspondences that it needs.
     solve : callable
-        Takes the points of the instances (B, points, 2), both pictures, and their true tilts (B, 2), which only
+        Takes the points of the instances (B, points, 2), both images, and their true tilts (B, 2), which only
         solvers for a known tilt look at.
     """
 
@@ -45,9 +45,9 @@ class Contender:
 def known_tilt() -> list[Contender]:
     """Solvers that are told the tilt."""
     return [
-        Contender("2 points", 2, lambda a, b, tilt: solvers.two_point(a, b, _per_picture(tilt))),
+        Contender("2 points", 2, lambda a, b, tilt: solvers.two_point(a, b, _per_image(tilt))),
         Contender(
-            "3 points, height free", 3, lambda a, b, tilt: solvers.three_point_similarity(a, b, _per_picture(tilt))
+            "3 points, height free", 3, lambda a, b, tilt: solvers.three_point_similarity(a, b, _per_image(tilt))
         ),
     ]
 
@@ -76,6 +76,6 @@ def unknown_tilt() -> list[Contender]:
     return own_unknown_tilt() + homlib_contenders()
 
 
-def _per_picture(tilt: FloatArray) -> FloatArray:
-    """The same tilt (B, 2) for both pictures of a sample; shape (B, 2, 2)."""
+def _per_image(tilt: FloatArray) -> FloatArray:
+    """The same tilt (B, 2) for both images of a sample; shape (B, 2, 2)."""
     return np.repeat(tilt[:, None, :], 2, axis=1)

@@ -18,7 +18,7 @@ PATHS = {"line": line_poses, "turn": turn_poses, "parallel parking": parking_pos
 
 _STEPS = (1, 2, 4)
 _MIN_MATCHES = 30
-_PER_PICTURE = 200
+_PER_IMAGE = 200
 _WRONG = 0.1  # share of the matches
 
 
@@ -123,9 +123,9 @@ def estimated_links(pairs: Iterable[FramePair], camera: Camera, solver: SolverNa
 def _matches(
     camera: Camera, from_plane: FloatArray, noise: float, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Noisy matches between two pictures, some of them wrong."""
+    """Noisy matches between two images, some of them wrong."""
     limit = np.array(camera.image_size) - 1.0
-    points1 = rng.uniform((0.0, 0.0), limit, (_PER_PICTURE, 2))
+    points1 = rng.uniform((0.0, 0.0), limit, (_PER_IMAGE, 2))
     points2 = pixels_of_texels(camera, from_plane[1], texels_of_pixels(camera, from_plane[0], points1))
     seen = ((points2 >= 0.0) & (points2 <= limit)).all(axis=1)
     points1, points2 = points1[seen], points2[seen]

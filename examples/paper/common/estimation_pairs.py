@@ -1,4 +1,4 @@
-"""Pairs of pictures with a known map between them, to judge estimators of homographies under distortion.
+"""Pairs of images with a known map between them, to judge estimators of homographies under distortion.
 
 Rendered ones, and planar scenes as in HPatches, to which division distortion is added.
 """
@@ -26,18 +26,18 @@ _RATIO = 0.9  # loose, so that the estimators have something to do
 
 @dataclass(frozen=True)
 class JudgedPair:
-    """Matches of two pictures of a plane through one lens, and where points truly go.
+    """Matches of two images of a plane through one lens, and where points truly go.
 
     Attributes
     ----------
     points1, points2 : ndarray of shape (N, 2)
         Matches, px.
     image_size : (int, int)
-        Of both pictures.
+        Of both images.
     distortion : float
         True λ.
     grid1, grid2 : ndarray of shape (M, 2)
-        Places all over what both pictures show, px in either.
+        Places all over what both images show, px in either.
     """
 
     points1: FloatArray
@@ -77,22 +77,22 @@ def rendered_pairs(count: int, distortion: float, *, free: bool, seed: int) -> I
 
 
 def _over_the_plane(sequence: RenderedSequence, points: FloatArray) -> FloatArray:
-    return sequence.to_picture(1, sequence.to_plane(0, points))
+    return sequence.to_image(1, sequence.to_plane(0, points))
 
 
 def scene_pairs(scenes: Sequence[PlanarScene], distortion: float, *, seed: int, per_scene: int) -> Iterator[JudgedPair]:
-    """The first picture of every scene with others, all distorted by the same λ, uniform from ``distortion`` to 0.
+    """The first image of every scene with others, all distorted by the same λ, uniform from ``distortion`` to 0.
 
-    Pictures of different sizes are brought to the size of the first, which a homography describes.
+    Images of different sizes are brought to the size of the first, which a homography describes.
     """
     for number, scene in enumerate(scenes):
         lam = float(np.random.default_rng((seed, number)).uniform(distortion, 0.0))
-        first = scene.pictures[0]()
+        first = scene.images[0]()
         size = (first.shape[1], first.shape[0])
         lens = Camera(size, lam)
         one = _through(lens, first, size)
-        for k in range(1, min(1 + per_scene, len(scene.pictures))):
-            other = scene.pictures[k]()
+        for k in range(1, min(1 + per_scene, len(scene.images))):
+            other = scene.images[k]()
             resize = np.diag([size[0] / other.shape[1], size[1] / other.shape[0], 1.0])
             homography = resize @ scene.homographies[k]
 
@@ -114,7 +114,7 @@ def _judged(one: Pixels, two: Pixels, lens: Camera, transfer: Callable[[FloatArr
 
 
 def _ideal(lens: Camera, points: FloatArray) -> FloatArray:
-    """Px of the distorted picture to px of the one without distortion, with the corners where they were."""
+    """Px of the distorted image to px of the one without distortion, with the corners where they were."""
     centre = np.array(lens.center)
     ideal: FloatArray = centre + (lens.undistort(points) - centre) * (1.0 + lens.distortion)
     return ideal
@@ -126,9 +126,9 @@ def _measured(lens: Camera, points: FloatArray) -> FloatArray:
     return lens.distort(centre + (points - centre) / (1.0 + lens.distortion))
 
 
-def _through(lens: Camera, picture: Pixels, size: tuple[int, int]) -> Pixels:
-    """A picture as the lens would have taken it."""
-    resized = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+def _through(lens: Camera, image: Pixels, size: tuple[int, int]) -> Pixels:
+    """An image as the lens would have taken it."""
+    resized = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     grid = np.stack(np.meshgrid(np.arange(size[0]), np.arange(size[1])), axis=-1).astype(np.float64)
     u, v = np.moveaxis(_ideal(lens, grid.reshape(-1, 2)).reshape(grid.shape).astype(np.float32), -1, 0)
     distorted = cv2.remap(resized, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)

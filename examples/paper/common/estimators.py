@@ -42,7 +42,7 @@ class Estimator:
     ----------
     name : str
     run : callable
-        Takes matches, px (N, 2), and the size of the pictures.
+        Takes matches, px (N, 2), and the size of the images.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Judgement:
     Attributes
     ----------
     error : float
-        Mean distance from the truth over what both pictures show, px of picture 2; inf without an estimate.
+        Mean distance from the truth over what both images show, px of image 2; inf without an estimate.
     distortion_error : float
     seconds : float
         Of processor time.

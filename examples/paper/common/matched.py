@@ -1,4 +1,4 @@
-"""Matched pairs of pictures, rendered with known truth and real, that several figures use."""
+"""Matched pairs of images, rendered with known truth and real, that several figures use."""
 
 from collections.abc import Sequence as Many
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ Tilt = tuple[float, float]
 
 @dataclass(frozen=True)
 class MatchedPair:
-    """Matches of two pictures.
+    """Matches of two images.
 
     Attributes
     ----------
@@ -51,14 +51,14 @@ def rendered_pair(
     scale: float = 1.0,
     tilt: Tilt = (0.0, 0.0),
 ) -> Sequence:
-    """Two pictures of a floor; noise and vignetting as of a small camera."""
+    """Two images of a floor; noise and vignetting as of a small camera."""
     poses = pair_poses(lens, overlap, yaw=yaw, direction=direction, scale=scale, tilt=tilt)
     photometry = Photometry(gain=np.array([1.0, 0.85]), vignetting=0.2, blur=0.5, noise=0.01)
     return sequence_over(lambda size: ground(size, seed), lens, poses, photometry=photometry, seed=seed)
 
 
 def match_rendered(sequence: Sequence, name: str, *, ratio: float | None = None, features: int = 2000) -> MatchedPair:
-    """Matches of the first two pictures of a sequence, whose poses have one tilt."""
+    """Matches of the first two images of a sequence, whose poses have one tilt."""
     options = FeatureOptions(max_features=features)
     first, second = (detect(sequence.frame(index), options) for index in (0, 1))
     matches = match(first, second, ratio)
@@ -68,14 +68,14 @@ def match_rendered(sequence: Sequence, name: str, *, ratio: float | None = None,
 
 
 def match_files(files: Many[Path], *, ratio: float | None = None, features: int = 4000) -> list[MatchedPair]:
-    """Matches of consecutive pictures; their focal length is guessed."""
+    """Matches of consecutive images; their focal length is guessed."""
     options = FeatureOptions(max_features=features)
-    pictures = [read_image(file).pixels for file in files]
-    found = [detect(pixels, options) for pixels in pictures]
+    images = [read_image(file).pixels for file in files]
+    found = [detect(pixels, options) for pixels in images]
     pairs = []
     for k in range(len(files) - 1):
         matches = match(found[k], found[k + 1], ratio)
-        camera = Camera((pictures[k].shape[1], pictures[k].shape[0])).with_focal()
+        camera = Camera((images[k].shape[1], images[k].shape[0])).with_focal()
         name = f"{files[k].stem} and {files[k + 1].stem}"
         pairs.append(MatchedPair(name, matches.points1, matches.points2, -matches.ratio, camera))
     return pairs

@@ -15,10 +15,10 @@ from rdstitch.solvers import Solutions
 from rdstitch.synthetic import PlanarInstances
 
 SIGMAS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.0)
-"""Standard deviations of the noise in px of a 640 x 480 picture."""
+"""Standard deviations of the noise in px of a 640 x 480 image."""
 
 HALF_DIAGONAL = 400.0
-"""Of that picture, px, and its focal length, so that λ is the same in both frames."""
+"""Of that image, px, and its focal length, so that λ is the same in both frames."""
 
 WITNESSES = 20
 """Further points, with the same noise, that choose among the solutions of a sample, as RANSAC does."""

@@ -1,4 +1,4 @@
-"""Planar scenes as in HPatches: pictures of one plane with the homographies from the first to each other one."""
+"""Planar scenes as in HPatches: images of one plane with the homographies from the first to each other one."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,17 +19,17 @@ _WARP = 0.25  # of the sides, by which corners of made scenes are moved
 
 @dataclass(frozen=True)
 class PlanarScene:
-    """Pictures of one plane, taken without distortion.
+    """Images of one plane, taken without distortion.
 
     Attributes
     ----------
-    pictures : sequence of callables
+    images : sequence of callables
         Each gives one.
     homographies : sequence of ndarray of shape (3, 3)
-        From the first picture to each, px; the first is the identity.
+        From the first image to each, px; the first is the identity.
     """
 
-    pictures: Sequence[Callable[[], Pixels]]
+    images: Sequence[Callable[[], Pixels]]
     homographies: Sequence[FloatArray]
 
 
@@ -58,9 +58,9 @@ def made_scenes(photo: Pixels | None, count: int, seed: int, size: tuple[int, in
         room = np.array([source.shape[1], source.shape[0]]) - 2 * np.array(size)
         corner = np.array(size) / 2 + rng.uniform(0.0, 1.0, 2) * np.maximum(room, 0)
         seen = [frame + corner, frame + corner + rng.uniform(-_WARP, _WARP, (4, 2)) * np.array(size)]
-        to_picture = [_perspective(corners, frame) for corners in seen]
-        warps = [partial(_warped, source, h, size) for h in to_picture]
-        scenes.append(PlanarScene(warps, [np.eye(3), to_picture[1] @ np.linalg.inv(to_picture[0])]))
+        to_image = [_perspective(corners, frame) for corners in seen]
+        warps = [partial(_warped, source, h, size) for h in to_image]
+        scenes.append(PlanarScene(warps, [np.eye(3), to_image[1] @ np.linalg.inv(to_image[0])]))
     return scenes
 
 

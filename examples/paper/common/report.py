@@ -1,4 +1,4 @@
-"""What a figure gives: tables that read as text and as Markdown, a plot, pictures, and what had to be left out."""
+"""What a figure gives: tables that read as text and as Markdown, a plot, images, and what had to be left out."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -59,15 +59,15 @@ class Report:
     tables : tuple of Table
     draw : callable, optional
         Draws the plot on an empty matplotlib Figure.
-    pictures : mapping of str to ndarray of shape (h, w) or (h, w, 3)
-        Pictures to be saved, by file name.
+    images : mapping of str to ndarray of shape (h, w) or (h, w, 3)
+        Images to be saved, by file name.
     notes : tuple of str
         What was left out, and why: one line each.
     """
 
     tables: tuple[Table, ...]
     draw: Draw | None = None
-    pictures: Mapping[str, Pixels] = field(default_factory=dict)
+    images: Mapping[str, Pixels] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
@@ -84,15 +84,15 @@ def _text(value: object) -> str:
 
 
 def save(report: Report, name: str, folder: Path) -> list[str]:
-    """Write a figure's text, plot and pictures; return one line about each file, or why there is none."""
+    """Write a figure's text, plot and images; return one line about each file, or why there is none."""
     from PIL import Image
 
     folder.mkdir(parents=True, exist_ok=True)
     text = folder / f"{name}.md"
     text.write_text(f"{report}\n", encoding="utf-8")
     said = [f"wrote {text}"]
-    for file, picture in report.pictures.items():
-        Image.fromarray(picture).save(folder / file)
+    for file, image in report.images.items():
+        Image.fromarray(image).save(folder / file)
         said.append(f"wrote {folder / file}")
     if report.draw is not None:
         said.append(_save_plot(report.draw, folder / f"{name}.png"))

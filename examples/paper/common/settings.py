@@ -1,4 +1,4 @@
-"""How much work a figure may do, and where the real pictures are."""
+"""How much work a figure may do, and where the real images are."""
 
 import enum
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class Settings:
     Attributes
     ----------
     effort : Effort
-    pictures : Path
+    images : Path
         Folder of the real sequences (``garfield_red``, ``copr``); figures do without those that are absent.
     peer_python : str, optional
         Python that has the package stitching, which brings an OpenCV of its own; the one that runs if not given.
@@ -31,7 +31,7 @@ class Settings:
     """
 
     effort: Effort
-    pictures: Path
+    images: Path
     peer_python: str | None = None
     hpatches: Path | None = None
 
@@ -41,7 +41,7 @@ class Settings:
 
     def real_sequence(self, name: str) -> list[Path]:
         """Files of a real sequence in the order of their names; none where it is absent."""
-        folder = self.pictures / name
+        folder = self.images / name
         if not folder.is_dir():
             return []
         return sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES)

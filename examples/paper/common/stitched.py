@@ -19,7 +19,7 @@ from rdstitch.synthetic import Sequence
 
 
 def stitch_files(files: Many[Path], options: StitchOptions) -> tuple[Registration, Pixels]:
-    """The registration and the mosaic of some pictures."""
+    """The registration and the mosaic of some images."""
     with TemporaryDirectory(prefix="rdstitch-paper-") as folder:
         output = Path(folder) / "mosaic.png"
         result = mosaic(files, output, options)
@@ -41,9 +41,9 @@ def register_files(files: Many[Path], options: StitchOptions) -> Registration | 
 
 
 def registration_error(alignment: Alignment, sequence: Sequence) -> AlignmentError:
-    """How far each point of the used pictures is from where it belongs on the true plane.
+    """How far each point of the used images is from where it belongs on the true plane.
 
-    A rectified plane may differ from the true one by a similarity only, the frame of a picture by a homography.
+    A rectified plane may differ from the true one by a similarity only, the frame of an image by a homography.
     """
     used = np.flatnonzero(alignment.used)
     transfers = {int(i): partial(to_plane, alignment.cameras[i], alignment.homographies[i]) for i in used}

@@ -23,13 +23,13 @@ _HUGIN = (
 
 @dataclass(frozen=True)
 class Stitcher:
-    """A program that makes a mosaic of pictures.
+    """A program that makes a mosaic of images.
 
     Attributes
     ----------
     name : str
     commands : callable
-        Takes the pictures, the file to write, and the horizontal field of view in degrees, which only the
+        Takes the images, the file to write, and the horizontal field of view in degrees, which only the
         hand-written recipe looks at; gives the commands.
     """
 
@@ -85,32 +85,32 @@ def _worker(python: str, name: str) -> Callable[[Sequence[Path], Path, float], l
     """One of :mod:`examples.paper.common.stitch_worker`."""
     start = f"import sys; sys.path.insert(0, {str(_ROOT)!r}); from examples.paper.common.stitch_worker import main"
     code = f"{start}; sys.exit(main(sys.argv[1:]))"
-    return lambda pictures, output, _: [[python, "-c", code, name, str(output), *map(str, pictures)]]
+    return lambda images, output, _: [[python, "-c", code, name, str(output), *map(str, images)]]
 
 
-def _hugin_automatic(pictures: Sequence[Path], output: Path, _: float) -> list[list[str]]:
-    """What Hugin does of its own: its assistant, from the pictures alone."""
+def _hugin_automatic(images: Sequence[Path], output: Path, _: float) -> list[list[str]]:
+    """What Hugin does of its own: its assistant, from the images alone."""
     return [
-        ["pto_gen", "-o", "a.pto", *map(str, pictures)],
+        ["pto_gen", "-o", "a.pto", *map(str, images)],
         ["hugin_executor", "--assistant", "a.pto"],
         ["hugin_executor", "--stitching", f"--prefix={output.stem}", "a.pto"],
     ]
 
 
-def _hugin_sphere(pictures: Sequence[Path], output: Path, field_of_view: float) -> list[list[str]]:
+def _hugin_sphere(images: Sequence[Path], output: Path, field_of_view: float) -> list[list[str]]:
     """The assistant, and the whole of what it has made on the sphere."""
-    generate, assist, stitch = _hugin_automatic(pictures, output, field_of_view)
+    generate, assist, stitch = _hugin_automatic(images, output, field_of_view)
     project = ["pano_modify", "--projection=2", "--fov=AUTO", "--canvas=AUTO", "--crop=AUTO", "-o", "a.pto", "a.pto"]
     return [generate, assist, project, stitch]
 
 
-def _hugin_by_hand(pictures: Sequence[Path], output: Path, field_of_view: float) -> list[list[str]]:
+def _hugin_by_hand(images: Sequence[Path], output: Path, field_of_view: float) -> list[list[str]]:
     """For a flat scene: the true field of view, positions first, then tilts, heights and distortion as well."""
-    others = range(1, len(pictures))
+    others = range(1, len(images))
     plane = ",".join(f"r{i},TrX{i},TrY{i}" for i in others)
     everything = ",".join(["y0,p0,b0", plane, *(f"y{i},p{i},TrZ{i}" for i in others)])
     return [
-        ["pto_gen", "-p", "0", "-f", f"{field_of_view:.3f}", "-o", "a.pto", *map(str, pictures)],
+        ["pto_gen", "-p", "0", "-f", f"{field_of_view:.3f}", "-o", "a.pto", *map(str, images)],
         ["cpfind", "--multirow", "-o", "a.pto", "a.pto"],
         ["cpclean", "-o", "a.pto", "a.pto"],
         ["pto_var", f"--opt={plane}", "-o", "a.pto", "a.pto"],

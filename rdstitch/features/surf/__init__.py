@@ -1,5 +1,5 @@
 """SURF, speeded-up robust features (Bay, Ess, Tuytelaars, Van Gool: CVIU 110, 2008), whose patents have expired.
 
 No OpenCV wheel contains it. ``hessian`` finds blobs (§3 of the paper), ``refinement`` makes them accurate on patches
-of the picture, and ``descriptor`` turns (§4.1) and describes them (§4.2).
+of the image, and ``descriptor`` turns (§4.1) and describes them (§4.2).
 """

@@ -1,6 +1,6 @@
 """Orientation (Bay et al., §4.1) and descriptor (§4.2) of keypoints, and SURF in the steps that all detectors take.
 
-The orientation is the strongest sum of gradients within 60°. Two departures from the paper, which for turned pictures
+The orientation is the strongest sum of gradients within 60°. Two departures from the paper, which for turned images
 bring its error from 6° to 0.6° (median) at no cost: the gradients are derivatives of Gaussians instead of Haar
 wavelets, which are not isotropic; and the window has a smooth edge, so that a gradient near it does not decide by being
 just in or out. The descriptor holds sums of Haar responses in 4 x 4 cells of a patch that is turned by it.
@@ -39,7 +39,7 @@ def orientations(levels: list[Grey], points: FloatArray, scale: FloatArray) -> F
     Parameters
     ----------
     levels : list of ndarray
-        The picture's pyramid.
+        The image's pyramid.
     points : ndarray of shape (N, 2)
         pixels.
     scale : ndarray of shape (N,)
@@ -100,7 +100,7 @@ def describe_patches(
     Parameters
     ----------
     levels : list of ndarray
-        The picture's pyramid.
+        The image's pyramid.
     points : ndarray of shape (N, 2)
         pixels.
     scale : ndarray of shape (N,)
@@ -166,7 +166,7 @@ _RESPONSE_WEIGHTS = _response_weights()
 
 @dataclass(frozen=True, eq=False)
 class SurfDetection:
-    """Blobs of a picture, to be described."""
+    """Blobs of an image, to be described."""
 
     levels: list[Grey]
     blobs: Blobs
@@ -175,7 +175,7 @@ class SurfDetection:
 
     @classmethod
     def find(cls, grey: Grey, options: FeatureOptions) -> Self:
-        """Find the blobs of a picture."""
+        """Find the blobs of an image."""
         blobs = find_blobs(grey, options.surf_threshold, options.surf_octaves, options.surf_layers)
         levels = pyramid(grey, options.surf_octaves + 3)
         if options.surf_refine:
@@ -184,7 +184,7 @@ class SurfDetection:
 
     @property
     def points(self) -> FloatArray:
-        """Places, pixels of the picture, (N, 2)."""
+        """Places, pixels of the image, (N, 2)."""
         return self.blobs.points
 
     @property

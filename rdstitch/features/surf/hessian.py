@@ -1,6 +1,6 @@
 """Blobs: maxima of the determinant of the Hessian over place and scale, by box filters (Bay et al., §3).
 
-Box filters of twice the size, sampled at every second pixel, are the same filters on the picture of half the size.
+Box filters of twice the size, sampled at every second pixel, are the same filters on the image of half the size.
 So an octave of SURF is the first octave on the next level of a pyramid, and needs neither large filters nor code of
 its own.
 """
@@ -27,7 +27,7 @@ _STRIP_ROWS = 48
 
 
 def pyramid(grey: Grey, levels: int) -> list[Grey]:
-    """At most ``levels`` levels, the picture itself first; an odd last row or column is left out of the next."""
+    """At most ``levels`` levels, the image itself first; an odd last row or column is left out of the next."""
     result = [grey]
     while len(result) < levels and min(result[-1].shape) >= 4:
         height, width = result[-1].shape
@@ -37,12 +37,12 @@ def pyramid(grey: Grey, levels: int) -> list[Grey]:
 
 
 def to_level(points: FloatArray, level: int) -> FloatArray:
-    """Pixels of the picture to pixels of a level; (0, 0) is the centre of the first pixel in both."""
+    """Pixels of the image to pixels of a level; (0, 0) is the centre of the first pixel in both."""
     return (points + 0.5) / float(2**level) - 0.5
 
 
 def from_level(points: FloatArray, level: int) -> FloatArray:
-    """Pixels of a level to pixels of the picture."""
+    """Pixels of a level to pixels of the image."""
     return (points + 0.5) * float(2**level) - 0.5
 
 
@@ -84,7 +84,7 @@ def vertex(values: NDArray[np.floating]) -> tuple[FloatArray, NDArray[np.bool_]]
 
 @dataclass(frozen=True, eq=False)
 class Blobs:
-    """Blobs of one picture.
+    """Blobs of one image.
 
     Attributes
     ----------
@@ -130,7 +130,7 @@ def find_blobs(grey: Grey, threshold: float, octaves: int, layers: int) -> Blobs
     threshold : float
         Least determinant of the Hessian, grey levels².
     octaves : int
-        Octaves of scale, each on the picture of half the size of the one before.
+        Octaves of scale, each on the image of half the size of the one before.
     layers : int
         Scales per octave at which there can be blobs; filters grow by 6 pixels from one to the next.
     """

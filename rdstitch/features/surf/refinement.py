@@ -1,6 +1,6 @@
 """Blobs to a fifth of a pixel: the determinant of the Hessian once more, with Gaussians instead of boxes, on patches.
 
-Box filters are not isotropic. When the picture turns by 30° their maxima move by half a pixel (median) and a third of
+Box filters are not isotropic. When the image turns by 30° their maxima move by half a pixel (median) and a third of
 them vanish. So each is confirmed and moved by the derivatives that the boxes stand for, on a few samples around it.
 The paper leaves this out; it costs a tenth of the time and halves the error of the correspondences, and with it λ's.
 
@@ -68,7 +68,7 @@ def sample_patches(
     Parameters
     ----------
     levels : list of ndarray
-        The picture's pyramid.
+        The image's pyramid.
     points : ndarray of shape (N, 2)
         Centres of the grids, pixels.
     spacing : ndarray of shape (N,)
@@ -86,7 +86,7 @@ def sample_patches(
     patches = np.empty((len(points), count, count), np.uint8)
     finest = np.clip(np.floor(np.log2(spacing)), 0, len(levels) - 1).astype(np.intp)
     place = np.arange(count, dtype=np.float32) - np.float32((count - 1) / 2)
-    for level, picture in enumerate(levels):
+    for level, image in enumerate(levels):
         here = np.flatnonzero(finest == level)
         centre = to_level(points[here], level).astype(np.float32)
         step = spacing[here] / 2**level
@@ -100,7 +100,7 @@ def sample_patches(
             map_v = v[part, None, :] + along[part, :, None]
             flat = (len(map_u), count * count)
             values = cv2.remap(
-                picture, map_u.reshape(flat), map_v.reshape(flat), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+                image, map_u.reshape(flat), map_v.reshape(flat), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
             )
             patches[here[part]] = values.reshape(-1, count, count)
     return patches
@@ -112,7 +112,7 @@ def refine(levels: list[Grey], blobs: Blobs) -> Blobs:
     Parameters
     ----------
     levels : list of ndarray
-        The picture's pyramid.
+        The image's pyramid.
 
     Returns
     -------

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rdstitch.alignment import AlignmentOptions, align, most_matches_read
-from rdstitch.alignment.build_result import AdjustedPictures, build_alignment
+from rdstitch.alignment.build_result import AdjustedImages, build_alignment
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import CONTRADICTS, Alignment, PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
@@ -153,7 +153,7 @@ def test_wrong_pairs_are_dropped_by_name(model: str) -> None:
     assert float(np.quantile(_pair_errors(found, given), 0.95)) < 0.3
 
 
-def test_pictures_without_connection_are_named() -> None:
+def test_images_without_connection_are_named() -> None:
     rng = np.random.default_rng(8)
     poses = np.concatenate([grid(3, 2, (0.4, 0.3), 0.2, rng), grid(2, 1, (0.4, 0.3), 0.2, rng), np.zeros((1, 6))])
     poses[6:8, X] += 50.0
@@ -165,7 +165,7 @@ def test_pictures_without_connection_are_named() -> None:
         message.images: message.text for message in explain_unaligned(found, [f"{k}.png" for k in range(9)], [900] * 9)
     }
     assert list(reasons) == [("6.png",), ("7.png",), ("8.png",)]
-    assert reasons["6.png",].startswith("in block 2 of 2, whose 2 pictures overlap with none of the others")
+    assert reasons["6.png",].startswith("in block 2 of 2, whose 2 images overlap with none of the others")
     assert reasons["7.png",] == reasons["6.png",]
     assert "no reliable overlap" in reasons["8.png",]
     blurred = explain_unaligned(found, [f"{k}.png" for k in range(9)], [900] * 8 + [290])
@@ -215,7 +215,7 @@ def test_measured_attitudes_replace_estimated_ones(std: float, model: str) -> No
     assert float(np.quantile(_pair_errors(found, given), 0.95)) < 0.2
 
 
-def test_the_reference_picture_is_the_frame() -> None:
+def test_the_reference_image_is_the_frame() -> None:
     rng = np.random.default_rng(13)
     given = scene(grid(3, 2, (0.4, 0.3), 0.2, rng), rng=rng)
     for model in ("similarity", "homography"):
@@ -227,12 +227,12 @@ def test_the_reference_picture_is_the_frame() -> None:
     np.testing.assert_allclose([rigid.poses.yaw[4], *rigid.poses.position[4], rigid.poses.height[4]], [0, 0, 0, 1])
 
 
-def test_any_picture_can_become_the_frame_after_the_adjustment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_any_image_can_become_the_frame_after_the_adjustment(monkeypatch: pytest.MonkeyPatch) -> None:
     """The adjustment may have held another one, turned and at another height: then the frame is changed."""
     rng = np.random.default_rng(12)
     poses = jittered(grid(3, 2, (0.4, 0.3), 1.2, rng), 0.2, 0.0, rng)
     given = scene(poses, tilt=(0.05, -0.04), rng=rng)
-    adjusted: list[AdjustedPictures] = []
+    adjusted: list[AdjustedImages] = []
     recipe = import_module("rdstitch.alignment.align")  # the package has a function of the module's name
     monkeypatch.setattr(recipe, "build_alignment", adjusted.append)
     _run(given, model="similarity", reference=0)
@@ -245,12 +245,12 @@ def test_any_picture_can_become_the_frame_after_the_adjustment(monkeypatch: pyte
         np.testing.assert_allclose(found.poses.position, expected, atol=0.01)
         np.testing.assert_allclose(found.poses.height, np.exp(poses[:, LOG_HEIGHT]) / height, rtol=0.01)
         assert found.poses.yaw[reference] == 0.0
-        # Where pictures lie to one another stays as it is.
+        # Where images lie to one another stays as it is.
         assert float(np.quantile(_pair_errors(found, given), 0.95)) < 0.3
 
 
 def test_of_links_with_as_many_matches_those_that_overlap_most_are_chained(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By every fifth picture, neighbours would be joined far away only, after all that the chains have drifted."""
+    """By every fifth image, neighbours would be joined far away only, after all that the chains have drifted."""
     module, trees = import_module("rdstitch.alignment.adjustment_problem"), []
 
     def noted(*given: object) -> SpanningTree:
@@ -294,9 +294,9 @@ def test_many_links_are_read_in_part_and_those_of_a_short_turn_whole() -> None:
 def test_mistakes_of_the_caller() -> None:
     rng = np.random.default_rng(15)
     given = scene(grid(2, 1, (0.4, 0.3), 0.2, rng), rng=rng)
-    with pytest.raises(RegistrationError, match="no two pictures overlap"):
+    with pytest.raises(RegistrationError, match="no two images overlap"):
         align(given.cameras, [])
-    with pytest.raises(ArgumentError, match="same pictures"):
+    with pytest.raises(ArgumentError, match="same images"):
         align(given.cameras, [given.links[0], given.links[0]])
     with pytest.raises(ArgumentError, match="none of the 1"):
         align(given.cameras[:1], given.links)
@@ -309,7 +309,7 @@ def test_mistakes_of_the_caller() -> None:
         replace(given.links[0], relation=failed)
 
 
-def test_a_picture_that_contradicts_the_others_names_them() -> None:
+def test_an_image_that_contradicts_the_others_names_them() -> None:
     rng = np.random.default_rng(11)
     found = _run(scene(grid(2, 1, (0.4, 0.3), 0.2, rng), rng=rng))
     contradicting = replace(found.links[0], image1=0, image2=2, used=False, reason=CONTRADICTS)
@@ -322,7 +322,7 @@ def test_a_picture_that_contradicts_the_others_names_them() -> None:
 
 
 def test_small_tilts_do_not_ask_for_a_short_focal_length() -> None:
-    """Pictures show tilts divided by the focal length, and hardly show that itself over rough ground."""
+    """Images show tilts divided by the focal length, and hardly show that itself over rough ground."""
     rng = np.random.default_rng(3)
     poses = jittered(grid(12, 1, (0.35, 0.1), 0.1, rng), 0.05, math.radians(1.5), rng)
     given = scene(poses, noise=0.5, per_link=60, relief=0.02, reach=2, focal_source=None, rng=rng)

@@ -62,7 +62,7 @@ def test_a_link_far_worse_than_the_others_misfits() -> None:
     ],
 )
 def test_a_link_is_suspected_by_what_its_covariance_allows(shift: float, noise: float, suspected: bool) -> None:
-    """One of the links of three by three pictures is off by a share of the half diagonal."""
+    """One of the links of three by three images is off by a share of the half diagonal."""
     rng = np.random.default_rng(4)
     given = scene(grid(3, 3, (0.3, 0.25), 0.1, rng), noise=noise, outliers=0.0, per_link=40, rng=rng)
     wrong = next(k for k, link in enumerate(given.links) if (link.image1, link.image2) == (3, 4))
@@ -75,7 +75,7 @@ def test_a_link_is_suspected_by_what_its_covariance_allows(shift: float, noise: 
 
 
 def test_pairs_that_show_a_vehicle_only_are_suspected_though_they_open_most_triangles() -> None:
-    """Six pictures in a row; those far apart have only in common what drives ahead."""
+    """Six images in a row; those far apart have only in common what drives ahead."""
     rng = np.random.default_rng(12)
     path = grid(6, 1, (0.45, 0.0), 0.1, rng)
     swaying = 0.15 * path + rng.normal(0.0, 0.04, path.shape) * (np.arange(6) == Y)
@@ -89,7 +89,7 @@ def test_pairs_that_show_a_vehicle_only_are_suspected_though_they_open_most_tria
 
 
 def _judged(given: Scene, links: list[Link]) -> tuple[BoolArray, NDArray[np.intp]]:
-    """What :func:`cycle_consistency` says of links between the pictures of a scene."""
+    """What :func:`cycle_consistency` says of links between the images of a scene."""
     observations = Observations.from_links(links, given.cameras)
     lens = np.zeros(len(LENS_PARAMETERS))
     lens[0] = given.distortion

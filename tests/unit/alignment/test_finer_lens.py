@@ -1,4 +1,4 @@
-"""The third coefficient of a lens: where all pictures together may show it, and nowhere else."""
+"""The third coefficient of a lens: where all images together may show it, and nowhere else."""
 
 import importlib
 from dataclasses import replace
@@ -16,7 +16,7 @@ from tests.lens_scenes import FISHEYE, SIZE, aligned, lens_distance, lens_scene
 align_module = importlib.import_module("rdstitch.alignment.align")
 
 
-def test_all_pictures_together_show_a_third_coefficient_that_pairs_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_images_together_show_a_third_coefficient_that_pairs_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
     given = lens_scene(replace(FISHEYE, distortion2=-0.03, distortion3=-0.03), 0)
     chosen = []
 

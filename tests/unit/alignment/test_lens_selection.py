@@ -1,4 +1,4 @@
-"""The ladder of lenses: as simple as the pictures allow, and never taken in by relief."""
+"""The ladder of lenses: as simple as the images allow, and never taken in by relief."""
 
 import importlib
 import re
@@ -89,7 +89,7 @@ def test_a_pair_says_whether_it_shows_the_lens() -> None:
         found = aligned(given)
         assert found.lens == "division"
         reasons.append(found.lens_reason)
-        messages.append([message for message in found.messages if message.code == "few-pictures"])
+        messages.append([message for message in found.messages if message.code == "few-images"])
     assert "whether μ is needed" not in reasons[0]
     assert "whether μ is needed, with which corners would lie" in reasons[1]
     assert not messages[0]
@@ -99,13 +99,13 @@ def test_a_pair_says_whether_it_shows_the_lens() -> None:
     assert float(off[1]) > 0.5
 
 
-def test_four_pictures_are_not_few() -> None:
+def test_four_images_are_not_few() -> None:
     rng = np.random.default_rng(0)
     poses = grid(2, 2, (0.5, 0.35), 0.5, rng)
     given = scene(poses, lens=Camera(SIZE, -0.25), rng=rng, noise=1.0, focal=420.0, per_link=40)
     found = aligned(given, lens="division3")
     assert radius_std(found.cameras[0], np.linspace(0.05, 1.0, 20))[-1] > 0.5
-    assert "few-pictures" not in [message.code for message in found.messages]
+    assert "few-images" not in [message.code for message in found.messages]
 
 
 def test_a_given_lens_is_not_doubted() -> None:
@@ -133,7 +133,7 @@ def test_nothing_runs_away_where_there_are_no_matches() -> None:
         if kept.sum() >= 30:
             links.append(replace(link, points1=link.points1[kept], points2=link.points2[kept]))
     found = aligned(replace(given, links=links), lens="division3")
-    camera = found.cameras[0]  # which could not be made if the lens folded the picture
+    camera = found.cameras[0]  # which could not be made if the lens folded the image
     assert found.lens == "division3"
     assert np.abs(np.array(camera.coefficients) - (-0.25, 0.0, 0.0)).max() < 0.3
     # The stated uncertainty covers what is not seen: the error at the corner is within it.
@@ -157,8 +157,8 @@ def test_a_pair_keeps_the_centre_in_the_middle_and_says_so() -> None:
     found = aligned(given)
     assert found.lens in ("division2", "division3")
     assert found.cameras[0].center == (319.5, 239.5)
-    assert "too few pictures to find the distortion centre" in found.lens_reason
-    assert "distortion centre: the middle of the picture" in described(found)
+    assert "too few images to find the distortion centre" in found.lens_reason
+    assert "distortion centre: the middle of the image" in described(found)
 
 
 def test_a_known_lens_is_kept_whole() -> None:
@@ -214,7 +214,7 @@ def _gains(total: float, spread: float) -> FloatArray:
         (3.0, 4.6, 2, "division2", False),  # 0.9
     ],
 )
-def test_a_richer_lens_must_gain_all_over_the_pictures(
+def test_a_richer_lens_must_gain_all_over_the_images(
     total: float, spread: float, added: int, simpler: str, preferred: bool
 ) -> None:
     judge = _Judge(NOISE, SEEN.link)
@@ -300,7 +300,7 @@ def test_a_lens_with_more_freed_is_the_next_that_has_it_all(freed: list[int], na
 
 
 @pytest.mark.parametrize(
-    ("pictures", "names", "fitted", "chosen"),
+    ("images", "names", "fitted", "chosen"),
     [
         (6, ["division", "division-center"], [[3, 4]], "division-center"),
         (6, ["division-center", "division2"], [[3, 4], [1, 3, 4]], "division-center"),
@@ -310,10 +310,10 @@ def test_a_lens_with_more_freed_is_the_next_that_has_it_all(freed: list[int], na
     ],
 )
 def test_each_lens_is_tried_from_the_simpler_one(
-    monkeypatch: pytest.MonkeyPatch, pictures: int, names: list[str], fitted: list[list[int]], chosen: str
+    monkeypatch: pytest.MonkeyPatch, images: int, names: list[str], fitted: list[list[int]], chosen: str
 ) -> None:
-    """The first is at hand where it is λ alone; of less than four pictures the centre stays in the middle."""
-    seen = observations(independent_errors(links=9 if pictures == 6 else 3), pictures)
+    """The first is at hand where it is λ alone; of less than four images the centre stays in the middle."""
+    seen = observations(independent_errors(links=9 if images == 6 else 3), images)
     good, bad = (adjusted(seen, np.full(len(seen.points1), value)) for value in (0.2, 9.0))
     starts: list[object] = []
     frees: list[list[int]] = []
@@ -334,7 +334,7 @@ def test_each_lens_is_tried_from_the_simpler_one(
     assert all(start is good.homographies for start in starts[1:])
     assert found.name == chosen
     assert (found.apart is bad) is (chosen == "division")
-    assert ("too few pictures" in found.reason) is (pictures == 3 and len(names) > 1)
+    assert ("too few images" in found.reason) is (images == 3 and len(names) > 1)
 
 
 def test_a_lens_that_is_given_is_not_chosen() -> None:

@@ -61,7 +61,7 @@ def test_changes_are_the_derivatives_of_the_errors(model: MotionModel) -> None:
 
 @pytest.mark.parametrize("model", ["similarity", "tilting"])
 def test_steps_are_what_adjusting_anew_finds(model: str) -> None:
-    """The points of picture 2 are moved by waves as large as the noise."""
+    """The points of image 2 are moved by waves as large as the noise."""
     adjuster, adjusted = _adjusted(PLANAR_MODELS[model])
     response, observations = LinearResponse.of(adjuster, adjusted), adjuster.observations
     wave = 0.3 * np.stack([np.sin(9.0 * observations.points2[:, 1]), np.cos(7.0 * observations.points2[:, 0])], axis=1)

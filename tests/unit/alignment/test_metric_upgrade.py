@@ -11,7 +11,7 @@ _FOCAL = 1.3  # half diagonals
 
 
 def _homographies(count: int) -> np.ndarray:
-    """Plane-to-picture homographies of tilted cameras over a plane, in a projective frame of it."""
+    """Plane-to-image homographies of tilted cameras over a plane, in a projective frame of it."""
     rng = np.random.default_rng(3)
     poses = np.zeros((count, 6))
     poses[:, :3] = rng.normal(0.0, 1.0, (count, 3))
@@ -20,8 +20,8 @@ def _homographies(count: int) -> np.ndarray:
     return POSE.matrices(poses, shared).matrices
 
 
-def test_memory_does_not_grow_with_pictures_times_tilts() -> None:
-    """All tilts of 2,000 pictures at once took 0.5 GB."""
+def test_memory_does_not_grow_with_images_times_tilts() -> None:
+    """All tilts of 2,000 images at once took 0.5 GB."""
     homographies = _homographies(2000)
     tracemalloc.start()
     try:
@@ -31,8 +31,8 @@ def test_memory_does_not_grow_with_pictures_times_tilts() -> None:
         tracemalloc.stop()
 
 
-def test_blocks_find_what_few_pictures_find() -> None:
-    """Pictures enough for many blocks of tilts, of the same poses as those that need one."""
+def test_blocks_find_what_few_images_find() -> None:
+    """Images enough for many blocks of tilts, of the same poses as those that need one."""
     few = _homographies(30)
     one, many = (metric_upgrade(own, 0, np.log(_FOCAL), 0.3) for own in (few, np.tile(few, (60, 1, 1))))
     np.testing.assert_allclose(many.poses[:30] - many.poses[0], one.poses - one.poses[0], atol=1e-9)

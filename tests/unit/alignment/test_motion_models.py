@@ -66,7 +66,7 @@ def test_natural_parameters_and_their_derivatives(model: MotionModel) -> None:
         np.testing.assert_allclose(model.physical_parameters(shared)[1][:, k], numeric, atol=1e-9)
 
 
-def test_two_pictures_are_related_by_the_planar_motion_between_them() -> None:
+def test_two_images_are_related_by_the_planar_motion_between_them() -> None:
     tilt, focal = (0.1, -0.05), 1.3
     motion = PlanarMotion(tilt, 0.4, (0.3, -0.2), 1.2)
     shared = SIMILARITY.shared_from_physical(np.array([*tilt, np.log(focal)]))

@@ -16,7 +16,7 @@ def test_the_noise_is_the_scatter_and_what_no_model_is_exact_to() -> None:
     found = NoiseModel.of_errors(seen, errors.reshape(-1, 2))
     assert found.noise == pytest.approx(math.hypot(0.5, EXACTNESS), rel=0.03)
     assert found.counted.all()
-    # Nine links of six pictures measure each point about twice; the errors themselves are independent.
+    # Nine links of six images measure each point about twice; the errors themselves are independent.
     assert found.overdispersion == pytest.approx(9 / 5, rel=0.35)
     assert found.effective == pytest.approx(2.0 * 540 / found.overdispersion, rel=0.02)
     assert found.price == pytest.approx(math.log(found.effective))

@@ -1,4 +1,4 @@
-"""What the agreement of neighbouring residuals says of the scene, whatever the size of the pictures."""
+"""What the agreement of neighbouring residuals says of the scene, whatever the size of the images."""
 
 from dataclasses import replace
 
@@ -61,7 +61,7 @@ def test_the_overdispersion_is_that_of_sums_over_cells() -> None:
     seen, _ = _residuals(1.0, 1.0)
     alike = np.repeat(np.random.default_rng(1).normal(size=(8, 2)), 100, axis=0)
     assert coherence(seen, alike, ALL).overdispersion == pytest.approx(25.0, rel=0.02)
-    # Every link counts the points of its pictures again: 8 links of 5 pictures.
+    # Every link counts the points of its images again: 8 links of 5 images.
     again = replace(seen, image1=np.array([0, 1, 2, 3, 0, 1, 2, 0]), image2=np.array([1, 2, 3, 4, 2, 3, 4, 3]))
     assert coherence(again, alike, ALL).overdispersion == pytest.approx(25.0 * 8 / 4, rel=0.02)
 

@@ -1,4 +1,4 @@
-"""Positions hold a chain over rough ground in shape where the pictures agree with them, and do nothing elsewhere."""
+"""Positions hold a chain over rough ground in shape where the images agree with them, and do nothing elsewhere."""
 
 from functools import cache
 
@@ -15,7 +15,7 @@ _HEIGHT = 300.0
 
 @cache
 def _strip(relief: float) -> Scene:
-    """Of 30 pictures: a shorter one keeps its shape without positions."""
+    """Of 30 images: a shorter one keeps its shape without positions."""
     rng = np.random.default_rng(1)
     return scene(grid(30, 1, (0.4, 0.1), 0.1, rng), per_link=50, relief=relief, rng=rng, focal_source="exif", reach=2)
 
@@ -38,7 +38,7 @@ def _without(relief: float) -> Alignment:
 
 
 def _bend(found: Alignment, given: Scene) -> float:
-    """Largest distance of a picture from its place after a similarity, in lengths of the strip."""
+    """Largest distance of an image from its place after a similarity, in lengths of the strip."""
     assert found.poses is not None
     a, b = (places @ [1.0, 1.0j] for places in (found.poses.position, given.poses[:, [X, Y]]))
     a, b = a - a.mean(), b - b.mean()
@@ -53,7 +53,7 @@ def test_positions_hold_a_strip_over_hills_in_shape() -> None:
     assert held.messages == ()
 
 
-def test_some_pictures_without_a_position_and_two_far_off_do_no_harm() -> None:
+def test_some_images_without_a_position_and_two_far_off_do_no_harm() -> None:
     given = _strip(0.15)
     positions = _positions(given, 2.0)
     positions[[3, 7, 8]] = np.nan
@@ -62,14 +62,14 @@ def test_some_pictures_without_a_position_and_two_far_off_do_no_harm() -> None:
     assert _bend(_aligned(given, positions), given) < 0.6 * _bend(_without(0.15), given)
 
 
-def test_over_a_plane_positions_change_nothing_that_the_pictures_know() -> None:
+def test_over_a_plane_positions_change_nothing_that_the_images_know() -> None:
     given = _strip(0.0)
     without, held = _without(0.0), _aligned(given, _positions(given, 3.0))
     assert abs(held.distortion - without.distortion) < 0.2 * without.distortion_std
     assert _bend(held, given) < _bend(without, given) + 0.001
 
 
-def test_positions_that_the_pictures_contradict_are_not_used_and_named() -> None:
+def test_positions_that_the_images_contradict_are_not_used_and_named() -> None:
     given = _strip(0.0)
     positions = np.random.default_rng(3).permutation(_positions(given, 2.0))
     without, ignored = _without(0.0), _aligned(given, positions)

@@ -1,4 +1,4 @@
-"""The picture in whose frame all others lie before the camera."""
+"""The image in whose frame all others lie before the camera."""
 
 from dataclasses import replace
 
@@ -10,15 +10,15 @@ from rdstitch.alignment.reference_frame import frontal_reference, in_frame_of
 from tests.alignment_scenes import scene
 
 
-def test_an_oblique_reference_gives_way_to_one_whose_horizon_no_picture_crosses() -> None:
+def test_an_oblique_reference_gives_way_to_one_whose_horizon_no_image_crosses() -> None:
     rng = np.random.default_rng(4)
     poses = np.zeros((3, 6))
     poses[:, X] = (0.0, 0.3, 0.6)
     given = scene(poses, rng=rng)
     found = align(given.cameras, given.links, AlignmentOptions(model="homography", reference=0))
     poses[0, PSI] = 1.1
-    to_pictures = POSE.matrices(poses, POSE.shared_from_physical(np.array([0.0, 0.0, 0.26]))).matrices
-    tilted = replace(found, homographies=np.asarray(np.linalg.inv(to_pictures), dtype=np.float64))
+    to_images = POSE.matrices(poses, POSE.shared_from_physical(np.array([0.0, 0.0, 0.26]))).matrices
+    tilted = replace(found, homographies=np.asarray(np.linalg.inv(to_images), dtype=np.float64))
     oblique = in_frame_of(tilted, 0)
     assert frontal_reference(oblique) in (1, 2)
     frontal = in_frame_of(oblique, 1)

@@ -54,7 +54,7 @@ def test_over_a_plane_nothing_changes() -> None:
     assert choose_over_relief(problem, choice, ["similarity", "tilting"]) is choice
 
 
-def test_of_two_pictures_tilts_do_what_heights_do() -> None:
+def test_of_two_images_tilts_do_what_heights_do() -> None:
     given = _scene(0.08)
     pair = replace(given, cameras=given.cameras[:2], links=[k for k in given.links if max(k.image1, k.image2) == 1])
     problem, fit = _fitted(pair)
@@ -72,7 +72,7 @@ def test_heights_are_found_as_they_scatter() -> None:
     o = problem.observations
     moved = np.linalg.norm(relief, axis=1) * noise
     baseline = np.linalg.norm((o.points2 - o.points1) * o.scale1[o.link, None], axis=1)
-    # Of pictures that hardly turn, a place as high as the amplitude moves by that share of how far it moves anyway.
+    # Of images that hardly turn, a place as high as the amplitude moves by that share of how far it moves anyway.
     assert 0.02 < np.median(moved / baseline) < 0.08
     assert 0.25 < noise < 0.6
 

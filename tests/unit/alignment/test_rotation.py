@@ -15,7 +15,7 @@ LENS = Camera((640, 480), -0.2, focal=554.0, focal_source="guess")
 
 
 def _links(rotations: np.ndarray, rng: np.random.Generator, noise: float = 0.2, count: int = 120) -> list[Link]:
-    """Matches between all pictures that overlap, with their true homographies."""
+    """Matches between all images that overlap, with their true homographies."""
     assert LENS.focal is not None
     focal = LENS.focal / LENS.half_diagonal
     k = np.diag([focal, focal, 1.0])
@@ -79,7 +79,7 @@ def test_the_horizon_is_level_whatever_the_frame(pitch: float) -> None:
     assert middle.max() == pytest.approx(65.0, abs=1e-6)
 
 
-def test_pictures_taken_with_the_camera_on_its_side_do_not_tip_the_horizon() -> None:
+def test_images_taken_with_the_camera_on_its_side_do_not_tip_the_horizon() -> None:
     heading, roll = np.radians(np.arange(6) * 25.0), np.radians([2.0, -1.0, 91.0, -2.0, -89.0, 1.0])
     rotations = camera_rotations(heading, 0.1, roll)
     down = (rotations @ level_frame(rotations, 0).T)[:, :, 1]
@@ -87,7 +87,7 @@ def test_pictures_taken_with_the_camera_on_its_side_do_not_tip_the_horizon() -> 
     np.testing.assert_allclose(np.degrees(np.arctan2(down[:, 0], down[:, 1])), np.degrees(roll), atol=2.0)
 
 
-def test_a_full_turn_has_the_reference_picture_ahead() -> None:
+def test_a_full_turn_has_the_reference_image_ahead() -> None:
     rotations = camera_rotations(np.arange(12) * np.pi / 6)
     ahead = (rotations @ level_frame(rotations, 5).T)[5, 2]
     np.testing.assert_allclose(ahead, (0.0, 0.0, 1.0), atol=1e-9)

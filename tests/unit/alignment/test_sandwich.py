@@ -20,13 +20,13 @@ from tests.lens_scenes import SIZE, aligned, lens_scene
 
 LENS, NOISE = Camera((640, 480), distortion=-0.2), 0.4
 KNOWN = (Prior(), Prior(), Prior(((1.0, float(np.log(1.3)), 0.01),)))
-"""The inverse variance of the focal length's logarithm: pictures from straight above do not show it."""
+"""The inverse variance of the focal length's logarithm: images from straight above do not show it."""
 
 PAIRS = [(i, j) for i in range(6) for j in range(i + 1, 6)]
 
 
 def _keypoints(matrices: FloatArray, ground: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, BoolArray]:
-    """Measured points (N, P, 2), half diagonals, and which of them (N, P) a picture sees."""
+    """Measured points (N, P, 2), half diagonals, and which of them (N, P) an image sees."""
     seen = np.stack([project(np.column_stack([ground, np.ones(len(ground))]) @ matrix.T) for matrix in matrices])
     pixels = LENS.distort(LENS.denormalize(seen.reshape(-1, 2))).reshape(seen.shape)
     inside = ((pixels >= 0.0) & (pixels <= np.array(LENS.image_size) - 1.0)).all(axis=2)
@@ -68,7 +68,7 @@ def _miss(seed: int, shared_keypoints: bool) -> float:
 
 @pytest.mark.parametrize("shared_keypoints", [False, True])
 def test_the_deviation_is_the_scatter(shared_keypoints: bool) -> None:
-    """15 pairs of 6 pictures, whose keypoints are all shared, or none of which is."""
+    """15 pairs of 6 images, whose keypoints are all shared, or none of which is."""
     misses = np.array([_miss(seed, shared_keypoints) for seed in range(40)])
     assert 0.68 < np.sqrt(np.mean(misses**2)) < 1.2
 
@@ -87,7 +87,7 @@ def test_the_stated_deviation_covers_relief(relief: float) -> None:
 
 
 @pytest.mark.slow
-def test_the_stated_deviation_covers_what_two_pictures_do_not_show() -> None:
+def test_the_stated_deviation_covers_what_two_images_do_not_show() -> None:
     """Two hardly show an axis off the middle: a tilt and a change of height stand for it, and λ is off."""
     lens = Camera(SIZE, -0.25, center=(333.0, 233.0))
     found = [aligned(lens_scene(lens, seed, columns=2, rows=1)) for seed in range(10)]
@@ -98,7 +98,7 @@ def test_the_stated_deviation_covers_what_two_pictures_do_not_show() -> None:
 
 
 def test_a_focal_length_that_no_lens_has_makes_the_lens_less_certain() -> None:
-    """Something else bends the pictures; what λ would be with a usual focal length is counted."""
+    """Something else bends the images; what λ would be with a usual focal length is counted."""
     poses = grid(3, 2, (0.06, 0.045), 0.2, np.random.default_rng(0))
     std = {}
     for source in ("option", "guess"):

@@ -23,7 +23,7 @@ def _aligned(row: Scene, **options: object) -> Alignment:
 
 
 def _sheared(row: Scene, amount: float) -> Scene:
-    """The rows of the pictures read one after another, while the camera moves across them."""
+    """The rows of the images read one after another, while the camera moves across them."""
 
     def shear(points: FloatArray) -> FloatArray:
         moved: FloatArray = points + amount * (points[:, 1:] - row.cameras[0].center[1]) * np.array([0.0, 1.0])
@@ -49,7 +49,7 @@ def test_a_rolling_shutter_is_shown_and_named() -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 6, 7])
-def test_pictures_cropped_each_elsewhere_are_doubted(seed: int) -> None:
+def test_images_cropped_each_elsewhere_are_doubted(seed: int) -> None:
     """None of the effects that are tried, but some of them grow with it."""
     rng = np.random.default_rng(seed)
     row = scene(grid(5, 1, (0.45, 0.0), 0.1, rng), rng=rng, reach=1, overlap=0.1, outliers=0.0, noise=0.2)
@@ -64,7 +64,7 @@ def test_pictures_cropped_each_elsewhere_are_doubted(seed: int) -> None:
     assert found.shown
 
 
-def test_an_off_center_lens_is_found_in_three_pictures_or_shown() -> None:
+def test_an_off_center_lens_is_found_in_three_images_or_shown() -> None:
     size = (640, 480)
     lens = Camera(size, distortion=-0.25, center=(319.5 + 48.0, 239.5 + 30.0))
     row = _row(4, lens=lens)
@@ -78,7 +78,7 @@ def test_an_off_center_lens_is_found_in_three_pictures_or_shown() -> None:
     assert "axis is off the middle" in held.cause
 
 
-def test_what_the_pictures_cannot_exclude_is_said() -> None:
+def test_what_the_images_cannot_exclude_is_said() -> None:
     """Of a long row with few matches nobody knows whether it is bent."""
     rng = np.random.default_rng(3)
     poses = grid(14, 1, (0.85, 0.0), 0.02, rng)

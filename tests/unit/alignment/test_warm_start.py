@@ -64,7 +64,7 @@ def test_more_links_give_what_they_give_without_the_earlier_alignment(
 
 
 def _misplaced(former: Alignment) -> Alignment:
-    """One picture lies a tenth of the height elsewhere."""
+    """One image lies a tenth of the height elsewhere."""
     assert former.poses is not None
     position = former.poses.position.copy()
     position[5] += 0.1

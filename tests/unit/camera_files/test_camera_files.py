@@ -31,7 +31,7 @@ CAMERAS = [
 
 
 def _points(camera: Camera) -> FloatArray:
-    """Measured px all over the picture."""
+    """Measured px all over the image."""
     width, height = camera.image_size
     u, v = np.meshgrid(np.linspace(0, width - 1, 23), np.linspace(0, height - 1, 17))
     return np.column_stack([u.ravel(), v.ravel()])
@@ -445,7 +445,7 @@ def test_the_methods_of_a_camera_fail_as_the_functions_do(tmp_path: Path) -> Non
 def _opencv_file(
     path: Path, focal: tuple[float, float], coefficients: list[float], size: tuple[int, int] | None, mark: str = ""
 ) -> Path:
-    """What somebody else's script writes, for pictures of 1280 x 960 pixels."""
+    """What somebody else's script writes, for images of 1280 x 960 pixels."""
     (fx, fy), count = focal, len(coefficients)
     sides = "" if size is None else f"image_width: {size[0]}\nimage_height: {size[1]}\n"
     path.write_text(
@@ -495,10 +495,10 @@ def test_pixels_that_are_no_squares_are_named_as_the_cause(tmp_path: Path) -> No
     assert usual.cause == ""
 
 
-def test_a_file_without_a_size_takes_that_of_the_pictures(tmp_path: Path) -> None:
+def test_a_file_without_a_size_takes_that_of_the_images(tmp_path: Path) -> None:
     file = _opencv_file(tmp_path / "c.yml", (900.0, 900.0), [-0.2, 0.05, 0.0, 0.0, 0.0], None)
     with pytest.raises(InputError, match="image_width"):
         load_camera(file)
     assert load_camera(file, image_size=(1280, 960)).image_size == (1280, 960)
-    with pytest.raises(InputError, match=r"principal point 641, 478 is not that of pictures of 640 x 480"):
+    with pytest.raises(InputError, match=r"principal point 641, 478 is not that of images of 640 x 480"):
         load_camera(file, image_size=(640, 480))

@@ -30,21 +30,21 @@ def scene() -> Scene:
 )
 def test_blocks_give_the_same_bytes(scene: Scene, tmp_path: Path, blend: Any, seam: Any, crop: Any) -> None:
     options = CompositeOptions(blend=blend, seam=seam, crop=crop, tile_size=256)
-    store, computed, pictures = Cache.at(tmp_path), [], []
+    store, computed, images = Cache.at(tmp_path), [], []
 
     def elsewhere(blocks: Iterable[Block]) -> Generator[list[Stored[BlockStrip]]]:
         for block in blocks:
             # As a worker in another process has it.
             copy = pickle.loads(pickle.dumps(block))
             computed.append(copy.tiles.box)
-            pictures.append(copy.pictures)
+            images.append(copy.images)
             yield copy.compute(store)
 
-    here = compose(scene.pictures, scene.canvas, options)
+    here = compose(scene.images, scene.canvas, options)
     shares: list[float] = []
-    there = compose(scene.pictures, scene.canvas, options, shares.append, elsewhere)
+    there = compose(scene.images, scene.canvas, options, shares.append, elsewhere)
     assert len(computed) > 1
-    assert min(map(len, pictures)) < len(scene.frames)
+    assert min(map(len, images)) < len(scene.frames)
     np.testing.assert_array_equal(there.pixels, here.pixels)
     np.testing.assert_array_equal(there.alpha, here.alpha)
     assert shares == sorted(shares)

@@ -14,7 +14,7 @@ def _shift(x: float, y: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float6
     return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
 
 
-def test_one_flat_picture_is_its_own_canvas() -> None:
+def test_one_flat_image_is_its_own_canvas() -> None:
     canvas = plan_canvas([FLAT], np.eye(3)[None])
     assert canvas.size == (400, 300)
     # Plane coordinates of the top-left px go to (0, 0).

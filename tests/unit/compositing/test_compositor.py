@@ -15,22 +15,22 @@ from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, OutputFile, compose, compose_to_file, plan_canvas
 from rdstitch.compositing.crop import largest_rectangle
 from rdstitch.compositing.options import ExposureMethod
-from rdstitch.compositing.placed_picture import PictureLoader, place_pictures
+from rdstitch.compositing.placed_image import ImageLoader, place_images
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.errors import ArgumentError, InputError, LimitError
 from rdstitch.io import Metadata, read_image
 from rdstitch.synthetic.rendering import Photometry
-from tests.compositing_scenes import Scene, as_picture, gradient, grey, inner, render
+from tests.compositing_scenes import Scene, as_image, gradient, grey, inner, render
 from tests.sampled import sampled
 
 
 def _compose(scene: Scene, **options: Any) -> Any:
-    return compose(scene.pictures, scene.canvas, CompositeOptions(**options))
+    return compose(scene.images, scene.canvas, CompositeOptions(**options))
 
 
 def _seams(scene: Scene, options: CompositeOptions) -> NDArray[np.bool_]:
     """Px within two of a seam."""
-    with prepare_composite(scene.pictures, scene.canvas, options) as ready:
+    with prepare_composite(scene.images, scene.canvas, options) as ready:
         seams = ready.renderer.seams
     assert seams is not None
     box = (0, 0, *scene.canvas.size)
@@ -69,7 +69,7 @@ def test_unequal_light_leaves_no_visible_seam(gamma: float, seed: int, exposure:
     assert np.std(estimated - np.log(gains) / gamma) < 0.03
 
 
-# A strip that gets darker from picture to picture, as automatic exposure leaves it over ground that gets brighter.
+# A strip that gets darker from image to image, as automatic exposure leaves it over ground that gets brighter.
 DRIFT = np.exp(np.linspace(0.8, -0.8, 6) / 2.2)
 
 
@@ -77,7 +77,7 @@ def _white(pixels: NDArray[Any]) -> float:
     return float((pixels.max(axis=-1) == 255).mean())
 
 
-def test_brightness_stays_near_that_of_the_pictures() -> None:
+def test_brightness_stays_near_that_of_the_images() -> None:
     """Ground that gets brighter from left to right, and a camera whose automatic exposure makes up for that."""
     scene = render(6, 1, size=(300, 220), seed=6)
     v, u = np.mgrid[:220, :300]
@@ -86,12 +86,12 @@ def test_brightness_stays_near_that_of_the_pictures() -> None:
         along = scene.rendering.to_plane(k, np.stack([u, v], axis=-1))[..., 0] - scene.rendering.poses.position[k, 0]
         brighter = np.exp(1.6 * along / scene.rendering.texture.size[0])[..., None]
         frames.append(np.clip(np.rint(frame * brighter), 0, 255).astype(np.uint8))
-    sources: list[PictureLoader] = [partial(as_picture, frame) for frame in frames]
+    sources: list[ImageLoader] = [partial(as_image, frame) for frame in frames]
     white, middle = {}, {}
     choices: tuple[ExposureMethod, ...] = ("gain", "balanced")
     for choice in choices:
         options = CompositeOptions(exposure=choice)
-        result = compose(place_pictures(sources, scene.cameras, scene.homographies), scene.canvas, options)
+        result = compose(place_images(sources, scene.cameras, scene.homographies), scene.canvas, options)
         lit = result.pixels[result.alpha > 0]
         white[choice], middle[choice] = _white(lit), float(np.median(lit))
     inputs = np.concatenate([frame.reshape(-1, 3) for frame in frames])
@@ -103,18 +103,18 @@ def test_brightness_stays_near_that_of_the_pictures() -> None:
 def test_brightness_that_drifts_becomes_a_slope_without_steps() -> None:
     scene = render(6, 1, size=(300, 220), seed=6)
     grey_wall = [np.full_like(frame, round(110 * gain)) for frame, gain in zip(scene.frames, DRIFT, strict=True)]
-    sources: list[PictureLoader] = [partial(as_picture, frame) for frame in grey_wall]
+    sources: list[ImageLoader] = [partial(as_image, frame) for frame in grey_wall]
     row = {}
     choices: tuple[ExposureMethod, ...] = ("none", "gain", "balanced")
     for choice in choices:
         options = CompositeOptions(exposure=choice, blend="none")
-        result = compose(place_pictures(sources, scene.cameras, scene.homographies), scene.canvas, options)
+        result = compose(place_images(sources, scene.cameras, scene.homographies), scene.canvas, options)
         row[choice] = result.pixels[result.pixels.shape[0] // 2, 30:-30, 0].astype(int)
     largest = {choice: np.abs(np.diff(values)).max() for choice, values in row.items()}
     assert largest["none"] > 12
     assert largest["balanced"] <= 2
     assert largest["gain"] <= 2
-    # Its ends are nearly as bright as those of the pictures, the whole no brighter than before.
+    # Its ends are nearly as bright as those of the images, the whole no brighter than before.
     own, even, mine = (np.log(values[0] / values[-1]) for values in row.values())
     assert abs(even) < 0.1 * own
     assert mine > 0.6 * own
@@ -122,17 +122,17 @@ def test_brightness_that_drifts_becomes_a_slope_without_steps() -> None:
 
 
 def test_a_clipped_sky_ends_in_no_step() -> None:
-    """The brighter picture is burnt out where the other is not; beside the seam the two are equally bright."""
+    """The brighter image is burnt out where the other is not; beside the seam the two are equally bright."""
     light = Photometry(gain=np.array([1.8, 1.0]), gamma=2.2)
     scene = render(2, 1, size=(320, 240), overlap=0.6, photometry=light, seed=8)
     sky = [frame.copy() for frame in scene.frames]
     sky[0][:100], sky[1][:100] = 255, 240
-    sources: list[PictureLoader] = [partial(as_picture, frame) for frame in sky]
+    sources: list[ImageLoader] = [partial(as_image, frame) for frame in sky]
     steps = {}
     choices: tuple[ExposureMethod, ...] = ("gain", "balanced")
     for choice in choices:
         options = CompositeOptions(exposure=choice, blend="none", seam="voronoi")
-        result = compose(place_pictures(sources, scene.cameras, scene.homographies), scene.canvas, options)
+        result = compose(place_images(sources, scene.cameras, scene.homographies), scene.canvas, options)
         row = grey(result.pixels)[60, 40:-40]
         steps[choice] = float(np.abs(np.diff(row)).max())
     assert steps["gain"] > 0.1
@@ -147,7 +147,7 @@ def test_vignetting_is_found() -> None:
     np.testing.assert_allclose(estimate, 1 - 0.4 * radius2, atol=0.03)
 
 
-def test_equal_pictures_are_not_touched() -> None:
+def test_equal_images_are_not_touched() -> None:
     scene = render(2, 1, seed=4)
     exposure = _compose(scene).exposure
     assert np.abs(exposure.log_gain).max() < 0.01
@@ -156,7 +156,7 @@ def test_equal_pictures_are_not_touched() -> None:
 
 @pytest.mark.parametrize("share", [0.06, 0.11, 0.2, 0.28, 0.4])
 @pytest.mark.parametrize("noise", [0.0, 2.0])
-def test_what_only_one_picture_shows_colours_nothing(share: float, noise: float) -> None:
+def test_what_only_one_image_shows_colours_nothing(share: float, noise: float) -> None:
     """Two pieces of white paper with text, equally exposed, and a blue header on the second."""
     rng, (width, height, step) = np.random.default_rng(4), (300, 360, 160)
     paper = np.full((height + step, width, 3), 245, np.uint8)
@@ -170,8 +170,8 @@ def test_what_only_one_picture_shows_colours_nothing(share: float, noise: float)
     lens = Camera((width, height))
     places = np.array([np.eye(3), np.eye(3)])
     places[1, 1, 2] = step / lens.half_diagonal
-    pictures = place_pictures([partial(as_picture, frame) for frame in frames], [lens] * 2, places)
-    result = compose(pictures, plan_canvas([lens] * 2, places), CompositeOptions(blend="none"))
+    images = place_images([partial(as_image, frame) for frame in frames], [lens] * 2, places)
+    result = compose(images, plan_canvas([lens] * 2, places), CompositeOptions(blend="none"))
     first, second = frames[0], frames[1]
     np.testing.assert_array_equal(result.pixels[:step], first[:step])
     np.testing.assert_array_equal(result.pixels[height : height + step], second[height - step :])
@@ -182,7 +182,7 @@ def test_what_only_one_picture_shows_colours_nothing(share: float, noise: float)
 
 @pytest.mark.parametrize(("seed", "people"), [(0, 0), (2, 6), (3, 6), (4, 6)])
 def test_gains_are_found_among_what_moved(seed: int, people: int) -> None:
-    """Patches of other colours, a seventh of each picture, hardly change what is found for true gains."""
+    """Patches of other colours, a seventh of each image, hardly change what is found for true gains."""
     rng, gains = np.random.default_rng(9 + seed), np.random.default_rng(seed).uniform(0.7, 1.3, 9)
     light = Photometry(gain=gains, vignetting=0.4, noise=0.004)
     scene = render(3, 3, size=(360, 270), photometry=light, seed=seed)
@@ -190,8 +190,8 @@ def test_gains_are_found_among_what_moved(seed: int, people: int) -> None:
     for frame in frames:
         for x, y in rng.integers(0, (310, 210), (people, 2)):
             frame[y : y + 60, x : x + 50] = rng.integers(0, 255, 3)
-    sources = [partial(as_picture, frame) for frame in frames]
-    placed = place_pictures(sources, scene.cameras, scene.homographies)
+    sources = [partial(as_image, frame) for frame in frames]
+    placed = place_images(sources, scene.cameras, scene.homographies)
     exposure = compose(placed, scene.canvas, CompositeOptions(exposure="gain")).exposure
     assert np.std(exposure.log_gain.mean(axis=1) - np.log(gains)) < 0.005
     np.testing.assert_allclose(np.exp(exposure.vignetting.sum()), 1 - 0.4, atol=0.05)
@@ -217,19 +217,19 @@ def test_nothing_of_the_covered_plane_is_missing() -> None:
 
 
 @pytest.mark.parametrize("shift", sampled([0, 75, -50, 150, -150, -125, -100, -75, -25, 25, 50, 100, 125], 5))
-def test_what_moved_is_taken_from_one_picture(shift: int) -> None:
-    """A disc that lies elsewhere in each of two pictures may appear whole, or not at all, but not cut or faded."""
+def test_what_moved_is_taken_from_one_image(shift: int) -> None:
+    """A disc that lies elsewhere in each of two images may appear whole, or not at all, but not cut or faded."""
     scene = render(2, 1, size=(640, 480), overlap=0.7, distortion=-0.1, seed=5)
     truth = scene.rendering
     frames = [frame.copy() for frame in scene.frames]
     middle = np.mean([truth.to_plane(i, np.array([[320.0, 240.0]]))[0] for i in (0, 1)], axis=0)
     places = middle + np.array([(shift - 20.0, 90.0), (shift + 25.0, -60.0)])
     for index, place in enumerate(places):
-        x, y = truth.to_picture(index, place[None])[0]
+        x, y = truth.to_image(index, place[None])[0]
         cv2.circle(frames[index], (round(float(x)), round(float(y))), 28, (255, 0, 255), -1)
-    sources = [partial(as_picture, frame) for frame in frames]
+    sources = [partial(as_image, frame) for frame in frames]
     result = compose(
-        place_pictures(sources, scene.cameras, scene.homographies), scene.canvas, CompositeOptions(exposure="none")
+        place_images(sources, scene.cameras, scene.homographies), scene.canvas, CompositeOptions(exposure="none")
     )
     pink = (result.pixels[..., 0] > 200) & (result.pixels[..., 1] < 60) & (result.pixels[..., 2] > 200)
     for place in places:
@@ -239,7 +239,7 @@ def test_what_moved_is_taken_from_one_picture(shift: int) -> None:
         assert share < 0.02 or share > 0.98
 
 
-def test_crop_keeps_no_hole_and_most_of_the_picture() -> None:
+def test_crop_keeps_no_hole_and_most_of_the_image() -> None:
     scene = render(3, 2)
     whole, cropped = _compose(scene), _compose(scene, crop="auto")
     assert (cropped.alpha == 255).all()
@@ -252,13 +252,13 @@ def test_crop_keeps_no_hole_and_most_of_the_picture() -> None:
 
 
 def test_crop_that_would_keep_little_is_not_done() -> None:
-    """Pictures that meet at their corners only."""
+    """Images that meet at their corners only."""
     lens = Camera((100, 80))
     steps = [np.array([[1.0, 0.0, 100.0 * k], [0.0, 1.0, 80.0 * k], [0.0, 0.0, lens.half_diagonal]]) for k in range(6)]
     matrices = np.stack([step @ np.diag([lens.half_diagonal] * 2 + [1.0]) for step in steps])
     canvas = plan_canvas([lens] * 6, matrices)
-    sources = [partial(as_picture, np.full((80, 100), 50, np.uint8))] * 6
-    result = compose(place_pictures(sources, [lens] * 6, matrices), canvas, CompositeOptions(crop="auto"))
+    sources = [partial(as_image, np.full((80, 100), 50, np.uint8))] * 6
+    result = compose(place_images(sources, [lens] * 6, matrices), canvas, CompositeOptions(crop="auto"))
     assert result.canvas.size == canvas.size == (600, 480)
     assert "not cropped" in result.messages[0].text
 
@@ -287,7 +287,7 @@ def test_file_is_what_memory_is(tmp_path: Path, suffix: str) -> None:
     told: list[float] = []
     done = compose_to_file(
         OutputFile(tmp_path / f"a.{suffix}", Metadata((1, 1), icc_profile=b"profile" * 30)),
-        scene.pictures,
+        scene.images,
         scene.canvas,
         CompositeOptions(tile_size=256),
         told.append,
@@ -310,11 +310,11 @@ def test_file_is_what_memory_is(tmp_path: Path, suffix: str) -> None:
 def test_sixteen_bits_grey_and_mixed_sizes() -> None:
     scene = render(3, 1, channels=1, photometry=Photometry(bits=16))
     frames = list(scene.frames)
-    # One picture at half the resolution: the same lens, another size.
+    # One image at half the resolution: the same lens, another size.
     frames[1] = cv2.resize(frames[1], (160, 120), interpolation=cv2.INTER_AREA)
     cameras = [c if k != 1 else c.resized((160, 120)) for k, c in enumerate(scene.cameras)]
-    sources = [partial(as_picture, frame) for frame in frames]
-    result = compose(place_pictures(sources, cameras, scene.homographies), scene.canvas, CompositeOptions())
+    sources = [partial(as_image, frame) for frame in frames]
+    result = compose(place_images(sources, cameras, scene.homographies), scene.canvas, CompositeOptions())
     assert result.pixels.dtype == np.uint16
     assert result.pixels.ndim == 2
     ok = inner(result.alpha)
@@ -325,21 +325,21 @@ def test_sixteen_bits_grey_and_mixed_sizes() -> None:
 def test_grey_among_colours_becomes_coloured() -> None:
     scene = render(2, 1)
     frames = [scene.frames[0], cv2.cvtColor(scene.frames[1], cv2.COLOR_RGB2GRAY)]
-    sources = [partial(as_picture, np.asarray(frame)) for frame in frames]
-    result = compose(place_pictures(sources, scene.cameras, scene.homographies), scene.canvas)
+    sources = [partial(as_image, np.asarray(frame)) for frame in frames]
+    result = compose(place_images(sources, scene.cameras, scene.homographies), scene.canvas)
     assert result.pixels.shape[2] == 3
 
 
-def test_pictures_that_do_not_fit() -> None:
+def test_images_that_do_not_fit() -> None:
     scene = render(2, 1)
-    wrong: list[PictureLoader] = [scene.sources[0], partial(as_picture, np.zeros((10, 10, 3), np.uint8))]
-    with pytest.raises(InputError, match="picture 2"):
-        compose(place_pictures(wrong, scene.cameras, scene.homographies), scene.canvas)
-    deep: list[PictureLoader] = [scene.sources[0], partial(as_picture, np.zeros((240, 320, 3), np.uint16))]
+    wrong: list[ImageLoader] = [scene.sources[0], partial(as_image, np.zeros((10, 10, 3), np.uint8))]
+    with pytest.raises(InputError, match="image 2"):
+        compose(place_images(wrong, scene.cameras, scene.homographies), scene.canvas)
+    deep: list[ImageLoader] = [scene.sources[0], partial(as_image, np.zeros((240, 320, 3), np.uint16))]
     with pytest.raises(InputError, match="uint16"):
-        compose(place_pictures(deep, scene.cameras, scene.homographies), scene.canvas)
+        compose(place_images(deep, scene.cameras, scene.homographies), scene.canvas)
     with pytest.raises(ArgumentError):
-        compose(place_pictures(scene.sources[:1], scene.cameras, scene.homographies), scene.canvas)
+        compose(place_images(scene.sources[:1], scene.cameras, scene.homographies), scene.canvas)
 
 
 def test_memory_limit_is_checked_before_the_work() -> None:

@@ -1,4 +1,4 @@
-"""Every picture is decoded once for exposure and seams, and once for the tiles, whatever memory there is."""
+"""Every image is decoded once for exposure and seams, and once for the tiles, whatever memory there is."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -9,33 +9,33 @@ import cv2
 import numpy as np
 import pytest
 
-from rdstitch.compositing import CompositeOptions, PlacedPicture, compose
+from rdstitch.compositing import CompositeOptions, PlacedImage, compose
 from rdstitch.compositing.boxes import Box, encloses
-from rdstitch.compositing.image_cache import PictureCache
-from rdstitch.compositing.source_images import LoadedPicture, PictureReader
-from rdstitch.io import Picture
+from rdstitch.compositing.image_cache import ImageCache
+from rdstitch.compositing.source_images import ImageReader, LoadedImage
+from rdstitch.io import DecodedImage
 from rdstitch.io.read import reduced
-from tests.compositing_scenes import Scene, as_picture, render
+from tests.compositing_scenes import Scene, as_image, render
 
 
-def _counted(scene: Scene, decoded: Counter[int], *, masked: bool) -> list[PlacedPicture]:
-    """The pictures of a scene; of masked ones a disc and a strip are transparent."""
-    pictures = []
-    for index, (frame, placed) in enumerate(zip(scene.frames, scene.pictures, strict=True)):
+def _counted(scene: Scene, decoded: Counter[int], *, masked: bool) -> list[PlacedImage]:
+    """The images of a scene; of masked ones a disc and a strip are transparent."""
+    images = []
+    for index, (frame, placed) in enumerate(zip(scene.frames, scene.images, strict=True)):
         alpha = np.full(frame.shape[:2], 255, dtype=np.uint8)
         cv2.circle(alpha, (80, 60 + 7 * index), 30, 0, -1)
         alpha[:20] = 0
-        picture = as_picture(frame, alpha if masked and index % 3 else None)
+        image = as_image(frame, alpha if masked and index % 3 else None)
 
-        def read(index: int = index, picture: Picture = picture) -> Picture:
+        def read(index: int = index, image: DecodedImage = image) -> DecodedImage:
             decoded[index] += 1
-            return picture
+            return image
 
-        def preview(reduction: int, picture: Picture = picture) -> Picture:
-            return reduced(picture, reduction)
+        def preview(reduction: int, image: DecodedImage = image) -> DecodedImage:
+            return reduced(image, reduction)
 
-        pictures.append(replace(placed, read=read, preview=preview))
-    return pictures
+        images.append(replace(placed, read=read, preview=preview))
+    return images
 
 
 @pytest.mark.parametrize("masked", [False, True])
@@ -53,26 +53,26 @@ def _counted(scene: Scene, decoded: Counter[int], *, masked: bool) -> list[Place
 def test_whatever_the_memory(options: dict[str, Any], masked: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = render(3, 3, size=(240, 180), rotate=37.0, scale=options.pop("scale", 1.5))
     requested: list[tuple[Box | None, Box]] = []
-    get = PictureCache.get
+    get = ImageCache.get
 
-    def watched(self: PictureCache, index: int, part: Box) -> LoadedPicture:
+    def watched(self: ImageCache, index: int, part: Box) -> LoadedImage:
         requested.append((self._expected[index], part))
         return get(self, index, part)
 
-    monkeypatch.setattr(PictureCache, "get", watched)
+    monkeypatch.setattr(ImageCache, "get", watched)
     chosen = CompositeOptions(tile_size=256, bands=4, **({"workers": 1} | options))
-    # Exposure and seams are decided on small pictures, which are not read smaller from pictures as small as these.
+    # Exposure and seams are decided on small images, which are not read smaller from images as small as these.
     most = 1 if options.get("exposure") == "none" else 2
     decoded: Counter[int] = Counter()
     plenty = compose(_counted(scene, decoded, masked=masked), scene.canvas, chosen)
     assert max(decoded.values()) <= most
     decoded.clear()
 
-    # The least that the plan allows: room for one picture.
-    def tight(reader: PictureReader, shrinks: Sequence[float], limit: int, *, ahead: bool) -> PictureCache:
-        return PictureCache(reader, shrinks, 1, ahead=ahead)
+    # The least that the plan allows: room for one image.
+    def tight(reader: ImageReader, shrinks: Sequence[float], limit: int, *, ahead: bool) -> ImageCache:
+        return ImageCache(reader, shrinks, 1, ahead=ahead)
 
-    monkeypatch.setattr("rdstitch.compositing.preparation.PictureCache", tight)
+    monkeypatch.setattr("rdstitch.compositing.preparation.ImageCache", tight)
     little = compose(_counted(scene, decoded, masked=masked), scene.canvas, chosen)
     assert max(decoded.values()) <= most
     np.testing.assert_array_equal(little.pixels, plenty.pixels)

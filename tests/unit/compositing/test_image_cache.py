@@ -1,4 +1,4 @@
-"""The cache of pictures: bounded, no more than is needed, and right all the same."""
+"""The cache of images: bounded, no more than is needed, and right all the same."""
 
 import tempfile
 from collections import Counter
@@ -14,38 +14,38 @@ import numpy as np
 import pytest
 
 from rdstitch.camera import Camera
-from rdstitch.compositing.image_cache import PictureCache
-from rdstitch.compositing.placed_picture import PlacedPicture, place_pictures
-from rdstitch.compositing.source_images import NOTHING, PictureOnDisk, PictureReader, prepare_picture
+from rdstitch.compositing.image_cache import ImageCache
+from rdstitch.compositing.placed_image import PlacedImage, place_images
+from rdstitch.compositing.source_images import NOTHING, ImageOnDisk, ImageReader, prepare_image
 from rdstitch.errors import InputError
-from rdstitch.io import Picture
+from rdstitch.io import DecodedImage
 from rdstitch.io.read import reduced
-from tests.compositing_scenes import as_picture
+from tests.compositing_scenes import as_image
 
 WHOLE = (0, 0, 200, 100)
 
 
 class DecodedImageCache:
-    """Four pictures, and how often each was read."""
+    """Four images, and how often each was read."""
 
     def __init__(self) -> None:
         rng = np.random.default_rng(0)
         self.frames = [rng.integers(0, 256, (100, 200), dtype=np.uint8) for _ in range(4)]
         self.reads: Counter[int] = Counter()
 
-    def read(self, index: int) -> Picture:
-        """One picture."""
+    def read(self, index: int) -> DecodedImage:
+        """One image."""
         self.reads[index] += 1
-        return as_picture(self.frames[index])
+        return as_image(self.frames[index])
 
-    def cache(self, limit: int, *, ahead: bool = False) -> PictureCache:
-        """All pictures, as they are."""
+    def cache(self, limit: int, *, ahead: bool = False) -> ImageCache:
+        """All images, as they are."""
         lens = Camera((200, 100))
         read = [lambda k=k: self.read(k) for k in range(4)]
-        reader = PictureReader(place_pictures(read, [lens] * 4, [np.eye(3)] * 4))
+        reader = ImageReader(place_images(read, [lens] * 4, [np.eye(3)] * 4))
         assert reader.samples[0] == 1
         self.reads.clear()
-        return PictureCache(reader, [1.0] * 4, limit, ahead=ahead)
+        return ImageCache(reader, [1.0] * 4, limit, ahead=ahead)
 
 
 @pytest.mark.parametrize("writable", [True, False])
@@ -69,11 +69,11 @@ def test_what_waits_on_disk_comes_back_as_it_was(kind: str) -> None:
     rng = np.random.default_rng(2)
     frames = [rng.integers(0, 200, (99, 201, 3)).astype(kind) for _ in range(3)]
     alpha = np.where(rng.random((99, 201)) < 0.1, np.uint8(0), np.uint8(255))
-    pictures = [replace(as_picture(frame), alpha=alpha) for frame in frames]
-    reader = PictureReader(
-        place_pictures([partial(lambda p: p, p) for p in pictures], [Camera((201, 99))] * 3, [np.eye(3)] * 3)
+    images = [replace(as_image(frame), alpha=alpha) for frame in frames]
+    reader = ImageReader(
+        place_images([partial(lambda p: p, p) for p in images], [Camera((201, 99))] * 3, [np.eye(3)] * 3)
     )
-    cache, whole = PictureCache(reader, [1.0] * 3, 1), [prepare_picture(p, 1.0) for p in pictures]
+    cache, whole = ImageCache(reader, [1.0] * 3, 1), [prepare_image(p, 1.0) for p in images]
     for _ in range(2):
         for index in range(3):
             kept, expected = cache.get(index, (50, 20, 90, 77)), whole[index].cut((50, 20, 90, 77))
@@ -88,7 +88,7 @@ def test_a_full_disk_costs_time_only(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(PictureOnDisk, "write", full)
+    monkeypatch.setattr(ImageOnDisk, "write", full)
     decoded_images = DecodedImageCache()
     cache = decoded_images.cache(limit=20_000)
     for index in (0, 1, 0):
@@ -119,7 +119,7 @@ def test_more_than_expected_is_read_once_more_and_kept() -> None:
     assert decoded_images.reads == {0: 2, 1: 1}
 
 
-def test_parts_that_are_done_with_go_before_pictures_do() -> None:
+def test_parts_that_are_done_with_go_before_images_do() -> None:
     decoded_images = DecodedImageCache()
     cache = decoded_images.cache(limit=50_000)
     for index in (0, 1):
@@ -140,7 +140,7 @@ def _until(told: Callable[[], bool]) -> None:
         sleep(0.001)
 
 
-def test_pictures_are_read_ahead_where_there_is_room() -> None:
+def test_images_are_read_ahead_where_there_is_room() -> None:
     decoded_images = DecodedImageCache()
     cache = decoded_images.cache(limit=45_000, ahead=True)
     cache.expect([WHOLE, WHOLE, WHOLE, NOTHING])
@@ -161,7 +161,7 @@ def test_nothing_is_read_ahead_once_it_is_closed() -> None:
     cache = decoded_images.cache(limit=80_000, ahead=True)
     reading, go_on = Event(), Event()
 
-    def slow(index: int) -> Picture:
+    def slow(index: int) -> DecodedImage:
         reading.set()
         assert go_on.wait(30)
         return DecodedImageCache.read(decoded_images, index)
@@ -178,30 +178,30 @@ def test_nothing_is_read_ahead_once_it_is_closed() -> None:
 
 @pytest.mark.parametrize("shrink", [1.0, 3.9, 5.0])
 @pytest.mark.parametrize("masked", [False, True])
-def test_the_room_for_a_picture_is_known_before(shrink: float, masked: bool) -> None:
-    picture = as_picture(np.zeros((300, 400), dtype=np.uint8))
+def test_the_room_for_an_image_is_known_before(shrink: float, masked: bool) -> None:
+    image = as_image(np.zeros((300, 400), dtype=np.uint8))
     if masked:
-        picture = replace(picture, alpha=np.eye(300, 400, dtype=np.uint8) * 255)
-    for preview in (None, partial(reduced, picture)):
-        reader = PictureReader([PlacedPicture(lambda: picture, Camera((400, 300)), np.eye(3), preview)])
+        image = replace(image, alpha=np.eye(300, 400, dtype=np.uint8) * 255)
+    for preview in (None, partial(reduced, image)):
+        reader = ImageReader([PlacedImage(lambda: image, Camera((400, 300)), np.eye(3), preview)])
         assert reader.masked(0) is masked
         assert reader.nbytes(0, shrink) >= reader.prepared(0, shrink).nbytes
 
 
-def test_a_failed_prefetch_raises_where_the_picture_is_read() -> None:
+def test_a_failed_prefetch_raises_where_the_image_is_read() -> None:
     decoded_images = DecodedImageCache()
     cache = decoded_images.cache(limit=80_000, ahead=True)
     decoded_images.frames[1] = decoded_images.frames[1][:50]
     cache.prefetch([1, 2])
     _until(lambda: decoded_images.reads[2] == 1)
-    with pytest.raises(InputError, match="picture 2 has 200 x 50 pixels"):
+    with pytest.raises(InputError, match="image 2 has 200 x 50 pixels"):
         cache.get(1, WHOLE)
 
 
 @pytest.mark.parametrize("shrink", [1.0, 5.0])
 def test_a_cut_holds_what_was_requested(shrink: float) -> None:
     frame = np.random.default_rng(1).integers(0, 256, (300, 400, 3), dtype=np.uint8)
-    whole = prepare_picture(as_picture(frame), shrink)
+    whole = prepare_image(as_image(frame), shrink)
     part = whole.cut((101, 53, 222, 177))
     again = part.cut((150, 100, 160, 110))
     for smaller, box in ((part, (101, 53, 222, 177)), (again, (150, 100, 160, 110))):

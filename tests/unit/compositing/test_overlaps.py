@@ -1,4 +1,4 @@
-"""What exposure is estimated from grows with the number of pictures, not with its square."""
+"""What exposure is estimated from grows with the number of images, not with its square."""
 
 from functools import partial
 from itertools import combinations
@@ -8,13 +8,13 @@ import pytest
 from scipy import sparse
 
 from rdstitch.camera import Camera
-from rdstitch.compositing import gain_compensation, overlap_cells, place_pictures, plan_canvas
+from rdstitch.compositing import gain_compensation, overlap_cells, place_images, plan_canvas
 from rdstitch.compositing.boxes import intersection, overlapping_pairs
 from rdstitch.compositing.overlap_cells import compare_overlaps
-from rdstitch.compositing.placed_picture import PlacedPicture
-from rdstitch.compositing.source_images import PictureReader
-from rdstitch.compositing.survey import Survey, survey_pictures
-from tests.compositing_scenes import as_picture
+from rdstitch.compositing.placed_image import PlacedImage
+from rdstitch.compositing.source_images import ImageReader
+from rdstitch.compositing.survey import Survey, survey_images
+from tests.compositing_scenes import as_image
 
 
 @pytest.mark.parametrize("shape", [(300, 80), (80, 300)])
@@ -31,55 +31,53 @@ def test_all_pairs_of_boxes_with_pixels_in_common(shape: tuple[int, int]) -> Non
     assert len(overlapping_pairs([None, boxes[0]])) == len(overlapping_pairs([])) == 0
 
 
-def test_of_pictures_in_two_places_each_keeps_few_neighbours_and_the_places_stay_connected() -> None:
+def test_of_images_in_two_places_each_keeps_few_neighbours_and_the_places_stay_connected() -> None:
     stacks = [(x + k % 3, k // 3, x + k % 3 + 100, k // 3 + 100) for x in (0, 96) for k in range(60)]
     pairs = overlapping_pairs(stacks, most=5)
     assert len(pairs) <= 120 * 5 + 119
     assert ((pairs[:, 0] >= 60) & (pairs[:, 1] < 60)).any()
 
 
-def _row(count: int) -> tuple[Survey, list[PlacedPicture]]:
-    """Tiny pictures side by side, each half over the next, and by turns darker and brighter."""
+def _row(count: int) -> tuple[Survey, list[PlacedImage]]:
+    """Tiny images side by side, each half over the next, and by turns darker and brighter."""
     lens = Camera((32, 24), distortion=0.0, focal=32.0)
     frames = [np.full((24, 32, 3), 100 + 20 * (k % 2), dtype=np.uint8) for k in range(count)]
     step = 16 / lens.half_diagonal
     places = np.array([[[1, 0, k * step], [0, 1, 0], [0, 0, 1]] for k in range(count)], dtype=np.float64)
     cameras = [lens] * count
-    pictures = place_pictures([partial(as_picture, frame) for frame in frames], cameras, places)
-    return survey_pictures(PictureReader(pictures), pictures, plan_canvas(cameras, places)), pictures
+    images = place_images([partial(as_image, frame) for frame in frames], cameras, places)
+    return survey_images(ImageReader(images), images, plan_canvas(cameras, places)), images
 
 
-def test_what_is_compared_is_linear_in_the_number_of_pictures() -> None:
-    """Two neighbours a picture in a row."""
+def test_what_is_compared_is_linear_in_the_number_of_images() -> None:
+    """Two neighbours an image in a row."""
     count = 400
-    survey, pictures = _row(count)
+    survey, images = _row(count)
     cells = compare_overlaps(survey)
     assert cells is not None
     assert cells.overlap.nnz == 2 * (count - 1)
-    exposure = gain_compensation.estimate_exposure(survey, pictures)
+    exposure = gain_compensation.estimate_exposure(survey, images)
     means = np.exp(exposure.log_gain + exposure.fields.mean(axis=(1, 2))).mean(axis=1)
     assert (means[1::2] > means[::2]).all()
 
 
 def test_gains_of_thousands_of_overlaps_take_a_few_cells_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
-    survey, pictures = _row(60)
-    of_all = gain_compensation.estimate_exposure(survey, pictures, "gain").log_gain
+    survey, images = _row(60)
+    of_all = gain_compensation.estimate_exposure(survey, images, "gain").log_gain
     monkeypatch.setattr(overlap_cells, "_MAX_CELLS", 600)
     cells = compare_overlaps(survey)
     assert cells is not None
     assert 59 <= len(cells.pair) <= 600
-    np.testing.assert_allclose(
-        gain_compensation.estimate_exposure(survey, pictures, "gain").log_gain, of_all, atol=1e-3
-    )
+    np.testing.assert_allclose(gain_compensation.estimate_exposure(survey, images, "gain").log_gain, of_all, atol=1e-3)
 
 
 def test_the_solution_is_the_direct_one() -> None:
     rng, (count, nodes, rows) = np.random.default_rng(5), (6, 49, 900)
     design = np.zeros((rows, count * nodes))
     for sign, shift in ((1.0, 0), (-1.0, 1)):
-        picture = np.arange(rows) % (count - 1) + shift
+        image = np.arange(rows) % (count - 1) + shift
         for _ in range(4):
-            design[np.arange(rows), picture * nodes + rng.integers(0, nodes, rows)] += 0.25 * sign
+            design[np.arange(rows), image * nodes + rng.integers(0, nodes, rows)] += 0.25 * sign
     weight, values, expected = rng.random(rows) * 1e3, rng.normal(size=(rows, 3)), rng.normal(size=(count * nodes, 3))
     precision = np.eye(count * nodes) * 0.1
     direct = np.linalg.solve(

@@ -11,9 +11,9 @@ from rdstitch.compositing import gain_compensation
 from rdstitch.compositing.canvas import plan_canvas
 from rdstitch.compositing.overlap_cells import compare_overlaps
 from rdstitch.compositing.photometric import Exposure, full_scale, no_exposure
-from rdstitch.compositing.placed_picture import place_pictures
-from rdstitch.compositing.source_images import PictureReader
-from rdstitch.compositing.survey import survey_pictures
+from rdstitch.compositing.placed_image import place_images
+from rdstitch.compositing.source_images import ImageReader
+from rdstitch.compositing.survey import survey_images
 from rdstitch.compositing.warp import locate, plan_warp
 from rdstitch.synthetic.rendering import Photometry
 from tests.compositing_scenes import render
@@ -62,16 +62,16 @@ def test_nothing_but_full_scale_becomes_full_scale(fields: FloatArray) -> None:
     np.testing.assert_array_equal(compressed[..., 2], clipped[..., 2])
 
 
-def test_a_picture_without_overlap_has_the_gain_that_its_camera_wrote_down() -> None:
+def test_an_image_without_overlap_has_the_gain_that_its_camera_wrote_down() -> None:
     scene = render(3, 1, size=(160, 120), photometry=Photometry(gain=np.array([1.0, 1.0, 2.0]), gamma=2.4), seed=2)
     apart = scene.homographies.copy()
     apart[2] = np.array([[1.0, 0.0, 2000.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) @ apart[2]
     canvas = plan_canvas(scene.cameras, apart)
-    sets = [place_pictures(scene.sources, scene.cameras, apart, exposure=e) for e in (None, [0.5, 0.5, 1.0])]
-    survey = survey_pictures(PictureReader(sets[0]), sets[0], canvas)
+    sets = [place_images(scene.sources, scene.cameras, apart, exposure=e) for e in (None, [0.5, 0.5, 1.0])]
+    survey = survey_images(ImageReader(sets[0]), sets[0], canvas)
     cells = compare_overlaps(survey)
     assert cells is not None
     differences = gain_compensation._Differences.of(cells, 0.055)
-    gains = [gain_compensation._fit(differences, pictures)[0].log_gain for pictures in sets]
+    gains = [gain_compensation._fit(differences, images)[0].log_gain for images in sets]
     assert np.abs(gains[0][2]).max() < 0.01
     np.testing.assert_allclose(gains[1][2] - gains[1][:2].mean(axis=0), np.log(2.0) / 2.4, atol=0.02)

@@ -37,7 +37,7 @@ def test_less_memory_means_smaller_tiles_on_fewer_threads() -> None:
         _planned(2**20)
 
 
-def test_pictures_with_transparent_parts_take_more() -> None:
+def test_images_with_transparent_parts_take_more() -> None:
     plain, masked = (_planned(masked=some) for some in (False, True))
     width, height = render(3, 1).cameras[0].image_size
     # Two while one is prepared, and all three in the cache.

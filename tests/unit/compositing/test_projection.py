@@ -14,13 +14,13 @@ from rdstitch.compositing.panorama_canvas import (
     photo_sphere_xmp,
     seen_directions,
 )
-from rdstitch.compositing.placed_picture import place_pictures
+from rdstitch.compositing.placed_image import place_images
 from rdstitch.compositing.projection import PLANE, Projection
 from rdstitch.compositing.warp import plan_warp
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, turning_sequence
 from rdstitch.synthetic.rendering import Photometry
-from tests.compositing_scenes import as_picture, gradient, grey
+from tests.compositing_scenes import as_image, gradient, grey
 
 NAMES = ("plane", "cylinder", "sphere", "mercator")
 LENS = Camera((160, 120), -0.2, focal=110.0, focal_source="option")
@@ -42,7 +42,7 @@ def _composed(
 ) -> Composite:
     frames = sequence.frames()
     return compose(
-        place_pictures([partial(as_picture, frame) for frame in frames], [LENS] * len(frames), directions),
+        place_images([partial(as_image, frame) for frame in frames], [LENS] * len(frames), directions),
         canvas,
         options,
     )
@@ -114,7 +114,7 @@ def test_a_gap_that_is_open_between_closed_corners_lies_at_the_border(heading: f
 
 @pytest.mark.parametrize("name", ["cylinder", "sphere", "mercator"])
 @pytest.mark.parametrize("rotate", [0.0, 15.0])
-def test_points_of_a_picture_come_back_through_the_warp(name: str, rotate: float) -> None:
+def test_points_of_an_image_come_back_through_the_warp(name: str, rotate: float) -> None:
     rotations = camera_rotations([0.4, -0.5], [0.2, -0.1], [0.1, 0.2])
     directions = _directions(rotations)
     canvas = plan_panorama([LENS] * 2, directions, projection=name, rotate=rotate)
@@ -152,13 +152,13 @@ def test_nothing_is_stretched_beyond_the_limit(name: str) -> None:
         assert cosine ** -(1 if name == "mercator" else 2) == pytest.approx(1.5, rel=0.01)
 
 
-def test_a_picture_that_is_stretched_everywhere_is_refused_by_name() -> None:
+def test_an_image_that_is_stretched_everywhere_is_refused_by_name() -> None:
     up = _directions(camera_rotations([0.0, 0.5], [0.0, 1.2]))
     with pytest.raises(LimitError, match=r"b.png.*--projection sphere, or raise --max-stretch"):
         plan_panorama([LENS] * 2, up, projection="cylinder", names=["a.png", "b.png"], max_stretch=1.2)
 
 
-# "balanced" keeps regions near the brightness of their own pictures, and so depends on which of them the extension of
+# "balanced" keeps regions near the brightness of their own images, and so depends on which of them the extension of
 # the canvas shows twice; what it may not do is to leave a step at the edge.
 OPTIONS = {
     "balanced": CompositeOptions(),
@@ -185,7 +185,7 @@ def test_a_full_turn_is_joined_without_a_seam(options: CompositeOptions) -> None
     assert steps[0] < np.quantile(steps, 0.99)
     if options.exposure == "balanced":
         return
-    # Shown from another heading, the same sphere is the same picture, moved.
+    # Shown from another heading, the same sphere is the same image, moved.
     turn = 2 * np.pi * 96 / canvas.size[0]
     turned = _directions(rotations @ camera_rotations(turn)[0].T)
     moved = _composed(sequence, turned, plan_panorama([LENS] * 9, turned), options)

@@ -1,4 +1,4 @@
-"""Seams run where pictures look alike, and each side of one comes from the picture that lies on that side."""
+"""Seams run where images look alike, and each side of one comes from the image that lies on that side."""
 
 from functools import partial
 
@@ -7,18 +7,18 @@ import pytest
 
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, compose, plan_canvas
-from rdstitch.compositing.placed_picture import place_pictures
-from tests.compositing_scenes import as_picture
+from rdstitch.compositing.placed_image import place_images
+from tests.compositing_scenes import as_image
 
 SIZE = (300, 200)
-SHIFT = 100  # pixels by which the second picture lies further right, or down
+SHIFT = 100  # pixels by which the second image lies further right, or down
 LEFT, ALIKE, RIGHT = 60, 128, 200
 
 
 @pytest.mark.parametrize("swapped", [False, True])
 @pytest.mark.parametrize("place", [180, 200, 220])
-def test_a_seam_runs_where_two_pictures_look_alike(place: int, swapped: bool) -> None:
-    """Two plain pictures of unequal grey that look alike in one column of the overlap alone."""
+def test_a_seam_runs_where_two_images_look_alike(place: int, swapped: bool) -> None:
+    """Two plain images of unequal grey that look alike in one column of the overlap alone."""
     column = np.arange(SIZE[0] + SHIFT)
     frames = []
     for grey, start in ((LEFT, 0), (RIGHT, SHIFT)):
@@ -33,7 +33,7 @@ def test_a_seam_runs_where_two_pictures_look_alike(place: int, swapped: bool) ->
     canvas = plan_canvas([lens, lens], homographies)
     options = CompositeOptions(exposure="none", seam="graphcut", blend="none")
     found = compose(
-        place_pictures([partial(as_picture, frame) for frame in frames], [lens, lens], homographies), canvas, options
+        place_images([partial(as_image, frame) for frame in frames], [lens, lens], homographies), canvas, options
     )
     assert canvas.size == (SIZE[0] + SHIFT, SIZE[1])
     assert (found.pixels[:, : place - 6] == LEFT).all()
@@ -41,7 +41,7 @@ def test_a_seam_runs_where_two_pictures_look_alike(place: int, swapped: bool) ->
 
 
 def test_a_seam_avoids_fine_detail_that_is_off_by_a_pixel() -> None:
-    """Grain that is the same in both pictures in a winding path alone; it is even grey in small ones."""
+    """Grain that is the same in both images in a winding path alone; it is even grey in small ones."""
     rng, (width, height, shift) = np.random.default_rng(2), (1200, 900, 400)
     grain = np.repeat(rng.integers(88, 168, (height, width + shift, 1)), 3, axis=2).astype(np.uint8)
     column = np.arange(width + shift)[None, :]
@@ -51,8 +51,8 @@ def test_a_seam_avoids_fine_detail_that_is_off_by_a_pixel() -> None:
     move[0, 2] = shift / lens.half_diagonal
     homographies = np.stack([np.eye(3), move])
     canvas = plan_canvas([lens, lens], homographies)
-    pictures = place_pictures([partial(as_picture, frame) for frame in frames], [lens, lens], homographies)
-    found = compose(pictures, canvas, CompositeOptions(exposure="none", blend="none")).pixels
+    images = place_images([partial(as_image, frame) for frame in frames], [lens, lens], homographies)
+    found = compose(images, canvas, CompositeOptions(exposure="none", blend="none")).pixels
     left, right = column < path - 30, column > path + 30
     assert (found == grain).all(axis=-1)[left].mean() > 0.99
     assert (found == off).all(axis=-1)[right].mean() > 0.99

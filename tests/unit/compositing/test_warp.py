@@ -8,20 +8,20 @@ from numpy.typing import NDArray
 
 from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions, compose, plan_canvas
-from rdstitch.compositing.placed_picture import place_pictures
+from rdstitch.compositing.placed_image import place_images
 from rdstitch.compositing.sampling import sample
-from rdstitch.compositing.source_images import prepare_picture
+from rdstitch.compositing.source_images import prepare_image
 from rdstitch.compositing.warp import locate, plan_warp
-from tests.compositing_scenes import as_picture, grey, inner, render
+from tests.compositing_scenes import as_image, grey, inner, render
 
 PLAIN = CompositeOptions(exposure="none", seam="none", blend="none")
 
 
-def test_identity_gives_the_picture_back() -> None:
+def test_identity_gives_the_image_back() -> None:
     frame = np.random.default_rng(0).integers(0, 256, (150, 200, 3), dtype=np.uint8)
     lens = Camera((200, 150))
     result = compose(
-        place_pictures([lambda: as_picture(frame)], [lens], np.eye(3)[None]),
+        place_images([lambda: as_image(frame)], [lens], np.eye(3)[None]),
         plan_canvas([lens], np.eye(3)[None]),
         PLAIN,
     )
@@ -29,18 +29,18 @@ def test_identity_gives_the_picture_back() -> None:
     assert (result.alpha == 255).all()
 
 
-def test_quarter_turn_gives_the_picture_turned() -> None:
+def test_quarter_turn_gives_the_image_turned() -> None:
     frame = np.random.default_rng(0).integers(0, 256, (150, 200), dtype=np.uint8)
     lens = Camera((200, 150))
     canvas = plan_canvas([lens], np.eye(3)[None], rotate=90)
-    result = compose(place_pictures([lambda: as_picture(frame)], [lens], np.eye(3)[None]), canvas, PLAIN)
+    result = compose(place_images([lambda: as_image(frame)], [lens], np.eye(3)[None]), canvas, PLAIN)
     np.testing.assert_array_equal(result.pixels, np.rot90(frame, -1))
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.125])
 @pytest.mark.parametrize("distortion", [-0.6, -0.25, 0.0, 0.3])
 def test_coordinates_are_exact_to_what_resampling_rounds(distortion: float, scale: float) -> None:
-    """The interpolated lattice against the model itself, inside the picture; of a smaller output, in its pixels."""
+    """The interpolated lattice against the model itself, inside the image; of a smaller output, in its pixels."""
     lens = Camera((800, 600), distortion=distortion)
     matrix = np.array([[0.95, 0.2, 0.1], [-0.2, 0.95, 0.3], [0.05, -0.03, 1.0]])
     canvas = plan_canvas([lens], matrix[None], scale=scale)
@@ -83,7 +83,7 @@ def test_a_box_anywhere_gives_the_same_coordinates() -> None:
 
 
 def test_coverage_ends_half_a_pixel_outside() -> None:
-    """Shifted by 0.3 px the picture still covers as many px; by 0.7 px it does too, one further on."""
+    """Shifted by 0.3 px the image still covers as many px; by 0.7 px it does too, one further on."""
     lens = Camera((50, 40))
     base = plan_canvas([lens], np.eye(3)[None])
     for shift, first in ((0.3, 0), (0.7, 1)):
@@ -91,7 +91,7 @@ def test_coverage_ends_half_a_pixel_outside() -> None:
         matrix[0, 2] = shift / lens.half_diagonal
         canvas = type(base)((60, 40), base.matrix, (base.footprints[0] + (shift, 0.0),))
         result = compose(
-            place_pictures([lambda: as_picture(np.full((40, 50), 9, np.uint8))], [lens], matrix[None]), canvas, PLAIN
+            place_images([lambda: as_image(np.full((40, 50), 9, np.uint8))], [lens], matrix[None]), canvas, PLAIN
         )
         covered = np.flatnonzero(result.alpha[20])
         assert (covered[0], covered[-1]) == (first, first + 49)
@@ -105,15 +105,15 @@ def test_shrinking_does_not_alias() -> None:
     lens = Camera((800, 600))
     for scale in (0.5, 0.27, 0.1):
         canvas = plan_canvas([lens], np.eye(3)[None], scale=scale)
-        result = compose(place_pictures([lambda: as_picture(stripes)], [lens], np.eye(3)[None]), canvas, PLAIN)
+        result = compose(place_images([lambda: as_image(stripes)], [lens], np.eye(3)[None]), canvas, PLAIN)
         middle = result.pixels[5:-5, 5:-5].astype(float)
         assert middle.mean() == pytest.approx(85, abs=1.0)
         assert middle.std() < 12
 
 
-def test_shrunk_picture_stays_in_place() -> None:
+def test_shrunk_image_stays_in_place() -> None:
     scene = render(1, 1, size=(640, 480), scale=0.23)
-    result = compose(scene.pictures, scene.canvas, PLAIN)
+    result = compose(scene.images, scene.canvas, PLAIN)
     truth, mine, ok = scene.truth(), grey(result.pixels), inner(result.alpha)
     shifts = [np.mean((np.roll(mine, (dy, dx), (0, 1))[ok] - truth[ok]) ** 2) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
     assert int(np.argmin(shifts)) == 4
@@ -126,7 +126,7 @@ def test_any_samples(shape: tuple[int, ...], dtype: type) -> None:
     frame: NDArray[Any] = (np.random.default_rng(0).random(shape) * 200).astype(dtype)
     lens = Camera((120, 90), distortion=-0.1)
     canvas = plan_canvas([lens], np.eye(3)[None])
-    result = compose(place_pictures([lambda: as_picture(frame)], [lens], np.eye(3)[None]), canvas, PLAIN)
+    result = compose(place_images([lambda: as_image(frame)], [lens], np.eye(3)[None]), canvas, PLAIN)
     assert result.pixels.dtype == dtype
     assert result.pixels.shape[2:] == shape[2:]
     lit = result.pixels[result.alpha > 0]
@@ -140,20 +140,20 @@ def test_transparent_parts_leave_no_trace() -> None:
     alpha[40:80, 50:100] = 0
     lens = Camera((160, 120), distortion=-0.2)
     canvas = plan_canvas([lens], np.eye(3)[None])
-    result = compose(place_pictures([lambda: as_picture(frame, alpha)], [lens], np.eye(3)[None]), canvas, PLAIN)
+    result = compose(place_images([lambda: as_image(frame, alpha)], [lens], np.eye(3)[None]), canvas, PLAIN)
     assert (result.pixels[result.alpha > 0] == 200).all()
     hole = plan_warp(lens, np.eye(3), canvas, 0)
     middle = hole.source_points(np.array([result.alpha.shape[1] / 2]), np.array([result.alpha.shape[0] / 2]))
     assert result.alpha[result.alpha.shape[0] // 2, result.alpha.shape[1] // 2] == 0, middle
 
 
-def test_sampling_a_reduced_picture_is_centred() -> None:
+def test_sampling_a_reduced_image_is_centred() -> None:
     ramp = np.tile(np.arange(360, dtype=np.float32), (60, 1))
     lens = Camera((360, 60))
     canvas = plan_canvas([lens], np.eye(3)[None], scale=1 / 6)
     warp = plan_warp(lens, np.eye(3), canvas, 0)
-    picture = prepare_picture(as_picture(ramp), warp.shrink)
-    assert picture.reduction == 3
-    values = sample(picture, locate(warp, (0, 0, *canvas.size)))
+    image = prepare_image(as_image(ramp), warp.shrink)
+    assert image.reduction == 3
+    values = sample(image, locate(warp, (0, 0, *canvas.size)))
     # The middle of six px; the Gaussian leaves a ramp alone, away from its ends.
     np.testing.assert_allclose(values[5, 5:-5], 6 * np.arange(60)[5:-5] + 2.5, atol=0.05)

@@ -36,7 +36,7 @@ from examples.paper.common.settings import Effort, Settings
 from examples.paper.common.subprocesses import run_all
 from rdstitch.synthetic import general_instances, planar_instances
 
-TINY = Settings(Effort.TINY, Path("no real pictures"))
+TINY = Settings(Effort.TINY, Path("no real images"))
 
 
 def test_a_table_reads_as_markdown() -> None:
@@ -53,11 +53,11 @@ def test_a_table_reads_as_markdown() -> None:
 
 
 def test_a_report_is_saved_with_its_plot_or_the_reason_why_not(tmp_path: Path) -> None:
-    picture = np.arange(12, dtype=np.uint8).reshape(3, 4)
-    report = Report((), lambda figure: figure.subplots(), {"picture.png": picture}, ("nothing was measured",))
+    image = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    report = Report((), lambda figure: figure.subplots(), {"image.png": image}, ("nothing was measured",))
     said = save(report, "name", tmp_path)
     assert (tmp_path / "name.md").read_text() == "Note: nothing was measured.\n"
-    assert (tmp_path / "picture.png").stat().st_size > 0
+    assert (tmp_path / "image.png").stat().st_size > 0
     assert (tmp_path / "name.png").exists() or "matplotlib is not installed" in said[-1]
 
 
@@ -129,8 +129,8 @@ def test_figure5_stitches_through_a_lens_that_is_no_division_model() -> None:
     assert measured["its misfit, px"] > 0.05
     assert measured["median error, px"] < 0.5
     assert measured["95 %, px"] < 1.0
-    assert all(picture.shape[0] > 240 and picture.std() > 10.0 for picture in report.pictures.values())
-    assert [note.split(" are ")[0] for note in report.notes] == [f"the real pictures {n}" for n in figure5.REAL_PAIRS]
+    assert all(image.shape[0] > 240 and image.std() > 10.0 for image in report.images.values())
+    assert [note.split(" are ")[0] for note in report.notes] == [f"the real images {n}" for n in figure5.REAL_PAIRS]
 
 
 def test_figure8_the_votes_straighten_and_rectify_a_chart() -> None:
@@ -141,7 +141,7 @@ def test_figure8_the_votes_straighten_and_rectify_a_chart() -> None:
     assert errors[figure8.ADJUSTED] < 2e-3
     assert votes.row(figure8.OWN)["interquartile range"] < 0.5 * votes.row("5 points")["interquartile range"]
     straight, rectified = "off by a homography, %", "off by a similarity, %"
-    measured, undistorted, final = (chart.row(name) for name in chart.column("picture"))
+    measured, undistorted, final = (chart.row(name) for name in chart.column("image"))
     assert undistorted[straight] < 0.01 * measured[straight]
     assert final[rectified] < 0.1 * undistorted[rectified]
     assert len(report.notes) == len(figure8.BOARDS)
@@ -151,13 +151,13 @@ def test_a_real_board_is_straightened_without_knowing_that_it_is_one(
     shared_data: Callable[[str], Path],
 ) -> None:
     folder = shared_data("opencv_chess_right")
-    pictures = Settings(Effort.TINY, folder.parent)
+    images = Settings(Effort.TINY, folder.parent)
     corners, truth = figure8.BOARDS["opencv_chess_right"]
-    found = figure8.vote_on_boards(pictures.real_sequence(folder.name), corners, truth, reach=1)
+    found = figure8.vote_on_boards(images.real_sequence(folder.name), corners, truth, reach=1)
     assert len(found.votes) >= 10
     assert abs(found.adjusted - truth) < 0.02
     assert found.off_by_adjusted < 1.2 * found.off_by_truth < 0.3 * found.off_before
-    assert found.picture.std() > 20.0
+    assert found.image.std() > 20.0
 
 
 def test_figure9_adjustment_brings_every_start_to_the_same_trajectory() -> None:
@@ -179,7 +179,7 @@ def test_figure10_ignoring_the_distortion_makes_surveys_drift() -> None:
     ignored = table.row(figure10.IGNORED)
     for name in (figure10.ESTIMATED, figure10.TWO_POINTS):
         row = table.row(name)
-        assert row["pictures"] == 6
+        assert row["images"] == 6
         assert abs(row["λ"] - figure10.DISTORTION) < 2e-3
         assert row["95 %, px"] < 0.1
         assert row["drift, chained, px"] < 0.5
@@ -219,12 +219,12 @@ def test_scenes_in_the_format_of_hpatches_are_read_and_distorted(tmp_path: Path)
     (made,) = made_scenes(None, 1, seed=3)
     folder = tmp_path / "v_ground"
     folder.mkdir()
-    for number, picture in enumerate(made.pictures, start=1):
-        Image.fromarray(picture()).save(folder / f"{number}.ppm")
+    for number, image in enumerate(made.images, start=1):
+        Image.fromarray(image()).save(folder / f"{number}.ppm")
     np.savetxt(folder / "H_1_2", made.homographies[1])
     (tmp_path / "empty").mkdir()
     (scene,) = read_scenes(tmp_path)
-    assert len(scene.pictures) == 2
+    assert len(scene.images) == 2
     np.testing.assert_allclose(scene.homographies[1], made.homographies[1])
     (pair,) = scene_pairs([scene], -0.4, seed=4, per_scene=5)
     assert -0.4 < pair.distortion < -0.01

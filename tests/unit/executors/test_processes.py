@@ -134,9 +134,9 @@ def test_after_a_failure_the_rest_is_cancelled(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("workers", "pictures", "kind"),
+    ("workers", "images", "kind"),
     [(1, 1000, ThreadPoolExecutor), (4, 12, ThreadPoolExecutor), (2, 1000, ProcessExecutor)],
 )
-def test_few_pictures_are_not_worth_starting_processes(workers: int, pictures: int, kind: type[Executor]) -> None:
-    with open_executor(workers, pictures) as executor:
+def test_few_images_are_not_worth_starting_processes(workers: int, images: int, kind: type[Executor]) -> None:
+    with open_executor(workers, images) as executor:
         assert isinstance(executor, kind)

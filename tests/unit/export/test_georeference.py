@@ -47,7 +47,7 @@ METRES_PER_TEXEL = 0.05
 
 @pytest.fixture(scope="module")
 def located(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], FloatArray]:
-    """A flight with positions in its EXIF, and where the middles of its pictures are: easting and northing, m."""
+    """A flight with positions in its EXIF, and where the middles of its images are: easting and northing, m."""
     sequence, folder = flight(4, 3, 2), tmp_path_factory.mktemp("located")
     middles = np.concatenate([sequence.to_plane(k, np.array([[199.5, 149.5]])) for k in range(len(sequence))])
     east, north = middles[:, 0] * METRES_PER_TEXEL, -middles[:, 1] * METRES_PER_TEXEL
@@ -64,12 +64,12 @@ def located(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], Float
 
 @pytest.fixture(scope="module")
 def cached(tmp_path_factory: pytest.TempPathFactory) -> StitchOptions:
-    """The pictures are registered once for all tests."""
+    """The images are registered once for all tests."""
     return StitchOptions(workers=1, cache=tmp_path_factory.mktemp("cache"))
 
 
 def _middles(output: Path) -> FloatArray:
-    """Px of the output where the pictures' middles are, by the sidecar."""
+    """Px of the output where the images' middles are, by the sidecar."""
     record = json.loads(output.with_name(output.name + ".json").read_text(encoding="utf-8"))
     found = transfers(record)
     return np.concatenate([found[k](np.array([[199.5, 149.5]])) for k in sorted(found)])
@@ -231,7 +231,7 @@ def test_one_bad_position_of_eight_is_named_and_left_out(wrong: GpsPosition, off
     np.testing.assert_allclose(place.to_map(corner), whole.to_map(corner), atol=0.1)
 
 
-def test_pictures_without_positions_leave_no_world_file(cached: StitchOptions, tmp_path: Path) -> None:
+def test_images_without_positions_leave_no_world_file(cached: StitchOptions, tmp_path: Path) -> None:
     mosaic(flight(4, 2).write(tmp_path), tmp_path / "a.png", cached)
     assert not list(tmp_path.glob("*.pgw"))
     assert not list(tmp_path.glob("*.prj"))

@@ -1,4 +1,4 @@
-"""How pictures are rendered for detection: alike if they have more than 8 bits, equalized if they show too little."""
+"""How images are rendered for detection: alike if they have more than 8 bits, equalized if they show too little."""
 
 from dataclasses import replace
 
@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 import rdstitch
 from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions, detect
-from rdstitch.features.picture import View, common_stretch, usual_stretch
-from rdstitch.synthetic import Photometry, PictureTexture, grid_poses, sequence_over
+from rdstitch.features.prepared_image import View, common_stretch, usual_stretch
+from rdstitch.synthetic import ImageTexture, Photometry, grid_poses, sequence_over
 from tests.cli.running import flight
 
 _OPTIONS = rdstitch.StitchOptions(workers=1, channel_order="rgb", features=rdstitch.FeatureOptions(max_features=800))
@@ -18,7 +18,7 @@ _OPTIONS = rdstitch.StitchOptions(workers=1, channel_order="rgb", features=rdsti
 
 @pytest.fixture(scope="module")
 def frames() -> list[NDArray[np.uint8]]:
-    """Three pictures in a chain."""
+    """Three images in a chain."""
     sequence = flight(3, 3)
     return [sequence.frame(index) for index in range(3)]
 
@@ -33,7 +33,7 @@ def _hazy(frames: list[NDArray[np.uint8]]) -> list[NDArray[np.uint8]]:
 
 def test_a_tenth_of_the_contrast_with_noise_is_seen_and_said(frames: list[NDArray[np.uint8]]) -> None:
     hazy = _hazy(frames)
-    clear, found = (rdstitch.calibrate(pictures, _OPTIONS) for pictures in (frames, hazy))
+    clear, found = (rdstitch.calibrate(images, _OPTIONS) for images in (frames, hazy))
     assert found.alignment.used.all()
     assert any(message.code == "low-contrast" for message in found.details)
     assert not any(message.code == "low-contrast" for message in clear.details)
@@ -49,7 +49,7 @@ def test_a_tenth_of_the_contrast_with_noise_is_seen_and_said(frames: list[NDArra
     assert sum(as_it_is.keypoints) < sum(found.keypoints) / 2
 
 
-def test_a_single_picture_of_little_contrast_is_seen_and_named(frames: list[NDArray[np.uint8]]) -> None:
+def test_a_single_image_of_little_contrast_is_seen_and_named(frames: list[NDArray[np.uint8]]) -> None:
     clear, found = (rdstitch.calibrate(k, _OPTIONS) for k in (frames, [frames[0], _hazy(frames)[1], frames[2]]))
     assert found.alignment.used.all()
     assert found.keypoints[::2] == clear.keypoints[::2]
@@ -59,19 +59,19 @@ def test_a_single_picture_of_little_contrast_is_seen_and_named(frames: list[NDAr
     assert message.text.startswith("shows little contrast")
 
 
-def test_deep_pictures_register_as_their_common_rendering_does(frames: list[NDArray[np.uint8]]) -> None:
-    """Each picture's own stretch would undo that the second one is darker."""
+def test_deep_images_register_as_their_common_rendering_does(frames: list[NDArray[np.uint8]]) -> None:
+    """Each image's own stretch would undo that the second one is darker."""
     darker = [np.rint(f.mean(axis=2) * gain).astype(np.uint8) for f, gain in zip(frames, (1.0, 0.5, 0.9), strict=True)]
     low, high = common_stretch(usual_stretch(View(frame)) for frame in darker) or (0.0, 255.0)
     rendered = [np.clip(np.rint((f - low) * 255.0 / (high - low)), 0, 255).astype(np.uint8) for f in darker]
     deep = [frame.astype(np.uint16) * 40 + 1000 for frame in darker]
-    first, second = (rdstitch.calibrate(pictures, _OPTIONS) for pictures in (rendered, deep))
+    first, second = (rdstitch.calibrate(images, _OPTIONS) for images in (rendered, deep))
     assert second.stretch == pytest.approx((low * 40 + 1000, high * 40 + 1000))
     assert first.keypoints == second.keypoints
     np.testing.assert_allclose(first.alignment.homographies, second.alignment.homographies, atol=1e-9)
 
 
-def test_a_picture_unlike_the_rest_does_not_decide() -> None:
+def test_an_image_unlike_the_rest_does_not_decide() -> None:
     usual = [(100.0, 900.0)] * 19
     assert common_stretch([*usual, (0.0, 65535.0)]) == (100.0, 900.0)
     assert common_stretch([None, (5.0, 9.0)]) == (5.0, 9.0)
@@ -85,7 +85,7 @@ def test_a_board_shows_few_features_but_no_little_contrast() -> None:
     lens = Camera((640, 480), distortion=-0.25, focal=600.0)
     squares = np.kron(np.indices((10, 16)).sum(axis=0) % 2, np.ones((110, 110)))
     poses = grid_poses(lens, 3, 1, overlap=0.7, yaw=0.2, shift=0.05, seed=3).shaken(seed=4, tilt=0.12)
-    plane = PictureTexture((60 + 130 * squares).astype(np.uint8))
+    plane = ImageTexture((60 + 130 * squares).astype(np.uint8))
     frames = sequence_over(plane, lens, poses, photometry=Photometry(noise=0.012, blur=0.7)).frames() * 3
     found = rdstitch.calibrate(frames, rdstitch.StitchOptions(workers=1))
     assert not any(message.code == "low-contrast" for message in found.details)

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.features.crossings import find_crossings
-from rdstitch.features.picture import View, prepare
+from rdstitch.features.prepared_image import View, prepare
 
 _SQUARES, _SUBPIXELS = 8, 6
 
@@ -47,5 +47,5 @@ def test_what_is_masked_has_none() -> None:
     assert found[:, 0].min() > 200
 
 
-def test_a_picture_of_nothing_has_none() -> None:
+def test_an_image_of_nothing_has_none() -> None:
     assert find_crossings(prepare(View(np.full((60, 80), 90, dtype=np.uint8)), None)).shape == (0, 2)

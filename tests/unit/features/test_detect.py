@@ -13,7 +13,7 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.features import FeatureOptions, Features, View, detect, detect_view, match
 from rdstitch.features.detect import spread, strongest
 from rdstitch.features.opencv import to_rootsift
-from rdstitch.features.picture import halving
+from rdstitch.features.prepared_image import halving
 from rdstitch.synthetic import ground
 
 KINDS = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk")
@@ -21,7 +21,7 @@ WIDTH, HEIGHT = 360, 300
 
 
 @pytest.fixture(scope="module")
-def picture() -> NDArray[np.uint8]:
+def image() -> NDArray[np.uint8]:
     """Ground, as sharp as a lens leaves it, RGB."""
     colour = ground((WIDTH, HEIGHT), 11, 3).region(0, 0, WIDTH, HEIGHT)
     smooth = np.asarray(cv2.GaussianBlur(colour, (0, 0), 1.0))
@@ -33,11 +33,11 @@ def same(a: Features, b: Features) -> bool:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_turned_picture_matches(kind: str, picture: NDArray[np.uint8]) -> None:
+def test_a_turned_image_matches(kind: str, image: NDArray[np.uint8]) -> None:
     motion = np.asarray(cv2.getRotationMatrix2D(((WIDTH - 1) / 2, (HEIGHT - 1) / 2), 20.0, 1.0), np.float64)
-    turned = np.asarray(cv2.warpAffine(picture, motion, (WIDTH, HEIGHT), flags=cv2.INTER_CUBIC), np.uint8)
+    turned = np.asarray(cv2.warpAffine(image, motion, (WIDTH, HEIGHT), flags=cv2.INTER_CUBIC), np.uint8)
     options = FeatureOptions(kind=kind, max_features=1500)
-    one, two = detect(picture, options), detect(turned, options)
+    one, two = detect(image, options), detect(turned, options)
     assert one.kind == kind
     assert one.image_size == (WIDTH, HEIGHT)
     assert (np.diff(one.response) <= 0).all()
@@ -52,14 +52,14 @@ def test_a_turned_picture_matches(kind: str, picture: NDArray[np.uint8]) -> None
     assert np.abs(bias).max() < 0.12
 
 
-def test_pictures_are_halved_until_they_are_small_enough() -> None:
+def test_images_are_halved_until_they_are_small_enough() -> None:
     sizes = [(1280, 960), (2000, 1000), (2001, 1000), (3880, 2850), (8000, 6000)]
     assert [halving(size, 2.0) for size in sizes] == [1, 1, 2, 4, 8]
     assert halving((640, 480), 5e-324) == 1024
 
 
 @pytest.mark.parametrize("size", [(3265, 2449), (6532, 4898), (4001, 1999), (2001, 1000)])
-def test_a_picture_that_was_read_smaller_is_worked_on_at_the_same_size(size: tuple[int, int]) -> None:
+def test_an_image_that_was_read_smaller_is_worked_on_at_the_same_size(size: tuple[int, int]) -> None:
     factor = halving(size, 2.0)
     width, height = (-(-n // factor) for n in size)
     assert width * height <= 2e6
@@ -68,12 +68,12 @@ def test_a_picture_that_was_read_smaller_is_worked_on_at_the_same_size(size: tup
 
 
 @pytest.mark.parametrize("kind", ["rootsift", "orb"])
-def test_a_picture_with_few_features_is_detected_at_a_larger_size(picture: NDArray[np.uint8], kind: str) -> None:
+def test_an_image_with_few_features_is_detected_at_a_larger_size(image: NDArray[np.uint8], kind: str) -> None:
     options = FeatureOptions(kind=kind, work_megapixels=0.02)
-    small = cv2.resize(picture, (90, 75), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(image, (90, 75), interpolation=cv2.INTER_AREA)
     found = len(detect(small, FeatureOptions(kind=kind, work_megapixels=None)))
-    assert len(detect(picture, replace(options, max_features=2 * found))) <= found
-    assert len(detect(picture, replace(options, max_features=2 * found + 2))) > 1.5 * found
+    assert len(detect(image, replace(options, max_features=2 * found))) <= found
+    assert len(detect(image, replace(options, max_features=2 * found + 2))) > 1.5 * found
 
 
 @pytest.mark.parametrize("kind", ["sift", "surf", "kaze"])
@@ -91,7 +91,7 @@ def test_a_blob_is_where_it_is_at_any_working_size(kind: str, work_megapixels: f
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("shape", [(240, 320), (240, 320, 3), (7, 5), (1, 1)])
-def test_a_blank_picture_has_no_features(kind: str, shape: tuple[int, ...]) -> None:
+def test_a_blank_image_has_no_features(kind: str, shape: tuple[int, ...]) -> None:
     found = detect(np.full(shape, 90, np.uint8), FeatureOptions(kind=kind))
     assert found.points.shape == (0, 2)
     assert found.descriptors.shape[0] == 0
@@ -100,10 +100,10 @@ def test_a_blank_picture_has_no_features(kind: str, shape: tuple[int, ...]) -> N
 
 
 @pytest.mark.parametrize("kind", ["rootsift", "surf", "orb"])
-def test_nothing_is_seen_behind_a_mask(kind: str, picture: NDArray[np.uint8]) -> None:
+def test_nothing_is_seen_behind_a_mask(kind: str, image: NDArray[np.uint8]) -> None:
     allowed = np.ones((HEIGHT, WIDTH), dtype=bool)
     allowed[100:220, 60:200] = False
-    covered = picture.copy()
+    covered = image.copy()
     covered[~allowed] = np.random.default_rng(0).integers(0, 256, (int((~allowed).sum()), 3))
     alpha = np.dstack([covered, np.where(allowed, 255, 0).astype(np.uint8)])
     number = covered.astype(np.float32)
@@ -127,8 +127,8 @@ def test_nothing_is_seen_behind_a_mask(kind: str, picture: NDArray[np.uint8]) ->
     assert allowed[y, x].all()
 
 
-def test_deeper_pictures_are_stretched(picture: NDArray[np.uint8]) -> None:
-    grey = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)
+def test_deeper_images_are_stretched(image: NDArray[np.uint8]) -> None:
+    grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
     options = FeatureOptions(max_features=4000)
     reference = detect(grey, options)
     for deep in (grey.astype(np.uint16) * 16 + 100, grey.astype(np.float64) / 1000, grey.astype(np.float32) * 9):
@@ -137,25 +137,25 @@ def test_deeper_pictures_are_stretched(picture: NDArray[np.uint8]) -> None:
         assert np.median(np.linalg.norm(found.points1 - found.points2, axis=1)) < 0.05
 
 
-def test_grey_layouts_agree(picture: NDArray[np.uint8]) -> None:
-    grey = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.uint8)
+def test_grey_layouts_agree(image: NDArray[np.uint8]) -> None:
+    grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
     opaque = np.full_like(grey, 255)
     reference = detect(grey)
-    for layout in (picture, grey[..., None], np.dstack([grey, opaque]), np.dstack([picture, opaque])):
+    for layout in (image, grey[..., None], np.dstack([grey, opaque]), np.dstack([image, opaque])):
         assert same(reference, detect(layout))
 
 
 @pytest.mark.parametrize("kind", ["rootsift", "surf", "orb", "brisk"])
-def test_threads_change_nothing(kind: str, picture: NDArray[np.uint8]) -> None:
+def test_threads_change_nothing(kind: str, image: NDArray[np.uint8]) -> None:
     options = FeatureOptions(kind=kind, max_features=700)
-    sources = [lambda _, i=i: View(np.rot90(picture, i).copy()) for i in range(4)]
+    sources = [lambda _, i=i: View(np.rot90(image, i).copy()) for i in range(4)]
     one = [detect_view(source, options) for source in sources]
     with ThreadPoolExecutor(3) as pool:
         several = list(pool.map(lambda source: detect_view(source, options), sources))
     before = cv2.getNumThreads()
     for threads in (1, 4):
         cv2.setNumThreads(threads)
-        assert same(detect(picture, options), one[0])
+        assert same(detect(image, options), one[0])
     cv2.setNumThreads(before)
     assert all(same(a, b) for a, b in zip(one, several, strict=True))
     assert one[1].image_size == (HEIGHT, WIDTH)
@@ -184,7 +184,7 @@ def test_a_detector_that_opencv_lacks_is_named(
         detect(np.zeros((50, 50), np.uint8), FeatureOptions(kind="orb"))
 
 
-def test_bad_arguments_are_refused(picture: NDArray[np.uint8]) -> None:
+def test_bad_arguments_are_refused(image: NDArray[np.uint8]) -> None:
     for options in (
         {"kind": "surfing"},
         {"max_features": 0},
@@ -195,9 +195,9 @@ def test_bad_arguments_are_refused(picture: NDArray[np.uint8]) -> None:
         with pytest.raises(ArgumentError):
             FeatureOptions(**options)
     with pytest.raises(ArgumentError, match="mask of shape"):
-        detect(picture, mask=np.ones((3, 3), bool))
+        detect(image, mask=np.ones((3, 3), bool))
     for bad in (np.zeros((0, 5), np.uint8), np.zeros((5, 5, 5, 5), np.uint8), np.zeros(5, np.uint8)):
-        with pytest.raises(ArgumentError, match="expected a picture"):
+        with pytest.raises(ArgumentError, match="expected an image"):
             detect(bad)
     with pytest.raises(ArgumentError, match="int32"):
         detect(np.zeros((50, 50), np.int32))
@@ -232,8 +232,8 @@ def test_spreading_serves_every_cell_before_any_twice() -> None:
     assert (strongest(response, 200) < 900).all()
 
 
-def test_spreading_fills_the_corners(picture: NDArray[np.uint8]) -> None:
-    dim = picture.astype(np.float64)
+def test_spreading_fills_the_corners(image: NDArray[np.uint8]) -> None:
+    dim = image.astype(np.float64)
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     radius = np.hypot(u - WIDTH / 2, v - HEIGHT / 2) / np.hypot(WIDTH / 2, HEIGHT / 2)
     dim = np.rint(128 + (dim - 128) * (1 - 0.75 * radius**2)[..., None]).astype(np.uint8)

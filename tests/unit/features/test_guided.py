@@ -15,7 +15,7 @@ def _features(points: FloatArray, descriptors: FloatArray, signs: FloatArray | N
 
 
 def _repeating(seed: int) -> tuple[Features, Features, FloatArray]:
-    """A grid of points that look alike in groups, in two pictures; and the shift between these."""
+    """A grid of points that look alike in groups, in two images; and the shift between these."""
     rng = np.random.default_rng(seed)
     grid = np.stack(np.meshgrid(np.arange(20.0, 400.0, 20.0), np.arange(20.0, 300.0, 20.0)), axis=-1).reshape(-1, 2)
     looks = rng.normal(size=(5, 64))[rng.integers(0, 5, len(grid))]

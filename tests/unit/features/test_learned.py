@@ -66,10 +66,10 @@ def five(points: np.ndarray) -> Features:
 
 
 def test_keypoints_of_a_network_are_features(aliked: Path) -> None:
-    picture = np.random.default_rng(0).integers(0, 256, (2 * SIDE, 2 * SIDE), dtype=np.uint8)
-    picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 3.0))
+    image = np.random.default_rng(0).integers(0, 256, (2 * SIDE, 2 * SIDE), dtype=np.uint8)
+    image = np.asarray(cv2.GaussianBlur(image, (0, 0), 3.0))
     options = FeatureOptions(kind="aliked", aliked_model=aliked, aliked_size=SIDE, max_features=20, spread=False)
-    found = detect(picture, options)
+    found = detect(image, options)
     assert found.descriptors.shape == (20, 64)
     assert found.image_size == (128, 128)
     np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), 1.0, rtol=1e-5)
@@ -77,7 +77,7 @@ def test_keypoints_of_a_network_are_features(aliked: Path) -> None:
     # Each keypoint tells the brightness of the cell that it lies in.
     for point, response in zip(found.points, found.response, strict=True):
         u, v = (point // (2 * CELL) * 2 * CELL).astype(int)
-        cell = picture[v : v + 2 * CELL, u : u + 2 * CELL]
+        cell = image[v : v + 2 * CELL, u : u + 2 * CELL]
         assert response * 255 == pytest.approx(cell.mean(), abs=2.0)
 
 
@@ -90,7 +90,7 @@ def test_lightglue_orders_by_confidence(lightglue: Path) -> None:
 
 
 def test_what_is_no_network_is_refused(tmp_path: Path, aliked: Path, lightglue: Path) -> None:
-    picture = np.zeros((SIDE, SIDE), np.uint8)
+    image = np.zeros((SIDE, SIDE), np.uint8)
     text = tmp_path / "text.onnx"
     text.write_text("not a network")
     for model, said in (
@@ -99,9 +99,9 @@ def test_what_is_no_network_is_refused(tmp_path: Path, aliked: Path, lightglue: 
         (lightglue, "not an ALIKED"),
     ):
         with pytest.raises(InputError, match=said):
-            detect(picture, FeatureOptions(kind="aliked", aliked_model=model))
+            detect(image, FeatureOptions(kind="aliked", aliked_model=model))
     with pytest.raises(ArgumentError, match="ONNX file"):
-        detect(picture, FeatureOptions(kind="aliked"))
+        detect(image, FeatureOptions(kind="aliked"))
     with pytest.raises(InputError, match="not an ONNX file"):
         LightGlue(text)
     points = np.zeros((5, 2))

@@ -30,7 +30,7 @@ def sift_like(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
 
 
 def pair_of(kind: str, seed: int) -> tuple[Features, Features]:
-    """Two pictures of which half the features show the same."""
+    """Two images of which half the features show the same."""
     rng = np.random.default_rng(seed)
     if kind == "binary":
         bits = rng.integers(0, 256, (150, 61), dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""What is left open in the options of detection depends on how many pictures share the work."""
+"""What is left open in the options of detection depends on how many images share the work."""
 
 import pytest
 
@@ -7,23 +7,23 @@ from rdstitch.features import FeatureOptions
 
 
 @pytest.mark.parametrize(("count", "share"), [(1, 4.0), (2, 4.0), (4, 2.0), (5, 1.6), (8, 1.0), (9, 1.0), (300, 1.0)])
-def test_few_pictures_share_what_eight_would_have(count: int, share: float) -> None:
-    features, megapixels = FeatureOptions().for_pictures(count).limits
+def test_few_images_share_what_eight_would_have(count: int, share: float) -> None:
+    features, megapixels = FeatureOptions().for_images(count).limits
     assert features == round(2000 * min(share, 2.0))
     assert megapixels is not None
     assert abs(megapixels - 0.6 * share) < 1e-9
 
 
 def test_what_is_given_is_kept() -> None:
-    assert FeatureOptions(max_features=700).for_pictures(2).limits == (700, 2.4)
-    assert FeatureOptions(work_megapixels=None).for_pictures(2).limits == (4000, None)
-    assert FeatureOptions(work_megapixels=0.3).for_pictures(2).limits == (4000, 0.3)
+    assert FeatureOptions(max_features=700).for_images(2).limits == (700, 2.4)
+    assert FeatureOptions(work_megapixels=None).for_images(2).limits == (4000, None)
+    assert FeatureOptions(work_megapixels=0.3).for_images(2).limits == (4000, 0.3)
 
 
 def test_numbers_stay_what_they_are() -> None:
-    """A run on seven of two pictures' options is that on two."""
-    two = FeatureOptions().for_pictures(2)
-    assert two.for_pictures(7) == two
+    """A run on seven of two images' options is that on two."""
+    two = FeatureOptions().for_images(2)
+    assert two.for_images(7) == two
 
 
 def test_other_words_are_refused() -> None:

@@ -1,4 +1,4 @@
-"""Where pictures overlap: as a few matches tell, generously, and not at all where they do not tell."""
+"""Where images overlap: as a few matches tell, generously, and not at all where they do not tell."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from rdstitch.features import Correspondences, Features, match, match_overlap
 from rdstitch.features.match import overlapping
 
 SIZE = (800, 600)
-SHIFT = np.array([560.0, 0.0])  # three tenths of the first picture are in the second
+SHIFT = np.array([560.0, 0.0])  # three tenths of the first image are in the second
 
 
 def _features(points: FloatArray, descriptors: FloatArray) -> Features:
@@ -19,7 +19,7 @@ def _features(points: FloatArray, descriptors: FloatArray) -> Features:
 
 
 @pytest.fixture(scope="module")
-def pictures() -> tuple[Features, Features]:
+def images() -> tuple[Features, Features]:
     """A strip of the plane, and the same farther to the right."""
     rng = np.random.default_rng(5)
     points = rng.uniform((0, 0), (1360, 600), (3000, 2))
@@ -50,56 +50,56 @@ def _chance(features1: Features, features2: Features, count: int) -> Corresponde
     return Correspondences.of(features1, features2, indices, np.full(count, 0.8))
 
 
-def test_what_overlaps_is_kept_and_most_of_the_rest_is_not(pictures: tuple[Features, Features]) -> None:
-    everything = match(*pictures)
-    parts = overlapping(*pictures, _some(everything, 80))
+def test_what_overlaps_is_kept_and_most_of_the_rest_is_not(images: tuple[Features, Features]) -> None:
+    everything = match(*images)
+    parts = overlapping(*images, _some(everything, 80))
     assert parts is not None
-    for side, (part, features) in enumerate(zip(parts, pictures, strict=True)):
+    for side, (part, features) in enumerate(zip(parts, images, strict=True)):
         assert np.isin(everything.indices[:, side], part).all()
         assert len(part) < 0.6 * len(features)
 
 
-def test_matches_in_the_overlap_are_those_of_the_whole(pictures: tuple[Features, Features]) -> None:
-    everything = match(*pictures)
-    found = match_overlap(match, *pictures, _some(everything, 80))
+def test_matches_in_the_overlap_are_those_of_the_whole(images: tuple[Features, Features]) -> None:
+    everything = match(*images)
+    found = match_overlap(match, *images, _some(everything, 80))
     for name in ("indices", "points1", "points2"):
         np.testing.assert_array_equal(np.sort(getattr(found, name), axis=0), np.sort(getattr(everything, name), axis=0))
-    np.testing.assert_array_equal(found.points1, pictures[0].points[found.indices[:, 0]])
-    np.testing.assert_array_equal(found.points2, pictures[1].points[found.indices[:, 1]])
+    np.testing.assert_array_equal(found.points1, images[0].points[found.indices[:, 0]])
+    np.testing.assert_array_equal(found.points2, images[1].points[found.indices[:, 1]])
 
 
-def test_a_few_matches_by_chance_do_not_widen_it(pictures: tuple[Features, Features]) -> None:
-    some = _some(match(*pictures), 80)
-    alone, beside = overlapping(*pictures, some), overlapping(*pictures, _joined(some, _chance(*pictures, 6)))
+def test_a_few_matches_by_chance_do_not_widen_it(images: tuple[Features, Features]) -> None:
+    some = _some(match(*images), 80)
+    alone, beside = overlapping(*images, some), overlapping(*images, _joined(some, _chance(*images, 6)))
     assert alone is not None
     assert beside is not None
     for clean, disturbed in zip(alone, beside, strict=True):
         assert len(np.setdiff1d(disturbed, clean)) < 0.1 * len(clean)
 
 
-def test_many_that_stand_alone_tell_nothing(pictures: tuple[Features, Features]) -> None:
-    assert overlapping(*pictures, _joined(_some(match(*pictures), 80), _chance(*pictures, 30))) is None
+def test_many_that_stand_alone_tell_nothing(images: tuple[Features, Features]) -> None:
+    assert overlapping(*images, _joined(_some(match(*images), 80), _chance(*images, 30))) is None
 
 
-def test_few_tell_nothing(pictures: tuple[Features, Features]) -> None:
-    everything = match(*pictures)
-    assert overlapping(*pictures, _some(everything, 40)) is None
-    found = match_overlap(match, *pictures, _some(everything, 40))
+def test_few_tell_nothing(images: tuple[Features, Features]) -> None:
+    everything = match(*images)
+    assert overlapping(*images, _some(everything, 40)) is None
+    found = match_overlap(match, *images, _some(everything, 40))
     np.testing.assert_array_equal(found.indices, everything.indices)
 
 
-def test_without_the_size_of_the_pictures_nothing_is_told(pictures: tuple[Features, Features]) -> None:
-    unknown = [replace(features, image_size=None) for features in pictures]
-    assert overlapping(unknown[0], unknown[1], _some(match(*pictures), 80)) is None
+def test_without_the_size_of_the_images_nothing_is_told(images: tuple[Features, Features]) -> None:
+    unknown = [replace(features, image_size=None) for features in images]
+    assert overlapping(unknown[0], unknown[1], _some(match(*images), 80)) is None
 
 
-def test_where_matches_are_sparse_it_reaches_farther(pictures: tuple[Features, Features]) -> None:
-    everything = match(*pictures)
+def test_where_matches_are_sparse_it_reaches_farther(images: tuple[Features, Features]) -> None:
+    everything = match(*images)
     low = everything.points1[:, 1] > 300
     thinned = np.concatenate([np.flatnonzero(low)[:60], np.flatnonzero(~low)[:14]])
     dense = np.flatnonzero(low)[:60]
     told, untold = (
-        overlapping(*pictures, Correspondences.of(*pictures, everything.indices[kept], everything.ratio[kept]))
+        overlapping(*images, Correspondences.of(*images, everything.indices[kept], everything.ratio[kept]))
         for kept in (thinned, dense)
     )
     assert told is not None

@@ -13,9 +13,9 @@ from rdstitch.synthetic import ground
 )
 def test_packed_features_match_as_before(kind: str, bytes_each: tuple[int, ...]) -> None:
     colour = ground((320, 240), 11, 1).region(0, 0, 320, 240)
-    picture = np.rint(cv2.GaussianBlur(colour, (0, 0), 1.0).reshape(240, 320) * 255).astype(np.uint8)
+    image = np.rint(cv2.GaussianBlur(colour, (0, 0), 1.0).reshape(240, 320) * 255).astype(np.uint8)
     options = FeatureOptions(kind=kind, max_features=500)
-    features = [detect(picture, options), detect(np.ascontiguousarray(picture[:, 40:]), options)]
+    features = [detect(image, options), detect(np.ascontiguousarray(image[:, 40:]), options)]
     packed = [PackedFeatures.pack(found) for found in features]
     again = [found.unpack() for found in packed]
     assert packed[0].descriptors.itemsize in bytes_each

@@ -49,7 +49,7 @@ def test_coarse_keypoints_are_as_many_and_as_strong(grey: NDArray[np.uint8]) -> 
 def test_coarse_keypoints_of_odd_sizes_lie_where_they_do_in_the_whole(
     grey: NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also where a picture is halved twice, and each time a row and a column are left over."""
+    """Also where an image is halved twice, and each time a row and a column are left over."""
     monkeypatch.setattr(sift_tiles, "LARGE", 250_000)
     odd = np.ascontiguousarray(grey[:799, :1279])
     whole, tiles = OpenCVDetection.find(odd, OPTIONS), SiftTilesDetection.find(odd, OPTIONS)

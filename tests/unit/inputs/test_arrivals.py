@@ -21,7 +21,7 @@ def _nowhere() -> Path:
     raise AssertionError("nothing needs to be written")
 
 
-def _picture(file: Path, level: int = 100) -> Path:
+def _image(file: Path, level: int = 100) -> Path:
     assert cv2.imwrite(str(file), np.full((12, 16), level, np.uint8))
     return file
 
@@ -32,7 +32,7 @@ def _names(frames: Iterator[Frame]) -> list[str]:
 
 def test_what_is_in_a_folder_comes_in_natural_order_and_then_it_ends(tmp_path: Path) -> None:
     for name in ("f10.png", "f9.png", ".hidden.png", "notes.txt"):
-        _picture(tmp_path / name) if name.endswith("png") else (tmp_path / name).write_text("")
+        _image(tmp_path / name) if name.endswith("png") else (tmp_path / name).write_text("")
     arrivals = Arrivals(tmp_path, frames_folder=_nowhere, idle=0.01)
     assert _names(iter(arrivals)) == ["f9.png", "f10.png"]
     assert arrivals.inputs == [str(tmp_path)]
@@ -43,7 +43,7 @@ def test_files_that_come_later_are_found_once_and_only_when_they_are_complete(
 ) -> None:
     monkeypatch.setattr(module, "_POLL_SECONDS", 0.02)
     frames = iter(Arrivals(tmp_path, frames_folder=_nowhere, idle=1.5))
-    _picture(tmp_path / "a.png")
+    _image(tmp_path / "a.png")
     assert next(frames).path.name == "a.png"
     data = (tmp_path / "a.png").read_bytes()
 
@@ -64,9 +64,9 @@ def test_files_that_come_later_are_found_once_and_only_when_they_are_complete(
 
 
 def test_a_file_that_rdstitch_wrote_is_none(tmp_path: Path) -> None:
-    _picture(tmp_path / "out.png")
+    _image(tmp_path / "out.png")
     (tmp_path / "out.png.json").write_text('{"format": "rdstitch sidecar", "output": {"file": "out.png"}}')
-    _picture(tmp_path / "frame.png")
+    _image(tmp_path / "frame.png")
     assert _names(iter(Arrivals(tmp_path, frames_folder=_nowhere, idle=0.01))) == ["frame.png"]
 
 
@@ -117,8 +117,8 @@ def test_every_nth_frame_of_a_video_with_its_number_and_time(video: Path) -> Non
     assert [frame.number for frame in frames] == [0, 2, 4]
     assert [frame.timestamp for frame in frames] == pytest.approx([0.0, 0.4, 0.8])
     assert [frame.path.name for frame in frames] == ["drive_000000.png", "drive_000002.png", "drive_000004.png"]
-    pictures = [frame.picture for frame in frames]
-    assert [int(np.median(picture.pixels)) for picture in pictures if picture] == pytest.approx([0, 80, 160], abs=3)
+    images = [frame.image for frame in frames]
+    assert [int(np.median(image.pixels)) for image in images if image] == pytest.approx([0, 80, 160], abs=3)
     assert arrivals.inputs == [str(video)]
 
 
@@ -139,7 +139,7 @@ def test_what_cannot_be_followed_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be followed"):
         Arrivals(tmp_path / "nothing", frames_folder=_nowhere)
     with pytest.raises(InputError, match="cannot be followed"):
-        Arrivals(_picture(tmp_path / "picture.png"), frames_folder=_nowhere)
+        Arrivals(_image(tmp_path / "image.png"), frames_folder=_nowhere)
     with pytest.raises(InputError, match="cannot open"):
         next(iter(Arrivals("tcp://127.0.0.1:9", frames_folder=_nowhere)))
     empty = io.StringIO("")

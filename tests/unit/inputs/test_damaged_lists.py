@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from rdstitch.errors import InputError
-from rdstitch.inputs.find import find_pictures
+from rdstitch.inputs.find import find_images
 from rdstitch.inputs.measurements import _read_table
 
 
@@ -16,7 +16,7 @@ def test_a_pattern_longer_than_any_name_is_refused_at_once(tmp_path: Path) -> No
     names.write_text("*." + "x" * 75_000, encoding="utf-8")
     start = time.process_time()
     with pytest.raises(InputError, match="a pattern of 75002 characters"):
-        find_pictures([f"@{names}"])
+        find_images([f"@{names}"])
     assert time.process_time() - start < 1.0
 
 

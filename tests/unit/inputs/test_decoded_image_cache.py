@@ -1,4 +1,4 @@
-"""Pictures between stages: decoded once where there is room, and the same whether there is or not."""
+"""Images between stages: decoded once where there is room, and the same whether there is or not."""
 
 import pickle
 from copy import deepcopy
@@ -16,7 +16,7 @@ from rdstitch.inputs.decoded_image_cache import DecodedImageCache
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import Metadata, write_image
 from rdstitch.io import read as reading
-from rdstitch.io.read import Picture, read_image
+from rdstitch.io.read import DecodedImage, read_image
 
 SIZE = (1500, 1000)  # halved once for a look at it
 
@@ -41,7 +41,7 @@ def read(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The reductions at which files are decoded."""
     seen: list[int] = []
 
-    def noted(path: Path, reduction: int, metadata: Metadata) -> Picture:
+    def noted(path: Path, reduction: int, metadata: Metadata) -> DecodedImage:
         seen.append(reduction)
         return read_image(path, reduction, metadata)
 
@@ -49,11 +49,11 @@ def read(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return seen
 
 
-def _picture(values: NDArray[np.uint8]) -> Picture:
-    return Picture(values, None, Metadata(values.shape[::-1]))
+def _image(values: NDArray[np.uint8]) -> DecodedImage:
+    return DecodedImage(values, None, Metadata(values.shape[::-1]))
 
 
-def test_a_picture_is_decoded_once_for_all_stages(source: Source, read: list[int]) -> None:
+def test_an_image_is_decoded_once_for_all_stages(source: Source, read: list[int]) -> None:
     shelved = replace(source, decoded_images=DecodedImageCache())
     looks = [shelved.read(reduction, keep=True).pixels for reduction in (2, 4, 8)]
     last = shelved.read(8).pixels
@@ -79,9 +79,9 @@ def test_tags_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     source = read_sources([tmp_path / "a.jpg"], skip_bad=False)[0][0]
     expected = read_image(tmp_path / "a.jpg")
     monkeypatch.setattr(reading, "metadata_of", None)
-    picture = source.read()
-    assert picture.metadata is source.metadata
-    np.testing.assert_array_equal(picture.pixels, expected.pixels)
+    image = source.read()
+    assert image.metadata is source.metadata
+    np.testing.assert_array_equal(image.pixels, expected.pixels)
 
 
 def test_a_larger_size_is_read_from_the_file(source: Source, read: list[int]) -> None:
@@ -104,9 +104,9 @@ def test_masks_are_kept_apart(source: Source, tmp_path: Path) -> None:
     assert shelved.read(2).alpha is None
 
 
-def test_pictures_for_which_there_is_no_room_are_not_kept() -> None:
+def test_images_for_which_there_is_no_room_are_not_kept() -> None:
     decoded_images = DecodedImageCache(room=250)
-    large, small = (_picture(np.zeros((10, n), np.uint8)) for n in (20, 5))
+    large, small = (_image(np.zeros((10, n), np.uint8)) for n in (20, 5))
     decoded_images.put("large", large)
     decoded_images.put("other", large)
     decoded_images.put("small", small)
@@ -119,9 +119,9 @@ def test_pictures_for_which_there_is_no_room_are_not_kept() -> None:
 
 
 def test_a_shelf_that_was_cleared_has_room_again() -> None:
-    decoded_images, picture = DecodedImageCache(room=250), _picture(np.zeros((10, 20), np.uint8))
-    decoded_images.put("one", picture)
+    decoded_images, image = DecodedImageCache(room=250), _image(np.zeros((10, 20), np.uint8))
+    decoded_images.put("one", image)
     decoded_images.clear()
     assert decoded_images.take("one") is None
-    decoded_images.put("two", picture)
-    assert decoded_images.take("two") is picture
+    decoded_images.put("two", image)
+    assert decoded_images.take("two") is image

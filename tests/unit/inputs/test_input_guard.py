@@ -1,4 +1,4 @@
-"""Files that change during a run, pictures that a decoder doubts, and those that need too much memory."""
+"""Files that change during a run, images that a decoder doubts, and those that need too much memory."""
 
 import os
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -24,7 +24,7 @@ def _source(path: Path, guard: InputGuard | None = None, max_memory: int | None 
 
 
 @pytest.mark.parametrize("how", ["another file", "in place", "in place and backdated"])
-def test_another_picture_of_the_same_size_is_noticed(tmp_path: Path, how: str) -> None:
+def test_another_image_of_the_same_size_is_noticed(tmp_path: Path, how: str) -> None:
     path, other = tmp_path / "a.bmp", tmp_path / "b.bmp"
     _save(path, 1)
     _save(other, 2)
@@ -79,7 +79,7 @@ def test_damage_is_named_or_refused(tmp_path: Path, strict: bool) -> None:
     assert message.images == (str(path),)
 
 
-def test_a_picture_that_needs_too_much_memory(tmp_path: Path) -> None:
+def test_an_image_that_needs_too_much_memory(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     Image.new("RGB", (1000, 500)).save(path)
     _source(path, max_memory=3_000_000)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rdstitch.inputs.find import find_pictures
+from rdstitch.inputs.find import find_images
 from rdstitch.inputs.frame_tracking import tracked
 from rdstitch.inputs.keyframes import Wanted, choose, keyframes, wanted_frames
 
@@ -60,7 +60,7 @@ def test_few_frames_share_more() -> None:
     assert len(sparse) >= 12
 
 
-def test_what_stays_in_the_picture_is_no_ground() -> None:
+def test_what_stays_in_the_image_is_no_ground() -> None:
     frames = _film([4.0 * k for k in range(60)])
     body = np.asarray(np.random.default_rng(1).integers(0, 255, (70, _WIDTH)), dtype=np.uint8)
     body = np.asarray(cv2.GaussianBlur(body, (5, 5), 0), dtype=np.uint8)
@@ -104,16 +104,16 @@ def test_of_a_video_these_frames_are_written_unless_the_user_says_which(tmp_path
     writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (_WIDTH, _HEIGHT))
     if not writer.isOpened():
         pytest.skip("this OpenCV writes no videos")
-    for picture in _film([4.0 * k for k in range(60)] + [236.0] * 20):
-        writer.write(cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR))
+    for image in _film([4.0 * k for k in range(60)] + [236.0] * 20):
+        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
     writer.release()
-    found = find_pictures([file], frames_folder=lambda: folder)
+    found = find_images([file], frames_folder=lambda: folder)
     numbers = [frame.number for frame in found.frames]
     assert numbers[0] == 0
     assert 12 <= len(numbers) < 30
     assert sum(number is not None and number > 60 for number in numbers) <= 1
     assert f"{len(numbers)} of 80 frames" in str(found.messages[0])
     assert len(list(folder.iterdir())) == len(numbers)
-    every = find_pictures([file], frames_folder=lambda: folder, every=20)
+    every = find_images([file], frames_folder=lambda: folder, every=20)
     assert [frame.number for frame in every.frames] == [0, 20, 40, 60]
     assert every.messages == []

@@ -11,7 +11,7 @@ from rdstitch.io.metadata import GpsPosition, Metadata
 
 
 def _source(gps: GpsPosition | None) -> Source:
-    return Source(Path("picture.jpg"), Metadata((640, 480), gps=gps), Camera((640, 480)))
+    return Source(Path("image.jpg"), Metadata((640, 480), gps=gps), Camera((640, 480)))
 
 
 def test_distances_are_those_on_the_ground_at_any_place() -> None:
@@ -25,7 +25,7 @@ def test_distances_are_those_on_the_ground_at_any_place() -> None:
     assert three[1] - one[1] > 110.0
 
 
-def test_a_picture_without_gps_is_nowhere() -> None:
+def test_an_image_without_gps_is_nowhere() -> None:
     places = positions_of([_source(None), _source(GpsPosition(1.0, 2.0))])
     assert np.isnan(places[0]).all()
     assert np.isfinite(places[1]).all()

@@ -1,4 +1,4 @@
-"""``--exclude`` and ``--include-only`` choose pictures by name or pattern."""
+"""``--exclude`` and ``--include-only`` choose images by name or pattern."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ def _names(exclude: tuple[str, ...] = (), include_only: tuple[str, ...] = ()) ->
         (("b[2].jpg",), (), ["a1.jpg", "a2.jpg", "b1.jpg"]),
     ],
 )
-def test_pictures_are_chosen_by_name(exclude: tuple[str, ...], include_only: tuple[str, ...], left: list[str]) -> None:
+def test_images_are_chosen_by_name(exclude: tuple[str, ...], include_only: tuple[str, ...], left: list[str]) -> None:
     assert _names(exclude, include_only) == left
 
 

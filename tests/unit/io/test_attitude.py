@@ -42,16 +42,16 @@ def test_a_gimbal_past_straight_down() -> None:
 
 
 def test_signs() -> None:
-    """Who looks a little ahead has the ground below him towards the bottom of the picture."""
+    """Who looks a little ahead has the ground below him towards the bottom of the image."""
     c, s = np.cos(np.radians(10.0)), np.sin(np.radians(10.0))
     for ahead in (Attitude(50.0, -80.0, 0.0, "dji-gimbal"), Attitude(50.0, 10.0, 0.0, "pix4d-camera")):
         np.testing.assert_allclose(ahead.nadir, (0.0, s, c), atol=1e-12)
-    # The drone's right side hangs down, and the ground below lies towards the picture's right.
+    # The drone's right side hangs down, and the ground below lies towards the image's right.
     np.testing.assert_allclose(Attitude(50.0, 0.0, 10.0, "pix4d-camera").nadir, (s, 0.0, c), atol=1e-12)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_directions_turn_with_the_picture(orientation: int) -> None:
+def test_directions_turn_with_the_image(orientation: int) -> None:
     attitude = Attitude(0.0, 10.0, 20.0, "pix4d-camera")
     x, y, ahead = attitude.nadir
     rows, columns = np.mgrid[0:3, 0:4]

@@ -53,7 +53,7 @@ def test_levels_and_tiles_are_those_of_the_standard(tmp_path: Path, width: int, 
         assert found == expected
 
 
-def test_tiles_are_the_picture(tmp_path: Path) -> None:
+def test_tiles_are_the_image(tmp_path: Path) -> None:
     pixels = _smooth(777, 1301)
     write_image(tmp_path / "a.dzi", pixels, quality=98)
     for row in range(4):

@@ -46,7 +46,7 @@ def test_it_decodes_what_pillow_does(
     np.testing.assert_array_equal(read_image(file, factor).pixels, found)
 
 
-def test_tiny_pictures_are_left_to_pillow(tmp_path: Path, pixels: NDArray[np.uint8]) -> None:
+def test_tiny_images_are_left_to_pillow(tmp_path: Path, pixels: NDArray[np.uint8]) -> None:
     for side, factor in ((3, 2), (5, 4), (7, 1)):
         Image.fromarray(pixels[:side, :side]).save(tmp_path / "a.jpg")
         assert decoded_jpeg(tmp_path / "a.jpg", (side, side), factor, grey=False) == (None, "")

@@ -1,4 +1,4 @@
-"""Headers of picture files."""
+"""Headers of image files."""
 
 import struct
 import zlib
@@ -43,7 +43,7 @@ def test_exif_behind_the_pixels_of_a_png_is_found(tmp_path: Path) -> None:
     assert (found.make, found.orientation, found.size) == ("Maker", 6, (40, 60))
 
 
-def test_a_png_that_ends_early_is_no_picture_without_metadata(tmp_path: Path) -> None:
+def test_a_png_that_ends_early_is_no_image_without_metadata(tmp_path: Path) -> None:
     file = _png(tmp_path / "cut.png")
     file.write_bytes(file.read_bytes()[:-40])
     with pytest.raises(Exception, match="cut"):

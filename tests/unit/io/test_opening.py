@@ -41,7 +41,7 @@ def test_only_the_documented_formats_are_opened(
 
     monkeypatch.setattr("subprocess.Popen", started)
     (tmp_path / "a.jpg").write_bytes(content)
-    with pytest.raises(InputError, match=r"a\.jpg: (is no picture in a format|not a picture)"):
+    with pytest.raises(InputError, match=r"a\.jpg: (is no image in a format|not an image)"):
         function(tmp_path / "a.jpg")  # type: ignore[operator]
 
 
@@ -88,10 +88,10 @@ def _exif(kind: int, count: int, value: bytes) -> bytes:
 )
 def test_orientation_of_any_type(tmp_path: Path, suffix: str, exif: bytes, orientation: int) -> None:
     Image.fromarray(_RGB).save(tmp_path / f"a.{suffix}", exif=exif)
-    picture = read_image(tmp_path / f"a.{suffix}")
-    assert picture.metadata.orientation == orientation
-    assert picture.pixels.shape[:2] == ((60, 40) if orientation == 6 else (40, 60))
-    Image.Exif().load(picture.metadata.exif)
+    image = read_image(tmp_path / f"a.{suffix}")
+    assert image.metadata.orientation == orientation
+    assert image.pixels.shape[:2] == ((60, 40) if orientation == 6 else (40, 60))
+    Image.Exif().load(image.metadata.exif)
 
 
 def _profile(size: int, space: bytes = b"RGB ") -> bytes:
@@ -142,7 +142,7 @@ def test_a_file_of_several_blocks_is_read_whole(tmp_path: Path) -> None:
         read_limited(tmp_path / "file", len(content) - 1)
 
 
-def test_deep_pictures_keep_their_channels(tmp_path: Path) -> None:
+def test_deep_images_keep_their_channels(tmp_path: Path) -> None:
     deep = np.random.default_rng(1).integers(0, 65536, (300, 200, 4), dtype=np.uint16)
     write_image(tmp_path / "a.png", deep[..., :3])
     np.testing.assert_array_equal(read_image(tmp_path / "a.png").pixels, deep[..., :3])

@@ -10,7 +10,7 @@ import tifffile
 from PIL import ExifTags, Image, features
 
 from rdstitch.errors import InputError
-from rdstitch.inputs.find import find_pictures
+from rdstitch.inputs.find import find_images
 from rdstitch.io import read_image, read_metadata
 
 
@@ -33,25 +33,25 @@ def test_formats_of_phones_in_a_folder(tmp_path: Path, suffix: str) -> None:
     else:
         given: dict[str, Any] = {"quality": 95, "exif": exif} if suffix == ".avif" else {}
         _smooth().save(file, **given)
-    assert [frame.path for frame in find_pictures([tmp_path]).frames] == [file]
-    picture, metadata = read_image(file), read_metadata(file)
+    assert [frame.path for frame in find_images([tmp_path]).frames] == [file]
+    image, metadata = read_image(file), read_metadata(file)
     assert metadata.size == (128, 96)
     if suffix != ".tga":
         assert metadata.model == "Phone"
         assert metadata.focal_px == pytest.approx(26 / np.hypot(36, 24) * np.hypot(128, 96))
-    assert picture.pixels.dtype == np.uint8
-    assert np.abs(picture.pixels.astype(float) - np.asarray(_smooth())).mean() < 4.0
+    assert image.pixels.dtype == np.uint8
+    assert np.abs(image.pixels.astype(float) - np.asarray(_smooth())).mean() < 4.0
 
 
 def test_raw_files(tmp_path: Path) -> None:
     pytest.importorskip("rawpy")
     file = _dng(tmp_path / "a.dng")
-    picture, metadata = read_image(file), read_metadata(file)
-    assert picture.pixels.dtype == np.uint16
-    assert picture.pixels.shape[1::-1] == metadata.size
+    image, metadata = read_image(file), read_metadata(file)
+    assert image.pixels.dtype == np.uint16
+    assert image.pixels.shape[1::-1] == metadata.size
     assert metadata.bit_depth == 16
     assert metadata.model == "Model"
-    levels = picture.pixels[..., 1].astype(float).mean(axis=0)
+    levels = image.pixels[..., 1].astype(float).mean(axis=0)
     assert np.corrcoef(levels, np.arange(len(levels)))[0, 1] > 0.9
 
 
@@ -60,7 +60,7 @@ def test_what_is_missing_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, package: str, extra: str
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    (tmp_path / name).write_bytes(b"picture")
+    (tmp_path / name).write_bytes(b"image")
     for read in (read_image, read_metadata):
         with pytest.raises(InputError, match=rf"rdstitch\[{extra}\]"):
             read(tmp_path / name)
@@ -69,16 +69,16 @@ def test_what_is_missing_is_named(
 @pytest.mark.parametrize("name", ["a.heic", "a.dng"])
 def test_damaged_files_are_named(tmp_path: Path, name: str) -> None:
     pytest.importorskip("pillow_heif" if name == "a.heic" else "rawpy")
-    (tmp_path / name).write_bytes(b"no picture at all")
+    (tmp_path / name).write_bytes(b"no image at all")
     for read in (read_image, read_metadata):
         with pytest.raises(InputError, match=name):
             read(tmp_path / name)
 
 
-def test_of_a_picture_in_two_formats_the_usual_one_is_taken(tmp_path: Path) -> None:
+def test_of_an_image_in_two_formats_the_usual_one_is_taken(tmp_path: Path) -> None:
     _smooth().save(tmp_path / "a.jpg")
     (tmp_path / "a.heic").write_bytes(b"the same")
-    assert [frame.path.name for frame in find_pictures([tmp_path]).frames] == ["a.jpg"]
+    assert [frame.path.name for frame in find_images([tmp_path]).frames] == ["a.jpg"]
 
 
 def _dng(file: Path) -> Path:

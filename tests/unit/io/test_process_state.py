@@ -1,4 +1,4 @@
-"""A host program that reads pictures in threads finds its warnings, handlers and log levels as they were."""
+"""A host program that reads images in threads finds its warnings, handlers and log levels as they were."""
 
 import logging
 import warnings

@@ -1,4 +1,4 @@
-"""Reading pictures: every common file works or gives one line that names it."""
+"""Reading images: every common file works or gives one line that names it."""
 
 import os
 import stat
@@ -17,12 +17,12 @@ from PIL import Image
 from rdstitch.errors import InputError
 from rdstitch.io import read_image, read_metadata
 
-Picture = NDArray[Any]
+Samples = NDArray[Any]
 
 
 @pytest.fixture
-def colours() -> Picture:
-    """A small picture whose every pixel differs, with 8 bits."""
+def colours() -> Samples:
+    """A small image whose every pixel differs, with 8 bits."""
     v, u = np.mgrid[:23, :31]
     return np.stack([u * 8, v * 11, (u * v) % 256], axis=-1).astype(np.uint8)
 
@@ -40,16 +40,16 @@ def _expect_one_line(path: Path, function: Callable[[Path], object], capfd: pyte
     return text
 
 
-def test_colour_is_in_rgb_order(tmp_path: Path, colours: Picture) -> None:
+def test_colour_is_in_rgb_order(tmp_path: Path, colours: Samples) -> None:
     for suffix in ("png", "tif", "bmp"):
         Image.fromarray(colours).save(tmp_path / f"a.{suffix}")
-        picture = read_image(tmp_path / f"a.{suffix}")
-        np.testing.assert_array_equal(picture.pixels, colours)
-        assert picture.alpha is None
+        image = read_image(tmp_path / f"a.{suffix}")
+        np.testing.assert_array_equal(image.pixels, colours)
+        assert image.alpha is None
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_orientation_is_applied(tmp_path: Path, colours: Picture, orientation: int) -> None:
+def test_orientation_is_applied(tmp_path: Path, colours: Samples, orientation: int) -> None:
     exif = Image.Exif()
     exif[0x0112] = orientation
     upright = Image.fromarray(colours)
@@ -65,17 +65,17 @@ def test_orientation_is_applied(tmp_path: Path, colours: Picture, orientation: i
         8: upright.transpose(Image.Transpose.ROTATE_270),
     }[orientation]
     stored.save(tmp_path / "a.png", exif=exif)
-    picture = read_image(tmp_path / "a.png")
-    np.testing.assert_array_equal(picture.pixels, colours)
-    assert picture.metadata.orientation == orientation
-    assert picture.metadata.size == (31, 23)
+    image = read_image(tmp_path / "a.png")
+    np.testing.assert_array_equal(image.pixels, colours)
+    assert image.metadata.orientation == orientation
+    assert image.metadata.size == (31, 23)
     assert Image.Exif().get(0x0112) is None
     kept = Image.Exif()
-    kept.load(picture.metadata.exif)
+    kept.load(image.metadata.exif)
     assert kept[0x0112] == 1
 
 
-def test_sixteen_bits_stay_sixteen(tmp_path: Path, colours: Picture) -> None:
+def test_sixteen_bits_stay_sixteen(tmp_path: Path, colours: Samples) -> None:
     deep = colours.astype(np.uint16) * 257 + 3
     tifffile.imwrite(tmp_path / "a.tif", deep, photometric="rgb")
     np.testing.assert_array_equal(read_image(tmp_path / "a.tif").pixels, deep)
@@ -95,36 +95,36 @@ def test_not_a_number_becomes_transparent(tmp_path: Path) -> None:
     values = np.linspace(0, 1, 12, dtype=np.float32).reshape(3, 4)
     values[1, 2], values[2, 0] = np.nan, np.inf
     tifffile.imwrite(tmp_path / "a.tif", values)
-    picture = read_image(tmp_path / "a.tif")
-    assert picture.alpha is not None
-    assert np.isfinite(picture.pixels).all()
-    np.testing.assert_array_equal(picture.alpha == 0, ~np.isfinite(values))
+    image = read_image(tmp_path / "a.tif")
+    assert image.alpha is not None
+    assert np.isfinite(image.pixels).all()
+    np.testing.assert_array_equal(image.alpha == 0, ~np.isfinite(values))
 
 
-def test_alpha_is_apart(tmp_path: Path, colours: Picture) -> None:
+def test_alpha_is_apart(tmp_path: Path, colours: Samples) -> None:
     alpha = np.where(colours[..., 0] > 100, 255, 0).astype(np.uint8)
     Image.fromarray(np.dstack([colours, alpha])).save(tmp_path / "a.png")
-    picture = read_image(tmp_path / "a.png")
-    np.testing.assert_array_equal(picture.pixels, colours)
-    np.testing.assert_array_equal(picture.alpha, alpha)
+    image = read_image(tmp_path / "a.png")
+    np.testing.assert_array_equal(image.pixels, colours)
+    np.testing.assert_array_equal(image.alpha, alpha)
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "CMYK", "YCbCr", "LAB", "I", "F", "I;16"])
-def test_every_mode_becomes_grey_or_rgb(tmp_path: Path, colours: Picture, mode: str) -> None:
+def test_every_mode_becomes_grey_or_rgb(tmp_path: Path, colours: Samples, mode: str) -> None:
     image = Image.fromarray(colours).convert("L" if mode in ("I;16", "F") else "RGB").convert(mode)
     image.save(tmp_path / "a.tif")
-    picture = read_image(tmp_path / "a.tif")
-    assert picture.pixels.shape[:2] == (23, 31)
-    assert picture.pixels.ndim == 2 or picture.pixels.shape[2] == 3
-    assert picture.pixels.dtype in (np.uint8, np.uint16, np.float32)
+    decoded = read_image(tmp_path / "a.tif")
+    assert decoded.pixels.shape[:2] == (23, 31)
+    assert decoded.pixels.ndim == 2 or decoded.pixels.shape[2] == 3
+    assert decoded.pixels.dtype in (np.uint8, np.uint16, np.float32)
 
 
-def test_cmyk_jpeg(tmp_path: Path, colours: Picture) -> None:
+def test_cmyk_jpeg(tmp_path: Path, colours: Samples) -> None:
     Image.fromarray(colours).convert("CMYK").save(tmp_path / "a.jpg", quality=98)
     assert np.abs(read_image(tmp_path / "a.jpg").pixels.astype(int) - colours).mean() < 12
 
 
-def test_first_picture_of_several(tmp_path: Path, colours: Picture) -> None:
+def test_first_image_of_several(tmp_path: Path, colours: Samples) -> None:
     frames = [Image.fromarray(colours), Image.fromarray(255 - colours)]
     for name in ("a.gif", "a.png", "a.webp", "a.tif"):
         frames[0].save(tmp_path / name, save_all=True, append_images=frames[1:])
@@ -143,7 +143,7 @@ def test_very_long(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["with space.png", "quo'te\".png", "new\nline.png", "ünï.png"])
-def test_odd_names(tmp_path: Path, colours: Picture, name: str) -> None:
+def test_odd_names(tmp_path: Path, colours: Samples, name: str) -> None:
     Image.fromarray(colours).save(tmp_path / name)
     np.testing.assert_array_equal(read_image(tmp_path / name).pixels, colours)
 
@@ -157,7 +157,7 @@ class TestBadFiles:
         [
             ("missing.jpg", None),
             ("empty.jpg", b""),
-            ("text.jpg", b"This is not a picture.\n" * 20),
+            ("text.jpg", b"This is not an image.\n" * 20),
             ("zeros.tif", bytes(1000)),
             ("header.png", b"\x89PNG\r\n\x1a\n"),
             ("header.jpg", b"\xff\xd8\xff\xe0"),
@@ -196,7 +196,7 @@ class TestBadFiles:
         assert "permission" in _expect_one_line(tmp_path / "a.png", read_image, capfd)
 
     @pytest.mark.parametrize("kind", ["jpg", "png", "deep.png", "tif", "packed.tif", "webp"])
-    def test_truncated(self, tmp_path: Path, colours: Picture, kind: str, capfd: pytest.CaptureFixture[str]) -> None:
+    def test_truncated(self, tmp_path: Path, colours: Samples, kind: str, capfd: pytest.CaptureFixture[str]) -> None:
         path = tmp_path / f"a.{kind}"
         large = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
         if kind == "deep.png":
@@ -255,7 +255,7 @@ class TestMetadata:
         assert metadata.attitude.source == "dji-gimbal"
         assert (metadata.make, metadata.model) == ("Maker", "Model")
 
-    def test_real_drone_picture(self, shared_data: Callable[[str], Path]) -> None:
+    def test_real_drone_image(self, shared_data: Callable[[str], Path]) -> None:
         (path,) = (p for p in shared_data("textures_cc0").iterdir() if p.suffix == ".JPG")
         metadata = read_metadata(path)
         assert metadata.focal_px == pytest.approx(3641.79, abs=0.01)

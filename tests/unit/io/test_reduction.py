@@ -1,4 +1,4 @@
-"""Pictures read smaller: px stand for whole blocks, whatever the format, the orientation and the mask."""
+"""Images read smaller: px stand for whole blocks, whatever the format, the orientation and the mask."""
 
 from pathlib import Path
 from typing import Any
@@ -30,16 +30,16 @@ def test_blocks_become_px(tmp_path: Path, pixels: NDArray[np.uint8], factor: int
     alpha = np.full((HEIGHT, WIDTH), 255, np.uint8)
     alpha[40:50, 60:90] = 0
     write_image(tmp_path / "a.png", pixels, alpha)
-    picture = read_image(tmp_path / "a.png", factor)
+    image = read_image(tmp_path / "a.png", factor)
     rows, columns = -(-HEIGHT // factor), -(-WIDTH // factor)
-    assert picture.pixels.shape == (rows, columns, 3)
-    assert picture.metadata.size == (WIDTH, HEIGHT)
-    assert picture.alpha is not None
+    assert image.pixels.shape == (rows, columns, 3)
+    assert image.metadata.size == (WIDTH, HEIGHT)
+    assert image.alpha is not None
     for y, x in ((0, 0), (45 // factor, 75 // factor), (rows - 1, columns - 1)):
         block = np.s_[y * factor : (y + 1) * factor, x * factor : (x + 1) * factor]
-        assert picture.alpha[y, x] == alpha[block].min()
-        if picture.alpha[y, x] and (y + 1) * factor <= HEIGHT and (x + 1) * factor <= WIDTH:
-            np.testing.assert_allclose(picture.pixels[y, x], pixels[block].mean(axis=(0, 1)), atol=0.51)
+        assert image.alpha[y, x] == alpha[block].min()
+        if image.alpha[y, x] and (y + 1) * factor <= HEIGHT and (x + 1) * factor <= WIDTH:
+            np.testing.assert_allclose(image.pixels[y, x], pixels[block].mean(axis=(0, 1)), atol=0.51)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -47,7 +47,7 @@ def test_blocks_become_px(tmp_path: Path, pixels: NDArray[np.uint8], factor: int
 def test_jpeg_is_reduced_where_it_lies(
     tmp_path: Path, pixels: NDArray[np.uint8], orientation: int, factor: int
 ) -> None:
-    """The decoder's own reduction is no other picture than the mean of blocks; half a px of shift would show."""
+    """The decoder's own reduction is no other image than the mean of blocks; half a px of shift would show."""
     exif = Image.Exif()
     exif[0x0112] = orientation
     write_image(tmp_path / "a.jpg", pixels, None, Metadata((WIDTH, HEIGHT), exif=exif.tobytes()), quality=98)
@@ -91,7 +91,7 @@ def test_halved_px_are_means_of_what_is_opaque(dtype: type[np.uint8 | np.uint16]
     np.testing.assert_array_equal(found[..., -1], np.floor(blocks[..., -1].mean(axis=(1, 3)) + 0.5))
 
 
-def test_features_of_a_reduced_picture_lie_where_they_are_in_the_whole(pixels: NDArray[Any]) -> None:
+def test_features_of_a_reduced_image_lie_where_they_are_in_the_whole(pixels: NDArray[Any]) -> None:
     large = np.asarray(cv2.resize(pixels, (4 * WIDTH, 4 * HEIGHT), interpolation=cv2.INTER_CUBIC))
     options = FeatureOptions(work_megapixels=WIDTH * HEIGHT / 1e6)
     whole = detect(large, options)

@@ -1,4 +1,4 @@
-"""Writing pictures: whole or not at all, the same bytes for the same picture, nothing lost."""
+"""Writing images: whole or not at all, the same bytes for the same image, nothing lost."""
 
 import itertools
 import os
@@ -32,7 +32,7 @@ from rdstitch.io.outputs import Outputs
 Pixels = NDArray[Any]
 
 
-def _picture(height: int, width: int, channels: int, dtype: type, seed: int = 0) -> Pixels:
+def _image(height: int, width: int, channels: int, dtype: type, seed: int = 0) -> Pixels:
     """Smooth colours with some texture."""
     rng = np.random.default_rng(seed)
     coarse = rng.integers(0, 256, (max(2, height // 16), max(2, width // 16), channels)).astype(np.float32)
@@ -49,7 +49,7 @@ def _picture(height: int, width: int, channels: int, dtype: type, seed: int = 0)
 def test_lossless_formats_lose_nothing(
     tmp_path: Path, suffix: str, dtype: type, channels: int, transparent: bool
 ) -> None:
-    pixels = _picture(300, 257, channels, dtype)
+    pixels = _image(300, 257, channels, dtype)
     alpha = np.full((300, 257), 255, np.uint8)
     alpha[:70, 30:] = 0
     write_image(tmp_path / f"a.{suffix}", pixels, alpha if transparent else None)
@@ -64,7 +64,7 @@ def test_lossless_formats_lose_nothing(
 
 @pytest.mark.parametrize("channels", [1, 3])
 def test_jpeg_from_strips_is_what_one_piece_gives(tmp_path: Path, channels: int) -> None:
-    pixels = _picture(256 * 9 + 37, 333, channels, np.uint8)
+    pixels = _image(256 * 9 + 37, 333, channels, np.uint8)
     write_image(tmp_path / "a.jpg", pixels)
     bgr = np.ascontiguousarray(pixels[..., ::-1]) if channels == 3 else pixels
     done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 95])
@@ -83,7 +83,7 @@ def test_jpeg_from_strips_is_what_one_piece_gives(tmp_path: Path, channels: int)
 def test_strips_do_not_matter(tmp_path_factory: pytest.TempPathFactory, suffix: str, data: st.DataObject) -> None:
     folder = tmp_path_factory.mktemp("strips")
     height, width = data.draw(st.integers(1, 1400)), data.draw(st.integers(1, 300))
-    pixels = _picture(height, width, 3, np.uint8)
+    pixels = _image(height, width, 3, np.uint8)
     alpha = np.where(pixels[..., 0] > 60, 255, 0).astype(np.uint8)
     write_image(folder / f"whole.{suffix}", pixels, alpha)
     layout = Layout((width, height), 3, np.dtype(np.uint8), transparent=True, metadata=Metadata((width, height)))
@@ -101,7 +101,7 @@ def test_strips_do_not_matter(tmp_path_factory: pytest.TempPathFactory, suffix: 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
 def test_same_bytes_twice(tmp_path: Path, suffix: str) -> None:
-    pixels = _picture(700, 400, 3, np.uint8)
+    pixels = _image(700, 400, 3, np.uint8)
     for name in ("a", "b"):
         write_image(tmp_path / f"{name}.{suffix}", pixels)
     assert (tmp_path / f"a.{suffix}").read_bytes() == (tmp_path / f"b.{suffix}").read_bytes()
@@ -113,7 +113,7 @@ def test_profile_and_exif_are_kept(tmp_path: Path, suffix: str) -> None:
     exif[0x010F], exif[0x0110] = "Maker", "Model"
     profile = bytes(range(256)) * 400
     metadata = Metadata((64, 64), dpi=(150.0, 150.0), exif=exif.tobytes(), icc_profile=profile)
-    write_image(tmp_path / f"a.{suffix}", _picture(64, 64, 3, np.uint8), None, metadata)
+    write_image(tmp_path / f"a.{suffix}", _image(64, 64, 3, np.uint8), None, metadata)
     back = read_image(tmp_path / f"a.{suffix}").metadata
     assert back.icc_profile == profile
     assert (back.make, back.model) == ("Maker", "Model")
@@ -122,7 +122,7 @@ def test_profile_and_exif_are_kept(tmp_path: Path, suffix: str) -> None:
 
 
 def test_tiff_has_overviews_of_half_the_size(tmp_path: Path) -> None:
-    pixels = _picture(1301, 1003, 3, np.uint8)
+    pixels = _image(1301, 1003, 3, np.uint8)
     alpha = np.full(pixels.shape[:2], 255, np.uint8)
     alpha[:200] = 0
     write_image(tmp_path / "a.tif", pixels, alpha)
@@ -138,7 +138,7 @@ def test_tiff_has_overviews_of_half_the_size(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("writes", [8, pytest.param(200, marks=pytest.mark.slow)])
 def test_tiff_has_the_same_bytes_every_time(tmp_path: Path, writes: int) -> None:
-    pixels = _picture(600, 700, 3, np.uint8)
+    pixels = _image(600, 700, 3, np.uint8)
     alpha = np.full(pixels.shape[:2], 255, np.uint8)
     alpha[:90], alpha[:, 640:] = 0, 0
     written = set()
@@ -151,7 +151,7 @@ def test_tiff_has_the_same_bytes_every_time(tmp_path: Path, writes: int) -> None
 
 
 def test_floats_need_tiff(tmp_path: Path) -> None:
-    pixels = _picture(40, 50, 3, np.float32)
+    pixels = _image(40, 50, 3, np.float32)
     write_image(tmp_path / "a.tif", pixels)
     np.testing.assert_array_equal(read_image(tmp_path / "a.tif").pixels, pixels)
     with pytest.raises(OutputError, match=r"\.tif"):
@@ -297,7 +297,7 @@ def test_grey_with_alpha_is_shown_by_other_readers(tmp_path: Path, dtype: type[n
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 @pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
-def test_gdal_sees_where_there_is_a_picture_at_every_size(tmp_path: Path, dtype: type[np.number[Any]]) -> None:
+def test_gdal_sees_where_there_is_an_image_at_every_size(tmp_path: Path, dtype: type[np.number[Any]]) -> None:
     rasterio = pytest.importorskip("rasterio")
     pixels, alpha = np.full((600, 1100), 1, dtype), np.zeros((600, 1100), np.uint8)
     alpha[100:500, 200:] = 255

@@ -11,7 +11,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.local_alignment import LocalAlignment, Match, align_locally
 from rdstitch.local_alignment.fit import Stiffness, fit_fields
-from rdstitch.local_alignment.matches import PicturesOnPlane, PlaneMatches, place_matches
+from rdstitch.local_alignment.matches import ImagesOnPlane, PlaneMatches, place_matches
 from rdstitch.radial_homography import from_plane, to_plane
 from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
 
@@ -27,7 +27,7 @@ def scene(kind: str | None, height: float = 0.05, seed: int = 1) -> Sequence:
 
 
 def homographies(sequence: Sequence, level: float | None = None) -> FloatArray:
-    """Of the pictures to the plane at a level, texels, or at the mean height of the ground."""
+    """Of the images to the plane at a level, texels, or at the mean height of the ground."""
     poses, relief = sequence.poses, sequence.relief
     if level is None:
         level = 0.0 if relief is None else float(relief.height.mean())
@@ -46,7 +46,7 @@ def matches(sequence: Sequence, noise: float = 0.2, wrong: float = 0.0, count: i
     for i in range(len(sequence)):
         for j in range(i + 1, len(sequence)):
             first = rng.uniform((0, 0), (639, 479), (count, 2))
-            second = sequence.ground_to_picture(j, sequence.to_ground(i, first))
+            second = sequence.ground_to_image(j, sequence.to_ground(i, first))
             seen = ((second >= 0) & (second <= (639, 479))).all(axis=1)
             if seen.sum() < 40:
                 continue
@@ -58,7 +58,7 @@ def matches(sequence: Sequence, noise: float = 0.2, wrong: float = 0.0, count: i
 
 
 def displacements(sequence: Sequence, matrices: FloatArray, local: LocalAlignment) -> FloatArray:
-    """How far two pictures are apart on the ground, texels, where both show the same place of the output."""
+    """How far two images are apart on the ground, texels, where both show the same place of the output."""
     rng = np.random.default_rng(4)
     found = []
     for i in range(len(sequence)):
@@ -109,8 +109,8 @@ def test_on_a_plane_nothing_is_moved(noise: float) -> None:
     assert local.before is None  # what neighbours have nothing of in common needs no fit
 
 
-def test_relief_of_single_pictures_is_tried() -> None:
-    # A sixth of the pictures shows relief: their matches agree with their neighbours', those of the others do not.
+def test_relief_of_single_images_is_tried() -> None:
+    # A sixth of the images shows relief: their matches agree with their neighbours', those of the others do not.
     sequence = scene(None)
     found = matches(sequence)
     bend = 3.0 * np.sin(found[0].points1 / 60.0)
@@ -130,12 +130,12 @@ def test_a_number_of_cells_is_used_in_any_case_and_off_in_none() -> None:
 def test_the_whole_does_not_move_and_fields_fade_where_nothing_supports_them() -> None:
     sequence = scene("bumps", 0.1)
     matrices = homographies(sequence)
-    pictures = PicturesOnPlane.of(CAMERAS, matrices)
-    placed = PlaneMatches.join(place_matches(matches(sequence), pictures))
-    fields = fit_fields(placed, pictures, Stiffness(12, 0.02))
+    images = ImagesOnPlane.of(CAMERAS, matrices)
+    placed = PlaneMatches.join(place_matches(matches(sequence), images))
+    fields = fit_fields(placed, images, Stiffness(12, 0.02))
     values = np.concatenate(fields.values)
     assert np.abs(values.mean(axis=0)).max() < 0.02 * np.abs(values).max()
-    # The first picture alone shows its outer corner.
+    # The first image alone shows its outer corner.
     corner, inner = fields.values[0].reshape(*fields.shapes[0], 2)[[0, -1], [0, -1]]
     assert np.linalg.norm(corner) < 0.3 * np.abs(fields.values[0]).max()
     assert np.linalg.norm(corner) < np.linalg.norm(inner) + 1.0
@@ -147,9 +147,9 @@ def test_nothing_folds_even_where_matches_say_so() -> None:
         Match(m.image1, m.image2, m.points1, m.points2 + 14.0 * np.sign(np.sin(m.points2[:, ::-1] / 15.0)))
         for m in matches(sequence, count=1000)
     ]
-    pictures = PicturesOnPlane.of(CAMERAS, homographies(sequence))
-    placed = PlaneMatches.join(place_matches(torn, pictures))
-    fields = fit_fields(placed, pictures, Stiffness(30, 5.0)).of_pictures()
+    images = ImagesOnPlane.of(CAMERAS, homographies(sequence))
+    placed = PlaneMatches.join(place_matches(torn, images))
+    fields = fit_fields(placed, images, Stiffness(30, 5.0)).of_images()
     assert 0.45 < max(field.steepest for field in fields) <= 0.501
 
 
@@ -162,7 +162,7 @@ def test_equal_matches_give_equal_fields() -> None:
 
 
 def test_that_ground_is_flat_is_found_pair_by_pair() -> None:
-    """Of thousands of pictures, the matches of all pairs together would be what takes memory."""
+    """Of thousands of images, the matches of all pairs together would be what takes memory."""
     sequence = scene(None)
     found = 40 * matches(sequence)
     tracemalloc.start()
@@ -191,8 +191,8 @@ def test_too_few_matches_are_said() -> None:
     assert align_locally(few, CAMERAS, homographies(sequence)).reason == "there are too few matches"
 
 
-def test_pictures_beyond_the_horizon_are_nowhere() -> None:
+def test_images_beyond_the_horizon_are_nowhere() -> None:
     nowhere = -np.broadcast_to(np.eye(3), (6, 3, 3))
     some = np.concatenate([nowhere[:3], homographies(scene(None))[3:]])
-    assert np.isfinite(PicturesOnPlane.of(CAMERAS, some).scale)
+    assert np.isfinite(ImagesOnPlane.of(CAMERAS, some).scale)
     assert align_locally(matches(scene(None)), CAMERAS, nowhere).reason == "there are too few matches"

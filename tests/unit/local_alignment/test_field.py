@@ -1,4 +1,4 @@
-"""A displacement field is a smooth surface through its nodes, in the picture's own pixels."""
+"""A displacement field is a smooth surface through its nodes, in the image's own pixels."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def test_it_passes_through_its_nodes_and_is_smooth_between() -> None:
     assert np.abs(np.diff(bend, axis=0)).max() < 0.05 * np.abs(bend).max()
 
 
-def test_beside_the_picture_it_goes_on_as_at_the_border() -> None:
+def test_beside_the_image_it_goes_on_as_at_the_border() -> None:
     field = DisplacementField.of(SIZE, VALUES)
     for border, step in (((0.0, 100.0), (-1.0, 0.0)), ((639.0, 300.0), (1.0, 0.0)), ((200.0, 479.0), (0.0, 1.0))):
         before, here, beyond = field(np.array(border) + np.outer((-1.0, 0.0, 1.0), step))

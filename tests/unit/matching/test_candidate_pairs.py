@@ -1,4 +1,4 @@
-"""Which pairs are looked at: all of a few pictures; of many, those that follow one another or look alike."""
+"""Which pairs are looked at: all of a few images; of many, those that follow one another or look alike."""
 
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -70,34 +70,34 @@ def test_the_number_of_pairs_grows_with_the_number_of_frames_not_with_its_square
 
 
 def _survey(side: int, order: NDArray[np.intp]) -> tuple[list[Features], set[tuple[int, int]]]:
-    """Pictures of a plane, side by side, half over one another, in some order; pairs that overlap by a quarter."""
+    """Images of a plane, side by side, half over one another, in some order; pairs that overlap by a quarter."""
     rng = np.random.default_rng(8)
     corners = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2) * 0.5
     corners = corners[order] + rng.uniform(-0.02, 0.02, (side**2, 2))
     places = rng.uniform(0.0, side / 2 + 1.0, ((10 * side) ** 2, 2))
     words = rng.normal(size=(len(places), 64)).astype(np.float32)
-    pictures = []
+    images = []
     for corner in corners:
         seen = words[((places > corner) & (places < corner + 1.0)).all(axis=1)]
         repeated = seen[rng.random(len(seen)) < 0.7]  # no detector finds all of them again
-        pictures.append(_features(repeated + 0.3 * rng.normal(size=repeated.shape).astype(np.float32)))
+        images.append(_features(repeated + 0.3 * rng.normal(size=repeated.shape).astype(np.float32)))
     shared = np.maximum(1.0 - np.abs(corners[:, None] - corners), 0.0).prod(axis=2)
-    return pictures, {(i, j) for i, j in np.argwhere(shared > 0.22).tolist() if i < j}
+    return images, {(i, j) for i, j in np.argwhere(shared > 0.22).tolist() if i < j}
 
 
 @pytest.mark.parametrize("ordered", [False, True])
-def test_pairs_that_overlap_are_among_fifteen_candidates_a_picture(ordered: bool) -> None:
+def test_pairs_that_overlap_are_among_fifteen_candidates_an_image(ordered: bool) -> None:
     side = 16
     order = np.arange(side**2) if ordered else np.random.default_rng(3).permutation(side**2)
-    pictures, overlapping = _survey(side, order)
-    pairs = set(first_pairs(pictures, seed=0))
+    images, overlapping = _survey(side, order)
+    pairs = set(first_pairs(images, seed=0))
     assert len(overlapping) > 3 * side**2
     assert 2 * len(pairs) <= CANDIDATES * side**2
     assert CANDIDATES <= 15
     assert len(overlapping & pairs) >= 0.997 * len(overlapping)
 
 
-def test_the_order_of_pictures_counts_only_where_it_means_something() -> None:
+def test_the_order_of_images_counts_only_where_it_means_something() -> None:
     side = 9
     following = {(i, i + 3) for i in range(side**2 - 3)}
     ordered, _ = _survey(side, np.arange(side**2))
@@ -107,24 +107,24 @@ def test_the_order_of_pictures_counts_only_where_it_means_something() -> None:
 
 
 def test_the_same_features_and_seed_give_the_same_pairs() -> None:
-    pictures, _ = _survey(7, np.random.default_rng(5).permutation(49))
-    assert first_pairs(pictures, seed=3) == first_pairs(pictures, seed=3)
+    images, _ = _survey(7, np.random.default_rng(5).permutation(49))
+    assert first_pairs(images, seed=3) == first_pairs(images, seed=3)
 
 
-def test_pictures_taken_near_each_other_are_paired_whatever_they_look_like() -> None:
+def test_images_taken_near_each_other_are_paired_whatever_they_look_like() -> None:
     rng = np.random.default_rng(0)
     count = 60
-    pictures = [_features(rng.normal(size=(30, 64)).astype(np.float32)) for _ in range(count)]
+    images = [_features(rng.normal(size=(30, 64)).astype(np.float32)) for _ in range(count)]
     turn = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
     positions = np.column_stack([np.cos(turn), np.sin(turn)])[rng.permutation(count)]
     positions[7] = np.nan
-    pairs = set(first_pairs(pictures, seed=0, positions=positions))
+    pairs = set(first_pairs(images, seed=0, positions=positions))
     near = np.linalg.norm(positions[:, None] - positions, axis=2) < 0.35
     assert {(i, j) for i, j in np.argwhere(near).tolist() if i < j} < pairs
     assert len({pair for pair in pairs if 7 in pair}) < count - 1
 
 
-def test_pictures_without_features_look_like_none() -> None:
+def test_images_without_features_look_like_none() -> None:
     nothing = _features(np.zeros((0, 64), dtype=np.float32))
     pairs = first_pairs([nothing, *_drive(34)], seed=1)
     assert len(pairs) > 34
@@ -133,8 +133,8 @@ def test_pictures_without_features_look_like_none() -> None:
 
 @pytest.mark.parametrize(("overlap", "found"), [(0.1, []), (0.2, [(0, 1)]), (0.5, [(0, 1)]), (0.9, [(0, 1)])])
 @pytest.mark.parametrize("size", [1.0, 0.4])
-def test_pictures_that_overlap_by_a_fifth_are_neighbours(overlap: float, found: list[object], size: float) -> None:
-    """Of the smaller footprint: the second picture may have been taken from nearer."""
+def test_images_that_overlap_by_a_fifth_are_neighbours(overlap: float, found: list[object], size: float) -> None:
+    """Of the smaller footprint: the second image may have been taken from nearer."""
     lens = Camera((640, 480))
     width, height = 639 / lens.half_diagonal, 479 / lens.half_diagonal
     x = (0.5 - size * (overlap - 0.5)) * width
@@ -212,22 +212,22 @@ def test_neighbours_with_partners_in_common_are_not_tried_again_but_loops_are_cl
 def test_too_few_features_for_words_look_like_none() -> None:
     """Words are learned from 640 descriptors or more, or not at all."""
     rng = np.random.default_rng(0)
-    pictures = [_features(rng.normal(size=(16, 64)).astype(np.float32)) for _ in range(39)]
-    assert similarity(FeatureStore.of(pictures), seed=1) is None
-    assert similarity(FeatureStore.of([*pictures, pictures[0]]), seed=1) is not None
+    images = [_features(rng.normal(size=(16, 64)).astype(np.float32)) for _ in range(39)]
+    assert similarity(FeatureStore.of(images), seed=1) is None
+    assert similarity(FeatureStore.of([*images, images[0]]), seed=1) is not None
 
 
-def test_pictures_that_look_like_none_are_paired_with_the_three_that_follow() -> None:
+def test_images_that_look_like_none_are_paired_with_the_three_that_follow() -> None:
     count = 40
     pairs = first_pairs([_features(np.zeros((0, 64), dtype=np.float32))] * count, seed=0)
     assert pairs == [(i, j) for i in range(count) for j in range(i + 1, min(i + 4, count))]
 
 
-def test_no_picture_is_paired_with_itself() -> None:
+def test_no_image_is_paired_with_itself() -> None:
     assert all(i < j for i, j in first_pairs(_drive(40), seed=0))
 
 
-def test_ten_neighbours_of_each_picture_are_candidates() -> None:
+def test_ten_neighbours_of_each_image_are_candidates() -> None:
     lens = Camera((640, 480))
     places = np.stack([np.eye(3)] * 11)
     places[:, 0, 2] = np.linspace(0.0, 0.1, 11)
@@ -245,7 +245,7 @@ def _alike(ordered: bool = False) -> Any:
     return SimpleNamespace(most_alike=most, peak=np.ones((4, 2), dtype=np.bool_), ordered=ordered, scores=scores)
 
 
-def test_pictures_without_features_are_like_none() -> None:
+def test_images_without_features_are_like_none() -> None:
     assert _alike_to_each(_alike(), {0, 1, 2, 3}) == {(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)}
     assert _alike_to_each(_alike(), {0, 1, 2}) == {(0, 1), (0, 2), (1, 2)}
     assert _alike_to_each(_alike(ordered=True), {0, 1, 2, 3}) == set()

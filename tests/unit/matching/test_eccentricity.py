@@ -10,7 +10,7 @@ from rdstitch.features import FeatureOptions, detect
 from rdstitch.matching.eccentricity import blob_radii, eccentricity
 
 OBLIQUE = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0011, 0.0004, 1.0]])
-SHARP = 4  # pixels of the drawing per pixel of the picture and side
+SHARP = 4  # pixels of the drawing per pixel of the image and side
 
 
 def _oblique(points: FloatArray) -> FloatArray:
@@ -18,24 +18,24 @@ def _oblique(points: FloatArray) -> FloatArray:
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
-def _pictures(center: FloatArray, radius: float) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+def _images(center: FloatArray, radius: float) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """A dark disc on light ground, 640 x 480 pixels, from above and obliquely."""
     turns = np.linspace(0.0, 2.0 * np.pi, 400)
     outline = center + radius * np.column_stack([np.cos(turns), np.sin(turns)])
-    pictures = []
+    images = []
     for points in (outline, _oblique(outline)):
         canvas = np.full((480 * SHARP, 640 * SHARP), 220, dtype=np.uint8)
         cv2.fillPoly(canvas, [np.rint((points + 0.5) * SHARP - 0.5).astype(np.int32)], 30)
-        pictures.append(np.asarray(cv2.resize(canvas, (640, 480), interpolation=cv2.INTER_AREA), dtype=np.uint8))
-    return pictures[0], pictures[1]
+        images.append(np.asarray(cv2.resize(canvas, (640, 480), interpolation=cv2.INTER_AREA), dtype=np.uint8))
+    return images[0], images[1]
 
 
 @pytest.mark.parametrize("kind", ["sift", "surf"])
 def test_keypoints_of_a_disc_are_where_it_says(kind: str) -> None:
     center, radius = np.array([420.0, 250.0]), 60.0
     keypoints = []
-    for picture, where in zip(_pictures(center, radius), (center, _oblique(center[None])[0]), strict=True):
-        features = detect(picture, FeatureOptions(kind=kind))
+    for image, where in zip(_images(center, radius), (center, _oblique(center[None])[0]), strict=True):
+        features = detect(image, FeatureOptions(kind=kind))
         keypoints.append(features.take(np.argsort(np.linalg.norm(features.points - where, axis=1))[:1]))
     above, oblique = keypoints
     radii = blob_radii(above)
@@ -72,7 +72,7 @@ def test_discs_that_are_not_seen_whole_have_none() -> None:
 
 def test_corners_have_no_blob() -> None:
     rng = np.random.default_rng(0)
-    picture = cv2.resize(rng.integers(0, 255, (60, 80), dtype=np.uint8), (640, 480))
-    found = detect(np.asarray(picture, dtype=np.uint8), FeatureOptions(kind="orb"))
+    image = cv2.resize(rng.integers(0, 255, (60, 80), dtype=np.uint8), (640, 480))
+    found = detect(np.asarray(image, dtype=np.uint8), FeatureOptions(kind="orb"))
     assert len(found) > 10
     assert (blob_radii(found) == 0.0).all()

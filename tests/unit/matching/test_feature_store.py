@@ -21,7 +21,7 @@ def test_features_are_read_in_the_pixels_that_are_wanted() -> None:
     features = _features(30, (801, 600))
     (smaller,) = FeatureStore.of([features]).at_sizes([(401, 300)])
     assert smaller.image_size == (401, 300)
-    # The corners of the pictures stay where they are, and so do half diagonals.
+    # The corners of the images stay where they are, and so do half diagonals.
     ratio = np.hypot(401, 300) / np.hypot(801, 600)
     np.testing.assert_allclose(smaller.points, (features.points - (400, 299.5)) * ratio + (200, 149.5), atol=0.4)
     np.testing.assert_allclose(smaller.scale, features.scale * ratio, rtol=2e-3)

@@ -29,7 +29,7 @@ def test_a_reversed_link_leads_back() -> None:
     assert again.relation.camera == link.relation.camera
 
 
-def test_every_other_link_of_a_sequence_is_reversed_however_far_apart_its_pictures_are() -> None:
+def test_every_other_link_of_a_sequence_is_reversed_however_far_apart_its_images_are() -> None:
     for apart in (1, 2, 3, 7):
         given = [_link(k, k + apart) for k in range(12)]
         backward = [link.image1 > link.image2 for link in in_alternate_directions(given)]

@@ -1,4 +1,4 @@
-"""Pictures of two lenses among one another, told apart by what the pairs see of λ."""
+"""Images of two lenses among one another, told apart by what the pairs see of λ."""
 
 import itertools
 
@@ -24,7 +24,7 @@ def _divided(
     seed: int = 1,
     size: tuple[int, int] = (640, 480),
 ) -> TwoLenses | None:
-    """The division by votes of pairs: off by ``common`` for both pictures, and by ``std`` for each."""
+    """The division by votes of pairs: off by ``common`` for both images, and by ``std`` for each."""
     i, j = np.array(pairs).T
     rng, own = np.random.default_rng(seed), np.array(lenses)
     votes = np.stack([own[i], own[j]], axis=1)
@@ -66,7 +66,7 @@ def test_where_no_pair_is_of_one_lens_nothing_can_be_kept(pairs: list[tuple[int,
     assert not found.certain
 
 
-def test_a_picture_that_may_belong_to_either_makes_the_division_uncertain() -> None:
+def test_an_image_that_may_belong_to_either_makes_the_division_uncertain() -> None:
     i, j = np.array(_CHAIN).T
     votes = np.array([(-0.2, -0.2), (-0.2, -0.05), (-0.05, -0.05), (-0.05, -0.13)])
     std = np.array([0.001, 0.001, 0.001, 0.05])
@@ -101,14 +101,14 @@ def test_pairs_that_see_nothing_say_nothing() -> None:
     assert _divided(_CHAIN[:1], [-0.2, -0.1], std=0.05) is None
 
 
-def test_pairs_of_one_lens_are_those_of_no_picture_that_was_left_out() -> None:
+def test_pairs_of_one_lens_are_those_of_no_image_that_was_left_out() -> None:
     found = SeparatedLenses([], {2: "another lens"}, None)
     assert found.of_one_lens([(0, 1), (1, 2), (2, 3), (0, 3)]) == [(0, 1), (0, 3)]
     assert SeparatedLenses([], {}, None).of_one_lens([(0, 1), (1, 2)]) == [(0, 1), (1, 2)]
 
 
 def test_divisions_begin_at_the_widest_gaps() -> None:
-    """Seven lenses, each of two pictures that a certain vote connects: the five widest gaps between them."""
+    """Seven lenses, each of two images that a certain vote connects: the five widest gaps between them."""
     levels = np.array([-0.50, -0.41, -0.33, -0.26, -0.20, -0.15, -0.11])
     pairs = np.array([(2 * k, 2 * k + 1) for k in range(7)] + [(2 * k + 1, 2 * k + 2) for k in range(6)])
     own = np.repeat(levels, 2)

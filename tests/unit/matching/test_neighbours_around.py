@@ -1,4 +1,4 @@
-"""Pairs of pictures from one centre that overlap: those that all pairs would give, without looking at all of them."""
+"""Pairs of images from one centre that overlap: those that all pairs would give, without looking at all of them."""
 
 from itertools import combinations
 

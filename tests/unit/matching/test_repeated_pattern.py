@@ -10,7 +10,7 @@ import rdstitch
 from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions, Features, detect
 from rdstitch.matching.repeated_pattern import MIN_REPETITION, match_pattern, repetition
-from rdstitch.synthetic import PictureTexture, Sequence, grid_poses, ground, sequence_over
+from rdstitch.synthetic import ImageTexture, Sequence, grid_poses, ground, sequence_over
 
 _SIDE = 40
 _LENS = Camera((400, 300), distortion=-0.25, focal=380.0)
@@ -19,13 +19,13 @@ _OPTIONS = FeatureOptions(max_features=800)
 
 @pytest.fixture(scope="module")
 def board() -> Sequence:
-    """Pictures of a chessboard with some dirt on it, from above and aslant."""
+    """Images of a chessboard with some dirt on it, from above and aslant."""
     squares = np.kron(np.indices((20, 44)).sum(axis=0) % 2, np.ones((_SIDE, _SIDE)))
     rng = np.random.default_rng(0)
     dirt = np.asarray(cv2.GaussianBlur(rng.normal(0.0, 1.0, squares.shape), (0, 0), 3.0))  # type: ignore[call-overload]
     pixels = np.clip(60 + 130 * squares + 60 * dirt, 0, 255).astype(np.uint8)
     poses = grid_poses(_LENS, 4, 1, overlap=0.6, yaw=0.2, shift=0.05, seed=3).shaken(seed=4, tilt=0.12)
-    return sequence_over(PictureTexture(pixels), _LENS, poses)
+    return sequence_over(ImageTexture(pixels), _LENS, poses)
 
 
 def _features(sequence: Sequence, index: int) -> Features:

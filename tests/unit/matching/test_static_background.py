@@ -1,4 +1,4 @@
-"""What stays where it is in the picture, and by how little it may move to count as that."""
+"""What stays where it is in the image, and by how little it may move to count as that."""
 
 import numpy as np
 import pytest
@@ -77,7 +77,7 @@ def test_most_pairs_are_static_by_their_majority() -> None:
     ("links", "count", "shown"),
     [
         ([(0, 1), (1, 2)], 3, True),
-        ([(0, 1)], 2, False),  # two pictures may do so by chance
+        ([(0, 1)], 2, False),  # two images may do so by chance
         ([(0, 1), (1, 2)], 6, True),
         ([(0, 1), (1, 2)], 7, False),  # less than half
         ([(0, 1), (2, 3), (4, 5)], 6, False),  # not connected

@@ -18,7 +18,7 @@ from rdstitch.matching.two_view_rounds import MovingPairs, Pairing
 from rdstitch.progress import silent
 
 LENS = Camera((640, 480), distortion=-0.2, focal=520.0)
-PICTURES = 4
+IMAGES = 4
 
 
 def _features(points: FloatArray, descriptors: FloatArray) -> Features:
@@ -34,7 +34,7 @@ def _descriptors(count: int, rng: np.random.Generator) -> FloatArray:
 
 
 def _pairing(resting: int, moving: int, repeated: int = 0, seed: int = 0) -> Pairing:
-    """Pictures in which some points rest, while a board with others is carried about, or is not there.
+    """Images in which some points rest, while a board with others is carried about, or is not there.
 
     Of the points of the board so many look like one another, in fives.
     """
@@ -44,7 +44,7 @@ def _pairing(resting: int, moving: int, repeated: int = 0, seed: int = 0) -> Pai
     names = _descriptors(resting + moving, rng)
     names[resting : resting + repeated] = np.repeat(names[resting : resting + repeated : 5], 5, axis=0)
     found = []
-    for index in range(PICTURES):
+    for index in range(IMAGES):
         angle, offset = 0.3 * index, np.array([0.12, -0.08]) * index
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         seen = board @ turn.T + offset
@@ -55,11 +55,11 @@ def _pairing(resting: int, moving: int, repeated: int = 0, seed: int = 0) -> Pai
         inside = ((points > 0) & (points < (639, 479))).all(axis=1)
         found.append(_features(points[inside], seen_as[inside]))
     matcher = partial(match, ratio=None)
-    cameras = [LENS.with_focal()] * PICTURES
+    cameras = [LENS.with_focal()] * IMAGES
     return Pairing(FeatureStore.of(found), cameras, matcher, MatchingOptions(), silent, ThreadPoolExecutor(1))
 
 
-ALL = [(i, j) for i in range(PICTURES) for j in range(i + 1, PICTURES)]
+ALL = [(i, j) for i in range(IMAGES) for j in range(i + 1, IMAGES)]
 
 
 def test_a_moving_board_is_found_before_a_static_background() -> None:
@@ -73,7 +73,7 @@ def test_a_moving_board_is_found_before_a_static_background() -> None:
     assert abs(distortion - LENS.distortion) < 0.02
 
 
-def test_pictures_that_are_really_static_stay_together() -> None:
+def test_images_that_are_really_static_stay_together() -> None:
     pairing = _pairing(400, 0)
     alone = pairing.estimate(ALL)
     assert pairing.remove_static_background(alone) == MovingPairs(pairing, alone, found=False)
@@ -109,7 +109,7 @@ def test_static_matches_of_features_that_were_matched_otherwise_are_dropped_too(
         assert len(kept) == (~static).sum()
 
 
-def test_weakly_linked_pictures_find_what_repeats_where_it_must_be() -> None:
+def test_weakly_linked_images_find_what_repeats_where_it_must_be() -> None:
     pairing = _pairing(0, 160, repeated=120)
     alone = pairing.estimate(ALL)
     assert all(pair.relation for pair in alone)
@@ -123,7 +123,7 @@ def test_weakly_linked_pictures_find_what_repeats_where_it_must_be() -> None:
     assert np.median(errors) < 0.02
 
 
-def test_pictures_with_many_matches_are_left_as_they_are() -> None:
+def test_images_with_many_matches_are_left_as_they_are() -> None:
     pairing = _pairing(0, 400)
     alone = pairing.estimate(ALL)
     cameras = [camera.with_focal() for camera in pairing.cameras]
@@ -131,7 +131,7 @@ def test_pictures_with_many_matches_are_left_as_they_are() -> None:
     assert pairing.guided_rematch(alone, alignment.support, alignment.transfer) == {}
 
 
-def test_pictures_that_share_nothing_are_rejected_by_the_prescreen() -> None:
+def test_images_that_share_nothing_are_rejected_by_the_prescreen() -> None:
     one, other = _pairing(0, 400), _pairing(0, 400, seed=1)
     together = replace(one, features=FeatureStore.of([*one.features[:2], *other.features[:2]]))
     assert list(together.prescreen_pairs(ALL)) == [(0, 1), (2, 3)]
@@ -155,7 +155,7 @@ def test_a_few_matches_beside_hundreds_do_not_pass_the_prescreen() -> None:
     assert list(known.prescreen_pairs(ALL)) == [(0, 1), (1, 2), (2, 3)]
 
 
-def test_pictures_behind_the_horizon_have_no_neighbours() -> None:
+def test_images_behind_the_horizon_have_no_neighbours() -> None:
     beyond = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [3.0, 0.0, 1.0]])
     assert neighbours([LENS] * 3, np.stack([beyond] * 3), set()) == []
     assert neighbours([LENS] * 3, np.stack([np.eye(3), beyond, beyond]), set()) == []

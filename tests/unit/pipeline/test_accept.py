@@ -1,4 +1,4 @@
-"""What leaving out a picture or a pair can heal, and what it would only hide."""
+"""What leaving out an image or a pair can heal, and what it would only hide."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -38,9 +38,7 @@ def _read(frames: list[Path]) -> list[Source]:
         ((), "failure", False),
     ],
 )
-def test_only_failures_of_many_pictures_concern_all(
-    images: tuple[str, ...], severity: Severity, expected: bool
-) -> None:
+def test_only_failures_of_many_images_concern_all(images: tuple[str, ...], severity: Severity, expected: bool) -> None:
     assert _concerns_all([Message("wrong", ("x.png",), "failure"), Message("wrong", images, severity)]) is expected
 
 
@@ -75,7 +73,7 @@ def test_motions_in_the_plane_are_compared_by_their_freedom(former: str, model: 
 
 
 class _Stub(SimpleNamespace):
-    """As much of a registration of four pictures, the third of which is damaged, as ``accept`` asks for."""
+    """As much of a registration of four images, the third of which is damaged, as ``accept`` asks for."""
 
     def with_messages(self, messages: object) -> Any:
         return _Stub(**{**vars(self), "found": messages})
@@ -99,7 +97,7 @@ def _stub(model: str, used: int) -> Any:
         ("tilting", 3, (), False),
         ("tilting", 3, (4,), True),  # the whole fails, the rest does not
         ("tilting", 3, (3, 4), None),
-        ("rigid", 2, (), False),  # most of the pictures would be missing
+        ("rigid", 2, (), False),  # most of the images would be missing
     ],
 )
 def test_what_is_damaged_is_left_out_where_the_others_fit_better(
@@ -134,7 +132,7 @@ def test_what_is_damaged_is_left_out_where_the_others_fit_better(
 
 
 def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Path) -> None:
-    """The pair of the other two pictures had been dropped for contradicting the third one, and 0 with it."""
+    """The pair of the other two images had been dropped for contradicting the third one, and 0 with it."""
     frames = flight(3, 3).write(tmp_path)
     sources = _read(frames)
     with open_executor(1, len(sources)) as executor:
@@ -169,7 +167,7 @@ def test_what_remains_has_metric_poses_where_they_are_needed(monkeypatch: pytest
 
 
 def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path: Path) -> None:
-    """What drives ahead fills a good third of every picture, and has more matches where pictures overlap little."""
+    """What drives ahead fills a good third of every image, and has more matches where images overlap little."""
     plane, ahead = flight(3, 3, overlap=0.4), flight(5, 3, overlap=0.4)
     middle = ahead.poses.position.mean(axis=0)
     slow = middle + 0.15 * (ahead.poses.position - middle) + [[0.0, 25.0], [0.0, -25.0], [0.0, 25.0]]

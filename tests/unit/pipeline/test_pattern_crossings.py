@@ -14,7 +14,7 @@ from rdstitch.features import FeatureOptions
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.pipeline import pattern_crossings as stage
 from rdstitch.pipeline import register as stages
-from rdstitch.synthetic import PictureTexture, Sequence, grid_poses, ground, sequence_over
+from rdstitch.synthetic import ImageTexture, Sequence, grid_poses, ground, sequence_over
 
 _LENS = Camera((400, 300), distortion=-0.25, focal=380.0)
 _OPTIONS = rdstitch.StitchOptions(workers=1, features=FeatureOptions(max_features=800))
@@ -23,7 +23,7 @@ _OPTIONS = rdstitch.StitchOptions(workers=1, features=FeatureOptions(max_feature
 def _board() -> Sequence:
     pixels = np.kron(np.indices((20, 44)).sum(axis=0) % 2, np.ones((40, 40)))
     poses = grid_poses(_LENS, 4, 1, overlap=0.6, yaw=0.2, shift=0.05, seed=3).shaken(seed=4, tilt=0.12)
-    return sequence_over(PictureTexture((60 + 130 * pixels).astype(np.uint8)), _LENS, poses)
+    return sequence_over(ImageTexture((60 + 130 * pixels).astype(np.uint8)), _LENS, poses)
 
 
 def _bend(camera: Camera) -> float:
@@ -56,7 +56,7 @@ def test_saddles_of_other_ground_change_nothing(monkeypatch: pytest.MonkeyPatch)
     assert found.camera == plain.camera
 
 
-def test_a_picture_that_only_crossings_place_is_looked_at_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_image_that_only_crossings_place_is_looked_at_too(monkeypatch: pytest.MonkeyPatch) -> None:
     def alignment(used: list[bool], support: set[tuple[int, int]], rms: float) -> SimpleNamespace:
         return SimpleNamespace(used=np.array(used), support=support, rms=rms, cameras=[_LENS] * 3)
 

@@ -11,7 +11,7 @@ from rdstitch.camera import Camera
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.pipeline import pattern_shifts
 from rdstitch.radial_homography import to_plane
-from rdstitch.synthetic import Photometry, PictureTexture, Sequence, grid_poses, ground, repeated, sequence_over
+from rdstitch.synthetic import ImageTexture, Photometry, Sequence, grid_poses, ground, repeated, sequence_over
 from rdstitch.verification.unique_places import UniqueShift
 
 LENS = Camera((320, 240), distortion=-0.15, focal=350.0)
@@ -28,7 +28,7 @@ def _stained_tiles() -> Sequence:
     rng = np.random.default_rng(8)
     for x, y in zip(rng.integers(8, width - 8, 25), rng.integers(8, height - 8, 25), strict=True):
         pixels[y - 4 : y + 5, x - 4 : x + 5] = rng.choice([0.02, 0.9])
-    return Sequence(PictureTexture(pixels), taken.lens, taken.poses, taken.photometry, seed=3)
+    return Sequence(ImageTexture(pixels), taken.lens, taken.poses, taken.photometry, seed=3)
 
 
 def test_stained_tiles_are_stitched_where_the_stains_agree() -> None:
@@ -41,8 +41,8 @@ def test_stained_tiles_are_stitched_where_the_stains_agree() -> None:
     assert "repeated-pattern" in [message.code for message in result.registration.warnings]
 
 
-def test_pictures_that_look_alike_nowhere_else_keep_their_places(monkeypatch: pytest.MonkeyPatch) -> None:
-    # As over a car park beside a meadow: keypoints repeat, but a picture shows too few periods to find stains in.
+def test_images_that_look_alike_nowhere_else_keep_their_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    # As over a car park beside a meadow: keypoints repeat, but an image shows too few periods to find stains in.
     sequence = sequence_over(partial(ground, seed=2), LENS, grid_poses(LENS, 3, 1, overlap=0.6, seed=3), seed=3)
     decided = {(0, 1): UniqueShift(np.zeros(2), 1.0, 1.0, 0.0)}
     monkeypatch.setattr(Pairing, "shows_repeated_pattern", property(lambda pairing: True))

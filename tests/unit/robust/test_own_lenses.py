@@ -1,4 +1,4 @@
-"""What one pair of pictures sees of two lenses."""
+"""What one pair of images sees of two lenses."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ _THRESHOLD = 3.0
 
 
 def _seen(first: Camera | None, second: Camera | None, seed: int, motion: str = "similarity") -> OwnLenses:
-    """What own lenses come to where pictures of one lens were taken with others instead."""
+    """What own lenses come to where images of one lens were taken with others instead."""
     matches = correspondences(400, seed=seed, motion=motion, noise=0.3)
     lens = matches.truth.camera
 
@@ -32,7 +32,7 @@ def _seen(first: Camera | None, second: Camera | None, seed: int, motion: str = 
 
 
 def _difference(found: OwnLenses) -> tuple[float, float]:
-    """λ of the second picture less that of the first, and its standard deviation."""
+    """λ of the second image less that of the first, and its standard deviation."""
     sign = np.array([-1.0, 1.0])
     return float(sign @ found.distortion), float(np.sqrt(sign @ found.covariance @ sign))
 

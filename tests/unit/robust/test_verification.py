@@ -54,7 +54,7 @@ def test_neighbouring_matches_count_once() -> None:
     assert rejection_reason(one_more, one_more, np.ones(len(one_more), dtype=np.bool_), SIZE, 3.0) is None
 
 
-def test_places_are_those_of_the_picture_with_fewer() -> None:
+def test_places_are_those_of_the_image_with_fewer() -> None:
     assert places(_apart(30), _apart(30), SIZE) == 30
     assert places(_apart(30), np.full((30, 2), 7.0), SIZE) == 1
     assert places(_apart(30)[:0], _apart(30)[:0], SIZE) == 0

@@ -156,12 +156,12 @@ def test_points_too_far_out_to_compute_with_have_no_solution(case: Case, scale: 
 
 
 @every_solver
-@pytest.mark.parametrize("picture", [0, 1, 2])
-def test_coincident_points_have_no_solution(case: Case, picture: int) -> None:
+@pytest.mark.parametrize("image", [0, 1, 2])
+def test_coincident_points_have_no_solution(case: Case, image: int) -> None:
     x1, x2 = samples(case, batch=50)
-    if picture != 1:
+    if image != 1:
         x1[:, 1] = x1[:, 0]
-    if picture != 0:
+    if image != 0:
         x2[:, 1] = x2[:, 0]
     assert len(case.solve(x1, x2)) == 0
 
@@ -205,7 +205,7 @@ def test_wrong_shapes_raise(case: Case, shapes: tuple[Any, Any]) -> None:
 
 
 @every_solver
-def test_pictures_of_different_shape_raise(case: Case) -> None:
+def test_images_of_different_shape_raise(case: Case) -> None:
     with pytest.raises(ArgumentError):
         case.solve(np.zeros((3, case.count, 2)), np.zeros((4, case.count, 2)))
 

@@ -10,7 +10,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.synthetic import (
     EndlessTexture,
     FisheyeLens,
-    PictureTexture,
+    ImageTexture,
     Poses,
     best_division_model,
     blank,
@@ -35,7 +35,7 @@ LENS = Camera((320, 240), -0.25, focal=260.0)
 @pytest.mark.parametrize("direction", [0.0, 0.5 * np.pi])
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.1, -0.08)])
 def test_pairs_overlap_as_requested(direction: float, tilt: tuple[float, float]) -> None:
-    """Along the middle row (or column), 70 % of the first picture is not in the second."""
+    """Along the middle row (or column), 70 % of the first image is not in the second."""
     poses, _ = fit_to_plane(LENS, pair_poses(LENS, 0.3, direction=direction, tilt=tilt))
     sequence = sequence_over(blank, LENS, poses)
     ends = [(-0.5, 119.5), (319.5, 119.5)] if direction == 0.0 else [(159.5, -0.5), (159.5, 239.5)]
@@ -44,9 +44,9 @@ def test_pairs_overlap_as_requested(direction: float, tilt: tuple[float, float])
     assert (first[1] - second[0]) / (first[1] - first[0]) == pytest.approx(0.3, abs=0.01)
 
 
-def test_all_that_pictures_see_lies_on_the_plane() -> None:
+def test_all_that_images_see_lies_on_the_plane() -> None:
     poses, (width, height) = fit_to_plane(LENS, grid_poses(LENS, 4, 3, yaw=0.3, shift=0.1, tilt=(0.05, 0.1)), margin=5)
-    sequence = sequence_over(PictureTexture(np.zeros((height, width), np.uint8)), LENS, poses, margin=5)
+    sequence = sequence_over(ImageTexture(np.zeros((height, width), np.uint8)), LENS, poses, margin=5)
     corners = np.array([(-0.5, -0.5), (319.5, -0.5), (319.5, 239.5), (-0.5, 239.5)])
     seen = np.concatenate([sequence.to_plane(index, corners) for index in range(12)])
     assert seen.min() > 4.0
@@ -55,12 +55,12 @@ def test_all_that_pictures_see_lies_on_the_plane() -> None:
         sequence_over(blank((width - 1, height)), LENS, poses, margin=5)
 
 
-def test_a_picture_of_the_horizon_is_refused() -> None:
+def test_an_image_of_the_horizon_is_refused() -> None:
     with pytest.raises(ArgumentError, match="horizon"):
         fit_to_plane(LENS, Poses.of([(0.0, 0.0)], 260.0, 0.0, (1.3, 0.0)))
 
 
-def test_motion_between_poses_is_the_homography_between_pictures() -> None:
+def test_motion_between_poses_is_the_homography_between_images() -> None:
     poses = grid_poses(LENS, 3, 2, yaw=3.0, tilt=(0.1, -0.2)).shaken(seed=1, height=0.2)
     from_plane = poses.from_plane()
     for i, j in ((0, 1), (4, 2), (5, 0)):
@@ -130,7 +130,7 @@ def test_endless_ground_is_the_same_wherever_it_is_cut() -> None:
     assert steps[7] < 2.0 * np.median(steps)
 
 
-def test_ground_has_the_spectrum_of_natural_pictures() -> None:
+def test_ground_has_the_spectrum_of_natural_images() -> None:
     """Power falls as frequency to the power -1.5 … -3, and seeds differ."""
     grey = ground((512, 512), 6, 1).region(0, 0, 512, 512)[:, :, 0].astype(np.float64)
     assert np.abs(grey - ground((512, 512), 7, 1).region(0, 0, 512, 512)[:, :, 0]).mean() > 0.05

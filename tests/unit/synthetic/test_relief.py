@@ -77,7 +77,7 @@ def test_truth_of_the_plane_does_not_know_of_relief() -> None:
     points = np.random.default_rng(3).uniform((0, 0), (319, 239), (50, 2))
     np.testing.assert_array_equal(rough.to_plane(0, points), flat.to_plane(0, points))
     np.testing.assert_array_equal(flat.to_ground(0, points), flat.to_plane(0, points))
-    np.testing.assert_allclose(rough.to_picture(0, rough.to_plane(0, points)), points, atol=1e-6)
+    np.testing.assert_allclose(rough.to_image(0, rough.to_plane(0, points)), points, atol=1e-6)
 
 
 def test_heights_of_zero_are_a_plane() -> None:
@@ -96,7 +96,7 @@ def test_a_wall_hides_what_is_behind_it_from_one_side_only() -> None:
     lens = Camera((640, 480), 0.0, focal=400.0)
     poses = Poses.of([(200.0, 200.0), (400.0, 200.0)], 400.0)
     sequence = Sequence(blank((600, 400)), lens, poses, relief=Relief(heights))
-    from_left, from_right = (sequence.to_ground(k, sequence.to_picture(k, behind)) for k in (0, 1))
+    from_left, from_right = (sequence.to_ground(k, sequence.to_image(k, behind)) for k in (0, 1))
     assert 280.0 <= from_left[0, 0] <= 300.0
     np.testing.assert_allclose(from_right, behind, atol=1e-6)
 
@@ -105,7 +105,7 @@ def test_a_wall_hides_what_is_behind_it_from_one_side_only() -> None:
 def test_points_of_the_ground_are_seen_where_rays_meet_them(kind: str) -> None:
     sequence = over(kind, 0.1)
     points = np.random.default_rng(7).uniform((5, 5), (314, 234), (200, 2))
-    seen = sequence.ground_to_picture(1, sequence.to_ground(1, points))
+    seen = sequence.ground_to_image(1, sequence.to_ground(1, points))
     error = np.linalg.norm(seen - points, axis=1)
     # Walls have one texel of ground for all their height.
     assert np.isfinite(error).mean() > 0.8

@@ -1,4 +1,4 @@
-"""Rendered pictures show what projection says they show."""
+"""Rendered images show what projection says they show."""
 
 from pathlib import Path
 
@@ -12,9 +12,9 @@ from rdstitch.errors import OutputError
 from rdstitch.synthetic import (
     BrownLens,
     FisheyeLens,
+    ImageTexture,
     Lens,
     Photometry,
-    PictureTexture,
     Poses,
     Relief,
     Sequence,
@@ -37,18 +37,18 @@ LENSES: list[Lens] = [
 IDS = ["division", "division2", "equidistant", "equisolid", "stereographic", "brown"]
 
 
-def blobs(size: tuple[int, int], places: FloatArray, sigma: float) -> PictureTexture:
+def blobs(size: tuple[int, int], places: FloatArray, sigma: float) -> ImageTexture:
     """Gaussian blobs at given texels on black ground."""
     x, y = np.arange(size[0]), np.arange(size[1])
     rows = np.exp(-((y[:, None] - places[:, 1]) ** 2) / (2.0 * sigma**2))
     columns = np.exp(-((x[:, None] - places[:, 0]) ** 2) / (2.0 * sigma**2))
-    return PictureTexture((rows @ columns.T).astype(np.float32))
+    return ImageTexture((rows @ columns.T).astype(np.float32))
 
 
-def centroid(picture: FloatArray, around: FloatArray, radius: int = 9) -> FloatArray:
+def centroid(image: FloatArray, around: FloatArray, radius: int = 9) -> FloatArray:
     """Centre of gravity of the light near a px, weighted by its square: far pixels count little."""
     u, v = np.rint(around).astype(int)
-    window = picture[v - radius : v + radius + 1, u - radius : u + radius + 1] ** 2
+    window = image[v - radius : v + radius + 1, u - radius : u + radius + 1] ** 2
     grid = np.arange(-radius, radius + 1)
     return np.array([u + (window.sum(axis=0) @ grid) / window.sum(), v + (window.sum(axis=1) @ grid) / window.sum()])
 
@@ -60,16 +60,16 @@ def test_a_blob_is_seen_where_projection_puts_it(lens: Lens, texels_per_pixel: f
     poses, size = fit_to_plane(lens, Poses.of([(0.0, 0.0)], texels_per_pixel * lens.focal, 0.4, (0.06, -0.05)))
     wanted = np.stack(np.meshgrid(np.linspace(25, 295, 7), np.linspace(25, 215, 5)), axis=-1).reshape(-1, 2)
     wanted += np.random.default_rng(1).uniform(-0.5, 0.5, wanted.shape)
-    sequence = Sequence(PictureTexture(np.zeros((1, 1), np.float32)), lens, poses)
+    sequence = Sequence(ImageTexture(np.zeros((1, 1), np.float32)), lens, poses)
     places = sequence.to_plane(0, wanted)
     sequence = Sequence(blobs(size, places, 2.0 * texels_per_pixel), lens, poses, Photometry(bits=16))
-    picture = sequence.frame(0).astype(np.float64)
-    found = np.array([centroid(picture, place) for place in wanted])
+    image = sequence.frame(0).astype(np.float64)
+    found = np.array([centroid(image, place) for place in wanted])
     # A round blob on the plane is seen by a lens that bends it: its centroid is off by up to 0.03 px at the corners.
     error = np.linalg.norm(found - wanted, axis=1)
     assert np.median(error) < 0.02
     assert error.max() < 0.06
-    np.testing.assert_allclose(sequence.to_picture(0, places), wanted, atol=1e-6)
+    np.testing.assert_allclose(sequence.to_image(0, places), wanted, atol=1e-6)
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=IDS)
@@ -82,7 +82,7 @@ def test_lenses_go_both_ways(lens: Lens) -> None:
     np.testing.assert_allclose(lens.undistort(np.asarray(lens.center)), lens.center, atol=1e-12)
 
 
-def test_two_pictures_are_related_by_their_planar_motion() -> None:
+def test_two_images_are_related_by_their_planar_motion() -> None:
     lens = Camera(SIZE, -0.3, focal=260.0)
     sequence = sequence_over(
         lambda size: ground(size, 1), lens, pair_poses(lens, 0.4, yaw=0.5, direction=1.0, scale=1.2, tilt=(0.1, 0.07))
@@ -92,23 +92,23 @@ def test_two_pictures_are_related_by_their_planar_motion() -> None:
     rays = (lens.undistort(points) - lens.center) / 260.0
     moved = np.column_stack([rays, np.ones(50)]) @ h.T
     expected = lens.distort(moved[:, :2] / moved[:, 2:] * 260.0 + lens.center)
-    np.testing.assert_allclose(sequence.to_picture(1, sequence.to_plane(0, points)), expected, atol=1e-8)
+    np.testing.assert_allclose(sequence.to_image(1, sequence.to_plane(0, points)), expected, atol=1e-8)
 
 
 def test_rendering_does_not_alias() -> None:
     """A checkerboard too fine to be resolved turns grey, not into moiré."""
     lens = Camera(SIZE, 0.0, focal=260.0)
     x, y = np.meshgrid(np.arange(2400), np.arange(1800))
-    board = PictureTexture((((x + y) % 2) * 255).astype(np.uint8))
+    board = ImageTexture((((x + y) % 2) * 255).astype(np.uint8))
     sequence = sequence_over(board, lens, Poses.of([(0.0, 0.0)], 5.0 * 260.0, 0.3))
-    picture = sequence.frame(0)[4:-4, 4:-4].astype(np.float64)
-    assert abs(picture.mean() - 127.5) < 2.0
-    assert picture.std() < 8.0
+    image = sequence.frame(0)[4:-4, 4:-4].astype(np.float64)
+    assert abs(image.mean() - 127.5) < 2.0
+    assert image.std() < 8.0
 
 
 def test_exposure_is_what_was_requested() -> None:
     lens = Camera(SIZE, 0.0, focal=260.0)
-    grey = PictureTexture(np.full((400, 500), 100, np.uint8))
+    grey = ImageTexture(np.full((400, 500), 100, np.uint8))
     poses = Poses.of([(0.0, 0.0), (5.0, 3.0)], 260.0)
     settings = Photometry(gain=np.array([1.0, 1.5]), vignetting=0.4, noise=0.01, bits=16)
     sequence = sequence_over(grey, lens, poses, photometry=settings, seed=4)
@@ -132,12 +132,12 @@ def test_a_raised_box_is_seen_in_parallax() -> None:
     relief = np.zeros((height, width), np.float32)
     relief[y - 20 : y + 21, x - 20 : x + 21] = 26.0
     sequence = Sequence(blobs((width, height), place[None], 2.0), lens, poses, relief=Relief(relief))
-    expected = sequence.to_picture(0, poses.position[0] + (place - poses.position[0]) * 260.0 / (260.0 - 26.0))
+    expected = sequence.to_image(0, poses.position[0] + (place - poses.position[0]) * 260.0 / (260.0 - 26.0))
     found = centroid(sequence.frame(0).astype(np.float64), expected)
     np.testing.assert_allclose(found, expected, atol=0.05)
 
 
-def test_reachable_is_where_pictures_look() -> None:
+def test_reachable_is_where_images_look() -> None:
     lens = Camera(SIZE, -0.3, focal=260.0)
     sequence = sequence_over(lambda size: ground(size, 1, 1), lens, pair_poses(lens, 0.3, yaw=0.2))
     mask = sequence.reachable()
@@ -145,7 +145,7 @@ def test_reachable_is_where_pictures_look() -> None:
     seen = np.zeros(len(places), dtype=np.bool_)
     near = np.zeros(len(places), dtype=np.bool_)
     for index in range(2):
-        u = sequence.to_picture(index, places)
+        u = sequence.to_image(index, places)
         border = np.minimum(u, np.array(SIZE) - 1 - u).min(axis=1)
         seen |= border > -0.5
         near |= np.abs(border) < 2.0
@@ -153,7 +153,7 @@ def test_reachable_is_where_pictures_look() -> None:
     np.testing.assert_array_equal(mask[row, column][~near], seen[~near])
 
 
-def test_written_pictures_are_the_frames(tmp_path: Path) -> None:
+def test_written_images_are_the_frames(tmp_path: Path) -> None:
     lens = Camera((64, 48), -0.3, focal=60.0)
     sequence = sequence_over(lambda size: ground(size, 1), lens, pair_poses(lens), photometry=Photometry(bits=16))
     paths = sequence.write(tmp_path)
@@ -165,12 +165,12 @@ def test_written_pictures_are_the_frames(tmp_path: Path) -> None:
         sequence.write(tmp_path / "missing")
 
 
-def test_large_pictures_are_rendered_in_strips_without_a_trace() -> None:
+def test_large_images_are_rendered_in_strips_without_a_trace() -> None:
     """The strips' borders show no line: neighbouring rows differ there as they do elsewhere."""
     lens = Camera((2000, 900), -0.2, focal=1500.0)
     sequence = sequence_over(lambda size: ground(size, 2, 1), lens, Poses.of([(0.0, 0.0)], 1500.0, 0.2))
-    picture = sequence.frame(0).astype(np.float64)
-    difference = np.abs(np.diff(picture, axis=0)).mean(axis=1)
+    image = sequence.frame(0).astype(np.float64)
+    difference = np.abs(np.diff(image, axis=0)).mean(axis=1)
     rows = 400_000 // 2000
     borders = np.arange(rows, 900, rows) - 1
     assert (difference[borders] < 1.2 * np.median(difference)).all()

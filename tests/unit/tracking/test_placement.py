@@ -44,7 +44,7 @@ def test_a_similarity_moves_a_placement_and_its_pose_alike() -> None:
     np.testing.assert_allclose([other.x, other.y, other.yaw, other.height], [*turned, 0.8, 1.2 / 0.9], atol=1e-9)
 
 
-def test_planes_are_brought_together_by_the_pictures_that_both_have() -> None:
+def test_planes_are_brought_together_by_the_images_that_both_have() -> None:
     placed = [_placed(0.0, 0.0, 0.2, 1.0), _placed(1.0, 0.5, -0.4, 1.1)]
     move = PlaneSimilarity(0.7 * complex(math.cos(1.0), math.sin(1.0)), 2.0 - 3.0j)
     found = PlaneSimilarity.between(placed, [move.applied(one) for one in placed])

@@ -1,4 +1,4 @@
-"""The picture of what has been seen so far."""
+"""The image of what has been seen so far."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ _CAMERA = Camera((160, 120))
 
 
 def _at(x: float, y: float) -> Placement:
-    """A picture straight from above, one unit of the plane for half its diagonal."""
+    """An image straight from above, one unit of the plane for half its diagonal."""
     return Placement(_CAMERA, np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]]), 1.0)
 
 

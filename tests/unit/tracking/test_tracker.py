@@ -11,7 +11,7 @@ from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
 from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions, Features, detect, match
-from rdstitch.features.picture import View, prepare
+from rdstitch.features.prepared_image import View, prepare
 from rdstitch.matching.options import PairOptions
 from rdstitch.synthetic import Sequence, blank, line_poses, sequence_over, turn_poses
 from rdstitch.tracking import Tracked, Tracker, TrackingOptions
@@ -38,7 +38,7 @@ def _features(sequence: Sequence, world: int = 0) -> list[Features]:
     words = rng.normal(size=(len(places), 32)).astype(np.float32)
     frames = []
     for index in range(len(sequence)):
-        seen = sequence.to_picture(index, places)
+        seen = sequence.to_image(index, places)
         inside = np.isfinite(seen).all(axis=1) & (seen > 0.0).all(axis=1) & (seen < np.array(SIZE) - 1.0).all(axis=1)
         points = seen[inside] + rng.normal(0.0, 0.2, (int(inside.sum()), 2))
         ones = np.ones(len(points))

@@ -1,4 +1,4 @@
-"""Which of two motions in the same pictures is the plane's, by what contradicts each."""
+"""Which of two motions in the same images is the plane's, by what contradicts each."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -13,18 +13,18 @@ from rdstitch.radial_homography import RadialHomography
 from rdstitch.synthetic.textures import ground
 from rdstitch.verification import competing_motions
 from rdstitch.verification.competing_motions import Cells, Contest, _Held, contest, fills_at_most, planes_of_pairs
-from rdstitch.verification.photometric_agreement import Agreement, Grey, PlacedPicture
+from rdstitch.verification.photometric_agreement import Agreement, ComparedImage, Grey
 
 SIZE = (400, 300)
 LENS = Camera(SIZE)
 PLANE = ground((1000, 400), seed=3, channels=1).region(0, 0, 1000, 400)[:, :, 0]
 AHEAD = ground((500, 400), seed=4, channels=1).region(0, 0, 500, 400)[:, :, 0]
 STEP, SWAY = 160, 20
-"""Pixels that the plane, and what drives ahead, moves by from picture to picture."""
+"""Pixels that the plane, and what drives ahead, moves by from image to image."""
 
 
-def _pictures(covered: float, count: int = 2) -> list[Grey]:
-    """Pictures of a plane; what drives ahead covers a part of each, from the right."""
+def _images(covered: float, count: int = 2) -> list[Grey]:
+    """Images of a plane; what drives ahead covers a part of each, from the right."""
     edge = round(SIZE[0] * (1.0 - covered))
     result = []
     for k in range(count):
@@ -35,7 +35,7 @@ def _pictures(covered: float, count: int = 2) -> list[Grey]:
 
 
 def _shift(pixels: float) -> FloatArray:
-    """As a homography from picture 1 to picture 2."""
+    """As a homography from image 1 to image 2."""
     matrix = np.eye(3)
     matrix[0, 2] = -pixels / LENS.half_diagonal
     return matrix
@@ -45,50 +45,50 @@ def _moving(pixels: float, inliers: Any = ()) -> RadialHomography:
     return RadialHomography(_shift(pixels), LENS, LENS, np.asarray(inliers, dtype=np.bool_))
 
 
-def _registration(monkeypatch: pytest.MonkeyPatch, pictures: list[Grey], places: list[float], pairs: Any = ()) -> Any:
-    """Pictures put at these places along the plane, pixels."""
+def _registration(monkeypatch: pytest.MonkeyPatch, images: list[Grey], places: list[float], pairs: Any = ()) -> Any:
+    """Images put at these places along the plane, pixels."""
 
-    def placed(source: int, camera: Camera, homography: FloatArray, stretch: object) -> PlacedPicture:
-        return PlacedPicture(np.ascontiguousarray(pictures[source], dtype=np.float32), camera, homography)
+    def placed(source: int, camera: Camera, homography: FloatArray, stretch: object) -> ComparedImage:
+        return ComparedImage(np.ascontiguousarray(images[source], dtype=np.float32), camera, homography)
 
-    monkeypatch.setattr(competing_motions, "placed_picture", placed)
+    monkeypatch.setattr(competing_motions, "placed_image", placed)
     homographies = np.stack([_shift(-place) for place in places])
     alignment = SimpleNamespace(
         cameras=[LENS] * len(places), homographies=homographies, distortion=0.0, distortion_std=0.0
     )
-    return SimpleNamespace(sources=range(len(pictures)), alignment=alignment, stretch=None, pairs=pairs)
+    return SimpleNamespace(sources=range(len(images)), alignment=alignment, stretch=None, pairs=pairs)
 
 
 @pytest.mark.parametrize("covered", [0.2, 0.35])
 def test_what_fills_less_than_half_is_not_the_plane(monkeypatch: pytest.MonkeyPatch, covered: float) -> None:
-    pictures = _pictures(covered)
-    right = _registration(monkeypatch, pictures, [0, STEP])
+    images = _images(covered)
+    right = _registration(monkeypatch, images, [0, STEP])
     found = contest(right, [(0, 1)], {(0, 1): _moving(SWAY)})
     assert (found.won, found.lost, found.doubtful) == (True, False, frozenset())
     assert found.rival_fills_at_most == pytest.approx(covered, abs=0.08)
     assert found.held > 0.8
-    wrong = contest(_registration(monkeypatch, pictures, [0, SWAY]), [(0, 1)], {(0, 1): _moving(STEP)})
+    wrong = contest(_registration(monkeypatch, images, [0, SWAY]), [(0, 1)], {(0, 1): _moving(STEP)})
     assert (wrong.won, wrong.lost, wrong.doubtful) == (False, True, frozenset({(0, 1)}))
 
 
-def test_what_covers_most_of_the_pictures_is_the_plane(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_covers_most_of_the_images_is_the_plane(monkeypatch: pytest.MonkeyPatch) -> None:
     """However little it moves; what it leaves free is an arm of the robot, say."""
-    pictures = _pictures(0.6)
-    assert not contest(_registration(monkeypatch, pictures, [0, STEP]), [(0, 1)], {(0, 1): _moving(SWAY)}).won
-    assert contest(_registration(monkeypatch, pictures, [0, SWAY]), [(0, 1)], {(0, 1): _moving(STEP)}).won
+    images = _images(0.6)
+    assert not contest(_registration(monkeypatch, images, [0, STEP]), [(0, 1)], {(0, 1): _moving(SWAY)}).won
+    assert contest(_registration(monkeypatch, images, [0, SWAY]), [(0, 1)], {(0, 1): _moving(STEP)}).won
 
 
 def test_a_pair_held_by_what_drives_ahead_is_found_by_its_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
     """Put beside each other so that they overlap little, the two are not seen to contradict each other much."""
-    pictures = _pictures(0.4, 3)
-    pictures[2] = pictures[2].copy()
+    images = _images(0.4, 3)
+    images[2] = images[2].copy()
     edge = round(0.6 * SIZE[0])
-    pictures[2][:, edge:] = AHEAD[: SIZE[1], 100 : 100 + SIZE[0]][:, edge:]
-    registration = _registration(monkeypatch, pictures, [0, STEP, STEP + 80])
+    images[2][:, edge:] = AHEAD[: SIZE[1], 100 : 100 + SIZE[0]][:, edge:]
+    registration = _registration(monkeypatch, images, [0, STEP, STEP + 80])
     rivals = {(0, 1): _moving(SWAY)}
     assert (1, 2) in contest(registration, [(0, 1), (1, 2)], rivals).doubtful
     # The same at its right place.
-    registration = _registration(monkeypatch, pictures, [0, STEP, 2 * STEP])
+    registration = _registration(monkeypatch, images, [0, STEP, 2 * STEP])
     assert contest(registration, [(0, 1), (1, 2)], rivals).doubtful == frozenset()
 
 
@@ -122,7 +122,7 @@ def _pair(first: int, second: int, on_plane: int, ahead: int) -> PairRegistratio
 def test_every_pair_is_moved_as_its_plane_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """In one of them what drives ahead has most matches, in the other the plane has."""
     pairs = (_pair(0, 1, 40, 60), _pair(1, 2, 40, 25))
-    found = planes_of_pairs(_registration(monkeypatch, _pictures(0.35, 3), [0, 0, 0], pairs), 3.0)
+    found = planes_of_pairs(_registration(monkeypatch, _images(0.35, 3), [0, 0, 0], pairs), 3.0)
     assert found is not None
     for pair in found:
         assert pair.relation.inliers.tolist() == (np.arange(len(pair.matches)) < 40).tolist()
@@ -131,7 +131,7 @@ def test_every_pair_is_moved_as_its_plane_does(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_pair_with_nothing_but_what_drives_ahead_is_no_pair(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = planes_of_pairs(_registration(monkeypatch, _pictures(0.35), [0, 0], (_pair(0, 1, 0, 60),)), 3.0)
+    found = planes_of_pairs(_registration(monkeypatch, _images(0.35), [0, 0], (_pair(0, 1, 0, 60),)), 3.0)
     assert found is not None
     assert not found[0].relation
     assert "less than half" in found[0].relation.reason
@@ -139,8 +139,8 @@ def test_a_pair_with_nothing_but_what_drives_ahead_is_no_pair(monkeypatch: pytes
 
 def test_where_all_pairs_show_a_plane_there_is_nothing_to_choose(monkeypatch: pytest.MonkeyPatch) -> None:
     pairs = (_pair(0, 1, 40, 0),)
-    assert planes_of_pairs(_registration(monkeypatch, _pictures(0.0), [0, STEP], pairs), 3.0) is None
-    assert planes_of_pairs(_registration(monkeypatch, _pictures(0.0), [0, STEP]), 3.0) is None
+    assert planes_of_pairs(_registration(monkeypatch, _images(0.0), [0, STEP], pairs), 3.0) is None
+    assert planes_of_pairs(_registration(monkeypatch, _images(0.0), [0, STEP]), 3.0) is None
 
 
 def test_what_is_not_seen_speaks_against_nothing() -> None:
@@ -158,7 +158,7 @@ def test_two_of_the_five_cells_around_a_place_hold_it() -> None:
         held = _Held([((0, 1), Cells(away, np.arange(6) < holding, 6, places))])
         cells = Cells(tried, np.array([True]), 1, tried)
         assert held.outside((0, 2), cells) == Agreement(outside, outside)
-        assert held.outside((3, 2), cells) == Agreement(1, 1)  # pictures that nothing is known of
+        assert held.outside((3, 2), cells) == Agreement(1, 1)  # images that nothing is known of
     far = Cells(tried + 300.0, np.array([True]), 1, tried + 300.0)
     assert held.outside((0, 1), far) == Agreement(1, 1)
 

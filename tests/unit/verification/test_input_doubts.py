@@ -1,4 +1,4 @@
-"""What headers and masks show of the pictures."""
+"""What headers and masks show of the images."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +19,7 @@ def _texts(*sources: Any) -> list[str]:
     return [message.text for message in doubtful_inputs(sources)]
 
 
-def test_pictures_of_one_camera_are_fine() -> None:
+def test_images_of_one_camera_are_fine() -> None:
     assert _texts(*(_source(f"{k}.jpg", model="A", serial="1", focal=900.0) for k in range(3))) == []
     assert _texts(_source("a"), _source("b")) == []
     assert _texts() == []
@@ -30,7 +30,7 @@ def test_several_cameras_are_named_the_commonest_first(other: dict[str, str]) ->
     (text,) = _texts(
         _source("z.jpg", focal=None, mask=None, **other), *(_source(f"{k}.jpg", model="A") for k in range(2))
     )
-    assert text.startswith("the pictures come from 2 cameras: A (2: 0.jpg, 1.jpg); ")
+    assert text.startswith("the images come from 2 cameras: A (2: 0.jpg, 1.jpg); ")
     assert "(1: z.jpg); stitch those of each on their own" in text
 
 
@@ -50,8 +50,8 @@ def test_a_lens_that_was_zoomed_is_noticed(focal: float, zoomed: bool) -> None:
         assert f"by up to {ratio:.2f} (between {near} and {far})" in found[0]
 
 
-def test_pictures_without_a_mask_among_others_are_named() -> None:
+def test_images_without_a_mask_among_others_are_named() -> None:
     masked = [_source(f"{k}.png", mask="m") for k in range(3)]
     assert _texts(*masked) == []
-    assert _texts(*masked, _source("x.png")) == ["1 of 4 pictures have no mask: x.png"]
-    assert _texts(masked[0], _source("x.png"), _source("y.png")) == ["2 of 3 pictures have no mask: x.png, y.png"]
+    assert _texts(*masked, _source("x.png")) == ["1 of 4 images have no mask: x.png"]
+    assert _texts(masked[0], _source("x.png"), _source("y.png")) == ["2 of 3 images have no mask: x.png, y.png"]

@@ -1,4 +1,4 @@
-"""What is said of pictures whose matches agree with each other, but not with the whole."""
+"""What is said of images whose matches agree with each other, but not with the whole."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -9,7 +9,7 @@ import pytest
 from rdstitch.alignment.result import LinkFit
 from rdstitch.camera import Camera
 from rdstitch.radial_homography import RadialHomography
-from rdstitch.verification.misfits import disagreeing_pairs, misfitting_pictures
+from rdstitch.verification.misfits import disagreeing_pairs, misfitting_images
 
 AHEAD = np.array([[1.0, 0.0, 0.3], [0.0, 1.0, 0.1], [0.0, 0.0, 1.0]])
 OBLIQUE = np.array([[1.0, 0.0, 0.3], [0.0, 0.4, 0.9], [0.0, 0.9, 0.6]])
@@ -24,7 +24,7 @@ def _registration(
     agree: float = 0.2,
     keypoints: tuple[int, ...] = (900, 900, 900),
 ) -> Any:
-    """Two pictures of which so many matches were given to the alignment, and a share agrees with it."""
+    """Two images of which so many matches were given to the alignment, and a share agrees with it."""
     camera = Camera((400, 300), distortion=distortion)
     relation = RadialHomography(homography, camera, camera, np.ones(count, dtype=np.bool_), distortion_std=0.01)
     fit = LinkFit(0, 1, count, int(agree * count), 0.5, True)
@@ -50,16 +50,16 @@ def test_the_reason_is_what_the_pair_shows(registration: Any, reason: str) -> No
     (message,) = disagreeing_pairs(registration).values()
     assert message.text.startswith("a.jpg and b.jpg: only ")
     assert reason in message.text
-    first, second = misfitting_pictures(registration, registration.alignment.links)
+    first, second = misfitting_images(registration, registration.alignment.links)
     assert reason in first.text
     assert second.images == ("folder/b.jpg",)
 
 
-def test_a_picture_of_few_features_is_said_to_be_blurred() -> None:
+def test_an_image_of_few_features_is_said_to_be_blurred() -> None:
     registration = _registration(100, AHEAD, keypoints=(900, 200, 900))
     (message,) = disagreeing_pairs(registration).values()
     assert message.text.endswith("; b.jpg has less than a third of the features that others have (blurred?)")
-    first, second = misfitting_pictures(registration, registration.alignment.links)
+    first, second = misfitting_images(registration, registration.alignment.links)
     assert "(trees, walls)?" in first.text
     assert "b.jpg has less than a third of the features that others have (blurred?)" in second.text
 
@@ -67,5 +67,5 @@ def test_a_picture_of_few_features_is_said_to_be_blurred() -> None:
 def test_what_agrees_is_not_named() -> None:
     half = _registration(100, AHEAD, agree=0.55)
     assert disagreeing_pairs(half) == {}
-    assert len(misfitting_pictures(half, half.alignment.links)) == 2
-    assert misfitting_pictures(_registration(100, AHEAD, agree=0.65), half.alignment.links[:0]) == []
+    assert len(misfitting_images(half, half.alignment.links)) == 2
+    assert misfitting_images(_registration(100, AHEAD, agree=0.65), half.alignment.links[:0]) == []

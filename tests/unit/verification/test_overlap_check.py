@@ -16,7 +16,7 @@ from rdstitch.camera import Camera
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.verification import overlap_check
 from rdstitch.verification.overlap_check import CheckedLink, _least_confirmed, _scales, share_alike
-from rdstitch.verification.photometric_agreement import Agreement, PlacedPicture
+from rdstitch.verification.photometric_agreement import Agreement, ComparedImage
 from rdstitch.verification.self_similarity import Ambiguity
 
 
@@ -51,16 +51,16 @@ def test_the_share_alike_is_that_of_all_cells() -> None:
     assert math.isnan(share_alike([]))
 
 
-def test_pictures_are_drawn_at_powers_of_two_of_the_median_scale() -> None:
+def test_images_are_drawn_at_powers_of_two_of_the_median_scale() -> None:
     assert _scales([1.0, 1.2, 1.3, 2.6, 0.6]) == pytest.approx([1.2, 1.2, 1.2, 2.4, 0.6])
 
 
-def test_a_turn_is_compared_between_the_two_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Halfway between two directions, each picture is tilted by half the angle; the scale is that of neither."""
-    seen: list[PlacedPicture] = []
+def test_a_turn_is_compared_between_the_two_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Halfway between two directions, each image is tilted by half the angle; the scale is that of neither."""
+    seen: list[ComparedImage] = []
     straight_on: list[FloatArray] = []
 
-    def agreement(*both: PlacedPicture) -> Agreement:
+    def agreement(*both: ComparedImage) -> Agreement:
         seen.extend(both)
         return Agreement(1, 1)
 
@@ -68,14 +68,14 @@ def test_a_turn_is_compared_between_the_two_pictures(monkeypatch: pytest.MonkeyP
         straight_on.append(homography)
         return 1.0
 
-    def of(picture: None, camera: Camera, matrix: FloatArray, stretch: None) -> PlacedPicture:
-        return PlacedPicture(np.zeros((2, 2), np.float32), camera, matrix)
+    def of(image: None, camera: Camera, matrix: FloatArray, stretch: None) -> ComparedImage:
+        return ComparedImage(np.zeros((2, 2), np.float32), camera, matrix)
 
     monkeypatch.setattr(overlap_check, "placement_ambiguity", lambda first, second: Ambiguity(1.0, 0.0, 0.0))
-    monkeypatch.setattr(overlap_check, "draw", lambda picture, scale: picture)
+    monkeypatch.setattr(overlap_check, "draw", lambda image, scale: image)
     monkeypatch.setattr(overlap_check, "drawing_scale", scale)
     monkeypatch.setattr(overlap_check, "overlap_agreement", agreement)
-    monkeypatch.setattr(PlacedPicture, "of", of)
+    monkeypatch.setattr(ComparedImage, "of", of)
     first, last, half = (rotation_from_vector(np.array([[0.0, angle, 0.0]]))[0] for angle in (0.1, 0.4, 0.15))
     lens = Camera((64, 48))
     focal = np.diag([0.7, 0.7, 1.0])  # half diagonals to directions
@@ -112,7 +112,7 @@ def test_cached_overlaps_are_those_of_the_same_links(monkeypatch: pytest.MonkeyP
     assert verdicts == [True, False, False]
 
 
-def test_over_rough_ground_pictures_look_alike_where_their_matches_are() -> None:
+def test_over_rough_ground_images_look_alike_where_their_matches_are() -> None:
     """Two pixels to the right of where the alignment expects them; of a link that is not used nothing is asked."""
     points = np.array([[10.0, 20.0], [30.0, 5.0]])
     link = SimpleNamespace(points1=points, points2=points + np.array([2.0, 0.0]))

@@ -1,4 +1,4 @@
-"""Parallax of a turn by hand, from pictures rendered with and without it."""
+"""Parallax of a turn by hand, from images rendered with and without it."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -63,7 +63,7 @@ def test_a_pure_turn_is_not_warned_of(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("focal", [0.7, 3.0])
 def test_parallax_is_along_one_translation_within_pixels(focal: float) -> None:
-    """What is off lies on great circles through one direction, or misses them by a share of the picture at most."""
+    """What is off lies on great circles through one direction, or misses them by a share of the image at most."""
     lens = Camera((800, 600))
     scale = np.diag([1.0 / focal, 1.0 / focal, 1.0])
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Whether two pictures look alike where they are put."""
+"""Whether two images look alike where they are put."""
 
 from typing import Any
 
@@ -7,13 +7,13 @@ import pytest
 from numpy.typing import NDArray
 
 from rdstitch.camera import Camera
-from rdstitch.io import Metadata, Picture
+from rdstitch.io import DecodedImage, Metadata
 from rdstitch.synthetic.textures import ground
 from rdstitch.verification.photometric_agreement import (
     COMPARED_SIDE,
     Agreement,
+    ComparedImage,
     Parallax,
-    PlacedPicture,
     overlap_agreement,
 )
 
@@ -24,15 +24,15 @@ LENS = Camera(SIZE)
 
 def _placed(
     left: int, top: int, *, put: tuple[float, float] = (0.0, 0.0), pixels: np.ndarray | None = None
-) -> PlacedPicture:
+) -> ComparedImage:
     """A window of the plane; ``put`` so many pixels beside its place."""
     seen = PLANE[top : top + SIZE[1], left : left + SIZE[0]] if pixels is None else pixels
     matrix = np.eye(3)
     matrix[:2, 2] = (np.array([left, top]) + put) / LENS.half_diagonal
-    return PlacedPicture(np.ascontiguousarray(seen, dtype=np.float32), LENS, matrix)
+    return ComparedImage(np.ascontiguousarray(seen, dtype=np.float32), LENS, matrix)
 
 
-def test_pictures_of_the_same_ground_agree() -> None:
+def test_images_of_the_same_ground_agree() -> None:
     found = overlap_agreement(_placed(100, 100), _placed(200, 150))
     assert found.cells > 40
     assert found.share > 0.95
@@ -98,19 +98,21 @@ def test_cells_lie_inside_the_overlap_and_there_are_not_too_many() -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_pictures_are_compared_small_and_grey(dtype: type) -> None:
+def test_images_are_compared_small_and_grey(dtype: type) -> None:
     full = np.iinfo(dtype).max
     pixels: NDArray[Any] = np.zeros((600, 2 * COMPARED_SIDE, 3), dtype=dtype)
     pixels[..., 0] = full
     alpha = np.full((600, 2 * COMPARED_SIDE), 255, np.uint8)
     alpha[:, :512] = 0
-    made = PlacedPicture.of(Picture(pixels, alpha, Metadata((1024, 600))), Camera((1024, 600)), np.eye(3))
+    made = ComparedImage.of(DecodedImage(pixels, alpha, Metadata((1024, 600))), Camera((1024, 600)), np.eye(3))
     assert made.grey.shape == (300, COMPARED_SIDE)
     assert made.camera.image_size == (COMPARED_SIDE, 300)
     assert np.isnan(made.grey[:, :250]).all()
     np.testing.assert_allclose(made.grey[:, 260:], 1.0 / 3.0, rtol=1e-5)
-    small = PlacedPicture.of(Picture(pixels[:100, :200], None, Metadata((200, 100))), Camera((200, 100)), np.eye(3))
+    small = ComparedImage.of(
+        DecodedImage(pixels[:100, :200], None, Metadata((200, 100))), Camera((200, 100)), np.eye(3)
+    )
     assert small.grey.shape == (100, 200)
-    dark = Picture(pixels[:100, :200, 0] // 10, None, Metadata((200, 100)))
-    low = PlacedPicture.of(dark, LENS, np.eye(3), (0.0, full / 5))
+    dark = DecodedImage(pixels[:100, :200, 0] // 10, None, Metadata((200, 100)))
+    low = ComparedImage.of(dark, LENS, np.eye(3), (0.0, full / 5))
     np.testing.assert_allclose(low.grey, 0.5, rtol=0.02)

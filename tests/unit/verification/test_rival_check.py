@@ -1,4 +1,4 @@
-"""Links by what their pictures show where nothing moves otherwise."""
+"""Links by what their images show where nothing moves otherwise."""
 
 from typing import Any
 
@@ -29,7 +29,7 @@ def _won(*pairs: tuple[int, int]) -> Contest:
 
 @pytest.mark.parametrize(("moves", "ambiguous"), [(180.0, False), (196.0, False), (120.0, True)])
 def test_what_fits_where_the_rival_puts_it_is_no_pattern(moves: float, ambiguous: bool) -> None:
-    """Within a twentieth of a picture."""
+    """Within a twentieth of an image."""
     rival = RivalMotion(0, 1, 40, 60, (30.0, 40.0), moves, RELATION)
     first, second = outside_rivals([_link(0, 1, 0.45), _link(1, 2, 0.45)], [rival], _won((0, 1)))
     assert first.ambiguity.ambiguous is ambiguous

@@ -53,11 +53,11 @@ def test_area_and_agreement_decide(area: int, agreement: float, severity: str | 
         (46, 0.2, 0.7, 0.3, "warning"),  # it holds wherever the rival does not, which is the smaller one
         (46, 0.2, 0.7, 0.6, "failure"),
         (46, 0.6, 0.7, 0.6, "warning"),
-        (20, 0.6, 0.4, 0.3, "failure"),  # most of the pictures contradict it, however much of the overlaps looks alike
+        (20, 0.6, 0.4, 0.3, "failure"),  # most of the images contradict it, however much of the overlaps looks alike
         (5, 0.45, 0.4, 1.0, "failure"),
     ],
 )
-def test_what_fills_less_than_half_of_the_pictures_fails(
+def test_what_fills_less_than_half_of_the_images_fails(
     area: int, agreement: float, fills: float, rival: float, severity: str
 ) -> None:
     compared = Contest(fills, rival, {(0, 1): Agreement(100, 90)}, frozenset())
@@ -74,7 +74,7 @@ def test_the_place_is_named() -> None:
 
 @pytest.mark.parametrize(("area", "off", "apart"), [(9, 90.0, False), (20, 51.0, True), (20, 49.0, False)])
 def test_tree_tops_are_not_apart(area: int, off: float, apart: bool) -> None:
-    """A twentieth of the diagonal of a picture."""
+    """A twentieth of the diagonal of an image."""
     relation = RadialHomography(np.eye(3), LENS, LENS, np.ones(20, dtype=np.bool_))
     rival = replace(_rival(area, 100 - area), disagreement=off, relation=relation)
     assert is_apart([rival, _rival(1, 0)]) is apart
@@ -97,7 +97,7 @@ MOVED = np.array([60.0, 20.0])
 def _found(
     points: FloatArray, other: FloatArray, *, rival: FloatArray | None = None, used: bool = True
 ) -> list[RivalMotion]:
-    """Of two pictures whose plane moves by :data:`MOVED`; matches at ``other`` move by that and ``rival``."""
+    """Of two images whose plane moves by :data:`MOVED`; matches at ``other`` move by that and ``rival``."""
 
     def transfer(i: int, j: int, points: FloatArray) -> FloatArray:
         return np.asarray(points + MOVED)
@@ -143,6 +143,6 @@ def test_a_few_wrong_matches_are_no_motion() -> None:
     assert _found(_grid(0, 0, 16, 6), _grid(0, 350, 10, 4), rival=wrong)[0].area == 0
 
 
-def test_pictures_that_are_not_used_or_do_not_agree_anywhere_are_left_alone() -> None:
+def test_images_that_are_not_used_or_do_not_agree_anywhere_are_left_alone() -> None:
     assert _found(_grid(0, 0, 16, 6), _grid(200, 350, 5, 4), used=False) == []
     assert _found(_grid(0, 0, 0, 0), _grid(200, 350, 5, 4)) == []

@@ -1,4 +1,4 @@
-"""Whether two pictures would fit elsewhere as well."""
+"""Whether two images would fit elsewhere as well."""
 
 import math
 
@@ -7,7 +7,7 @@ import pytest
 
 from rdstitch.camera import Camera
 from rdstitch.synthetic.textures import ground
-from rdstitch.verification.photometric_agreement import PlacedPicture
+from rdstitch.verification.photometric_agreement import ComparedImage
 from rdstitch.verification.self_similarity import Ambiguity, draw, drawing_scale, placement_ambiguity
 
 SIZE = (256, 192)
@@ -17,13 +17,13 @@ PLANE = ground((700, 600), seed=5, channels=1).region(0, 0, 700, 600)[:, :, 0]
 
 def _placed(
     plane: np.ndarray, left: int, top: int, *, put: tuple[float, float] = (0.0, 0.0), scale: float = 1.0
-) -> PlacedPicture:
+) -> ComparedImage:
     matrix = np.diag([scale, scale, 1.0])
     matrix[:2, 2] = scale * (np.array([left, top]) + put) / LENS.half_diagonal
-    return PlacedPicture(np.ascontiguousarray(plane[top : top + 192, left : left + 256], np.float32), LENS, matrix)
+    return ComparedImage(np.ascontiguousarray(plane[top : top + 192, left : left + 256], np.float32), LENS, matrix)
 
 
-def _ambiguity(first: PlacedPicture, second: PlacedPicture) -> Ambiguity:
+def _ambiguity(first: ComparedImage, second: ComparedImage) -> Ambiguity:
     scale = drawing_scale(second.camera, second.homography)
     return placement_ambiguity(draw(first, scale), draw(second, scale))
 
@@ -59,9 +59,9 @@ def test_a_wrong_place_is_ambiguous() -> None:
     assert found.shift == pytest.approx(25.0 / 256, abs=0.006)
 
 
-def test_pictures_that_do_not_touch_say_nothing() -> None:
+def test_images_that_do_not_touch_say_nothing() -> None:
     assert _ambiguity(_placed(PLANE, 0, 0), _placed(PLANE, 400, 300)) == Ambiguity(0.0, 0.0, 0.0)
-    behind = PlacedPicture(np.zeros((192, 256), np.float32), LENS, np.diag([1.0, 1.0, -1.0]))
+    behind = ComparedImage(np.zeros((192, 256), np.float32), LENS, np.diag([1.0, 1.0, -1.0]))
     drawn = draw(behind, 100.0)
     assert drawn.pixels.shape == (1, 1)
     assert np.isnan(drawn.pixels).all()
@@ -82,9 +82,9 @@ def test_as_good_is_nine_tenths_and_alike(here: float, elsewhere: float, ambiguo
     assert Ambiguity(here, elsewhere, 0.2).ambiguous is ambiguous
 
 
-def test_a_large_picture_is_drawn_small_and_at_the_scale_of_its_middle() -> None:
+def test_a_large_image_is_drawn_small_and_at_the_scale_of_its_middle() -> None:
     large = Camera((1024, 768))
-    made = PlacedPicture(np.zeros((768, 1024), np.float32), large, np.eye(3))
+    made = ComparedImage(np.zeros((768, 1024), np.float32), large, np.eye(3))
     # 640 pixels of half a diagonal a unit, and a quarter of its size.
     assert drawing_scale(made.camera, made.homography) == pytest.approx(160.0)
     assert draw(made, 160.0).pixels.shape in ((192, 256), (193, 257))

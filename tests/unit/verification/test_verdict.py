@@ -1,4 +1,4 @@
-"""What the verdict fails: a registration that the pixels, the matches or the pictures themselves speak against."""
+"""What the verdict fails: a registration that the pixels, the matches or the images themselves speak against."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -31,7 +31,7 @@ THRESHOLD = 3.0
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Registration:
-    """Three pictures in a chain, rightly registered."""
+    """Three images in a chain, rightly registered."""
     frames = flight(3, 3).write(tmp_path_factory.mktemp("good"))
     sources, _ = read_sources(frames, camera=None, focal=380.0, distortion=None, skip_bad=False)
     options = StitchOptions(workers=1, features=FeatureOptions(max_features=600))
@@ -47,17 +47,17 @@ def test_a_right_registration_passes(good: Registration) -> None:
     assert judge(good, THRESHOLD) == ()
 
 
-def _moved(good: Registration, picture: int, shift: float) -> Registration:
-    """A picture put elsewhere on the plane, by a share of the half diagonal; its matches say what they said."""
+def _moved(good: Registration, image: int, shift: float) -> Registration:
+    """An image put elsewhere on the plane, by a share of the half diagonal; its matches say what they said."""
     homographies = good.alignment.homographies.copy()
     move = np.eye(3)
     move[:2, 2] = shift * 0.6, shift * 0.8
-    homographies[picture] = homographies[picture] @ move
+    homographies[image] = homographies[image] @ move
     return replace(good, alignment=replace(good.alignment, homographies=homographies))
 
 
 @pytest.mark.parametrize("shift", [0.03, 0.05])
-def test_pictures_that_do_not_look_alike_where_they_are_put_fail(good: Registration, shift: float) -> None:
+def test_images_that_do_not_look_alike_where_they_are_put_fail(good: Registration, shift: float) -> None:
     """However well their matches agree: repeated structure does that."""
     found = _texts(_moved(good, 2, shift))
     assert any("do not look alike where they are put together" in text for text in found)
@@ -66,7 +66,7 @@ def test_pictures_that_do_not_look_alike_where_they_are_put_fail(good: Registrat
 
 
 def test_a_wrong_pair_beside_enough_right_ones_is_a_warning(good: Registration) -> None:
-    """Here picture 2 is held by a pair that is right, and another is called wrong by its matches."""
+    """Here image 2 is held by a pair that is right, and another is called wrong by its matches."""
     used = [fit for fit in good.alignment.links if fit.used]
     closing = replace(used[0], image1=0, image2=2, count=100, inliers=40)
     doubled = replace(good, alignment=replace(good.alignment, links=(*used, closing)))
@@ -78,7 +78,7 @@ def test_a_wrong_pair_beside_enough_right_ones_is_a_warning(good: Registration) 
 @pytest.mark.parametrize(("rms", "fails"), [(2.9, False), (8.9, False), (9.1, True), (np.nan, True)])
 def test_errors_far_beyond_the_threshold_fail(good: Registration, rms: float, fails: bool) -> None:
     found = _texts(replace(good, alignment=replace(good.alignment, rms=rms)))
-    assert any("the pictures disagree by" in text for text in found) is fails
+    assert any("the images disagree by" in text for text in found) is fails
 
 
 @pytest.mark.parametrize(("share", "fails"), [(0.45, True), (0.55, False)])
@@ -90,7 +90,7 @@ def test_matches_of_which_less_than_half_agree_fail(good: Registration, share: f
 
 
 @pytest.mark.parametrize(("share", "fails"), [(0.55, True), (0.65, False)])
-def test_a_picture_of_whose_matches_many_disagree_fails(good: Registration, share: float, fails: bool) -> None:
+def test_an_image_of_whose_matches_many_disagree_fails(good: Registration, share: float, fails: bool) -> None:
     links = tuple(
         replace(fit, count=1000, inliers=int(1000 * share) if 2 in (fit.image1, fit.image2) else 1000)
         for fit in good.alignment.links
@@ -100,7 +100,7 @@ def test_a_picture_of_whose_matches_many_disagree_fails(good: Registration, shar
     assert any(text.startswith(Path(good.sources[2].path).name) for text in found) is fails
 
 
-def test_pictures_without_texture_are_not_called_unlike(good: Registration, tmp_path: Path) -> None:
+def test_images_without_texture_are_not_called_unlike(good: Registration, tmp_path: Path) -> None:
     """Where there is nothing to compare, nothing speaks against the matches."""
     sources = []
     for source in good.sources:
@@ -125,7 +125,7 @@ def test_relief_is_a_warning_that_names_the_pair_where_it_is_largest(good: Regis
     assert f"between {names[0]} and {names[1]} (9.0 pixels)" in message.text
 
 
-def test_one_wrong_pair_does_not_condemn_its_pictures(good: Registration) -> None:
+def test_one_wrong_pair_does_not_condemn_its_images(good: Registration) -> None:
     links = [replace(fit, count=100, inliers=95) for fit in good.alignment.links]
     closing = replace(links[0], image1=0, image2=2, count=100, inliers=10)
     messages = judge(replace(good, alignment=replace(good.alignment, links=(*links, closing))), THRESHOLD)
@@ -166,7 +166,7 @@ def test_a_tenth_of_an_overlap_must_look_alike(
 def test_where_something_moves_otherwise_two_fifths_must_look_alike(
     good: Registration, monkeypatch: pytest.MonkeyPatch, share: float, severities: list[str]
 ) -> None:
-    """A vehicle that two pictures have in common alone fills less of what a plane would fill."""
+    """A vehicle that two images have in common alone fills less of what a plane would fill."""
     rival = RivalMotion(0, 1, 20, 80, (30.0, 40.0), 120.0)
     monkeypatch.setattr(verdict, "find_rival_motions", lambda *_: [rival])
     found = _checked_by(monkeypatch, good, _checked(100, int(100 * share)), _checked(100, 90, pair=(1, 2)))
@@ -186,7 +186,7 @@ def test_pairs_that_the_rival_may_hold_together_do_not_count(
     checked = [_checked(100, 48), _checked(100, 45, pair=(1, 2))]
     for area, fills, doubtful, texts in (
         (5, 0.8, frozenset({(0, 1)}), []),  # a rival of a twentieth, and a plane that may be one
-        (5, 0.45, frozenset({(0, 1)}), ["not clear which"]),  # of all pictures together
+        (5, 0.45, frozenset({(0, 1)}), ["not clear which"]),  # of all images together
         (20, 0.8, frozenset({(0, 1)}), ["held together by what moves otherwise"]),
         (20, 0.8, frozenset(), []),
     ):
@@ -208,7 +208,7 @@ def test_a_pattern_all_over_is_one_failure(
     checked = [_checked(100, 90, pair=pair, elsewhere=0.9 * (k < ambiguous)) for k, pair in enumerate(pairs)]
     found = _checked_by(monkeypatch, good, *checked)
     assert any(f"{ambiguous} of 3 pairs fit as well elsewhere" in message.text for message in found) is of_all
-    assert any("25% of a picture away" in message.text or "one pair fits badly" in message.text for message in found)
+    assert any("25% of an image away" in message.text or "one pair fits badly" in message.text for message in found)
 
 
 @pytest.mark.parametrize(("shown", "resting", "count"), [((0, 1), False, 0), ((1, 2), False, 1), ((1, 2), True, 0)])
@@ -227,14 +227,14 @@ def test_what_only_the_places_suffer_from_is_not_said_of_a_lens(
 @pytest.mark.parametrize(
     ("rms", "share", "severity"), [(8.9, 0.26, "warning"), (8.9, 0.24, "failure"), (9.1, 0.9, "failure")]
 )
-def test_errors_of_rough_ground_are_a_warning_where_pictures_look_alike(
+def test_errors_of_rough_ground_are_a_warning_where_images_look_alike(
     good: Registration, monkeypatch: pytest.MonkeyPatch, rms: float, share: float, severity: str
 ) -> None:
     alignment = good.alignment
     rough = replace(alignment, rms=rms, relief=replace(alignment.relief, found=True))
     checked = [_checked(100, int(100 * share)), _checked(7, 7, pair=(1, 2))]
     found = _checked_by(monkeypatch, replace(good, alignment=rough), *checked)
-    (message,) = [m for m in found if "the pictures disagree by" in m.text]
+    (message,) = [m for m in found if "the images disagree by" in m.text]
     assert message.severity == severity
 
 
@@ -250,14 +250,14 @@ def test_errors_of_rough_ground_are_a_warning_where_pictures_look_alike(
 def test_larger_errors_are_a_warning_where_relief_explains_them(
     good: Registration, monkeypatch: pytest.MonkeyPatch, size: float, share: float, rms: float, severity: str
 ) -> None:
-    """What neighbours do not have in common stays below the threshold, and the pictures clearly look alike."""
+    """What neighbours do not have in common stays below the threshold, and the images clearly look alike."""
     alignment = replace(good.alignment, rms=rms, relief=replace(good.alignment.relief, found=True, size=size))
     found = _checked_by(monkeypatch, replace(good, alignment=alignment), _checked(100, int(100 * share)))
-    (message,) = [m for m in found if "the pictures disagree by" in m.text]
+    (message,) = [m for m in found if "the images disagree by" in m.text]
     assert message.severity == severity
 
 
-def test_only_pairs_without_which_the_pictures_fall_apart_decide() -> None:
+def test_only_pairs_without_which_the_images_fall_apart_decide() -> None:
     message = Message("doubtful", (), "failure")
     used = [LinkFit(i, j, 100, 90, 0.5, True) for i, j in ((0, 1), (1, 2), (0, 2), (2, 3))]
     assert verdict._decisive({(0, 1): message}, used, 4) == []
@@ -266,7 +266,7 @@ def test_only_pairs_without_which_the_pictures_fall_apart_decide() -> None:
     assert verdict._decisive({}, used, 4) == []
 
 
-def test_of_doubtful_pairs_on_which_nothing_depends_the_pictures_are_named() -> None:
+def test_of_doubtful_pairs_on_which_nothing_depends_the_images_are_named() -> None:
     paths = [f"folder/{name}.jpg" for name in "abcd"]
     (message,) = verdict._outvoted(paths, [(2, 3), (0, 2)])
     assert message.images == ("folder/a.jpg", "folder/c.jpg", "folder/d.jpg")
@@ -278,7 +278,7 @@ def test_of_doubtful_pairs_on_which_nothing_depends_the_pictures_are_named() -> 
     assert verdict._outvoted(paths, []) == []
 
 
-def test_a_doubtful_shape_names_the_picture_and_the_size(good: Registration) -> None:
+def test_a_doubtful_shape_names_the_image_and_the_size(good: Registration) -> None:
     alignment = good.alignment
     assert alignment.shape is not None
     doubtful = replace(alignment.shape, doubtful=True, shown=True, image=2, shift=6.0, shift_std=8.0)
@@ -292,7 +292,7 @@ def test_a_doubtful_shape_names_the_picture_and_the_size(good: Registration) -> 
     assert "homography of its own" in message.text
 
 
-def test_two_pictures_that_are_left_of_one_lens_may_be_of_a_curved_wall(good: Registration) -> None:
+def test_two_images_that_are_left_of_one_lens_may_be_of_a_curved_wall(good: Registration) -> None:
     divided = replace(good, mixed=TwoLenses(np.array([False, False, True]), (-0.1, -0.2), certain=True))
     assert judge(divided, THRESHOLD) == ()
     links = [fit for fit in good.alignment.links if 2 not in (fit.image1, fit.image2)]

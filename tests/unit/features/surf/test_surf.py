@@ -1,4 +1,4 @@
-"""SURF finds blobs where and as large as they are, and describes them the same however the picture is turned."""
+"""SURF finds blobs where and as large as they are, and describes them the same however the image is turned."""
 
 from dataclasses import replace
 
@@ -18,8 +18,8 @@ Grey = NDArray[np.uint8]
 
 def texture(width: int = 480, height: int = 400, seed: int = 5) -> Grey:
     """Ground, smoothed as a lens does."""
-    picture = ground((width, height), seed, 1).region(0, 0, width, height).reshape(height, width)
-    return np.asarray(cv2.convertScaleAbs(cv2.GaussianBlur(picture, (0, 0), 1.0), alpha=255.0), np.uint8)
+    image = ground((width, height), seed, 1).region(0, 0, width, height).reshape(height, width)
+    return np.asarray(cv2.convertScaleAbs(cv2.GaussianBlur(image, (0, 0), 1.0), alpha=255.0), np.uint8)
 
 
 def blob(center: tuple[float, float], sigma: float, sign: int = 1, size: int = 160) -> Grey:
@@ -30,7 +30,7 @@ def blob(center: tuple[float, float], sigma: float, sign: int = 1, size: int = 1
 
 
 def turned(grey: Grey, degrees: float) -> tuple[Grey, NDArray[np.float64]]:
-    """The picture turned about its centre, and the motion (2, 3)."""
+    """The image turned about its centre, and the motion (2, 3)."""
     height, width = grey.shape
     motion = np.asarray(cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), degrees, 1.0), np.float64)
     return np.asarray(cv2.warpAffine(grey, motion, (width, height), flags=cv2.INTER_CUBIC), np.uint8), motion
@@ -114,7 +114,7 @@ def test_the_threshold_takes_the_strongest_blobs() -> None:
 
 
 @pytest.mark.parametrize("degrees", [10.0, 37.0, 90.0, 160.0])
-def test_orientation_turns_with_the_picture(degrees: float) -> None:
+def test_orientation_turns_with_the_image(degrees: float) -> None:
     grey = texture()
     other, motion = turned(grey, degrees)
     rng = np.random.default_rng(0)

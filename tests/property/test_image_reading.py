@@ -1,4 +1,4 @@
-"""Whatever a picture file holds, reading it gives a picture or one line that names the file.
+"""Whatever an image file holds, reading it gives an image or one line that names the file.
 
 ``pytest --hypothesis-profile long tests/property`` asks for as long as patience lasts.
 """
@@ -17,7 +17,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from rdstitch.errors import InputError
-from rdstitch.io import Metadata, Picture, read_image, read_metadata
+from rdstitch.io import DecodedImage, Metadata, read_image, read_metadata
 
 _XMP = (
     b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:GimbalYawDegree="+12.5" '
@@ -92,10 +92,12 @@ def _damaged(draw: st.DrawFn, good: bytes) -> bytes:
     return bytes(data)
 
 
-def _reads_or_complains(read: Callable[[Path], Metadata | Picture], content: bytes) -> Metadata | Picture | None:
+def _reads_or_complains(
+    read: Callable[[Path], Metadata | DecodedImage], content: bytes
+) -> Metadata | DecodedImage | None:
     found, complaint = None, ""
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "picture"
+        file = Path(folder) / "image"
         file.write_bytes(content)
         try:
             found = read(file)
@@ -121,16 +123,16 @@ def test_the_good_ones_tell_all(kind: str) -> None:
 @pytest.mark.parametrize("kind", FILES)
 @given(data=st.data())
 @settings(suppress_health_check=[HealthCheck.too_slow], deadline=None)
-def test_damaged_pictures(kind: str, data: st.DataObject) -> None:
+def test_damaged_images(kind: str, data: st.DataObject) -> None:
     content = data.draw(_damaged(FILES[kind]))
     metadata = _reads_or_complains(read_metadata, content)
     if isinstance(metadata, Metadata):
         assert min(metadata.size) >= 1
         assert metadata.focal_px is None or 0 < metadata.focal_px < float("inf")
-        # Fields that claim an enormous picture cost nothing to say and much to try.
+        # Fields that claim an enormous image cost nothing to say and much to try.
         if metadata.size[0] * metadata.size[1] > 10**6:
             return
-    picture = _reads_or_complains(read_image, content)
-    if isinstance(picture, Picture):
-        assert picture.pixels.size > 0
-        assert np.isfinite(picture.pixels).all()
+    image = _reads_or_complains(read_image, content)
+    if isinstance(image, DecodedImage):
+        assert image.pixels.size > 0
+        assert np.isfinite(image.pixels).all()

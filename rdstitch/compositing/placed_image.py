@@ -1,4 +1,4 @@
-"""One registered picture, as the compositor takes it."""
+"""One registered image, as the compositor takes it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,18 +9,18 @@ from numpy.typing import ArrayLike
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
-from rdstitch.io.read import Picture
+from rdstitch.io.read import DecodedImage
 
-PictureLoader = Callable[[], Picture]
-Preview = Callable[[int], Picture]
+ImageLoader = Callable[[], DecodedImage]
+Preview = Callable[[int], DecodedImage]
 
 Displacement = Callable[[FloatArray], FloatArray]
-"""Displacement of a picture's content, pixels (..., 2), at measured pixels (..., 2): what local alignment found."""
+"""Displacement of an image's content, pixels (..., 2), at measured pixels (..., 2): what local alignment found."""
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedPicture:
-    """A picture and its place.
+class PlacedImage:
+    """An image and its place.
 
     Attributes
     ----------
@@ -32,14 +32,14 @@ class PlacedPicture:
     preview : callable, optional
         Reads it reduced by a factor, which is quicker; see :func:`rdstitch.io.read_image`.
     exposure : float, optional
-        As the camera wrote it down (time x sensitivity / f-number²), up to a factor common to all pictures.
+        As the camera wrote it down (time x sensitivity / f-number²), up to a factor common to all images.
     displacement : callable, optional
         What local alignment adds to its measured pixels; see :class:`rdstitch.compositing.warp.Warp`.
     path : str
         What messages call it; its number if empty.
     """
 
-    read: PictureLoader
+    read: ImageLoader
     camera: Camera
     homography: FloatArray
     preview: Preview | None = None
@@ -48,8 +48,8 @@ class PlacedPicture:
     path: str = ""
 
 
-def place_pictures(
-    loaders: Sequence[PictureLoader],
+def place_images(
+    loaders: Sequence[ImageLoader],
     cameras: Sequence[Camera],
     homographies: ArrayLike,
     *,
@@ -57,8 +57,8 @@ def place_pictures(
     exposure: Sequence[float | None] | None = None,
     displacement: Sequence[Displacement | None] | None = None,
     paths: Sequence[str] | None = None,
-) -> list[PlacedPicture]:
-    """Pictures from lists of what is known of each; see :class:`PlacedPicture`.
+) -> list[PlacedImage]:
+    """Images from lists of what is known of each; see :class:`PlacedImage`.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def place_pictures(
     count, matrices = len(loaders), np.asarray(homographies, dtype=np.float64)
     given = (cameras, matrices, preview, exposure, displacement, paths)
     if any(values is not None and len(values) != count for values in given):
-        raise ArgumentError("pictures, cameras, homographies and what else is given must be equally many")
+        raise ArgumentError("images, cameras, homographies and what else is given must be equally many")
     nothing = [None] * count
     more = (preview or nothing, exposure or nothing, displacement or nothing, paths or [""] * count)
-    return [PlacedPicture(*known) for known in zip(loaders, cameras, matrices, *more, strict=True)]
+    return [PlacedImage(*known) for known in zip(loaders, cameras, matrices, *more, strict=True)]

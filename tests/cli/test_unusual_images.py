@@ -1,4 +1,4 @@
-"""Pictures that are unusual, yet pictures: stitched like any other."""
+"""Images that are unusual, yet images: stitched like any other."""
 
 import json
 from collections.abc import Callable
@@ -75,7 +75,7 @@ def _hostile_exif(good: Path, folder: Path) -> Path:
 @pytest.mark.parametrize(
     "make", [_cmyk, _palette, _transparent, _grey, _turned, _with_a_hole, _sixteen_bit, _hostile_exif]
 )
-def test_unusual_pictures_are_stitched(rdstitch: Run, place: Path, make: Make) -> None:
+def test_unusual_images_are_stitched(rdstitch: Run, place: Path, make: Make) -> None:
     odd = make(place / "b.png", place)
     done = rdstitch("pano", place / "a.png", odd, "-o", place / "out.tif", *CACHED)
     assert (done.status, done.err) == (0, "")

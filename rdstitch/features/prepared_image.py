@@ -1,4 +1,4 @@
-"""A picture as detectors want it: grey, 8 bits, of working size, with the distance to what is masked."""
+"""An image as detectors want it: grey, 8 bits, of working size, with the distance to what is masked."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -28,17 +28,17 @@ Stretch = tuple[float, float]
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A picture as it was loaded, whole or smaller.
+    """An image as it was loaded, whole or smaller.
 
     Attributes
     ----------
     image : ndarray of shape (height, width) or (height, width, bands)
     mask : ndarray of shape (height, width), bool or uint8, or None
-        True or not zero where the picture counts; None for everywhere.
+        True or not zero where the image counts; None for everywhere.
     reduction : int
-        Blocks of so many pixels a side of the whole picture are one pixel.
+        Blocks of so many pixels a side of the whole image are one pixel.
     image_size : (int, int), optional
-        Width and height of the whole picture, pixels; where it is not given, this is the whole.
+        Width and height of the whole image, pixels; where it is not given, this is the whole.
     """
 
     image: PixelArray
@@ -48,13 +48,13 @@ class View:
 
     @property
     def full_size(self) -> tuple[int, int]:
-        """Width and height of the whole picture, pixels."""
+        """Width and height of the whole image, pixels."""
         return self.image_size or (self.image.shape[1], self.image.shape[0])
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedPicture:
-    """A grey picture of working size.
+class PreparedImage:
+    """A grey image of working size.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class PreparedPicture:
     clearance : ndarray of shape (height, width), float32, or None
         Distance to the nearest masked pixel, pixels of ``grey``, zero if masked; None without mask.
     factor : ndarray of shape (2,)
-        Pixels of the whole picture for one of this, horizontally and vertically.
+        Pixels of the whole image for one of this, horizontally and vertically.
     full_size : (int, int)
         Width and height, pixels.
     """
@@ -87,7 +87,7 @@ class PreparedPicture:
         return clearance > radius
 
     def to_full_size(self, points: FloatArray) -> FloatArray:
-        """Pixels of ``grey`` to pixels of the full-size picture; (0, 0) is the centre of the first pixel in both."""
+        """Pixels of ``grey`` to pixels of the full-size image; (0, 0) is the centre of the first pixel in both."""
         return (points + 0.5) * self.factor - 0.5
 
 
@@ -102,11 +102,11 @@ def halving(image_size: tuple[int, int], megapixels: float) -> int:
 
 def prepare(
     view: View, work_megapixels: float | None, *, stretch: Stretch | None = None, equalize: bool = False
-) -> PreparedPicture:
-    """Make a picture ready for detection; see :func:`rdstitch.features.detect.detect` for what it may be."""
+) -> PreparedImage:
+    """Make an image ready for detection; see :func:`rdstitch.features.detect.detect` for what it may be."""
     image, mask = view.image, view.mask
     if image.ndim not in (2, 3) or image.size == 0:
-        raise ArgumentError(f"expected a picture of shape (height, width[, bands]), not {image.shape}")
+        raise ArgumentError(f"expected an image of shape (height, width[, bands]), not {image.shape}")
     usable = _usable(image, mask)
     if image.ndim == 3 and image.shape[2] > 4:
         image = _grey(image)
@@ -125,7 +125,7 @@ def prepare(
     clearance = None
     if usable is not None:
         clearance = np.asarray(cv2.distanceTransform(usable.astype(np.uint8), cv2.DIST_L2, 5), np.float32)
-    return PreparedPicture(grey, clearance, shrink, view.full_size)
+    return PreparedImage(grey, clearance, shrink, view.full_size)
 
 
 def _usable(image: PixelArray, mask: Mask | None) -> NDArray[np.bool_] | None:
@@ -133,7 +133,7 @@ def _usable(image: PixelArray, mask: Mask | None) -> NDArray[np.bool_] | None:
     parts: list[NDArray[np.bool_]] = []
     if mask is not None:
         if mask.shape != image.shape[:2]:
-            raise ArgumentError(f"mask of shape {mask.shape} for a picture of shape {image.shape[:2]}")
+            raise ArgumentError(f"mask of shape {mask.shape} for an image of shape {image.shape[:2]}")
         parts.append(mask != 0)
     if image.ndim == 3 and image.shape[2] in (2, 4):
         parts.append(image[..., -1] > 0)
@@ -148,7 +148,7 @@ def _grey(image: PixelArray) -> PixelArray:
     if image.dtype.kind == "f":
         image = image.astype(np.float32)
     elif image.dtype not in (np.uint8, np.uint16):
-        raise ArgumentError(f"expected a picture of uint8, uint16 or float, not {image.dtype}")
+        raise ArgumentError(f"expected an image of uint8, uint16 or float, not {image.dtype}")
     if image.ndim == 2:
         return image
     if image.shape[2] < 3:
@@ -160,12 +160,12 @@ def _grey(image: PixelArray) -> PixelArray:
 
 
 def usual_stretch(view: View) -> Stretch | None:
-    """The stretch that uses 8 bits best for one picture; None where all of it is masked."""
+    """The stretch that uses 8 bits best for one image; None where all of it is masked."""
     return _stretch(_grey(view.image), _usable(view.image, view.mask))
 
 
 def common_stretch(usual: Iterable[Stretch | None]) -> Stretch | None:
-    """One for all pictures of a set; a tenth of them may be darker, or brighter, than the rest."""
+    """One for all images of a set; a tenth of them may be darker, or brighter, than the rest."""
     found = np.array([stretch for stretch in usual if stretch is not None])
     if not len(found):
         return None
@@ -182,7 +182,7 @@ def _stretch(grey: PixelArray, usable: NDArray[np.bool_] | None) -> Stretch | No
 
 
 def _eight_bits(grey: PixelArray, usable: NDArray[np.bool_] | None, stretch: Stretch | None) -> NDArray[np.uint8]:
-    """Stretch pictures to 8 bits, those that have no more only by a given stretch."""
+    """Stretch images to 8 bits, those that have no more only by a given stretch."""
     if grey.dtype == np.uint8 and stretch is None:
         return np.ascontiguousarray(grey, dtype=np.uint8)
     stretch = stretch or _stretch(grey, usable)

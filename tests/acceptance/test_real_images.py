@@ -1,4 +1,4 @@
-"""Real pictures with known lenses: drones over a park and a field, and chessboards before wide lenses."""
+"""Real images with known lenses: drones over a park and a field, and chessboards before wide lenses."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -20,9 +20,9 @@ Locate = Callable[[str], Path]
 )
 def test_consecutive_pairs(name: str, distortion: float, largest_error: float, shared_data: Locate) -> None:
     """The median over pairs is nearer the truth than the best other library's; what is refused is told."""
-    pictures = sorted(shared_data(name).glob("*.*"))
+    images = sorted(shared_data(name).glob("*.*"))
     found, refused = [], []
-    for pair in pairwise(pictures):
+    for pair in pairwise(images):
         try:
             registration = rdstitch.calibrate(pair)
         except RdstitchError as error:
