@@ -3,7 +3,7 @@
 Points are in pixels ``(u, v)`` with the centre of the top-left pixel at ``(0, 0)``, or *normalized*:
 ``x = (u - c) / s`` with ``c`` the distortion centre and ``s`` the scale in pixels. λ belongs to its scale;
 :class:`Camera` keeps it for ``s`` = half the image diagonal, so that ``1 + λ`` is the factor at the image
-corner.
+corner; where the lens draws a circle that is smaller than the image, ``s`` is the radius of that circle.
 
 The lens is the division model of :mod:`rdstitch.division_model`, with λ alone or with further even coefficients.
 """
@@ -103,6 +103,8 @@ class Camera:
     distortion_std : float or None
         Standard deviation of :attr:`nearest_distortion`, with what is left open of parameters that were not estimated,
         and of the ground; None where it was given and not estimated.
+    image_circle : float or None
+        Radius about :attr:`center`, pixels, out to which the lens draws; None where it fills the image.
     lens_covariance : tuple of 5 tuples of 5 floats, or None
         Covariance of :data:`LENS_PARAMETERS` by the matches alone, if those that were not estimated, for which it is
         zero, are exactly as given; None where nothing was.
@@ -131,6 +133,7 @@ class Camera:
     focal_std: float | None = None
     tilt: tuple[float, float] | None = None
     tilt_std: tuple[float, float] | None = None
+    image_circle: float | None = None
 
     def __post_init__(self) -> None:
         """Fill in the image centre and check every value."""
@@ -149,6 +152,8 @@ class Camera:
         if self.focal_source is not None and self.focal_source not in FOCAL_LOG_STD:
             raise ArgumentError(f"unknown source of a focal length: {self.focal_source!r}")
         with np.errstate(all="ignore"):  # absurd values, from a damaged file, overflow
+            if self.image_circle is not None and not self.image_circle > 0.0:
+                raise ImpossibleCameraError(f"an image circle has a radius above 0 pixels, not {self.image_circle:g}")
             corner = self._corner_radius
             if not (math.isfinite(corner * corner) and not folds(corner, self.coefficients)):
                 raise ImpossibleCameraError(
@@ -213,9 +218,9 @@ class Camera:
 
     @property
     def _corner_radius(self) -> float:
-        """Distance of the farthest corner from the centre, half diagonals."""
+        """Distance of the farthest corner from the centre, or of the edge of the image circle, half diagonals."""
         farthest = (max(c, n - 1 - c) + 0.5 for c, n in zip(self.center, self.image_size, strict=True))
-        return math.hypot(*farthest) / self.half_diagonal
+        return min(math.hypot(*farthest), self.image_circle or math.inf) / self.half_diagonal
 
     def _radii2(self) -> FloatArray:
         """Squared radii, half diagonals, of points evenly over the image, as far as it can be undistorted."""
@@ -227,14 +232,15 @@ class Camera:
     @property
     def drawn_radius(self) -> float:
         """Measured radius, pixels, up to which images are drawn; inf where that is all of them."""
+        circle = self.image_circle or math.inf
         if not self.sees_beyond_horizon:
-            return math.inf
-        return stretch_radius(self.distortion, self.higher, _MAX_STRETCH) * self.half_diagonal
+            return circle
+        return min(circle, stretch_radius(self.distortion, self.higher, _MAX_STRETCH) * self.half_diagonal)
 
     @property
     def half_diagonal(self) -> float:
-        """Half the image diagonal, pixels: the scale ``s`` of the frame that λ is given in."""
-        return math.hypot(*self.image_size) / 2
+        """Half the image diagonal, or the radius of a smaller image circle, pixels: the scale ``s`` of λ's frame."""
+        return min(math.hypot(*self.image_size) / 2, self.image_circle or math.inf)
 
     @property
     def distortion_px(self) -> float:
@@ -264,6 +270,10 @@ class Camera:
         """The camera with another, given lens; the distortion centre stays."""
         lens = replace(self, distortion=distortion, distortion2=distortion2, distortion3=distortion3)
         return replace(lens, distortion_std=None, lens_covariance=None)
+
+    def without_lens(self) -> "Camera":
+        """A camera of which only the images' size and centre, and its image circle, are known."""
+        return Camera(self.image_size, center=self.center, image_circle=self.image_circle)
 
     def normalize(self, points: ArrayLike) -> FloatArray:
         """Pixels (..., 2) to normalized points, in half diagonals from the centre."""
@@ -301,8 +311,10 @@ class Camera:
         factor = math.hypot(*image_size) / math.hypot(*self.image_size)
         offset = [(c - (n - 1) / 2) * factor for c, n in zip(self.center, self.image_size, strict=True)]
         center = ((image_size[0] - 1) / 2 + offset[0], (image_size[1] - 1) / 2 + offset[1])
-        focal, std = (None if value is None else value * factor for value in (self.focal, self.focal_std))
-        return replace(self, image_size=image_size, center=center, focal=focal, focal_std=std)
+        focal, std, circle = (
+            None if value is None else value * factor for value in (self.focal, self.focal_std, self.image_circle)
+        )
+        return replace(self, image_size=image_size, center=center, focal=focal, focal_std=std, image_circle=circle)
 
     def turned(self, orientation: int) -> Self:
         """The same camera on the image after an EXIF orientation: what has a direction is turned with it."""
@@ -330,6 +342,7 @@ class Camera:
             "version": FILE_VERSION,
             "image_size": list(self.image_size),
             "center_px": list(self.center),
+            "image_circle_px": self.image_circle,
             "lambda": nearest,
             "lambda_std": self.distortion_std,
             "lambda_fit_rms_px": rms,

@@ -54,7 +54,7 @@ def read_lens(record: Record, size: tuple[int, int], focal_source: str | None) -
     InputError
         When a field is missing or wrong.
     """
-    focal = record.get("focal_px")
+    focal, circle = record.get("focal_px"), record.get("image_circle_px")
     distortion, second, third = _read_coefficients(record)
     try:
         return Camera(
@@ -65,6 +65,7 @@ def read_lens(record: Record, size: tuple[int, int], focal_source: str | None) -
             center=record["center_px"].pair(),
             focal=None if focal is None else focal.number(),
             focal_source=focal_source,
+            image_circle=None if circle is None else circle.number(),
         )
     except ArgumentError as error:
         record.fail(str(error))

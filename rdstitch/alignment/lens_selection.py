@@ -48,6 +48,9 @@ _SHARED_GAIN, _SHARED_GAIN_OF_SERIES = 2.5, 1.0
 """Standard deviations of the mean gain of the parts that the observations fall into, by which it must exceed 0; and
 where μ is needed already, so that it is certain that λ alone does not describe the lens."""
 
+_FISHEYE = -0.4
+"""λ below which only fisheyes are: their projections are series; an equidistant one has it from 120 degrees on."""
+
 _CELLS = 4
 """Cells per side of a link's overlap, each of which is a part where there are few links."""
 
@@ -241,11 +244,11 @@ class _Judge:
     ) -> bool:
         """Whether a richer lens gains more than its parameters cost, and all over the images.
 
-        A lens that λ does not describe is a series that has been cut off: beyond μ a parameter costs what Akaike's
-        criterion takes for it, not Schwarz's, which takes the simpler lens for the true one.
+        A lens that λ does not describe, such as most fisheyes, is a series that has been cut off: beyond, a parameter
+        costs what Akaike's criterion takes for it, not Schwarz's, which takes the simpler lens for the true one.
         """
         gain = self.noise.misfit(simpler.squared) - self.noise.misfit(richer.squared)
-        series = simpler_name == "division2"
+        series = simpler_name == "division2" or float(simpler.parameters.lens[0]) < _FISHEYE
         each, shared = (2.0, _SHARED_GAIN_OF_SERIES) if series else (self.noise.price, _SHARED_GAIN)
         return float(gain.sum()) > added * each and self.significance(gain) > shared
 

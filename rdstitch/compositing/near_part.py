@@ -16,7 +16,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera, points_over
 from rdstitch.io.read import DecodedImage
 
-_PROBES = 33  # points of a grid over the image, a side, at which the stretch is measured
+_PROBES = 33  # points of a grid over the image, and along its outline, a side, at which the stretch is measured
 _POINTS_PER_SIDE = 64  # as the canvas samples outlines: undistorted, straight sides are curved
 _ROWS = 64  # rows of a mask that are computed at a time, so that they stay in the processor's cache
 
@@ -117,7 +117,9 @@ def near_parts(
 
 def _stretch(camera: Camera, matrix: FloatArray, resolution: float) -> tuple[FloatArray, FloatArray]:
     """Canvas pixels per undistorted pixel, in the direction in which they are most, and depth, over an image (K,)."""
-    flat = camera.normalize(camera.undistort(points_over(camera.image_size, _PROBES)))
+    grid = points_over(camera.image_size, _PROBES)
+    drawn = grid[np.linalg.norm(grid - camera.center, axis=1) <= camera.drawn_radius]
+    flat = camera.normalize(camera.undistort(np.concatenate([drawn, camera.outline(_PROBES)])))
     flat = flat[np.isfinite(flat).all(axis=1)]  # a fisheye may see beyond its horizon
     moved = flat @ matrix[:, :2].T + matrix[:, 2]
     depth: FloatArray = moved[:, 2]

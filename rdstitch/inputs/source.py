@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rdstitch.cache import Cache
 from rdstitch.camera import Camera
@@ -94,9 +95,10 @@ class Source:
             return cache.file(self.path)
         return cache.digest((self.frame.image.pixels, self.frame.image.alpha))
 
-    def mask_content(self, cache: Cache) -> tuple[str, int | None]:
-        """The same of its mask."""
-        return cache.file(self.mask), self.mask_frame
+    def mask_content(self, cache: Cache) -> tuple[object, ...]:
+        """The same of its mask, and of the image circle."""
+        circle = () if self.camera.image_circle is None else (*self.camera.center, self.camera.image_circle)
+        return cache.file(self.mask), self.mask_frame, circle
 
     def reduction(self, megapixels: float | None) -> int:
         """By how much it can be read smaller and has no fewer pixels than an image halved to so many 10⁶ pixels."""
@@ -118,12 +120,12 @@ class Source:
         # Smaller ones are made from one size, whether that is at hand or not: the same comes out.
         usual = self.reduction(WORK_MEGAPIXELS)
         if reduction % usual:
-            return self._load(reduction)
+            return self._within_circle(self._load(reduction), reduction)
         key = (self.path, self.mask, self.mask_frame)
         image = self.decoded_images.take(key) or self._load(usual)
         if keep:
             self.decoded_images.put(key, image)
-        return reduced(image, reduction // usual)
+        return self._within_circle(reduced(image, reduction // usual), reduction)
 
     def view(self, megapixels: float | None) -> View:
         """What detection at so many 10⁶ pixels needs of it; it is kept for the stages that read it again."""
@@ -146,10 +148,23 @@ class Source:
             raise InputError(f"{self.path}: has {now} pixels now, but had {before} before; run again")
         if self.mask is None:
             return image
-        alpha = block_minimum(read_mask(self.mask, expected, self.mask_frame), reduction)
-        if image.alpha is not None:
-            alpha = np.minimum(alpha, image.alpha)
-        return replace(image, alpha=alpha)
+        return _masked(image, block_minimum(read_mask(self.mask, expected, self.mask_frame), reduction))
+
+    def _within_circle(self, image: DecodedImage, reduction: int) -> DecodedImage:
+        """The image without what lies beyond the image circle; its pixels are blocks of so many a side."""
+        if self.camera.image_circle is None:
+            return image
+        x, y = (
+            np.arange(count) * reduction + (reduction - 1) / 2 - center
+            for count, center in zip(image.pixels.shape[1::-1], self.camera.center, strict=True)
+        )
+        inside = x**2 + y[:, None] ** 2 <= self.camera.image_circle**2
+        return _masked(image, np.where(inside, np.uint8(255), np.uint8(0)))
+
+
+def _masked(image: DecodedImage, alpha: NDArray[np.uint8]) -> DecodedImage:
+    """The image where both its own alpha and another one have it."""
+    return replace(image, alpha=alpha if image.alpha is None else np.minimum(image.alpha, alpha))
 
 
 def read_sources(

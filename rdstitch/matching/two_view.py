@@ -5,7 +5,7 @@ and matches, which lie in the cache of the run, and give names back.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from threading import Lock
 from typing import TypeVar
@@ -199,8 +199,7 @@ def _pair_matches(
 ) -> PairMatches:
     """Matches of a pair as estimation takes them."""
     camera = cameras[0]
-    own = Camera(camera.image_size, focal=camera.focal, focal_source=camera.focal_source, center=camera.center)
-    own = own.with_focal()
+    own = replace(camera.without_lens(), focal=camera.focal, focal_source=camera.focal_source).with_focal()
     known = None if None in tilts else np.array(tilts, dtype=np.float64)
     other = own.resized(cameras[1].image_size)
     return PairMatches(found.points1, found.points2, own, other, -found.ratio, known)

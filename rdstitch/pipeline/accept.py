@@ -163,7 +163,7 @@ def _plane_of_most(registration: Registration, threshold: float, aligner: Aligne
 
 
 def _may_be_another_plane(found: Iterable[Message]) -> bool:
-    """Whether something moves otherwise than what was registered, or the whole fails."""
+    """Whether something moves differently from what was registered, or the whole fails."""
     return any(
         message.code == "rival-motion" or (message.severity == "failure" and not message.images) for message in found
     )

@@ -183,7 +183,8 @@ def _masked(placed: PlacedImages) -> list[Message]:
     if placed.static is None:
         return []
     share = float(placed.static.mean())
-    return [Message(f"{share:.0%} of every image is black, or stays where it is, in all of them, and was masked")]
+    text = f"{share:.0%} of every image is black, or stays where it is, in all of them, and was masked"
+    return [Message(text, severity="detail")]
 
 
 def _files_beside(output: str | Path | None, placed: PlacedImages, overwrite: bool) -> tuple[Path, ...]:

@@ -90,7 +90,7 @@ class PlacedImages:
         alignment = registration.alignment
         used = np.flatnonzero(alignment.used)
         return cls(
-            [registration.sources[i] for i in used],
+            [replace(registration.sources[i], camera=alignment.cameras[i]) for i in used],
             [alignment.cameras[i] for i in used],
             alignment.homographies[used],
             int(np.flatnonzero(used == alignment.reference)[0]),

@@ -12,6 +12,7 @@ from rdstitch.alignment.reference_frame import frontal_reference, in_frame_of
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.cache import Cache
 from rdstitch.features import LightGlue, Matcher, match
+from rdstitch.inputs.image_circle import with_image_circle
 from rdstitch.inputs.measurements import positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import first_pairs
@@ -75,6 +76,8 @@ def register(
     options = options.for_images(len(sources))
     cache = Cache.at(options.cache)
     layout_matters = not (lens_only or metric)
+    if options.known_distortion is None:
+        sources = with_image_circle(sources, executor, options.features.limits[1])
     aligner = Aligner.of(sources, options, cache, prefer_turn=prefer_turn, layout_matters=layout_matters)
     store = cache if options.cache is not None else Cache.for_this_run()
     rendered = detect_by_contrast(sources, options.features, executor, store, skip_bad=skip_bad, progress=progress)

@@ -169,6 +169,7 @@ def lens_fields(camera: Camera) -> dict[str, Any]:
     """What of an image's camera depends on the size of the image, and λ with it."""
     return {
         "center_px": camera.center,
+        "image_circle_px": camera.image_circle,
         "lambda": camera.nearest_distortion,
         "coefficients": camera.coefficients,
         "focal_px": camera.focal,

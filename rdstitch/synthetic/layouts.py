@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.synthetic.lenses import Lens, focal_length
-from rdstitch.synthetic.poses import Poses, texels_of_pixels
+from rdstitch.synthetic.poses import Poses, plane_outline
 
 Tilt = tuple[float, float]
 
@@ -233,11 +233,8 @@ def joined(*parts: Poses) -> Poses:
 
 def _extent(lens: Lens, tilt: Tilt, texels_per_pixel: float) -> FloatArray:
     """Width and height in texels that an image shows of the plane along its middle row and column."""
-    width, height = lens.image_size
-    (cx, cy) = (width - 1) / 2, (height - 1) / 2
-    ends = [(-0.5, cy), (width - 0.5, cy), (cx, -0.5), (cx, height - 0.5)]
     pose = Poses.of((0.0, 0.0), texels_per_pixel * focal_length(lens), 0.0, tilt)
-    left, right, top, bottom = texels_of_pixels(lens, pose.from_plane()[0], ends)
+    top, right, bottom, left = plane_outline(lens, pose.from_plane()[0], 2)[1::2]
     extent = np.array([np.linalg.norm(right - left), np.linalg.norm(bottom - top)])
     if not np.isfinite(extent).all():
         raise ArgumentError("the image sees beyond the horizon or beyond its lens")

@@ -1,5 +1,6 @@
 """Lenses to render with. :class:`rdstitch.camera.Camera` is one; the others are no division model."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -8,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
+from rdstitch.camera import Camera, border_of
 from rdstitch.camera_files.lens_fit import fit_lens
 from rdstitch.camera_files.lens_models import Brown
 from rdstitch.errors import ArgumentError
@@ -45,6 +46,9 @@ class Lens(Protocol):
     def distort(self, points: ArrayLike) -> FloatArray:
         """The inverse of :meth:`undistort`."""
 
+    def outline(self, points_per_side: int) -> FloatArray:
+        """Outer border of what the lens draws, clockwise, pixels (4 points_per_side, 2)."""
+
 
 @dataclass(frozen=True)
 class _FixedFocalLens:
@@ -75,6 +79,10 @@ class _FixedFocalLens:
     def _denormalize(self, points: FloatArray) -> FloatArray:
         return points * self.focal + self.center
 
+    def outline(self, points_per_side: int) -> FloatArray:
+        """Outer border of the image, clockwise, pixels (4 points_per_side, 2)."""
+        return border_of(self.image_size, points_per_side)
+
 
 @dataclass(frozen=True)
 class FisheyeLens(_FixedFocalLens):
@@ -84,20 +92,24 @@ class FisheyeLens(_FixedFocalLens):
     ----------
     kind : str
         "equidistant" (``focal * θ``), "equisolid" (``2 focal sin(θ/2)``) or "stereographic" (``2 focal tan(θ/2)``).
+    image_circle : float
+        Radius about the centre, pixels, beyond which the image is black.
     """
 
     kind: str = field(default="equidistant", kw_only=True)
+    image_circle: float = field(default=math.inf, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.kind not in _FISHEYES:
             raise ArgumentError(f"a fisheye is {', '.join(_FISHEYES)}, not {self.kind}")
 
     def undistort(self, points: ArrayLike) -> FloatArray:
-        """Measured pixels to pinhole pixels; NaN for rays at 90° and more."""
+        """Measured pixels to pinhole pixels; NaN for rays at 90° and more, and beyond the image circle."""
         x = self._normalize(points)
         radius = np.linalg.norm(x, axis=-1, keepdims=True)
         angle = _FISHEYES[self.kind][1](radius)
-        tangent = np.tan(np.where(angle < np.pi / 2, angle, np.nan))
+        drawn = (angle < np.pi / 2) & (radius <= self.image_circle / self.focal * (1.0 + 1e-9))
+        tangent = np.tan(np.where(drawn, angle, np.nan))
         return self._denormalize(x * np.where(radius > 0.0, tangent / np.maximum(radius, 1e-300), 1.0))
 
     def distort(self, points: ArrayLike) -> FloatArray:
@@ -106,6 +118,12 @@ class FisheyeLens(_FixedFocalLens):
         tangent = np.linalg.norm(x, axis=-1, keepdims=True)
         radius = _FISHEYES[self.kind][0](np.arctan(tangent))
         return self._denormalize(x * np.where(tangent > 0.0, radius / np.maximum(tangent, 1e-300), 1.0))
+
+    def outline(self, points_per_side: int) -> FloatArray:
+        """Outer border of the image, or of its circle, clockwise, pixels (4 points_per_side, 2)."""
+        offset = super().outline(points_per_side) - self.center
+        radius = np.linalg.norm(offset, axis=1, keepdims=True)
+        return np.asarray(self.center + offset * np.minimum(1.0, self.image_circle / radius))
 
 
 @dataclass(frozen=True)

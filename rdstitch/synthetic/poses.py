@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import border_of
 from rdstitch.errors import ArgumentError
 from rdstitch.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
 from rdstitch.radial_homography import project
@@ -129,7 +128,7 @@ def plane_outline(lens: Lens, from_plane: FloatArray, points_per_side: int = 32)
     from_plane : ndarray of shape (..., 3, 3)
         See :meth:`Poses.from_plane`; leading axes are kept.
     """
-    return texels_of_pixels(lens, from_plane, border_of(lens.image_size, points_per_side))
+    return texels_of_pixels(lens, from_plane, lens.outline(points_per_side))
 
 
 def texels_of_pixels(lens: Lens, from_plane: FloatArray, points: ArrayLike) -> FloatArray:

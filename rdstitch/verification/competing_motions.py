@@ -297,6 +297,6 @@ def _strongest_motions(
 def _matches(pair: PairRegistration, chosen: IntArray) -> PairMatches:
     """Some of the matches of a pair, as pairs are estimated from."""
     own, matched = pair.relation, pair.correspondences.take(chosen)
-    camera = Camera(own.camera.image_size, center=own.camera.center).with_focal()
+    camera = own.camera.without_lens().with_focal()
     other = camera.resized(own.camera2.image_size)
     return PairMatches(matched.points1, matched.points2, camera, other, -matched.ratio)

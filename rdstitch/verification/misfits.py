@@ -39,7 +39,7 @@ def disagreeing_pairs(registration: Registration) -> dict[Pair, Message]:
             f"{' and '.join(names_of(both))}: only {fit.inliers} of {fit.count} matches agree with the whole; "
             f"{_few_features(registration, (fit.image1, fit.image2)) or remedy}"
         )
-        result[fit.image1, fit.image2] = Message(text, both, "failure")
+        result[fit.image1, fit.image2] = Message(text, both, "failure", "misfitting-pair")
     return result
 
 
@@ -52,7 +52,7 @@ def misfitting_images(registration: Registration, links: Sequence[LinkFit]) -> l
         if kept < _MIN_MATCHES_PER_IMAGE * given:
             reason = _few_features(registration, (k,)) or _reason(registration, own)
             text = f"only {kept} of {given} of its matches agree with the whole; {reason}"
-            result.append(Message(text, (str(source.path),), "failure"))
+            result.append(Message(text, (str(source.path),), "failure", "misfitting-image"))
     return result
 
 

@@ -1,4 +1,4 @@
-"""What the checks of overlaps come to where something moves otherwise than the plane."""
+"""What the checks of overlaps come to where something moves differently from the plane."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -163,7 +163,7 @@ def rival_messages(
     first, second = names_of(images)
     u, v = worst.center
     what = (
-        f"{share:.0%} of what the images have in common moves otherwise than the rest, most of it around "
+        f"{share:.0%} of what the images have in common moves differently from the rest, most of it around "
         f"({u:.0f}, {v:.0f}) of {first} when compared with {second}, by {worst.disagreement:.0f} pixels"
     )
     clear = agreement >= _CLEAR_AGREEMENT or (share < _CONTESTED_SHARE and not agreement < MIN_AGREEMENT)
@@ -203,7 +203,7 @@ class _Rest:
     @property
     def matches(self) -> PairMatches:
         """As pairs are estimated from."""
-        camera = Camera(self._camera.image_size, center=self._camera.center).with_focal()
+        camera = self._camera.without_lens().with_focal()
         rest, matched = self.unexplained, self._matched
         other = camera.resized(self._other.image_size)
         return PairMatches(matched.points1[rest], matched.points2[rest], camera, other, -matched.ratio[rest])

@@ -20,7 +20,7 @@ from rdstitch.verification.overlap_check import CheckedLink, check_overlaps, sha
 from rdstitch.verification.parallax import find_parallax, parallax_messages
 from rdstitch.verification.rival_check import compare_with_rivals, outside_rivals
 from rdstitch.verification.rival_motion import MIN_AGREEMENT, find_rival_motions, is_apart, rival_messages
-from rdstitch.verification.rules import Situation, spoken
+from rdstitch.verification.rules import Situation, one_of_each, spoken
 
 Pair = tuple[int, int]
 
@@ -46,7 +46,10 @@ class RefusedError(RegistrationError):
     code = "not-reliable"
 
     def __init__(self, registration: Registration) -> None:
-        reasons = "; ".join(message.clause for message in registration.failures)
+        chosen = one_of_each(registration.failures)
+        reasons = "; ".join(message.clause for message in chosen)
+        if rest := len(registration.failures) - len(chosen):
+            reasons += f"; and {rest} more like {'these' if len(chosen) > 1 else 'this'}"
         super().__init__(f"no reliable result: {reasons} (--force writes it all the same)")
         self.registration = registration
 
@@ -256,10 +259,9 @@ def _decisive(suspicions: Mapping[Pair, Message], used: Sequence[LinkFit], count
     return [(i, j) for i, j in suspicions if part[i] != part[j]]
 
 
-def _of_pair(paths: Sequence[str], link: LinkFit, text: str, severity: Severity = "failure") -> Message:
+def _of_pair(paths: Sequence[str], link: LinkFit, text: str, code: str, severity: Severity = "failure") -> Message:
     """A message on two images; ``text`` follows their names."""
     both = paths[link.image1], paths[link.image2]
-    code = "doubtful-seam" if severity == "warning" else ""
     return Message(f"{' and '.join(names_of(both))}{text}", both, severity, code)
 
 
@@ -271,6 +273,7 @@ def _unlike(paths: Sequence[str], checked: Sequence[CheckedLink], least: float) 
             link.fit,
             f" do not look alike where they are put together ({link.agreement.confirming} of {link.agreement.cells} "
             "places agree)",
+            "unlike",
         )
         for link in checked
         if link.agreement.cells >= _MIN_CELLS and link.agreement.share < least
@@ -280,11 +283,14 @@ def _unlike(paths: Sequence[str], checked: Sequence[CheckedLink], least: float) 
 def _of_the_rival(
     paths: Sequence[str], checked: Sequence[CheckedLink], compared: Contest | None
 ) -> dict[Pair, Message]:
-    """Images that may be held together by what moves otherwise than the plane; none where that holds all of them."""
+    """Images that may be held together by what moves differently from the plane; none where that holds all of them."""
     doubtful = frozenset[Pair]() if compared is None or compared.lost else compared.doubtful
     return {
         link.pair: _of_pair(
-            paths, link.fit, " may be held together by what moves otherwise than the plane (a vehicle?)"
+            paths,
+            link.fit,
+            " may be held together by what moves differently from the plane (a vehicle?)",
+            "second-motion",
         )
         for link in checked
         if link.pair in doubtful
@@ -299,6 +305,7 @@ def _ambiguous(paths: Sequence[str], checked: Sequence[CheckedLink]) -> dict[Pai
             link.fit,
             f" fit as well elsewhere, {link.ambiguity.shift:.0%} of an image away (a repeated pattern?); "
             "take images that share something unique",
+            "ambiguous",
         )
         for link in checked
         if link.ambiguity.ambiguous and not link.unique
@@ -328,6 +335,7 @@ def _little_alike(paths: Sequence[str], checked: Sequence[CheckedLink]) -> list[
             link.fit,
             f": only {link.agreement.confirming} of {link.agreement.cells} places look alike; "
             "look at the seam between them",
+            "doubtful-seam",
             "warning",
         )
         for link in checked

@@ -1,0 +1,64 @@
+"""Of a fisheye whose circle is smaller than its images, the circle is found, and what is black around it is no content."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rdstitch
+from rdstitch.arrays import FloatArray
+from rdstitch.inputs.image_circle import find_circle
+from rdstitch.synthetic import FisheyeLens, grid_poses, ground, sequence_over
+from tests.acceptance.rendered import geometry
+
+
+def _grey(shape: tuple[int, int], radius: float, center: tuple[float, float], level: float = 120.0) -> FloatArray:
+    rng = np.random.default_rng(1)
+    u, v = np.meshgrid(np.arange(shape[1]), np.arange(shape[0]))
+    content = level * rng.uniform(0.3, 1.7, shape)
+    dark = 4.0 + rng.normal(0.0, 2.0, shape)
+    return np.where(np.hypot(u - center[0], v - center[1]) <= radius, content, dark).astype(np.float32)
+
+
+@pytest.mark.parametrize(("radius", "center"), [(110.0, (160.0, 120.0)), (140.0, (150.0, 122.0))])
+def test_a_circle_is_found_also_where_the_longer_sides_cut_it_off(radius: float, center: tuple[float, float]) -> None:
+    found = find_circle(_grey((240, 320), radius, center))
+    assert found is not None
+    assert found.center == pytest.approx(center, abs=1.0)
+    assert found.radius == pytest.approx(radius, abs=1.0)
+
+
+def test_other_dark_borders_are_no_circle() -> None:
+    u, v = np.meshgrid(np.arange(320), np.arange(240))
+    bright = _grey((240, 320), 1000.0, (0.0, 0.0))
+    frame = (np.abs(u - 160) < 140) & (np.abs(v - 120) < 100)
+    pincushion = np.hypot(u - 160, v - 120) < 130 + 60 * np.abs(np.sin(2 * np.arctan2(v - 120, u - 160)))
+    for content in (frame, pincushion, np.ones_like(frame), np.zeros_like(frame)):
+        assert find_circle(np.where(content, bright, np.float32(3.0)).astype(np.float32)) is None
+
+
+def test_a_circular_fisheye_is_stitched_and_calibrated(tmp_path: Path) -> None:
+    """Of 150 degrees: one plus λ in the frame of the image's corners would be below zero."""
+    lens = FisheyeLens((480, 360), 165.0 / np.radians(75.0), offset=(4.0, -2.0), image_circle=165.0)
+    poses = grid_poses(lens, 3, 3, overlap=0.88, yaw=np.pi, tilt=(0.03, -0.02), seed=3)
+    sequence = sequence_over(lambda size: ground(size, 3, channels=1), lens, poses)
+    files = sequence.write(tmp_path)
+    result = rdstitch.mosaic(files)
+    alignment = result.registration.alignment
+    assert alignment.used.all()
+    camera = alignment.cameras[0]
+    assert camera.image_circle == pytest.approx(0.97 * 165.0, abs=2.0)
+    assert camera.center == pytest.approx(lens.center, abs=0.3)
+    inner = lens.center + 155.0 * np.array([(np.cos(a), np.sin(a)) for a in np.linspace(0.0, 6.0, 9)])
+    ratio = np.linalg.norm(camera.undistort(inner) - camera.center, axis=1) / np.linalg.norm(
+        lens.undistort(inner) - lens.center, axis=1
+    )
+    assert ratio == pytest.approx(ratio.mean(), rel=0.02)
+    error = geometry(sequence, result, "similarity")
+    assert error.median < 0.3
+    camera.save(tmp_path / "camera.json")
+    again = rdstitch.Camera.load(tmp_path / "camera.json")
+    assert again.image_circle == camera.image_circle
+    given = rdstitch.mosaic(files, options=rdstitch.StitchOptions(camera=again)).registration.alignment
+    assert given.used.all()
+    assert given.cameras[0].coefficients == camera.coefficients
