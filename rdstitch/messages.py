@@ -27,12 +27,15 @@ class Message:
         text gives. "failure": the result cannot be relied on.
     code : str
         Heading in docs/troubleshooting.md; empty where the text says it all.
+    kind : str
+        What is alike of messages on different images; of findings only.
     """
 
     text: str
     images: tuple[str, ...] = ()
     severity: Severity = "warning"
     code: str = ""
+    kind: str = ""
 
     def __str__(self) -> str:
         """The line for standard error."""

@@ -64,6 +64,11 @@ class PairRegistration:
         return f"<PairRegistration {self.image1}, {self.image2}: {self.relation!r}>"
 
     @property
+    def images(self) -> Pair:
+        """Indices of both images."""
+        return self.image1, self.image2
+
+    @property
     def correspondences(self) -> Correspondences:
         """The putative matches, pixels; read every time."""
         return self.matches.load()

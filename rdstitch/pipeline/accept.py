@@ -17,15 +17,13 @@ from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner, impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.registration import Registration
-from rdstitch.verification.competing_motions import planes_of_pairs
+from rdstitch.verification.findings import Finding
+from rdstitch.verification.messages import messages_of
+from rdstitch.verification.second_motion import planes_of_pairs
 from rdstitch.verification.verdict import RefusedError, judge
 
 _MAX_SCALE_UNCERTAINTY = 0.05  # share that lengths may be off by, as far as the focal length is, without a word
 _MAX_ROUNDS = 20  # times that something is left out; each takes one adjustment
-
-_FEW_PAIRS = 500
-"""Pairs up to which every failure is reason enough to look for a second motion in each: that takes 20 seconds then. In
-larger sets something has been seen to move otherwise, or the failure is one of the whole."""
 
 
 @dataclass(frozen=True)
@@ -93,32 +91,31 @@ def accept(
         registration, undamaged = undamaged, None
     checked = partial(judge, threshold=options.threshold, executor=executor, cache=cache, lens_only=lens_only)
     current, found = registration, checked(registration)
-    first = registration.with_messages(found)
-    if not first.ok and undamaged is not None and undamaged.with_messages(judged := checked(undamaged)).ok:
+    first, found_first = registration, found
+    if _fails(found) and undamaged is not None and not _fails(judged := checked(undamaged)):
         current, found = undamaged, judged
-    elif not first.ok and not options.force:
-        left = _Offenders({}, {})
-        plane = None
-        if not lens_only and (len(registration.pairs) <= _FEW_PAIRS or _may_be_another_plane(found)):
-            plane = _plane_of_most(registration, options.threshold, aligner)
+    elif _fails(found) and not options.force:
+        another = not lens_only and _may_be_another_plane(found)
+        plane = _plane_of_most(registration, options, aligner) if another else None
         judged = () if plane is None else checked(plane)
-        if plane is not None and not _concerns_all(judged):
-            registration, current, found = plane, plane, judged
+        if plane is not None and not any(map(_is_of_the_whole, judged)):
+            current, found = plane, judged
+        start, left = current, _Offenders({}, {})
         for _ in range(_MAX_ROUNDS):
-            if current.with_messages(found).ok:
+            if not _fails(found):
                 break
-            if _concerns_all(found):
-                raise RefusedError(at_full_size(first if current is registration else current.with_messages(found)))
+            if any(map(_is_of_the_whole, found)):
+                raise RefusedError(_told(current, found))
             worst = _worst(current, found)
             left |= worst
-            shrunk = _without(registration, left, aligner) if worst else None
+            shrunk = _without(start, left, aligner) if worst else None
             # Where as many images fail as pass, nobody can say which of them are right.
             if shrunk is None or shrunk.alignment.used.sum() <= len(left.reasons):
-                raise RefusedError(at_full_size(first))
+                raise RefusedError(_told(first, found_first))
             current, found = shrunk, checked(shrunk)
-    accepted = at_full_size(current).with_messages(found)
-    if not accepted.ok and not options.force:
-        raise RefusedError(at_full_size(first))
+    if _fails(found) and not options.force:
+        raise RefusedError(_told(first, found_first))
+    accepted = _told(current, found)
     if options.strict and accepted.left_out:
         raise PartialResultError("; ".join(map(str, told_once(accepted.left_out))))
     return accepted
@@ -147,11 +144,25 @@ def _is_simpler(model: str, former: str) -> bool:
     return {model, former} <= PLANAR_MODELS.keys() and by_freedom.index(model) < by_freedom.index(former)
 
 
-def _plane_of_most(registration: Registration, threshold: float, aligner: Aligner) -> Registration | None:
+def _fails(found: Iterable[Finding]) -> bool:
+    return any(finding.fails for finding in found)
+
+
+def _told(registration: Registration, found: Sequence[Finding]) -> Registration:
+    """A registration at full size, with what was found of it in words."""
+    return at_full_size(registration).with_messages(messages_of(found, registration))
+
+
+def _may_be_another_plane(found: Iterable[Finding]) -> bool:
+    """Whether something moves differently from what was registered, or the whole fails."""
+    return any(finding.kind in ("second motion", "undecided motion") or _is_of_the_whole(finding) for finding in found)
+
+
+def _plane_of_most(registration: Registration, options: StitchOptions, aligner: Aligner) -> Registration | None:
     """Of two motions in the images that which may fill most of them; None where that is not to be seen."""
     if registration.static_background:
         return None
-    pairs = planes_of_pairs(registration, threshold)
+    pairs = planes_of_pairs(registration, options.threshold)
     if pairs is None:
         return None
     try:
@@ -162,33 +173,26 @@ def _plane_of_most(registration: Registration, threshold: float, aligner: Aligne
     return plane if 2 * plane.alignment.used.sum() > len(registration.sources) else None
 
 
-def _may_be_another_plane(found: Iterable[Message]) -> bool:
-    """Whether something moves differently from what was registered, or the whole fails."""
-    return any(
-        message.code == "rival-motion" or (message.severity == "failure" and not message.images) for message in found
-    )
+def _is_of_the_whole(finding: Finding) -> bool:
+    """Whether it is a failure that no image or pair is to blame for."""
+    return finding.fails and len(finding.images) not in (1, 2)
 
 
-def _concerns_all(found: Iterable[Message]) -> bool:
-    """Whether something fails that no image or pair is to blame for, so that leaving one out would only hide it."""
-    return any(message.severity == "failure" and len(message.images) > 2 for message in found)
-
-
-def _worst(registration: Registration, found: Iterable[Message]) -> _Offenders:
+def _worst(registration: Registration, found: Iterable[Finding]) -> _Offenders:
     """The worst images, no two of them linked, since a bad image spoils its neighbours; else the failing pairs."""
-    index = {str(source.path): k for k, source in enumerate(registration.sources)}
-    failures = [message for message in found if message.severity == "failure"]
-    single = {index[m.images[0]]: m for m in failures if len(m.images) == 1}
+    failures = [finding for finding in found if finding.fails]
+    single = {finding.images[0]: finding for finding in failures if len(finding.images) == 1}
     if not single:
-        pairs = (m for m in failures if len(m.images) == 2)
-        return _Offenders({}, {(index[m.images[0]], index[m.images[1]]): m for m in pairs})
+        pairs = [finding for finding in failures if len(finding.images) == 2]
+        said = zip(pairs, messages_of(pairs, registration), strict=True)
+        return _Offenders({}, {(finding.images[0], finding.images[1]): message for finding, message in said})
     used = [fit for fit in registration.alignment.links if fit.used]
     fit_share = agreement(used, len(registration.sources))
     chosen: dict[int, Message] = {}
     for image in sorted(single, key=lambda k: (fit_share[k], k)):
         linked = {fit.image1 + fit.image2 - image for fit in used if image in (fit.image1, fit.image2)}
         if not linked & chosen.keys():
-            chosen[image] = single[image]
+            (chosen[image],) = messages_of([single[image]], registration)
     return _Offenders(chosen, {})
 
 

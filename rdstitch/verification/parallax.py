@@ -14,7 +14,6 @@ from rdstitch.alignment import Alignment
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import Camera
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.messages import Message, names_of
 
 _MIN_ERROR, _MAX_ERROR = 0.002, 0.15
 """Of an image's diagonal: between what noise does and what only wrong matches do."""
@@ -66,21 +65,6 @@ def find_parallax(alignment: Alignment, pairs: Sequence[PairRegistration], seed:
     registered = [pair for pair in pairs if pair.relation and alignment.used[[pair.image1, pair.image2]].all()]
     found = [parallax for pair in registered if (parallax := _parallax(alignment, pair, rng)) is not None]
     return sorted(found, key=lambda parallax: -parallax.size)
-
-
-def parallax_messages(paths: Sequence[str], found: Sequence[Parallax]) -> list[Message]:
-    """A warning that names the worst pair and the size; none where there is no parallax."""
-    if not found:
-        return []
-    worst = found[0]
-    images = (paths[worst.image1], paths[worst.image2])
-    first, second = names_of(images)
-    text = (
-        "the camera moved while it turned (parallax), or things moved before it: they are off by up to "
-        f"{worst.size:.0f} pixels between {first} and {second} ({worst.share:.0%} of their matches); turn about the "
-        "lens, not about yourself"
-    )
-    return [Message(text, images, code="parallax")]
 
 
 def _parallax(alignment: Alignment, pair: PairRegistration, rng: np.random.Generator) -> Parallax | None:

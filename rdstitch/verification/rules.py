@@ -1,95 +1,296 @@
-"""Which findings are said aloud, in one table; what is not goes into the report and ``-v`` as a detail.
+"""The rules that a result is judged by: every threshold with its unit and what set it, and what is found with them.
 
 A warning is for what puts this result at risk. Where images look alike in the pixels, what their matches say of depth
-or of errors has been hidden by local alignment and seams, and does not.
+or of errors has been hidden by local alignment and seams, and is a detail.
 """
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple
 
-from rdstitch.messages import Message
+from rdstitch.alignment.result import LinkFit
+from rdstitch.alignment.unaligned import few_features
+from rdstitch.inputs.source import Source
+from rdstitch.verification.evidence import MIN_CELLS, Evidence
+from rdstitch.verification.findings import Finding
+from rdstitch.verification.overlap_check import CheckedLink, share_alike
+from rdstitch.verification.second_motion import FILLED_BY_A_PLANE, is_separate, share_of
 
 MAX_WARNINGS = 3
 """Lines of one run."""
 
 
-@dataclass(frozen=True)
-class Situation:
-    """What the rules look at.
+class Limit(NamedTuple):
+    """A threshold."""
 
-    Attributes
-    ----------
-    alike : float
-        Median share of the overlaps that looks alike, [0, 1].
-    flat : bool
-        Whether the images are said to show a plane that three or more of them hold together: of a turn, and of two
-        images, only overlaps can be wrong, and they are looked at.
-    depth : bool
-        Whether the scene has depth, or the camera moved while it turned.
-    shape_doubtful : bool
-        Whether the shape of the whole may be off, by less than an image.
-    """
-
-    alike: float
-    flat: bool
-    depth: bool
-    shape_doubtful: bool
+    value: float
+    unit: str
+    source: str
 
 
-@dataclass(frozen=True)
-class Rule:
-    """When a finding is said.
-
-    Attributes
-    ----------
-    code : str
-        Of the message.
-    kind : str
-        What it is about; of one kind the first is said.
-    speaks : callable
-    """
-
-    code: str
-    kind: str
-    speaks: Callable[[Situation], bool]
-
-
-_HIDDEN = 0.25
-"""Share of the overlaps that looks alike from which on depth leaves no break that is seen: 0.26 to 1 in 22 published
-sets of hand-held images that a person would keep (``python -m tests.benchmarks.world``)."""
-
-RULES = (
-    Rule("shape", "flatness", lambda found: found.flat and found.shape_doubtful),
-    Rule("relief", "flatness", lambda found: found.flat or found.alike < _HIDDEN),
-    Rule("parallax", "flatness", lambda found: found.alike < _HIDDEN),
-    Rule("rival-motion", "rival-motion", lambda found: found.flat or not found.depth),
-    Rule("doubtful-seam", "doubtful-seam", lambda found: not found.depth or found.alike < _HIDDEN),
-)
-"""The gravest first; what has no rule is always said, and before these."""
+LIMITS = {
+    "inliers of a pair": Limit(0.5, "share of its matches", "less is another motion than that of the whole"),
+    "inliers of an image": Limit(
+        0.6, "share of its matches", "right images have been seen to have 0.83 even with relief, others 0.52"
+    ),
+    "few matches": Limit(40, "matches", "pairs that share nothing have been seen to have up to 33 of one motion"),
+    "error": Limit(1.0, "thresholds, rms of the whole", "the definition of an inlier"),
+    "error of rough ground": Limit(3.0, "thresholds, where images look alike", "small_failures, classical"),
+    "error that relief explains": Limit(0.02, "of an image's diagonal", "python -m tests.benchmarks.relief"),
+    "alike": Limit(0.25, "share of the overlaps", "0.26 to 1 in 22 sets that a person would keep: benchmarks.world"),
+    "clearly alike": Limit(0.5, "share of the overlaps", "python -m tests.benchmarks.relief"),
+    "unlike": Limit(0.10, "share of the cells of an overlap", "chance reaches 0.07; low sun, parallax, blur 0.20"),
+    "little alike": Limit(0.15, "share of the cells of an overlap", "between the two"),
+    "unlike, undecided": Limit(
+        0.4, "share of the cells of an overlap", "vehicles 0.15 to 0.36, planes beside one 0.2 to 0.9: benchmarks.trust"
+    ),
+    "pattern": Limit(0.4, "share of the checked pairs", "more is a pattern all over: leaving some out proves nothing"),
+    "second motion": Limit(0.1, "share of the area of either motion", "trees and houses reach 0.08: benchmarks.trust"),
+    "zoom": Limit(1.03, "ratio of focal lengths in EXIF", "they are rounded to about one per cent"),
+}
 
 
-def spoken(messages: Iterable[Message], found: Situation) -> tuple[Message, ...]:
-    """Make details of warnings that their rule silences, of all but the first of a kind, and of more than a few."""
-    given, order = list(messages), {rule.code: number for number, rule in enumerate(RULES)}
-    kinds: set[str] = set()
-    aloud: set[int] = set()
-    for number in sorted(range(len(given)), key=lambda index: order.get(given[index].code, -1)):
-        message = given[number]
-        rule = RULES[order[message.code]] if message.code in order else None
-        kind = message.code if rule is None else rule.kind
-        silent = (kind and kind in kinds) or (rule is not None and not rule.speaks(found))
-        if message.severity == "warning" and not silent and len(aloud) < MAX_WARNINGS:
-            aloud.add(number)
-            kinds.add(kind)
-    return tuple(
-        replace(message, severity="detail") if message.severity == "warning" and number not in aloud else message
-        for number, message in enumerate(given)
+def _limit(name: str) -> float:
+    return LIMITS[name].value
+
+
+def disagreeing_pairs(found: Evidence) -> Iterator[Finding]:
+    """Pairs of whose matches most do not fit into the whole."""
+    for fit in found.used:
+        if fit.inliers < _limit("inliers of a pair") * fit.count:
+            reason = _reason(found, (fit.image1, fit.image2), [fit], "stitch them on their own")
+            yield _of_matches("pair misfits", (fit.image1, fit.image2), [fit], reason)
+
+
+def _misfitting_images(found: Evidence) -> Iterator[Finding]:
+    """Images of whose matches too many do not fit into the whole, over all pairs that do."""
+    agreeing = [fit for fit in found.used if fit.inliers >= _limit("inliers of a pair") * fit.count]
+    for k in range(len(found.registration.sources)):
+        own = [fit for fit in agreeing if k in (fit.image1, fit.image2)]
+        if sum(fit.inliers for fit in own) < _limit("inliers of an image") * sum(fit.count for fit in own):
+            yield _of_matches("image misfits", (k,), own, _reason(found, (k,), own))
+
+
+def _matches_disagree(found: Evidence) -> Iterator[Finding]:
+    if sum(fit.inliers for fit in found.used) < _limit("inliers of a pair") * sum(fit.count for fit in found.used):
+        yield _of_matches("matches disagree", (), found.used)
+
+
+def _of_matches(kind: str, images: tuple[int, ...], fits: Sequence[LinkFit], reason: str = "") -> Finding:
+    inliers, count = sum(fit.inliers for fit in fits), sum(fit.count for fit in fits)
+    return Finding(kind, images, values={"inliers": inliers, "count": count, "reason": reason})
+
+
+def _reason(found: Evidence, images: Sequence[int], fits: Sequence[LinkFit], remedy: str = "") -> str:
+    """Why matches agree with each other only."""
+    few = [(found.registration.sources[k].name, few_features(found.registration.keypoints, k)) for k in images]
+    if any(why for _, why in few):
+        return ", ".join(f"{name} has {why}" for name, why in few if why)
+    why = "they agree with each other: another plane, camera or zoom, or none (trees, walls)?"
+    if sum(fit.count for fit in fits) < _limit("few matches"):
+        why = "too few to place it: little overlap, or none?"
+    return f"{why} {remedy}".strip()
+
+
+def _mixed_lenses(found: Evidence) -> Iterator[Finding]:
+    """Two lenses whose images were not separated: it is not clear which are whose, or each has one image only."""
+    mixed = found.registration.mixed
+    if mixed is not None and not mixed.certain:
+        own, others = ([k for k, second in enumerate(mixed.second) if second == which] for which in (True, False))
+        there, here = mixed.distortion
+        yield Finding("lenses mixed", values={"own": own, "others": others, "here": here, "there": there})
+
+
+def _errors(found: Evidence) -> Iterator[Finding]:
+    """Errors of all pairs together; those of rough ground are a warning where the pixels agree."""
+    alignment, threshold = found.alignment, found.threshold
+    rms, relief = alignment.rms, alignment.relief
+    if rms <= _limit("error") * threshold:
+        return
+    largest = _limit("error that relief explains") * 2.0 * max(camera.half_diagonal for camera in alignment.cameras)
+    # Without what neighbours have in common, errors are those of a plane.
+    explained = rms <= largest and rms**2 - relief.size**2 <= (_limit("error") * threshold) ** 2
+    # Where the pixels agree, depth that one surface does not explain has been found a place all the same.
+    rough = (rms <= _limit("error of rough ground") * threshold and found.alike >= _limit("alike")) or (
+        relief.found and explained and found.alike >= _limit("clearly alike")
     )
+    values = {"rms": rms, "threshold": threshold}
+    yield Finding("rough", (), "warning", values) if rough else Finding("errors", values=values)
 
 
-def one_of_each(failures: Iterable[Message]) -> list[Message]:
-    """Return the first failure of each code, of few codes: what one line can say."""
-    first: dict[str, Message] = {}
-    for failure in failures:
-        first.setdefault(failure.code or failure.text, failure)
-    return list(first.values())[:MAX_WARNINGS]
+def _depth(found: Evidence) -> Iterator[Finding]:
+    """Parallax of a turn, or errors that neighbouring matches have in common, and where they are largest."""
+    if found.parallax:
+        worst = found.parallax[0]
+        values = {"size": worst.size, "share": worst.share}
+        yield Finding("parallax", (worst.image1, worst.image2), "warning", values)
+    elif found.alignment.relief.found:
+        fit = max(found.used, key=lambda fit: fit.rms)
+        what = found.alignment.relief.explanation
+        kind = "depth of a turn" if found.alignment.on_sphere else "relief"
+        yield Finding(kind, (fit.image1, fit.image2), "warning", {"what": what, "rms": fit.rms})
+
+
+def _shape(found: Evidence) -> Iterator[Finding]:
+    """A shape of the whole that the overlaps do not hold, and the image that may be off the most."""
+    alignment, shape = found.alignment, found.alignment.shape
+    if shape is None or found.lens_only:
+        return
+    if alignment.focal is None:
+        # Chains of free homographies bend with whatever is not modelled, a curved wall for one.
+        yield Finding("shape unknown", (shape.image,), "warning", {"size": _size_of_shape(found)})
+    elif shape.doubtful:
+        remedy = "more rows of images" if alignment.distortion_std == 0.0 else "the lens, or more rows of images"
+        values = {"size": _size_of_shape(found), "cause": shape.cause, "remedy": remedy}
+        yield Finding("shape bent" if shape.shown else "shape free", (shape.image,), "warning", values)
+
+
+def _size_of_shape(found: Evidence) -> float:
+    shape = found.alignment.shape
+    return math.inf if shape is None else math.hypot(shape.shift, shape.shift_std)
+
+
+def _unlike(found: Evidence) -> Iterator[Finding]:
+    """Images that were put together and do not look alike there.
+
+    What two images share of a plane looks alike; where something else moves, it may be that which holds them.
+    """
+    least = _limit("unlike, undecided" if _undecided(found) else "unlike")
+    for link in found.seen:
+        if link.agreement.cells >= MIN_CELLS and link.agreement.share < least:
+            yield Finding("unlike", link.pair, values=_cells_of(link))
+
+
+def _undecided(found: Evidence) -> bool:
+    """Whether something moves differently, and the pixels do not say which of the two is the plane."""
+    compared = found.compared
+    return is_separate(found.motions) and not (compared is not None and (compared.won or compared.lost))
+
+
+def _little_alike(found: Evidence) -> Iterator[Finding]:
+    """Images that look less alike than most where they are put together."""
+    for link in found.seen:
+        if link.agreement.cells >= MIN_CELLS and link.agreement.share < _limit("little alike"):
+            yield Finding("little alike", link.pair, "warning", _cells_of(link))
+
+
+def _cells_of(link: CheckedLink) -> dict[str, object]:
+    return {"confirming": link.agreement.confirming, "cells": link.agreement.cells}
+
+
+def _held_by_second_motion(found: Evidence) -> Iterator[Finding]:
+    """Images that what moves differently may hold together; none where that holds all of them."""
+    if found.compared is not None and not found.compared.lost:
+        doubtful = found.compared.doubtful
+        yield from (Finding("held by another", link.pair) for link in found.checked if link.pair in doubtful)
+
+
+def _ambiguous(found: Evidence) -> Iterator[Finding]:
+    for pair, link in found.ambiguous.items():
+        yield Finding("ambiguous", pair, values={"shift": link.ambiguity.shift})
+
+
+def _pattern(found: Evidence) -> Iterator[Finding]:
+    """A pattern over so many pairs that leaving some of them out proves nothing; or one in which the unique decided."""
+    if len(found.ambiguous) > _limit("pattern") * len(found.checked):
+        yield Finding("pattern", values={"count": len(found.ambiguous), "of": len(found.checked)})
+    settled = [link for link in found.seen if link.unique]
+    if settled:
+        yield Finding("settled pattern", min(settled, key=lambda link: link.agreement.share).pair, "warning")
+
+
+def _second_motion(found: Evidence) -> Iterator[Finding]:
+    """What moves differently: a failure of all images where it may be the plane, as without the one that shows it best
+    it would only be harder to see.
+    """
+    motions = found.motions
+    if found.lens_only:  # the same a period of the pattern further on; what is static has a message of its own
+        motions = [] if found.static else [own for own in motions if own.images not in found.ambiguous]
+    share, compared = share_of(motions), found.compared
+    if found.parallax or not motions or (share < _limit("second motion") and compared is None):
+        return
+    alike = share_alike(found.checked)
+    clear = alike >= FILLED_BY_A_PLANE or (share < FILLED_BY_A_PLANE and not alike < _limit("unlike, undecided"))
+    if compared is not None:
+        clear = compared.won or (clear and not compared.lost)
+    worst = max(motions, key=lambda own: own.area)
+    off = min(worst.disagreement, 2.0 * found.alignment.cameras[worst.images[0]].half_diagonal)
+    values = {"share": share, "place": worst.center, "shown": worst.images, "off": off}
+    if found.lens_only or clear:
+        yield Finding("second motion", worst.images, "warning", values)
+    else:
+        yield Finding("undecided motion", tuple(sorted({k for own in motions for k in own.images})), "failure", values)
+
+
+def _two_left(found: Evidence) -> Iterator[Finding]:
+    """Two images without a third, taken for one of another lens, which is all that tells a curved wall from a plane."""
+    used = found.alignment.used
+    if found.registration.mixed is not None and used.sum() == 2:
+        yield Finding("two of one lens", tuple(used.nonzero()[0].tolist()), "warning")
+
+
+def _inputs(found: Evidence) -> Iterator[Finding]:
+    """Images of several cameras or zoom settings, and images without a mask among others, by headers and files."""
+    sources = found.registration.sources
+    bodies: dict[str, list[int]] = {}
+    for k, source in enumerate(sources):
+        m = source.metadata
+        if m.model or m.serial:
+            bodies.setdefault(" ".join(filter(None, (m.make, m.model, m.serial))), []).append(k)
+    focal = {k: _focal_share(source) for k, source in enumerate(sources) if source.metadata.focal_px is not None}
+    if len(bodies) > 1:
+        yield Finding("several cameras", (), "warning", {"bodies": bodies})
+    elif focal and max(focal.values()) > _limit("zoom") * min(focal.values()):
+        near, far = min(focal, key=lambda k: focal[k]), max(focal, key=lambda k: focal[k])
+        yield Finding("zoomed", (), "warning", {"ratio": focal[far] / focal[near], "near": near, "far": far})
+    without = [k for k, source in enumerate(sources) if source.mask is None]
+    if 0 < len(without) < len(sources):
+        yield Finding("unmasked", (), "warning", {"without": without})
+
+
+def _focal_share(source: Source) -> float:
+    return float(source.metadata.focal_px or 0.0) / max(source.metadata.size)
+
+
+Find = Callable[[Evidence], Iterable[Finding]]
+
+OF_MATCHES: tuple[Find, ...] = (_mixed_lenses, _matches_disagree, _misfitting_images)
+"""Failures by which the pixels need not be asked: of images that may be left out."""
+
+OF_PAIRS: tuple[Find, ...] = (disagreeing_pairs, _unlike, _held_by_second_motion, _ambiguous)
+"""Suspicions of pairs, the last of each counts: a failure where images hang on it alone."""
+
+OF_THE_WHOLE: tuple[Find, ...] = (_errors, _depth, _shape, _pattern, _second_motion, _little_alike, _two_left, _inputs)
+"""Everything else."""
+
+OF_PLACES = {
+    "shape unknown", "shape bent", "shape free", "pattern", "settled pattern", "little alike", "ambiguous", "outvoted"
+}  # fmt: skip
+"""Kinds that make the places of images doubtful and leave the lens as it is: a board shifted by a square is as straight
+as before."""
+
+
+def _bent(found: Evidence) -> bool:
+    return found.flat and _size_of_shape(found) < min(2.0 * camera.half_diagonal for camera in found.alignment.cameras)
+
+
+def _seen(found: Evidence) -> bool:
+    """Whether depth leaves breaks that are seen."""
+    return found.alike < _limit("alike")
+
+
+class Aloud(NamedTuple):
+    """When a warning of a kind is one, and not a detail; of one topic the first is."""
+
+    topic: str
+    speaks: Callable[[Evidence], bool] = lambda found: True
+
+
+ALOUD = {
+    **dict.fromkeys(("shape unknown", "shape bent", "shape free"), Aloud("flatness", _bent)),
+    **dict.fromkeys(("rough", "relief"), Aloud("flatness", lambda found: found.flat or _seen(found))),
+    **dict.fromkeys(("parallax", "depth of a turn"), Aloud("flatness", _seen)),
+    "second motion": Aloud("second motion", lambda found: found.flat or not found.depth),
+    "little alike": Aloud("little alike", lambda found: not found.depth or _seen(found)),
+}
+"""The gravest first; other kinds are always said, and before these."""

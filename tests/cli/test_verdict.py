@@ -10,6 +10,7 @@ from PIL import ExifTags, Image
 from rdstitch.camera import Camera
 from rdstitch.messages import Message
 from rdstitch.pipeline import accept
+from rdstitch.verification.findings import Finding
 from tests.cli.running import CACHED, DISTORTION, Run, flight
 
 # Without a focal length, a path says that its lengths are guessed.
@@ -18,7 +19,9 @@ OUTPUTS = {"pano": "out.png", "mosaic": "out.png", "calibrate": "camera.json", "
 
 
 def _pretend(monkeypatch: pytest.MonkeyPatch, *found: Message) -> None:
-    monkeypatch.setattr(accept, "judge", lambda *arguments, **options: found)
+    findings = tuple(Finding("pretended", severity=message.severity) for message in found)
+    monkeypatch.setattr(accept, "judge", lambda *arguments, **options: findings)
+    monkeypatch.setattr(accept, "messages_of", lambda *arguments: list(found))
 
 
 @pytest.mark.parametrize("command", OUTPUTS)

@@ -7,6 +7,7 @@ from rdstitch_cli.help_pages import troubleshooting
 
 from rdstitch import errors
 from rdstitch.messages import Message, left_out
+from rdstitch.verification.messages import TEXTS
 from rdstitch.verification.verdict import RefusedError
 
 _ROOT = Path(__file__).parents[2]
@@ -17,6 +18,7 @@ def test_every_code_has_a_paragraph_and_every_paragraph_a_code() -> None:
     of_errors = {kind.code for kind in vars(errors).values() if isinstance(kind, type) and hasattr(kind, "code")}
     sources = [path.read_text(encoding="utf-8") for path in (_ROOT / "rdstitch").rglob("*.py")]
     of_messages = {code for text in sources for code in re.findall(r'code ?= ?"([a-z-]+)"', text)}
+    of_messages |= {code for code, _ in TEXTS.values()}
     assert {RefusedError.code, "relief", "lambda-not-observable"} <= of_messages
     assert sorted(headings) == sorted((of_errors | of_messages) - {""})
     assert sorted(troubleshooting()) == sorted(headings)

@@ -1,18 +1,22 @@
-"""Of a fisheye whose circle is smaller than its images, the circle is found, and what is black around it is no content."""
+"""A fisheye whose circle is smaller than its images: the circle is found, and what is black around it is no content."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import rdstitch
-from rdstitch.arrays import FloatArray
 from rdstitch.inputs.image_circle import find_circle
 from rdstitch.synthetic import FisheyeLens, grid_poses, ground, sequence_over
 from tests.acceptance.rendered import geometry
 
+Grey = NDArray[np.float32]
 
-def _grey(shape: tuple[int, int], radius: float, center: tuple[float, float], level: float = 120.0) -> FloatArray:
+
+def _grey(
+    shape: tuple[int, int], radius: float, center: tuple[float, float], level: float = 120.0
+) -> NDArray[np.float32]:
     rng = np.random.default_rng(1)
     u, v = np.meshgrid(np.arange(shape[1]), np.arange(shape[0]))
     content = level * rng.uniform(0.3, 1.7, shape)

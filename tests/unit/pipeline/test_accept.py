@@ -16,9 +16,10 @@ from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import write_image
 from rdstitch.messages import Message, Severity, left_out
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.accept import _concerns_all, _is_simpler, _may_be_another_plane, _Offenders, _without, accept
+from rdstitch.pipeline.accept import _is_of_the_whole, _is_simpler, _may_be_another_plane, _Offenders, _without, accept
 from rdstitch.pipeline.aligner import Aligner
 from rdstitch.pipeline.register import register
+from rdstitch.verification.findings import Finding
 from tests.cli.running import flight
 
 OPTIONS = StitchOptions(workers=1, features=FeatureOptions(max_features=600))
@@ -31,31 +32,32 @@ def _read(frames: list[Path]) -> list[Source]:
 @pytest.mark.parametrize(
     ("images", "severity", "expected"),
     [
-        (("a.png", "b.png", "c.png"), "failure", True),
-        (("a.png", "b.png", "c.png"), "warning", False),
-        (("a.png", "b.png"), "failure", False),
-        (("a.png",), "failure", False),
-        ((), "failure", False),
+        ((0, 1, 2), "failure", True),
+        ((0, 1, 2), "warning", False),
+        ((0, 1), "failure", False),
+        ((0,), "failure", False),
+        ((), "failure", True),
     ],
 )
-def test_only_failures_of_many_images_concern_all(images: tuple[str, ...], severity: Severity, expected: bool) -> None:
-    assert _concerns_all([Message("wrong", ("x.png",), "failure"), Message("wrong", images, severity)]) is expected
+def test_leaving_out_an_image_or_a_pair_mends_what_is_theirs(
+    images: tuple[int, ...], severity: Severity, expected: bool
+) -> None:
+    assert _is_of_the_whole(Finding("errors", images, severity)) is expected
 
 
 @pytest.mark.parametrize(
-    ("images", "severity", "code", "expected"),
+    ("finding", "expected"),
     [
-        (("a.png",), "failure", "", False),
-        (("a.png", "b.png"), "failure", "", False),
-        ((), "warning", "", False),
-        ((), "failure", "", True),
-        (("a.png", "b.png"), "warning", "rival-motion", True),
+        (Finding("image misfits", (0,)), False),
+        (Finding("unlike", (0, 1)), False),
+        (Finding("unmasked", (), "warning"), False),
+        (Finding("errors"), True),
+        (Finding("second motion", (0, 1), "warning"), True),
+        (Finding("undecided motion", (0, 1)), True),
     ],
 )
-def test_in_large_sets_a_second_motion_is_looked_for_where_it_may_be(
-    images: tuple[str, ...], severity: Severity, code: str, expected: bool
-) -> None:
-    assert _may_be_another_plane([Message("wrong", images, severity, code)]) is expected
+def test_another_plane_is_looked_for_where_there_may_be_one(finding: Finding, expected: bool) -> None:
+    assert _may_be_another_plane([finding]) is expected
 
 
 @pytest.mark.parametrize(
@@ -110,8 +112,8 @@ def test_what_is_damaged_is_left_out_where_the_others_fit_better(
         asked.append(offenders)
         return smaller
 
-    def judge(registration: Any, **_: object) -> tuple[Message, ...]:
-        return (Message("moves otherwise", (), "failure"),) if registration.alignment.used.sum() in fails else ()
+    def judge(registration: Any, **_: object) -> tuple[Finding, ...]:
+        return (Finding("pattern", values={"count": 2, "of": 3}),) if registration.alignment.used.sum() in fails else ()
 
     stage = "rdstitch.pipeline.accept"
     monkeypatch.setattr(f"{stage}._without", without)
@@ -184,4 +186,3 @@ def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path:
     assert np.all(np.abs(steps[1]) > 0.7)
     (message,) = accepted.messages
     assert (message.code, message.severity) == ("rival-motion", "warning")
-    assert "what was stitched fills" in message.text

@@ -21,7 +21,12 @@ def _names(solvers: list[MinimalSolver]) -> list[tuple[str, int, bool]]:
 
 
 def test_the_solvers_that_what_is_known_allows() -> None:
-    always = [("three_point_similarity", 3, False), ("four_point", 4, False), ("five_point", 5, False)]
+    always = [
+        ("three_point_similarity", 3, False),
+        ("four_point", 4, False),
+        ("five_point", 5, False),
+        ("four_point_dlt", 4, False),
+    ]
     assert _names(minimal_solvers(FOCAL, 0.1, False, None)) == [("three_point", 3, False), *always]
     assert _names(minimal_solvers(FOCAL, 0.1, True, None)) == [("two_point", 2, False), *always]
     known = [("two_point_similarity", 2, True), ("four_point_dlt", 4, True)]

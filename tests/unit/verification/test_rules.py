@@ -1,58 +1,234 @@
-"""Which findings are said aloud."""
+"""What the rules find, what is said of it, and what is said aloud."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
+from rdstitch.alignment.result import LinkFit
+from rdstitch.camera import Camera
 from rdstitch.messages import Message
-from rdstitch.verification.rules import MAX_WARNINGS, Situation, spoken
+from rdstitch.verification import rules
+from rdstitch.verification.evidence import Evidence
+from rdstitch.verification.findings import Finding
+from rdstitch.verification.messages import TEXTS, messages_of
+from rdstitch.verification.overlap_check import CheckedLink
+from rdstitch.verification.photometric_agreement import Agreement
+from rdstitch.verification.second_motion import MotionComparison, SecondMotion
+from rdstitch.verification.self_similarity import Ambiguity
+from rdstitch.verification.verdict import _aloud
 
-GOOD = Situation(alike=0.8, flat=True, depth=False, shape_doubtful=False)
-RELIEF, SHAPE, PARALLAX = (Message(code, ("a.jpg",), code=code) for code in ("relief", "shape", "parallax"))
-RIVAL = Message("a vehicle?", ("a.jpg",), code="rival-motion")
+CAMERA = Camera((400, 300))
+GOOD: Any = SimpleNamespace(alike=0.8, flat=True, depth=False, alignment=None)
+SHAPED: Any = SimpleNamespace(
+    **{**vars(GOOD), "alignment": SimpleNamespace(shape=SimpleNamespace(shift=6.0, shift_std=8.0), cameras=[CAMERA])}
+)
 
 
-def _said(*messages: Message, found: Situation = GOOD) -> list[str]:
-    return [message.code for message in spoken(messages, found) if message.severity == "warning"]
+def _with(found: Any, **changed: Any) -> Any:
+    return SimpleNamespace(**{**vars(found), **changed})
+
+
+def _said(*kinds: str, found: Any = SHAPED) -> list[str]:
+    findings = [Finding(kind, (0,), "warning") for kind in kinds]
+    return [finding.kind for finding in _aloud(findings, found) if finding.severity == "warning"]
 
 
 def test_what_is_not_said_is_a_detail() -> None:
-    (note,) = spoken([PARALLAX], GOOD)
-    assert note == replace(PARALLAX, severity="detail")
+    (note,) = _aloud([Finding("parallax", (0, 1), "warning", {"size": 3.0})], GOOD)
+    assert note == Finding("parallax", (0, 1), "detail", {"size": 3.0})
 
 
-@pytest.mark.parametrize("code", ["relief", "parallax"])
-def test_of_a_turn_and_of_pairs_only_what_is_seen_is_said(code: str) -> None:
-    message, turned = Message(code, code=code), replace(GOOD, flat=False, depth=True)
-    assert _said(message, found=turned) == []
-    assert _said(message, found=replace(turned, alike=0.1)) == [code]
+@pytest.mark.parametrize("kind", ["relief", "parallax"])
+def test_of_a_turn_and_of_pairs_only_what_is_seen_is_said(kind: str) -> None:
+    turned = _with(GOOD, flat=False, depth=True)
+    assert _said(kind, found=turned) == []
+    assert _said(kind, found=_with(turned, alike=0.1)) == [kind]
 
 
 def test_of_a_plane_one_line_says_that_it_may_be_none() -> None:
-    rough = replace(GOOD, depth=True)
-    assert _said(RELIEF, found=rough) == ["relief"]
-    assert _said(RELIEF, SHAPE, found=replace(rough, shape_doubtful=True)) == ["shape"]
-    assert _said(SHAPE) == []
+    assert _said("relief") == ["relief"]
+    assert _said("relief", "shape bent") == ["shape bent"]
+    small = SimpleNamespace(shape=SimpleNamespace(shift=1e4, shift_std=8.0), cameras=[CAMERA])
+    assert _said("shape bent", found=_with(SHAPED, alignment=small)) == []  # by more than an image
 
 
 def test_depth_is_no_vehicle() -> None:
-    assert _said(RIVAL, found=replace(GOOD, flat=False, depth=True)) == []
-    assert _said(RIVAL) == ["rival-motion"]
+    assert _said("second motion", found=_with(GOOD, flat=False, depth=True)) == []
+    assert _said("second motion") == ["second motion"]
 
 
 def test_a_seam_among_trees_is_no_doubtful_one() -> None:
-    seam = Message("only 8 of 61 places look alike", ("a.jpg", "b.jpg"), code="doubtful-seam")
-    assert _said(seam) == ["doubtful-seam"]
-    assert _said(seam, found=replace(GOOD, depth=True)) == []
+    assert _said("little alike") == ["little alike"]
+    assert _said("little alike", found=_with(GOOD, depth=True)) == []
 
 
-def test_failures_and_images_left_out_stay() -> None:
-    given = [Message("no", (), "failure", "relief"), Message("no", ("a.jpg",), "left out")]
-    assert list(spoken(given, replace(GOOD, flat=False))) == given
+def test_failures_stay() -> None:
+    given = (Finding("errors"), Finding("image misfits", (1,)))
+    assert _aloud(given, _with(GOOD, flat=False)) == given
 
 
 def test_there_are_a_few_lines_of_a_run_the_gravest_first_and_one_of_a_kind() -> None:
-    others = [Message(str(number), code=f"other-{number}") for number in range(MAX_WARNINGS)]
-    assert _said(RIVAL, *others) == [other.code for other in others]
-    assert _said(others[0], replace(others[0], text="again")) == ["other-0"]
-    assert len(spoken([RIVAL, *others, *others], GOOD)) == 1 + 2 * MAX_WARNINGS
+    others = ["unmasked", "zoomed", "two of one lens", "settled pattern"][: rules.MAX_WARNINGS]
+    assert _said("second motion", *others) == others
+    assert _said(others[0], others[0]) == others[:1]
+
+
+def test_every_kind_has_a_sentence_and_every_threshold_its_unit_and_source() -> None:
+    assert set(rules.ALOUD) | rules.OF_PLACES <= {*TEXTS, "outvoted"}
+    assert all(limit.unit and limit.source for limit in rules.LIMITS.values())
+
+
+MOTION = SecondMotion((0, 1), 46, 54, (30.0, 40.0), 120.0)
+
+
+def _of_motions(motion: SecondMotion, alike: float, compared: MotionComparison | None = None, **changed: Any) -> Any:
+    """Severity and words of what is said of a second motion."""
+    checked = [
+        CheckedLink(
+            LinkFit(0, 1, 9, 9, 0.5, True), Agreement(1000, round(1000 * np.nan_to_num(alike))), Ambiguity(1, 0, 0)
+        )
+    ]
+    found = SimpleNamespace(
+        motions=[motion], compared=compared, checked=[] if np.isnan(alike) else checked, parallax=[], static=False,
+        lens_only=False, ambiguous={}, alignment=SimpleNamespace(cameras=[CAMERA] * 2),
+    )  # fmt: skip
+    registration: Any = SimpleNamespace(sources=[SimpleNamespace(path=f"folder/{name}.png") for name in "ab"])
+    said = messages_of(rules._second_motion(_with(found, **changed)), registration)
+    return [(message.severity, message.text) for message in said]
+
+
+@pytest.mark.parametrize(
+    ("area", "alike", "severity"),
+    [
+        (9, 0.2, None),
+        (11, 0.9, "warning"),
+        (11, np.nan, "warning"),
+        (11, 0.39, "failure"),
+        (44, 0.41, "warning"),
+        (51, 0.49, "failure"),
+        (51, np.nan, "failure"),
+        (51, 0.51, "warning"),  # more than half of what is shared looks alike, whatever has more matches
+    ],
+)
+def test_area_and_agreement_decide(area: int, alike: float, severity: str | None) -> None:
+    said = _of_motions(replace(MOTION, area=area, plane_area=100 - area), alike)
+    assert [how for how, _ in said] == ([] if severity is None else [severity])
+
+
+@pytest.mark.parametrize(
+    ("area", "alike", "fills", "second", "severity"),
+    [
+        (46, 0.2, 0.7, 0.3, "warning"),  # it holds wherever the other does not, which is the smaller one
+        (46, 0.2, 0.7, 0.6, "failure"),
+        (46, 0.6, 0.7, 0.6, "warning"),
+        (20, 0.6, 0.4, 0.3, "failure"),  # most of the images contradict it, however much of the overlaps looks alike
+        (5, 0.45, 0.4, 1.0, "failure"),
+    ],
+)
+def test_what_fills_less_than_half_of_the_images_fails(
+    area: int, alike: float, fills: float, second: float, severity: str
+) -> None:
+    compared = MotionComparison(fills, second, {(0, 1): Agreement(100, 90)}, frozenset())
+    ((how, _),) = _of_motions(replace(MOTION, area=area, plane_area=100 - area), alike, compared)
+    assert how == severity
+
+
+def test_the_place_is_named_and_no_distance_is_larger_than_an_image() -> None:
+    ((_, text),) = _of_motions(MOTION, 0.8)
+    for part in ("46%", "(30, 40) of a.png", "b.png", "120 pixels", "a mask keeps it out"):
+        assert part in text
+    ((_, text),) = _of_motions(replace(MOTION, disagreement=np.inf), 0.8)
+    assert "by 500 pixels" in text
+
+
+def test_a_second_motion_does_not_spoil_the_lens() -> None:
+    ((how, _),) = _of_motions(MOTION, 0.1, lens_only=True)
+    assert how == "warning"
+
+
+def _registration(count: int, *, agree: float = 0.2, keypoints: tuple[int, ...] = (900, 900, 900)) -> Any:
+    """Two images of which so many matches were given to the alignment, and a share agrees with it."""
+    fit = LinkFit(0, 1, count, int(agree * count), 0.5, True)
+    sources = [SimpleNamespace(path=f"folder/{name}.jpg", name=f"{name}.jpg") for name in "ab"]
+    return SimpleNamespace(alignment=SimpleNamespace(links=(fit,)), sources=sources, keypoints=keypoints)
+
+
+def _misfits(registration: Any) -> list[Message]:
+    found = Evidence(registration, 3.0)
+    return messages_of([*rules.disagreeing_pairs(found), *rules._misfitting_images(found)], registration)
+
+
+@pytest.mark.parametrize(
+    ("registration", "reason"),
+    [
+        (_registration(39), "too few to place it: little overlap, or none? stitch them on their own"),
+        (_registration(41), "another plane, camera or zoom, or none (trees, walls)? stitch them on their own"),
+        (_registration(41, keypoints=(900, 200, 900)), "b.jpg has less than a third of the features that others have"),
+    ],
+)
+def test_a_pair_whose_matches_agree_with_each_other_only_is_named(registration: Any, reason: str) -> None:
+    (message,) = _misfits(registration)
+    assert message.images == ("folder/a.jpg", "folder/b.jpg")
+    assert message.text.startswith("a.jpg and b.jpg: only ")
+    assert reason in message.text
+
+
+def test_images_of_whose_matches_two_fifths_disagree_are_named() -> None:
+    first, second = _misfits(_registration(100, agree=0.55, keypoints=(900, 200, 900)))
+    assert "only 55 of 100 of its matches agree with the whole; they agree with each other" in first.text
+    assert "b.jpg has less than a third of the features that others have (blurred?)" in second.text
+    assert second.images == ("folder/b.jpg",)
+    assert _misfits(_registration(100, agree=0.65)) == []
+
+
+def _source(
+    name: str, *, model: str = "", make: str = "", serial: str = "", focal: float | None = None, mask: Any = None
+) -> Any:
+    metadata = SimpleNamespace(make=make, model=model, serial=serial, focal_px=focal, size=(1000, 800))
+    return SimpleNamespace(path=f"folder/{name}", metadata=metadata, mask=mask)
+
+
+def _texts(*sources: Any) -> list[str]:
+    registration: Any = SimpleNamespace(sources=sources)
+    return [message.text for message in messages_of(rules._inputs(Evidence(registration, 3.0)), registration)]
+
+
+def test_images_of_one_camera_are_fine() -> None:
+    assert _texts(*(_source(f"{k}.jpg", model="A", serial="1", focal=900.0) for k in range(3))) == []
+    assert _texts(_source("a"), _source("b")) == []
+    assert _texts() == []
+
+
+@pytest.mark.parametrize("other", [{"model": "B"}, {"model": "A", "serial": "2"}, {"make": "X", "model": "A"}])
+def test_several_cameras_are_named_the_commonest_first(other: dict[str, str]) -> None:
+    (text,) = _texts(
+        _source("z.jpg", focal=None, mask=None, **other), *(_source(f"{k}.jpg", model="A") for k in range(2))
+    )
+    assert text.startswith("the images come from 2 cameras: A (2: 0.jpg, 1.jpg); ")
+    assert "(1: z.jpg); stitch those of each on their own" in text
+
+
+def test_a_serial_number_is_enough_and_no_header_is_no_camera() -> None:
+    assert len(_texts(_source("a", serial="1"), _source("b", serial="2"))) == 1
+    assert _texts(_source("a", serial="1"), _source("b", make="X")) == []
+
+
+@pytest.mark.parametrize(("focal", "zoomed"), [(925.0, False), (930.0, True), (870.0, True)])
+def test_a_lens_that_was_zoomed_is_noticed(focal: float, zoomed: bool) -> None:
+    """By more than three per cent, of which one is rounding."""
+    found = _texts(_source("a.jpg", model="A", focal=900.0), _source("b.jpg", model="A", focal=focal))
+    assert bool(found) is zoomed
+    if zoomed:
+        near, far = ("a.jpg", "b.jpg") if focal > 900 else ("b.jpg", "a.jpg")
+        ratio = max(focal, 900.0) / min(focal, 900.0)
+        assert f"by up to {ratio:.2f} (between {near} and {far})" in found[0]
+
+
+def test_images_without_a_mask_among_others_are_named() -> None:
+    masked = [_source(f"{k}.png", mask="m") for k in range(3)]
+    assert _texts(*masked) == []
+    assert _texts(*masked, _source("x.png")) == ["1 of 4 images have no mask: x.png"]
+    assert _texts(masked[0], _source("x.png"), _source("y.png")) == ["2 of 3 images have no mask: x.png, y.png"]

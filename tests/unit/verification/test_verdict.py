@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,13 +19,13 @@ from rdstitch.options import StitchOptions
 from rdstitch.pipeline.register import register
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.registration import Registration
-from rdstitch.verification import rival_check, verdict
-from rdstitch.verification.competing_motions import Contest
+from rdstitch.verification import evidence, verdict
+from rdstitch.verification.findings import Finding
+from rdstitch.verification.messages import messages_of
 from rdstitch.verification.overlap_check import CheckedLink
 from rdstitch.verification.photometric_agreement import Agreement
-from rdstitch.verification.rival_motion import RivalMotion
+from rdstitch.verification.second_motion import MotionComparison, SecondMotion
 from rdstitch.verification.self_similarity import Ambiguity
-from rdstitch.verification.verdict import judge
 from tests.cli.running import flight
 
 THRESHOLD = 3.0
@@ -37,6 +39,11 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Registration:
     options = StitchOptions(workers=1, features=FeatureOptions(max_features=600))
     with open_executor(1, len(sources)) as executor:
         return register(sources, options, executor, skip_bad=False)
+
+
+def judge(registration: Registration, threshold: float, *, lens_only: bool = False) -> tuple[Message, ...]:
+    """What is found, in words."""
+    return tuple(messages_of(verdict.judge(registration, threshold, lens_only=lens_only), registration))
 
 
 def _texts(registration: Registration, *, lens_only: bool = False) -> list[str]:
@@ -138,7 +145,7 @@ def _checked(cells: int, confirming: int, *, pair: tuple[int, int] = (0, 1), els
 
 
 def _checked_by(monkeypatch: pytest.MonkeyPatch, good: Registration, *checked: CheckedLink) -> list[Message]:
-    monkeypatch.setattr(verdict, "check_overlaps", lambda *_: list(checked))
+    monkeypatch.setattr(evidence, "check_overlaps", lambda *_: list(checked))
     return list(judge(good, THRESHOLD))
 
 
@@ -163,37 +170,38 @@ def test_a_tenth_of_an_overlap_must_look_alike(
 
 
 @pytest.mark.parametrize(("share", "severities"), [(0.39, ["failure", "warning"]), (0.41, ["warning"])])
-def test_where_something_moves_otherwise_two_fifths_must_look_alike(
+def test_where_something_moves_differently_two_fifths_must_look_alike(
     good: Registration, monkeypatch: pytest.MonkeyPatch, share: float, severities: list[str]
 ) -> None:
     """A vehicle that two images have in common alone fills less of what a plane would fill."""
-    rival = RivalMotion(0, 1, 20, 80, (30.0, 40.0), 120.0)
-    monkeypatch.setattr(verdict, "find_rival_motions", lambda *_: [rival])
+    second = SecondMotion((0, 1), 20, 80, (30.0, 40.0), 120.0)
+    monkeypatch.setattr(evidence, "find_second_motions", lambda *_: [second])
     found = _checked_by(monkeypatch, good, _checked(100, int(100 * share)), _checked(100, 90, pair=(1, 2)))
     assert [message.severity for message in found] == severities
     outside = {(0, 1): Agreement(50, 39), (1, 2): Agreement(100, 90)}
-    monkeypatch.setattr(rival_check, "contest", lambda *_: Contest(0.8, 0.3, outside, frozenset()))
-    compared = judge(good, THRESHOLD)  # what moves otherwise was seen to be smaller
+    monkeypatch.setattr(evidence, "compare_motions", lambda *_: MotionComparison(0.8, 0.3, outside, frozenset()))
+    compared = judge(good, THRESHOLD)  # what moves differently was seen to be smaller
     assert [message.severity for message in compared] == ["warning"]
 
 
-def test_pairs_that_the_rival_may_hold_together_do_not_count(
+def test_pairs_that_the_second_may_hold_together_do_not_count(
     good: Registration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However much alike they look: what drives ahead does."""
-    first, second = good.alignment.cameras[:2]
-    relation = RadialHomography(np.eye(3), first, second, np.ones(20, dtype=np.bool_))
+    camera, other = good.alignment.cameras[:2]
+    relation = RadialHomography(np.eye(3), camera, other, np.ones(20, dtype=np.bool_))
     checked = [_checked(100, 48), _checked(100, 45, pair=(1, 2))]
     for area, fills, doubtful, texts in (
-        (5, 0.8, frozenset({(0, 1)}), []),  # a rival of a twentieth, and a plane that may be one
+        (5, 0.8, frozenset({(0, 1)}), []),  # a motion of a twentieth, and a plane that may be one
         (5, 0.45, frozenset({(0, 1)}), ["not clear which"]),  # of all images together
-        (20, 0.8, frozenset({(0, 1)}), ["held together by what moves otherwise"]),
+        (20, 0.8, frozenset({(0, 1)}), ["held together by what moves differently"]),
         (20, 0.8, frozenset(), []),
     ):
-        rival = RivalMotion(0, 1, area, 100 - area, (30.0, 40.0), 120.0, relation)
-        monkeypatch.setattr(verdict, "find_rival_motions", lambda *_, rival=rival: [rival])
-        found = Contest(fills, 0.3, {}, doubtful)
-        monkeypatch.setattr(rival_check, "contest", lambda *_, found=found: found)
+        second = SecondMotion((0, 1), area, 100 - area, (30.0, 40.0), 120.0, relation)
+        monkeypatch.setattr(evidence, "find_second_motions", lambda *_, second=second: [second])
+        found = MotionComparison(fills, 0.3, {}, doubtful)
+        compared = found if area == 20 or found.lost else None
+        monkeypatch.setattr(evidence, "compare_motions", lambda *_, compared=compared: compared)
         failures = [m.text for m in _checked_by(monkeypatch, good, *checked) if m.severity == "failure"]
         assert len(failures) == len(texts)
         assert all(part in text for part, text in zip(texts, failures, strict=True))
@@ -216,11 +224,11 @@ def test_what_only_the_places_suffer_from_is_not_said_of_a_lens(
     good: Registration, monkeypatch: pytest.MonkeyPatch, shown: tuple[int, int], resting: bool, count: int
 ) -> None:
     """A pair of a repeated pattern moves by periods too, and there are no seams to look at."""
-    monkeypatch.setattr(verdict, "find_rival_motions", lambda *_: [RivalMotion(*shown, 20, 80, (30.0, 40.0), 120.0)])
+    monkeypatch.setattr(evidence, "find_second_motions", lambda *_: [SecondMotion(shown, 20, 80, (30.0, 40.0), 120.0)])
     checked = [_checked(100, 90, elsewhere=0.9), _checked(100, 5, pair=(1, 2))]
-    monkeypatch.setattr(verdict, "check_overlaps", lambda *_: checked)
+    monkeypatch.setattr(evidence, "check_overlaps", lambda *_: checked)
     found = judge(replace(good, static_background=resting), THRESHOLD, lens_only=True)
-    assert sum("moves otherwise" in message.text for message in found) == count
+    assert sum("moves differently" in message.text for message in found) == count
     assert not any("elsewhere" in message.text or "seam" in message.text for message in found)
 
 
@@ -258,24 +266,27 @@ def test_larger_errors_are_a_warning_where_relief_explains_them(
 
 
 def test_only_pairs_without_which_the_images_fall_apart_decide() -> None:
-    message = Message("doubtful", (), "failure")
     used = [LinkFit(i, j, 100, 90, 0.5, True) for i, j in ((0, 1), (1, 2), (0, 2), (2, 3))]
-    assert verdict._decisive({(0, 1): message}, used, 4) == []
-    assert verdict._decisive({(0, 1): message, (2, 3): message}, used, 4) == [(2, 3)]
-    assert verdict._decisive({(0, 1): message, (0, 2): message}, used, 4) == [(0, 1), (0, 2)]
-    assert verdict._decisive({}, used, 4) == []
+    assert verdict.decisive_pairs({(0, 1)}, used, 4) == []
+    assert verdict.decisive_pairs([(0, 1), (2, 3)], used, 4) == [(2, 3)]
+    assert verdict.decisive_pairs([(0, 1), (0, 2)], used, 4) == [(0, 1), (0, 2)]
+    assert verdict.decisive_pairs([], used, 4) == []
 
 
 def test_of_doubtful_pairs_on_which_nothing_depends_the_images_are_named() -> None:
-    paths = [f"folder/{name}.jpg" for name in "abcd"]
-    (message,) = verdict._outvoted(paths, [(2, 3), (0, 2)])
+    registration: Any = SimpleNamespace(sources=[SimpleNamespace(path=f"folder/{name}.jpg") for name in "abcd"])
+
+    def said(*findings: Finding) -> list[Message]:
+        return messages_of(verdict._outvoted(findings), registration)
+
+    (message,) = said(Finding("unlike", (2, 3)), Finding("pair misfits", (0, 2)))
     assert message.images == ("folder/a.jpg", "folder/c.jpg", "folder/d.jpg")
     assert "2 pairs fit badly, and little depends on them: c.jpg and d.jpg, a.jpg and c.jpg" in message.text
-    badly, twice = verdict._outvoted(paths, [(2, 3), (0, 2)], {(0, 2)})
+    badly, twice = said(Finding("unlike", (2, 3)), Finding("ambiguous", (0, 2)))
     assert "one pair fits badly, and little depends on it: c.jpg and d.jpg" in badly.text
     assert "one pair fits as well elsewhere (a repeated pattern?)" in twice.text
     assert twice.images == ("folder/a.jpg", "folder/c.jpg")
-    assert verdict._outvoted(paths, []) == []
+    assert said() == []
 
 
 def test_a_doubtful_shape_names_the_image_and_the_size(good: Registration) -> None:

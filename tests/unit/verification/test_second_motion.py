@@ -6,14 +6,29 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rdstitch.alignment.result import LinkFit
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.matching.two_view import PairRegistration
+from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.synthetic.textures import ground
-from rdstitch.verification import competing_motions
-from rdstitch.verification.competing_motions import Cells, Contest, _Held, contest, fills_at_most, planes_of_pairs
+from rdstitch.verification import second_motion
+from rdstitch.verification.overlap_check import CheckedLink
 from rdstitch.verification.photometric_agreement import Agreement, ComparedImage, Grey
+from rdstitch.verification.second_motion import (
+    Cells,
+    MotionComparison,
+    SecondMotion,
+    _Held,
+    compare_motions,
+    fills_at_most,
+    find_second_motions,
+    is_separate,
+    outside_second_motions,
+    planes_of_pairs,
+    share_of,
+)
+from rdstitch.verification.self_similarity import Ambiguity
 
 SIZE = (400, 300)
 LENS = Camera(SIZE)
@@ -21,6 +36,10 @@ PLANE = ground((1000, 400), seed=3, channels=1).region(0, 0, 1000, 400)[:, :, 0]
 AHEAD = ground((500, 400), seed=4, channels=1).region(0, 0, 500, 400)[:, :, 0]
 STEP, SWAY = 160, 20
 """Pixels that the plane, and what drives ahead, moves by from image to image."""
+
+
+def _link(first: int, second: int, shift: float = 0.0) -> CheckedLink:
+    return CheckedLink(LinkFit(first, second, 100, 90, 0.5, True), Agreement(100, 20), Ambiguity(0.4, 0.6, shift))
 
 
 def _images(covered: float, count: int = 2) -> list[Grey]:
@@ -51,31 +70,36 @@ def _registration(monkeypatch: pytest.MonkeyPatch, images: list[Grey], places: l
     def placed(source: int, camera: Camera, homography: FloatArray, stretch: object) -> ComparedImage:
         return ComparedImage(np.ascontiguousarray(images[source], dtype=np.float32), camera, homography)
 
-    monkeypatch.setattr(competing_motions, "placed_image", placed)
+    monkeypatch.setattr(second_motion, "placed_image", placed)
     homographies = np.stack([_shift(-place) for place in places])
-    alignment = SimpleNamespace(
-        cameras=[LENS] * len(places), homographies=homographies, distortion=0.0, distortion_std=0.0
-    )
+    alignment = SimpleNamespace(cameras=[LENS] * len(places), homographies=homographies, on_sphere=False)
     return SimpleNamespace(sources=range(len(images)), alignment=alignment, stretch=None, pairs=pairs)
+
+
+def _contest(registration: Any, pairs: list[Pair], motions: dict[Pair, RadialHomography]) -> MotionComparison:
+    """Where what moves differently covers a fifth of the matched area."""
+    second = [SecondMotion(pair, 20, 80, disagreement=120.0, relation=motion) for pair, motion in motions.items()]
+    found = compare_motions(registration, second, [_link(*pair) for pair in pairs])
+    assert found is not None
+    return found
 
 
 @pytest.mark.parametrize("covered", [0.2, 0.35])
 def test_what_fills_less_than_half_is_not_the_plane(monkeypatch: pytest.MonkeyPatch, covered: float) -> None:
     images = _images(covered)
     right = _registration(monkeypatch, images, [0, STEP])
-    found = contest(right, [(0, 1)], {(0, 1): _moving(SWAY)})
+    found = _contest(right, [(0, 1)], {(0, 1): _moving(SWAY)})
     assert (found.won, found.lost, found.doubtful) == (True, False, frozenset())
-    assert found.rival_fills_at_most == pytest.approx(covered, abs=0.08)
-    assert found.held > 0.8
-    wrong = contest(_registration(monkeypatch, images, [0, SWAY]), [(0, 1)], {(0, 1): _moving(STEP)})
+    assert found.second_fills_at_most == pytest.approx(covered, abs=0.08)
+    wrong = _contest(_registration(monkeypatch, images, [0, SWAY]), [(0, 1)], {(0, 1): _moving(STEP)})
     assert (wrong.won, wrong.lost, wrong.doubtful) == (False, True, frozenset({(0, 1)}))
 
 
 def test_what_covers_most_of_the_images_is_the_plane(monkeypatch: pytest.MonkeyPatch) -> None:
     """However little it moves; what it leaves free is an arm of the robot, say."""
     images = _images(0.6)
-    assert not contest(_registration(monkeypatch, images, [0, STEP]), [(0, 1)], {(0, 1): _moving(SWAY)}).won
-    assert contest(_registration(monkeypatch, images, [0, SWAY]), [(0, 1)], {(0, 1): _moving(STEP)}).won
+    assert not _contest(_registration(monkeypatch, images, [0, STEP]), [(0, 1)], {(0, 1): _moving(SWAY)}).won
+    assert _contest(_registration(monkeypatch, images, [0, SWAY]), [(0, 1)], {(0, 1): _moving(STEP)}).won
 
 
 def test_a_pair_held_by_what_drives_ahead_is_found_by_its_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,11 +109,11 @@ def test_a_pair_held_by_what_drives_ahead_is_found_by_its_neighbours(monkeypatch
     edge = round(0.6 * SIZE[0])
     images[2][:, edge:] = AHEAD[: SIZE[1], 100 : 100 + SIZE[0]][:, edge:]
     registration = _registration(monkeypatch, images, [0, STEP, STEP + 80])
-    rivals = {(0, 1): _moving(SWAY)}
-    assert (1, 2) in contest(registration, [(0, 1), (1, 2)], rivals).doubtful
+    second = {(0, 1): _moving(SWAY)}
+    assert (1, 2) in _contest(registration, [(0, 1), (1, 2)], second).doubtful
     # The same at its right place.
     registration = _registration(monkeypatch, images, [0, STEP, 2 * STEP])
-    assert contest(registration, [(0, 1), (1, 2)], rivals).doubtful == frozenset()
+    assert _contest(registration, [(0, 1), (1, 2)], second).doubtful == frozenset()
 
 
 class _Matched:
@@ -164,7 +188,7 @@ def test_two_of_the_five_cells_around_a_place_hold_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fills", "rival", "agreement", "won", "lost"),
+    ("fills", "second", "agreement", "won", "lost"),
     [
         (0.6, 0.4, Agreement(100, 40), True, False),
         (0.6, 0.4, Agreement(100, 25), False, False),
@@ -172,8 +196,97 @@ def test_two_of_the_five_cells_around_a_place_hold_it() -> None:
         (0.45, 0.4, Agreement(100, 90), False, True),
     ],
 )
-def test_the_plane_holds_and_its_rival_fills_little(
-    fills: float, rival: float, agreement: Agreement, won: bool, lost: bool
+def test_the_plane_holds_and_the_other_fills_little(
+    fills: float, second: float, agreement: Agreement, won: bool, lost: bool
 ) -> None:
-    found = Contest(fills, rival, {(0, 1): agreement}, frozenset())
+    found = MotionComparison(fills, second, {(0, 1): agreement}, frozenset())
     assert (found.won, found.lost) == (won, lost)
+
+
+@pytest.mark.parametrize(("moves", "ambiguous"), [(180.0, False), (196.0, False), (120.0, True)])
+def test_what_fits_where_the_second_motion_puts_it_is_no_pattern(moves: float, ambiguous: bool) -> None:
+    """Within a twentieth of an image."""
+    second_motion = SecondMotion((0, 1), 40, 60, (30.0, 40.0), moves, _moving(0.0))
+    won = MotionComparison(0.8, 0.3, {(0, 1): Agreement(50, 45)}, frozenset())
+    first, second = outside_second_motions([_link(0, 1, 0.45), _link(1, 2, 0.45)], [second_motion], won)
+    assert first.ambiguity.ambiguous is ambiguous
+    assert second.ambiguity.ambiguous
+    assert (first.agreement, second.agreement) == (Agreement(50, 45), Agreement(100, 20))
+
+
+@pytest.mark.parametrize("compared", [None, MotionComparison(0.8, 0.6, {(0, 1): Agreement(50, 45)}, frozenset())])
+def test_where_no_motion_is_seen_to_be_smaller_links_stay(compared: Any) -> None:
+    links = [_link(0, 1, 0.45)]
+    second_motion = SecondMotion((0, 1), 40, 60, (30.0, 40.0), 180.0, _moving(0.0))
+    assert outside_second_motions(links, [second_motion], compared) is links
+
+
+WIDE = Camera((800, 600))
+MOVED = np.array([60.0, 20.0])
+
+
+def _found(
+    points: FloatArray, other: FloatArray, *, second: FloatArray | None = None, used: bool = True
+) -> list[SecondMotion]:
+    """Of two images whose plane moves by :data:`MOVED`; matches at ``other`` move by that and ``second``."""
+
+    def transfer(i: int, j: int, points: FloatArray) -> FloatArray:
+        return np.asarray(points + MOVED)
+
+    off = np.array([40.0, -30.0]) if second is None else second
+    points1 = np.concatenate([points, other])
+    points2 = np.concatenate([points + MOVED, other + MOVED + off])
+    alignment: Any = SimpleNamespace(cameras=[WIDE] * 2, used=np.array([True, used]), transfer=transfer)
+    matched: Any = _Matched(points1, points2)
+    pair = PairRegistration(0, 1, matched, _moving(0.0))
+    return find_second_motions(alignment, [pair], 3.0)
+
+
+def _grid(left: float, top: float, columns: int, rows: int, step: float = 50.0) -> FloatArray:
+    """Points in the middle of as many cells of 50 pixels."""
+    x, y = np.meshgrid(np.arange(columns), np.arange(rows))
+    return np.asarray(np.stack([left + step * (x.ravel() + 0.5), top + step * (y.ravel() + 0.5)], axis=1))
+
+
+def test_a_second_motion_is_found_with_its_place_and_area() -> None:
+    (found,) = _found(_grid(0, 0, 16, 6), _grid(200, 350, 5, 4))
+    assert (found.area, found.plane_area) == (20, 96)
+    assert share_of([found]) == pytest.approx(20 / 116)
+    assert found.center == pytest.approx((325.0, 450.0))
+    assert found.disagreement == pytest.approx(50.0, abs=0.1)
+
+
+def test_area_that_the_plane_covers_too_does_not_count() -> None:
+    (found,) = _found(_grid(0, 0, 16, 10), _grid(200, 350, 5, 4) + 5.0)
+    assert (found.area, found.plane_area) == (5, 160)
+
+
+@pytest.mark.parametrize(("size", "area"), [(0.018, 0), (0.022, 20)])
+def test_what_relief_does_is_no_motion(size: float, area: int) -> None:
+    """Up to two hundredths of the diagonal."""
+    (found,) = _found(_grid(0, 0, 16, 6), _grid(200, 350, 5, 4), second=size * 1000.0 * np.array([0.6, 0.8]))
+    assert found.area == area
+
+
+def test_a_few_wrong_matches_are_no_motion() -> None:
+    assert _found(_grid(0, 0, 16, 6), _grid(200, 350, 11, 1))[0].area == 0
+    wrong = np.random.default_rng(0).uniform(-300.0, 300.0, (40, 2))
+    assert _found(_grid(0, 0, 16, 6), _grid(0, 350, 10, 4), second=wrong)[0].area == 0
+
+
+def test_images_that_are_not_used_or_do_not_agree_anywhere_are_left_alone() -> None:
+    assert _found(_grid(0, 0, 16, 6), _grid(200, 350, 5, 4), used=False) == []
+    assert _found(_grid(0, 0, 0, 0), _grid(200, 350, 5, 4)) == []
+
+
+@pytest.mark.parametrize(("area", "off", "separate"), [(9, 90.0, False), (20, 51.0, True), (20, 49.0, False)])
+def test_tree_tops_are_no_motion_of_their_own(area: int, off: float, separate: bool) -> None:
+    """A twentieth of the diagonal of an image."""
+    relation = RadialHomography(np.eye(3), WIDE, WIDE, np.ones(20, dtype=np.bool_))
+    motion = SecondMotion((0, 1), area, 100 - area, (30.0, 40.0), off, relation)
+    assert is_separate([motion, SecondMotion((0, 1), 1, 0)]) is separate
+
+
+def test_the_share_is_of_all_pairs_together() -> None:
+    assert share_of([SecondMotion((0, 1), 0, 60), SecondMotion((1, 2), 30, 10)]) == 0.3
+    assert share_of([]) == 0.0

@@ -1,0 +1,117 @@
+"""What speaks for and against a registration: its matches, its pixels, and motions that it does not explain."""
+
+from collections.abc import Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from rdstitch.alignment.result import Alignment, LinkFit
+from rdstitch.cache import NO_CACHE, Cache
+from rdstitch.matching.two_view import Pair
+from rdstitch.registration import Registration
+from rdstitch.verification.overlap_check import CheckedLink, check_overlaps
+from rdstitch.verification.parallax import Parallax, find_parallax
+from rdstitch.verification.second_motion import (
+    MotionComparison,
+    SecondMotion,
+    compare_motions,
+    find_second_motions,
+    outside_second_motions,
+)
+
+MIN_CELLS = 8
+"""Cells of an overlap that have texture; of fewer the pixels say nothing."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Everything that rules look at; what takes long is computed when the first of them asks for it.
+
+    Attributes
+    ----------
+    registration : Registration
+    threshold : float
+        Largest transfer error of an inlier of a pair, pixels.
+    executor : concurrent.futures.Executor, optional
+        Where images are compared; None: in one thread.
+    cache : Cache
+    lens_only : bool
+        Only the lens is wanted, so that the places of images do not matter.
+    """
+
+    registration: Registration
+    threshold: float
+    executor: Executor | None = None
+    cache: Cache = NO_CACHE
+    lens_only: bool = False
+
+    @property
+    def alignment(self) -> Alignment:
+        """Of the registration."""
+        return self.registration.alignment
+
+    @property
+    def static(self) -> bool:
+        """Whether the images mostly show what is static in them: some matches of that remain, which agree with nothing,
+        and it looks alike anywhere but where the moving plane puts it.
+        """
+        return self.registration.static_background
+
+    @cached_property
+    def used(self) -> list[LinkFit]:
+        """The links that the alignment uses."""
+        return [fit for fit in self.alignment.links if fit.used]
+
+    @cached_property
+    def checked(self) -> list[CheckedLink]:
+        """What the pixels say of each used link, or of the least confirmed of many."""
+        if self.static:
+            return []
+        with nullcontext(self.executor) if self.executor is not None else ThreadPoolExecutor(1) as where:
+            return check_overlaps(self.registration, where, self.cache)
+
+    @cached_property
+    def motions(self) -> list[SecondMotion]:
+        """What moves differently, pair by pair."""
+        return find_second_motions(self.alignment, self.registration.pairs, self.threshold)
+
+    @cached_property
+    def compared(self) -> MotionComparison | None:
+        """Which of the two motions is the plane, by the pixels."""
+        return compare_motions(self.registration, self.motions, self.checked)
+
+    @cached_property
+    def seen(self) -> Sequence[CheckedLink]:
+        """The checked links, where nothing moves differently if that is the smaller part."""
+        return outside_second_motions(self.checked, self.motions, self.compared)
+
+    @cached_property
+    def ambiguous(self) -> dict[Pair, CheckedLink]:
+        """Pairs of a repeated pattern, of which nobody can say by how many periods they are apart."""
+        return {link.pair: link for link in self.seen if link.ambiguity.ambiguous and not link.unique}
+
+    @cached_property
+    def parallax(self) -> list[Parallax]:
+        """How far pairs of a turn are from one about the lens, the worst first."""
+        return find_parallax(self.alignment, self.registration.pairs) if self.alignment.on_sphere else []
+
+    @cached_property
+    def alike(self) -> float:
+        """How much alike images look where most pairs put them, [0, 1]; 0 where there is nothing to see."""
+        shares = [link.agreement.share for link in self.checked if link.agreement.cells >= MIN_CELLS]
+        return float(np.median(shares)) if shares else 0.0
+
+    @property
+    def flat(self) -> bool:
+        """Whether the images are said to show a plane that three or more of them hold together: of a turn, and of two
+        images, only overlaps can be wrong, and they are looked at.
+        """
+        return not self.alignment.on_sphere and int(self.alignment.used.sum()) > 2
+
+    @property
+    def depth(self) -> bool:
+        """Whether the scene has depth, or the camera moved while it turned."""
+        return self.alignment.relief.found or bool(self.parallax)
