@@ -120,6 +120,27 @@ def verbosity(command: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
+class FlatFieldFile(UserPath):
+    """A file, or auto, or off."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Keep the words; of anything else, make a path."""
+        return value if value in ("auto", "off") else super().convert(value, param, ctx)
+
+
+def flat_field(usual: str) -> Decorator[Any]:
+    """The option, and what a command does without it."""
+    return click.option(
+        "--flat-field",
+        type=FlatFieldFile(),
+        default=usual,
+        show_default=True,
+        metavar="auto|off|FILE",
+        help="Take out the illumination that all tiles share: as they show it, or as this image and, on a second page, "
+        "the dark field have it.",
+    )
+
+
 distortion = click.option(
     "--lambda",
     "distortion",

@@ -19,6 +19,7 @@ from rdstitch.inputs.frame import Images, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.atomic import check_distinct, check_output, text_bytes
+from rdstitch.io.flat_field import read_flat_field
 from rdstitch.io.outputs import Outputs
 from rdstitch.io.reduction import mean_of_channels
 from rdstitch.local_alignment import no_local_alignment
@@ -30,6 +31,7 @@ from rdstitch.pipeline.recipes import compose_registration
 from rdstitch.progress import Progress, silent
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.registration import Registration
+from rdstitch.stage.flat_field import estimate_illumination
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.options import TileOptions
 from rdstitch.stage.positions import grid_from_files, grid_from_names, grid_from_table, oriented
@@ -77,7 +79,7 @@ def tiles(
     with found_images(as_inputs(inputs), output=output, topic=options.topic) as found:
         registration, tiled = _registered(found, output, positions_file, options, progress)
         with Outputs(options.overwrite) as outputs, stitch.executor(len(registration.sources)) as executor:
-            _write_places(outputs, positions_file, registration, tiled)
+            _write_beside(outputs, positions_file, options, registration, tiled)
             local = no_local_alignment("tiles on a stage")
             return compose_registration(registration, local, executor, output, stitch, progress, beside, outputs)
 
@@ -102,7 +104,7 @@ def place_tiles(
     with found_images(as_inputs(inputs), topic=options.topic) as found:
         registration, tiled = _registered(found, None, positions_file, options, progress)
     with Outputs(options.overwrite) as outputs:
-        _write_places(outputs, positions_file, registration, tiled)
+        _write_beside(outputs, positions_file, options, registration, tiled)
     return tiled, registration
 
 
@@ -120,17 +122,28 @@ def _registered(
     sources, unread = read_sources(found.frames, skip_bad=not options.strict, guard=guard, max_memory=limit)
     if len(sources) < 2:
         raise InputError(f"{unread[0].images[0]}: {unread[0].text}" if unread else "name two tiles or more")
+    check_size(sources)
+    sources, illumination = with_flat_field(sources, options.flat_field)
     read = partial(_plane, sources, options.channel)
     grid = _grid(sources, options, read)
     tiled = register_tiles(grid, read, search=options.search, distortion=options.distortion, progress=progress)
-    return _registration(sources, tiled).with_messages([*unread, *found.messages]), tiled
+    return _registration(sources, tiled).with_messages([*unread, *found.messages, *illumination]), tiled
 
 
-def _write_places(
-    outputs: Outputs, file: str | Path | None, registration: Registration, tiled: TileRegistration
+def _write_beside(
+    outputs: Outputs,
+    file: str | Path | None,
+    options: TileOptions,
+    registration: Registration,
+    tiled: TileRegistration,
 ) -> None:
+    """The table of places, and the flat field, where they are wanted."""
     if file is not None:
         outputs.write(file, text_bytes(places_table([source.name for source in registration.sources], tiled)))
+    field = registration.sources[0].flat_field
+    if options.save_flat_field is not None and field is not None:
+        with outputs.writing(options.save_flat_field) as staged:
+            field.write(staged)
 
 
 def _check_outputs(
@@ -140,7 +153,7 @@ def _check_outputs(
     named = [options.positions, None if options.flat_field in ("auto", "off") else options.flat_field]
     inputs = [*inputs, *(file for file in named if file is not None)]
     written = [] if output is None else [output, f"{output}.json"]
-    written += [] if positions_file is None else [positions_file]
+    written += [file for file in (positions_file, options.save_flat_field) if file is not None]
     for file in written:
         check_output(file, options.overwrite, inputs, **({} if file == output else {"suffixes": ()}))
     check_distinct(written)
@@ -158,13 +171,36 @@ def _plane(sources: Sequence[Source], channel: int | None, index: int) -> NDArra
     return np.ascontiguousarray(pixels[..., channel])
 
 
+def check_size(sources: Sequence[Source]) -> None:
+    """Refuse tiles of several sizes."""
+    (w1, h1), other = sources[0].camera.image_size, None
+    other = next((source for source in sources if source.camera.image_size != (w1, h1)), None)
+    if other is not None:
+        w2, h2 = other.camera.image_size
+        raise InputError(f"{other.path}: has {w2} x {h2} pixels, the tiles before it have {w1} x {h1}; leave it out")
+
+
+def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list[Source], list[Message]]:
+    """The tiles, which are read without the illumination that all have; and what there is to say of that."""
+    if wanted == "off":
+        return list(sources), []
+    if wanted != "auto":
+        pixels = sources[0].read(keep=True).pixels
+        channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+        field = read_flat_field(wanted, sources[0].camera.image_size, channels)
+        return [replace(source, flat_field=field) for source in sources], []
+    shown = estimate_illumination(lambda index: sources[index].read(keep=True).pixels, len(sources))
+    if shown.field is None:
+        text = f"{len(sources)} tiles show no illumination that they have in common, and samples stay as they are"
+        return list(sources), [Message(text, severity="note", code="flat-field")]
+    dark = ", ".join(f"{value:.0f}" for value in shown.dark)
+    text = f"flat field: {shown.shading:.0%} less light where it is darkest, ± {shown.error:.1%}; dark level {dark}"
+    return [replace(source, flat_field=shown.field) for source in sources], [Message(text, severity="note")]
+
+
 def _grid(sources: Sequence[Source], options: TileOptions, read: Callable[[int], NDArray[Any]]) -> TileGrid:
     """Where the tiles should be."""
     size = sources[0].camera.image_size
-    other = next((source for source in sources if source.camera.image_size != size), None)
-    if other is not None:
-        (w1, h1), (w2, h2) = size, other.camera.image_size
-        raise InputError(f"{other.path}: has {w2} x {h2} pixels, the tiles before it have {w1} x {h1}; leave it out")
     names = [source.name for source in sources]
     if options.grid is not None:
         grid = grid_from_names(names, options.grid, options.overlap, size)

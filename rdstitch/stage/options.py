@@ -32,7 +32,9 @@ class TileOptions:
     channel : int, optional
         That is registered, from 0; the mean of all if not given.
     flat_field : str or path
-        "auto", "off", or an image file.
+        "auto": from the tiles themselves; "off"; or an image file, whose second page, if it has one, is the dark field.
+    save_flat_field : path, optional
+        TIFF file to write the flat field and the dark field to.
     distortion : float, optional
         λ where it is known.
     composite : CompositeOptions
@@ -56,6 +58,7 @@ class TileOptions:
     search: float | None = None
     channel: int | None = None
     flat_field: str | Path = "auto"
+    save_flat_field: str | Path | None = None
     distortion: float | None = None
     composite: CompositeOptions = field(default_factory=measured_samples)
     overwrite: bool = False

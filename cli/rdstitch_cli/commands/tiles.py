@@ -61,6 +61,13 @@ Examples:
 @click.option(
     "--channel", type=WholeNumber(0), metavar="N", help="Register this channel, from 0; otherwise the mean of all."
 )
+@options.flat_field("auto")
+@click.option(
+    "--save-flat-field",
+    type=options.IMAGE,
+    metavar="FILE",
+    help="Write the flat field and the dark field to this TIFF file, for the next slide.",
+)
 @options.distortion
 @options.cut
 @options.crop
