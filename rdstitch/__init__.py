@@ -27,12 +27,15 @@ if TYPE_CHECKING:
         calibrate,
         mosaic,
         pano,
+        place_tiles,
+        tiles,
         trajectory,
         undistort,
     )
     from rdstitch.radial_homography import RadialHomography
     from rdstitch.report import write_report
     from rdstitch.robust import estimate_radial_homography
+    from rdstitch.stage import TileOptions
 
     __version__: str
 
@@ -50,10 +53,11 @@ _HOMES = {
         "rdstitch.features": "FeatureOptions",
         "rdstitch.messages": "Message",
         "rdstitch.pipeline": "Recomposition Registration StitchOptions StitchResult "
-        "apply calibrate mosaic pano trajectory undistort",
+        "apply calibrate mosaic pano place_tiles tiles trajectory undistort",
         "rdstitch.radial_homography": "RadialHomography",
         "rdstitch.report": "write_report",
         "rdstitch.robust": "estimate_radial_homography",
+        "rdstitch.stage": "TileOptions",
     }.items()
     for name in names.split()
 }
@@ -71,6 +75,7 @@ __all__ = [
     "Registration",
     "StitchOptions",
     "StitchResult",
+    "TileOptions",
     "Trajectory",
     "apply",
     "calibrate",
@@ -80,9 +85,11 @@ __all__ = [
     "load_camera",
     "mosaic",
     "pano",
+    "place_tiles",
     "save_camera",
     "solvers",
     "synthetic",
+    "tiles",
     "trajectory",
     "undistort",
     "write_report",

@@ -11,17 +11,17 @@ class _Part(ModuleType):
 
 
 if TYPE_CHECKING:
-    from scipy import linalg, ndimage, sparse, spatial, special
+    from scipy import fft, linalg, ndimage, sparse, spatial, special
     from scipy.sparse import csgraph
     from scipy.sparse import linalg as sparse_linalg
     from scipy.spatial import distance
 else:
-    linalg, ndimage, sparse, spatial, special, csgraph, sparse_linalg, distance = map(
+    fft, linalg, ndimage, sparse, spatial, special, csgraph, sparse_linalg, distance = map(
         _Part,
         (
-            *("scipy.linalg", "scipy.ndimage", "scipy.sparse", "scipy.spatial", "scipy.special"),
+            *("scipy.fft", "scipy.linalg", "scipy.ndimage", "scipy.sparse", "scipy.spatial", "scipy.special"),
             *("scipy.sparse.csgraph", "scipy.sparse.linalg", "scipy.spatial.distance"),
         ),
     )
 
-__all__ = ["csgraph", "distance", "linalg", "ndimage", "sparse", "sparse_linalg", "spatial", "special"]
+__all__ = ["csgraph", "distance", "fft", "linalg", "ndimage", "sparse", "sparse_linalg", "spatial", "special"]

@@ -14,6 +14,7 @@ _GROUPS = {
         "output overwrite images preview reference camera focal mask scale report layout image_format frame height "
         "view quiet"
     ),
+    "Stage": "grid overlap positions positions_only pixel_size search channel flat_field save_flat_field",
     "Input": "following idle refresh every exclude include_only match topic timestamps",
     "Camera": "distortion lens tilt attitude attitude_std save_camera",
     "Features and registration": (
@@ -28,7 +29,8 @@ _GROUPS = {
 _OTHERS = "Other options"
 _BRIEF = (
     "output overwrite images preview camera distortion focal mask exclude every following reference scale gsd crop "
-    "max_size exposure report cache workers quiet config help help_all"
+    "max_size exposure report cache workers quiet config help help_all grid overlap positions positions_only "
+    "pixel_size search channel flat_field save_flat_field"
 )
 _FEW = 25  # options that are shown all at once
 _ALL = "rdstitch_cli.help_all"

@@ -23,6 +23,7 @@ from rdstitch_cli.commands.calibrate import calibrate
 from rdstitch_cli.commands.doctor import doctor
 from rdstitch_cli.commands.mosaic import mosaic
 from rdstitch_cli.commands.pano import pano
+from rdstitch_cli.commands.tiles import tiles
 from rdstitch_cli.commands.trajectory import trajectory
 from rdstitch_cli.commands.undistort import undistort
 from rdstitch_cli.config import config_option
@@ -93,7 +94,7 @@ def cli(context: click.Context, debug: bool) -> None:
     context.obj = debug
 
 
-for command in (pano, mosaic, apply, calibrate, trajectory, undistort, doctor):
+for command in (pano, mosaic, tiles, apply, calibrate, trajectory, undistort, doctor):
     command.params.append(config_option())
     command.epilog = f"{command.epilog or ''}\n\n{EXIT_STATUSES}"
     cli.add_command(command)

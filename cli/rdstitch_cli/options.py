@@ -120,19 +120,42 @@ def verbosity(command: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
+class FlatFieldFile(UserPath):
+    """A file, or auto, or off."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Keep the words; of anything else, make a path."""
+        return value if value in ("auto", "off") else super().convert(value, param, ctx)
+
+
+def flat_field(usual: str) -> Decorator[Any]:
+    """The option, and what a command does without it."""
+    return click.option(
+        "--flat-field",
+        type=FlatFieldFile(),
+        default=usual,
+        show_default=True,
+        metavar="auto|off|FILE",
+        help="Take out the illumination that all tiles share: as they show it, or as this image and, on a second page, "
+        "the dark field have it.",
+    )
+
+
+distortion = click.option(
+    "--lambda",
+    "distortion",
+    type=RealNumber(),
+    metavar="L",
+    help="Known λ for half the image diagonal; it is kept.",
+)
+
 lens = together(
     _file(
         "--camera",
         "FILE",
         "Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap or Hugin; its lens is kept.",
     ),
-    click.option(
-        "--lambda",
-        "distortion",
-        type=RealNumber(),
-        metavar="L",
-        help="Known λ for half the image diagonal; it is kept.",
-    ),
+    distortion,
 )
 
 known = together(
@@ -233,6 +256,50 @@ trust = together(
     strict, click.option("--force", is_flag=True, help="Write the result even when it fails its own checks.")
 )
 
+
+def _blend(usual: str) -> Decorator[Any]:
+    """The option, and how a command blends without it."""
+    text = "How images pass into one another; none cuts, for measuring."
+    return _choice("--blend", ["none", "feather", "multiband"], usual, text)
+
+
+blend, cut = _blend("multiband"), _blend("none")
+
+crop = click.option(
+    "--crop/--no-crop",
+    default=False,
+    callback=lambda _context, _option, value: "auto" if value else "none",
+    help="Cut to the largest rectangle without holes.",
+)
+
+interpolation = _choice("--interpolation", ["linear", "cubic", "lanczos"], "cubic", "Kernel of the one resampling.")
+
+output_form = together(
+    _number(
+        "--background",
+        WholeNumber(0, 255),
+        0,
+        "What no image covers, in JPEG and .dzi: 0 black to 255 white.",
+        "GREY",
+    ),
+    click.option(
+        "--max-memory",
+        type=Bytes(),
+        help="Memory that compositing may take, as 800M; otherwise a quarter of what is available, at least 400M.",
+    ),
+    _number("--scale", RealNumber(), 1.0, "Factor to the size of the output; 1 keeps resolution."),
+    click.option(
+        "--max-size",
+        type=WholeNumber(1),
+        metavar="N",
+        help="Longest side of the output, pixels; smaller than --scale makes it where that is more.",
+    ),
+    _number("--quality", WholeNumber(1, 100), 95, "Quality of JPEG and WebP, 1 to 100.", "Q"),
+    click.option(
+        "--dry-run", is_flag=True, help="Say what compositing would take (size, memory, time); write nothing."
+    ),
+)
+
 compositing = together(
     _choice(
         "--exposure",
@@ -248,38 +315,16 @@ compositing = together(
         "graphcut",
         "Where images meet: round what differs, midway, or wherever they overlap.",
     ),
-    _choice(
-        "--blend",
-        ["none", "feather", "multiband"],
-        "multiband",
-        "How images pass into one another; none cuts, for measuring.",
-    ),
-    click.option(
-        "--crop/--no-crop",
-        default=False,
-        callback=lambda _context, _option, value: "auto" if value else "none",
-        help="Cut to the largest rectangle without holes.",
-    ),
+    blend,
+    crop,
     _choice(
         "--projection",
         ["auto", "plane", "cylinder", "sphere", "mercator"],
         "auto",
         "How images taken by turning on the spot are laid out.",
     ),
-    _choice("--interpolation", ["linear", "cubic", "lanczos"], "cubic", "Kernel of the one resampling."),
-    _number(
-        "--background",
-        WholeNumber(0, 255),
-        0,
-        "What no image covers, in JPEG and .dzi: 0 black to 255 white.",
-        "GREY",
-    ),
-    click.option(
-        "--max-memory",
-        type=Bytes(),
-        help="Memory that compositing may take, as 800M; otherwise a quarter of what is available, at least 400M.",
-    ),
-    _number("--scale", RealNumber(), 1.0, "Factor to the size of the output; 1 keeps resolution."),
+    interpolation,
+    output_form,
     _number(
         "--max-stretch",
         RealNumber(1.0, min_open=True),
@@ -287,13 +332,6 @@ compositing = together(
         "What an oblique image shows N times coarser than the reference image is not drawn.",
         "N",
     ),
-    click.option(
-        "--max-size",
-        type=WholeNumber(1),
-        metavar="N",
-        help="Longest side of the output, pixels; smaller than --scale makes it where that is more.",
-    ),
-    _number("--quality", WholeNumber(1, 100), 95, "Quality of JPEG and WebP, 1 to 100.", "Q"),
     _number("--rotate", RealNumber(), 0.0, "Turn the output clockwise, degrees; north is then not turned up.", "DEG"),
     click.option(
         "--north-up/--no-north-up",
@@ -308,9 +346,6 @@ compositing = together(
         "epsg",
         type=Epsg(),
         help="Coordinate system of the map; otherwise UTM on WGS 84. Others than UTM need rasterio.",
-    ),
-    click.option(
-        "--dry-run", is_flag=True, help="Say what compositing would take (size, memory, time); write nothing."
     ),
 )
 

@@ -18,6 +18,7 @@ from rdstitch.file_access import canonical_name, held_in_memory, is_url
 from rdstitch.inputs.decoded_image_cache import DecodedImageCache
 from rdstitch.inputs.frame import Frame, Named
 from rdstitch.inputs.input_guard import InputGuard
+from rdstitch.io.flat_field import FlatField
 from rdstitch.io.mask import read_mask
 from rdstitch.io.metadata import Metadata, read_metadata
 from rdstitch.io.read import DecodedImage, read_image, reduced
@@ -52,6 +53,8 @@ class Source:
         Where it is kept between two stages that both look at it.
     guard : InputGuard
         What notices changes of the file, and damage.
+    flat_field : FlatField or None
+        Illumination that is taken out of the pixels.
     """
 
     path: Path
@@ -65,6 +68,7 @@ class Source:
         default_factory=partial(DecodedImageCache, room=0), compare=False, repr=False
     )
     guard: InputGuard = field(default_factory=InputGuard, compare=False, repr=False)
+    flat_field: FlatField | None = field(default=None, compare=False, repr=False)
 
     @property
     def name(self) -> str:
@@ -146,6 +150,8 @@ class Source:
         if image.pixels.shape[1::-1] != reduced_size(expected, reduction):
             now, before = ("{} x {}".format(*size) for size in (read_metadata(self.path).size, expected))
             raise InputError(f"{self.path}: has {now} pixels now, but had {before} before; run again")
+        if self.flat_field is not None:
+            image = replace(image, pixels=self.flat_field.corrected(image.pixels, reduction))
         if self.mask is None:
             return image
         return _masked(image, block_minimum(read_mask(self.mask, expected, self.mask_frame), reduction))

@@ -4,6 +4,7 @@ from rdstitch.options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.recipes import calibrate, mosaic, pano, trajectory
 from rdstitch.pipeline.recomposition import Recomposition
+from rdstitch.pipeline.stage_tiles import place_tiles, tiles
 from rdstitch.pipeline.undistort_images import undistort
 from rdstitch.registration import Registration
 from rdstitch.stitch_result import StitchResult
@@ -17,6 +18,8 @@ __all__ = [
     "calibrate",
     "mosaic",
     "pano",
+    "place_tiles",
+    "tiles",
     "trajectory",
     "undistort",
 ]

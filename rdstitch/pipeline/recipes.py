@@ -18,6 +18,7 @@ from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.source import Source
 from rdstitch.io.atomic import check_distinct, check_output, json_bytes, text_bytes
 from rdstitch.io.outputs import Outputs
+from rdstitch.local_alignment import LocalAlignment
 from rdstitch.messages import Message, told_once
 from rdstitch.options import StitchOptions
 from rdstitch.orientation import quarter_turn
@@ -310,41 +311,56 @@ def _composite(
     """
     registration = on_whole_pixels(with_frontal_reference(registration, options, always=frontal))
     local = align_registration_locally(registration, options.local_alignment)
-    placed = PlacedImages.of(registration, local.fields or None)
     with Outputs(options.overwrite) as outputs:
-        composed = compose_images(
-            placed,
-            output,
-            options.composite,
-            options.threads,
-            progress,
-            overwrite=options.overwrite,
-            outputs=outputs,
-            elsewhere=blocks_on(executor, placed.sources, options.cache),
-            dry_run=options.dry_run,
-        )
-        result = StitchResult(
-            _finished(registration).with_messages(composed.messages),
-            composed.canvas,
-            options.for_images(len(registration.sources)),
-            None if output is None else Path(output),
-            composed.composite,
-            composed.plan,
-            composed.fingerprint,
-            local,
-            composed.place,
-            composed.place_reason,
-        )
-        if not options.dry_run:
-            failed = outputs.attempt(options.save_camera or "", partial(_save_camera, registration, options, outputs))
-            if output is not None:
-                failed += write_page(outputs, output, composed, partial(viewed_images, result))
-            result = replace(result, registration=result.registration.with_messages(failed))
-            if beside is not None:
-                beside(outputs, result)
-            if output is not None:
-                # Last: whoever finds it finds what it belongs to.
-                outputs.write(f"{output}.json", json_bytes(sidecar(result)))
+        return compose_registration(registration, local, executor, output, options, progress, beside, outputs)
+
+
+def compose_registration(
+    registration: Registration,
+    local: LocalAlignment,
+    executor: Executor,
+    output: str | Path | None,
+    options: StitchOptions,
+    progress: Progress,
+    beside: Callable[[Outputs, StitchResult], None] | None,
+    outputs: Outputs,
+) -> StitchResult:
+    """Compose images at the places of a registration, into memory or among the outputs, with all that belongs to it."""
+    placed = PlacedImages.of(registration, local.fields or None)
+    composed = compose_images(
+        placed,
+        output,
+        options.composite,
+        options.threads,
+        progress,
+        overwrite=options.overwrite,
+        outputs=outputs,
+        elsewhere=blocks_on(executor, placed.sources, options.cache),
+        dry_run=options.dry_run,
+    )
+    result = StitchResult(
+        _finished(registration).with_messages(composed.messages),
+        composed.canvas,
+        options.for_images(len(registration.sources)),
+        None if output is None else Path(output),
+        composed.composite,
+        composed.plan,
+        composed.fingerprint,
+        local,
+        composed.place,
+        composed.place_reason,
+    )
+    if options.dry_run:
+        return result
+    failed = outputs.attempt(options.save_camera or "", partial(_save_camera, registration, options, outputs))
+    if output is not None:
+        failed += write_page(outputs, output, composed, partial(viewed_images, result))
+    result = replace(result, registration=result.registration.with_messages(failed))
+    if beside is not None:
+        beside(outputs, result)
+    if output is not None:
+        # Last: whoever finds it finds what it belongs to.
+        outputs.write(f"{output}.json", json_bytes(sidecar(result)))
     return result
 
 

@@ -1,0 +1,77 @@
+"""What every image of a camera gets of the light, pixel by pixel, and taking it out of samples."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from rdstitch.errors import InputError
+from rdstitch.io.opening import check_readable, decoding
+from rdstitch.io.reduction import block_mean
+
+
+@dataclass(frozen=True, eq=False)
+class FlatField:
+    """Illumination of all images of a camera: ``measured = gain * light + dark``.
+
+    Attributes
+    ----------
+    gain : ndarray of shape (h, w, C), float32
+        Mean 1 in each channel.
+    dark : ndarray of shape (h, w, C) or (1, 1, C), float32
+        Samples without light.
+    """
+
+    gain: NDArray[np.float32]
+    dark: NDArray[np.float32]
+
+    def corrected(self, pixels: NDArray[Any], reduction: int = 1) -> NDArray[Any]:
+        """``(v - dark) / gain + dark`` of samples (h, w) or (h, w, C), reduced or not, in their type.
+
+        The dark level stays, so that noise about it is not cut off at 0.
+        """
+        gain, dark = (block_mean(a, reduction) if a.shape[0] > 1 else a for a in (self.gain, self.dark))
+        flat = pixels.reshape(*pixels.shape[:2], -1)
+        values = (flat.astype(np.float32) - dark) / gain.reshape(*pixels.shape[:2], -1) + dark
+        if pixels.dtype.kind == "u":
+            values = np.clip(np.rint(values), 0, np.iinfo(pixels.dtype).max)
+        return values.astype(pixels.dtype).reshape(pixels.shape)
+
+    def write(self, file: Path) -> None:
+        """Write a TIFF file of two pages, the gain and the dark field."""
+        with tifffile.TiffWriter(file) as tiff:
+            for plane in (self.gain, np.broadcast_to(self.dark, self.gain.shape)):
+                tiff.write(
+                    np.ascontiguousarray(plane.squeeze()), compression="zlib", metadata=None, software="rdstitch"
+                )
+
+
+def read_flat_field(file: str | Path, size: tuple[int, int], channels: int) -> FlatField:
+    """The flat field of an image file, and the dark field where it has a second page.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read, has another size than the images, or is not positive.
+    """
+    path = Path(file)
+    check_readable(path)
+    read: Callable[[Any], NDArray[np.float32]] = lambda page: np.asarray(page.asarray(), dtype=np.float32)  # noqa: E731
+    with decoding(path), tifffile.TiffFile(path) as tiff:
+        pages = [read(page) for page in tiff.pages[:2]]
+    if any(page.shape[:2] != size[::-1] for page in pages):
+        raise InputError(
+            f"{file}: has {pages[0].shape[1]} x {pages[0].shape[0]} pixels, but the tiles {size[0]} x {size[1]}"
+        )
+    planes = [page.reshape(*page.shape[:2], -1) for page in pages]
+    if any(plane.shape[2] not in (1, channels) for plane in planes):
+        raise InputError(f"{file}: has {planes[0].shape[2]} channels, but the tiles {channels}")
+    gain = planes[0]
+    if not (np.isfinite(gain).all() and (gain > 0).all()):
+        raise InputError(f"{file}: a flat field must be positive everywhere")
+    dark = planes[1] if len(planes) > 1 else np.zeros((1, 1, gain.shape[2]), dtype=np.float32)
+    return FlatField(gain / gain.mean(axis=(0, 1)), dark)

@@ -1,0 +1,301 @@
+"""Tiles on a stage: from files whose places are roughly known to one image, or to a table of places."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.alignment import Alignment
+from rdstitch.alignment.result import LinkFit, ReliefTest
+from rdstitch.errors import ArgumentError, InputError, RegistrationError
+from rdstitch.features import Correspondences
+from rdstitch.inputs.find import FoundImages, found_images
+from rdstitch.inputs.frame import Images, as_inputs
+from rdstitch.inputs.input_guard import InputGuard
+from rdstitch.inputs.source import Source, read_sources
+from rdstitch.io.atomic import check_distinct, check_output, text_bytes
+from rdstitch.io.flat_field import read_flat_field
+from rdstitch.io.outputs import Outputs
+from rdstitch.io.reduction import mean_of_channels
+from rdstitch.local_alignment import no_local_alignment
+from rdstitch.matching.feature_store import StoredMatches
+from rdstitch.matching.two_view import PairRegistration
+from rdstitch.messages import MAX_NAMED, Message, names_of
+from rdstitch.options import StitchOptions
+from rdstitch.pipeline.recipes import compose_registration
+from rdstitch.progress import Progress, silent
+from rdstitch.radial_homography import RadialHomography
+from rdstitch.registration import Registration
+from rdstitch.stage.flat_field import estimate_illumination
+from rdstitch.stage.grid import TileGrid
+from rdstitch.stage.options import TileOptions
+from rdstitch.stage.positions import grid_from_files, grid_from_names, grid_from_table, oriented
+from rdstitch.stage.register import TileRegistration, evidence, register_tiles
+from rdstitch.stage.table import places_table
+from rdstitch.stitch_result import StitchResult
+
+
+def tiles(
+    inputs: Images,
+    output: str | Path | None = None,
+    options: TileOptions | None = None,
+    *,
+    positions_file: str | Path | None = None,
+    progress: Progress = silent,
+    beside: Callable[[Outputs, StitchResult], None] | None = None,
+) -> StitchResult:
+    """Stitch tiles taken on a stage, whose places are roughly known.
+
+    Parameters
+    ----------
+    inputs : path, ndarray, or iterable of them
+        What :func:`rdstitch.mosaic` takes; all of one size.
+    output : path, optional
+        As for :func:`rdstitch.mosaic`.
+    options : TileOptions, optional
+    positions_file : path, optional
+        CSV file to write the places to as well.
+    progress, beside
+        As for :func:`rdstitch.mosaic`.
+
+    Raises
+    ------
+    RdstitchError
+        See the tree in :mod:`rdstitch.errors`.
+    """
+    options = options or TileOptions()
+    stitch = StitchOptions(
+        distortion=options.distortion,
+        composite=options.composite,
+        overwrite=options.overwrite,
+        dry_run=options.dry_run,
+        workers=options.workers,
+    )
+    with found_images(as_inputs(inputs), output=output, topic=options.topic) as found:
+        registration, tiled = _registered(found, output, positions_file, options, progress)
+        with Outputs(options.overwrite) as outputs, stitch.executor(len(registration.sources)) as executor:
+            _write_beside(outputs, positions_file, options, registration, tiled)
+            local = no_local_alignment("tiles on a stage")
+            return compose_registration(registration, local, executor, output, stitch, progress, beside, outputs)
+
+
+def place_tiles(
+    inputs: Images,
+    positions_file: str | Path | None = None,
+    options: TileOptions | None = None,
+    *,
+    progress: Progress = silent,
+) -> tuple[TileRegistration, Registration]:
+    """Find the places of tiles as :func:`tiles` does, and compose nothing.
+
+    Parameters
+    ----------
+    positions_file : path, optional
+        CSV file to write the places to.
+    inputs, options, progress
+        As for :func:`tiles`.
+    """
+    options = options or TileOptions()
+    with found_images(as_inputs(inputs), topic=options.topic) as found:
+        registration, tiled = _registered(found, None, positions_file, options, progress)
+    with Outputs(options.overwrite) as outputs:
+        _write_beside(outputs, positions_file, options, registration, tiled)
+    return tiled, registration
+
+
+def _registered(
+    found: FoundImages,
+    output: str | Path | None,
+    positions_file: str | Path | None,
+    options: TileOptions,
+    progress: Progress,
+) -> tuple[Registration, TileRegistration]:
+    """The places of all tiles, once it is clear that everything can be written."""
+    _check_outputs(output, positions_file, options, found.files)
+    guard = InputGuard(options.strict)
+    limit = options.composite.max_memory
+    sources, unread = read_sources(found.frames, skip_bad=not options.strict, guard=guard, max_memory=limit)
+    if len(sources) < 2:
+        raise InputError(f"{unread[0].images[0]}: {unread[0].text}" if unread else "name two tiles or more")
+    check_size(sources)
+    sources, illumination = with_flat_field(sources, options.flat_field)
+    read = partial(_plane, sources, options.channel)
+    grid = _grid(sources, options, read)
+    tiled = register_tiles(grid, read, search=options.search, distortion=options.distortion, progress=progress)
+    return _registration(sources, tiled).with_messages([*unread, *found.messages, *illumination]), tiled
+
+
+def _write_beside(
+    outputs: Outputs,
+    file: str | Path | None,
+    options: TileOptions,
+    registration: Registration,
+    tiled: TileRegistration,
+) -> None:
+    """The table of places, and the flat field, where they are wanted."""
+    if file is not None:
+        outputs.write(file, text_bytes(places_table([source.name for source in registration.sources], tiled)))
+    field = registration.sources[0].flat_field
+    if options.save_flat_field is not None and field is not None:
+        with outputs.writing(options.save_flat_field) as staged:
+            field.write(staged)
+
+
+def _check_outputs(
+    output: str | Path | None, positions_file: str | Path | None, options: TileOptions, inputs: Sequence[str | Path]
+) -> None:
+    """Find out before long work whether everything can be written."""
+    named = [options.positions, None if options.flat_field in ("auto", "off") else options.flat_field]
+    inputs = [*inputs, *(file for file in named if file is not None)]
+    written = [] if output is None else [output, f"{output}.json"]
+    written += [file for file in (positions_file, options.save_flat_field) if file is not None]
+    for file in written:
+        check_output(file, options.overwrite, inputs, **({} if file == output else {"suffixes": ()}))
+    check_distinct(written)
+
+
+def _plane(sources: Sequence[Source], channel: int | None, index: int) -> NDArray[Any]:
+    """A tile as it is registered."""
+    pixels = sources[index].read(keep=True).pixels
+    if pixels.ndim == 2:
+        return pixels
+    if channel is None:
+        return mean_of_channels(pixels.astype(np.float32)) if pixels.shape[2] <= 4 else pixels.mean(axis=2)
+    if channel >= pixels.shape[2]:
+        raise ArgumentError(f"{sources[index].path}: has {pixels.shape[2]} channels, of which {channel} is none")
+    return np.ascontiguousarray(pixels[..., channel])
+
+
+def check_size(sources: Sequence[Source]) -> None:
+    """Refuse tiles of several sizes."""
+    (w1, h1), other = sources[0].camera.image_size, None
+    other = next((source for source in sources if source.camera.image_size != (w1, h1)), None)
+    if other is not None:
+        w2, h2 = other.camera.image_size
+        raise InputError(f"{other.path}: has {w2} x {h2} pixels, the tiles before it have {w1} x {h1}; leave it out")
+
+
+def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list[Source], list[Message]]:
+    """The tiles, which are read without the illumination that all have; and what there is to say of that."""
+    if wanted == "off":
+        return list(sources), []
+    if wanted != "auto":
+        pixels = sources[0].read(keep=True).pixels
+        channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+        field = read_flat_field(wanted, sources[0].camera.image_size, channels)
+        return [replace(source, flat_field=field) for source in sources], []
+    shown = estimate_illumination(lambda index: sources[index].read(keep=True).pixels, len(sources))
+    if shown.field is None:
+        text = f"{len(sources)} tiles show no illumination that they have in common, and samples stay as they are"
+        return list(sources), [Message(text, severity="note", code="flat-field")]
+    dark = ", ".join(f"{value:.0f}" for value in shown.dark)
+    text = f"flat field: {shown.shading:.0%} less light where it is darkest, ± {shown.error:.1%}; dark level {dark}"
+    return [replace(source, flat_field=shown.field) for source in sources], [Message(text, severity="note")]
+
+
+def _grid(sources: Sequence[Source], options: TileOptions, read: Callable[[int], NDArray[Any]]) -> TileGrid:
+    """Where the tiles should be."""
+    size = sources[0].camera.image_size
+    names = [source.name for source in sources]
+    if options.grid is not None:
+        grid = grid_from_names(names, options.grid, options.overlap, size)
+        return replace(grid, pixel_size=options.pixel_size)
+    if options.positions is not None:
+        grid = grid_from_table(names, options.positions, size, options.pixel_size)
+    else:
+        grid = grid_from_files([source.path for source in sources], size, options.pixel_size)
+    return oriented(grid, partial(evidence, read=read, search=options.search))
+
+
+def _registration(sources: Sequence[Source], tiled: TileRegistration) -> Registration:
+    """What was found, in the form that everything after registration takes."""
+    fitted, links = tiled.adjustment, tiled.links
+    if not tiled.linked.any():
+        raise RegistrationError(
+            f"none of {len(tiled.compared)} pairs of neighbours show the same where they should: the places "
+            f"({tiled.grid.source}) or the overlap may be wrong; --search PX looks farther"
+        )
+    cameras = [replace(source.camera, distortion=fitted.distortion) for source in sources]
+    half = cameras[0].half_diagonal
+    places = fitted.places - fitted.places[0]
+    if fitted.distortion == 0.0:
+        # Without a lens to take out every sample can stay as it was measured.
+        places = np.rint(places)
+    homographies = np.tile(np.eye(3), (len(sources), 1, 1))
+    homographies[:, :2, 2] = places / half
+    pairs, fits = [], []
+    for number, (first, second) in enumerate(links.tiles.tolist()):
+        own = links.pair == number
+        relation = np.eye(3)
+        relation[:2, 2] = (fitted.places[first] - fitted.places[second]) / half
+        agreeing = fitted.squared[own] / fitted.noise < 16.0
+        errors = np.linalg.norm(fitted.residuals[own], axis=1)
+        used = bool(fitted.weights[number] > 0.25)
+        rms = math.sqrt(float((errors[agreeing] ** 2).mean())) if agreeing.any() else math.nan
+        matches = Correspondences(
+            np.tile(np.arange(int(own.sum()), dtype=np.intp)[:, None], 2),
+            links.points1[own],
+            links.points2[own],
+            np.zeros(int(own.sum())),
+        )
+        pair = RadialHomography(
+            relation, cameras[first], cameras[second], agreeing, model="rigid", rms=rms, reason="correlation"
+        )
+        pairs.append(PairRegistration(first, second, StoredMatches.of(matches), pair))
+        reason = "" if used else "contradicts the other links"
+        fits.append(LinkFit(first, second, len(errors), int(agreeing.sum()), rms if used else math.nan, used, reason))
+    used_pairs = [fit for fit in fits if fit.used]
+    rms = math.sqrt(float(np.mean([fit.rms**2 for fit in used_pairs if fit.inliers] or [math.nan])))
+    alignment = Alignment(
+        cameras=tuple(cameras),
+        homographies=homographies,
+        used=np.ones(len(sources), dtype=np.bool_),
+        components=(tuple(range(len(sources))),),
+        reference=0,
+        model="rigid",
+        model_reason="a stage moves without turning",
+        poses=None,
+        tilt=None,
+        tilt_spread=0.0,
+        focal=None,
+        focal_std=None,
+        distortion=fitted.distortion,
+        distortion_std=fitted.distortion_std,
+        lens="division",
+        lens_reason="one parameter",
+        parameters=(),
+        covariance=np.empty((0, 0)),
+        rms=rms,
+        links=tuple(fits),
+        relief=ReliefTest(False, 0.0, 0.0, "Taken to be flat: tiles on a stage."),
+    )
+    counts = np.bincount(links.tiles[links.pair].ravel(), minlength=len(sources))
+    return Registration(tuple(sources), tuple(counts.tolist()), tuple(pairs), alignment, _messages(sources, tiled))
+
+
+def _messages(sources: Sequence[Source], tiled: TileRegistration) -> tuple[Message, ...]:
+    """What the user should know of the places."""
+    stage = tiled.adjustment.stage
+    messages = []
+    alone = np.flatnonzero(~tiled.linked)
+    if len(alone):
+        paths = [str(sources[k].path) for k in alone.tolist()]
+        named = ", ".join(names_of(paths)[:MAX_NAMED]) + (" …" if len(alone) > MAX_NAMED else "")
+        who = "1 tile has its place" if len(alone) == 1 else f"{len(alone)} tiles have their places"
+        text = f"{who} from the stage alone, ± {stage.std:.1f} pixels, since no neighbour shows the same: {named}"
+        messages.append(Message(text, severity="note", code="nominal-places"))
+    if len(tiled.groups) > 1:
+        others = [k for group in tiled.groups[1:] for k in group]
+        paths = [str(sources[k].path) for k in others]
+        named = ", ".join(names_of(paths)[:MAX_NAMED]) + (" …" if len(others) > MAX_NAMED else "")
+        text = (
+            f"tiles form {len(tiled.groups)} groups that only the stage holds together, ± "
+            f"{max(stage.std, stage.row_std, stage.column_std):.1f} pixels: {named} have no link to the largest"
+        )
+        messages.append(Message(text, code="nominal-places"))
+    return tuple(messages)

@@ -1,0 +1,106 @@
+"""Phase correlation of the blocks of an overlap, whitened as far as they are more than noise."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.arrays import FloatArray
+from rdstitch.scipy_parts import fft
+from rdstitch.stage.overlap import Overlap
+
+Image = NDArray[np.float32]
+
+_TAPER = 0.15
+"""Share of a window on each side over which it falls to 0."""
+
+_NOISE_SHARE = 4.0
+"""Products of spectra are whitened where they are so many times what noise would give."""
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """Correlation of each block over all displacements within a radius.
+
+    Attributes
+    ----------
+    values : ndarray of shape (K, 2 P + 1, 2 P + 1), float16
+        Rows are displacements in y, from -P on; columns in x. Noise has the standard deviation 1 in their sum.
+    """
+
+    values: NDArray[np.float16]
+
+    @property
+    def reach(self) -> int:
+        """P, pixels."""
+        return int(self.values.shape[1] // 2)
+
+    def total(self, shifts: FloatArray, radius: int) -> FloatArray:
+        """Sum over the blocks, each displaced by its shift (K, 2) besides, (2 R + 1, 2 R + 1)."""
+        total = np.zeros((2 * radius + 1, 2 * radius + 1), dtype=np.float32)
+        for surface, (x, y) in zip(self.values, np.rint(shifts).astype(int).tolist(), strict=True):
+            top, left = self.reach - radius + y, self.reach - radius + x
+            if min(top, left) >= 0 and max(top, left) <= 2 * (self.reach - radius):
+                total += surface[top : top + 2 * radius + 1, left : left + 2 * radius + 1]
+        return total.astype(np.float64)
+
+
+def correlate(first: Image, second: Image, overlap: Overlap, reach: int) -> Surfaces:
+    """Correlate every block of two tiles (h, w) for displacements up to ``reach`` pixels.
+
+    A displacement e at a block means that what the first tile shows at p is at ``p - offset - e`` in the second.
+    """
+    sizes = overlap.blocks[:, 2:] - overlap.blocks[:, :2] + 2 * reach
+    shape = tuple(int(fft.next_fast_len(int(side), real=True)) for side in sizes.max(axis=0)[::-1])
+    frames = np.zeros((2, len(sizes), *shape), dtype=np.float32)
+    # A block is as long in the first tile as it is, and reaches as far as the search in the second; across, both do.
+    along = int(np.argmax(np.ptp(overlap.blocks[:, :2], axis=0))) if len(sizes) > 1 else -1
+    noise = np.zeros((2, len(sizes)))
+    for number, block in enumerate(overlap.blocks):
+        margins = np.full(2, reach)
+        inner = margins.copy()
+        if along >= 0:
+            inner[along] = 0
+        corner = block[:2] - reach
+        noise[0, number] = _fill(frames[0, number], first, block, inner, corner)
+        moved = block - np.tile(overlap.offset, 2)
+        noise[1, number] = _fill(frames[1, number], second, moved, margins, corner - overlap.offset)
+    spectra = fft.rfft2(frames)
+    product = spectra[0] * np.conj(spectra[1])
+    floor = np.float32(_NOISE_SHARE) * np.sqrt(noise[0] * noise[1]).astype(np.float32)
+    product /= np.abs(product) + floor[:, None, None] + np.float32(1e-12)
+    power = float((np.abs(product) ** 2).sum()) * 2.0
+    surface = fft.irfft2(product, s=shape) * (shape[0] * shape[1] / np.sqrt(power + 1e-12))
+    rows, columns = (np.arange(-reach, reach + 1) % side for side in shape)
+    return Surfaces(surface[:, rows[:, None], columns].astype(np.float16))
+
+
+def _fill(
+    frame: Image, tile: Image, block: NDArray[np.intp], margin: NDArray[np.intp], corner: NDArray[np.intp]
+) -> float:
+    """Lay a block with a margin, as far as the tile has it, tapered into a frame; return its spectrum's noise power."""
+    low = np.maximum(block[:2] - margin, 0)
+    high = np.minimum(block[2:] + margin, tile.shape[::-1])
+    if (high - low < 4).any():
+        return 0.0
+    part = tile[low[1] : high[1], low[0] : high[0]]
+    weights = _taper(part.shape[0])[:, None] * _taper(part.shape[1])
+    x, y = low - corner
+    frame[y : y + part.shape[0], x : x + part.shape[1]] = (part - part.mean()) * weights
+    return noise_variance(part) * float((weights**2).sum())
+
+
+def noise_variance(part: Image) -> float:
+    """Variance of white noise in an image, by second differences, which content hardly has; half of them count."""
+    rows = part[::2]
+    second = rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]
+    deviation = float(np.median(np.abs(second))) / 0.6745
+    return deviation**2 / 6.0
+
+
+@lru_cache(maxsize=64)
+def _taper(length: int) -> Image:
+    """A window that falls to 0 as a cosine at both ends."""
+    distance = (np.minimum(np.arange(length), np.arange(length)[::-1]) + 0.5) / max(1.0, _TAPER * length)
+    return np.asarray(0.5 - 0.5 * np.cos(np.pi * np.minimum(distance, 1.0)), dtype=np.float32)

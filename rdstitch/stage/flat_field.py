@@ -1,0 +1,182 @@
+"""The flat field of tiles from the tiles themselves, whatever they show.
+
+What a tile shows changes as often from light to dark across a cell's border as from dark to light; the light changes
+there in every tile alike. So the medians, over all tiles, of the logarithmic steps between neighbouring cells are those
+of the illumination, which is a smooth surface over them.
+
+The dark level D, which light does not multiply, is where the variance of photon noise, which is in proportion to the
+light, becomes 0 (photon transfer). Samples that are no counts of light, as of JPEG files, show none, and D is 0.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.arrays import FloatArray
+from rdstitch.io.flat_field import FlatField
+from rdstitch.io.reduction import block_mean
+
+_CELLS = 24
+"""Cells along each side of a tile."""
+
+_SIDE = 512
+"""Pixels of the longer side that are enough."""
+
+_DEGREE = 4
+"""Of the polynomial that the logarithm of the illumination is."""
+
+_BINS, _LEAST_BINS, _LEAST_IN_BIN = 24, 6, 16
+"""Bins of brightness, and cells of a bin, by which noise is compared with light."""
+
+
+@dataclass(frozen=True)
+class Illumination:
+    """The flat field that tiles show, or why they do not.
+
+    Attributes
+    ----------
+    field : FlatField or None
+        None where the tiles do not show it better than by half of what it is.
+    error : float
+        Its root mean square error, by how far two halves of the tiles differ.
+    shading : float
+        Largest share of the light that is missing.
+    dark : ndarray of shape (C,)
+    """
+
+    field: FlatField | None
+    error: float
+    shading: float
+    dark: FloatArray
+
+
+class _Statistics:
+    """Ground, and variance of noise, of all cells of all tiles."""
+
+    def __init__(self, tiles: Iterable[NDArray[Any]]) -> None:
+        ground, variance = [], []
+        for tile in tiles:
+            factor = max(1, round(max(tile.shape[:2]) / _SIDE))
+            small = block_mean(tile, factor).reshape(-(-tile.shape[0] // factor), -(-tile.shape[1] // factor), -1)
+            rows, columns = (max(1, side // _CELLS) for side in small.shape[:2])
+            cut = small[: rows * _CELLS, : columns * _CELLS].astype(np.float32)
+            cells = cut.reshape(_CELLS, rows, _CELLS, columns, -1).transpose(0, 2, 4, 1, 3)
+            cells = cells.reshape(_CELLS, _CELLS, cut.shape[2], -1)
+            middle = np.median(cells, axis=-1)
+            ground.append(middle)
+            variance.append(_noise(tile.reshape(*tile.shape[:2], -1)))
+        self.size = small.shape[:2]
+        self.used = rows * _CELLS, columns * _CELLS
+        self.ground, self.variance = np.array(ground, dtype=np.float64), np.array(variance, dtype=np.float64)
+
+
+def _noise(tile: NDArray[Any]) -> FloatArray:
+    """Variance of the noise in each cell of a tile (h, w, C), by second differences in every other row."""
+    second = tile[::2].astype(np.float32)
+    second = np.abs(second[:, :-2] - 2.0 * second[:, 1:-1] + second[:, 2:])
+    rows, columns = (max(1, side // _CELLS) for side in second.shape[:2])
+    cut = second[: rows * _CELLS, : columns * _CELLS]
+    cells = cut.reshape(_CELLS, rows, _CELLS, columns, -1).transpose(0, 2, 4, 1, 3)
+    deviation = np.median(cells.reshape(_CELLS, _CELLS, tile.shape[2], -1), axis=-1) / 0.6745
+    return np.asarray(deviation**2 / 6.0)
+
+
+def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Illumination:
+    """Estimate the flat field and the dark level of tiles.
+
+    Parameters
+    ----------
+    read : callable
+        Gives a tile (h, w) or (h, w, C).
+    count : int
+        Number of tiles.
+    """
+    first = read(0)
+    shown = _Statistics(read(index) for index in range(count))
+    channels = shown.ground.shape[3]
+    height, width = first.shape[:2]
+    # Centres of the pixels in the frame of the cells, from -1 to 1.
+    x, y = (
+        (2.0 * (np.arange(side) + 0.5) * small / side / used - 1.0)
+        for side, small, used in ((width, shown.size[1], shown.used[1]), (height, shown.size[0], shown.used[0]))
+    )
+    gain = np.empty((height, width, channels), dtype=np.float32)
+    dark, errors, noise = np.zeros(channels), [], []
+    for channel in range(channels):
+        ground = shown.ground[..., channel]
+        dark[channel] = _dark_level(ground, shown.variance[..., channel])
+        whole = _fitted(ground - dark[channel])
+        halves = [_fitted(ground[k::2] - dark[channel]) for k in (0, 1)] if count > 1 else [whole, 2.0 * whole]
+        gain[..., channel] = np.exp(_surface(whole, x, y))
+        gain[..., channel] /= gain[..., channel].mean()
+        cells = [np.exp(_on_cells(coefficients)) for coefficients in (whole, *halves)]
+        errors.append(float(np.sqrt(((cells[1] / cells[1].mean() - cells[2] / cells[2].mean()) ** 2).mean())) / 2.0)
+        noise.append(float((cells[0] / cells[0].mean()).std()))
+    field = FlatField(gain, dark.astype(np.float32)[None, None])
+    good = all(error < 0.5 * spread for error, spread in zip(errors, noise, strict=True)) and bool(
+        np.isfinite(gain).all()
+    )
+    missing = float(1.0 - (gain.min(axis=(0, 1)) / gain.max(axis=(0, 1))).min())
+    return Illumination(field if good else None, max(errors), missing, dark)
+
+
+def _powers() -> list[tuple[int, int]]:
+    """Exponents of x and y; the constant is left out, since the gain has mean 1."""
+    return [(i, k) for i in range(_DEGREE + 1) for k in range(_DEGREE + 1 - i) if i + k]
+
+
+def _surface(coefficients: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+    """The polynomial at columns x and rows y, (h, w)."""
+    table = np.zeros((_DEGREE + 1, _DEGREE + 1))
+    for (i, k), value in zip(_powers(), coefficients, strict=True):
+        table[k, i] = value
+    return np.asarray(np.polynomial.polynomial.polygrid2d(y, x, table))
+
+
+def _middles() -> FloatArray:
+    return np.asarray((2.0 * np.arange(_CELLS) + 1.0) / _CELLS - 1.0)
+
+
+def _on_cells(coefficients: FloatArray) -> FloatArray:
+    return _surface(coefficients, _middles(), _middles())
+
+
+def _fitted(light: FloatArray) -> FloatArray:
+    """Coefficients of the logarithm of the illumination, from light (N, cells, cells)."""
+    logarithm = np.log(np.maximum(light, max(1e-3 * float(np.median(light)), 1e-9)))
+    values = [np.median(np.diff(logarithm, axis=axis), axis=0).ravel() for axis in (1, 2)]
+    x, y = np.meshgrid(_middles(), _middles())
+    columns = [x**i * y**k for i, k in _powers()]
+    matrix = np.stack(
+        [np.concatenate([np.diff(c, axis=0).ravel(), np.diff(c, axis=1).ravel()]) for c in columns], axis=1
+    )
+    right = np.concatenate(values)
+    weights = np.ones(len(right))
+    for _ in range(5):
+        solution = np.linalg.lstsq(matrix * weights[:, None], right * weights, rcond=None)[0]
+        residual = right - matrix @ solution
+        scale = max(float(np.median(np.abs(residual))) / 0.6745, 1e-12)
+        weights = 1.0 / (1.0 + (residual / (3.0 * scale)) ** 2)
+    return np.asarray(solution)
+
+
+def _dark_level(ground: FloatArray, variance: FloatArray) -> float:
+    """D of a channel by its photon noise, whose variance is in proportion to the light; 0 where that is not so."""
+    mean, noise = ground.ravel(), variance.ravel()
+    order = np.argsort(mean)
+    bins = [part for part in np.array_split(order, min(_BINS, len(order) // _LEAST_IN_BIN)) if len(part)]
+    if len(bins) < _LEAST_BINS:
+        return 0.0
+    x, y = (np.array([np.median(values[part]) for part in bins]) for values in (mean, noise))
+    # Median of the slopes between all bins: texture, which is taken for noise, makes some of them too steep.
+    first, second = np.triu_indices(len(x), 1)
+    apart = x[second] - x[first] > 0.0
+    slopes = (y[second] - y[first])[apart] / (x[second] - x[first])[apart]
+    low, slope = np.quantile(slopes, [0.16, 0.5]) if len(slopes) else (0.0, 0.0)
+    if not low > 0.0:
+        return 0.0
+    dark = float(np.median(x - y / slope))
+    return dark if 0.0 < dark < float(np.quantile(mean, 0.01)) else 0.0

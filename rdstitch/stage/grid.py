@@ -1,0 +1,84 @@
+"""Where the stage was told to bring each tile: nominal places, rows and columns."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.errors import ArgumentError
+
+_SAME_LINE = 0.25
+"""Share of a tile within which places belong to one row or column."""
+
+_MIN_OVERLAP = 0.3
+"""Share of a tile's shorter side along which an overlap is worth comparing: corners of diagonal neighbours are not."""
+
+
+@dataclass(frozen=True)
+class TileGrid:
+    """Nominal places of tiles of one size.
+
+    Attributes
+    ----------
+    places : ndarray of shape (N, 2)
+        Of the first pixel of each tile, pixels; x to the right, y down.
+    size : (int, int)
+        Width and height of a tile, pixels.
+    pixel_size : float or None
+        Micrometres, where it is known.
+    source : str
+        Where the places come from, for reports.
+    """
+
+    places: FloatArray
+    size: tuple[int, int]
+    pixel_size: float | None = None
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        if self.places.ndim != 2 or self.places.shape[1] != 2 or not np.isfinite(self.places).all():
+            raise ArgumentError("places of tiles are finite numbers x, y, one pair a tile")
+
+    def __len__(self) -> int:
+        """Number of tiles."""
+        return len(self.places)
+
+    @property
+    def rows(self) -> IntArray:
+        """Row of each tile, from 0 at the top."""
+        return _lines(self.places[:, 1], _SAME_LINE * self.size[1])
+
+    @property
+    def columns(self) -> IntArray:
+        """Column of each tile, from 0 at the left."""
+        return _lines(self.places[:, 0], _SAME_LINE * self.size[0])
+
+    def neighbours(self, reach: float) -> NDArray[np.intp]:
+        """Pairs of tiles that overlap along a good part of a side, or come so near that they may, (M, 2).
+
+        Parameters
+        ----------
+        reach : float
+            How much nearer to one another tiles may be than they were told, pixels.
+        """
+        size = np.array(self.size, dtype=np.float64)
+        order = np.argsort(self.places[:, 1], kind="stable")
+        y = self.places[order, 1]
+        pairs = []
+        for position, first in enumerate(order.tolist()):
+            stop = int(np.searchsorted(y, y[position] + size[1] + reach))
+            others = order[position + 1 : stop]
+            common = size - np.abs(self.places[others] - self.places[first])
+            near = (common > -reach / 2).all(axis=1) & (common.max(axis=1) > _MIN_OVERLAP * size.min())
+            pairs += [(min(first, k), max(first, k)) for k in others[near].tolist()]
+        return np.array(sorted(pairs), dtype=np.intp).reshape(-1, 2)
+
+
+def _lines(values: FloatArray, tolerance: float) -> IntArray:
+    """Numbers of the groups that values along an axis form, from the smallest on."""
+    order = np.argsort(values, kind="stable")
+    steps = np.diff(values[order], prepend=values[order[0]]) > tolerance
+    lines = np.empty(len(values), dtype=np.intp)
+    lines[order] = np.cumsum(steps)
+    return lines

@@ -1,0 +1,77 @@
+"""The expected overlap of two tiles, cut into blocks along its longer side."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rdstitch.arrays import FloatArray, IntArray
+
+_BLOCKS = 8
+"""Blocks along a side of a tile: a lens that bends the overlap hardly bends one of them."""
+
+
+_LEAST_SIDE = 40
+"""Side of a block, pixels, from which on it has enough of independent pixels for its displacement to be sure."""
+
+
+def _count(length: int, side: int) -> int:
+    """Blocks along a length on a tile of a side."""
+    return max(1, min(round(length / side * _BLOCKS), length // _LEAST_SIDE))
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Two tiles and what they should have in common.
+
+    Attributes
+    ----------
+    first, second : int
+    offset : ndarray of shape (2,), int
+        Expected place of the second in the first, pixels.
+    blocks : ndarray of shape (K, 4), int
+        Boxes x0, y0, x1, y1 in the first tile, end exclusive.
+    """
+
+    first: int
+    second: int
+    offset: IntArray
+    blocks: IntArray
+
+    @classmethod
+    def expected(cls, first: int, second: int, offset: FloatArray, size: tuple[int, int], least: int) -> "Overlap":
+        """For tiles of a size, one of which should lie at an offset in the other.
+
+        An overlap narrower than ``least`` pixels is taken to be so wide.
+        """
+        side = np.array(size)
+        whole = np.rint(offset).astype(np.intp)
+        low, high = np.maximum(0, whole), np.minimum(side, side + whole)
+        lacking = np.maximum(0, least - (high - low))
+        # Of the second tile so much is expected beyond the border of the first.
+        low, high = low - np.where(whole > 0, lacking, 0), high + np.where(whole > 0, 0, lacking)
+        along = int(np.argmax(high - low))
+        count = _count(int((high - low)[along]), int(side[along]))
+        edges = np.rint(np.linspace(low[along], high[along], count + 1)).astype(np.intp)
+        blocks = np.empty((count, 4), dtype=np.intp)
+        blocks[:, :2], blocks[:, 2:] = low, high
+        blocks[:, along], blocks[:, 2 + along] = edges[:-1], edges[1:]
+        return cls(first, second, whole, blocks)
+
+    @property
+    def whole(self) -> IntArray:
+        """All blocks as one, (1, 4)."""
+        return np.concatenate([self.blocks[:, :2].min(axis=0), self.blocks[:, 2:].max(axis=0)])[None]
+
+    @property
+    def centers(self) -> FloatArray:
+        """Middle of each block in the first tile, pixels (K, 2)."""
+        return np.asarray((self.blocks[:, :2] + self.blocks[:, 2:] - 1) / 2.0)
+
+    def cells(self, size: tuple[int, int]) -> IntArray:
+        """The blocks cut across too where the overlap is wide, (L, 4): a lens bends none of these to speak of."""
+        parts = []
+        for x0, y0, x1, y1 in self.blocks.tolist():
+            across, down = (_count(b - a, n) for a, b, n in ((x0, x1, size[0]), (y0, y1, size[1])))
+            x, y = np.rint(np.linspace(x0, x1, across + 1)), np.rint(np.linspace(y0, y1, down + 1))
+            parts += [(x[i], y[k], x[i + 1], y[k + 1]) for k in range(down) for i in range(across)]
+        return np.array(parts, dtype=np.intp)

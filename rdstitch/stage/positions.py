@@ -1,0 +1,245 @@
+"""Nominal places of tiles by what users have: a table, file names, OME-XML, Micro-Manager's metadata."""
+
+import csv
+import json
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import tifffile
+
+from rdstitch.errors import ArgumentError, InputError
+from rdstitch.file_access import canonical_name, canonical_text, open_regular
+from rdstitch.io.opening import TIFF_MAGIC, decoding
+from rdstitch.records import read_text
+from rdstitch.stage.grid import TileGrid
+
+_NAMES = ("name", "file", "filename", "image")
+_MICROMETRES = {"nm": 1e-3, "µm": 1.0, "um": 1.0, "μm": 1.0, "micron": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6}
+_METADATA_FILE = "metadata.txt"
+_HOW = (
+    "say where they are: --grid 'r{row}c{col}' --overlap PERCENT for names, or --positions FILE with name,x,y; "
+    "OME-TIFF and Micro-Manager files may say it themselves"
+)
+
+
+@dataclass(frozen=True)
+class StagePosition:
+    """Where one tile is.
+
+    Attributes
+    ----------
+    x, y : float
+    unit : float or None
+        Micrometres that these count; None for pixels.
+    pixel_size : float or None
+        Micrometres, where the file says it.
+    """
+
+    x: float
+    y: float
+    unit: float | None
+    pixel_size: float | None = None
+
+
+def grid_from_names(names: Sequence[str], pattern: str, overlap: float, size: tuple[int, int]) -> TileGrid:
+    """Places by rows and columns in file names.
+
+    Parameters
+    ----------
+    pattern : str
+        Part of a name in which ``{row}`` and ``{col}`` stand for numbers; ``*`` for anything.
+    overlap : float
+        Share of a tile that its neighbours show too.
+
+    Raises
+    ------
+    ArgumentError
+        When the pattern has no row or column, or a name does not fit.
+    """
+    if pattern.count("{row}") != 1 or pattern.count("{col}") != 1:
+        raise ArgumentError(f"the grid '{pattern}' must have {{row}} and {{col}} once each, as in 'r{{row}}c{{col}}'")
+    if not 0.0 <= overlap < 1.0:
+        raise ArgumentError(f"tiles overlap by 0 to less than 100 %, not {100 * overlap:g} %")
+    expression = re.escape(pattern).replace(r"\{row\}", r"(?P<row>\d+)").replace(r"\{col\}", r"(?P<col>\d+)")
+    wanted = re.compile(expression.replace(r"\*", ".*"))
+    cells = []
+    for name in names:
+        found = wanted.search(name)
+        if found is None:
+            raise ArgumentError(f"{name}: does not fit the grid '{pattern}'")
+        cells.append((int(found["col"]), int(found["row"])))
+    if len(set(cells)) < len(cells):
+        twice = next(cell for cell in cells if cells.count(cell) > 1)
+        raise ArgumentError(f"several tiles are row {twice[1]}, column {twice[0]}; name those of one channel only")
+    places = np.array(cells, dtype=np.float64) - np.min(cells, axis=0)
+    return TileGrid(places * np.array(size) * (1.0 - overlap), size, None, f"file names, {100 * overlap:g} % overlap")
+
+
+def grid_from_table(
+    names: Sequence[str], file: str | Path, size: tuple[int, int], pixel_size: float | None
+) -> TileGrid:
+    """Places by a CSV file with the columns ``name``, ``x`` and ``y``, pixels, or ``x_um`` and ``y_um``.
+
+    Raises
+    ------
+    InputError
+        When the file is no such table, or has no line for a tile.
+    """
+    lines = read_text(Path(file)).splitlines()
+    header = [cell.strip().lower() for cell in next(csv.reader(lines[:1]), [])]
+    name = next((column for column in _NAMES if column in header), None)
+    pair = next((p for p in (("x", "y"), ("x_px", "y_px"), ("x_um", "y_um")) if set(p) <= set(header)), None)
+    if name is None or pair is None:
+        raise InputError(f"{file}: the first line must name the columns name, x, y (pixels) or name, x_um, y_um")
+    table = {}
+    for number, row in enumerate(csv.DictReader(lines, fieldnames=header), start=1):
+        if number == 1:
+            continue
+        try:
+            x, y = (float(row[column]) for column in pair)
+            if not (math.isfinite(x) and math.isfinite(y)):
+                raise ValueError
+        except (TypeError, ValueError):
+            raise InputError(f"{file}: line {number} has no numbers for {pair[0]} and {pair[1]}") from None
+        unit = 1.0 if pair[0].endswith("um") else None
+        table[canonical_text(Path(str(row[name]).strip()).name)] = StagePosition(x, y, unit)
+    missing = [item for item in names if item not in table]
+    if missing:
+        raise InputError(f"{file}: has no line for {missing[0]}; add one with its place")
+    return _grid([table[item] for item in names], size, pixel_size, Path(file).name)
+
+
+def grid_from_files(files: Sequence[Path], size: tuple[int, int], pixel_size: float | None) -> TileGrid:
+    """Places by what the files say: OME-XML, Micro-Manager's tags, or its ``metadata.txt`` beside them.
+
+    Raises
+    ------
+    InputError
+        When a file says nothing.
+    """
+    beside: dict[Path, dict[str, StagePosition]] = {}
+    found = []
+    for file in files:
+        position = position_of(file)
+        if position is None:
+            folder = file.parent
+            if folder not in beside:
+                beside[folder] = _micro_manager_file(folder / _METADATA_FILE)
+            position = beside[folder].get(canonical_name(file.name))
+        if position is None:
+            raise InputError(f"{file}: does not say where it was taken; {_HOW}")
+        found.append(position)
+    return _grid(found, size, pixel_size, "the files' metadata")
+
+
+def position_of(file: Path) -> StagePosition | None:
+    """Where a TIFF file says that it was taken; None where it says nothing."""
+    with decoding(file):
+        with open_regular(file) as stream:
+            if stream.read(4) not in TIFF_MAGIC:
+                return None
+            stream.seek(0)
+            with tifffile.TiffFile(stream, name=str(file)) as tiff:
+                ome, tag = tiff.ome_metadata, tiff.pages.first.tags.get("MicroManagerMetadata")
+        if ome:
+            found = ome_position(ome)
+            if found is not None:
+                return found
+        return None if tag is None else _micro_manager_position(tag.value)
+
+
+def ome_position(text: str) -> StagePosition | None:
+    """The place of the first image in OME-XML; None where it has none."""
+    try:
+        elements = list(ElementTree.fromstring(text).iter())
+    except ElementTree.ParseError:
+        return None
+    pixels = next((e for e in elements if _tag(e) == "Pixels"), None)
+    plane = next((e for e in elements if _tag(e) == "Plane" and {"PositionX", "PositionY"} <= e.attrib.keys()), None)
+    if pixels is None or plane is None:
+        return None
+    unit = plane.get("PositionXUnit", "µm")
+    size = pixels.get("PhysicalSizeX")
+    scale = _MICROMETRES.get(pixels.get("PhysicalSizeXUnit", "µm"))
+    return StagePosition(
+        float(plane.attrib["PositionX"]),
+        float(plane.attrib["PositionY"]),
+        # "reference frame" is what programs write that do not know the unit: pixels.
+        _MICROMETRES.get(unit),
+        float(size) * scale if size and scale else None,
+    )
+
+
+def _tag(element: ElementTree.Element) -> str:
+    return element.tag.rpartition("}")[2]
+
+
+def _micro_manager_file(file: Path) -> dict[str, StagePosition]:
+    """Places by file name in Micro-Manager's ``metadata.txt``; none where there is no such file."""
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    found = {}
+    for key, entry in content.items() if isinstance(content, dict) else ():
+        position = _micro_manager_position(entry) if isinstance(entry, dict) else None
+        if position is not None:
+            name = entry.get("FileName") or key.removeprefix("Metadata-")
+            found[canonical_text(Path(str(name)).name)] = position
+    return found
+
+
+def _micro_manager_position(entry: Any) -> StagePosition | None:
+    """A place among what Micro-Manager wrote of one image."""
+    try:
+        x, y = float(entry["XPositionUm"]), float(entry["YPositionUm"])
+        size = float(entry.get("PixelSizeUm") or 0.0)
+    except (TypeError, ValueError, LookupError, AttributeError):
+        return None
+    return StagePosition(x, y, 1.0, size or None)
+
+
+def _grid(found: Sequence[StagePosition], size: tuple[int, int], pixel_size: float | None, source: str) -> TileGrid:
+    """Places in pixels, whatever they were given in."""
+    pixel_size = pixel_size or next((item.pixel_size for item in found if item.pixel_size), None)
+    places = np.array([(item.x, item.y) for item in found], dtype=np.float64)
+    unit = found[0].unit
+    if unit is not None:
+        if pixel_size is None:
+            raise InputError(f"{source}: gives micrometres, but no file says how large a pixel is; add --pixel-size UM")
+        places *= unit / pixel_size
+    return TileGrid(places - places.min(axis=0), size, pixel_size, source)
+
+
+ORIENTATIONS: tuple[tuple[tuple[int, int], tuple[int, int]], ...] = (
+    ((1, 0), (0, 1)),
+    ((1, 0), (0, -1)),
+    ((-1, 0), (0, 1)),
+    ((-1, 0), (0, -1)),
+    ((0, 1), (1, 0)),
+    ((0, 1), (-1, 0)),
+    ((0, -1), (1, 0)),
+    ((0, -1), (-1, 0)),
+)
+"""How the axes of a stage may lie in the image: rows are what x and y of the image are of the stage's."""
+
+
+_CLEARLY = 1.2
+"""How many times the evidence other axes must have: of two where one is right, the pairs along it agree in both."""
+
+
+def oriented(grid: TileGrid, evidence: Callable[[TileGrid], float]) -> TileGrid:
+    """The grid with the axes of the stage as the tiles show them; unchanged unless others are shown clearly better."""
+    best, most = grid, _CLEARLY * evidence(grid)
+    for matrix in ORIENTATIONS[1:]:
+        places = grid.places @ np.array(matrix, dtype=np.float64).T
+        turned = TileGrid(places - places.min(axis=0), grid.size, grid.pixel_size, grid.source)
+        if (shown := evidence(turned)) > most:
+            best, most = turned, shown
+    return best

@@ -1,0 +1,308 @@
+"""From nominal places and tiles to all places: correlate, learn the stage, refine, adjust."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.io.reduction import block_mean
+from rdstitch.progress import Progress, silent
+from rdstitch.scipy_parts import csgraph, sparse
+from rdstitch.stage.adjustment import Adjustment, LinkedPoints, adjust
+from rdstitch.stage.correlation import Surfaces, correlate
+from rdstitch.stage.grid import TileGrid
+from rdstitch.stage.overlap import Overlap
+from rdstitch.stage.refinement import BlockMatches, refine
+
+Reader = Callable[[int], NDArray[Any]]
+"""Gives a tile as it is registered, (h, w)."""
+
+_COARSE_SIDE = 512
+"""Pixels of the longer side of a tile that are enough to find a displacement to a pixel of theirs."""
+
+_SEARCH = 0.05
+"""Displacement from the nominal place that is searched where the user does not say, share of the longer side."""
+
+_LENS_REACH = 0.02
+"""What the lens may displace the blocks of an overlap against each other besides, share of the longer side."""
+
+_LENSES = np.linspace(-0.04, 0.04, 21)
+"""Values of λ that are tried before it is estimated."""
+
+_FALSE_ALARMS = 1e-4
+"""Chance that the highest of all peaks of noise is taken for an overlap."""
+
+_LARGEST_REACH = 4.0
+"""Standard deviations of the stage within which a peak of little height is looked for."""
+
+_AGREES = 0.25
+"""Weight of a pair from which on it holds its tiles."""
+
+_PROBED = 16
+"""Pairs by which the axes of the stage are found."""
+
+_LEAST_BLOCK = 0.02
+"""Overlap that is compared at least, share of the longer side."""
+
+
+@dataclass(frozen=True)
+class TileRegistration:
+    """Where all tiles are, and what shows it.
+
+    Attributes
+    ----------
+    grid : TileGrid
+    adjustment : Adjustment
+    links : LinkedPoints
+        Blocks of all pairs that show something.
+    compared : ndarray of shape (Q, 2), int
+        All pairs that were compared.
+    linked : ndarray of shape (N,), bool
+        Tiles that links hold; the others have the place that the model of the stage gives them.
+    groups : tuple of tuple of int
+        Tiles that links hold together, the largest group first.
+    """
+
+    grid: TileGrid
+    adjustment: Adjustment
+    links: LinkedPoints
+    compared: IntArray
+    linked: BoolArray
+    groups: tuple[tuple[int, ...], ...]
+
+
+def register_tiles(
+    grid: TileGrid,
+    read: Reader,
+    *,
+    search: float | None = None,
+    distortion: float | None = None,
+    progress: Progress = silent,
+) -> TileRegistration:
+    """Find the places of all tiles.
+
+    Parameters
+    ----------
+    read : callable
+        Gives each tile (h, w); called twice for each, in their order.
+    search : float, optional
+        How far two neighbours may be from where they should be to each other, pixels.
+    distortion : float, optional
+        λ where it is known.
+    """
+    side = max(grid.size)
+    search = _SEARCH * side if search is None else search
+    pairs = grid.neighbours(search)
+    factor = max(1, round(side / _COARSE_SIDE))
+    radius, spare = max(2, math.ceil(search / factor)), math.ceil(_LENS_REACH * side / factor)
+    least = math.ceil(_LEAST_BLOCK * side)
+
+    def expected(pair: IntArray, places: FloatArray, scale: int) -> Overlap:
+        size = -(-grid.size[0] // scale), -(-grid.size[1] // scale)
+        first, second = pair.tolist()
+        return Overlap.expected(first, second, (places[second] - places[first]) / scale, size, least // scale)
+
+    overlaps = [expected(pair, grid.places, factor) for pair in pairs]
+    surfaces: list[Surfaces] = []
+    for number, (one, two) in enumerate(_in_pairs(lambda k: _coarse(read(k), factor), pairs)):
+        surfaces.append(correlate(one, two, overlaps[number], radius + spare))
+        progress("correlating", number + 1, len(pairs))
+    lens = _Lens(grid, factor)
+    known = _best_lens(surfaces, overlaps, lens, radius) if distortion is None else distortion
+    peaks = [_peak(s, o, lens.shifts(o, known), radius) for s, o in zip(surfaces, overlaps, strict=True)]
+    rough = _adjusted(grid, pairs, peaks, factor, search, known)
+    # Again, nearer to where the stage as it has shown itself puts them.
+    near = rough.places
+    std = max(rough.stage.std, factor / 2.0)
+    window = max(2, min(radius, math.ceil(_LARGEST_REACH * math.sqrt(2.0) * std / factor)))
+    peaks = [
+        _peak(s, o, lens.shifts(o, known), radius, ((near[p[1]] - near[p[0]]) / factor - o.offset, window))
+        for s, o, p in zip(surfaces, overlaps, pairs, strict=True)
+    ]
+    shown = [k for k, peak in enumerate(peaks) if peak is not None]
+    if not shown:
+        return _result(grid, pairs, [], rough)
+    rough = _adjusted(grid, pairs, peaks, factor, search, known)
+    matches: dict[int, BlockMatches] = {}
+    exact = _Lens(grid, 1)
+    for number, (one, two) in enumerate(_in_pairs(read, pairs[shown])):
+        peak = peaks[shown[number]]
+        assert peak is not None
+        pair = pairs[shown[number]]
+        overlap = expected(pair, _moved(grid.places, pair, peak.offset * factor), 1)
+        for cells in (overlap.cells(grid.size), overlap.whole):
+            cut = replace(overlap, blocks=cells)
+            displacements = peak.offset * factor + exact.shifts(cut, known)
+            found = refine(one, two, cells, displacements, factor + 1.5)
+            if len(found):
+                matches[shown[number]] = found
+                break
+        progress("refining", number + 1, len(shown))
+    if not matches:
+        return _result(grid, pairs, [], rough)
+    links = _links(pairs, matches)
+    std = search / 3.0
+    fitted = adjust(grid, links, std, 0.0 if distortion is None else distortion)
+    if distortion is None:
+        bent = adjust(grid, links, std, known, free_lens=True)
+        if fitted.cost(bent.noise) - bent.cost(bent.noise) > math.log(max(2, len(links.pair))):
+            fitted = bent
+        else:
+            fitted = replace(fitted, distortion_std=bent.distortion_std)
+    return _result(grid, pairs, links, fitted)
+
+
+def evidence(grid: TileGrid, *, read: Reader, search: float | None = None) -> float:
+    """How clearly some neighbours correlate where the grid has them, in heights of peaks above noise."""
+    side = max(grid.size)
+    search = _SEARCH * side if search is None else search
+    pairs = grid.neighbours(search)
+    if not len(pairs):
+        return 0.0
+    pairs = pairs[np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _PROBED)).astype(np.intp))]
+    factor = max(1, round(side / _COARSE_SIDE))
+    radius = max(2, math.ceil(search / factor))
+    size = -(-grid.size[0] // factor), -(-grid.size[1] // factor)
+    shown = 0.0
+    for pair, (one, two) in zip(pairs, _in_pairs(lambda k: _coarse(read(k), factor), pairs), strict=True):
+        offset = (grid.places[pair[1]] - grid.places[pair[0]]) / factor
+        overlap = Overlap.expected(int(pair[0]), int(pair[1]), offset, size, math.ceil(_LEAST_BLOCK * max(size)))
+        total = correlate(one, two, overlap, radius).total(np.zeros((len(overlap.blocks), 2)), radius)
+        shown += max(0.0, float(total.max()) - _threshold(total, radius))
+    return shown
+
+
+def _coarse(tile: NDArray[Any], factor: int) -> NDArray[np.float32]:
+    return np.asarray(block_mean(tile, factor), dtype=np.float32)
+
+
+def _in_pairs(read: Reader, pairs: IntArray) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+    """The tiles of each pair; each is read when it is first needed, and kept until its last pair has been."""
+    last = {int(tile): number for number, pair in enumerate(pairs) for tile in pair}
+    held: dict[int, NDArray[Any]] = {}
+    for number, pair in enumerate(pairs.tolist()):
+        for tile in pair:
+            if tile not in held:
+                held[tile] = read(tile)
+        yield held[pair[0]], held[pair[1]]
+        for tile in pair:
+            if last[tile] == number:
+                del held[tile]
+
+
+class _Lens:
+    """What a lens displaces blocks by."""
+
+    def __init__(self, grid: TileGrid, factor: int) -> None:
+        size = np.array(grid.size) / factor
+        self.center, self.scale = (size - 1.0) / 2.0, math.hypot(*size) / 2.0
+
+    def shifts(self, overlap: Overlap, distortion: float) -> FloatArray:
+        """Displacement of each block of an overlap (K, 2) by λ, mean 0."""
+        if distortion == 0.0:
+            return np.zeros((len(overlap.blocks), 2))
+        first = overlap.centers
+        bent = [self._bend(points, distortion) for points in (first, first - overlap.offset)]
+        shifts = bent[1] - bent[0]
+        return np.asarray(shifts - shifts.mean(axis=0))
+
+    def _bend(self, points: FloatArray, distortion: float) -> FloatArray:
+        away = (points - self.center) / self.scale
+        r2 = (away**2).sum(axis=1, keepdims=True)
+        return np.asarray(self.scale * away * (1.0 / (1.0 + distortion * r2) - 1.0))
+
+
+@dataclass(frozen=True)
+class _Peak:
+    """Where a pair correlates: the place of the second tile in the first, coarse pixels, and how clearly."""
+
+    offset: FloatArray
+    height: float
+
+
+def _best_lens(surfaces: Sequence[Surfaces], overlaps: Sequence[Overlap], lens: _Lens, radius: int) -> float:
+    """λ for which the blocks of all pairs agree best."""
+    heights = np.zeros(len(_LENSES))
+    usual = len(_LENSES) // 2
+    for surface, overlap in zip(surfaces, overlaps, strict=True):
+        tops = np.array([surface.total(lens.shifts(overlap, value), radius).max() for value in _LENSES])
+        if tops.max() > _threshold(surface.total(np.zeros((len(overlap.blocks), 2)), radius), radius):
+            heights += tops
+    return 0.0 if heights.max() <= heights[usual] else float(_LENSES[int(heights.argmax())])
+
+
+def _threshold(total: FloatArray, radius: int) -> float:
+    """Height that a peak of noise hardly reaches within a window."""
+    deviation = float(np.median(np.abs(total))) / 0.6745
+    return deviation * math.sqrt(2.0 * math.log((2 * radius + 1) ** 2 / _FALSE_ALARMS))
+
+
+def _peak(
+    surface: Surfaces,
+    overlap: Overlap,
+    shifts: FloatArray,
+    radius: int,
+    near: tuple[FloatArray, int] | None = None,
+) -> _Peak | None:
+    """The highest peak of a pair, if it is no noise; near an expected displacement, if that is given with a window."""
+    total = surface.total(shifts, radius)
+    middle, window = (np.zeros(2), radius) if near is None else near
+    low = np.clip(np.rint(middle).astype(int) - window + radius, 0, 2 * radius)
+    high = np.clip(np.rint(middle).astype(int) + window + radius + 1, 1, 2 * radius + 1)
+    part = total[low[1] : high[1], low[0] : high[0]]
+    y, x = np.unravel_index(int(part.argmax()), part.shape)
+    height = float(part[y, x])
+    if height < _threshold(total, window):
+        return None
+    return _Peak(overlap.offset + low + (x, y) - radius, height)
+
+
+def _moved(places: FloatArray, pair: IntArray, offset: FloatArray) -> FloatArray:
+    """The places with the second tile of a pair at an offset in the first."""
+    moved = places.copy()
+    moved[pair[1]] = moved[pair[0]] + offset
+    return moved
+
+
+def _adjusted(
+    grid: TileGrid, pairs: IntArray, peaks: Sequence[_Peak | None], factor: int, search: float, distortion: float
+) -> Adjustment:
+    """Places by the peaks alone."""
+    matches = {}
+    for number, peak in enumerate(peaks):
+        if peak is not None:
+            middle = (np.array(grid.size) - 1.0 + peak.offset * factor) / 2.0
+            information = np.eye(2)[None] / (factor / 2.0) ** 2
+            matches[number] = BlockMatches(middle[None], (middle - peak.offset * factor)[None], information)
+    return adjust(grid, _links(pairs, matches), search / 3.0, distortion)
+
+
+def _links(pairs: IntArray, matches: dict[int, BlockMatches]) -> LinkedPoints:
+    """What pairs show, as one."""
+    found = list(matches.values())
+    if not found:
+        return LinkedPoints(
+            np.empty(0, np.intp), np.empty((0, 2), np.intp), np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2, 2))
+        )
+    return LinkedPoints(
+        np.repeat(np.arange(len(found)), [len(match) for match in found]),
+        pairs[list(matches)],
+        np.concatenate([match.points1 for match in found]),
+        np.concatenate([match.points2 for match in found]),
+        np.concatenate([match.information for match in found]),
+    )
+
+
+def _result(grid: TileGrid, pairs: IntArray, links: Any, fitted: Adjustment) -> TileRegistration:
+    links = links or _links(pairs, {})
+    held = links.tiles[fitted.weights[: len(links.tiles)] > _AGREES]
+    joined = sparse.coo_matrix((np.ones(len(held)), held.T), shape=(len(grid),) * 2)
+    count, label = csgraph.connected_components(joined, directed=False)
+    groups = [np.flatnonzero(label == k) for k in range(count)]
+    groups = sorted((group for group in groups if len(group) > 1), key=len, reverse=True)
+    linked = np.isin(np.arange(len(grid)), held)
+    return TileRegistration(grid, fitted, links, pairs, linked, tuple(tuple(g.tolist()) for g in groups))

@@ -1,0 +1,67 @@
+"""``rdstitch tiles``, run for real on rendered tiles of a stage."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from rdstitch.synthetic.stage import StageGrid
+from tests.cli.running import Run
+
+STAGE = StageGrid(rows=3, columns=3, tile=256, overlap=0.15, content=0.8, backlash=4.0, seed=5)
+NAMED = ("--grid", "r{row}c{col}", "--overlap", "15")
+
+
+@pytest.fixture(scope="module")
+def slide(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of nine tiles."""
+    folder = tmp_path_factory.mktemp("slide")
+    STAGE.write(folder)
+    return folder
+
+
+def test_samples_of_the_mosaic_are_those_of_the_tiles(rdstitch: Run, slide: Path, tmp_path: Path) -> None:
+    output, table = tmp_path / "slide.tif", tmp_path / "places.csv"
+    done = rdstitch(
+        "tiles", slide, *NAMED, "-o", output, "--positions-only", table, "--report", tmp_path / "r.html", "-j", "1"
+    )
+    assert done.status == 0
+    mosaic = tifffile.imread(output)
+    rows = list(csv.DictReader(table.read_text(encoding="utf-8").splitlines()))
+    found = np.array([(float(row["x"]), float(row["y"])) for row in rows])
+    off = found - STAGE.places
+    assert np.linalg.norm(off - np.median(off, axis=0), axis=1).max() < 0.5
+    middle = STAGE.render(4)[60:-60, 60:-60]
+    x, y = np.rint(found[4]).astype(int) + 60
+    near = [
+        mosaic[y + dy : y + dy + middle.shape[0], x + dx : x + dx + middle.shape[1]]
+        for dy in (-1, 0, 1)
+        for dx in (-1, 0, 1)
+    ]
+    assert any(np.array_equal(part, middle) for part in near)
+    assert json.loads(output.with_name("slide.tif.json").read_text(encoding="utf-8"))["model"] == "rigid"
+
+
+def test_places_from_a_mirrored_stage_are_found_too(rdstitch: Run, slide: Path, tmp_path: Path) -> None:
+    lines = [f"r{r:02d}c{c:02d}.tif,{-x},{y}" for (r, c), (x, y) in zip(STAGE.cells, STAGE.nominal, strict=True)]
+    stage = tmp_path / "stage.csv"
+    stage.write_text("\n".join(["name,x,y", *lines]), encoding="utf-8")
+    table = tmp_path / "places.csv"
+    done = rdstitch("tiles", slide, "--positions", stage, "--positions-only", table, "-j", "1")
+    assert done.status == 0
+    rows = list(csv.DictReader(table.read_text(encoding="utf-8").splitlines()))
+    assert float(rows[0]["x"]) < float(rows[2]["x"])
+    assert not list(tmp_path.glob("*.json"))
+
+
+def test_wrong_places_are_refused_in_one_line(rdstitch: Run, slide: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out.tif"
+    done = rdstitch("tiles", slide, "--grid", "r{row}c{col}", "--overlap", "60", "-o", output)
+    assert (done.status, done.err.count("\n")) == (4, 1)
+    assert "--search" in done.err
+    assert not output.exists()
+    assert rdstitch("tiles", slide, "-o", output).status == 3
+    assert rdstitch("tiles", slide, *NAMED).status == 2
