@@ -11,7 +11,7 @@ from functools import cache, partial
 from pathlib import Path
 
 from rdstitch.errors import InputError
-from rdstitch.file_access import canonical_name, canonical_text, is_url, read_limited, remote_names
+from rdstitch.file_access import MAX_FILE, canonical_name, canonical_text, is_url, read_limited, read_text, remote_names
 from rdstitch.inputs.frame import Frame, Named, files_of
 from rdstitch.inputs.keyframes import wanted_frames
 from rdstitch.inputs.rosbag import extract_images, is_bag
@@ -19,7 +19,6 @@ from rdstitch.io.optional_readers import HEIF_SUFFIXES, RAW_SUFFIXES
 from rdstitch.io.staging import temporary_folder
 from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames, grey_frames
 from rdstitch.messages import Message, names_of, shortened
-from rdstitch.records import MAX_FILE, read_text
 
 _MAX_PATTERN = 4096  # characters: longer names no file has, and compiling a pattern takes the square of its length
 IMAGE_SUFFIXES = frozenset(

@@ -292,7 +292,7 @@ def test_what_an_option_names_to_be_read_is_never_replaced(rdstitch: Run, frames
     [
         ("rdstitch.report.page.report_page", "report.html"),
         ("rdstitch.pipeline.compose.viewer_page", "field.html"),
-        ("rdstitch.pipeline.recipes.camera_file_text", "camera.json"),
+        ("rdstitch.camera_files.camera_file_text", "camera.json"),
         ("rdstitch.export.georeference.Georeference.world_file_texts", "field.jgw"),
     ],
 )

@@ -26,7 +26,8 @@ NOISE = 2e-3
 
 def same(first: Solutions, second: Solutions, scale: float = 1.0, tolerance: float = 1e-7) -> None:
     """Whether all λ of both, the second's times ``scale``, are the same in nearly every sample: nearly double roots,
-    which come in twos, depend on rounding."""
+    which come in twos, depend on rounding.
+    """
     different = 0
     for sample in range(BATCH):
         a = first.distortion[first.sample == sample]
