@@ -8,6 +8,7 @@ whether or not a version number was raised; what is damaged is computed again.
 import hashlib
 import os
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,12 +22,12 @@ from typing import Any, Self, TypeVar
 from rdstitch.errors import ArgumentError, InputError, OutputError
 from rdstitch.file_access import is_url, open_regular, read_limited, remote_status
 from rdstitch.io.packing import digest, is_of, pack, unpack
-from rdstitch.io.staging import lock, remove_dead_files
 from rdstitch.stored import MAX_ENTRY, Stored, TemporaryFolder, entry_name
 
 Value = TypeVar("Value")
 
 _FORMAT = 1
+_ABANDONED_SECONDS = 3600.0  # since a process last wrote into an unfinished entry; it was killed
 _CORRUPT_ENTRY_ERRORS = (ValueError, LookupError, ArithmeticError)
 _OPENCV = tuple(f"opencv-{kind}" for kind in ("contrib-python-headless", "contrib-python", "python-headless", "python"))
 _PACKAGES = ("numpy", "scipy", *_OPENCV, "pillow", "simplejpeg", "tifffile")
@@ -270,12 +271,14 @@ def _write_at_once(file: Path, data: bytes) -> None:
         with suppress(FileExistsError):
             folder.mkdir()
             folder.chmod(mode)
-    remove_dead_files(file.parent)
+    for leftover in file.parent.glob(".*.part"):
+        with suppress(OSError):
+            if time.time() - leftover.stat().st_mtime > _ABANDONED_SECONDS:
+                leftover.unlink()
     handle, name = tempfile.mkstemp(prefix=".", suffix=".part", dir=file.parent)
     temporary = Path(name)
     try:
         with os.fdopen(handle, "wb") as stream:
-            lock(handle)
             stream.write(data)
         temporary.chmod(mode & 0o666)
         temporary.replace(file)

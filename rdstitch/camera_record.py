@@ -2,91 +2,84 @@
 
 import math
 from dataclasses import replace
+from typing import Annotated, Literal
 
-from rdstitch.camera import FILE_VERSION, LENS_PARAMETERS, Camera
-from rdstitch.errors import ArgumentError
-from rdstitch.records import Record
+from msgspec import Meta, Struct, field
 
+from rdstitch.camera import FILE_VERSION, Camera
+from rdstitch.records import NonNegative, Pair, Size, Triple
 
-def camera_from_record(record: Record) -> Camera:
-    """The camera that a record describes.
-
-    Raises
-    ------
-    InputError
-        When the record is something else; the text names the field.
-    """
-    if record["format"].value != "rdstitch camera" or record["version"].value not in range(1, FILE_VERSION + 1):
-        record.fail(f"is not an rdstitch camera of version 1 to {FILE_VERSION}")
-    source = None if record.get("focal_px") is None else "file"
-    return replace(
-        read_lens(record, record["image_size"].size(), source),
-        distortion_std=_deviation(record.get("lambda_std")),
-        lens_covariance=_read_covariance(record.get("lens_covariance")),
-        focal_std=_deviation(record.get("focal_std_px")),
-        tilt=_angles(record.get("tilt_deg")),
-        tilt_std=_angles(record.get("tilt_std_deg")),
-    )
+FocalSource = Literal["option", "file", "exif", "estimate", "guess"]
+_Row = tuple[float, float, float, float, float]
 
 
-def _deviation(record: Record | None) -> float | None:
-    """A standard deviation; None where there is none."""
-    if record is None:
-        return None
-    if not (value := record.number()) >= 0.0:
-        record.expected("a standard deviation, zero or more")
-    return value
+class LensRecord(Struct, kw_only=True):
+    """What of a camera depends on the size of the image, and λ with it."""
 
+    center_px: Pair | None = None
+    image_circle_px: float | None = None
+    lambda_: float | None = field(name="lambda", default=None)
+    # Version 1 had λ and μ only.
+    lambda2: float = 0.0
+    coefficients: Triple | None = None
+    focal_px: float | None = None
+    focal_source: FocalSource | None = None
 
-def _angles(record: Record | None) -> tuple[float, float] | None:
-    """Two angles of degrees, in radians; None where there are none."""
-    if record is None:
-        return None
-    psi, theta = record.pair()
-    return math.radians(psi), math.radians(theta)
+    def lens(self, size: tuple[int, int]) -> Camera:
+        """The lens on an image of a size; not how far it is determined.
 
-
-def read_lens(record: Record, size: tuple[int, int], focal_source: str | None) -> Camera:
-    """The lens that a record describes, on an image of a size; not how far it is determined.
-
-    Raises
-    ------
-    InputError
-        When a field is missing or wrong.
-    """
-    focal, circle = record.get("focal_px"), record.get("image_circle_px")
-    distortion, second, third = _read_coefficients(record)
-    try:
+        Raises
+        ------
+        ValueError
+            When there is none, or it is impossible.
+        """
+        if self.center_px is None or (self.coefficients is None and self.lambda_ is None):
+            raise ValueError(f"{'center_px' if self.center_px is None else 'lambda'} is missing")
+        distortion, second, third = self.coefficients or (self.lambda_ or 0.0, self.lambda2, 0.0)
         return Camera(
             image_size=size,
             distortion=distortion,
             distortion2=second,
             distortion3=third,
-            center=record["center_px"].pair(),
-            focal=None if focal is None else focal.number(),
-            focal_source=focal_source,
-            image_circle=None if circle is None else circle.number(),
+            center=self.center_px,
+            focal=self.focal_px,
+            focal_source=self.focal_source,
+            image_circle=self.image_circle_px,
         )
-    except ArgumentError as error:
-        record.fail(str(error))
 
 
-def _read_coefficients(record: Record) -> tuple[float, float, float]:
-    """λ, μ and ν of a record: ``coefficients``, or ``lambda`` and ``lambda2`` as version 1 has them."""
-    if (given := record.get("coefficients")) is None:
-        second = record.get("lambda2")
-        return record["lambda"].number(), 0.0 if second is None else second.number(), 0.0
-    values = given.numbers()
-    if len(values) != 3:
-        given.expected("three coefficients")
-    return values[0], values[1], values[2]
+class CameraRecord(LensRecord, kw_only=True):
+    """A camera file of rdstitch."""
+
+    format: Literal["rdstitch camera"]
+    version: Annotated[int, Meta(ge=1, le=FILE_VERSION)]
+    image_size: Size
+    lambda_std: NonNegative | None = None
+    lambda_fit_rms_px: NonNegative = 0.0
+    lambda_fit_largest_px: NonNegative = 0.0
+    lens_covariance: tuple[_Row, _Row, _Row, _Row, _Row] | None = None
+    lambda_px: float | None = None
+    lambda_focal: float | None = None
+    focal_std_px: NonNegative | None = None
+    tilt_deg: Pair | None = None
+    tilt_std_deg: Pair | None = None
+
+    def __post_init__(self) -> None:
+        self.camera()
+
+    def camera(self) -> Camera:
+        """The camera that it describes."""
+        lens = self.lens(self.image_size)
+        return replace(
+            lens,
+            focal_source=None if lens.focal is None else "file",
+            distortion_std=self.lambda_std,
+            lens_covariance=self.lens_covariance,
+            focal_std=self.focal_std_px,
+            tilt=_radians(self.tilt_deg),
+            tilt_std=_radians(self.tilt_std_deg),
+        )
 
 
-def _read_covariance(record: Record | None) -> tuple[tuple[float, ...], ...] | None:
-    """Rows of :attr:`Camera.lens_covariance`."""
-    if record is None:
-        return None
-    rows = tuple(row.numbers() for row in record.items())
-    if [len(row) for row in rows] != [len(LENS_PARAMETERS)] * len(LENS_PARAMETERS):
-        record.expected(f"{len(LENS_PARAMETERS)} rows of as many numbers")
-    return rows
+def _radians(angles: Pair | None) -> Pair | None:
+    return None if angles is None else (math.radians(angles[0]), math.radians(angles[1]))

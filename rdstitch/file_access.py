@@ -17,6 +17,10 @@ from io import BufferedReader, BytesIO
 from pathlib import Path
 from typing import Any
 
+from rdstitch.errors import InputError
+
+MAX_FILE = 256 * 2**20  # bytes of a text; a sidecar of ten thousand images has about 30 MB
+
 _BLOCK = 2**18  # bytes of a file that are fetched at a time where only its header is wanted
 _READ_AT_ONCE = 2**22  # bytes
 # Two letters or more: one is a drive.
@@ -190,3 +194,23 @@ def read_limited(path: str | Path, most: int, *, regular: bool = True) -> bytes:
     if left <= 0:
         raise OSError(errno.EFBIG, "too large to be such a file", str(path))
     return b"".join(blocks)
+
+
+def read_text(path: str | Path, *, regular: bool = True) -> str:
+    """The text of a file of a reasonable size.
+
+    Parameters
+    ----------
+    regular : bool
+        Refuse pipes and devices, of which reading may not come to an end.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read.
+    """
+    try:
+        # Names of files that are not UTF-8 are written as they are, and come back as they were.
+        return read_limited(path, MAX_FILE, regular=regular).decode("utf-8-sig", "surrogateescape")
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error

@@ -1,56 +1,39 @@
-"""Strict reading of JSON: every value is checked, and every complaint names the file and the field."""
+"""JSON and YAML as records: every value is checked by its type, and every complaint names the file and the field."""
 
 import json
 import math
-from collections.abc import Iterable, Iterator
-from pathlib import Path
-from typing import Any, Never, Self
+import re
+from collections.abc import Callable
+from typing import Annotated, Any, TypeVar
 
+import msgspec
 import numpy as np
-from numpy.typing import NDArray
+from msgspec import Meta
 
 from rdstitch.errors import InputError
-from rdstitch.file_access import read_limited
 
-MAX_FILE = 256 * 2**20  # bytes; a sidecar of ten thousand images has about 30 MB
-_MAX_SIDE = 10**7  # pixels
-_MIN_ENTRY, _MAX_ENTRY = 1e-30, 1e30  # of matrices
 _DEEPEST = 50  # objects and lists within one another
+_MAX_YAML = 2**20  # characters
+_MIN_ENTRY, _MAX_ENTRY = 1e-30, 1e30  # of matrices
+
+Kind = TypeVar("Kind")
+Count = Annotated[int, Meta(ge=0)]
+NonNegative = Annotated[float, Meta(ge=0.0)]
+Side = Annotated[int, Meta(ge=1, le=10**7)]
+Size = Annotated[tuple[Side, Side], Meta(description="width and height, px")]
+Pair = tuple[float, float]
+Triple = tuple[float, float, float]
+Matrix = Annotated[tuple[Triple, Triple, Triple], Meta(description="3 x 3, row by row")]
 
 
-def read_text(path: str | Path, *, regular: bool = True) -> str:
-    """The text of a file of a reasonable size.
-
-    Parameters
-    ----------
-    regular : bool
-        Refuse pipes and devices, of which reading may not come to an end.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read.
-    """
-    try:
-        # Names of files that are not UTF-8 are written as they are, and come back as they were.
-        return read_limited(path, MAX_FILE, regular=regular).decode("utf-8-sig", "surrogateescape")
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-
-
-def read_json(path: str | Path) -> "Record":
-    """A JSON file as a record to be taken apart.
+def parse_json(text: str, file: str) -> Any:
+    """JSON text as plain values; ``file`` is what messages call it.
 
     Raises
     ------
     InputError
-        When the file cannot be read or is no JSON.
+        When it is no JSON, is too deep to be walked through, or holds numbers that JSON cannot express.
     """
-    return parse_json(read_text(path), str(path))
-
-
-def parse_json(text: str, file: str) -> "Record":
-    """JSON text as a record; ``file`` is what messages call it."""
     try:
         value = json.loads(text)
     except json.JSONDecodeError as error:
@@ -58,161 +41,81 @@ def parse_json(text: str, file: str) -> "Record":
         raise InputError(f"{file}: is not JSON: {error.msg} at {where}") from error
     except (RecursionError, ValueError) as error:
         raise InputError(f"{file}: is not JSON that can be read: {error}") from error
-    _check(file, value)
-    return Record(file, "", value)
+    return _checked(value, file)
 
 
-def _check(file: str, value: Any) -> None:
-    """Refuse what is too deep to be walked through, and numbers that JSON cannot express."""
+def parse_yaml(text: str, file: str) -> Any:
+    """YAML text as plain values, also as OpenCV writes it; see :func:`parse_json`."""
+    import yaml
+
+    class Loader(yaml.SafeLoader):
+        """Knows OpenCV's matrices, which are objects."""
+
+    Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", yaml.SafeLoader.construct_yaml_map)  # type: ignore[type-var]
+    if len(text) > _MAX_YAML:
+        raise InputError(f"{file}: is too large for a camera file")
+    try:
+        # OpenCV's directive has a colon where the standard has a space.
+        return _checked(yaml.load(re.sub(r"^%YAML:.*", "", text), Loader), file)
+    except yaml.MarkedYAMLError as error:
+        line = 0 if error.problem_mark is None else error.problem_mark.line + 1
+        raise InputError(f"{file}: line {line}: is not YAML: {error.problem}; no camera file?") from error
+    except (yaml.YAMLError, RecursionError, ValueError, TypeError, LookupError) as error:
+        raise InputError(f"{file}: is not YAML that can be read: {error}") from error
+
+
+def convert(value: Any, kind: Callable[..., Kind], file: str, field: str = "", *, strict: bool = True) -> Kind:
+    """Plain values as a record.
+
+    Parameters
+    ----------
+    kind : type
+        A msgspec struct or dataclass; further fields are ignored.
+    field : str
+        Where in the file the value is, such as ``images[2].size``; empty for the whole.
+    strict : bool
+        Refuse texts as numbers.
+
+    Raises
+    ------
+    InputError
+        When a field is missing or wrong; the text names it.
+    """
+    try:
+        return msgspec.convert(value, kind, strict=strict)  # type: ignore[no-any-return]
+    except msgspec.ValidationError as error:
+        problem, _, path = str(error).partition(" - at `$")
+        if missing := re.fullmatch(r"Object missing required field `(.*)`", problem):
+            path, problem = f"{path.rstrip('`')}.{missing[1]}", "is missing"
+        place = (field + path.rstrip("`")).lstrip(".")
+        raise InputError(": ".join(filter(None, (file, place, problem[:1].lower() + problem[1:])))) from error
+    except (UnicodeError, OverflowError) as error:
+        raise InputError(f"{file}: cannot be read: {error}") from error
+
+
+def check_invertible(matrix: tuple[Triple, Triple, Triple], name: str) -> None:
+    """Refuse a matrix that has no inverse, or of which products are no numbers.
+
+    Raises
+    ------
+    ValueError
+        Which makes the record that it belongs to a wrong one.
+    """
+    largest = float(np.abs(matrix).max())
+    if not (_MIN_ENTRY <= largest <= _MAX_ENTRY and np.linalg.cond(np.array(matrix) / largest) < 1e12):
+        raise ValueError(f"{name} is singular, or not of reasonable size")
+
+
+def _checked(value: Any, file: str) -> Any:
     containers: list[tuple[str, int, Any]] = [("", 1, {"": value})]
     while containers:
         field, depth, container = containers.pop()
         if depth > _DEEPEST:
             raise InputError(f"{file}: {field}: is nested too deeply")
         for key, item in container.items() if isinstance(container, dict) else enumerate(container):
+            name = f"{field}[{key}]" if isinstance(container, list) else f"{field}.{key}".lstrip(".")
             if isinstance(item, float) and not math.isfinite(item):
-                raise InputError(f"{file}: {_within(field, key)}: expected a finite number, not {item}")
+                raise InputError(f"{file}: {name}: expected a finite number, not {item}")
             if isinstance(item, (dict, list)):
-                containers.append((_within(field, key), depth + 1, item))
-
-
-def _within(field: str, key: str | int) -> str:
-    """Name of a field of a field."""
-    if isinstance(key, int):
-        return f"{field}[{key}]"
-    return f"{field}.{key}" if field else key
-
-
-class Record:
-    """A value of a JSON file with its place in it; every reading method raises InputError for what it does not expect.
-
-    Parameters
-    ----------
-    file : str
-        Name of the file, for messages.
-    field : str
-        Where in the file the value is, such as ``images[2].size``; empty for the whole.
-    value : object
-        What :func:`json.loads` gives.
-    """
-
-    def __init__(self, file: str, field: str, value: Any) -> None:
-        self.file, self.field, self.value = file, field, value
-
-    def fail(self, problem: str) -> Never:
-        """Refuse the value."""
-        raise InputError(f"{self.file}: {self.field or 'the content'}: {problem}")
-
-    def expected(self, what: str) -> Never:
-        """Refuse the value since it is something else."""
-        shown = json.dumps(self.value, ensure_ascii=False, default=str)
-        self.fail(f"expected {what}, not {shown if len(shown) <= 60 else shown[:57] + '...'}")
-
-    def __getitem__(self, key: str) -> Self:
-        """The value of a key that must be there."""
-        fields = self.fields()
-        if key not in fields:
-            self._child(key, None).fail("is missing")
-        return fields[key]
-
-    def get(self, key: str) -> Self | None:
-        """The value of a key; None where it is missing or null."""
-        found = self.fields().get(key)
-        return None if found is None or found.value is None else found
-
-    def fields(self) -> dict[str, Self]:
-        """The values of an object by their keys."""
-        if not isinstance(self.value, dict):
-            self.expected("an object {...}")
-        return {key: self._child(key, value) for key, value in self.value.items()}
-
-    def items(self) -> Iterator[Self]:
-        """The values of a list."""
-        if not isinstance(self.value, list):
-            self.expected("a list [...]")
-        for index, value in enumerate(self.value):
-            yield type(self)(self.file, _within(self.field, index), value)
-
-    def text(self) -> str:
-        """A string."""
-        if not isinstance(self.value, str):
-            self.expected("a text")
-        return self.value
-
-    def choice(self, allowed: Iterable[str]) -> str:
-        """One of several strings."""
-        known = tuple(allowed)
-        if self.value not in known:
-            self.expected("one of " + ", ".join(known))
-        return str(self.value)
-
-    def flag(self) -> bool:
-        """True or false."""
-        if not isinstance(self.value, bool):
-            self.expected("true or false")
-        return self.value
-
-    def integer(self, least: int | None = None) -> int:
-        """A whole number, also where it is written as 3.0."""
-        value = self.value
-        if isinstance(value, float) and value.is_integer() and abs(value) < 2**53:
-            value = int(value)
-        if isinstance(value, bool) or not isinstance(value, int) or (least is not None and value < least):
-            self.expected("a whole number" + ("" if least is None else f" of at least {least}"))
-        return int(value)
-
-    def number(self) -> float:
-        """A finite number."""
-        if isinstance(self.value, bool) or not isinstance(self.value, (int, float)):
-            self.expected("a number")
-        try:
-            value = float(self.value)
-        except OverflowError:
-            self.expected("a number of reasonable size")
-        if not math.isfinite(value):
-            self.expected("a finite number")
-        return value
-
-    def numbers(self, count: int | None = None) -> tuple[float, ...]:
-        """A list of finite numbers, so many of them."""
-        values = tuple(item.number() for item in self.items())
-        if count is not None and len(values) != count:
-            self.expected(f"{count} numbers")
-        return values
-
-    def pair(self) -> tuple[float, float]:
-        """Two finite numbers."""
-        first, second = self.numbers(2)
-        return first, second
-
-    def size(self) -> tuple[int, int]:
-        """Width and height of an image, pixels."""
-        values = [item.side() for item in self.items()]
-        if len(values) != 2:
-            self.expected("width and height in pixels")
-        return values[0], values[1]
-
-    def side(self) -> int:
-        """Width or height of an image, pixels."""
-        value = self.integer(1)
-        if value > _MAX_SIDE:
-            self.expected("a width or height in pixels")
-        return value
-
-    def matrix(self) -> NDArray[np.float64]:
-        """A 3 x 3 matrix that can be inverted."""
-        rows = [row.numbers(3) for row in self.items()]
-        if len(rows) != 3:
-            self.expected("three rows of three numbers")
-        array = np.array(rows, dtype=np.float64)
-        # Products of several of them must be numbers too.
-        if not _MIN_ENTRY <= np.abs(array).max() <= _MAX_ENTRY:
-            self.fail(f"the matrix needs entries of {_MIN_ENTRY:g} to {_MAX_ENTRY:g}")
-        with np.errstate(all="ignore"):
-            scale = np.abs(array).max()
-            if scale == 0.0 or not np.linalg.cond(array / scale) < 1e12:
-                self.fail("the matrix is singular")
-        return array
-
-    def _child(self, key: str, value: Any) -> Self:
-        return type(self)(self.file, _within(self.field, key), value)
+                containers.append((name, depth + 1, item))
+    return value

@@ -76,7 +76,7 @@ def _apply(context: click.Context, option: click.Parameter, path: Path | None) -
 
 
 def _parse(path: Path) -> dict[str, Any]:
-    from rdstitch.records import read_text
+    from rdstitch.file_access import read_text
 
     try:
         return tomllib.loads(read_text(path))

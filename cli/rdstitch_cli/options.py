@@ -26,7 +26,7 @@ from rdstitch_cli.terminal import Reporter
 Command = TypeVar("Command", bound=Callable[..., Any])
 Decorator = Callable[[Command], Command]
 
-FEATURES = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk", "aliked")
+FEATURES = ("rootsift", "sift", "surf", "orb", "akaze", "aliked")
 SOLVERS = ("auto", "two-point", "three-point", "three-point-similarity", "four-point", "five-point")
 LENSES = ("auto", "division", "division-center", "division2", "division3")
 MODELS = ("auto", "rigid", "similarity", "tilting", "pose", "homography", "rotation")

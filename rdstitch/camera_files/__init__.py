@@ -15,41 +15,35 @@
 What is written follows from the name, as above; what is read is known by its content.
 """
 
-import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any, TypeVar
 
 from rdstitch.camera import Camera
+from rdstitch.camera_files import writing
+from rdstitch.camera_files.fitting import CameraFile
 from rdstitch.camera_files.hugin import hugin_project, is_hugin, read_hugin
 from rdstitch.camera_files.lens_fit import LensFit
-from rdstitch.camera_files.opencv import (
+from rdstitch.camera_files.reading import (
     ImageSize,
+    colmap_cameras,
     is_opencv,
-    opencv_fisheye_yaml,
-    opencv_json,
-    opencv_yaml,
-    parse_yaml,
-    read_opencv,
-)
-from rdstitch.camera_files.opendronemap import is_opendronemap, opendronemap_json, read_opendronemap
-from rdstitch.camera_files.own_camera import CameraFile, read_comments
-from rdstitch.camera_files.text_formats import (
-    camera_chain_yaml,
-    camera_info_yaml,
-    colmap_text,
-    is_colmap,
-    is_kalibr,
     read_colmap,
     read_kalibr,
+    read_opencv,
+    read_opendronemap,
 )
-from rdstitch.camera_record import camera_from_record
-from rdstitch.errors import OutputError
+from rdstitch.camera_record import CameraRecord
+from rdstitch.errors import ArgumentError, InputError, OutputError
+from rdstitch.file_access import read_text
 from rdstitch.io.atomic import text_bytes, write_bytes_atomic
-from rdstitch.records import parse_json, read_text
+from rdstitch.records import convert, parse_json, parse_yaml
 
 __all__ = ["CAMERA_SUFFIXES", "CameraFile", "LensFit", "export_note", "load_camera", "read_camera_file", "save_camera"]
+
+Value = TypeVar("Value")
 
 CAMERA_SUFFIXES = (".json", ".yml", ".yaml", ".pto", ".txt")
 """How names of camera files end, lower case."""
@@ -96,22 +90,46 @@ def read_camera_file(path: str | Path, image_size: ImageSize | None = None) -> C
         When the file cannot be read, is no camera file, or tells of a lens that λ cannot describe.
     """
     text, file = read_text(path), str(path)
-    if text.lstrip().startswith("{"):
-        record = parse_json(text, file)
-        if is_opencv(record):
-            return read_opencv(record, image_size)
-        if is_opendronemap(record):
-            return read_opendronemap(record)
-        return CameraFile(camera_from_record(record), "rdstitch")
-    if is_hugin(text):
-        return read_hugin(text, file)
-    if (own := read_comments(text, file, "rdstitch")) is not None:
-        return own
-    if is_colmap(text):
-        return read_colmap(text, file)
-    if is_kalibr(text):
-        return read_kalibr(text, file)
-    return read_opencv(parse_yaml(text, file), image_size)
+    try:
+        if text.lstrip().startswith("{"):
+            return _of_content(parse_json(text, file), file, image_size)
+        own = next((line for line in text.splitlines() if line.startswith(writing.OWN_COMMENT)), None)
+        if own is not None:
+            return _own(parse_json(own.removeprefix(writing.OWN_COMMENT), file), file)
+        if is_hugin(text):
+            return read_hugin(text, file)
+        if cameras := colmap_cameras(text):
+            return read_colmap(_only(cameras), file)
+        return _of_content(parse_yaml(text, file), file, image_size)
+    except ArgumentError as error:
+        raise InputError(f"{file}: {error}") from error
+
+
+def _of_content(content: Any, file: str, image_size: ImageSize | None) -> CameraFile:
+    """The camera of plain values, whosever they are."""
+    if is_opencv(content):
+        if (own := content.get(writing.OWN)) is not None:
+            return _own(own, file, writing.OWN)
+        return read_opencv(content, file, image_size)
+    entries = content.items() if isinstance(content, dict) else ()
+    for key, read in (("projection_type", read_opendronemap), ("camera_model", read_kalibr)):
+        if found := [(name, entry) for name, entry in entries if isinstance(entry, dict) and key in entry]:
+            name, entry = _only(found)
+            if (own := entry.get(writing.OWN)) is not None:
+                return _own(own, file, f"{name}.{writing.OWN}")
+            return read(entry, file, str(name))
+    return _own(content, file)
+
+
+def _only(cameras: Sequence[Value]) -> Value:
+    if len(cameras) > 1:
+        raise ArgumentError(f"holds {len(cameras)} cameras; keep the one that took the images")
+    return cameras[0]
+
+
+def _own(content: Any, file: str, field: str = "") -> CameraFile:
+    """What rdstitch wrote, alone or into the file of others."""
+    return CameraFile(convert(content, CameraRecord, file, field).camera(), "rdstitch")
 
 
 def save_camera(camera: Camera, path: str | Path) -> None:
@@ -161,25 +179,21 @@ def _writer(path: Path) -> Callable[[Camera], str]:
     raise OutputError(f"{path}: not the name of a camera file; use one of {' '.join(CAMERA_SUFFIXES)}")
 
 
-def _own_json(camera: Camera) -> str:
-    return json.dumps(camera.as_dict(), indent=2) + "\n"
-
-
 _WRITERS: dict[str, Callable[[Camera], str]] = {
-    "cameras.json": opendronemap_json,
-    "opencv.json": opencv_json,
-    "*.opencv.json": opencv_json,
-    "?*.json": _own_json,
-    "camera_info.yml": camera_info_yaml,
-    "camera_info.yaml": camera_info_yaml,
-    "camchain.yaml": camera_chain_yaml,
-    "fisheye.yml": opencv_fisheye_yaml,
-    "fisheye.yaml": opencv_fisheye_yaml,
-    "*.fisheye.yml": opencv_fisheye_yaml,
-    "*.fisheye.yaml": opencv_fisheye_yaml,
-    "?*.yml": opencv_yaml,
-    "?*.yaml": opencv_yaml,
-    "cameras.txt": colmap_text,
+    "cameras.json": writing.opendronemap_json,
+    "opencv.json": writing.opencv_json,
+    "*.opencv.json": writing.opencv_json,
+    "?*.json": writing.own_json,
+    "camera_info.yml": writing.camera_info_yaml,
+    "camera_info.yaml": writing.camera_info_yaml,
+    "camchain.yaml": writing.camera_chain_yaml,
+    "fisheye.yml": writing.opencv_fisheye_yaml,
+    "fisheye.yaml": writing.opencv_fisheye_yaml,
+    "*.fisheye.yml": writing.opencv_fisheye_yaml,
+    "*.fisheye.yaml": writing.opencv_fisheye_yaml,
+    "?*.yml": writing.opencv_yaml,
+    "?*.yaml": writing.opencv_yaml,
+    "cameras.txt": writing.colmap_text,
     "?*.pto": hugin_project,
 }
 """By the name of the file, the first that fits."""

@@ -7,18 +7,20 @@ the undistorted radius is that of an equidistant one.
 
 import math
 import re
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta, Struct
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
+from rdstitch.camera_files.fitting import CameraFile, fitted_camera
 from rdstitch.camera_files.lens_fit import LensFit, LensSamples
 from rdstitch.camera_files.lens_models import CLOSE
-from rdstitch.camera_files.own_camera import CameraFile, comments, fitted_camera, read_comments
-from rdstitch.errors import InputError
-from rdstitch.records import Record
+from rdstitch.camera_files.writing import comments
+from rdstitch.errors import ArgumentError
+from rdstitch.records import Side, convert
 
-_KIND = "Hugin"
 _POWERS = (4, 3, 2)
 _RECTILINEAR, _CIRCULAR_FISHEYE, _FISHEYE = 0, 2, 3
 _PARAMETER = re.compile(r"([A-Za-z]+)(\"[^\"]*\"|\S*)")
@@ -32,36 +34,44 @@ def is_hugin(text: str) -> bool:
     return re.search(r"^(?:[pimo] |# hugin)", text, re.MULTILINE) is not None
 
 
+class _Image(Struct, kw_only=True):
+    """The parameters of an image line that describe its lens."""
+
+    f: int
+    w: Side
+    h: Side
+    v: Annotated[float, Meta(gt=0.0, lt=180.0, description="field of view, degrees")]
+    a: float = 0.0
+    b: float = 0.0
+    c: float = 0.0
+    d: float = 0.0
+    e: float = 0.0
+
+
 def read_hugin(text: str, file: str) -> CameraFile:
-    """The lens of the first image; without rdstitch's own line, λ is fitted.
+    """The lens of the first image, to which λ is fitted.
 
     Raises
     ------
-    InputError
+    InputError, ArgumentError
         When there is no image, a parameter is wrong, or the lens is neither a rectilinear one nor a fisheye.
     """
-    if (own := read_comments(text, file, _KIND)) is not None:
-        return own
     image = next((line for line in text.splitlines() if line.startswith("i ")), None)
     if image is None:
-        raise InputError(f"{file}: has no image line, and so no lens")
-    lens = Record(file, "the first image", {name: _number(value) for name, value in _PARAMETER.findall(image[2:])})
-    projection = lens["f"].integer()
-    if projection not in (_RECTILINEAR, _CIRCULAR_FISHEYE, _FISHEYE):
-        lens["f"].fail("only rectilinear lenses (f0) and fisheyes (f2, f3) are known here")
+        raise ArgumentError("has no image line, and so no lens")
+    lens = convert(dict(_PARAMETER.findall(image[2:])), _Image, file, strict=False)
+    if lens.f not in (_RECTILINEAR, _CIRCULAR_FISHEYE, _FISHEYE):
+        raise ArgumentError("f: only rectilinear lenses (f0) and fisheyes (f2, f3) are known here")
+    projection, a, b, c = lens.f, lens.a, lens.b, lens.c
     bend = np.positive if projection == _RECTILINEAR else np.arctan
-    size = (lens["w"].side(), lens["h"].side())
-    a, b, c, d, e = (0.0 if lens.get(name) is None else lens[name].number() for name in "abcde")
-    view = lens["v"].number()
-    if not 0.0 < view < 180.0:
-        lens["v"].expected("a field of view between 0 and 180 degrees")
-    center, unit = ((size[0] - 1) / 2 + d, (size[1] - 1) / 2 + e), min(size) / 2
+    size = (lens.w, lens.h)
+    center, unit = ((size[0] - 1) / 2 + lens.d, (size[1] - 1) / 2 + lens.e), min(size) / 2
     linear = 1.0 - a - b - c
     if linear <= 0.0:
-        lens.fail("a + b + c must be below 1")
+        raise ArgumentError("a + b + c must be below 1")
 
     # Tangents of the half field of view for a rectilinear lens, angles for a fisheye.
-    half_view = math.radians(view) / 2
+    half_view = math.radians(lens.v) / 2
     focal = size[0] / 2 / (math.tan(half_view) if projection == _RECTILINEAR else half_view) * linear
 
     def forward(points: FloatArray) -> FloatArray:
@@ -73,7 +83,7 @@ def read_hugin(text: str, file: str) -> CameraFile:
         result: FloatArray = np.where(radius > 0.0, bent / np.maximum(radius, 1e-300), focal) * rays + center
         return result
 
-    return fitted_camera(lens, _KIND, forward, size, center, focal)
+    return fitted_camera(forward, "Hugin", size, center, focal)
 
 
 def hugin_project(camera: Camera) -> str:
@@ -106,11 +116,3 @@ def _fit(samples: LensSamples, straight: FloatArray, unit: float) -> tuple[Float
     """Coefficients of :data:`_POWERS`, in ``unit``, that turn ideal radii (N,), focal lengths, into measured ones."""
     size = samples.focal / unit
     return samples.fit(straight, (straight[:, None] * size) ** np.array(_POWERS) / size)
-
-
-def _number(text: str) -> float | str:
-    """A parameter's value; what is no number stays a text, to be complained about where it matters."""
-    try:
-        return float(text)
-    except ValueError:
-        return text

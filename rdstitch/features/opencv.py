@@ -112,10 +112,9 @@ def create_detector(options: FeatureOptions) -> Any:
         if kind == "orb":
             # Many more than wanted, because ORB keeps the strongest of the whole image and we spread them.
             return cv2.ORB.create(nfeatures=8 * options.limits[0], fastThreshold=options.orb_fast_threshold)
-        name = f"{kind.upper()}_create"
-        # OpenCV 5 moved these to xfeatures2d.
-        create = getattr(cv2 if hasattr(cv2, name) else cv2.xfeatures2d, name)
-        return create(thresh=options.brisk_threshold) if kind == "brisk" else create(threshold=options.kaze_threshold)
+        # OpenCV 5 moved it to xfeatures2d.
+        namespace: Any = cv2 if hasattr(cv2, "AKAZE_create") else cv2.xfeatures2d
+        return namespace.AKAZE_create(threshold=options.akaze_threshold)
     except (AttributeError, cv2.error) as error:
         raise ArgumentError(
             f"features {options.kind!r} are not in this OpenCV ({cv2.__version__}); choose others"

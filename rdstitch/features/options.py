@@ -6,7 +6,7 @@ from typing import Literal, Self
 
 from rdstitch.errors import ArgumentError
 
-KINDS = ("rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk", "aliked")
+KINDS = ("rootsift", "sift", "surf", "orb", "akaze", "aliked")
 WORK_MEGAPIXELS = 0.6
 """10⁶ pixels to which images of a large set are halved unless it is said otherwise."""
 MAX_FEATURES = 2000
@@ -27,7 +27,7 @@ class FeatureOptions:
     Attributes
     ----------
     kind : str
-        "rootsift", "sift", "surf", "orb", "akaze", "kaze", "brisk" or "aliked".
+        "rootsift", "sift", "surf", "orb", "akaze" or "aliked".
     max_features : int, optional
         Keypoints kept per image; None: 2,000, and more where there are few images, see :meth:`for_images`.
     work_megapixels : float or "auto", optional
@@ -58,10 +58,8 @@ class FeatureOptions:
         Place blobs by Gaussian derivatives; False: by box filters alone, as the paper does.
     orb_fast_threshold : int
         Grey levels by which a corner must differ from its surroundings.
-    kaze_threshold : float
-        Least response of KAZE and AKAZE; 0.001 is OpenCV's.
-    brisk_threshold : int
-        Grey levels by which a corner must differ; 30 is OpenCV's.
+    akaze_threshold : float
+        Least response of AKAZE; 0.001 is OpenCV's.
     aliked_model : path, optional
         ONNX file of the network of "aliked".
     aliked_size : int
@@ -88,8 +86,7 @@ class FeatureOptions:
     surf_upright: bool = False
     surf_refine: bool = True
     orb_fast_threshold: int = 7
-    kaze_threshold: float = 0.0005
-    brisk_threshold: int = 25
+    akaze_threshold: float = 0.0005
     aliked_model: str | Path | None = None
     aliked_size: int = 640
 

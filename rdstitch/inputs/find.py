@@ -11,16 +11,14 @@ from functools import cache, partial
 from pathlib import Path
 
 from rdstitch.errors import InputError
-from rdstitch.file_access import canonical_name, canonical_text, is_url, read_limited, remote_names
+from rdstitch.file_access import MAX_FILE, canonical_name, canonical_text, is_url, read_limited, read_text, remote_names
 from rdstitch.inputs.frame import Frame, Named, files_of
 from rdstitch.inputs.keyframes import wanted_frames
 from rdstitch.inputs.rosbag import extract_images, is_bag
-from rdstitch.io.fingerprint import interrupted_outputs
 from rdstitch.io.optional_readers import HEIF_SUFFIXES, RAW_SUFFIXES
 from rdstitch.io.staging import temporary_folder
 from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames, grey_frames
 from rdstitch.messages import Message, names_of, shortened
-from rdstitch.records import MAX_FILE, read_text
 
 _MAX_PATTERN = 4096  # characters: longer names no file has, and compiling a pattern takes the square of its length
 IMAGE_SUFFIXES = frozenset(
@@ -123,18 +121,13 @@ def find_images(
     outputs: list[Path] = []
     notes: list[Message] = []
     containers: list[Path] = []
-    interrupted = cache(interrupted_outputs)
     found = list(_expand(arguments, frames_folder, every, notes, containers, topic))
     stills = [(item, named) for item, named in found if not isinstance(item, _Clip)]
     if every is None and stills:
         notes += [item.among(len(stills)) for item, _ in found if isinstance(item, _Clip)]
         found = list(stills)
     for frame, named in ((frame, named) for item, named in found for frame in _frames_of(item)):
-        is_output = (
-            frame.image is None
-            and not is_url(frame.path)
-            and (is_rdstitch_output(frame.path) or frame.path.name in interrupted(frame.path.parent))
-        )
+        is_output = frame.image is None and not is_url(frame.path) and is_rdstitch_output(frame.path)
         if _entry(frame.path) in unwanted and is_output:
             continue
         if is_output and not named:

@@ -11,11 +11,10 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
-from rdstitch.file_access import canonical_text
+from rdstitch.file_access import canonical_text, read_text
 from rdstitch.inputs.source import Source
 from rdstitch.orientation import turning_matrix
 from rdstitch.planar_motion import tilt_from_normal, turned_tilt
-from rdstitch.records import read_text
 
 XMP = "xmp"
 """The value of ``attitude`` that stands for the images' own XMP."""

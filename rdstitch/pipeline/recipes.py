@@ -9,7 +9,6 @@ from typing import Literal
 
 from rdstitch.alignment.stored_frame import stored, turned_alignment
 from rdstitch.alignment.trajectory import Trajectory
-from rdstitch.camera_files import CAMERA_SUFFIXES, camera_file_text
 from rdstitch.errors import RegistrationError
 from rdstitch.export.trajectory_files import WRITERS, TrajectoryFrame, frame_of, has_times, path_as_svg
 from rdstitch.inputs.find import found_images
@@ -291,6 +290,8 @@ def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Se
         check_output(output, options.overwrite, inputs)
         check_output(f"{output}.json", options.overwrite, inputs, suffixes=())
     if options.save_camera is not None:
+        from rdstitch.camera_files import CAMERA_SUFFIXES
+
         check_output(options.save_camera, options.overwrite, inputs, suffixes=CAMERA_SUFFIXES)
         check_distinct([options.save_camera, *([] if output is None else [f"{output}.json"])])
 
@@ -373,4 +374,6 @@ def _finished(registration: Registration) -> Registration:
 
 def _save_camera(registration: Registration, options: StitchOptions, outputs: Outputs) -> None:
     if options.save_camera is not None:
+        from rdstitch.camera_files import camera_file_text
+
         outputs.write(options.save_camera, text_bytes(camera_file_text(registration.camera, options.save_camera)))

@@ -1,26 +1,26 @@
 """Reading a sidecar: a registration that was found before, checked field by field."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import FOCAL_LOG_STD, Camera
-from rdstitch.camera_record import read_lens
+from rdstitch.camera import Camera
 from rdstitch.compositing import CompositeOptions
-from rdstitch.compositing.options import PROJECTIONS
-from rdstitch.errors import ArgumentError
+from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.crs import Crs
 from rdstitch.export.georeference import Georeference
+from rdstitch.file_access import read_text
 from rdstitch.io.deepzoom import tiles_folder
 from rdstitch.io.fingerprint import Fingerprint, fingerprint
 from rdstitch.local_alignment import DisplacementField
-from rdstitch.records import Record, read_json
 from rdstitch.sidecar.write import VERSION
+
+if TYPE_CHECKING:
+    from rdstitch.sidecar.schema import ImageRecord, OutputRecord
 
 
 @dataclass(frozen=True)
@@ -84,31 +84,35 @@ class SavedRegistration:
 
 
 def read_sidecar(path: str | Path) -> SavedRegistration:
-    """Read a sidecar; fields that recomposing does not need are kept but not looked into.
+    """Read a sidecar; every field that is there is checked.
 
     Raises
     ------
     InputError
         When the file cannot be read, is no sidecar, or a field is not what it should be; the text names both.
     """
-    record = read_json(path)
-    if (kind := record["format"]).value != "rdstitch sidecar":
-        kind.expected('"rdstitch sidecar"')
-    if (version := record["version"]).value not in range(1, VERSION + 1):
-        version.fail(f"this rdstitch reads versions 1 to {VERSION} of sidecars, not {version.value}")
-    record["verdict"].fields()
-    _check_output(record["output"])
-    images = tuple(_image(item) for item in record["images"].items())
-    return SavedRegistration(
-        Path(path),
-        images,
-        _reference(record["reference"], images),
-        record["lambda"].number(),
-        record["model"].text() == "rotation",
-        _as_laid_out(_composite_options(record["options"]["composite"]), record),
-        _place(record["output"]),
-        record.value,
-    )
+    # Imported late: no other command should wait for it.
+    from rdstitch.records import convert, parse_json
+    from rdstitch.sidecar.schema import SidecarRecord
+
+    content = parse_json(read_text(path), str(path))
+    if isinstance(content, dict) and isinstance(found := content.get("version"), int) and found > VERSION:
+        raise InputError(f"{path}: version: this rdstitch reads versions 1 to {VERSION} of sidecars, not {found}")
+    record = convert(content, SidecarRecord, str(path))
+    unknown = [name for name in record.options.composite if name not in CompositeOptions.__dataclass_fields__]
+    if unknown:
+        raise InputError(f"{path}: options.composite.{unknown[0]}: this rdstitch has no such option")
+    composite = convert(record.options.composite, CompositeOptions, str(path), "options.composite")
+    turned = record.model == "rotation"
+    if composite.projection == "auto" and turned:
+        composite = replace(composite, projection=record.output.projection or "auto")
+    images = tuple(map(_image, record.images))
+    reference = next(k for k, image in enumerate(record.images) if image.name == record.reference and image.used)
+    try:
+        place = _place(record.output)
+    except ArgumentError as error:
+        raise InputError(f"{path}: output.georeference.crs: {error}") from error
+    return SavedRegistration(Path(path), images, reference, record.lambda_, turned, composite, place, content)
 
 
 def mismatch_with_image(saved: SavedRegistration) -> str:
@@ -125,111 +129,30 @@ def mismatch_with_image(saved: SavedRegistration) -> str:
     return "" if same else f"{image}: is not the image that {saved.path.name} was written with; one of them is newer"
 
 
-def _check_output(record: Record) -> None:
-    """What tells which image the sidecar belongs to; versions before had no size and digest."""
-    if (name := record.get("file")) is not None and Path(name.text()).name != name.value:
-        name.expected("the name of a file in the same folder")
-    if (size := record.get("bytes")) is not None:
-        size.integer(0)
-    if (digest := record.get("sha256")) is not None:
-        digest.text()
-
-
-def _place(output: Record) -> Georeference | None:
+def _place(output: "OutputRecord") -> Georeference | None:
     """Where the plane lies on the Earth; versions before did not say."""
-    record = output.get("georeference")
-    if record is None or (code := record.get("crs")) is None:
+    record = output.georeference
+    if record is None or record.crs is None or record.pixel_to_map is None or output.plane_to_output is None:
         return None
-    prefix, _, number = code.text().partition(":")
-    if prefix != "EPSG" or not number.isdecimal():
-        code.expected("EPSG: and a number")
-    try:
-        crs = Crs(int(number))
-    except ArgumentError as error:
-        code.fail(str(error))
-    (a, b, east), (_, _, north) = (row.numbers(3) for row in _two(record["pixel_to_map"]))
-    from_plane = output["plane_to_output"].matrix()
-    if not (a or b) or not np.any(from_plane[0, :2]):
-        record["pixel_to_map"].expected("a similarity")
-    off = [(item["name"].text(), item.get("off_m")) for item in record["rejected"].items()]
+    (a, b, east), (_, _, north) = record.pixel_to_map
     place = Georeference(
-        crs,
+        Crs(int(record.crs.removeprefix("EPSG:"))),
         complex(a, b),
         complex(east, north),
-        record["rms_m"].number(),
-        record["positions_used"].integer(0),
-        record["positions"].integer(0),
-        tuple((name, math.inf if away is None else away.number()) for name, away in off),
+        record.rms_m,
+        record.positions_used,
+        record.positions,
+        tuple((item.name, math.inf if item.off_m is None else item.off_m) for item in record.rejected),
     )
-    return place.after(np.linalg.inv(from_plane).astype(np.float64))
+    return place.after(np.linalg.inv(output.plane_to_output).astype(np.float64))
 
 
-def _image(record: Record) -> SavedImage:
-    name, path, used = record["name"].text(), record["path"].text(), record["used"].flag()
-    camera = None
-    if record.get("size") is not None:
-        source = record.get("focal_source")
-        camera = read_lens(record, record["size"].size(), None if source is None else source.choice(FOCAL_LOG_STD))
-    if used and camera is None:
-        record["size"].expected("width and height of an image that was used")
-    to_plane = record["to_plane"].matrix() if used else None
-    field = record.get("displacement")
-    moved = None if field is None or not used or camera is None else _displacement(field, camera)
-    return SavedImage(name, path, camera, to_plane, record["reason"].text(), moved)
-
-
-def _displacement(record: Record, camera: Camera) -> DisplacementField:
-    columns, rows = (item.integer(least=2) for item in _two(record["grid"]))
-    nodes = [item.pair() for item in record["px"].items()]
-    if len(nodes) != rows * columns:
-        record["px"].expected(f"{rows * columns} displacements")
-    return DisplacementField(camera.image_size, np.array(nodes, dtype=np.float64).reshape(rows, columns, 2))
-
-
-def _two(record: Record) -> list[Record]:
-    items = list(record.items())
-    if len(items) != 2:
-        record.expected("two numbers")
-    return items
-
-
-def _reference(record: Record, images: Sequence[SavedImage]) -> int:
-    name = record.text()
-    found = [index for index, image in enumerate(images) if image.name == name and image.to_plane is not None]
-    if not found:
-        record.fail(f"there is no used image {name!r}")
-    return found[0]
-
-
-def _composite_options(record: Record) -> CompositeOptions:
-    """The compositing options; what this version does not know is refused, what it added has its default."""
-    hints, known = get_type_hints(CompositeOptions), {option.name for option in fields(CompositeOptions)}
-    given = {}
-    for name, value in record.fields().items():
-        if name not in known:
-            value.fail("this rdstitch has no such option")
-        given[name] = _option(value, hints[name])
-    try:
-        return CompositeOptions(**given)
-    except ArgumentError as error:
-        record.fail(str(error))
-
-
-def _as_laid_out(options: CompositeOptions, record: Record) -> CompositeOptions:
-    """The options with the projection that "auto" came to where the camera turned on the spot."""
-    if options.projection != "auto" or record["model"].value != "rotation":
-        return options
-    chosen = record["output"]["projection"].choice(PROJECTIONS)
-    return replace(options, projection=next(name for name in PROJECTIONS if name == chosen))
-
-
-def _option(record: Record, hint: Any) -> Any:
-    """A value of the type that an option has."""
-    kinds = get_args(hint) or (hint,)
-    if record.value is None and type(None) in kinds:
-        return None
-    if bool in kinds:
-        return record.flag()
-    if float in kinds:
-        return record.number()
-    return record.integer() if int in kinds else record.text()
+def _image(record: "ImageRecord") -> SavedImage:
+    camera = None if record.size is None else record.lens(record.size)
+    to_plane = np.array(record.to_plane, dtype=np.float64) if record.used else None
+    moved, found = None, record.displacement
+    if found is not None and record.used and camera is not None:
+        columns, rows = found.grid
+        nodes = np.array(found.px, dtype=np.float64).reshape(rows, columns, 2)
+        moved = DisplacementField(camera.image_size, nodes)
+    return SavedImage(record.name, record.path, camera, to_plane, record.reason, moved)

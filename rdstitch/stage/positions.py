@@ -14,9 +14,8 @@ import numpy as np
 import tifffile
 
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.file_access import canonical_name, canonical_text, open_regular
+from rdstitch.file_access import canonical_name, canonical_text, open_regular, read_text
 from rdstitch.io.opening import TIFF_MAGIC, decoding
-from rdstitch.records import read_text
 from rdstitch.stage.grid import TileGrid
 
 _NAMES = ("name", "file", "filename", "image")

@@ -40,8 +40,6 @@ ROWS = {
     "surf, boxes only": replace(FULL_SIZE, kind="surf", surf_refine=False),
     "orb": replace(FULL_SIZE, kind="orb"),
     "akaze": replace(FULL_SIZE, kind="akaze"),
-    "kaze": replace(FULL_SIZE, kind="kaze"),
-    "brisk": replace(FULL_SIZE, kind="brisk"),
 }
 
 Grey = NDArray[np.uint8]

@@ -34,7 +34,7 @@ def images(kind: str, count: int) -> tuple[Features, Features]:
         unit = [values / np.linalg.norm(values, axis=1, keepdims=True) for values in (raw, other)]
         one, two = (np.rint(512 * values).astype(np.float32) for values in unit)
         return features(one), features(two[rng.permutation(count)])
-    width = {"orb": 32, "brisk": 64}[kind]
+    width = 32
     bits, fresh = rng.integers(0, 256, (2, count, width), dtype=np.uint8)
     flips = rng.integers(0, 256, bits.shape, dtype=np.uint8) & rng.integers(0, 256, bits.shape, dtype=np.uint8)
     return features(bits), features(np.where(half, bits ^ flips, fresh)[rng.permutation(count)])
@@ -70,7 +70,7 @@ def main() -> None:
     print(f"{count} x {count} descriptors, one thread (set OMP_NUM_THREADS=1)\n")
     print("| descriptors | matches | identical | cv2.BFMatcher s | rdstitch s | ratio | peak MB |")
     print("| --- | --: | --- | --: | --: | --: | --: |")
-    for kind in ("sift", "orb", "brisk"):
+    for kind in ("sift", "orb"):
         one, two = images(kind, count)
         expected, slow = timed(lambda one=one, two=two: brute_force(one, two), 1)  # type: ignore[misc]
         found, fast = timed(lambda one=one, two=two: match(one, two, RATIO), 3)  # type: ignore[misc]

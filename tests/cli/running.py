@@ -9,7 +9,6 @@ import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,14 +17,13 @@ from jsonschema import Draft202012Validator
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.camera_record import camera_from_record
+from rdstitch.camera_record import CameraRecord
 from rdstitch.radial_homography import project
-from rdstitch.records import Record
+from rdstitch.records import convert
+from rdstitch.sidecar.schema import json_schema
 from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
 
-SIDECAR_SCHEMA = Draft202012Validator(
-    json.loads(files("rdstitch.sidecar").joinpath("sidecar.schema.json").read_text(encoding="utf-8"))
-)
+SIDECAR_SCHEMA = Draft202012Validator(json_schema())
 
 # A shell ignores interrupts for what it runs in the background, these tests for one, and children inherit that.
 _PROGRAM = """
@@ -139,7 +137,7 @@ def transfers(record: dict[str, Any]) -> Mapping[int, Callable[[FloatArray], Flo
     for index, image in enumerate(record["images"]):
         if image["used"]:
             width, height = image["size"]
-            lens = camera_from_record(Record("sidecar", "camera", {**camera, "image_size": [width, height]}))
+            lens = convert({**camera, "image_size": [width, height]}, CameraRecord, "sidecar").camera()
             found[index] = partial(_to_output, lens, np.array(image["to_output"]))
     return found
 

@@ -71,7 +71,7 @@ def test_local_alignment_is_applied_again(rdstitch: Run, frames: list[Path], tmp
     _sidecar(made["5"]).write_text(json.dumps(content), encoding="utf-8")
     refused = _apply(rdstitch, _sidecar(made["5"]), frames[0].parent, tmp_path / "no.png")
     assert refused.status == 3
-    assert "displacement.px" in refused.err
+    assert "images[0].displacement: expected" in refused.err
 
 
 @pytest.mark.parametrize("text", ["1", "101", "much"])

@@ -3,8 +3,6 @@
 import json
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -12,22 +10,22 @@ import pytest
 from PIL import ExifTags, Image
 
 from rdstitch.doctor import examine
-from rdstitch.doctor.examine import _FEATURES_MEMORY, _memory
 from tests.cli.running import Run
 
 
 def test_nothing_is_amiss(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     done = rdstitch("doctor", frames[0].parent)
     assert (done.status, done.err) == (0, "")
-    assert "images:   3\n" in done.out
+    assert "images:     3\n" in done.out
     assert "400 x 300 (3)" in done.out
-    assert "every image has a partner; 1 group" in done.out
+    assert "every image has a place" in done.out
     assert "none: go ahead" in done.out
     found = json.loads(rdstitch("doctor", *frames, "--json").out)
     assert found["images"] == 3
     assert 0.35 < found["overlap"] < 0.7  # rendered with a half
-    assert found["seconds"] > 0
-    assert found["memory_bytes"] > 2**20
+    assert found["plan"]["seconds"] > 0
+    assert found["plan"]["memory_bytes"] > 2**20
+    assert found["plan"]["canvas_size"][0] > 800
 
 
 def test_faults_are_found(frames: list[Path], stranger: Path, tmp_path: Path) -> None:
@@ -70,8 +68,8 @@ def test_zooms_and_cameras_are_told_apart(frames: list[Path], tmp_path: Path) ->
 def test_images_that_have_nothing_in_common(frames: list[Path], stranger: Path, rdstitch: Run) -> None:
     found = examine([frames[0], stranger])
     assert found.overlap is None
-    assert found.groups == 2
-    assert "no overlap was found" in found.advice[0]
+    assert (found.plan, found.alone) == (None, (frames[0].name, stranger.name))
+    assert "overlap" in found.advice[0]
     assert rdstitch("doctor", "no_such_file.jpg").status == 3
 
 
@@ -87,13 +85,3 @@ def test_what_cannot_be_read_is_named_once(rdstitch: Run, tmp_path: Path) -> Non
     missing = tmp_path / "nofolder"
     done = rdstitch("doctor", missing)
     assert (done.status, done.line.count(str(missing))) == (3, 1)
-
-
-def test_expected_memory_is_that_of_the_work_and_at_most_what_compositing_keeps_to(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("rdstitch.compositing.plan.available_memory", lambda: 0)
-    source: Any = SimpleNamespace(metadata=SimpleNamespace(size=(480, 360), channels=3, bit_depth=8))
-    few, many, more = (_memory([source] * count, 0.5, 2) for count in (12, 2000, 3000))
-    assert few < 400 * 2**20 < many
-    assert more - many == 1000 * _FEATURES_MEMORY

@@ -9,9 +9,9 @@ import pytest
 from rdstitch_cli.options import FEATURES
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera_record import camera_from_record
+from rdstitch.camera_record import CameraRecord
 from rdstitch.features import KINDS
-from rdstitch.records import Record
+from rdstitch.records import convert
 from tests.cli.running import Run, transfers
 from tests.sampled import sampled
 
@@ -34,7 +34,7 @@ def overlap(record: dict[str, Any]) -> FloatArray:
     """Where a grid over the second image lies in the first one, px; NaN where it is outside."""
     camera = record["camera"]
     width, height = camera["image_size"]
-    lens = camera_from_record(Record("sidecar", "camera", camera))
+    lens = convert(camera, CameraRecord, "sidecar").camera()
     u, v = np.meshgrid(np.linspace(0, width - 1, 40), np.linspace(0, height - 1, 30))
     # The frame is that of the first image: its undistorted px are only scaled and shifted.
     first = np.array(record["images"][0]["to_output"])

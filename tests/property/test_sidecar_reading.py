@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rdstitch.camera import Camera
 from rdstitch.errors import InputError
 from rdstitch.options import StitchOptions
 from rdstitch.sidecar.read import read_sidecar
@@ -34,13 +35,25 @@ GOOD: dict[str, Any] = {
     "format": "rdstitch sidecar",
     "version": 2,
     "lambda": -0.2,
+    "lambda_std": 0.001,
+    "lambda_px": -3.2e-6,
+    "lambda_focal": -0.46,
+    "lambda_known": False,
+    "camera": Camera((400, 300), -0.2, focal=380.0, focal_source="exif").as_dict(),
+    "tilt_deg": None,
+    "focal_px": 380.0,
+    "focal_source": "exif",
     "model": "similarity",
+    "model_reason": "it is enough",
+    "rms_px": 0.5,
     "reference": "a.jpg",
-    "output": {"file": "out.tif", "size": [400, 300]},
+    "output": {"file": "out.tif", "size": [400, 300], "plane_to_output": _IMAGE["to_plane"]},
     "images": [_IMAGE, _LEFT_OUT, _UNREAD],
     "pairs": [],
     "verdict": {"ok": True},
     "options": plain(StitchOptions()),
+    "seed": 0,
+    "versions": {"rdstitch": "0.1.0"},
 }
 
 
@@ -82,16 +95,20 @@ def test_a_good_one_is_read_whole(tmp_path: Path) -> None:
         (("images", 0, "size"), "wide", "images[0].size"),
         (("images", 0, "size"), [400], "images[0].size"),
         (("images", 0, "size"), [400, 0], "images[0].size[1]"),
-        (("images", 0, "size"), None, "images[0].size"),
+        (("images", 0, "size"), None, "images[0]"),
         (("images", 0, "coefficients"), [5, 0, 0], "images[0]"),
         (("images", 0, "coefficients"), [True, 0, 0], "images[0].coefficients[0]"),
         (("images", 0, "used"), 1, "images[0].used"),
         (("images", 0, "focal_source"), "guesswork", "images[0].focal_source"),
-        (("images", 0, "to_plane"), [[1, 0, 0], [0, 1, 0], [1, 1, 0]], "images[0].to_plane"),
+        (("images", 0, "to_plane"), [[1, 0, 0], [0, 1, 0], [1, 1, 0]], "images[0]"),
         (("images", 0, "to_plane"), [[1, 0, 0], [0, "1", 0], [0, 0, 1]], "images[0].to_plane[1][1]"),
-        (("images",), [], "reference"),
+        (("images",), [], "images"),
         (("reference",), "b.jpg", "reference"),
-        (("options", "composite", "blend"), "magic", "options.composite"),
+        (("pairs",), None, "pairs"),
+        (("output", "file"), "../out.tif", "output.file"),
+        (("output", "plane_to_output"), [[0, 0, 0]] * 3, "output"),
+        (("camera", "lens_covariance"), [[1, 0]], "camera.lens_covariance"),
+        (("options", "composite", "blend"), "magic", "options.composite.blend"),
         (("options", "composite", "blur"), 1, "options.composite.blur"),
         (("options", "composite", "scale"), float("inf"), "options.composite.scale"),
     ],

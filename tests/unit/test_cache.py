@@ -17,7 +17,6 @@ from rdstitch import cache
 from rdstitch.cache import Cache
 from rdstitch.features import FeatureOptions
 from rdstitch.io.packing import pack
-from rdstitch.io.staging import lock, remove_dead_files
 from rdstitch.pipeline import StitchOptions, mosaic
 from tests.cli.running import flight
 
@@ -159,19 +158,17 @@ def test_an_emptied_check_is_made_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="nothing proves a process dead there")
-def test_unfinished_files_of_dead_processes_are_removed(tmp_path: Path) -> None:
+def test_abandoned_unfinished_files_are_removed(tmp_path: Path) -> None:
     cache = Cache(tmp_path)
     cache.recall("stage", (), (1,), lambda: 1)
-    (folder,) = {file.parent for file in tmp_path.rglob("*") if file.is_file()}
-    dead, fresh, alive = (folder / f".{name}.part" for name in ("dead", "fresh", "alive"))
-    for file in (dead, fresh, alive):
+    (entry,) = (file for file in tmp_path.rglob("*") if file.is_file())
+    abandoned, fresh = (entry.with_name(f".{name}.part") for name in ("abandoned", "fresh"))
+    for file in (abandoned, fresh):
         file.write_bytes(b"half")
-    for file in (dead, alive):
-        os.utime(file, (0, 0))
-    with alive.open("rb+") as stream:
-        lock(stream.fileno())
-        remove_dead_files(folder)
-    assert (dead.exists(), fresh.exists(), alive.exists()) == (False, True, True)
+    os.utime(abandoned, (0, 0))
+    entry.unlink()
+    cache.recall("stage", (), (1,), lambda: 1)
+    assert (entry.exists(), abandoned.exists(), fresh.exists()) == (True, False, True)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="nothing proves a process dead there")

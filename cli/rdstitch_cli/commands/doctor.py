@@ -24,10 +24,11 @@ Examples:
 @options.as_json("what was found")
 @options.verbosity
 def doctor(inputs: tuple[Path, ...], every: int | None, topic: str | None, as_json: bool, reporter: Reporter) -> None:
-    """Find out at a glance what a run will meet, and what to change before it.
+    """Find out what a run will meet, and what to change before it.
 
-    INPUT is what 'rdstitch mosaic' takes. Shown are sizes, cameras and zooms by EXIF, blur, exposure, overlap, and the
-    memory and time to expect. It says what is likely; nothing is registered or written.
+    INPUT is what 'rdstitch mosaic' takes. Shown are sizes, cameras and zooms by EXIF, blur, exposure, and, by a dry run
+    on small versions of the images, overlap, size of the mosaic, and memory and time of compositing it. Nothing is
+    written.
     """
     from rdstitch.doctor import examine
     from rdstitch.io.atomic import json_bytes

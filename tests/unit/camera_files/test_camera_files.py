@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,9 +15,9 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.camera_files import load_camera, read_camera_file, save_camera
 from rdstitch.camera_files.lens_models import Brown
-from rdstitch.camera_files.opencv import parse_yaml
 from rdstitch.errors import InputError, OutputError
 from rdstitch.orientation import turning_matrix
+from rdstitch.records import parse_yaml
 
 OPENCV = ["c.yml", "c.yaml", "opencv.json", "left.opencv.json", "a.fisheye.yml"]
 FOREIGN = [*OPENCV, "cameras.json", "c.pto", "camera_info.yaml", "camchain.yaml", "cameras.txt"]
@@ -143,20 +144,24 @@ Parsed = tuple[list[float], list[float], str]
 """fx, fy, cx, cy; coefficients; and the name of the model."""
 
 
+def _numbers(values: list[Any]) -> list[float]:
+    return [float(value) for value in values]
+
+
 def _camera_info(text: str) -> Parsed:
     record = parse_yaml(text, "camera_info.yaml")
-    fx, _, cx, _, fy, cy = record["camera_matrix"]["data"].numbers()[:6]
+    fx, _, cx, _, fy, cy = _numbers(record["camera_matrix"]["data"])[:6]
     return (
         [fx, fy, cx, cy],
-        list(record["distortion_coefficients"]["data"].numbers()),
-        record["distortion_model"].text(),
+        _numbers(record["distortion_coefficients"]["data"]),
+        record["distortion_model"],
     )
 
 
 def _camera_chain(text: str) -> Parsed:
     record = parse_yaml(text, "camchain.yaml")["cam0"]
-    values = list(record["distortion_coeffs"].numbers())
-    return list(record["intrinsics"].numbers()), values, record["distortion_model"].text()
+    values = _numbers(record["distortion_coeffs"])
+    return _numbers(record["intrinsics"]), values, record["distortion_model"]
 
 
 def _colmap(text: str) -> Parsed:
@@ -167,8 +172,8 @@ def _colmap(text: str) -> Parsed:
 
 def _fisheye(text: str) -> Parsed:
     record = parse_yaml(text, "fisheye.yml")
-    fx, _, cx, _, fy, cy = record["camera_matrix"]["data"].numbers()[:6]
-    return [fx, fy, cx, cy], list(record["distortion_coefficients"]["data"].numbers()), "equi"
+    fx, _, cx, _, fy, cy = _numbers(record["camera_matrix"]["data"])[:6]
+    return [fx, fy, cx, cy], _numbers(record["distortion_coefficients"]["data"]), "equi"
 
 
 def _opencv(text: str) -> Parsed:
@@ -177,7 +182,7 @@ def _opencv(text: str) -> Parsed:
         matrix, values = content["camera_matrix"]["data"], content["distortion_coefficients"]["data"]
     else:
         record = parse_yaml(text, "c.yml")
-        matrix, values = (record[name]["data"].numbers() for name in ("camera_matrix", "distortion_coefficients"))
+        matrix, values = (_numbers(record[name]["data"]) for name in ("camera_matrix", "distortion_coefficients"))
     return [matrix[0], matrix[4], matrix[2], matrix[5]], list(values), "opencv"
 
 

@@ -12,12 +12,11 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from rdstitch.errors import InputError
-from rdstitch.file_access import open_regular, read_limited
+from rdstitch.file_access import open_regular, read_limited, read_text
 from rdstitch.io import Metadata, read_image, read_metadata, write_image
 from rdstitch.io.attitude import xmp_number
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
 from rdstitch.io.metadata import MAX_PROFILE
-from rdstitch.records import read_text
 
 _RGB = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
 

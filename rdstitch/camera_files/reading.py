@@ -1,0 +1,252 @@
+"""Camera files of others as records: OpenCV's and ROS's, OpenDroneMap's, Kalibr's and COLMAP's.
+
+OpenCV's own reader is not used: it says on standard error what it does not like, and crashes on some of it.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta, Struct
+
+from rdstitch.camera_files.fitting import CameraFile, fitted_lens
+from rdstitch.camera_files.lens_models import Brown, Fisheye
+from rdstitch.errors import ArgumentError
+from rdstitch.records import Count, Side, Size, convert
+
+ImageSize = Callable[[], tuple[int, int]]
+"""Gives width and height, pixels, where a file does not say them."""
+
+_ALIASES = {
+    **dict.fromkeys(("cameraMatrix", "Camera_Matrix", "K"), "camera_matrix"),
+    **dict.fromkeys(("distCoeffs", "dist_coeffs", "Distortion_Coefficients", "D"), "distortion_coefficients"),
+    "image_Width": "image_width",
+    "image_Height": "image_height",
+}
+"""Names in files of OpenCV's samples and of ROS, and what OpenCV's calibration calls the same."""
+
+_WIDE = 0.9  # half diagonals in focal lengths: fisheyes begin there, at 84 degrees by the usual model
+_ASYMMETRIC, _TIMES_CLOSER = 0.005, 4.0  # half diagonals off every symmetric lens, and times the fisheye's error
+_OFF_CENTER = 0.15  # of the image's sides: principal points lie nearer to the middle
+
+_COLMAP = {
+    "SIMPLE_PINHOLE": (1, 0),
+    "PINHOLE": (2, 0),
+    "SIMPLE_RADIAL": (1, 1),
+    "RADIAL": (1, 2),
+    "OPENCV": (2, 4),
+    "FULL_OPENCV": (2, 8),
+    "SIMPLE_RADIAL_FISHEYE": (1, 1),
+    "RADIAL_FISHEYE": (1, 2),
+    "OPENCV_FISHEYE": (2, 4),
+}
+"""COLMAP's models: how many focal lengths, and how many of OpenCV's coefficients, in its order."""
+
+_COLMAP_LINE = re.compile(r"\s*\d+\s+([A-Z_]+)\s+(\d+)\s+(\d+)\s+(\S.*)")
+
+
+class _Matrix(Struct):
+    """A matrix of FileStorage: its shape and its values in one list."""
+
+    rows: Count
+    cols: Count
+    data: Annotated[list[float], Meta(max_length=100)]
+
+    def __post_init__(self) -> None:
+        if self.rows * self.cols != len(self.data):
+            raise ValueError("the shape is not what it should be")
+
+
+class _OpenCV(Struct, kw_only=True):
+    """Brown's model with up to 8 coefficients, or that of ``cv2.fisheye`` with 4."""
+
+    camera_matrix: _Matrix
+    distortion_coefficients: _Matrix
+    image_width: Side | None = None
+    image_height: Side | None = None
+    distortion_model: Literal["plumb_bob", "rational_polynomial", "equidistant", "fisheye"] | None = None
+    fisheye_model: Count | None = None
+
+    @property
+    def is_fisheye(self) -> bool | None:
+        """Whether the coefficients are those of the fisheye model; None where nothing says."""
+        if self.distortion_model is not None:
+            return self.distortion_model in ("equidistant", "fisheye")
+        return None if self.fisheye_model is None else self.fisheye_model > 0
+
+
+class _OpenDroneMap(Struct, kw_only=True):
+    """Lens models of OpenSfM, with lengths in units of the longer side."""
+
+    projection_type: Literal["perspective", "brown", "simple_radial", "radial", "fisheye_opencv"]
+    width: Side
+    height: Side
+    focal: float | None = None
+    focal_x: float | None = None
+    focal_y: float | None = None
+    c_x: float = 0.0
+    c_y: float = 0.0
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("focal_x", "focal_y") if self.focal is None else ():
+            if getattr(self, name) is None:
+                raise ValueError(f"{name} is missing")
+
+
+class _Kalibr(Struct, kw_only=True):
+    camera_model: Literal["pinhole"]
+    distortion_model: Literal["none", "radtan", "equi"]
+    intrinsics: tuple[float, float, float, float]
+    distortion_coeffs: Annotated[list[float], Meta(max_length=4)] = []
+    resolution: Size
+
+    def __post_init__(self) -> None:
+        if self.distortion_model != "none" and len(self.distortion_coeffs) != 4:
+            raise ValueError("expected 4 distortion_coeffs")
+
+
+def is_opencv(content: Any) -> bool:
+    """Whether plain values look like OpenCV's."""
+    return isinstance(content, dict) and any(_ALIASES.get(name, name) == "camera_matrix" for name in content)
+
+
+def read_opencv(content: dict[str, Any], file: str, image_size: ImageSize | None = None) -> CameraFile:
+    """The camera of a FileStorage, to which λ is fitted.
+
+    Four coefficients may be Brown's or those of ``cv2.fisheye``, and only a mark says which. Where there is none they
+    are Brown's, unless they clearly make a fisheye.
+    """
+    named = {_ALIASES.get(name, name): value for name, value in content.items()}
+    record = convert(named, _OpenCV, file, strict=False)
+    matrix, k = record.camera_matrix, record.distortion_coefficients.data
+    if (matrix.rows, matrix.cols) != (3, 3):
+        raise ArgumentError("camera_matrix: expected 3 rows of 3")
+    fx, skew, cx, _, fy, cy = matrix.data[:6]
+    if not (fx > 0.0 and fy > 0.0 and abs(skew) < 1e-6 * fx):
+        raise ArgumentError("camera_matrix: expected positive focal lengths and no skew")
+    read = partial(
+        fitted_lens, kind="OpenCV", size=_size(record, (cx, cy), image_size), field="distortion_coefficients: "
+    )
+    if (marked := record.is_fisheye) and len(k) != 4:
+        raise ArgumentError("distortion_coefficients: expected the 4 coefficients of a fisheye")
+    fisheye = Fisheye((fx, fy), (cx, cy), tuple(k))
+    if marked:
+        return read(fisheye)
+    if len(k) not in (0, 4, 5, 8, 12, 14) or any(k[8:]):
+        raise ArgumentError(
+            "distortion_coefficients: expected 4, 5 or 8; thin prisms and tilted sensors are not known here"
+        )
+    lens = Brown.of_opencv((fx, fy), (cx, cy), k[:8])
+    if marked is not None or len(k) != 4 or not any(k):
+        return read(lens)
+    try:
+        other = read(fisheye)
+    except ArgumentError:
+        return read(lens)
+    try:
+        found = read(lens)
+    except ArgumentError:
+        found = None
+    if found is None or _is_rather(other, found):
+        raise ArgumentError(
+            "distortion_coefficients: these 4 make no lens of OpenCV's usual model, but one of cv2.fisheye; if they "
+            'are that, add "fisheye_model: 1", else "distortion_model: plumb_bob"'
+        )
+    return found
+
+
+def _is_rather(fisheye: CameraFile, brown: CameraFile) -> bool:
+    """Whether coefficients are a fisheye's: these make a symmetric lens of a wide field of view, Brown's do not."""
+    camera, one, other = brown.camera, fisheye.fit, brown.fit
+    if camera.focal is None or one is None or other is None:
+        return False
+    wide = camera.half_diagonal > _WIDE * camera.focal
+    return wide and other.largest > max(_ASYMMETRIC * camera.half_diagonal, _TIMES_CLOSER * one.largest)
+
+
+def _size(record: _OpenCV, center: tuple[float, float], image_size: ImageSize | None) -> tuple[int, int]:
+    """Width and height, of the images where the file does not say them."""
+    given = record.image_width, record.image_height
+    if given[0] is not None and given[1] is not None:
+        return given[0], given[1]
+    if image_size is None or given != (None, None):
+        raise ArgumentError(f"image_{'width' if given[0] is None else 'height'}: is missing")
+    size = image_size()
+    if any(abs((c + 0.5) / side - 0.5) > _OFF_CENTER for c, side in zip(center, size, strict=True)):
+        raise ArgumentError(
+            f"has no image_width and image_height, and its principal point {center[0]:.0f}, {center[1]:.0f} is not "
+            f"that of images of {size[0]} x {size[1]} pixels; add the size that it was calibrated for"
+        )
+    return size
+
+
+def read_opendronemap(entry: Any, file: str, name: str) -> CameraFile:
+    """The one camera of a ``cameras.json``, to which λ is fitted."""
+    record = convert(entry, _OpenDroneMap, file, name)
+    size, longer = (record.width, record.height), max(record.width, record.height)
+    fx, fy = (record.focal or value or 0.0 for value in (record.focal_x, record.focal_y))
+    focal = (fx * longer, fy * longer)
+    center = ((size[0] - 1) / 2 + record.c_x * longer, (size[1] - 1) / 2 + record.c_y * longer)
+    _check_focal(focal)
+    lens: Brown | Fisheye = Brown(focal, center, (record.k1, record.k2, record.k3), (record.p1, record.p2))
+    if record.projection_type == "fisheye_opencv":
+        lens = Fisheye(focal, center, (record.k1, record.k2, record.k3, record.k4))
+    return fitted_lens(lens, "OpenDroneMap", size)
+
+
+def read_kalibr(entry: Any, file: str, name: str) -> CameraFile:
+    """The one camera of a chain, to which λ is fitted."""
+    record = convert(entry, _Kalibr, file, name, strict=False)
+    k = [] if record.distortion_model == "none" else record.distortion_coeffs
+    return _fitted("Kalibr", record.resolution, record.intrinsics, k, fisheye=record.distortion_model == "equi")
+
+
+def colmap_cameras(text: str) -> list[tuple[str, ...]]:
+    """Model, width, height and parameters of the cameras in the text, if it is a ``cameras.txt``."""
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    matches = [_COLMAP_LINE.fullmatch(line) for line in lines]
+    return [match.groups() for match in matches if match] if matches[:1] != [None] else []
+
+
+def read_colmap(camera: Sequence[str], file: str) -> CameraFile:
+    """A camera of a ``cameras.txt``, to which λ is fitted."""
+    model, width, height, given = camera
+    if model not in _COLMAP:
+        raise ArgumentError(f"MODEL: expected one of {', '.join(_COLMAP)}, not {model}")
+    focals, coefficients = _COLMAP[model]
+    values = convert(given.split(), list[float], file, "PARAMS", strict=False)
+    if len(values) != focals + 2 + coefficients:
+        raise ArgumentError(f"PARAMS: expected {focals + 2 + coefficients} numbers, not {len(values)}")
+    # COLMAP's pixels have their centres at halves.
+    intrinsics = (values[0], values[focals - 1], values[focals] - 0.5, values[focals + 1] - 0.5)
+    size = convert((width, height), tuple[int, int], file, "SIZE", strict=False)
+    return _fitted("COLMAP", size, intrinsics, values[focals + 2 :], fisheye="FISHEYE" in model)
+
+
+def _fitted(
+    kind: str,
+    size: tuple[int, int],
+    intrinsics: tuple[float, float, float, float],
+    coefficients: Sequence[float],
+    *,
+    fisheye: bool,
+) -> CameraFile:
+    """The camera of a focal length and centre along x and y, and OpenCV's coefficients."""
+    fx, fy, cx, cy = intrinsics
+    _check_focal((fx, fy))
+    lens: Brown | Fisheye = Brown.of_opencv((fx, fy), (cx, cy), coefficients)
+    if fisheye:
+        lens = Fisheye((fx, fy), (cx, cy), tuple(coefficients))
+    return fitted_lens(lens, kind, size)
+
+
+def _check_focal(focal: tuple[float, float]) -> None:
+    if not min(focal) > 0.0:
+        raise ArgumentError(f"expected positive focal lengths, not {focal[0]:g} and {focal[1]:g}")

@@ -1,0 +1,229 @@
+"""The sidecar's fields with their types, as they are checked when it is read, and the JSON Schema that follows.
+
+docs/sidecar.md describes them. Fields may be added; a change that would mislead a reader raises the version. What
+earlier versions did not have has a default.
+"""
+
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta, Struct, field
+
+from rdstitch.camera_record import CameraRecord, FocalSource, LensRecord
+from rdstitch.compositing.options import ProjectionName
+from rdstitch.records import Count, Matrix, NonNegative, Pair, Size, Triple, check_invertible
+from rdstitch.sidecar.write import VERSION
+
+Lens = Literal["division", "division-center", "division2", "division3"]
+Model = Literal["rigid", "similarity", "tilting", "pose", "homography", "rotation"]
+_Positive = Annotated[float, Meta(gt=0.0)]
+_FileName = Annotated[str, Meta(pattern=r"^[^/\\]+$", description="in the folder of the sidecar")]
+_Digest = Annotated[
+    str,
+    Meta(description="SHA-256 of the file; of a Deep Zoom image that of the list of its files, as sha256sum has it"),
+]
+
+
+class Rejected(Struct):
+    """A GPS position that was not used."""
+
+    name: str
+    off_m: float | None
+
+
+class GeoreferenceRecord(Struct, kw_only=True):
+    """Where the output lies on the Earth; or only the reason why that is not known."""
+
+    reason: str | None = None
+    crs: Annotated[str, Meta(pattern="^EPSG:[0-9]+$")] | None = None
+    gsd_m: _Positive | None = None
+    pixel_to_map: tuple[Triple, Triple] | None = None
+    north_up: bool | None = None
+    positions: Count = 0
+    positions_used: Count = 0
+    rms_m: NonNegative = 0.0
+    rejected: list[Rejected] = []
+
+    def __post_init__(self) -> None:
+        if self.crs is not None and (self.pixel_to_map is None or not any(self.pixel_to_map[0][:2])):
+            raise ValueError("expected a similarity as pixel_to_map")
+
+
+class OutputRecord(Struct, kw_only=True):
+    """The image that the sidecar belongs to."""
+
+    file: _FileName | None = None
+    bytes: Count | None = None
+    sha256: _Digest | None = None
+    size: Size | None = None
+    plane_to_output: Matrix | None = None
+    projection: ProjectionName | None = None
+    wraps_around: bool = False
+    field_of_view_deg: Pair | None = None
+    center_deg: Pair | None = None
+    georeference: GeoreferenceRecord | None = None
+
+    def __post_init__(self) -> None:
+        if self.plane_to_output is not None:
+            check_invertible(self.plane_to_output, "plane_to_output")
+
+
+class HeldOut(Struct):
+    """Residuals of matches that took no part in the fit, px."""
+
+    median: NonNegative
+    percentile95: NonNegative
+
+
+class BeforeAfter(Struct):
+    """The same without and with local alignment."""
+
+    before: HeldOut | None
+    after: HeldOut | None
+
+
+class LocalAlignmentRecord(Struct):
+    """What local alignment found; the displacements are with the images."""
+
+    used: bool
+    reason: str
+    cells: Annotated[int, Meta(ge=0, description="of the grid, along the longer side of an image")]
+    held_out_px: BeforeAfter
+
+
+class Displacement(Struct):
+    """What local alignment adds to the pixels of an image, on a grid from its first to its last pixel."""
+
+    grid: Annotated[tuple[Annotated[int, Meta(ge=2)], Annotated[int, Meta(ge=2)]], Meta(description="columns and rows")]
+    px: Annotated[list[Pair], Meta(description="x and y at every node, row by row")]
+
+    def __post_init__(self) -> None:
+        if len(self.px) != self.grid[0] * self.grid[1]:
+            raise ValueError(f"expected {self.grid[0] * self.grid[1]} displacements, not {len(self.px)}")
+
+
+class PoseRecord(Struct):
+    """Where the camera was, in heights of the reference image."""
+
+    x: float
+    y: float
+    height: _Positive
+    yaw_deg: float
+    tilt_deg: Pair
+
+
+class ImageRecord(LensRecord, kw_only=True):
+    """One image; one that could not be read has no size."""
+
+    name: str
+    path: str
+    size: Size | None
+    used: bool
+    reason: str
+    features: Count | None = None
+    to_plane: Matrix | None = None
+    to_output: Matrix | None = None
+    displacement: Displacement | None = None
+    pose: PoseRecord | None = None
+
+    def __post_init__(self) -> None:
+        if self.size is not None:
+            self.lens(self.size)
+        if self.used and (self.size is None or self.to_plane is None):
+            raise ValueError(f"is used, and needs {'size' if self.size is None else 'to_plane'}")
+        if self.to_plane is not None:
+            check_invertible(self.to_plane, "to_plane")
+
+
+class PairRecord(Struct, kw_only=True):
+    """One pair of images that was looked at."""
+
+    images: tuple[str, str]
+    matches: Count
+    inliers: Count
+    rms_px: float | None
+    lambda_: float | None = field(name="lambda")
+    lambda_std: float | None
+    model: Model | None
+    homography: Matrix | None
+    solver: str | None
+    iterations: Count
+    ok: bool
+    reason: str
+    used: bool
+    dropped: str
+    inliers_of_whole: Count | None
+    rms_of_whole_px: float | None
+
+
+class ReliefRecord(Struct):
+    """Whether the scene is the plane that it is taken for."""
+
+    found: bool
+    coherence: float | None
+    size: float | None
+    explanation: str
+
+
+class VerdictRecord(Struct):
+    """Whether the result can be relied on."""
+
+    ok: bool
+    failures: list[str] = []
+    warnings: list[str] = []
+    relief: ReliefRecord | None = None
+
+
+class OptionsRecord(Struct):
+    """What the image was made with; those of compositing are read by their own rules."""
+
+    composite: dict[str, Any]
+
+
+class Applied(Struct):
+    """Only in the sidecar of ``apply``: what was applied, and how images found their places."""
+
+    sidecar: str
+    matched: Literal["name", "order"]
+
+
+class SidecarRecord(Struct, kw_only=True):
+    """What ``rdstitch pano``, ``mosaic`` and ``apply`` write beside an image."""
+
+    format: Literal["rdstitch sidecar"]
+    version: Annotated[int, Meta(ge=1, le=VERSION)]
+    lambda_: Annotated[float, Meta(description="of the division model for half the image diagonal")] = field(
+        name="lambda"
+    )
+    lambda_std: Annotated[float, Meta(ge=0.0, description="0 where λ was given, null where it cannot be seen")] | None
+    lambda_px: float
+    lambda_focal: float | None
+    lambda_known: bool
+    lens: Lens | None = None
+    lens_reason: str = ""
+    camera: CameraRecord
+    tilt_deg: Pair | None
+    focal_px: float | None
+    focal_source: FocalSource | None
+    model: Model
+    model_reason: str
+    rms_px: NonNegative | None
+    reference: str
+    output: OutputRecord
+    local_alignment: LocalAlignmentRecord | None = None
+    images: Annotated[list[ImageRecord], Meta(min_length=1)]
+    pairs: list[PairRecord]
+    verdict: VerdictRecord
+    options: OptionsRecord
+    seed: Count
+    versions: dict[str, str]
+    applied: Applied | None = None
+
+    def __post_init__(self) -> None:
+        if not any(image.name == self.reference and image.used for image in self.images):
+            raise ValueError(f"reference: there is no used image {self.reference!r}")
+
+
+def json_schema() -> dict[str, Any]:
+    """The JSON Schema of sidecars of this version."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **msgspec.json.schema(SidecarRecord)}
