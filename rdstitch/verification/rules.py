@@ -211,6 +211,7 @@ def _second_motion(found: Evidence) -> Iterator[Finding]:
         return
     alike = share_alike(found.checked)
     clear = alike >= FILLED_BY_A_PLANE or (share < FILLED_BY_A_PLANE and not alike < _limit("unlike, undecided"))
+    clear |= found.depth and alike >= _limit("alike")  # nearer and farther things move differently
     if compared is not None:
         clear = compared.won or (clear and not compared.lost)
     worst = max(motions, key=lambda own: own.area)
