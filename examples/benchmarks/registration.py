@@ -1,15 +1,11 @@
-"""Registration measured: ``python -m tests.benchmarks.registration [--pairs N] [--frames N] [--folder DIR] …``.
+"""Registration measured: ``python -m examples.benchmarks.registration [--pairs N] [--frames N] [--folder DIR] …``.
 
 Processor time of pairs, beside homlib's estimators in the same run, and of whole mosaics by stage, beside OpenCV and
 the package stitching where they are installed (``--peer-python``: a Python that has it). ``--folder`` adds one's own
 images. Times depend on the machine: only those of one run compare.
 """
 
-import argparse
-import resource
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,6 +14,7 @@ from typing import Any
 import numpy as np
 
 import rdstitch
+from examples.benchmarks.driver import StageTimes, peak_memory, run, timed
 from examples.paper.common.peers import optional_module
 from examples.paper.common.stitchers import installed_stitchers
 from examples.paper.common.subprocesses import run_all
@@ -61,11 +58,11 @@ def print_pairs(count: int) -> None:
 def _estimators(pairs: list[PairMatches]) -> Iterator[tuple[str, FloatArray, FloatArray]]:
     """Name, seconds of each pair, and λ of each pair; inf where there is none."""
     how = EstimationOptions(select_below=_SELECT_BELOW)
-    rounds = [_timed(lambda: estimate_radial_homographies(pairs, how)) for _ in range(_ROUNDS)]
+    rounds = [timed(lambda: estimate_radial_homographies(pairs, how)) for _ in range(_ROUNDS)]
     seconds, found = min(rounds, key=lambda result: result[0])
     yield "rdstitch, all pairs in a batch", np.full(len(pairs), seconds / len(pairs)), _distortions(found)
     for name, options in (("rdstitch, one by one", how), ("  with competing motion models", EstimationOptions())):
-        alone = [_timed(partial(_alone, pair, options)) for pair in pairs]
+        alone = [timed(partial(_alone, pair, options)) for pair in pairs]
         yield name, np.array([taken for taken, _ in alone]), _distortions([one for _, one in alone])
     homlib = optional_module("homlib")
     if homlib is None:
@@ -89,7 +86,7 @@ def _lomsac(homlib: Any, function: str, pair: PairMatches) -> tuple[float, float
     options.max_num_iterations = 10_000
     options.final_least_squares = True
     x1, x2 = (np.asfortranarray(camera.normalize(points).T) for points in (pair.points1, pair.points2))
-    taken, (pose, _) = _timed(lambda: getattr(homlib, function)(x1, x2, options))
+    taken, (pose, _) = timed(lambda: getattr(homlib, function)(x1, x2, options))
     return taken, float(pose.distortion_parameter)
 
 
@@ -97,33 +94,12 @@ def _distortions(found: list[rdstitch.RadialHomography]) -> FloatArray:
     return np.array([one.distortion if one else np.inf for one in found])
 
 
-def _timed(work: Callable[[], Any]) -> tuple[float, Any]:
-    """Processor seconds, and what came of it."""
-    begun = time.process_time()
-    result = work()
-    return time.process_time() - begun, result
-
-
-@dataclass
-class StageTimes:
-    """Processor seconds until each stage last reported; a progress of recipes."""
-
-    begun: float = field(default_factory=time.process_time)
-    spent: dict[str, float] = field(default_factory=dict)
-
-    def __call__(self, stage: str, done: int, total: int) -> None:
-        """What has passed since the last report belongs to the stage that now reports."""
-        now = time.process_time()
-        self.spent[stage] = self.spent.get(stage, 0.0) + now - self.begun
-        self.begun = now
-
-
 def print_mosaic(name: str, folder: Path, sequence: Sequence | None = None) -> None:
     """A line: processor time, λ, pairs, errors against the truth where it is known; and one of the stages."""
     stages = StageTimes()
     options = rdstitch.StitchOptions(workers=1, overwrite=True, force=True)
     with TemporaryDirectory() as output:
-        seconds, result = _timed(lambda: rdstitch.mosaic([folder], Path(output) / "out.jpg", options, progress=stages))
+        seconds, result = timed(lambda: rdstitch.mosaic([folder], Path(output) / "out.jpg", options, progress=stages))
     alignment, pairs = result.registration.alignment, result.registration.pairs
     used, count = int(alignment.used.sum()), len(alignment.used)
     line = _times(name, seconds, count, result.canvas.size)
@@ -156,34 +132,34 @@ def print_peers(files: list[Path], peer_python: str | None) -> None:
     print(*notes, sep="\n")
 
 
-def main() -> None:
+def main(
+    *,
+    pairs: int = 100,
+    frames: int = 80,
+    views: bool = True,
+    folder: tuple[Path, ...] = (),
+    peer_python: str | None = None,
+) -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description="Processor time of registration")
-    parser.add_argument("--pairs", type=int, default=100, help="pairs of each kind; 0: none")
-    parser.add_argument("--frames", type=int, default=80, help="frames of 480 x 360 along a path; 0: none")
-    parser.add_argument("--views", action=argparse.BooleanOptionalAction, default=True, help="12 views of 640 x 480")
-    parser.add_argument("--folder", type=Path, action="append", default=[], help="images to stitch besides")
-    parser.add_argument("--peer-python", help="a Python that has the package stitching")
-    given = parser.parse_args()
-    if given.pairs:
-        print_pairs(given.pairs)
+    if pairs:
+        print_pairs(pairs)
     print(f"\n{'processor time of mosaic, s':34s}{'whole':>8s}{'an image':>10s}{'a Mpx':>9s}")
-    with TemporaryDirectory() as folder:
+    with TemporaryDirectory() as rendered:
         work: list[tuple[str, Path, Sequence | None]] = []
-        if given.views:
-            work.append(("12 views of 640 x 480", Path(folder) / "views", SETS[0].sequence(seed=100)))
-        if given.frames:
-            drive = floor_drive("parking", given.frames, seed=23, overlap=0.75, size=(480, 360))
-            work.append((f"{given.frames} frames of 480 x 360", Path(folder) / "frames", drive))
+        if views:
+            work.append(("12 views of 640 x 480", Path(rendered) / "views", SETS[0].sequence(seed=100)))
+        if frames:
+            drive = floor_drive("parking", frames, seed=23, overlap=0.75, size=(480, 360))
+            work.append((f"{frames} frames of 480 x 360", Path(rendered) / "frames", drive))
         for _, place, sequence in work:
             assert sequence is not None
             place.mkdir()
             sequence.write(place)
-        for name, place, sequence in [*work, *((own.name, own, None) for own in given.folder)]:
+        for name, place, sequence in [*work, *((own.name, own, None) for own in folder)]:
             print_mosaic(name, place, sequence)
-            print_peers(sorted(path.resolve() for path in place.iterdir() if path.suffix != ".csv"), given.peer_python)
-    print(f"\nlargest memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
+            print_peers(sorted(path.resolve() for path in place.iterdir() if path.suffix != ".csv"), peer_python)
+    print(f"\nlargest memory {peak_memory():.0f} MB")
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -1,4 +1,4 @@
-"""Cost and accuracy by the number of frames: ``python -m tests.benchmarks.scale [COUNT …] [--shuffled] [--register]``.
+"""Cost and accuracy by the number of frames: ``python -m examples.benchmarks.scale [COUNT …]``.
 
 A drone's survey of 480 x 360 frames, one lane beside the other, is rendered frame by frame into a temporary folder (60
 kB a frame) and stitched by one worker in a process of its own. Printed are processor time and peak memory by stage, the
@@ -6,7 +6,6 @@ error of λ, and the largest position error of any frame, also as a share of the
 those of one run compare.
 """
 
-import argparse
 import json
 import resource
 import subprocess
@@ -19,13 +18,12 @@ from typing import Any
 import numpy as np
 
 import rdstitch
+from examples.benchmarks.driver import StagePeaks, StageTimes, run
 from examples.judging import alignment_error
 from rdstitch.camera import Camera
 from rdstitch.io.write import write_image
 from rdstitch.radial_homography import to_plane
 from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over, survey_poses
-from tests.benchmarks.peak_memory import StagePeaks
-from tests.benchmarks.registration import StageTimes
 
 COUNTS = (100, 300, 1000, 3000)
 DISTORTION = -0.25
@@ -111,26 +109,22 @@ def print_row(row: dict[str, Any], first: dict[str, Any]) -> None:
         print(f"{'':8s}{unit}: " + ", ".join(f"{stage} {value:.1f}" for stage, value in most), flush=True)
 
 
-def main() -> None:
+def main(
+    counts: tuple[int, ...] = COUNTS, *, shuffled: bool = False, register: bool = False, folder: Path | None = None
+) -> None:
     """Print the table; or, in a process of its own, one row of it as JSON."""
-    parser = argparse.ArgumentParser(description="Cost and accuracy by the number of frames")
-    parser.add_argument("counts", type=int, nargs="*", default=list(COUNTS), help="numbers of frames")
-    parser.add_argument("--shuffled", action="store_true", help="frames in no order")
-    parser.add_argument("--register", action="store_true", help="registration only, no image")
-    parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.folder is not None:
-        print(json.dumps(measure(given.folder, given.counts[0], given.shuffled, given.register)))
+    if folder is not None:
+        print(json.dumps(measure(folder, counts[0], shuffled, register)))
         return
     columns = ("s", "ms/frame", "ratio", "MB", "MB/frame", "used", "pairs/fr.", "Δλ", "median", "largest", "% of path")
     widths = (10, 10, 8, 10, 10, 8, 10, 11, 9, 9, 10)
     print(f"{'frames':>8}" + "".join(f"{name:>{width}}" for name, width in zip(columns, widths, strict=True)))
     first: dict[str, Any] | None = None
-    for count in given.counts:
-        with TemporaryDirectory() as folder:
-            write_frames(survey(count), frame_order(count, given.shuffled), Path(folder))
-            command = [sys.executable, "-m", "tests.benchmarks.scale", str(count), "--folder", folder]
-            command += ["--shuffled"] * given.shuffled + ["--register"] * given.register
+    for count in counts:
+        with TemporaryDirectory() as rendered:
+            write_frames(survey(count), frame_order(count, shuffled), Path(rendered))
+            command = [sys.executable, "-m", "examples.benchmarks.scale", str(count), "--folder", rendered]
+            command += ["--shuffled"] * shuffled + ["--register"] * register
             printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
         row = json.loads(printed.splitlines()[-1])
         first = first or row
@@ -138,4 +132,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -1,4 +1,4 @@
-"""Strips over rough ground: ``python -m tests.benchmarks.relief [--sets N] [--images N]``.
+"""Strips over rough ground: ``python -m examples.benchmarks.relief [--sets N] [--images N]``.
 
 Every set is a strip of images by one camera over hills ("bumps"), buildings or ridges ("slopes") of 2, 5 or 10 % of
 its height, or over a plane, as matches with 0.3 pixels of noise and 10 % outliers, through two-view estimation and
@@ -15,12 +15,12 @@ relief
     ``|λ - truth| <= 3 σ``, and the median of ``|λ - truth| / σ`` and of σ.
 """
 
-import argparse
 import time
 from collections.abc import Iterator
 
 import numpy as np
 
+from examples.benchmarks.driver import run
 from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.result import Alignment
 from rdstitch.errors import RdstitchError
@@ -39,28 +39,23 @@ def windows(item: Strip, images: int, seed: int) -> Iterator[tuple[int, Strip]]:
             yield count, item.window(first, count)
 
 
-def main() -> None:
+def main(
+    *, sets: int = 2, first: int = 0, images: int = 40, kind: str | None = None, height: float | None = None
+) -> None:
     """Print a row for every kind of ground."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sets", type=int, default=2, help="of each row")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first set")
-    parser.add_argument("--images", type=int, default=40)
-    parser.add_argument("--kind", choices=[*RELIEFS, "flat"], help="only this kind of ground")
-    parser.add_argument("--height", type=float, choices=HEIGHTS, help="only this one")
-    arguments = parser.parse_args()
     rows = [("flat", 0.0), *((kind, height) for height in HEIGHTS for kind in RELIEFS)]
     ratios: dict[int, list[float]] = {}
-    for kind, height in rows:
-        if arguments.kind not in (None, kind) or arguments.height not in (None, height):
+    for ground, rise in rows:
+        if kind not in (None, ground) or height not in (None, rise):
             continue
         start, shapes, cameras, noticed, own = time.process_time(), [], 0, 0, dict[int, list[tuple[float, float]]]()
-        for seed in range(arguments.first, arguments.first + arguments.sets):
-            item = strip(kind, height, seed, arguments.images)
-            for count, part in windows(item, arguments.images, seed):
+        for seed in range(first, first + sets):
+            item = strip(ground, rise, seed, images)
+            for count, part in windows(item, images, seed):
                 found = _aligned(part)
                 if found is None:
                     continue
-                if count == arguments.images:
+                if count == images:
                     shapes.append(displacement(item, found))
                     cameras += found.model != "homography"
                     noticed += found.relief.found
@@ -68,7 +63,7 @@ def main() -> None:
                 own.setdefault(count, []).append((error, found.distortion_std))
         shapes = shapes or [np.nan]
         print(
-            f"{kind} {height:.0%}: one camera {cameras} of {arguments.sets}, "
+            f"{ground} {rise:.0%}: one camera {cameras} of {sets}, "
             f"shape {100 * np.median(shapes):.2f} ({100 * max(shapes):.2f}) %, relief {noticed}, "
             + "; ".join(_of_distortion(count, pairs) for count, pairs in sorted(own.items()))
             + f"; {time.process_time() - start:.0f} s",
@@ -102,4 +97,4 @@ def _of_distortion(count: int, pairs: list[tuple[float, float]]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

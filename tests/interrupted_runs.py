@@ -1,12 +1,5 @@
-"""kill -9 measured: ``python -m tests.benchmarks.interruptions [--frames N] [--kills N] [--seed N]``.
+"""Runs with ``--cache`` that are killed at random moments and continue from the cache."""
 
-Frames of a robot's drive are registered with ``--cache``; the process is killed at random moments, and the next run
-goes on from the cache. Printed is how much of the work was begun more than once, by the processor time that it takes,
-and whether the result has the same bytes.
-"""
-
-import argparse
-import os
 import random
 import subprocess
 import sys
@@ -88,22 +81,3 @@ def repeated(frames: int, kills: int, seed: int = 0) -> tuple[dict[str, float], 
         shares = {kind: killed[kind] / count - 1.0 for kind, count in plain.items()}
         shares["all work"] = sum(shares[kind] * taken for kind, taken in seconds.items()) / sum(seconds.values())
         return shares, outputs[0].read_bytes() == outputs[1].read_bytes()
-
-
-def main() -> None:
-    """Print what was done again."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--frames", type=int, default=300)
-    parser.add_argument("--kills", type=int, default=10)
-    parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    shares, same = repeated(given.frames, given.kills, given.seed)
-    names = {"_detect": "detected", "_match_signs": "matched", "estimate_radial_homographies": "estimated"}
-    for kind, share in shares.items():
-        print(f"{names.get(kind, kind):10s}{100 * share:6.1f} % again")
-    print("the same bytes" if same else "OTHER BYTES")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,11 +1,10 @@
-"""The minimal solvers, measured: ``python -m tests.benchmarks.solvers [--seed N]``.
+"""The minimal solvers, measured: ``python -m examples.benchmarks.solvers [--seed N]``.
 
 Accuracy on 20,000 noise-free instances a solver; time on batches of 4,096 and on single samples. Times are printed with
 their ratio to the linear algebra that elimination templates of the same problems cost, measured in turns with the
 solvers in the same run; it is processor time, of all cores together.
 """
 
-import argparse
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
+from examples.benchmarks.driver import run
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
 from rdstitch.solvers import Solutions
@@ -166,12 +166,8 @@ def _all(peer: Callable[..., list[Any]], pairs: list[tuple[FloatArray, FloatArra
     return [peer(a, b) for a, b in pairs]
 
 
-def main() -> None:
+def main(*, seed: int = 20_000) -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description="Accuracy and speed of the minimal solvers")
-    parser.add_argument("--seed", type=int, default=20_000)
-    seed = parser.parse_args().seed
-
     print(f"{INSTANCES:,} noise-free instances, λ in [-0.7, 0], tilt up to 0.3 rad, any yaw")
     print(f"{'':24s}{'solutions':>11s}{'solved %':>10s}{'found %':>10s}{'median |Δλ|':>12s}{'median |ΔH|':>12s}")
     for case in cases(seed, INSTANCES, known_tilt=0.3):
@@ -197,4 +193,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -1,17 +1,17 @@
-"""How many of the pairs that overlap are candidates: ``python -m tests.benchmarks.retrieval [COUNT …] [--ordered]``.
+"""How many of the pairs that overlap are candidates: ``python -m examples.benchmarks.retrieval [COUNT …] [--ordered]``.
 
 A drone's survey of 320 x 240 frames is rendered, its features are detected, and the candidate pairs of the shuffled
 frames are compared with the pairs that truly overlap: those whose footprints on the plane share so much of the smaller
 one.
 """
 
-import argparse
 import time
 
 import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
+from examples.benchmarks.driver import run
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions, detect
@@ -46,22 +46,18 @@ def overlaps(footprints: list[FloatArray]) -> dict[tuple[int, int], float]:
     return found
 
 
-def main() -> None:
+def main(
+    counts: tuple[int, ...] = (100, 300, 1000), *, ordered: bool = False, features: int = 1000, seed: int = 5
+) -> None:
     """Print one line per number of frames."""
-    parser = argparse.ArgumentParser(description="Recall of candidate pairs")
-    parser.add_argument("counts", type=int, nargs="*", default=[100, 300, 1000], help="numbers of frames")
-    parser.add_argument("--ordered", action="store_true", help="frames in the order in which they were taken")
-    parser.add_argument("--features", type=int, default=1000, help="features a frame")
-    parser.add_argument("--seed", type=int, default=5)
-    given = parser.parse_args()
     print("frames  candidates a frame  ms a frame  " + "  ".join(f"overlap ≥ {least:.2f}" for least in OVERLAPS))
-    for count in given.counts:
-        sequence = survey(count, given.seed)
-        order = np.arange(count) if given.ordered else np.random.default_rng(given.seed).permutation(count)
-        options = FeatureOptions(max_features=given.features)
-        features = FeatureStore.of(detect(sequence.frame(index), options) for index in order.tolist())
+    for count in counts:
+        sequence = survey(count, seed)
+        order = np.arange(count) if ordered else np.random.default_rng(seed).permutation(count)
+        options = FeatureOptions(max_features=features)
+        store = FeatureStore.of(detect(sequence.frame(index), options) for index in order.tolist())
         begun = time.process_time()
-        pairs = set(first_pairs(features, seed=0))
+        pairs = set(first_pairs(store, seed=0))
         taken = time.process_time() - begun
         shared = overlaps(list(plane_outline(sequence.lens, sequence.poses.from_plane()[order])))
         line = f"{count:6d}{2 * len(pairs) / count:20.1f}{1e3 * taken / count:12.1f}  "
@@ -72,4 +68,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

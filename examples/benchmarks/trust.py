@@ -1,9 +1,9 @@
 """Is any result wrong that claims to be right? And how many of the solvable sets are solved?
 
-python -m tests.benchmarks.trust [--sets 300] [--first 0] [--kind pair] [--keep FILE]
+``python -m examples.benchmarks.trust [--sets 300] [--kind pair]``; ``--kind adverse`` takes all adverse ones in turn,
+``--keep FILE`` continues an earlier run.
 """
 
-import argparse
 import json
 import time
 from collections import Counter
@@ -11,6 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from examples.benchmarks.driver import run
 from tests.adverse_sets import ADVERSE, SOLVABLE_ADVERSE
 from tests.trust_sets import HOPELESS, ODD, SOLVABLE, SPOILED, Judged, judge_set, trust_set
 
@@ -18,49 +19,38 @@ _SOLVABLE = (*SOLVABLE, *ODD, *SPOILED, *SOLVABLE_ADVERSE)
 _OTHERS = (*HOPELESS, *(kind for kind in ADVERSE if kind not in SOLVABLE_ADVERSE))
 
 
-def main() -> None:
+def main(
+    *, sets: int = 30, first: int = 0, kind: str | None = None, keep: Path | None = None, verbose: bool = False
+) -> None:
     """Print every set that was not solved right, and the totals."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sets", type=int, default=30, help="number of random sets")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first one")
-    parser.add_argument(
-        "--kind",
-        choices=(*_SOLVABLE, *_OTHERS, "adverse"),
-        help="only sets of this kind, or of all adverse ones in turn",
-    )
-    parser.add_argument(
-        "--keep", type=Path, help="a line here for each set; those that are here already are not done again"
-    )
-    parser.add_argument("--verbose", action="store_true", help="one line for every set")
-    wanted = parser.parse_args()
     counts: Counter[tuple[str, str]] = Counter()
-    kept = _read(wanted.keep)
+    kept = _read(keep)
     start, done = time.process_time(), 0
-    for seed in range(wanted.first, wanted.first + wanted.sets):
+    for seed in range(first, first + sets):
         judged = kept.get(seed)
         if judged is None:
-            judged, done = _judge(seed, wanted.kind), done + 1
-            if wanted.keep is not None:
-                with wanted.keep.open("a", encoding="utf-8") as stream:
+            judged, done = _judge(seed, kind), done + 1
+            if keep is not None:
+                with keep.open("a", encoding="utf-8") as stream:
                     stream.write(json.dumps({"seed": seed, **asdict(judged)}) + "\n")
         what = _outcome(judged)
         silent, solved = what == "silently wrong", what == "solved"
         counts[judged.kind, what] += 1
-        if silent or wanted.verbose or (judged.kind in _SOLVABLE and not solved):
+        if silent or verbose or (judged.kind in _SOLVABLE and not solved):
             print(
                 f"{seed} {judged.kind}: {what}, status {judged.status}, {judged.error:.2f} px: {judged.text[:230]}",
                 flush=True,
             )
     columns = ("solved", "in part", "refused", "warned of", "silently wrong")
     print(f"\n{'kind':16}" + "".join(f"{name:>16}" for name in columns))
-    for kind in (*_SOLVABLE, *_OTHERS):
-        print(f"{kind:16}" + "".join(f"{counts[kind, name]:16}" for name in columns))
+    for each in (*_SOLVABLE, *_OTHERS):
+        print(f"{each:16}" + "".join(f"{counts[each, name]:16}" for name in columns))
     solvable = sum(count for (kind, _), count in counts.items() if kind in _SOLVABLE)
     share = sum(counts[kind, "solved"] for kind in _SOLVABLE) / max(solvable, 1)
     refused = sum(counts[kind, "refused"] for kind in _SOLVABLE) / max(solvable, 1)
     wrong = sum(counts[kind, "silently wrong"] for kind in (*_SOLVABLE, *_OTHERS))
     print(f"\n{share:.1%} of {solvable} solvable sets solved, {refused:.1%} refused; ", end="")
-    print(f"{wrong} of {wanted.sets} sets silently wrong; ", end="")
+    print(f"{wrong} of {sets} sets silently wrong; ", end="")
     print(f"{(time.process_time() - start) / max(done, 1):.1f} s of processor time a set")
 
 
@@ -87,4 +77,4 @@ def _read(file: Path | None) -> dict[int, Judged]:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

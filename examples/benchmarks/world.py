@@ -1,4 +1,4 @@
-"""Sets of the world, as a user would stitch them: ``python -m tests.benchmarks.world FOLDER… [--output DIR]``.
+"""Sets of the world, as a user would stitch them: ``python -m examples.benchmarks.world FOLDER… [--output DIR]``.
 
 Every subfolder that holds images is one set; each is stitched by ``rdstitch mosaic`` with no option. A row a set: exit
 status, images used, model, λ, the ratio of the areas that a pixel gets within the output (98 % over 2 %), the focal
@@ -7,7 +7,6 @@ processor time beside it. A result is "good" where the status is 0, all images a
 at most 30, and no image folded: what a person sees at a glance. Look at the images in ``--output`` for the rest.
 """
 
-import argparse
 import json
 import math
 import os
@@ -21,9 +20,9 @@ from typing import Any
 
 import numpy as np
 
+from examples.benchmarks.driver import SUFFIXES, images_of, run
 from rdstitch.arrays import FloatArray
 
-_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
 _GRID = np.stack(np.meshgrid([0.1, 0.5, 0.9], [0.1, 0.5, 0.9]), axis=-1).reshape(-1, 2)
 _MAX_DISTORTION, _MAX_STRETCH = 0.09, 30.0
 _MAX_SECONDS = 900
@@ -93,7 +92,7 @@ def shape_of(images: list[dict[str, Any]]) -> tuple[float, bool]:
     return float(high / max(low, 1e-12)), folded
 
 
-def run(command: list[str]) -> tuple[int, str, float]:
+def execute(command: list[str]) -> tuple[int, str, float]:
     """Run a command; its status, standard error, and processor time."""
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors)
@@ -104,15 +103,15 @@ def run(command: list[str]) -> tuple[int, str, float]:
 
 def stitch(folder: Path, output: Path, options: list[str], peer: str | None) -> Row:
     """Stitch one set."""
-    files = sorted(str(file) for file in folder.iterdir() if file.suffix.lower() in _SUFFIXES)
+    files = [str(file) for file in images_of(folder)]
     written = output / f"{folder.name}.jpg"
     program = ["timeout", str(_MAX_SECONDS), sys.executable, "-m", "rdstitch_cli"]
-    status, errors, seconds = run([*program, "mosaic", *files, "-o", str(written), "--overwrite", *options])
+    status, errors, seconds = execute([*program, "mosaic", *files, "-o", str(written), "--overwrite", *options])
     messages = tuple(line for line in errors.splitlines() if line.startswith("rdstitch:"))
     (output / f"{folder.name}.txt").write_text(errors)
     peer_seconds = math.nan
     if peer is not None:
-        peer_seconds = run(
+        peer_seconds = execute(
             ["timeout", str(_MAX_SECONDS), peer, *files, "--output", str(output / f"{folder.name}.peer.jpg")]
         )[2]
     sidecar = Path(f"{written}.json")
@@ -139,24 +138,17 @@ def stitch(folder: Path, output: Path, options: list[str], peer: str | None) -> 
     )
 
 
-def main() -> None:
+def main(
+    folders: tuple[Path, ...], *, output: Path | None = None, peer: str | None = None, jobs: int = 1, options: str = ""
+) -> None:
     """Print a row a set."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folders", nargs="+", type=Path)
-    parser.add_argument("--output", type=Path)
-    parser.add_argument("--peer", help="the command stitch of the package stitching")
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--options", default="", help="more options for rdstitch, in one string")
-    arguments = parser.parse_args()
-    sets = sorted(
-        {file.parent for folder in arguments.folders for file in folder.rglob("*") if file.suffix.lower() in _SUFFIXES}
-    )
-    output = arguments.output or Path(tempfile.mkdtemp())
+    sets = sorted({file.parent for folder in folders for file in folder.rglob("*") if file.suffix.lower() in SUFFIXES})
+    output = output or Path(tempfile.mkdtemp())
     output.mkdir(parents=True, exist_ok=True)
     print("     set                      status used  model           λ    areas   f/half lines  cpu s  peer s")
-    with ThreadPoolExecutor(arguments.jobs) as pool:
+    with ThreadPoolExecutor(jobs) as pool:
         rows = []
-        for row in pool.map(lambda folder: stitch(folder, output, arguments.options.split(), arguments.peer), sets):
+        for row in pool.map(lambda folder: stitch(folder, output, options.split(), peer), sets):
             print(row, flush=True)
             rows.append(row)
     ratios = [row.seconds / row.peer_seconds for row in rows if math.isfinite(row.peer_seconds)]
@@ -167,4 +159,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -1,21 +1,20 @@
 """How the global adjustment grows with the number of frames, and how near it comes to the truth.
 
-Run as ``python -m tests.benchmarks.adjustment [COUNT …] [--path robot|ring|survey] [--links N] [--model MODEL …]``.
+Run as ``python -m examples.benchmarks.adjustment [COUNT …]``.
 Links are synthesised along a robot's path (a line, a turn, a parallel-parking path), around a ring that closes, or over
 a survey of parallel lanes. Printed are processor times per frame, and relative to the shortest sequence of the same
 run; the largest memory so far; and the drift, as the root mean square and as the largest error of a position in per
 cent of the path.
 """
 
-import argparse
 import math
-import resource
 import time
+from typing import Literal
 
 import numpy as np
 
+from examples.benchmarks.driver import peak_memory, run
 from rdstitch.alignment import AlignmentOptions, align
-from rdstitch.alignment.model_family import MODELS
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
@@ -51,14 +50,14 @@ def largest_error(found: Trajectory, truth: Trajectory) -> float:
     return float(np.abs(np.vdot(one, two) / np.vdot(one, one) * one - two).max()) / truth.length
 
 
-def main() -> None:
+def main(
+    counts: tuple[int, ...] = (40, 80, 160, 320),
+    *,
+    path: Literal["robot", "ring", "survey"] = "robot",
+    links: int = 6,
+    model: tuple[str, ...] = ("auto", "homography"),
+) -> None:
     """Print one line per model and number of frames."""
-    parser = argparse.ArgumentParser(description="Cost and accuracy of the global adjustment")
-    parser.add_argument("counts", type=int, nargs="*", default=[40, 80, 160, 320], help="numbers of frames")
-    parser.add_argument("--path", choices=("robot", "ring", "survey"), default="robot")
-    parser.add_argument("--links", type=int, default=6, help="next frames that each is linked with")
-    parser.add_argument("--model", nargs="*", choices=("auto", *MODELS), default=["auto", "homography"])
-    given = parser.parse_args()
     columns = (
         "model",
         "frames",
@@ -74,26 +73,26 @@ def main() -> None:
         "rot. °",
     )
     print("".join(f"{column:>11}" for column in (*columns, "drift %", "largest %")))
-    for model in given.model:
+    for one in model:
         first = math.nan
-        for count in given.counts:
-            made = synthesised(given.path, count, given.links)
+        for count in counts:
+            made = synthesised(path, count, links)
             begin = time.process_time()
-            found = align(made.cameras, made.links, AlignmentOptions(model=model))
+            found = align(made.cameras, made.links, AlignmentOptions(model=one))
             seconds = time.process_time() - begin
             each = seconds / count * 1e3
             first = each if math.isnan(first) else first
-            memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-            row = f"{model:>11}{count:11d}{int(found.used.sum()):11d}{len(made.links):11d}"
+            memory = peak_memory()
+            row = f"{one:>11}{count:11d}{int(found.used.sum()):11d}{len(made.links):11d}"
             row += f"{seconds:11.1f}{each:11.1f}{each / first:11.2f}"
             row += f"{memory:11.0f}{found.model:>11}{found.distortion - made.distortion:11.5f}"
             if found.poses is not None:
-                path, truth = Trajectory.from_alignment(found), true_path(made.poses)
-                error = compare_trajectories(path, truth)
+                run_path, truth = Trajectory.from_alignment(found), true_path(made.poses)
+                error = compare_trajectories(run_path, truth)
                 row += f"{100 * error.translation_in_own_unit:11.4f}{math.degrees(error.rotation):11.4f}"
-                row += f"{100 * error.drift:11.4f}{100 * largest_error(path, truth):11.4f}"
+                row += f"{100 * error.drift:11.4f}{100 * largest_error(run_path, truth):11.4f}"
             print(row, flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -1,4 +1,4 @@
-"""Rendered sets through fisheyes, Brown lenses and one-parameter lenses: ``python -m tests.benchmarks.lenses``.
+"""Rendered sets through fisheyes, Brown lenses and one-parameter lenses: ``python -m examples.benchmarks.lenses``.
 
 For each set the lens that was chosen, λ, and the distance from the true plane after the best similarity, pixels of the
 images: with the ladder of lenses, and with λ alone. At the end, for each kind of lens, the share of the sets in which
@@ -8,7 +8,6 @@ the ladder stopped at its first rung, the medians over the sets, and the worst s
 that is off by up to 5 % of width and height.
 """
 
-import argparse
 import tempfile
 import time
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from examples.benchmarks.driver import run
 from examples.judging import AlignmentError, alignment_error
 from rdstitch.alignment import Alignment
 from rdstitch.camera import Camera
@@ -123,25 +123,25 @@ def summary(name: str, chosen: str, found: list[Figures]) -> str:
     )
 
 
-def main() -> None:
+def main(
+    names: tuple[str, ...] = NAMES,
+    *,
+    seeds: int = 1,
+    first: int = 0,
+    lens: tuple[LensName, ...] = ("auto", "division"),
+    width: int = 640,
+) -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", default=list(NAMES), help=", ".join((*NAMES, *RANDOM)))
-    parser.add_argument("--seeds", type=int, default=1, help="sets of each kind of lens")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first set")
-    parser.add_argument("--lens", action="append", help="auto, division, …; both of these if not given")
-    parser.add_argument("--width", type=int, default=640, help="of the images, pixels; their height is 3/4 of it")
-    given = parser.parse_args()
-    size = (given.width, given.width * 3 // 4)
+    size = (width, width * 3 // 4)
     results: dict[tuple[str, str], list[Figures]] = {}
-    for name in given.names:
-        for seed in range(given.first, given.first + given.seeds):
-            lens = lens_of(name, seed, size)
-            poses = grid_poses(lens, 4, 3, overlap=0.5, yaw=np.pi, shift=0.05, tilt=(0.05, -0.03), seed=seed)
-            sequence = sequence_over(partial(ground, seed=seed, channels=1), lens, poses)
+    for name in names:
+        for seed in range(first, first + seeds):
+            camera = lens_of(name, seed, size)
+            poses = grid_poses(camera, 4, 3, overlap=0.5, yaw=np.pi, shift=0.05, tilt=(0.05, -0.03), seed=seed)
+            sequence = sequence_over(partial(ground, seed=seed, channels=1), camera, poses)
             with tempfile.TemporaryDirectory() as folder:
                 files = sequence.write(folder)
-                for chosen in given.lens or ("auto", "division"):
+                for chosen in lens:
                     try:
                         found = measure(name, seed, chosen, files, sequence)
                         results.setdefault((name, chosen), []).append(found)
@@ -152,4 +152,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

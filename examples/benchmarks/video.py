@@ -1,4 +1,4 @@
-"""A video stitched as it is: ``python -m tests.benchmarks.video [--frames N] [--overlap SHARE] [--every N|auto]``.
+"""A video stitched as it is: ``python -m examples.benchmarks.video [--frames N] [--overlap SHARE] [--every N|auto]``.
 
 A robot's drive of 640 x 480 frames is rendered, written as a Motion JPEG video and stitched by one thread in a process
 of its own. Printed are the processor time of a frame of the video, of the whole and by stage; how many frames were
@@ -6,7 +6,6 @@ taken; the error of λ, and the errors of position of the frames taken; and how 
 is in the mosaic. Times depend on the machine: only those of one run compare.
 """
 
-import argparse
 import json
 import resource
 import subprocess
@@ -20,13 +19,12 @@ import cv2
 import numpy as np
 
 import rdstitch
+from examples.benchmarks.driver import StageTimes, peak_memory, run
 from examples.judging import alignment_error
 from rdstitch.radial_homography import to_plane
 from rdstitch.synthetic import Sequence
 from rdstitch.synthetic.poses import plane_outline
-from tests.benchmarks.peak_memory import peak_memory
-from tests.benchmarks.registration import StageTimes
-from tests.floor_drives import DISTORTION, PATHS, floor_drive
+from tests.floor_drives import DISTORTION, floor_drive
 
 _SEED = 3
 _GRID = (5, 4)  # points of a frame at which its place is compared
@@ -87,35 +85,36 @@ def measure(file: Path, sequence: Sequence, every: int | None) -> dict[str, Any]
     }
 
 
-def main() -> None:
+def main(
+    *,
+    frames: int = 400,
+    path: str = "parking",
+    overlap: float = 0.95,
+    every: str = "auto",
+    video: Path | None = None,
+    run_here: bool = False,
+) -> None:
     """Print the figures."""
-    parser = argparse.ArgumentParser(description="Processor time and accuracy of a video")
-    parser.add_argument("--frames", type=int, default=400)
-    parser.add_argument("--path", choices=sorted(PATHS), default="parking")
-    parser.add_argument("--overlap", type=float, default=0.95, help="of frames that follow one another")
-    parser.add_argument("--every", default="auto", help="as of the command")
-    parser.add_argument("--video", type=Path, help="keep the video here, and use it if it is there")
-    parser.add_argument("--measure", action="store_true", help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    drive = floor_drive(given.path, given.frames, seed=_SEED, overlap=given.overlap)
-    if given.measure:
-        print(json.dumps(measure(given.video, drive, None if given.every == "auto" else int(given.every))))
+    drive = floor_drive(path, frames, seed=_SEED, overlap=overlap)
+    if run_here:
+        assert video is not None
+        print(json.dumps(measure(video, drive, None if every == "auto" else int(every))))
         return
     with TemporaryDirectory() as folder:
-        file = given.video or Path(folder) / "drive.avi"
+        file = video or Path(folder) / "drive.avi"
         if not file.exists():
             write_video(drive, file)
-        command = [sys.executable, "-m", "tests.benchmarks.video", "--measure", *sys.argv[1:], "--video", str(file)]
+        command = [sys.executable, "-m", "examples.benchmarks.video", "--run-here", *sys.argv[1:], "--video", str(file)]
         printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     row = json.loads(printed.splitlines()[-1])
-    each = row["seconds"] / given.frames
+    each = row["seconds"] / frames
     print(f"{row['seconds']:.1f} s, {each:.3f} s a frame; {row['memory']:.0f} MB", end="; ")
-    print(f"{row['taken']} of {given.frames} frames taken, {row['used']} aligned; {row['ground']:.2%} of the ground")
+    print(f"{row['taken']} of {frames} frames taken, {row['used']} aligned; {row['ground']:.2%} of the ground")
     print(f"λ - truth {row['distortion'] - DISTORTION:+.5f}; error of position in px: median", end=" ")
     print(f"{row['median']:.3f}, 95 % {row['percentile95']:.3f}, largest {row['largest']:.3f}")
     costliest = sorted(row["stages"].items(), key=lambda stage: -stage[1])[:_STAGES_SHOWN]
-    print("ms a frame: " + ", ".join(f"{stage} {1e3 * taken / given.frames:.1f}" for stage, taken in costliest))
+    print("ms a frame: " + ", ".join(f"{stage} {1e3 * taken / frames:.1f}" for stage, taken in costliest))
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

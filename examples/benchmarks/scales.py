@@ -1,11 +1,10 @@
-"""The same folder at other sizes: ``python -m tests.benchmarks.scales FOLDER... [--calibrate]``.
+"""The same folder at other sizes: ``python -m examples.benchmarks.scales FOLDER... [--calibrate]``.
 
 Every folder is registered as it is, at half its size and enlarged twice, as ``mosaic`` does, or ``calibrate``. Printed
 are the images used, λ and its standard deviation, and how far λ is from that of the folder as it is, in standard
 deviations of the less certain one. Images are handed on as arrays, so that their headers do not matter.
 """
 
-import argparse
 import math
 import time
 from collections.abc import Sequence
@@ -16,6 +15,7 @@ import cv2
 import numpy as np
 
 import rdstitch
+from examples.benchmarks.driver import run
 from rdstitch.errors import InputError, RdstitchError
 from rdstitch.features.prepared_image import PixelArray
 from rdstitch.io.read import read_image
@@ -78,18 +78,13 @@ def outcome_of(images: Sequence[PixelArray], *, calibrate: bool) -> Outcome:
     return Outcome(0, tuple(found.used.tolist()), found.distortion, found.distortion_std, text)
 
 
-def main() -> None:
+def main(folders: tuple[Path, ...], *, calibrate: bool = False, messages: bool = False) -> None:
     """Print a line for every folder and size."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folders", nargs="+", type=Path)
-    parser.add_argument("--calibrate", action="store_true")
-    parser.add_argument("--messages", action="store_true", help="print what the user would read, too")
-    arguments = parser.parse_args()
-    for folder in arguments.folders:
+    for folder in folders:
         images, first = images_of(folder), None
         for scale in SCALES:
             start = time.process_time()
-            found = outcome_of([resized(image, scale) for image in images], calibrate=arguments.calibrate)
+            found = outcome_of([resized(image, scale) for image in images], calibrate=calibrate)
             first = first or found
             away = abs(found.distortion - first.distortion) / max(found.deviation, first.deviation)
             print(
@@ -99,9 +94,9 @@ def main() -> None:
                 f"{time.process_time() - start:.0f} s",
                 flush=True,
             )
-            if found.status or arguments.messages:
+            if found.status or messages:
                 print(f"    {found.text}")
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -1,4 +1,4 @@
-"""Panoramas by rotation, measured: ``python -m tests.benchmarks.panoramas [NAME …]``.
+"""Panoramas by rotation, measured: ``python -m examples.benchmarks.panoramas [NAME …]``.
 
 Rendered sets of a camera that turns on the spot, with known rotations, λ and focal length. Errors are those of
 directions, in pixels of the images, after the best rotation of the whole; "closes" is the largest error of the
@@ -7,7 +7,6 @@ times: what it finds, and its time, depend on its random numbers. Its times are 
 times its median rdstitch takes. All are processor times of registration, checks and compositing.
 """
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
@@ -16,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from examples.benchmarks.driver import run
 from rdstitch.alignment import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
@@ -91,16 +91,12 @@ def stitched_by_opencv(images: list[Pixels], seeds: int) -> tuple[list[int], lis
     return used, sorted(seconds)
 
 
-def main() -> None:
+def main(names: tuple[str, ...] = tuple(SETS), *, seeds: int = 5) -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description="Accuracy and time of panoramas, beside OpenCV's stitcher")
-    parser.add_argument("names", nargs="*", choices=[*SETS, []], help="sets; all of them if none is named")
-    parser.add_argument("--seeds", type=int, default=5, help="of OpenCV's random numbers")
-    given = parser.parse_args()
     cv2.setNumThreads(1)
     head = f"{'set':12s}{'used':>8s}{'Δλ':>10s}{'Δf %':>9s}{'median px':>11s}{'closes px':>11s}{'s':>7s}"
     print(f"{head}  times OpenCV's: used, s")
-    for name in given.names or SETS:
+    for name in names or SETS:
         truth = rendered(name)
         with tempfile.TemporaryDirectory() as folder:
             paths = truth.write(folder, "p{:02d}.png")
@@ -116,10 +112,10 @@ def main() -> None:
             end="  ",
             flush=True,
         )
-        used, peer = stitched_by_opencv(images, given.seeds)
+        used, peer = stitched_by_opencv(images, seeds)
         times = " ".join(f"{t:.1f}" for t in peer)
         print(f"{seconds / np.median(peer):5.2f}: {min(used)} to {max(used)} used, {times}", flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

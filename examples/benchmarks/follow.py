@@ -1,4 +1,4 @@
-"""Frames followed as they arrive: ``python -m tests.benchmarks.follow [--frames N] [--path PATH] [--overlap SHARE]``.
+"""Frames followed as they arrive: ``python -m examples.benchmarks.follow``.
 
 A robot's drive of 640 x 480 frames is rendered into a temporary folder and followed, by one thread. Printed are the
 processor time of a frame, reading and preview included, until λ is known and from then on; λ as it converges; how far
@@ -6,8 +6,6 @@ the path of the poses as they were first given is from the truth; and the larges
 at the end.
 """
 
-import argparse
-import resource
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,12 +13,13 @@ from tempfile import TemporaryDirectory
 import cv2
 import numpy as np
 
+from examples.benchmarks.driver import peak_memory, run
 from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
 from rdstitch.inputs.arrivals import Arrivals
 from rdstitch.io.write import write_image
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.follow import FollowedFrame, follow
-from tests.floor_drives import DISTORTION, PATHS, floor_drive, true_path
+from tests.floor_drives import DISTORTION, floor_drive, true_path
 
 
 def path_of(frames: list[FollowedFrame]) -> Trajectory:
@@ -32,22 +31,12 @@ def path_of(frames: list[FollowedFrame]) -> Trajectory:
     return Trajectory(np.array(numbers), places, yaw, height)
 
 
-def peak() -> float:
-    """Largest memory of this process so far, MB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
-def main() -> None:
+def main(*, frames: int = 200, path: str = "turn", overlap: float = 0.9) -> None:
     """Print the figures."""
-    parser = argparse.ArgumentParser(description="Frame rate and accuracy of --follow")
-    parser.add_argument("--frames", type=int, default=200)
-    parser.add_argument("--path", choices=sorted(PATHS), default="turn")
-    parser.add_argument("--overlap", type=float, default=0.9, help="of frames that follow one another")
-    given = parser.parse_args()
     cv2.setNumThreads(1)
-    drive = floor_drive(given.path, given.frames, seed=3, overlap=given.overlap)
+    drive = floor_drive(path, frames, seed=3, overlap=overlap)
     with TemporaryDirectory() as folder:
-        for index in range(given.frames):
+        for index in range(frames):
             write_image(Path(folder) / f"frame_{index:05d}.jpg", drive.frame(index))
         arrivals = Arrivals(folder, frames_folder=lambda: Path(folder), idle=0.5)
         preview = Path(folder) / ".preview.jpg"
@@ -56,8 +45,8 @@ def main() -> None:
             found.append(frame)
             spent.append((now := time.process_time()) - last)
             last = now
-            if len(found) == given.frames // 3:
-                memory = peak()
+            if len(found) == frames // 3:
+                memory = peak_memory()
     aligned = [k for k, frame in enumerate(found) if frame.tracked and frame.tracked.placement is not None]
     known = next((k for k, frame in enumerate(found) if frame.tracked and frame.tracked.distortion_known), 0)
     before, after = np.array(spent[:known]), np.array(spent[known:])
@@ -70,9 +59,9 @@ def main() -> None:
             print(f"after {share:4.0%} of the frames: λ - truth {tracked.distortion - DISTORTION:+.5f}", end=" ")
             print(f"± {tracked.distortion_std:.5f}")
     error = compare_trajectories(path_of(found), true_path(drive))
-    print(f"{len(aligned)} of {given.frames} frames placed; drift {error.drift:.3%} of the path")
-    print(f"largest memory {memory:.0f} MB after a third, {peak():.0f} MB at the end")
+    print(f"{len(aligned)} of {frames} frames placed; drift {error.drift:.3%} of the path")
+    print(f"largest memory {memory:.0f} MB after a third, {peak_memory():.0f} MB at the end")
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -1,16 +1,16 @@
-"""Is a turn on the spot told from a move over a plane? ``python -m tests.benchmarks.turn_or_plane [--sets 20]``.
+"""Is a turn on the spot told from a move over a plane? ``python -m examples.benchmarks.turn_or_plane [--sets 20]``.
 
 Half of the sets are turns, with and without parallax; half are images of a plane: pairs, chains and grids of a robot
 or a drone, and free poses as of a hand or a kite. One line for every set whose kind was not found, and the totals.
 """
 
-import argparse
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from examples.benchmarks.driver import run
 from rdstitch.camera import Camera
 from rdstitch.errors import RdstitchError
 from rdstitch.pipeline import StitchOptions, mosaic
@@ -58,16 +58,12 @@ def plane(seed: int) -> Sequence:
     return sequence_over(lambda size: ground(size, seed), lens, poses, photometry=Photometry(noise=0.012), seed=seed)
 
 
-def main() -> None:
+def main(*, sets: int = 20, first: int = 0) -> None:
     """Print what was not found, and the totals."""
-    parser = argparse.ArgumentParser(description="Is a turn on the spot told from a move over a plane?")
-    parser.add_argument("--sets", type=int, default=20)
-    parser.add_argument("--first", type=int, default=0, help="seed of the first one")
-    wanted = parser.parse_args()
     right = both = refused = 0
     parallax = {True: [0, 0], False: [0, 0]}
     start = time.process_time()
-    for seed in range(wanted.first, wanted.first + wanted.sets):
+    for seed in range(first, first + sets):
         turns = seed % 2 == 1
         with TemporaryDirectory() as folder:
             paths = (turn if turns else plane)(seed).write(Path(folder))
@@ -87,11 +83,11 @@ def main() -> None:
             text = f"{alignment.model}, {len(paths)} images, rms {alignment.rms:.2f}: {alignment.model_reason}"
             print(f"{seed} {'turn' if turns else 'plane'}: {text}", flush=True)
     print(
-        f"{right} of {wanted.sets} sets right, {both} more said that both explain the images, {refused} refused; "
+        f"{right} of {sets} sets right, {both} more said that both explain the images, {refused} refused; "
         f"parallax: {parallax[True][1]} of {sum(parallax[True])} turns by hand, {parallax[False][1]} of "
-        f"{sum(parallax[False])} others; {(time.process_time() - start) / wanted.sets:.1f} s a set"
+        f"{sum(parallax[False])} others; {(time.process_time() - start) / sets:.1f} s a set"
     )
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

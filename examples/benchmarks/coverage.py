@@ -1,14 +1,13 @@
-"""Is λ's standard deviation honest? ``python -m tests.benchmarks.coverage FOLDER=λ... [--windows N] [--sizes 2 4 8]``.
+"""Is λ's standard deviation honest? ``python -m examples.benchmarks.coverage FOLDER=λ...``.
 
 Windows of images that follow one another, at random places of folders whose λ is known, are calibrated each on its
 own. Printed are λ of each, its standard deviation and error in standard deviations, and in the end the share within
-three and the median. ``python -m tests.benchmarks.relief`` prints the same for rendered ground, flat and rough.
+three and the median. ``python -m examples.benchmarks.relief`` prints the same for rendered ground, flat and rough.
 
 λ is that of the one-parameter lens nearest over the whole image. A λ fitted to the corners of a chessboard, which do
 not reach the corners of the image, is another one: of a GoPro -0.545 there and -0.594 in the whole.
 """
 
-import argparse
 import math
 import time
 from pathlib import Path
@@ -16,27 +15,20 @@ from pathlib import Path
 import numpy as np
 
 import rdstitch
+from examples.benchmarks.driver import images_of, run
 from rdstitch.errors import RdstitchError
 
-_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 
-
-def main() -> None:
+def main(folders: tuple[str, ...], *, windows: int = 2, sizes: tuple[int, ...] = (2, 4, 8), seed: int = 0) -> None:
     """Print a line for every window."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folders", nargs="+", metavar="FOLDER=LAMBDA")
-    parser.add_argument("--windows", type=int, default=2, help="of each size")
-    parser.add_argument("--sizes", type=int, nargs="+", default=[2, 4, 8])
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
     ratios: list[float] = []
     refused = 0
-    for named in arguments.folders:
+    for named in folders:
         folder, truth = Path(named.rpartition("=")[0]), float(named.rpartition("=")[2])
-        files = sorted(file for file in folder.iterdir() if file.suffix.lower() in _SUFFIXES)
-        rng = np.random.default_rng(arguments.seed)
-        for size in arguments.sizes:
-            for first in rng.integers(0, len(files) - size + 1, arguments.windows).tolist():
+        files = images_of(folder)
+        rng = np.random.default_rng(seed)
+        for size in sizes:
+            for first in rng.integers(0, len(files) - size + 1, windows).tolist():
                 start = time.process_time()
                 try:
                     registration = rdstitch.calibrate(files[first : first + size], rdstitch.StitchOptions(workers=1))
@@ -62,4 +54,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)
