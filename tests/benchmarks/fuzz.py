@@ -26,7 +26,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -37,15 +36,13 @@ from rdstitch_cli.config import read_config
 from rdstitch_cli.main import cli
 from rdstitch_cli.terminal import one_line
 
-from rdstitch.alignment.result import PlanarPoses, ReliefTest
 from rdstitch.camera import Camera
 from rdstitch.camera_files import load_camera
 from rdstitch.errors import RdstitchError
-from rdstitch.features import Features
 from rdstitch.inputs.find import find_images
 from rdstitch.inputs.measurements import with_attitudes
 from rdstitch.inputs.source import Source
-from rdstitch.io import packing, read_image, read_metadata, write_image
+from rdstitch.io import read_image, read_metadata, write_image
 from rdstitch.io.deepzoom import holds_only_tiles
 from rdstitch.io.mask import read_mask
 from rdstitch.io.metadata import Metadata, metadata_of
@@ -116,25 +113,6 @@ def _exif_blocks() -> tuple[bytes, ...]:
     head = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01"
     text, number = b"\x02\0\x02\0\0\x006\0\0\0", b"\x0b\0\x01\0\0\0\0\0\xc0\x40"
     return (whole, *(head + value + bytes(4) for value in (text, number)))
-
-
-def _entries() -> tuple[bytes, ...]:
-    """What the cache holds, without the digest that guards it."""
-    rng = np.random.default_rng(7)
-    camera = Camera((400, 300), -0.2, focal=380.0, focal_source="exif", distortion_std=float("inf"))
-    numbers = rng.random(9)
-    descriptors = rng.random((9, 8)).astype(np.float32)
-    features = Features(rng.random((9, 2)), descriptors, numbers, numbers, numbers, None, "sift", (400, 300))
-    poses = PlanarPoses(rng.random(3), rng.random((3, 2)), rng.random(3), rng.random((3, 2)))
-    values = ("name", features), {"cameras": (camera, camera), "poses": poses, "file": Path("a/b"), "none": None}
-    return tuple(packing.pack(value)[packing._HEAD - 8 :] for value in values)
-
-
-def _entry(file: Path) -> Any:
-    body = file.read_bytes()
-    data = packing._MAGIC + sha256(body).digest() + body
-    # The cache computes again; nobody is told.
-    return _by_name(file, partial(packing.unpack, data, (Camera, Features, PlanarPoses, ReliefTest)))
 
 
 def _xmp(file: Path) -> Any:
@@ -218,7 +196,6 @@ PARSERS = (
     Parser("sidecar", (json.dumps(SIDECAR).encode(), json.dumps(SIDECAR, indent=2).encode()), read_sidecar),
     Parser("camera file", tuple(text.encode() for text in CAMERA_FILES), load_camera),
     Parser("config file", _CONFIGURATIONS, _configuration),
-    Parser("cache entry", _entries(), _entry),
     Parser("attitude table", _TABLES, _attitudes),
     Parser("list", _LISTS, _list),
     Parser("sidecar beside an image", (json.dumps(SIDECAR).encode(),), is_rdstitch_output, "a.png.json"),
