@@ -185,11 +185,11 @@ def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list
     if wanted == "off":
         return list(sources), []
     if wanted != "auto":
-        pixels = sources[0].read(keep=True).pixels
+        pixels = sources[0].read().pixels
         channels = 1 if pixels.ndim == 2 else pixels.shape[2]
         field = read_flat_field(wanted, sources[0].camera.image_size, channels)
         return [replace(source, flat_field=field) for source in sources], []
-    shown = estimate_illumination(lambda index: sources[index].read(keep=True).pixels, len(sources))
+    shown = estimate_illumination(lambda index: sources[index].read().pixels, len(sources))
     if shown.field is None:
         text = f"{len(sources)} tiles show no illumination that they have in common, and samples stay as they are"
         return list(sources), [Message(text, severity="note", code="flat-field")]
