@@ -1,5 +1,6 @@
 """Displacements of blocks to a fraction of a pixel, by Newton's method on their correlation, with their covariance."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,9 @@ _SIGNIFICANT = 5.0
 
 _CORRELATED = 4.0 * np.pi * _SMOOTHING**2
 """Pixels that share their noise after the filter."""
+
+
+Transfer = Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -44,25 +48,21 @@ class BlockMatches:
 
 
 def refine(
-    first: NDArray[Any], second: NDArray[Any], blocks: IntArray, displacements: FloatArray, tolerance: float
+    first: NDArray[Any], second: NDArray[Any], blocks: IntArray, transfer: Transfer, tolerance: float
 ) -> BlockMatches:
-    """Refine the displacements of blocks of the first tile in the second.
+    """Refine where blocks of the first tile are in the second.
 
     Parameters
     ----------
     first, second : ndarray of shape (h, w)
     blocks : ndarray of shape (K, 4)
         Boxes in the first tile.
-    displacements : ndarray of shape (K, 2)
-        What is at p in the first is at ``p - displacement`` in the second, about.
+    transfer : callable
+        Gives the places in the second tile, about, of points (N, 2) of the first; its lens is in it.
     tolerance : float
         By how much that may be wrong, pixels.
     """
-    found = []
-    for block, displacement in zip(blocks, displacements, strict=True):
-        match = _refined(first, second, block, displacement, tolerance)
-        if match is not None:
-            found.append(match)
+    found = [match for block in blocks if (match := _refined(first, second, block, transfer, tolerance)) is not None]
     if not found:
         return BlockMatches(np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2, 2)))
     points1, points2, information = (np.array(values) for values in zip(*found, strict=True))
@@ -70,18 +70,24 @@ def refine(
 
 
 def _refined(
-    first: NDArray[Any], second: NDArray[Any], block: IntArray, displacement: FloatArray, tolerance: float
+    first: NDArray[Any], second: NDArray[Any], block: IntArray, transfer: Transfer, tolerance: float
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Places of a block's content in both tiles and their information; None where it shows nothing."""
-    whole = np.rint(displacement).astype(np.intp)
     sides = np.array([first.shape[::-1], second.shape[::-1]])
-    low = np.maximum(np.maximum(block[:2], _MARGIN), whole + _MARGIN)
-    high = np.minimum(np.minimum(block[2:], sides[0] - _MARGIN), sides[1] + whole - _MARGIN)
+    corners = np.array([block[[0, 1]], block[[2, 1]], block[[0, 3]], block[[2, 3]]], dtype=np.float64)
+    off = corners - transfer(corners)
+    # What the search may need beside them is there of both.
+    low = np.maximum(block[:2], np.maximum(0, np.ceil(off.max(axis=0)).astype(np.intp)) + _MARGIN)
+    high = np.minimum(block[2:], np.minimum(sides[0], sides[1] + np.floor(off.min(axis=0)).astype(np.intp)) - _MARGIN)
     if (high - low < _MIN_SIDE).any():
         return None
-    one = _smooth(first, low, high)
-    wide = _smooth(second, low - whole - _MARGIN + 1, high - whole + _MARGIN - 1)
-    inner = slice(_MARGIN - 1, 1 - _MARGIN)
+    columns, rows = (np.arange(a, b, dtype=np.float64) for a, b in zip(low, high, strict=True))
+    points = np.stack(np.meshgrid(columns, rows), axis=-1)
+    moved = transfer(points.reshape(-1, 2)).reshape(points.shape)
+    corner = np.maximum(np.floor(moved.min(axis=(0, 1))).astype(np.intp) - _MARGIN, 0)
+    stop = np.minimum(np.ceil(moved.max(axis=(0, 1))).astype(np.intp) + _MARGIN + 1, sides[1])
+    maps = (moved - corner).astype(np.float32)
+    one, wide = _smooth(first, low, high), _smooth(second, corner, stop)
     weight = _window(*one.shape)
     total = float(weight.sum())
     one -= float((weight * one).sum()) / total
@@ -89,9 +95,8 @@ def _refined(
     gradient1 = _gradient(one)
     shift = np.zeros(2)
     for _ in range(_ITERATIONS):
-        matrix = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]]])
-        moved = cv2.warpAffine(wide, matrix, wide.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-        two = moved[inner, inner]
+        x, y = (maps[..., k] - np.float32(shift[k]) for k in (0, 1))
+        two = cv2.remap(wide, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         two = two - float((weight * two).sum()) / total
         spread = np.sqrt(float((weight * two * two).sum()) / total)
         if not min(spread, deviation) > 0.0:
@@ -117,10 +122,9 @@ def _refined(
         return None
     noise = float((weight * difference**2).sum()) / total * _CORRELATED
     energy = np.array([[float((a * b / np.maximum(weight, 1e-6)).sum()) for b in mean] for a in mean])
-    covariance = noise * energy
-    information = hessian @ np.linalg.pinv(covariance) @ hessian
+    information = hessian @ np.linalg.pinv(noise * energy) @ hessian
     point = low + _centroid(mean)
-    return point, point - whole - shift, information
+    return point, transfer(point[None])[0] - shift, information
 
 
 def _smooth(tile: NDArray[Any], low: IntArray, high: IntArray) -> NDArray[np.float32]:
