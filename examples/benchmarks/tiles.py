@@ -17,7 +17,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.inputs.source import read_sources
-from rdstitch.pipeline.stage_tiles import with_flat_field
+from rdstitch.pipeline.flat_field import with_flat_field
 from rdstitch.stage import TileGrid, register_tiles
 from rdstitch.synthetic.stage import Specimen, StageGrid
 

@@ -11,6 +11,7 @@ from rdstitch.report.camera_path import path_over_plane
 from rdstitch.report.lens import grid, lens_curve, votes
 from rdstitch.report.output import local_alignment, mosaic
 from rdstitch.report.pairs import match_graph, matched, residual_map
+from rdstitch.report.stage import stage
 from rdstitch.report.summary import notices, run, summary, timings
 from rdstitch.stitch_result import StitchResult
 
@@ -83,6 +84,7 @@ def report_page(
     body = [
         summary(registration, stitched),
         notices(registration),
+        stage(registration),
         "" if stitched is None else mosaic(stitched, staged),
         match_graph(registration),
         votes(registration),
