@@ -10,6 +10,7 @@ from rdstitch.report.camera_path import path_over_plane
 from rdstitch.report.lens import grid, lens_curve, votes
 from rdstitch.report.output import local_alignment, mosaic
 from rdstitch.report.pairs import match_graph, matched, residual_map
+from rdstitch.report.stage import stage
 from rdstitch.report.summary import notices, run, summary, timings
 from rdstitch.report.svg import Content, Markup, element, joined
 from rdstitch.stitch_result import StitchResult
@@ -84,6 +85,7 @@ def report_page(
     body: list[Content] = [
         summary(registration, stitched),
         notices(registration),
+        stage(registration),
         "" if stitched is None else mosaic(stitched, staged),
         match_graph(registration),
         votes(registration),
