@@ -129,6 +129,16 @@ class Renderer:
         )
         return part, tuple(chosen)
 
+    def owners(self, box: Box) -> list[Layer]:
+        """The images of a box with the weights (h, w) that their samples have in it, which add up to 1."""
+        layers = self._layers(box)
+        total = np.zeros((box[3] - box[1], box[2] - box[0]), dtype=np.float32)
+        for layer in layers:
+            cut(total, box, layer.box)[...] += layer.weight
+        np.maximum(total, np.finfo(np.float32).tiny, out=total)
+        shares = [replace(layer, weight=layer.weight / cut(total, box, layer.box)) for layer in layers]
+        return [part for layer in shares if (part := layer.weighted_part(box)) is not None]
+
     def _contact_zone(self, layers: Sequence[Layer], box: Box) -> Box | None:
         """The part of a box in which blending can mix images; elsewhere it would return the only one there."""
         supports = [self._blend_support(layer.box) for layer in layers]

@@ -2,6 +2,7 @@
 
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
+from rdstitch.pipeline.composer import Composer
 from rdstitch.pipeline.recipes import calibrate, mosaic, pano, trajectory
 from rdstitch.pipeline.recomposition import Recomposition
 from rdstitch.pipeline.stage_tiles import place_tiles, tiles
@@ -10,6 +11,7 @@ from rdstitch.registration import Registration
 from rdstitch.stitch_result import StitchResult
 
 __all__ = [
+    "Composer",
     "Recomposition",
     "Registration",
     "StitchOptions",

@@ -114,8 +114,9 @@ def apply(
         guard = InputGuard(strict)
         sources, left_out = _sources(saved, chosen, guard, options.max_memory)
         used = _used(saved, sources, left_out, mask, strict=strict)
+        placed = _placed(saved, used)
         composed = compose_images(
-            _placed(saved, used),
+            placed,
             output,
             options,
             StitchOptions(workers=workers).threads,
@@ -129,6 +130,7 @@ def apply(
             tuple(sources),
             matched,
             left_out,
+            placed,
             composed.canvas,
             options,
             None if output is None else Path(output),
