@@ -3,7 +3,7 @@
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.composer import Composer
-from rdstitch.pipeline.recipes import calibrate, mosaic, pano, trajectory
+from rdstitch.pipeline.recipes import calibrate, mosaic, mosaic_blocks, pano, trajectory
 from rdstitch.pipeline.recomposition import Recomposition
 from rdstitch.pipeline.stage_tiles import place_tiles, tiles
 from rdstitch.pipeline.undistort_images import undistort
@@ -19,6 +19,7 @@ __all__ = [
     "apply",
     "calibrate",
     "mosaic",
+    "mosaic_blocks",
     "pano",
     "place_tiles",
     "tiles",
