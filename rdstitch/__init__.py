@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         tiles,
         trajectory,
         undistort,
+        write_layers,
     )
     from rdstitch.pipeline.follow import FollowedPoses, Pose, Tracker
     from rdstitch.radial_homography import RadialHomography
@@ -56,7 +57,7 @@ _HOMES = {
         "rdstitch.features": "FeatureOptions",
         "rdstitch.messages": "Message",
         "rdstitch.pipeline": "Composer Recomposition Registration StitchOptions StitchResult "
-        "apply calibrate mosaic mosaic_blocks pano place_tiles tiles trajectory undistort",
+        "apply calibrate mosaic mosaic_blocks pano place_tiles tiles trajectory undistort write_layers",
         "rdstitch.pipeline.follow": "FollowedPoses Pose Tracker",
         "rdstitch.radial_homography": "RadialHomography",
         "rdstitch.report": "write_report",
@@ -101,6 +102,7 @@ __all__ = [
     "tiles",
     "trajectory",
     "undistort",
+    "write_layers",
     "write_report",
 ]
 

@@ -129,6 +129,20 @@ class Renderer:
         )
         return part, tuple(chosen)
 
+    def layer(self, index: int, box: Box) -> tuple[NDArray[Any], NDArray[np.bool_], NDArray[np.bool_]]:
+        """One image on its own in a box: samples (h, w, C), what it covers, and what of that the composite shows."""
+        geometry = locate(self.warps[index], box)
+        covered, opacity = geometry.inside, self._opacity(index, geometry)
+        if opacity is not None:
+            covered = covered & (opacity > 0)
+        mask = np.zeros(covered.shape, dtype=np.bool_)
+        for own in self.owners(box):
+            if own.index == index:
+                cut(mask, box, own.box)[...] |= own.weight > 0
+        samples = self._samples(Layer(index, box, covered.astype(np.float32), geometry), box)
+        samples[~covered] = 0
+        return samples, covered, mask
+
     def owners(self, box: Box) -> list[Layer]:
         """The images of a box with the weights (h, w) that their samples have in it, which add up to 1."""
         layers = self._layers(box)

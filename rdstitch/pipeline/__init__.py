@@ -3,6 +3,7 @@
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.composer import Composer
+from rdstitch.pipeline.layers import write_layers
 from rdstitch.pipeline.recipes import calibrate, mosaic, mosaic_blocks, pano, trajectory
 from rdstitch.pipeline.recomposition import Recomposition
 from rdstitch.pipeline.stage_tiles import place_tiles, tiles
@@ -25,4 +26,5 @@ __all__ = [
     "tiles",
     "trajectory",
     "undistort",
+    "write_layers",
 ]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.compositing.options import Interpolation
+from rdstitch.compositing.options import CompositeOptions, Interpolation
 from rdstitch.compositing.tables import CompositeTables
 from rdstitch.inputs.frame import in_order
 from rdstitch.pipeline.placed_images import PlacedImages
@@ -51,11 +51,7 @@ class Composer:
     """
 
     def __init__(self, result: StitchResult | Recomposition, interpolation: Interpolation = "linear") -> None:
-        if isinstance(result, StitchResult):
-            placed = PlacedImages.of(result.registration, result.local_alignment.fields or None)
-            options = result.options.composite
-        else:
-            placed, options = result.placed, result.composite_options
+        placed, options = placed_by(result)
         images, options = placed.images(result.canvas.near), replace(options, interpolation=interpolation)
         self.names = tuple(source.name for source in placed.sources)
         self._tables, self._order = CompositeTables.of(images, result.canvas, options), result.image_order
@@ -78,3 +74,11 @@ class Composer:
         return in_order(
             self._tables.compose([in_order(np.asarray(image), self._order) for image in images]), self._order
         )
+
+
+def placed_by(result: StitchResult | Recomposition) -> tuple[PlacedImages, CompositeOptions]:
+    """The images of a result in their places, and how they are put together."""
+    if isinstance(result, StitchResult):
+        placed = PlacedImages.of(result.registration, result.local_alignment.fields or None)
+        return placed, result.options.composite
+    return result.placed, result.composite_options

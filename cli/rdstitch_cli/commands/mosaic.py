@@ -11,7 +11,7 @@ from rdstitch.messages import shortened
 from rdstitch_cli import following as live
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import GroupedCommand
-from rdstitch_cli.stitching import Report, stitch_options, summarize
+from rdstitch_cli.stitching import Report, staged_beside, stitch_options, summarize
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
@@ -51,6 +51,8 @@ def mosaic(
     idle: float | None,
     refresh: float,
     report: Path | None,
+    layers: Path | None,
+    whole_layers: bool,
     as_json: bool,
     reporter: Reporter,
     **given: Any,
@@ -74,7 +76,8 @@ def mosaic(
         if following:
             arrived = live.followed(inputs, stitch, reporter, output=output, every=every, idle=idle, refresh=refresh)
             paths = stack.enter_context(arrived)
-        how: dict[str, Any] = {"every": every, "progress": report_page.progress, "beside": report_page.stage}
+        beside = staged_beside(report_page, reporter, layers, whole_layers=whole_layers)
+        how: dict[str, Any] = {"every": every, "progress": report_page.progress, "beside": beside}
         with report_page.explaining():
             if all_blocks:
                 results = mosaic_blocks(paths, output, stitch, **how)
