@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rdstitch.features import FeatureOptions
     from rdstitch.messages import Message
     from rdstitch.pipeline import (
+        Composer,
         Recomposition,
         Registration,
         StitchOptions,
@@ -26,12 +27,15 @@ if TYPE_CHECKING:
         apply,
         calibrate,
         mosaic,
+        mosaic_blocks,
         pano,
         place_tiles,
         tiles,
         trajectory,
         undistort,
+        write_layers,
     )
+    from rdstitch.pipeline.follow import FollowedPoses, Pose, Tracker
     from rdstitch.radial_homography import RadialHomography
     from rdstitch.report import write_report
     from rdstitch.robust import estimate_radial_homography
@@ -52,8 +56,9 @@ _HOMES = {
         "rdstitch.errors": "RdstitchError",
         "rdstitch.features": "FeatureOptions",
         "rdstitch.messages": "Message",
-        "rdstitch.pipeline": "Recomposition Registration StitchOptions StitchResult "
-        "apply calibrate mosaic pano place_tiles tiles trajectory undistort",
+        "rdstitch.pipeline": "Composer Recomposition Registration StitchOptions StitchResult "
+        "apply calibrate mosaic mosaic_blocks pano place_tiles tiles trajectory undistort write_layers",
+        "rdstitch.pipeline.follow": "FollowedPoses Pose Tracker",
         "rdstitch.radial_homography": "RadialHomography",
         "rdstitch.report": "write_report",
         "rdstitch.robust": "estimate_radial_homography",
@@ -65,10 +70,13 @@ _HOMES = {
 __all__ = [
     "Alignment",
     "Camera",
+    "Composer",
     "CompositeOptions",
     "Examination",
     "FeatureOptions",
+    "FollowedPoses",
     "Message",
+    "Pose",
     "RadialHomography",
     "RdstitchError",
     "Recomposition",
@@ -76,6 +84,7 @@ __all__ = [
     "StitchOptions",
     "StitchResult",
     "TileOptions",
+    "Tracker",
     "Trajectory",
     "apply",
     "calibrate",
@@ -84,6 +93,7 @@ __all__ = [
     "examine",
     "load_camera",
     "mosaic",
+    "mosaic_blocks",
     "pano",
     "place_tiles",
     "save_camera",
@@ -92,6 +102,7 @@ __all__ = [
     "tiles",
     "trajectory",
     "undistort",
+    "write_layers",
     "write_report",
 ]
 

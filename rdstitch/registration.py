@@ -112,6 +112,11 @@ class Registration:
         return of_severity(self.messages, "left out")
 
     @property
+    def used_names(self) -> list[str]:
+        """Of the images that are in the result."""
+        return [source.name for source, used in zip(self.sources, self.alignment.used, strict=True) if used]
+
+    @property
     def summary(self) -> str:
         """How many images are in the result, and λ with its standard deviation, in one line."""
         used = int(self.alignment.used.sum())

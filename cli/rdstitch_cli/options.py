@@ -350,6 +350,17 @@ compositing = together(
 )
 
 # What every command that registers images takes, and what those take that also compose them.
+layers = together(
+    click.option(
+        "--layers",
+        type=IMAGE,
+        metavar="DIR",
+        help="Write each image, warped, with alpha, and its mask into DIR: TIFF, cropped, with the offsets that "
+        "enblend reads.",
+    ),
+    click.option("--whole-layers", is_flag=True, help="With --layers: on the whole canvas instead of cropped."),
+)
+
 registration = together(overwrite, known, estimation, report, trust)
 
 stitching = together(
@@ -371,6 +382,7 @@ stitching = together(
         "where matches that took no part in it come nearer; a number of cells along an image's longer side: always.",
     ),
     compositing,
+    layers,
     _file(
         "--save-camera",
         "FILE",

@@ -3,7 +3,7 @@
 import math
 import shlex
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -166,6 +166,27 @@ class Report:
 
         for message in outputs.attempt(file, write):
             self._reporter.warn(str(message))
+
+
+def staged_beside(
+    report: Report, reporter: Reporter, layers: Path | None, *, whole_layers: bool
+) -> Callable[["Outputs", "StitchResult"], None]:
+    """What stages the report, and the layers where they are wanted, together with the image."""
+    if whole_layers and layers is None:
+        raise click.UsageError("--whole-layers goes with --layers DIR")
+
+    def stage(outputs: "Outputs", result: "StitchResult") -> None:
+        report.stage(outputs, result)
+        if (folder := layers) is None:
+            return
+        from rdstitch.pipeline import write_layers
+
+        overwrite = result.options.overwrite
+        write = partial(write_layers, result, folder, whole=whole_layers, overwrite=overwrite, outputs=outputs)
+        for message in outputs.attempt(folder, write):
+            reporter.warn(str(message))
+
+    return stage
 
 
 def _command_line() -> str:

@@ -18,11 +18,11 @@ from rdstitch.alignment.trajectory import Trajectory, compare_trajectories
 from rdstitch.inputs.arrivals import Arrivals
 from rdstitch.io.write import write_image
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.follow import FollowedFrame, follow
+from rdstitch.pipeline.follow import Pose, follow
 from tests.floor_drives import DISTORTION, floor_drive, true_path
 
 
-def path_of(frames: list[FollowedFrame]) -> Trajectory:
+def path_of(frames: list[Pose]) -> Trajectory:
     """The path of the poses as they were first given."""
     known = {frame.number: pose for frame in frames if frame.tracked and (pose := frame.tracked.pose)}
     numbers = sorted(known)
@@ -40,7 +40,7 @@ def main(*, frames: int = 200, path: str = "turn", overlap: float = 0.9) -> None
             write_image(Path(folder) / f"frame_{index:05d}.jpg", drive.frame(index))
         arrivals = Arrivals(folder, frames_folder=lambda: Path(folder), idle=0.5)
         preview = Path(folder) / ".preview.jpg"
-        found, spent, memory, last = list[FollowedFrame](), list[float](), 0.0, time.process_time()
+        found, spent, memory, last = list[Pose](), list[float](), 0.0, time.process_time()
         for frame in follow(arrivals, StitchOptions(workers=1), preview=preview, refresh=1.0):
             found.append(frame)
             spent.append((now := time.process_time()) - last)

@@ -26,7 +26,7 @@ from rdstitch.local_alignment.field import nodes_around
 # The correction is smooth: it is computed at this spacing, canvas pixels, and interpolated.
 _LATTICE = LATTICE_STEPS[0]
 _ROWS = 128  # that are corrected at a time
-_DEPTHS = {"uint8": cv2.CV_8U, "uint16": cv2.CV_16U, "float32": cv2.CV_32F}
+DEPTHS = {"uint8": cv2.CV_8U, "uint16": cv2.CV_16U, "float32": cv2.CV_32F}
 
 
 @dataclass(frozen=True)
@@ -89,11 +89,19 @@ class Exposure:
         )
         return self._apply(pixels, factors, rates)
 
+    def factors(self, index: int, geometry: Geometry) -> Float32Array:
+        """What samples of image ``index`` are multiplied by, (h, w, C), before highlights are compressed."""
+        gain = np.exp(-self.log_gain[index]).astype(np.float32)
+        if not (self.vignetting.any() or self.fields.size):
+            return np.broadcast_to(gain, (*geometry.shape, len(gain)))
+        nodes = self._smooth_nodes(index, geometry) * gain
+        return _joined([interpolated(nodes[..., k], geometry.box, _LATTICE) for k in range(len(gain))])
+
     def _apply(self, pixels: NDArray[Any], factors: list[Any], rates: list[Any]) -> NDArray[Any]:
         """``q (v + b) - b``, compressed above the knee; one array for all channels, or one plane a channel."""
         full = np.float32(full_scale(pixels.dtype))
         offset, knee = np.float32(self.offset) * full, np.float32(self.knee) * full
-        depth = _DEPTHS[pixels.dtype.name]
+        depth = DEPTHS[pixels.dtype.name]
         done = np.empty_like(pixels)
         flat = done.reshape(len(done), -1)
 

@@ -129,6 +129,30 @@ class Renderer:
         )
         return part, tuple(chosen)
 
+    def layer(self, index: int, box: Box) -> tuple[NDArray[Any], NDArray[np.bool_], NDArray[np.bool_]]:
+        """One image on its own in a box: samples (h, w, C), what it covers, and what of that the composite shows."""
+        geometry = locate(self.warps[index], box)
+        covered, opacity = geometry.inside, self._opacity(index, geometry)
+        if opacity is not None:
+            covered = covered & (opacity > 0)
+        mask = np.zeros(covered.shape, dtype=np.bool_)
+        for own in self.owners(box):
+            if own.index == index:
+                cut(mask, box, own.box)[...] |= own.weight > 0
+        samples = self._samples(Layer(index, box, covered.astype(np.float32), geometry), box)
+        samples[~covered] = 0
+        return samples, covered, mask
+
+    def owners(self, box: Box) -> list[Layer]:
+        """The images of a box with the weights (h, w) that their samples have in it, which add up to 1."""
+        layers = self._layers(box)
+        total = np.zeros((box[3] - box[1], box[2] - box[0]), dtype=np.float32)
+        for layer in layers:
+            cut(total, box, layer.box)[...] += layer.weight
+        np.maximum(total, np.finfo(np.float32).tiny, out=total)
+        shares = [replace(layer, weight=layer.weight / cut(total, box, layer.box)) for layer in layers]
+        return [part for layer in shares if (part := layer.weighted_part(box)) is not None]
+
     def _contact_zone(self, layers: Sequence[Layer], box: Box) -> Box | None:
         """The part of a box in which blending can mix images; elsewhere it would return the only one there."""
         supports = [self._blend_support(layer.box) for layer in layers]

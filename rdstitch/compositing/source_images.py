@@ -155,19 +155,27 @@ def prepare_image(image: DecodedImage, shrink: float, reduction: int = 1) -> Loa
         opaque = image.alpha >= _OPAQUE_FROM
         pixels = filled(pixels, opaque)
     del image  # as large as all that is left of it
+    pixels, smaller = smoothed(pixels, shrink, reduction)
+    if smaller > reduction and opaque is not None:
+        opaque = block_mean(opaque.astype(np.float32), smaller // reduction) > 0.999
+    reduction = smaller
+    if opaque is None:
+        return LoadedImage(pixels, reduction=reduction)
+    return LoadedImage(pixels, *opacity(opaque), reduction)
+
+
+def smoothed(pixels: NDArray[Any], shrink: float, reduction: int = 1) -> tuple[NDArray[Any], int]:
+    """Pixels without what an output that shrinks them cannot show, and what they are smaller by than the original."""
     # Blocks alone alias; a Gaussian on at least two pixels per output pixel does not.
     further = max(1, int(shrink / reduction / 2))
     if further > 1:
         pixels = block_mean(pixels, further)
-        opaque = None if opaque is None else block_mean(opaque.astype(np.float32), further) > 0.999
         reduction *= further
     rest = shrink / reduction
     if rest > _NEGLIGIBLE_SHRINK:
         sigma = 0.5 * math.sqrt(rest**2 - 1.0)
-        pixels = cv2.GaussianBlur(pixels, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
-    if opaque is None:
-        return LoadedImage(pixels, reduction=reduction)
-    return LoadedImage(pixels, *opacity(opaque), reduction)
+        pixels = np.asarray(cv2.GaussianBlur(pixels, (0, 0), sigma, borderType=cv2.BORDER_REFLECT))
+    return pixels, reduction
 
 
 class ImageReader:

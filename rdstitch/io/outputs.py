@@ -96,7 +96,7 @@ class Outputs:
         with self.writing(path) as staged:
             staged.write_bytes(data)
 
-    def attempt(self, path: str | Path, stage: Callable[[], None]) -> list[Message]:
+    def attempt(self, path: str | Path, stage: Callable[[], object]) -> list[Message]:
         """Stage what belongs beside an image, whose failure must not cost the image: a warning, where it fails."""
         count = len(self._items)
         try:

@@ -2,7 +2,9 @@
 
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
-from rdstitch.pipeline.recipes import calibrate, mosaic, pano, trajectory
+from rdstitch.pipeline.composer import Composer
+from rdstitch.pipeline.layers import write_layers
+from rdstitch.pipeline.recipes import calibrate, mosaic, mosaic_blocks, pano, trajectory
 from rdstitch.pipeline.recomposition import Recomposition
 from rdstitch.pipeline.stage_tiles import place_tiles, tiles
 from rdstitch.pipeline.undistort_images import undistort
@@ -10,6 +12,7 @@ from rdstitch.registration import Registration
 from rdstitch.stitch_result import StitchResult
 
 __all__ = [
+    "Composer",
     "Recomposition",
     "Registration",
     "StitchOptions",
@@ -17,9 +20,11 @@ __all__ = [
     "apply",
     "calibrate",
     "mosaic",
+    "mosaic_blocks",
     "pano",
     "place_tiles",
     "tiles",
     "trajectory",
     "undistort",
+    "write_layers",
 ]

@@ -123,8 +123,9 @@ def apply(
             corrected, said = with_flat_field(list(used.values()), flat_field)
             used = dict(zip(used, corrected, strict=True))
             doubts += said
+        placed = _placed(saved, used)
         composed = compose_images(
-            _placed(saved, used),
+            placed,
             output,
             options,
             StitchOptions(workers=workers).threads,
@@ -138,6 +139,7 @@ def apply(
             tuple(sources),
             matched,
             left_out,
+            placed,
             composed.canvas,
             options,
             None if output is None else Path(output),

@@ -14,7 +14,7 @@ from rdstitch.errors import InputError
 from rdstitch.export.trajectory_files import TrajectoryFrame, in_frame
 from rdstitch.features import FeatureOptions, Features, detect_view, match
 from rdstitch.features.prepared_image import PreparedImage, prepare
-from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.frame import Frame, Image, as_inputs
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.selection import is_selected, with_masks
 from rdstitch.inputs.source import Source
@@ -24,7 +24,8 @@ from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import alignment_options
 from rdstitch.pipeline.read_inputs import read_frames
 from rdstitch.pipeline.working_size import at_working_size
-from rdstitch.tracking import CameraPose, Preview, Tracked, Tracker, TrackingOptions
+from rdstitch.tracking import CameraPose, Preview, Tracked, TrackingOptions
+from rdstitch.tracking import Tracker as FrameTracker
 
 _FEATURES = 600  # of a frame, that suffice to follow it
 _MEGAPIXELS = 0.1  # 10⁶ pixels in which they are detected: a frame of 640 x 480 pixels is halved once
@@ -65,8 +66,8 @@ class FollowedPoses:
 
 
 @dataclass(frozen=True)
-class FollowedFrame:
-    """What is known of one frame when it has arrived.
+class Pose:
+    """What is known of one frame when it has arrived; false where that is no place.
 
     Attributes
     ----------
@@ -89,6 +90,21 @@ class FollowedFrame:
     tracked: Tracked | None
     reason: str = ""
     poses: FollowedPoses = FollowedPoses()
+
+    def __bool__(self) -> bool:
+        return self.tracked is not None and self.tracked.pose is not None
+
+    @property
+    def position(self) -> tuple[float, float, float] | None:
+        """X, y and height above the plane, in the frame and unit of the tracker; None where there is no place."""
+        at = self.poses.fields(None if self.tracked is None else self.tracked.pose)
+        x, y, height = at["x"], at["y"], at["height"]
+        return None if x is None or y is None or height is None else (x, y, height)
+
+    @property
+    def yaw(self) -> float | None:
+        """Heading, radians, counterclockwise as seen from above; None where there is no place."""
+        return None if self.tracked is None or self.tracked.pose is None else self.tracked.pose.yaw
 
     def as_dict(self) -> dict[str, Any]:
         """As a line of JSON takes it; null for what is not known."""
@@ -119,7 +135,7 @@ def follow(
     comes_again: Callable[[Frame], bool] = lambda frame: False,
     preview: Path | None = None,
     refresh: float = 5.0,
-) -> Iterator[FollowedFrame]:
+) -> Iterator[Pose]:
     """Register frames as they arrive, against the last keyframes.
 
     Poses are for watching: loops are closed, and every pair is used, only when all frames are registered together
@@ -141,15 +157,12 @@ def follow(
 
     Yields
     ------
-    FollowedFrame
+    Pose
         One a frame; and one more for keyframes that find their place only later.
     """
-    features = _live_features(options.features)
-    pair = options.matching.pair
-    tracker = Tracker(TrackingOptions(pair, alignment_options([], options)), partial(match, ratio=options.ratio))
+    tracker = Tracker(options, poses)
     sketch = None if preview is None else _Sketch(preview, refresh)
-    labels: dict[int, FollowedFrame] = {}  # of the frames that may still find their place
-    printed, numbers = poses or FollowedPoses(), count()
+    numbers = count()
     unread: dict[Path, int] = {}  # numbers of frames that come again
     for arrived in frames:
         if not is_selected(arrived, options.exclude, options.include_only):
@@ -157,29 +170,101 @@ def follow(
         number = unread.pop(arrived.path, -1)
         number = next(numbers) if number < 0 else number
         frame = arrived if arrived.number is not None else replace(arrived, number=number)
-        source, image, reason = _read(frame, options, features)
+        source, image, reason = tracker.read(frame)
         if (image is None or (source is not None and source.guard.messages)) and comes_again(arrived):
             unread[arrived.path] = number
             continue
-        label = FollowedFrame(frame.path.name, frame.number or 0, math.nan, None, reason, printed)
-        if source is None or image is None:
-            yield label
-            continue
-        label = replace(label, name=source.name, timestamp=printed.timestamp(source))
-        camera = at_working_size(source.camera, features.limits[1])
-        results = tracker.add(partial(_features, source, features, camera), camera, image)
-        labels[results[-1].number] = label
-        for result in results:
-            known = labels[result.number]
-            why = "" if result.placement is not None else _why(tracker, result)
-            yield replace(known, tracked=result, reason=why)
-        waiting = tracker.numbers_without_place
-        labels = {number: known for number, known in labels.items() if number in waiting}
-        if sketch is not None:
-            sketch.add(source, results[-1])
-        source.decoded_images.clear()
+        found = tracker.register(frame, source, image, reason)
+        yield from found
+        if source is not None and (result := found[-1].tracked) is not None:
+            if sketch is not None:
+                sketch.add(source, result)
+            source.decoded_images.clear()
     if sketch is not None:
         sketch.write()
+
+
+class Tracker:
+    """Registers frames of one camera as they come; what :func:`follow` does of one source.
+
+    Parameters
+    ----------
+    options : StitchOptions, optional
+    poses : FollowedPoses, optional
+        The height of the first keyframe, which gives the unit of positions, and the frame of reference.
+
+    Attributes
+    ----------
+    revised : tuple of Pose
+        Of earlier frames that found their place with the last one.
+
+    Examples
+    --------
+    >>> import cv2
+    >>> import rdstitch
+    >>> tracker = rdstitch.Tracker()
+    >>> pose = tracker.add(cv2.imread("left.png"), 0.0)
+    >>> bool(pose), pose.position, pose.reason
+    (False, None, 'the first frames wait for others')
+    """
+
+    def __init__(self, options: StitchOptions | None = None, poses: FollowedPoses | None = None) -> None:
+        self._options, self._poses = options or StitchOptions(), poses or FollowedPoses()
+        self._detection = _live_features(self._options.features)
+        how = TrackingOptions(self._options.matching.pair, alignment_options([], self._options))
+        self._frames = FrameTracker(how, partial(match, ratio=self._options.ratio))
+        self._labels: dict[int, Pose] = {}  # of the frames that may still find their place
+        self._numbers = count()
+        self.revised: tuple[Pose, ...] = ()
+
+    def add(self, image: Image, timestamp: float | None = None) -> Pose:
+        """Register the next frame.
+
+        Parameters
+        ----------
+        image : ndarray, Pillow image or path
+            Arrays are as :func:`rdstitch.mosaic` takes them.
+        timestamp : float, optional
+            s.
+
+        Returns
+        -------
+        Pose
+            False, with the reason, where the frame has no place, or not yet: those of the first frames come later, in
+            :attr:`revised`.
+        """
+        number = next(self._numbers)
+        (named,) = as_inputs(image, self._options.channel_order)
+        frame = replace(named, path=Path(f"image_{number:04d}")) if isinstance(named, Frame) else Frame(Path(named))
+        frame = replace(frame, number=number, timestamp=timestamp)
+        *revised, pose = self.register(frame, *self.read(frame))
+        self.revised = tuple(revised)
+        return pose
+
+    def read(self, frame: Frame) -> tuple[Source | None, PreparedImage | None, str]:
+        """The frame as a source, and as it is tracked; or why it is not."""
+        return _read(frame, self._options, self._detection)
+
+    def register(self, frame: Frame, source: Source | None, image: PreparedImage | None, reason: str) -> list[Pose]:
+        """Register a frame that was read; it comes last, after those before it that only now have found their place."""
+        label = Pose(frame.path.name, frame.number or 0, math.nan, None, reason, self._poses)
+        if source is None or image is None:
+            return [label]
+        label = replace(label, name=source.name, timestamp=self._poses.timestamp(source))
+        camera = at_working_size(source.camera, self._detection.limits[1])
+        results = self._frames.add(partial(_features, source, self._detection, camera), camera, image)
+        self._labels[results[-1].number] = label
+        found = [
+            replace(
+                self._labels[result.number],
+                tracked=result,
+                reason="" if result.placement is not None else _why(self._frames, result),
+            )
+            for result in results
+        ]
+        waiting = self._frames.numbers_without_place
+        self._labels = {number: known for number, known in self._labels.items() if number in waiting}
+        return found
 
 
 class _Sketch:
@@ -237,7 +322,7 @@ def _features(source: Source, options: FeatureOptions, camera: Camera) -> Featur
     return FeatureStore.of([detect_view(source.view, options)]).at_sizes([camera.image_size])[0]
 
 
-def _why(tracker: Tracker, result: Tracked) -> str:
+def _why(tracker: FrameTracker, result: Tracked) -> str:
     """Why a frame has no place."""
     if result.inliers or not result.number:
         return "the first frames wait for others" if tracker.waits else "its motion fits no plane yet"

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,11 +13,12 @@ from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.errors import RegistrationError
 from rdstitch.export.trajectory_files import WRITERS, TrajectoryFrame, frame_of, has_times, path_as_svg
 from rdstitch.inputs.find import found_images
-from rdstitch.inputs.frame import Images, as_inputs
+from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.source import Source
 from rdstitch.io.atomic import check_distinct, check_output, json_bytes, text_bytes
 from rdstitch.io.outputs import Outputs
+from rdstitch.io.staging import temporary_folder
 from rdstitch.local_alignment import LocalAlignment
 from rdstitch.messages import Message, told_once
 from rdstitch.options import StitchOptions
@@ -32,6 +34,7 @@ from rdstitch.progress import Progress, silent
 from rdstitch.registration import Registration
 from rdstitch.sidecar.write import sidecar
 from rdstitch.stitch_result import StitchResult
+from rdstitch.verification.verdict import RefusedError
 
 TrajectoryFormat = Literal["csv", "tum", "kitti"]
 
@@ -127,6 +130,87 @@ def mosaic(
     ('small.tif', np.True_)
     """
     return _stitch(inputs, output, options or StitchOptions(), every, progress, beside, pano=False)
+
+
+def mosaic_blocks(
+    inputs: Images,
+    output: str | Path,
+    options: StitchOptions | None = None,
+    *,
+    every: int | None = None,
+    progress: Progress = silent,
+    beside: Callable[[Outputs, StitchResult], None] | None = None,
+) -> tuple[StitchResult, ...]:
+    """Stitch every block of images that overlap: :func:`mosaic`, and again of what it left out, while that overlaps.
+
+    Parameters
+    ----------
+    inputs, options, every, progress, beside
+        As for :func:`mosaic`; ``beside``, the camera file and the reference image are for the largest block.
+    output : path
+        Of the largest block; ``field.tif`` is followed by ``field-2.tif`` and so on.
+
+    Returns
+    -------
+    tuple of StitchResult
+        The largest block first. Images that are left out are named in the first, if they are in no block.
+
+    Raises
+    ------
+    RdstitchError
+        As by :func:`mosaic`, where not even one block can be stitched.
+    """
+    options, file = options or StitchOptions(), Path(output)
+    results: list[StitchResult] = []
+    refused: list[Message] = []
+    given = as_inputs(inputs, options.channel_order)
+    with found_images(given, output=output, every=every, topic=options.topic) as found, ExitStack() as stack:
+        _check_outputs(output, options, found.files)
+        if options.cache is None:
+            # What was found of images and pairs serves the next block.
+            options = replace(options, cache=stack.enter_context(temporary_folder()))
+        frames = list(found.frames)
+        while len(frames) > 1 or not results:
+            name = file.with_name(f"{file.stem}-{len(results) + 1}{file.suffix}") if results else file
+            try:
+                result = mosaic(frames, name, options, progress=progress, beside=beside)
+                registration = result.registration
+            except RegistrationError as error:
+                if not results:
+                    raise
+                if not isinstance(error, RefusedError):
+                    break
+                registration = error.registration
+                refused.append(Message(f"a further block of {registration.alignment.used.sum()} images: {error}"))
+            else:
+                results.append(result)
+                options, beside = replace(options, save_camera=None, reference=None), None
+            pairs = zip(registration.sources, registration.alignment.used, strict=True)
+            done = {_frame_key(source.frame or Frame(source.path)) for source, used in pairs if used}
+            frames = [frame for frame in frames if _frame_key(frame) not in done]
+    return (_without_blocks(results[0], results[1:], [*found.messages, *refused]), *map(_without_blocks, results[1:]))
+
+
+def _frame_key(frame: Frame) -> tuple[Path, int | None]:
+    return frame.path, frame.number
+
+
+def _without_blocks(
+    result: StitchResult, others: Sequence[StitchResult] | None = None, more: Sequence[Message] = ()
+) -> StitchResult:
+    """A block that does not name as left out what is in others; without others, nothing: the first one names it."""
+    elsewhere = {
+        str(source.path)
+        for registration in (other.registration for other in others or ())
+        for source, used in zip(registration.sources, registration.alignment.used, strict=True)
+        if used
+    }
+    kept = [
+        message
+        for message in result.registration.messages
+        if message.severity != "left out" or (others is not None and not elsewhere.issuperset(message.images))
+    ]
+    return replace(result, registration=replace(result.registration, messages=(*kept, *more)))
 
 
 def _stitch(

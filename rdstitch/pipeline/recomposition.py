@@ -12,6 +12,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.messages import Message
 from rdstitch.orientation import inverse
+from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.write import (
     VERSION,
@@ -39,6 +40,8 @@ class Recomposition(OutputImage):
         "name" or "order".
     left_out : dict of int to Message
         Images that the registration used and that are not in the output, by their number, with the reason.
+    placed : PlacedImages
+        Those that are in the output.
     canvas : Canvas
     composite_options : CompositeOptions
     output : Path or None
@@ -61,6 +64,7 @@ class Recomposition(OutputImage):
     sources: tuple[Source | None, ...]
     matched: str
     left_out: Mapping[int, Message]
+    placed: PlacedImages
     canvas: Canvas
     composite_options: CompositeOptions
     output: Path | None = None

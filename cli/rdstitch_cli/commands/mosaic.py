@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from rdstitch.messages import shortened
 from rdstitch_cli import following as live
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import GroupedCommand
-from rdstitch_cli.stitching import Report, stitch_options, summarize
+from rdstitch_cli.stitching import Report, staged_beside, stitch_options, summarize
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
@@ -33,16 +34,25 @@ Examples:
 @options.stitching
 @options.every
 @options.topic
+@click.option(
+    "--all-blocks",
+    is_flag=True,
+    help="Stitch what is left out again while it overlaps: the largest block of images becomes OUTPUT, the others "
+    "OUTPUT with -2, -3, … before its suffix.",
+)
 @live.follow
 @live.refresh
 def mosaic(
     inputs: tuple[Path, ...],
     output: Path,
     every: int | None,
+    all_blocks: bool,
     following: bool,
     idle: float | None,
     refresh: float,
     report: Path | None,
+    layers: Path | None,
+    whole_layers: bool,
     as_json: bool,
     reporter: Reporter,
     **given: Any,
@@ -54,7 +64,10 @@ def mosaic(
     With --follow, frames are registered as they arrive.
     """
     from rdstitch.pipeline import mosaic as recipe
+    from rdstitch.pipeline import mosaic_blocks
 
+    if all_blocks and (following or given["strict"]):
+        raise click.UsageError("--all-blocks goes neither with --follow nor with --strict")
     with ExitStack() as stack:
         stitch = stitch_options(reporter, **given)
         named: list[Path] = [] if following else options.resolve(inputs)
@@ -63,11 +76,18 @@ def mosaic(
         if following:
             arrived = live.followed(inputs, stitch, reporter, output=output, every=every, idle=idle, refresh=refresh)
             paths = stack.enter_context(arrived)
+        beside = staged_beside(report_page, reporter, layers, whole_layers=whole_layers)
+        how: dict[str, Any] = {"every": every, "progress": report_page.progress, "beside": beside}
         with report_page.explaining():
-            result = recipe(paths, output, stitch, every=every, progress=report_page.progress, beside=report_page.stage)
-        if following and not as_json:
-            live.print_result(result.registration, reporter, output)
-        else:
-            summarize(result, reporter, as_json=as_json)
-        if result.plan is None:
-            reporter.made(result.summary)
+            if all_blocks:
+                results = mosaic_blocks(paths, output, stitch, **how)
+            else:
+                results = (recipe(paths, output, stitch, **how),)
+        for result in results:
+            if following and not as_json:
+                live.print_result(result.registration, reporter, output)
+            else:
+                summarize(result, reporter, as_json=as_json)
+            if result.plan is None:
+                images = f" ({shortened(result.registration.used_names)})" if all_blocks else ""
+                reporter.made(f"{result.summary}{images}")

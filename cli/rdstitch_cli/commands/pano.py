@@ -7,7 +7,7 @@ import click
 
 from rdstitch_cli import options
 from rdstitch_cli.help_pages import GroupedCommand
-from rdstitch_cli.stitching import Report, stitch_options, summarize
+from rdstitch_cli.stitching import Report, staged_beside, stitch_options, summarize
 from rdstitch_cli.terminal import Reporter
 
 
@@ -30,6 +30,8 @@ def pano(
     output: Path,
     every: int | None,
     report: Path | None,
+    layers: Path | None,
+    whole_layers: bool,
     as_json: bool,
     reporter: Reporter,
     **given: Any,
@@ -43,6 +45,7 @@ def pano(
 
     paths = options.resolve(inputs)
     report_page = Report(report, reporter, paths, given["overwrite"], output)
+    beside = staged_beside(report_page, reporter, layers, whole_layers=whole_layers)
     with report_page.explaining():
         result = recipe(
             paths,
@@ -50,7 +53,7 @@ def pano(
             stitch_options(reporter, **given),
             every=every,
             progress=report_page.progress,
-            beside=report_page.stage,
+            beside=beside,
         )
     summarize(result, reporter, as_json=as_json)
     if result.plan is None:

@@ -1,0 +1,139 @@
+"""A composite as tables: where each image's samples come from and what they count, for one set of images after another.
+
+What depends on the place of the images is computed once. A set then takes one resampling of what is seen of each
+image, one product and one sum.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.compositing.boxes import Box, Float32Array, cut
+from rdstitch.compositing.canvas import Canvas
+from rdstitch.compositing.options import CompositeOptions
+from rdstitch.compositing.photometric import DEPTHS, full_scale
+from rdstitch.compositing.placed_image import PlacedImage
+from rdstitch.compositing.preparation import prepare_composite
+from rdstitch.compositing.render import Layer
+from rdstitch.compositing.sampling import INTERPOLATION, remap, sample_places
+from rdstitch.compositing.source_images import LoadedImage, smoothed
+from rdstitch.errors import ArgumentError
+
+
+@dataclass(frozen=True, eq=False)
+class _Share:
+    """What one image gives to a box of the output."""
+
+    index: int
+    box: Box
+    places: tuple[NDArray[np.int16], NDArray[np.uint16]]
+    weight: Float32Array
+    factors: Float32Array  # (h, w, C): weight times gain, for images with the channels of the first ones
+
+
+@dataclass(frozen=True, eq=False)
+class CompositeTables:
+    """Everything about a composite but the samples of its images.
+
+    Attributes
+    ----------
+    canvas : Canvas
+    alpha : ndarray of shape (H, W), uint8
+        255 where an image lies, else 0.
+    """
+
+    canvas: Canvas
+    alpha: NDArray[np.uint8]
+    _sizes: tuple[tuple[int, int], ...]
+    _shrinks: tuple[float, ...]
+    _shares: tuple[_Share, ...]
+    _offset: Float32Array | None  # (H, W, C), share of the full range
+    _interpolation: int
+
+    @classmethod
+    def of(cls, images: Sequence[PlacedImage], canvas: Canvas, options: CompositeOptions) -> Self:
+        """Tables of a canvas, by exposure and seams of the images that are there now.
+
+        Neighbours are feathered along their seams where ``options`` have them blended in bands, which takes longer
+        than all the rest; highlights are clipped where it compresses them.
+        """
+        blend = "feather" if options.blend == "multiband" else options.blend
+        options = replace(options, blend=blend, crop="none")
+        with prepare_composite(images, canvas, options) as prepared:
+            renderer, box = prepared.renderer, prepared.tiles.box
+            covered = np.zeros((box[3] - box[1], box[2] - box[0]), dtype=np.uint8)
+            exposure, channels = renderer.exposure, renderer.channels
+            offset = np.zeros((*covered.shape, channels), dtype=np.float32) if exposure.offset else None
+            shares = []
+            for layer in renderer.owners(box):
+                cut(covered, box, layer.box)[layer.weight > 0] = 255
+                factors = exposure.factors(layer.index, layer.geometry) * layer.weight[..., None]
+                if offset is not None:
+                    part = factors - layer.weight[..., None]
+                    cut(offset, box, layer.box)[...] += part * np.float32(exposure.offset)
+                shares.append(_share(layer, box, factors))
+            shrinks = tuple(warp.shrink for warp in renderer.warps)
+            kernel = INTERPOLATION[options.interpolation]
+            sizes = tuple(image.camera.image_size for image in images)
+            return cls(prepared.canvas, covered, sizes, shrinks, tuple(shares), offset, kernel)
+
+    def compose(self, images: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        """Put a set of images together.
+
+        Parameters
+        ----------
+        images : sequence of ndarray of shape (H, W) or (H, W, C)
+            In the order of those that the tables were made for, each of the size of its camera; uint8, uint16 or
+            floating point. Of other bands than these, exposure is left as it is.
+
+        Raises
+        ------
+        ArgumentError
+            When number, size or kind of the images is another.
+        """
+        self._check(images)
+        first = images[0]
+        channels = 1 if first.ndim == 2 else first.shape[2]
+        corrected = channels == self._shares[0].factors.shape[2]
+        height, width = self.alpha.shape
+        total = np.zeros((height, width * channels), dtype=np.float32)
+        if corrected and self._offset is not None:
+            total += self._offset.reshape(total.shape) * np.float32(full_scale(first.dtype))
+        samples = [smoothed(image, shrink)[0] for image, shrink in zip(images, self._shrinks, strict=True)]
+        for share in self._shares:
+            x0, y0, x1, y1 = share.box
+            factors = share.factors if corrected else np.repeat(share.weight[..., None], channels, axis=2)
+            pixels = remap(samples[share.index], *share.places, self._interpolation)
+            # OpenCV multiplies samples of any type by fractions, several times faster than numpy.
+            pixels, factors = (values.reshape(y1 - y0, -1) for values in (pixels, factors))
+            product = cv2.multiply(pixels, factors, dtype=cv2.CV_32F)
+            part = total[y0:y1, x0 * channels : x1 * channels]
+            cv2.add(part, product, dst=part)
+        # Rounded and clipped to the type; the type stubs lack scalars.
+        done = cv2.subtract(total, 0.0, dtype=DEPTHS[first.dtype.name])  # type: ignore[call-overload]
+        return np.asarray(done).reshape(height, width, *first.shape[2:])
+
+    def _check(self, images: Sequence[NDArray[Any]]) -> None:
+        """Refuse images that the tables are not for."""
+        if len(images) != len(self._sizes):
+            raise ArgumentError(f"expected {len(self._sizes)} images, not {len(images)}")
+        for number, (image, size) in enumerate(zip(images, self._sizes, strict=True), 1):
+            if image.ndim not in (2, 3) or image.shape[1::-1] != size:
+                raise ArgumentError(f"image {number} is of shape {image.shape}; its camera has {size[0]} x {size[1]}")
+            kind, first = (image.shape[2:], image.dtype), (images[0].shape[2:], images[0].dtype)
+            if kind != first or image.dtype.name not in DEPTHS:
+                raise ArgumentError(f"image {number} has samples unlike the first, or not uint8, uint16 or float32")
+
+
+def _share(layer: Layer, box: Box, factors: Float32Array) -> _Share:
+    """The tables of a layer on a box of the canvas, in pixels of the box."""
+    warp, (x, y), (x0, y0, x1, y1) = layer.geometry.warp, box[:2], layer.box
+    width, height = warp.camera.image_size
+    # How much smaller an image gets depends on its size, not on its samples.
+    stand_in, reduction = smoothed(np.zeros((height, width), dtype=np.uint8), warp.shrink)
+    places = sample_places(LoadedImage(stand_in, reduction=reduction), layer.geometry)
+    return _Share(layer.index, (x0 - x, y0 - y, x1 - x, y1 - y), places, layer.weight, factors)

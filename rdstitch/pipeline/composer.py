@@ -1,0 +1,84 @@
+"""Register once, compose for ever: sets of images from the same cameras in the same places."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rdstitch.compositing.options import CompositeOptions, Interpolation
+from rdstitch.compositing.tables import CompositeTables
+from rdstitch.inputs.frame import in_order
+from rdstitch.pipeline.placed_images import PlacedImages
+from rdstitch.pipeline.recomposition import Recomposition
+from rdstitch.stitch_result import StitchResult
+
+
+class Composer:
+    """Composes one set of images after another by a result: fixed cameras, frames of videos, bands.
+
+    Where the images lie, seams and exposure are those of the result, computed once; see
+    :class:`rdstitch.compositing.tables.CompositeTables` for what is simpler than in a single image.
+
+    Parameters
+    ----------
+    result : StitchResult or Recomposition
+        Of :func:`rdstitch.pano` or :func:`rdstitch.mosaic`, a dry run will do; or, by a sidecar,
+        ``rdstitch.apply(sidecar, images, dry_run=True)``. Its images are read once more.
+    interpolation : str
+        "linear", "cubic" or "lanczos".
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the images that are drawn: the order in which :meth:`compose` takes them.
+    alpha : ndarray of shape (H, W), uint8
+        255 where an image lies, else 0.
+
+    Raises
+    ------
+    InputError
+        When an image cannot be read any more.
+
+    Examples
+    --------
+    >>> import cv2
+    >>> import rdstitch
+    >>> composer = rdstitch.Composer(rdstitch.pano(["left.png", "middle.png"]))
+    >>> composer.compose([cv2.imread(name) for name in composer.names]).shape[2]
+    3
+    """
+
+    def __init__(self, result: StitchResult | Recomposition, interpolation: Interpolation = "linear") -> None:
+        placed, options = placed_by(result)
+        images, options = placed.images(result.canvas.near), replace(options, interpolation=interpolation)
+        self.names = tuple(source.name for source in placed.sources)
+        self._tables, self._order = CompositeTables.of(images, result.canvas, options), result.image_order
+        self.alpha = self._tables.alpha
+
+    def compose(self, images: Iterable[NDArray[Any]]) -> NDArray[Any]:
+        """Put one set of images together, (H, W) or (H, W, C).
+
+        Parameters
+        ----------
+        images : iterable of ndarray of shape (h, w) or (h, w, C)
+            One for each of :attr:`names`, of its size; uint8, uint16 or float32, channels in the order of the
+            result's images.
+
+        Raises
+        ------
+        ArgumentError
+            When number, size or kind of the images is another.
+        """
+        return in_order(
+            self._tables.compose([in_order(np.asarray(image), self._order) for image in images]), self._order
+        )
+
+
+def placed_by(result: StitchResult | Recomposition) -> tuple[PlacedImages, CompositeOptions]:
+    """The images of a result in their places, and how they are put together."""
+    if isinstance(result, StitchResult):
+        placed = PlacedImages.of(result.registration, result.local_alignment.fields or None)
+        return placed, result.options.composite
+    return result.placed, result.composite_options
