@@ -28,8 +28,7 @@ def run(benchmark: Callable[..., None]) -> None:
         first = [given.pop(name) for name in positional]
         benchmark(*first, **given)
 
-    description = sys.modules[benchmark.__module__].__doc__
-    click.Command(benchmark.__module__, params=parameters, callback=call, help=description)()
+    click.Command("benchmark", params=parameters, callback=call, help=benchmark.__globals__["__doc__"])()
 
 
 def _signature(benchmark: Callable[..., None]) -> dict[str, inspect.Parameter]:
@@ -50,7 +49,8 @@ def _parameter(parameter: inspect.Parameter, hint: Any) -> click.Parameter:
         return click.Argument(
             [parameter.name], type=kind, nargs=-1 if several else 1, required=required, default=default
         )
-    flag = f"--{parameter.name.replace('_', '-')}"
+    name = parameter.name.replace("_", "-")
+    flag = f"--{name}/--no-{name}" if default is True else f"--{name}"
     return click.Option([flag], type=kind, is_flag=hint is bool, multiple=several, default=default, show_default=True)
 
 

@@ -5,7 +5,6 @@ Rendered grids of fluorescence and brightfield tiles: how far tiles are off, λ,
 of tiles that overlaps hold together; tiles with content are those of which overlaps show it.
 """
 
-import argparse
 import json
 import subprocess
 import tempfile
@@ -15,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from examples.benchmarks.driver import run
 from rdstitch.arrays import FloatArray
 from rdstitch.inputs.source import read_sources
 from rdstitch.pipeline.flat_field import with_flat_field
@@ -125,19 +125,13 @@ def measure(name: str, stage: StageGrid, folder: Path, peer: str | None) -> None
         )
 
 
-def main() -> None:
+def main(*, rows: int = 10, tile: int = 1024, only: str = "", peer_python: str | None = None) -> None:
     """Run all sets, or those whose name contains a text."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rows", type=int, default=10)
-    parser.add_argument("--tile", type=int, default=1024)
-    parser.add_argument("--only", default="")
-    parser.add_argument("--peer-python")
-    given = parser.parse_args()
-    for name, stage in grids(given.rows, given.tile):
-        if given.only in name:
+    for name, stage in grids(rows, tile):
+        if only in name:
             with tempfile.TemporaryDirectory() as folder:
-                measure(name, stage, Path(folder), given.peer_python)
+                measure(name, stage, Path(folder), peer_python)
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -14,21 +14,6 @@ from rdstitch.pipeline import register
 from tests.cli.running import CACHED, Run
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (("--scale", "1e-300"), "scale must lie between"),
-        (("--scale", "1e300"), "scale must lie between"),
-        (("-j", "99999999999999999999"), "workers must be at most"),
-        (("--threshold", "1e308"), "threshold"),
-        (("--focal", "1e308"), "focal length"),
-    ],
-)
-def test_options(rdstitch: Run, frames: list[Path], tmp_path: Path, options: tuple[str, str], words: str) -> None:
-    done = rdstitch("pano", *frames[:2], "-o", tmp_path / "out.png", *CACHED, *options)
-    assert (done.status, words in done.line) == (2, True)
-
-
 def test_numbers_where_a_configuration_may_have_units(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text("[common]\nattitude-std = 1.0\nmax-memory = 800_000_000\n", encoding="utf-8")
     arguments = ("pano", *frames[:2], "-o", tmp_path / "out.png", *CACHED, "--config", tmp_path / "a.toml")

@@ -60,14 +60,6 @@ def test_every_status_of_the_error_tree_is_documented() -> None:
         assert re.search(rf"^\s+{kind.exit_status}\s+\S", EXIT_STATUSES, re.MULTILINE), kind
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_options_speak_of_their_own_command(name: str) -> None:
-    for option in _options(cli.commands[name]):
-        others = {other for other in COMMANDS if other != name and re.search(rf"\b{other}\b", option.help or "")}
-        # What INPUT may be is described once.
-        assert others <= {"mosaic"}, option.name
-
-
 def test_the_bare_command_shows_all_of_its_help(rdstitch: Run) -> None:
     assert rdstitch().err == rdstitch("-h").out
     assert "..." not in rdstitch("-h").out.partition("Examples:")[0].partition("[ARGS]...")[2]

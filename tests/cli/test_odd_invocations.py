@@ -47,6 +47,8 @@ def place(tmp_path: Path, frames: list[Path], monkeypatch: pytest.MonkeyPatch) -
         ("pano a.png b.png -o out.png --focal 1e300", 2, "has a focal length of 1e+300 pixels"),
         ("pano a.png b.png -o out.png --threshold nan", 2, "threshold"),
         ("pano a.png b.png -o out.png --scale 0", 2, "scale must lie between"),
+        ("pano a.png b.png -o out.png --scale 1e300", 2, "scale must lie between"),
+        ("pano a.png b.png -o out.png --threshold 1e308", 2, "threshold"),
         ("pano a.png b.png -o out.png --scale 1e-9", 2, "scale must lie between"),
         ("pano a.png b.png -o out.png --scale 100", 7, "--scale nearer to 1"),
         ("pano a.png b.png -o out.png --max-memory 1M", 7, "raise --max-memory"),

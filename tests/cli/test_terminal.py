@@ -6,10 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import click
 import pytest
-from rdstitch_cli.help_pages import place_of
-from rdstitch_cli.main import cli
 from rdstitch_cli.parameter_types import UserPath
 from rdstitch_cli.terminal import Reporter, spell_out
 
@@ -74,18 +71,6 @@ def test_quality_makes_files_smaller(rdstitch: Run, frames: list[Path], tmp_path
         sizes.append(file.stat().st_size)
     assert sizes[1] < 0.5 * sizes[0]
     assert rdstitch("pano", *frames, "-o", tmp_path / "q.jpg", "--quality", "0", *CACHED).status == 2
-
-
-@pytest.mark.parametrize("name", sorted(set(cli.commands) - {"help"}))
-def test_at_most_ten_options_come_first(name: str) -> None:
-    places = {
-        parameter.name: place_of(parameter.name or "")[0]
-        for parameter in cli.commands[name].params
-        if isinstance(parameter, click.Option)
-    }
-    first = [option for option, place in places.items() if place == "Options that matter first"]
-    assert 0 < len(first) <= 10
-    assert "output" in first or name == "doctor"
 
 
 def test_help_is_a_command_too(rdstitch: Run) -> None:

@@ -13,25 +13,16 @@ from rdstitch.inputs import source as sources
 from rdstitch.io import Metadata, read_metadata
 from rdstitch.pipeline import accept
 from rdstitch.verification.verdict import judge
-from tests.cli.faulty import UNREADABLE, UNUSABLE, Make
+from tests.cli.faulty import UNREADABLE, UNUSABLE
 from tests.cli.running import CACHED, Run, check_refused, finished, shown, start, state_of
 
 
-@pytest.mark.parametrize("make", UNREADABLE.values(), ids=UNREADABLE.keys())
-def test_unreadable_images(rdstitch: Run, place: Path, make: Make) -> None:
-    bad = make(place / "b.png", place)
+@pytest.mark.parametrize(("kind", "status"), [*((kind, 3) for kind in UNREADABLE), *((kind, 4) for kind in UNUSABLE)])
+def test_inputs_that_are_refused(rdstitch: Run, place: Path, kind: str, status: int) -> None:
+    bad = {**UNREADABLE, **UNUSABLE}[kind](place / "b.png", place)
     before = state_of(place)
     done = rdstitch("pano", "-o", place / "out.png", *CACHED, place / "a.png", bad)
-    check_refused(done, 3, bad)
-    assert state_of(place) == before
-
-
-@pytest.mark.parametrize("make", UNUSABLE.values(), ids=UNUSABLE.keys())
-def test_images_that_fit_to_nothing(rdstitch: Run, place: Path, make: Make) -> None:
-    bad = make(place / "b.png", place)
-    before = state_of(place)
-    done = rdstitch("pano", place / "a.png", bad, "-o", place / "out.png", *CACHED)
-    check_refused(done, 4, bad.name)
+    check_refused(done, status, bad if status == 3 else bad.name)
     assert state_of(place) == before
 
 

@@ -5,7 +5,6 @@ import json
 import re
 import shutil
 import subprocess
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -105,23 +104,6 @@ def read_shown(data: bytes) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     from PIL import Image
 
     return np.asarray(np.asarray(Image.open(io.BytesIO(data)))[..., 3] > 0)
-
-
-def _packed_sizes() -> dict[str, int]:
-    """Bytes of every file of the wheel, each compressed on its own as a wheel does it."""
-    sizes = {}
-    for folder in ("rdstitch", "cli/rdstitch_cli"):
-        for file in (_ROOT / folder).rglob("*"):
-            if file.is_file() and "__pycache__" not in file.parts:
-                packed = io.BytesIO()
-                with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-                    archive.write(file, str(file.relative_to(_ROOT)))
-                sizes[file.name if file.suffix == ".js" else str(file)] = len(packed.getvalue())
-    return sizes
-
-
-def test_the_wheel_is_small() -> None:
-    assert 0 < sum(_packed_sizes().values()) <= 1_000_000
 
 
 def test_the_page_is_no_report(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ def test_text_is_as_good_as_a_path() -> None:
         ({"local_alignment": 1}, "cells"),
         ({"scheduler": "tcp://somewhere:8786"}, "--cache"),
         ({"seed": -1}, "negative"),
+        ({"workers": 10**20}, "workers must be at most"),
     ],
 )
 def test_what_contradicts_itself_is_refused(wrong: dict[str, Any], named: str) -> None:

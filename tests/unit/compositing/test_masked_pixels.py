@@ -3,11 +3,9 @@
 import tracemalloc
 
 import numpy as np
-import pytest
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from rdstitch.compositing.masked_pixels import OPAQUE, filled, opacity
+from rdstitch.compositing.masked_pixels import filled
 
 
 def test_what_is_transparent_has_the_samples_of_the_nearest_opaque_pixel() -> None:
@@ -24,34 +22,6 @@ def test_what_is_transparent_has_the_samples_of_the_nearest_opaque_pixel() -> No
     assert opaque[tuple(source.T)].all()
     nearest = np.asarray(KDTree(np.argwhere(opaque)).query(hidden)[0])
     assert (np.linalg.norm(source - hidden, axis=1) <= 1.05 * nearest).all()  # distances of 5 x 5 chamfers
-
-
-def _masks() -> dict[str, NDArray[np.bool_]]:
-    y, x = np.mgrid[:1100, :300]
-    return {
-        "sky": y > 700 + 0.3 * x,
-        "ground": y < 300,
-        "band": (y > 480) & (y < 520),
-        "gap": (y < 100) | (y > 900),
-        "circle": (x - 150) ** 2 + (y - 550) ** 2 < 140**2,
-    }
-
-
-@pytest.mark.parametrize("name", list(_masks()))
-def test_rows_apart_give_what_the_whole_does_near_the_mask_and_opaque_samples_elsewhere(name: str) -> None:
-    opaque = _masks()[name]
-    y, x = np.mgrid[: opaque.shape[0], : opaque.shape[1]]
-    pixels = np.where(opaque[..., None], np.stack([x, y, 0 * x], axis=-1), 0).astype(np.uint16)
-    made = filled(pixels, opaque)
-    hidden, source = np.argwhere(~opaque), made[~opaque][:, 1::-1].astype(np.intp)
-    assert opaque[tuple(source.T)].all()
-    nearest = np.asarray(KDTree(np.argwhere(opaque)).query(hidden)[0])
-    near = nearest <= 60
-    assert (np.linalg.norm(source - hidden, axis=1)[near] <= 1.05 * nearest[near]).all()
-    reach = 0.125 * min(opaque.shape)
-    inside = np.asarray(KDTree(hidden).query(np.argwhere(opaque))[0]) / reach
-    np.testing.assert_allclose(opacity(opaque)[0][opaque] / OPAQUE, np.minimum(inside, 1.0), rtol=0.05)
-    assert not opacity(opaque)[0][~opaque].any()
 
 
 def test_where_nothing_is_opaque_there_is_nothing_to_fill_with() -> None:

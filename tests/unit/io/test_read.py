@@ -2,8 +2,6 @@
 
 import os
 import stat
-import struct
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,19 +23,6 @@ def colours() -> Samples:
     """A small image whose every pixel differs, with 8 bits."""
     v, u = np.mgrid[:23, :31]
     return np.stack([u * 8, v * 11, (u * v) % 256], axis=-1).astype(np.uint8)
-
-
-def _expect_one_line(path: Path, function: Callable[[Path], object], capfd: pytest.CaptureFixture[str]) -> str:
-    """The text of the InputError; nothing may leak to standard error."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        with pytest.raises(InputError) as caught:
-            function(path)
-    text = str(caught.value)
-    assert "\n" not in text
-    assert str(path) in text
-    assert capfd.readouterr() == ("", "")
-    return text
 
 
 def test_colour_is_in_rgb_order(tmp_path: Path, colours: Samples) -> None:
@@ -148,74 +133,12 @@ def test_odd_names(tmp_path: Path, colours: Samples, name: str) -> None:
     np.testing.assert_array_equal(read_image(tmp_path / name).pixels, colours)
 
 
-class TestBadFiles:
-    """None of these may end otherwise than in one line."""
-
-    @pytest.mark.parametrize("function", [read_image, read_metadata])
-    @pytest.mark.parametrize(
-        ("name", "content"),
-        [
-            ("missing.jpg", None),
-            ("empty.jpg", b""),
-            ("text.jpg", b"This is not an image.\n" * 20),
-            ("zeros.tif", bytes(1000)),
-            ("header.png", b"\x89PNG\r\n\x1a\n"),
-            ("header.jpg", b"\xff\xd8\xff\xe0"),
-            ("header.tif", b"II*\0\x08\0\0\0"),
-            ("big.tif", b"II+\0\x08\0\0\0" + bytes(8)),
-            ("loop.tif", b"II*\0\x08\0\0\0\0\0\x08\0\0\0"),
-        ],
-    )
-    def test_content(
-        self,
-        tmp_path: Path,
-        name: str,
-        content: bytes | None,
-        function: Callable[[Path], object],
-        capfd: pytest.CaptureFixture[str],
-    ) -> None:
-        if content is not None:
-            (tmp_path / name).write_bytes(content)
-        _expect_one_line(tmp_path / name, function, capfd)
-
-    def test_folder(self, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-        assert "folder" in _expect_one_line(tmp_path, read_image, capfd)
-
-    def test_link_to_itself(self, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-        (tmp_path / "a.jpg").symlink_to(tmp_path / "a.jpg")
-        _expect_one_line(tmp_path / "a.jpg", read_image, capfd)
-
-    def test_pipe_does_not_block(self, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-        os.mkfifo(tmp_path / "a.jpg")
-        _expect_one_line(tmp_path / "a.jpg", read_image, capfd)
-
-    @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
-    def test_unreadable(self, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-        Image.new("L", (4, 4)).save(tmp_path / "a.png")
-        (tmp_path / "a.png").chmod(stat.S_IWUSR)
-        assert "permission" in _expect_one_line(tmp_path / "a.png", read_image, capfd)
-
-    @pytest.mark.parametrize("kind", ["jpg", "png", "deep.png", "tif", "packed.tif", "webp"])
-    def test_truncated(self, tmp_path: Path, colours: Samples, kind: str, capfd: pytest.CaptureFixture[str]) -> None:
-        path = tmp_path / f"a.{kind}"
-        large = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
-        if kind == "deep.png":
-            from rdstitch.io import write_image
-
-            write_image(path, large.astype(np.uint16) * 257)
-        else:
-            Image.fromarray(large).save(path, **({"compression": "tiff_lzw"} if kind == "packed.tif" else {}))
-        whole = path.read_bytes()
-        for share in (0.1, 0.5, 0.9):
-            path.write_bytes(whole[: int(len(whole) * share)])
-            _expect_one_line(path, read_image, capfd)
-
-    def test_lying_sizes(self, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-        header = struct.pack(">IIBBBBB", 2_000_000, 2_000_000, 8, 2, 0, 0, 0)
-        from rdstitch.io.encoding import png_chunk
-
-        (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", header) + png_chunk(b"IEND", b""))
-        _expect_one_line(tmp_path / "a.png", read_image, capfd)
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+def test_what_may_not_be_read(tmp_path: Path) -> None:
+    Image.new("L", (4, 4)).save(tmp_path / "a.png")
+    (tmp_path / "a.png").chmod(stat.S_IWUSR)
+    with pytest.raises(InputError, match="permission"):
+        read_image(tmp_path / "a.png")
 
 
 class TestMetadata:

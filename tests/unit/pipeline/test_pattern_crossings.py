@@ -1,8 +1,6 @@
 """Boards are calibrated by the crossings of their edges, other ground as before."""
 
 from functools import partial
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +10,6 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions
 from rdstitch.matching.two_view_rounds import Pairing
-from rdstitch.pipeline import pattern_crossings as stage
 from rdstitch.pipeline import register as stages
 from rdstitch.synthetic import ImageTexture, Sequence, grid_poses, ground, sequence_over
 
@@ -54,27 +51,3 @@ def test_saddles_of_other_ground_change_nothing(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(Pairing, "match_repeated_patterns", lambda pairing, pairs: pairs)
     found = rdstitch.calibrate(frames, _OPTIONS)
     assert found.camera == plain.camera
-
-
-def test_an_image_that_only_crossings_place_is_looked_at_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    def alignment(used: list[bool], support: set[tuple[int, int]], rms: float) -> SimpleNamespace:
-        return SimpleNamespace(used=np.array(used), support=support, rms=rms, cameras=[_LENS] * 3)
-
-    seen: list[dict[int, FloatArray]] = []
-
-    def matched(pair: SimpleNamespace, _: object, crossings: dict[int, FloatArray], __: float) -> SimpleNamespace:
-        seen.append({k: crossings[k] for k in (pair.image1, pair.image2)})
-        return SimpleNamespace(**vars(pair))
-
-    monkeypatch.setattr(stage, "find_crossings", lambda _: np.zeros((1, 2)))
-    monkeypatch.setattr(stage, "prepare", lambda *_, **__: None)
-    monkeypatch.setattr(stage, "_matched", matched)
-    pairs = [SimpleNamespace(image1=0, image2=1), SimpleNamespace(image1=1, image2=2)]
-    before = SimpleNamespace(pairs=pairs, alignment=alignment([True, True, False], {(0, 1)}, 1.0))
-    after: Any = SimpleNamespace(alignment=alignment([True, True, True], {(0, 1), (1, 2)}, 0.1))
-    aligner: Any = SimpleNamespace(threshold=3.0, align=lambda *_: after)
-    pairing: Any = SimpleNamespace(shows_repeated_pattern=True)
-    sources: Any = [SimpleNamespace(view=lambda _: None, camera=_LENS)] * 3
-    aligned: Any = before
-    assert stage.match_crossings(aligner, pairing, aligned, sources, None, 1) == (after, {})
-    assert [sorted(places) for places in seen] == [[0, 1], [0, 1], [1, 2]]
