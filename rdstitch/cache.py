@@ -12,23 +12,22 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from rdstitch.errors import ArgumentError, InputError, OutputError
-from rdstitch.file_access import is_url, open_regular, read_limited, remote_status
-from rdstitch.io.packing import digest, is_of, pack, unpack
-from rdstitch.stored import MAX_ENTRY, Stored, TemporaryFolder, entry_name
+from rdstitch.errors import InputError, OutputError
+from rdstitch.file_access import is_url, open_regular, remote_status
+from rdstitch.io.packing import digest, pack
+from rdstitch.stored import Stored, TemporaryFolder, entry_name, read_entry
 
 Value = TypeVar("Value")
 
-_FORMAT = 1
+_FORMAT = 2
 _ABANDONED_SECONDS = 3600.0  # since a process last wrote into an unfinished entry; it was killed
-_CORRUPT_ENTRY_ERRORS = (ValueError, LookupError, ArithmeticError)
 _OPENCV = tuple(f"opencv-{kind}" for kind in ("contrib-python-headless", "contrib-python", "python-headless", "python"))
 _PACKAGES = ("numpy", "scipy", *_OPENCV, "pillow", "simplejpeg", "tifffile")
 
@@ -82,92 +81,46 @@ class Cache:
         if not os.access(self.folder, os.W_OK | os.X_OK):
             raise OutputError(f"{self.folder}: no permission to write into the folder of the cache")
 
-    def recall(
-        self,
-        stage: str,
-        kinds: tuple[type, ...],
-        inputs: tuple[Any, ...],
-        compute: Callable[[], Value],
-        valid: Callable[[Value], bool] = lambda value: True,
-        *,
-        hint: Any = object,
-    ) -> Value:
+    def recall(self, stage: str, inputs: tuple[Any, ...], compute: Callable[[], Value]) -> Value:
         """What a stage gives for its inputs: from an earlier run, else computed now and kept.
 
         Parameters
         ----------
         stage : str
             Name of the stage.
-        kinds : tuple of dataclass
-            What the result is made of.
         inputs : tuple
-            Everything that the result depends on, as :func:`rdstitch.io.packing.pack` takes it.
+            Everything that the result depends on, as :func:`rdstitch.io.packing.digest` takes it.
         compute : callable
             Gives the result.
-        valid : callable
-            Whether an entry is a result for these inputs by its shapes and ranges; else it is computed again, as where
-            it raises one of the errors that wrong values lead to.
-        hint : type, optional
-            What ``valid`` takes: an entry of another type is computed again.
         """
-        if self.folder is None:
-            return compute()
-        file = self._file(stage, inputs)
-        kept = _read(file, kinds, valid, hint)
-        if kept:
-            return kept[0]
-        value = compute()
-        self._keep(file, value)
-        return value
+        return self.recall_many(stage, [inputs], lambda _: [compute()])[0]
 
-    def stored(
-        self,
-        stage: str,
-        kinds: tuple[type, ...],
-        inputs: tuple[Any, ...],
-        compute: Callable[[], Value],
-        valid: Callable[[Value], bool] = lambda value: True,
-        *,
-        hint: Any = object,
-    ) -> Stored[Value]:
+    def stored(self, stage: str, inputs: tuple[Any, ...], compute: Callable[[], Value]) -> Stored[Value]:
         """As :meth:`recall`, but the result stays on disk until it is loaded."""
         if self.folder is None:
             return Stored(value=compute())
         file = self._file(stage, inputs)
-        if _read(file, kinds, valid, hint):
-            return Stored(file, kinds, folder=self.temporary)
+        if _read(file):
+            return Stored(file, folder=self.temporary)
         value = compute()
-        return Stored(file, kinds, folder=self.temporary) if self._keep(file, value) else Stored(value=value)
+        return Stored(file, folder=self.temporary) if self._keep(file, value) else Stored(value=value)
 
     def recall_many(
-        self,
-        stage: str,
-        kinds: tuple[type, ...],
-        inputs: Sequence[tuple[Any, ...]],
-        compute: Callable[[list[int]], list[Value]],
-        valid: Callable[[int, Value], bool] = lambda index, value: True,
-        *,
-        hint: Any = object,
+        self, stage: str, inputs: Sequence[tuple[Any, ...]], compute: Callable[[list[int]], list[Value]]
     ) -> list[Value]:
         """As :meth:`recall` for a stage that computes several results at once.
 
         Parameters
         ----------
-        stage, kinds
-            As in :meth:`recall`.
         inputs : sequence of tuple
             Of each result.
         compute : callable
             Gives the results of some of the inputs, called with their places.
-        valid : callable
-            As in :meth:`recall`, with the place.
-        hint
-            As in :meth:`recall`, of each.
         """
         if self.folder is None:
             return compute(list(range(len(inputs))))
         files = [self._file(stage, own) for own in inputs]
-        found = [_read(file, kinds, partial(valid, index), hint) for index, file in enumerate(files)]
+        found: list[list[Value]] = [_read(file) for file in files]
         missing = [index for index, kept in enumerate(found) if not kept]
         for index, value in zip(missing, compute(missing) if missing else [], strict=True):
             found[index] = [value]
@@ -213,13 +166,8 @@ class Cache:
             return os.urandom(16).hex()
 
     def digest(self, value: Any) -> str:
-        """What stands for a large value in the inputs of several results; empty without a cache.
-
-        Items of a tuple are packed one after the other, so that they are not all in memory twice.
-        """
-        if self.folder is None:
-            return ""
-        return digest(tuple(map(digest, value)) if isinstance(value, tuple) else value)
+        """What stands for a large value in the inputs of several results; empty without a cache."""
+        return "" if self.folder is None else digest(value)
 
 
 @cache
@@ -248,12 +196,10 @@ def _sources(folder: Traversable, prefix: str) -> Iterator[tuple[str, bytes]]:
             yield prefix + entry.name, entry.read_bytes()
 
 
-def _read(file: Path, kinds: tuple[type, ...], valid: Callable[[Value], bool], hint: Any) -> list[Value]:
-    """The result that a file holds; none where it is missing, damaged, or no result for these inputs."""
-    with suppress(InputError, ArgumentError, OSError, *_CORRUPT_ENTRY_ERRORS):
-        kept: tuple[str, Value] = unpack(read_limited(file, MAX_ENTRY), kinds)
-        if is_of(kept, tuple[str, hint]) and kept[0] == entry_name(file) and valid(kept[1]):
-            return [kept[1]]
+def _read(file: Path) -> list[Any]:
+    """The result that a file holds; none where it is missing, damaged, or that of another name."""
+    with suppress(InputError, OSError):
+        return [read_entry(file)[0]]
     return []
 
 

@@ -2,7 +2,7 @@
 
 With λ alone this is the one-parameter model (Fitzgibbon 2001; Valtonen Örnhag et al., eq. 2); λ < 0 is barrel
 distortion. A stereographic fisheye is exactly that; three coefficients describe equidistant and equisolid fisheyes of
-150 degrees to 0.07 pixels where λ alone leaves 4 to 6 (``tests/benchmarks/lens_models.py``).
+150 degrees to 0.07 pixels where λ alone leaves 4 to 6.
 
 Points are normalized: the distortion centre is the origin, the unit is half the image diagonal unless stated.
 """

@@ -12,6 +12,7 @@ from rdstitch.matching.mixed_lenses import TwoLenses
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.messages import Message, of_severity
 from rdstitch.orientation import inverse
+from rdstitch.stage.register import TileRegistration
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,8 @@ class Registration:
         Whether a part of what the images show stays where it is in them, and only what moves was registered.
     stretch : (float, float) or None
         Grey levels of all images that count as black and white; None for those of 8 bits.
+    tiles : TileRegistration or None
+        Of tiles on a stage: what the stage does, and which tiles have their places from it alone.
     mixed : TwoLenses or None
         Where images of two lenses are mixed. If it is clear which belong together, the others are left out.
     """
@@ -63,6 +66,7 @@ class Registration:
     static_background: bool = False
     mixed: TwoLenses | None = None
     stretch: tuple[float, float] | None = None
+    tiles: TileRegistration | None = None
 
     def __repr__(self) -> str:
         return f"<Registration {self.summary}>"

@@ -10,14 +10,14 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, Generic, TypeVar, cast
 
-from rdstitch.errors import ArgumentError, InputError
+from rdstitch.errors import InputError
 from rdstitch.file_access import read_limited
 from rdstitch.io.packing import unpack
 from rdstitch.io.staging import StagingFolder
 
 Value = TypeVar("Value")
 
-MAX_ENTRY = 2**31  # bytes
+_MAX_ENTRY = 2**31  # bytes
 _CAPACITY = 16 * 2**20  # bytes of files whose content is kept in memory
 
 
@@ -64,8 +64,6 @@ class Stored(Generic[Value]):
     ----------
     file : Path or None
         Entry of a cache.
-    kinds : tuple of dataclass
-        What the result is made of.
     value : Value or None
         The result itself, without a file.
     folder : TemporaryFolder or None
@@ -73,7 +71,6 @@ class Stored(Generic[Value]):
     """
 
     file: Path | None = None
-    kinds: tuple[type, ...] = ()
     value: Value | None = None
     folder: TemporaryFolder | None = field(default=None, compare=False, repr=False)
 
@@ -87,7 +84,7 @@ class Stored(Generic[Value]):
         """
         if self.file is None:
             return cast(Value, self.value)
-        return cast(Value, _recent.recall(self.file, self._read))
+        return cast(Value, _recent.recall(self.file))
 
     @property
     def name(self) -> str:
@@ -100,21 +97,28 @@ class Stored(Generic[Value]):
             with suppress(OSError):
                 self.file.unlink()
 
-    def _read(self) -> tuple[Value, int]:
-        assert self.file is not None
-        try:
-            data = read_limited(self.file, MAX_ENTRY)
-            name, value = unpack(data, self.kinds)
-            if name == self.name:
-                return value, len(data)
-        except (InputError, ArgumentError, OSError, TypeError, ValueError) as error:
-            raise InputError(f"{self.file}: this entry of the cache vanished or was damaged; run again") from error
-        raise InputError(f"{self.file}: this entry of the cache was replaced by another; run again")
-
 
 def entry_name(file: Path) -> str:
     """The name of a result, as it is also written into its file: what is mistaken for it is no better than damaged."""
     return file.parent.name + file.name
+
+
+def read_entry(file: Path) -> tuple[Any, int]:
+    """The result that a file holds, and the file's size, bytes.
+
+    Raises
+    ------
+    InputError
+        When the file has vanished, is damaged, or holds the result of another name.
+    """
+    try:
+        data = read_limited(file, _MAX_ENTRY)
+        name, value = unpack(data)
+    except (InputError, OSError, TypeError, ValueError) as error:
+        raise InputError(f"{file}: this entry of the cache vanished or was damaged; run again") from error
+    if name != entry_name(file):
+        raise InputError(f"{file}: this entry of the cache was replaced by another; run again")
+    return value, len(data)
 
 
 class _RecentlyUsed:
@@ -125,11 +129,11 @@ class _RecentlyUsed:
         self._held: OrderedDict[Path, tuple[Any, int]] = OrderedDict()
         self._lock = Lock()
 
-    def recall(self, file: Path, read: Callable[[], tuple[Any, int]]) -> Any:
+    def recall(self, file: Path) -> Any:
         with self._lock, suppress(KeyError):
             self._held.move_to_end(file)
             return self._held[file][0]
-        value, size = read()
+        value, size = read_entry(file)
         with self._lock:
             if file not in self._held:
                 self._held[file] = value, size

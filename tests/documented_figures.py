@@ -1,6 +1,6 @@
 """Figures in the documentation that commands print: ``python -m tests.documented_figures`` compares, ``--write`` mends.
 
-In README every console block of which the first command works on ``examples/data`` is run; in docs/features.md the
+In README every console block of which the first command works on ``examples/data`` is run; in docs/measurements.md the
 table of all kinds of features on one pair. Seconds are not compared.
 """
 
@@ -17,7 +17,7 @@ from pathlib import Path
 from rdstitch_cli.main import run
 
 ROOT = Path(__file__).parents[1]
-README, FEATURES = ROOT / "README.md", ROOT / "docs/features.md"
+README, MEASUREMENTS = ROOT / "README.md", ROOT / "docs/measurements.md"
 _SECONDS = re.compile(r", \d+\.\d s$", re.MULTILINE)
 _BLOCK = re.compile(r"(?ms)^```console\n(\$ rdstitch \w+ examples/data.*?)^```$")
 _ROW = re.compile(r"(?m)^\| (\w+) \| \d+ \| \d+ \| (-?[\d.]+) \|$")
@@ -26,7 +26,7 @@ _ROW = re.compile(r"(?m)^\| (\w+) \| \d+ \| \d+ \| (-?[\d.]+) \|$")
 def main(arguments: list[str]) -> int:
     """Compare, or write."""
     stale = 0
-    for file, current in ((README, readme()), (FEATURES, features())):
+    for file, current in ((README, readme()), (MEASUREMENTS, features())):
         text = file.read_text(encoding="utf-8")
         if without_seconds(text) != without_seconds(current):
             stale += 1
@@ -47,7 +47,7 @@ def features(kinds: tuple[str, ...] = ()) -> str:
     def row(found: re.Match[str]) -> str:
         return found[0] if kinds and found[1] not in kinds else feature_row(found[1])
 
-    return _ROW.sub(row, FEATURES.read_text(encoding="utf-8"))
+    return _ROW.sub(row, MEASUREMENTS.read_text(encoding="utf-8"))
 
 
 def feature_row(kind: str) -> str:

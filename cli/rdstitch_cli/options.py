@@ -136,8 +136,8 @@ def flat_field(usual: str) -> Decorator[Any]:
         default=usual,
         show_default=True,
         metavar="auto|off|FILE",
-        help="Take out the illumination that all tiles share: as they show it, or as this image and, on a second page, "
-        "the dark field have it.",
+        help="Take out the illumination that all images share: as they show it, or as FILE has it and, on its second "
+        "page, the dark field.",
     )
 
 

@@ -52,10 +52,10 @@ class Block:
 
     def compute(self, store: Cache) -> list[Stored[BlockStrip]]:
         """Its strips from top to bottom, in the store, which must be this run's own."""
-        kinds, box = (BlockStrip,), self.tiles.box
+        box = self.tiles.box
         with one_opencv_thread():
             return [
-                store.stored("blocks", kinds, (box, number), partial(BlockStrip, *strip))
+                store.stored("blocks", (box, number), partial(BlockStrip, *strip))
                 for number, strip in enumerate(self.tiles.strips())
             ]
 

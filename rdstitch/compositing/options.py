@@ -11,7 +11,6 @@ Seam = Literal["none", "voronoi", "graphcut"]
 Blend = Literal["none", "feather", "multiband"]
 Crop = Literal["none", "auto"]
 ProjectionName = Literal["auto", "plane", "cylinder", "sphere", "mercator"]
-PROJECTIONS: tuple[ProjectionName, ...] = get_args(ProjectionName)
 Interpolation = Literal["linear", "cubic", "lanczos"]
 
 

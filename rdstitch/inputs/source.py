@@ -125,7 +125,7 @@ class Source:
         usual = self.reduction(WORK_MEGAPIXELS)
         if reduction % usual:
             return self._within_circle(self._load(reduction), reduction)
-        key = (self.path, self.mask, self.mask_frame)
+        key = (self.path, self.mask, self.mask_frame, self.flat_field)
         image = self.decoded_images.take(key) or self._load(usual)
         if keep:
             self.decoded_images.put(key, image)

@@ -16,6 +16,7 @@ from rdstitch.camera import is_focal_length
 from rdstitch.file_access import open_regular
 from rdstitch.io.attitude import Attitude, finite, read_attitude, xmp_number, xmp_text
 from rdstitch.io.colour import ink_transform
+from rdstitch.io.ome_xml import read_ome
 from rdstitch.io.opening import check_megapixels, check_readable, decoding, has_late_metadata, opened_image
 from rdstitch.io.optional_readers import is_raw, raw_exif, raw_size
 from rdstitch.orientation import turned_size, turning_matrix
@@ -84,6 +85,10 @@ class Metadata:
         XMP packet that is to be written; what files have is not kept.
     profile_lost : str
         Why the file's colour profile is not kept; empty where it is, or where there is none.
+    pixel_size : float or None
+        Micrometres, where OME-XML says it.
+    planes : bool
+        Whether the channels are those of a microscope, on pages of their own, and no colours.
     """
 
     size: tuple[int, int]
@@ -104,6 +109,8 @@ class Metadata:
     xmp: bytes = b""
     profile_lost: str = ""
     channels: int = 3
+    pixel_size: float | None = None
+    planes: bool = False
 
     @property
     def nadir(self) -> tuple[float, float, float] | None:
@@ -140,7 +147,8 @@ def read_metadata(path: str | Path) -> Metadata:
             with opened_image(file) as image:
                 if image.format == "PNG" and not _EXIF_OF_PNG & image.info.keys() and not has_late_metadata(file):
                     image.info["exif"] = b""  # so that Pillow does not decode the pixels in search of it
-                return metadata_of(image)
+                found = metadata_of(image)
+                return _with_ome(file, found) if image.format == "TIFF" else found
         except SyntaxError:
             # Pillow knows few sample layouts of TIFF (no 16-bit colour with alpha, no five bands).
             with open_regular(file) as stream, tifffile.TiffFile(stream, name=str(file)) as tiff:
@@ -149,7 +157,19 @@ def read_metadata(path: str | Path) -> Metadata:
                 if min(size) < 1:
                     raise ValueError("no pixels") from None
                 check_megapixels(file, size)
-                return Metadata(size, bit_depth=page.bitspersample, channels=page.samplesperpixel)
+                found = Metadata(size, bit_depth=page.bitspersample, channels=page.samplesperpixel)
+            return _with_ome(file, found)
+
+
+def _with_ome(file: Path, found: Metadata) -> Metadata:
+    """The same with what OME-XML says besides."""
+    with open_regular(file) as stream, tifffile.TiffFile(stream, name=str(file)) as tiff:
+        told = read_ome(tiff.ome_metadata)
+        pages = 1 if told is None or told.channels == 1 else len(tiff.pages)
+    if told is None:
+        return found
+    apart = 1 < told.channels <= pages
+    return replace(found, pixel_size=told.pixel_size, planes=apart, channels=told.channels if apart else found.channels)
 
 
 def _raw_metadata(file: Path) -> Metadata:

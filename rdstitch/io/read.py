@@ -19,6 +19,7 @@ from rdstitch.errors import InputError
 from rdstitch.file_access import open_regular
 from rdstitch.io.colour import srgb_of_lab, without_inks
 from rdstitch.io.metadata import Metadata, metadata_of, read_metadata
+from rdstitch.io.ome_xml import read_ome
 from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, opened_image
 from rdstitch.io.optional_readers import is_raw, read_raw
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
@@ -265,6 +266,8 @@ def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
     """Samples and alpha of the first page, with any number of bands, or the mask on a page of its own."""
     with open_regular(file) as stream, tifffile.TiffFile(stream, name=str(file)) as tiff:
         page = tiff.pages.first
+        if (planes := _channel_planes(tiff)) is not None:
+            return planes, None
         kind = page.photometric
         plain = kind in _PLAIN or kind in _LAB
         has_alpha = any(extra in (1, 2) for extra in page.extrasamples)
@@ -302,6 +305,16 @@ def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
         samples, alpha = samples[..., :-1], samples[..., -1]
         return (samples[..., 0] if samples.shape[2] == 1 else samples), alpha
     return samples, mask
+
+
+def _channel_planes(tiff: tifffile.TiffFile) -> Pixels | None:
+    """The channels of an OME-TIFF that has them on pages of their own, (h, w, C); None of other files."""
+    told = read_ome(tiff.ome_metadata)
+    if told is None or not 1 < told.channels <= len(tiff.pages):
+        return None
+    pages = [page for page in tiff.pages[: told.channels] if isinstance(page, tifffile.TiffPage)]
+    alike = len({(page.shape, page.dtype) for page in pages}) == 1 and pages[0].axes == "YX"
+    return np.stack([page.asarray() for page in pages], axis=-1) if alike and len(pages) == told.channels else None
 
 
 def as_image(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Metadata) -> DecodedImage:

@@ -24,7 +24,7 @@ from rdstitch.io.layout import STRIP_ROWS, Layout, Strip, with_alpha
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.reduction import halved
 
-_TILE = 256
+TILE = 256
 _REDUCED, _MASK = 1, 4  # kinds of pages (NewSubfileType)
 _STRIP = 64  # rows
 # Smaller images need no overview.
@@ -50,7 +50,7 @@ def write_tiff(path: Path, layout: Layout, strips: Iterable[Strip], extra_tags: 
     extra_tags
         Further tags of the first page, for example of a GeoTIFF.
     """
-    sizes = [layout.size, *_overview_sizes(layout.size)]
+    sizes = [layout.size, *overview_sizes(layout.size)]
     total = sum(w * h for w, h in sizes) * layout.samples_per_pixel * layout.dtype.itemsize
     joined: Iterable[NDArray[Any]] = (with_alpha(*strip) if layout.transparent else strip[0] for strip in strips)
     mask: list[bytes] | None = [] if _has_mask(layout) else None
@@ -93,16 +93,16 @@ def _write_page(
     dpi = None if kind else layout.metadata.dpi
     tiled = samples != 2
     tiff.write(
-        (_encoded(block) for block in (_tiles(strips) if tiled else _short_strips(strips))),
+        (encoded_tile(block) for block in (tiles_of(strips) if tiled else _short_strips(strips))),
         shape=(height, width, samples) if samples > 1 else (height, width),
         dtype=layout.dtype,
         photometric="rgb" if colour == 3 else "minisblack",
         planarconfig="contig" if samples > 1 else None,
         extrasamples=extra or None,
-        tile=(_TILE, _TILE) if tiled else None,
+        tile=(TILE, TILE) if tiled else None,
         rowsperstrip=None if tiled else _STRIP,
         compression="zlib",
-        predictor=_has_predictor(layout.dtype),
+        predictor=has_predictor(layout.dtype),
         # Tiles that tifffile holds before it writes them; 256 MB by default.
         buffersize=_BUFFER,
         metadata=None,
@@ -118,7 +118,7 @@ def _write_page(
 def _without_alpha(strips: Iterable[NDArray[Any]], mask: list[bytes]) -> Iterator[NDArray[Any]]:
     """The strips without alpha; tiles of where that is not 0, one bit a pixel, are added to ``mask`` as stored."""
     for strip in strips:
-        bits = (np.packbits(tile[..., 0], axis=1) for tile in _tiles([strip[..., -1:] > 0]))
+        bits = (np.packbits(tile[..., 0], axis=1) for tile in tiles_of([strip[..., -1:] > 0]))
         mask += [_deflated(tile) for tile in bits]
         yield strip[..., :-1]
 
@@ -130,7 +130,7 @@ def _write_mask(tiff: tifffile.TiffWriter, size: tuple[int, int], tiles: list[by
         shape=size[::-1],
         dtype=np.bool_,
         photometric="mask",
-        tile=(_TILE, _TILE),
+        tile=(TILE, TILE),
         compression="zlib",
         metadata=None,
         software="rdstitch",
@@ -138,13 +138,13 @@ def _write_mask(tiff: tifffile.TiffWriter, size: tuple[int, int], tiles: list[by
     )
 
 
-def _tiles(strips: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
+def tiles_of(strips: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
     """Tiles in the order of the file; those at the right and lower border completed."""
     for strip in strips:
-        for y in range(0, strip.shape[0], _TILE):
-            for x in range(0, strip.shape[1], _TILE):
-                tile = strip[y : y + _TILE, x : x + _TILE]
-                missing = [(0, _TILE - n) for n in tile.shape[:2]] + [(0, 0)]
+        for y in range(0, strip.shape[0], TILE):
+            for x in range(0, strip.shape[1], TILE):
+                tile = strip[y : y + TILE, x : x + TILE]
+                missing = [(0, TILE - n) for n in tile.shape[:2]] + [(0, 0)]
                 yield np.pad(tile, missing) if any(b for _, b in missing) else tile
 
 
@@ -153,15 +153,15 @@ def _short_strips(strips: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
         yield from (strip[y : y + _STRIP] for y in range(0, strip.shape[0], _STRIP))
 
 
-def _has_predictor(dtype: np.dtype[Any]) -> bool:
+def has_predictor(dtype: np.dtype[Any]) -> bool:
     """Whether differences of neighbours are stored; what is usual for floating point, few programs can read."""
     return dtype.kind == "u"
 
 
-def _encoded(tile: NDArray[Any]) -> bytes:
+def encoded_tile(tile: NDArray[Any]) -> bytes:
     """A tile (h, w, C) as it stands in the file."""
     stored = tile.copy()
-    if _has_predictor(tile.dtype):
+    if has_predictor(tile.dtype):
         stored[:, 1:] -= tile[:, :-1]
     return _deflated(stored)
 
@@ -208,7 +208,7 @@ def _copied_tags(metadata: Metadata) -> Iterator[ExtraTag]:
                 yield int(tag), 2, 0, text, True
 
 
-def _overview_sizes(size: tuple[int, int]) -> list[tuple[int, int]]:
+def overview_sizes(size: tuple[int, int]) -> list[tuple[int, int]]:
     """Sizes of the overviews, each half of the one before, rounded up."""
     sizes = []
     width, height = size

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.errors import ArgumentError, LimitError, OutputError
+from rdstitch.io import ome
 from rdstitch.io.atomic import IMAGE_SUFFIXES
 from rdstitch.io.deepzoom import check_tiles_folder, tiles_folder, write_deep_zoom
 from rdstitch.io.encoding import jpeg_pieces, png_pieces
@@ -127,7 +128,10 @@ def write_strips(
             write_deep_zoom(staged, tiles, layout, checked)
     else:
         with outputs.writing(file) as staged:
-            _write_file(staged, suffix, layout, checked, extra_tags)
+            if file.name.lower().endswith(ome.SUFFIXES):
+                ome.write_ome_tiff(staged, layout, checked)
+            else:
+                _write_file(staged, suffix, layout, checked, extra_tags)
     with naming(file):
         return fingerprint(staged, tiles)
 

@@ -27,7 +27,7 @@ are apart by a third of the camera's height."""
 _ROUGH = 0.5
 """Matches off the planes, for each inlier of all pairs together, from which on the planes are not the ground. Below,
 most pairs show one plane, and what is off it are outliers: buildings reach 0.4, a flat scene 0
-(``python -m tests.benchmarks.relief``)."""
+(``python -m examples.benchmarks.relief``)."""
 
 
 def over_rough_ground(pairs: Sequence[PairRegistration], threshold: float) -> Sequence[PairRegistration]:

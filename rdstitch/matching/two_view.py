@@ -19,7 +19,6 @@ from rdstitch.matching.feature_store import StoredFeatures, StoredMatches
 from rdstitch.matching.links import Link
 from rdstitch.matching.options import PairOptions
 from rdstitch.matching.static_places import StaticPlaces
-from rdstitch.planar_motion import PlanarMotion
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
 
@@ -125,14 +124,9 @@ def _match_pair(
             return task.matcher(load(one), load(two))
         return match_overlap(task.matcher, load(one), load(two), known.load())
 
-    def valid(found: Correspondences) -> bool:
-        features1, features2 = load(one), load(two)
-        own = found.of(features1, features2, found.indices, found.ratio)
-        return np.array_equal(own.points1, found.points1) and np.array_equal(own.points2, found.points2)
-
     cache = task.cache
     inputs = (one.key(cache), two.key(cache), task.how, None if known is None else known.key(cache))
-    stored = cache.stored("matches", (Correspondences,), inputs, compute, valid, hint=Correspondences)
+    stored = cache.stored("matches", inputs, compute)
     return StoredMatches(stored, len(stored.load()))
 
 
@@ -182,18 +176,14 @@ def estimate_pairs(task: EstimationTask) -> list[tuple[StoredMatches, RadialHomo
         with _one_estimation:
             return estimate_radial_homographies(pairs, how)
 
-    def valid(place: int, relation: RadialHomography) -> bool:
-        return relation.homography.shape == (3, 3) and relation.inliers.shape == (len(matches[place]),)
-
-    kinds = (RadialHomography, Camera, PlanarMotion)
-    relations = task.cache.recall_many("pairs", kinds, inputs, estimate, valid, hint=RadialHomography)
+    relations = task.cache.recall_many("pairs", inputs, estimate)
     return list(zip(matches, relations, strict=True))
 
 
 def _moving(found: StoredMatches, static: StaticPlaces, store: Cache) -> StoredMatches:
     """The matches that are left without those that are static."""
     inputs = (found.key(store), static.radius, static.places.data)
-    stored = store.stored("moving-matches", (Correspondences,), inputs, lambda: static.without_static(found.load()))
+    stored = store.stored("moving-matches", inputs, lambda: static.without_static(found.load()))
     return StoredMatches(stored, len(stored.load()))
 
 

@@ -9,7 +9,6 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions, align, most_matches_read
-from rdstitch.alignment.result import LinkFit, PlanarPoses, ReliefTest, ShapeTest
 from rdstitch.alignment.stored_frame import stored, turned_alignment, turned_link, turned_tilts, turns
 from rdstitch.arrays import FloatArray
 from rdstitch.cache import Cache
@@ -24,7 +23,7 @@ from rdstitch.matching.neighbours_around import neighbours_around
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
-from rdstitch.messages import Message, names_of
+from rdstitch.messages import names_of
 from rdstitch.options import StitchOptions
 from rdstitch.orientation import quarter_turn
 from rdstitch.pipeline.inlier_selection import reselect_inliers
@@ -191,14 +190,7 @@ class Aligner:
         former = None if former is None else turned_alignment(former, back, None)
         inputs = (cameras, self.cache.digest(links), self.options, self.cache.digest(former))
         compute = partial(align, cameras, links, self.options, former=former)
-        kinds = (Alignment, Camera, LinkFit, PlanarPoses, ReliefTest, ShapeTest, Message)
-
-        def valid(alignment: Alignment) -> bool:
-            count = len(self.cameras)
-            found, given = ([camera.image_size for camera in every] for every in (alignment.cameras, cameras))
-            return found == given and alignment.used.shape == (count,) and alignment.homographies.shape == (count, 3, 3)
-
-        alignment = self.cache.recall("alignment", kinds, inputs, compute, valid, hint=Alignment)
+        alignment = self.cache.recall("alignment", inputs, compute)
         down = None if gravity is None else np.einsum("nij,nj->ni", turns(self._turns), np.asarray(gravity))
         return turned_alignment(alignment, self._turns, down)
 

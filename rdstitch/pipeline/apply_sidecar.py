@@ -27,6 +27,7 @@ from rdstitch.messages import Message, told_once
 from rdstitch.messages import left_out as left_out_message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.compose import Composed, compose_images, plainly_viewed, write_page
+from rdstitch.pipeline.flat_field import check_size, with_flat_field
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.recomposition import Recomposition, applied_sidecar
 from rdstitch.progress import Progress, silent
@@ -44,6 +45,7 @@ def apply(
     *,
     match: MatchBy = "auto",
     mask: str | Path | None = None,
+    flat_field: str | Path = "off",
     every: int | None = 1,
     topic: str | None = None,
     workers: int = 0,
@@ -71,6 +73,8 @@ def apply(
         "order": the one at the same position of equally many. "auto": by name, or by order where no name is the same.
     mask : path, optional
         Image, or folder of them, that is dark where the images do not count.
+    flat_field : str or path
+        Illumination that is taken out: "off", "auto" by what the images have in common, or an image file.
     every : int, optional
         Look among every n-th frame of videos and ROS bags; None: among those that show new ground.
     topic : str, optional
@@ -114,6 +118,11 @@ def apply(
         guard = InputGuard(strict)
         sources, left_out = _sources(saved, chosen, guard, options.max_memory)
         used = _used(saved, sources, left_out, mask, strict=strict)
+        if flat_field != "off":
+            check_size(list(used.values()))
+            corrected, said = with_flat_field(list(used.values()), flat_field)
+            used = dict(zip(used, corrected, strict=True))
+            doubts += said
         placed = _placed(saved, used)
         composed = compose_images(
             placed,

@@ -145,7 +145,11 @@ def compose_images(
         there = moved(place, canvas, final)
         return [] if there is None else there.tiff_tags()
 
-    file = OutputFile(output, placed.sources[0].metadata.of_composite(), tags, outputs)
+    metadata = placed.sources[0].metadata.of_composite()
+    if metadata.pixel_size is not None:
+        scaled = None if options.max_size is not None else metadata.pixel_size / options.scale
+        metadata = replace(metadata, pixel_size=scaled)
+    file = OutputFile(output, metadata, tags, outputs)
     written = compose_to_file(file, images, canvas, options, report, elsewhere)
     place = moved(place, canvas, written.canvas)
     beside = []

@@ -129,18 +129,7 @@ def _detected(source: Source, task: DetectionTask) -> StoredFeatures:
     def compute() -> PackedFeatures:
         return PackedFeatures.pack(detect_view(source.view, options))
 
-    kinds = (PackedFeatures, Features)
-    stored = store.stored(
-        "features", kinds, inputs, compute, lambda found: _are_of(source, found.unpack()), hint=PackedFeatures
-    )
-    return StoredFeatures.at(stored)
-
-
-def _are_of(source: Source, features: Features) -> bool:
-    """Whether features may be those of an image: all lie in it."""
-    size = source.camera.image_size
-    within = (features.points >= -0.5) & (features.points <= np.array(size) - 0.5)
-    return features.image_size == size and bool(within.all()) and bool(np.isfinite(features.descriptors).all())
+    return StoredFeatures.at(store.stored("features", inputs, compute))
 
 
 def _no_features(options: FeatureOptions, source: Source) -> Features:
@@ -251,4 +240,4 @@ def _stretch_of_one(task: _StretchTask) -> tuple[Stretch | None, GuardNotes]:
             return None
 
     inputs = (source.content(store), source.mask_content(store), task.megapixels)
-    return store.recall("stretches", (), inputs, compute), source.guard.notes_on([source.path])
+    return store.recall("stretches", inputs, compute), source.guard.notes_on([source.path])

@@ -10,7 +10,6 @@ from rdstitch.alignment import Alignment
 from rdstitch.alignment.bundle_adjustment import sigma_of
 from rdstitch.arrays import FloatArray
 from rdstitch.cache import NO_CACHE, Cache
-from rdstitch.features import Correspondences
 from rdstitch.matching.eccentricity import eccentricity
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import PairRegistration
@@ -86,7 +85,7 @@ def _moved(
     shifts = eccentricity(transfer, matches.points1, radii[matches.indices[:, 0]])
     points2 = matches.points2 - np.nan_to_num(shifts)
     moved = replace(matches, points2=points2)
-    stored = store.stored("moved-matches", (Correspondences,), (found.key(store), shifts), lambda: moved)
+    stored = store.stored("moved-matches", (found.key(store), shifts), lambda: moved)
     left = transfer(matches.points1) - points2
     lengths, errors = (np.nan_to_num(np.linalg.norm(d, axis=1), nan=np.inf) for d in (shifts, left))
     return StoredMatches(stored, len(matches)), lengths, errors

@@ -19,7 +19,6 @@ from rdstitch.inputs.frame import Images, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.atomic import check_distinct, check_output, text_bytes
-from rdstitch.io.flat_field import read_flat_field
 from rdstitch.io.outputs import Outputs
 from rdstitch.io.reduction import mean_of_channels
 from rdstitch.local_alignment import no_local_alignment
@@ -27,11 +26,11 @@ from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.messages import MAX_NAMED, Message, names_of
 from rdstitch.options import StitchOptions
+from rdstitch.pipeline.flat_field import check_size, with_flat_field
 from rdstitch.pipeline.recipes import compose_registration
 from rdstitch.progress import Progress, silent
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.registration import Registration
-from rdstitch.stage.flat_field import estimate_illumination
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.options import TileOptions
 from rdstitch.stage.positions import grid_from_files, grid_from_names, grid_from_table, oriented
@@ -126,6 +125,8 @@ def _registered(
     sources, illumination = with_flat_field(sources, options.flat_field)
     read = partial(_plane, sources, options.channel)
     grid = _grid(sources, options, read)
+    if grid.pixel_size is not None:
+        sources = [replace(s, metadata=replace(s.metadata, pixel_size=grid.pixel_size)) for s in sources]
     tiled = register_tiles(grid, read, search=options.search, distortion=options.distortion, progress=progress)
     return _registration(sources, tiled).with_messages([*unread, *found.messages, *illumination]), tiled
 
@@ -171,42 +172,15 @@ def _plane(sources: Sequence[Source], channel: int | None, index: int) -> NDArra
     return np.ascontiguousarray(pixels[..., channel])
 
 
-def check_size(sources: Sequence[Source]) -> None:
-    """Refuse tiles of several sizes."""
-    (w1, h1), other = sources[0].camera.image_size, None
-    other = next((source for source in sources if source.camera.image_size != (w1, h1)), None)
-    if other is not None:
-        w2, h2 = other.camera.image_size
-        raise InputError(f"{other.path}: has {w2} x {h2} pixels, the tiles before it have {w1} x {h1}; leave it out")
-
-
-def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list[Source], list[Message]]:
-    """The tiles, which are read without the illumination that all have; and what there is to say of that."""
-    if wanted == "off":
-        return list(sources), []
-    if wanted != "auto":
-        pixels = sources[0].read(keep=True).pixels
-        channels = 1 if pixels.ndim == 2 else pixels.shape[2]
-        field = read_flat_field(wanted, sources[0].camera.image_size, channels)
-        return [replace(source, flat_field=field) for source in sources], []
-    shown = estimate_illumination(lambda index: sources[index].read(keep=True).pixels, len(sources))
-    if shown.field is None:
-        text = f"{len(sources)} tiles show no illumination that they have in common, and samples stay as they are"
-        return list(sources), [Message(text, severity="note", code="flat-field")]
-    dark = ", ".join(f"{value:.0f}" for value in shown.dark)
-    text = f"flat field: {shown.shading:.0%} less light where it is darkest, ± {shown.error:.1%}; dark level {dark}"
-    return [replace(source, flat_field=shown.field) for source in sources], [Message(text, severity="note")]
-
-
 def _grid(sources: Sequence[Source], options: TileOptions, read: Callable[[int], NDArray[Any]]) -> TileGrid:
     """Where the tiles should be."""
     size = sources[0].camera.image_size
     names = [source.name for source in sources]
     if options.grid is not None:
         grid = grid_from_names(names, options.grid, options.overlap, size)
-        return replace(grid, pixel_size=options.pixel_size)
+        return replace(grid, pixel_size=options.pixel_size or sources[0].metadata.pixel_size)
     if options.positions is not None:
-        grid = grid_from_table(names, options.positions, size, options.pixel_size)
+        grid = grid_from_table(names, options.positions, size, options.pixel_size or sources[0].metadata.pixel_size)
     else:
         grid = grid_from_files([source.path for source in sources], size, options.pixel_size)
     return oriented(grid, partial(evidence, read=read, search=options.search))
@@ -275,7 +249,9 @@ def _registration(sources: Sequence[Source], tiled: TileRegistration) -> Registr
         relief=ReliefTest(False, 0.0, 0.0, "Taken to be flat: tiles on a stage."),
     )
     counts = np.bincount(links.tiles[links.pair].ravel(), minlength=len(sources))
-    return Registration(tuple(sources), tuple(counts.tolist()), tuple(pairs), alignment, _messages(sources, tiled))
+    return Registration(
+        tuple(sources), tuple(counts.tolist()), tuple(pairs), alignment, _messages(sources, tiled), tiles=tiled
+    )
 
 
 def _messages(sources: Sequence[Source], tiled: TileRegistration) -> tuple[Message, ...]:

@@ -10,7 +10,7 @@ from rdstitch.compositing.panorama_canvas import seen_directions
 from rdstitch.export.trajectory_files import path_as_svg
 from rdstitch.registration import Registration
 from rdstitch.report.geometry import middle
-from rdstitch.report.svg import BLUE, GREY, RED, drawing, element, label, path, section
+from rdstitch.report.svg import BLUE, GREY, RED, Markup, drawing, element, label, path, section
 
 _WIDTH, _MARGIN = 900.0, 30.0
 _STEP = 30  # degrees between the lines of the grid
@@ -28,7 +28,7 @@ def path_over_plane(registration: Registration) -> str:
         "Trajectory",
         f"{len(path)} positions in the order of the images, {length:.2f} heights of the first one long; the green "
         "dot is the first, arrows point to the upper side of the image.",
-        path_as_svg(path),
+        Markup(path_as_svg(path)),
     )
 
 
@@ -49,7 +49,7 @@ def view_directions(registration: Registration) -> str:
             outlines.append(path(line, closed=True, stroke=BLUE, fill=BLUE, fill_opacity=0.08, stroke_opacity=0.6))
     frame = element("rect", x=_MARGIN, y=_MARGIN, width=360.0 * scale, height=180.0 * scale)
     parts.append(element("clipPath", frame, id="all-around"))
-    parts.append(element("g", "".join(outlines), clip_path="url(#all-around)"))
+    parts.append(element("g", outlines, clip_path="url(#all-around)"))
     for index in used:
         x, y = _placed(np.degrees(middle(registration, index))[None], scale)[0]
         fill = RED if index == alignment.reference else GREY
@@ -70,7 +70,7 @@ def _placed(degrees: FloatArray, scale: float) -> FloatArray:
     return placed
 
 
-def _grid(scale: float) -> list[str]:
+def _grid(scale: float) -> list[Markup]:
     """Meridians and parallels with their degrees."""
     parts = []
     for angle in range(-180, 181, _STEP):

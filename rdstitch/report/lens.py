@@ -1,7 +1,6 @@
 """The lens: what it does to a grid, its curve over the radius with the matches that support it, and each pair's λ."""
 
 import math
-from html import escape
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +33,7 @@ def grid(registration: Registration) -> str:
         "Lens",
         f"Left: {reference.name}, and straight lines of the scene as the lens bends them. Right: rows and columns of "
         "the image after undistortion; the red frame is the image before.",
-        element("div", _before(camera, of_source(reference, int(_GRID_WIDTH))) + _after(camera), class_="beside"),
+        element("div", _before(camera, of_source(reference, int(_GRID_WIDTH))), _after(camera), class_="beside"),
     )
 
 
@@ -85,7 +84,7 @@ def lens_curve(registration: Registration) -> str:
         "How many pixels farther from the distortion centre the lens measures a ray than the one-parameter lens with "
         f"λ = {alignment.distortion:.4f} (red) does, with twice the standard deviation on either side; below it, how "
         f"many matches there are at each radius. {_support(camera, places, farthest)}",
-        element("ul", "".join(element("li", escape(line)) for line in describe_lens(alignment, camera))),
+        element("ul", (element("li", line) for line in describe_lens(alignment, camera))),
         _curve(camera, radii, _counts(camera, places, farthest)),
     )
 

@@ -1,13 +1,12 @@
 """The image that came out, with the outlines of the images in it, and what local alignment moved."""
 
-from html import escape
 from pathlib import Path
 
 import numpy as np
 
 from rdstitch.local_alignment import DisplacementField
 from rdstitch.report.geometry import of_mosaic
-from rdstitch.report.svg import BLUE, GREY, YELLOW, drawing, element, label, line, path, section
+from rdstitch.report.svg import BLUE, GREY, YELLOW, drawing, element, joined, label, line, path, section
 from rdstitch.stitch_result import StitchResult
 from rdstitch.viewer import viewer_path
 
@@ -34,7 +33,7 @@ def mosaic(result: StitchResult, staged: Path | None = None) -> str:
     for text, outlines in zip(names, result.canvas.outlines, strict=True):
         places = [(outline + 0.5) * scale for outline in outlines]
         shapes = (path(place, closed=True, stroke=YELLOW, stroke_opacity=0.7, pointer_events="all") for place in places)
-        parts.append(element("g", element("title", escape(text)) + "".join(shapes)))
+        parts.append(element("g", element("title", text), shapes))
         if len(names) <= _MAX_NAMES:
             x, y = min((place.mean(axis=0) for place in places), key=lambda middle: abs(middle[0] - width * scale / 2))
             style = {"fill": "white", "stroke": "black", "stroke_width": 3.0, "paint_order": "stroke"}
@@ -89,4 +88,4 @@ def _image(field: DisplacementField, name: str, x: float, y: float, side: float,
         title = element("title", f"{np.linalg.norm(by):.2f} pixels")
         arrows.append(line(start, end, title, stroke=BLUE, stroke_width=1.5))
         arrows.append(element("circle", cx=float(start[0]), cy=float(start[1]), r=1.2, fill=BLUE))
-    return frame + "".join(arrows) + label(x, y + height * scale + 13.0, f"{name}: up to {field.largest:.1f} pixels")
+    return joined(frame, arrows, label(x, y + height * scale + 13.0, f"{name}: up to {field.largest:.1f} pixels"))

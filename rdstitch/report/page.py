@@ -1,7 +1,6 @@
 """The page: all sections in one self-contained HTML file."""
 
 from collections.abc import Sequence
-from html import escape
 from importlib.metadata import version
 from pathlib import Path
 
@@ -11,11 +10,14 @@ from rdstitch.report.camera_path import path_over_plane
 from rdstitch.report.lens import grid, lens_curve, votes
 from rdstitch.report.output import local_alignment, mosaic
 from rdstitch.report.pairs import match_graph, matched, residual_map
+from rdstitch.report.stage import stage
 from rdstitch.report.summary import notices, run, summary, timings
+from rdstitch.report.svg import Content, Markup, element, joined
 from rdstitch.stitch_result import StitchResult
 
 REPORT_SUFFIXES = (".html", ".htm")
 
+_VIEWPORT = "width=device-width, initial-scale=1"
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 960px; margin: 2em auto; padding: 0 1em; }
 h1 { font-size: 1.6em; }
@@ -80,9 +82,10 @@ def report_page(
     stitched = result if isinstance(result, StitchResult) else None
     registration = result.registration if isinstance(result, StitchResult) else result
     title = "rdstitch report" if stitched is None or stitched.output is None else stitched.output.name
-    body = [
+    body: list[Content] = [
         summary(registration, stitched),
         notices(registration),
+        stage(registration),
         "" if stitched is None else mosaic(stitched, staged),
         match_graph(registration),
         votes(registration),
@@ -95,10 +98,14 @@ def report_page(
         timings(stages),
         run(None if stitched is None else stitched.options, command),
     ]
-    return (
-        f'<!DOCTYPE html>\n<html lang="en">\n<head><meta charset="utf-8">'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><title>{escape(title)}</title>'
-        f"<style>{_STYLE}</style></head>\n<body>\n<h1>{escape(title)}</h1>\n"
-        + "\n".join(body)
-        + f"\n<footer><p>rdstitch {version('rdstitch')}</p></footer>\n</body>\n</html>\n"
+    head = Markup(f'<meta charset="utf-8"><meta name="viewport" content="{_VIEWPORT}"><style>{_STYLE}</style>')
+    footer = element("footer", element("p", f"rdstitch {version('rdstitch')}"))
+    return joined(
+        Markup("<!DOCTYPE html>\n"),
+        element(
+            "html",
+            element("head", head, element("title", title)),
+            element("body", element("h1", title), body, footer),
+            lang="en",
+        ),
     )

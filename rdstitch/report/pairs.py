@@ -1,6 +1,5 @@
 """The pairs: over the outlines of the images, the best and the worst one, and what the model leaves over."""
 
-from html import escape
 from typing import Any
 
 import numpy as np
@@ -9,7 +8,22 @@ from rdstitch.alignment.result import LinkFit
 from rdstitch.arrays import FloatArray
 from rdstitch.registration import Registration
 from rdstitch.report.geometry import footprint, middle, of_source, pairs_of, residuals
-from rdstitch.report.svg import BLUE, GREEN, GREY, RED, counted, drawing, element, fit_into, label, line, path, section
+from rdstitch.report.svg import (
+    BLUE,
+    GREEN,
+    GREY,
+    RED,
+    Markup,
+    counted,
+    drawing,
+    element,
+    fit_into,
+    joined,
+    label,
+    line,
+    path,
+    section,
+)
 
 _GRAPH_SIDE, _GRAPH_MARGIN = 900.0, 20.0
 _LINE_HEIGHT = 11.0  # height of a name
@@ -36,7 +50,7 @@ def match_graph(registration: Registration) -> str:
     for fit in sorted(links, key=lambda fit: fit.rms):
         share = float(np.nan_to_num(np.clip(fit.rms / alignment.rms - 0.75, 0.0, 1.0)))
         names = " and ".join(registration.sources[k].name for k in (fit.image1, fit.image2))
-        title = element("title", f"{escape(names)}: {fit.inliers} of {fit.count} matches, {fit.rms:.2f} pixels")
+        title = element("title", f"{names}: {fit.inliers} of {fit.count} matches, {fit.rms:.2f} pixels")
         start, end = ((centers[k] + shift) * scale for k in (fit.image1, fit.image2))
         thickness = float(np.clip(np.log10(fit.inliers + 1.0), 0.5, 4.0))
         parts.append(line(start, end, title, stroke=_mixed(share), stroke_width=thickness))
@@ -117,10 +131,10 @@ def _pair(registration: Registration, title: str, fit: LinkFit) -> str:
     names = " and ".join(source.name for source in sources)
     agree = f"{fit.inliers} of {int(inliers.sum())} inliers agree with the whole, rms {fit.rms:.2f} pixels"
     text = f"{title}: {names}; {agree}"
-    return element("h3", escape(text)) + drawing(2 * _IMAGE_WIDTH + _IMAGE_GAP, tall, parts, text)
+    return joined(element("h3", text), drawing(2 * _IMAGE_WIDTH + _IMAGE_GAP, tall, parts, text))
 
 
-def _match_lines(starts: FloatArray, stops: FloatArray, colour: str, opacity: float) -> list[str]:
+def _match_lines(starts: FloatArray, stops: FloatArray, colour: str, opacity: float) -> list[Markup]:
     """Lines between points, spread evenly over the matches where there are too many."""
     chosen = np.unique(np.linspace(0, max(len(starts) - 1, 0), min(len(starts), _MAX_LINES)).astype(int))
     ends = zip(starts[chosen], stops[chosen], strict=True)
@@ -150,8 +164,10 @@ def residual_map(registration: Registration) -> str:
     side, darkest = _MAP_WIDTH / _COLUMNS, float(rms[enough].max())
     longest = max(float(np.linalg.norm(mean[enough], axis=1).max()), 1e-9)
     parts = [
-        '<defs><marker id="residual" markerWidth="5" markerHeight="5" refX="3" refY="2.5" orient="auto">'
-        f'<path d="M0,0 L5,2.5 L0,5 z" fill="{RED}"/></marker></defs>'
+        Markup(
+            '<defs><marker id="residual" markerWidth="5" markerHeight="5" refX="3" refY="2.5" orient="auto">'
+            f'<path d="M0,0 L5,2.5 L0,5 z" fill="{RED}"/></marker></defs>'
+        )
     ]
     for index in np.flatnonzero(enough):
         y, x = divmod(int(index), _COLUMNS)

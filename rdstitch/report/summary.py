@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from datetime import datetime
-from html import escape
 from importlib.metadata import version
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 from rdstitch.options import StitchOptions
 from rdstitch.registration import Registration
 from rdstitch.report.geometry import of_source
-from rdstitch.report.svg import BLUE, drawing, element, label, section, table
+from rdstitch.report.svg import BLUE, drawing, element, joined, label, section, table
 from rdstitch.stitch_result import StitchResult
 
 _THUMBNAIL = 200  # pixels of the longer side
@@ -40,7 +39,7 @@ def summary(registration: Registration, result: StitchResult | None) -> str:
         rows.append(("focal length", f"{camera.focal:.1f}{std} pixels ({camera.focal_source})"))
     if result is not None:
         rows.append(("output", "{} x {} pixels".format(*result.canvas.size)))
-    return section("Summary", "", _verdict(registration), table((), rows))
+    return section("Summary", "", _verdict(registration), table(rows))
 
 
 def notices(registration: Registration) -> str:
@@ -64,9 +63,8 @@ def _left_out(registration: Registration) -> str:
         source = sources.get(message.images[0])
         image = None if source is None else of_source(source, _THUMBNAIL)
         drawn = "" if image is None else element("img", src=image, alt="")
-        caption = element("figcaption", escape(f"{message.images[0]}: {message.text}"))
-        shown.append(element("figure", drawn + caption))
-    return element("h3", "Left out") + element("div", "".join(shown), class_="thumbnails")
+        shown.append(element("figure", drawn, element("figcaption", f"{message.images[0]}: {message.text}")))
+    return joined(element("h3", "Left out"), element("div", shown, class_="thumbnails"))
 
 
 def _motion(model: str, reason: str) -> str:
@@ -78,7 +76,7 @@ def _verdict(registration: Registration) -> str:
     if registration.ok:
         return element("p", "The result passed its own checks.", class_="good")
     failures = "; ".join(message.clause for message in registration.failures)
-    return element("p", escape(f"Not to be relied on: {failures}"), class_="bad")
+    return element("p", f"Not to be relied on: {failures}", class_="bad")
 
 
 def _lambda(registration: Registration) -> str:
@@ -97,8 +95,8 @@ def _unread(registration: Registration) -> int:
 
 def _bullets(title: str, items: Sequence[str], none: str) -> str:
     if not items:
-        return element("p", escape(none))
-    return element("h3", escape(title)) + element("ul", "".join(element("li", escape(item)) for item in items))
+        return element("p", none)
+    return joined(element("h3", title), element("ul", (element("li", item) for item in items)))
 
 
 def run(options: StitchOptions | None, command: str) -> str:
@@ -109,7 +107,7 @@ def run(options: StitchOptions | None, command: str) -> str:
     if options is not None:
         changed = _changed(options, type(options)())
         rows.append(("options", "; ".join(changed) if changed else "all as usual"))
-    return section("Run", "", table((), rows))
+    return section("Run", "", table(rows))
 
 
 def _changed(options: Any, defaults: Any, prefix: str = "") -> list[str]:

@@ -1,6 +1,6 @@
 """Small pieces of SVG and HTML, as text."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from html import escape
 from typing import Any
 
@@ -10,20 +10,37 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 
 _VOID = ("img",)
+
+
+class Markup(str):
+    """Text that is HTML or SVG already; every other text is escaped where it becomes a part of some."""
+
+    __slots__ = ()
+
+
+Content = str | Iterable["Content"]
+
 BLUE, GREEN, RED, GREY, YELLOW = "#2463a8", "#2a9d4a", "#c8352b", "#8a8f98", "#ffd92f"
 
 
-def element(name: str, content: str = "", **attributes: Any) -> str:
+def joined(*content: Content) -> Markup:
+    """Markup and texts, or lists of them, one after the other; texts are escaped."""
+    parts = (item if isinstance(item, str) else joined(*item) for item in content)
+    return Markup("".join(part if isinstance(part, Markup) else escape(part) for part in parts))
+
+
+def element(name: str, *content: Content, **attributes: Any) -> Markup:
     """One element; ``stroke_width`` becomes ``stroke-width``, ``class_`` becomes ``class``."""
     given = "".join(f' {key.rstrip("_").replace("_", "-")}="{_text(value)}"' for key, value in attributes.items())
-    return f"<{name}{given}>" if name in _VOID else f"<{name}{given}>{content}</{name}>"
+    return Markup(f"<{name}{given}>" if name in _VOID else f"<{name}{given}>{joined(*content)}</{name}>")
 
 
-def drawing(width: float, height: float, parts: Iterable[str], title: str) -> str:
+def drawing(width: float, height: float, parts: Content, title: str) -> Markup:
     """A drawing that is as wide as there is room."""
     return element(
         "svg",
-        element("title", escape(title)) + "".join(parts),
+        element("title", title),
+        parts,
         xmlns="http://www.w3.org/2000/svg",
         viewBox=f"0 0 {width:.1f} {height:.1f}",
         role="img",
@@ -31,18 +48,18 @@ def drawing(width: float, height: float, parts: Iterable[str], title: str) -> st
     )
 
 
-def line(start: Iterable[float], end: Iterable[float], content: str = "", **attributes: Any) -> str:
+def line(start: Iterable[float], end: Iterable[float], *content: Content, **attributes: Any) -> Markup:
     """A straight line between two points."""
     (x1, y1), (x2, y2) = map(float, start), map(float, end)
-    return element("line", content, x1=x1, y1=y1, x2=x2, y2=y2, **attributes)
+    return element("line", *content, x1=x1, y1=y1, x2=x2, y2=y2, **attributes)
 
 
-def label(x: float, y: float, text: str, **attributes: Any) -> str:
+def label(x: float, y: float, text: str, **attributes: Any) -> Markup:
     """A text at a place."""
-    return element("text", escape(text), x=x, y=y, **{"font_size": 12, **attributes})
+    return element("text", text, x=x, y=y, **{"font_size": 12, **attributes})
 
 
-def path(points: FloatArray, closed: bool = False, **attributes: Any) -> str:
+def path(points: FloatArray, closed: bool = False, **attributes: Any) -> Markup:
     """A line through points (N, 2); points that are not finite interrupt it."""
     pieces, lifted = [], True
     for x, y in points:
@@ -54,11 +71,9 @@ def path(points: FloatArray, closed: bool = False, **attributes: Any) -> str:
     return element("path", d=" ".join(pieces) + ("Z" if closed else ""), **{"fill": "none", **attributes})
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table of texts, which are escaped."""
-    top = "".join(element("th", escape(text)) for text in head)
-    body = "".join(element("tr", "".join(element("td", escape(cell)) for cell in row)) for row in rows)
-    return element("table", (element("tr", top) if head else "") + body)
+def table(rows: Iterable[Iterable[str]]) -> Markup:
+    """A table of texts."""
+    return element("table", (element("tr", (element("td", cell) for cell in row)) for row in rows))
 
 
 def counted(count: int, one: str) -> str:
@@ -66,9 +81,9 @@ def counted(count: int, one: str) -> str:
     return f"{count} {one if count == 1 else one + 's'}"
 
 
-def section(title: str, explanation: str, *content: str) -> str:
+def section(title: str, explanation: str, *content: Content) -> Markup:
     """A part of the page with its heading."""
-    return element("section", element("h2", escape(title)) + element("p", escape(explanation)) + "".join(content))
+    return element("section", element("h2", title), element("p", explanation), *content)
 
 
 def fit_into(points: NDArray[np.float64], side: float, margin: float) -> tuple[FloatArray, float, tuple[float, float]]:

@@ -13,8 +13,7 @@ PAIR_WIDTH, ALIGNMENT_WIDTH = 4.0, 3.5
 """Widths of the loss in standard deviations of an error's coordinate.
 
 A pair's noise is estimated from its few matches alone, so that its loss is a little wider. It does not matter much:
-over 72 pairs the median error of λ is 0.0017 at half that width, and 0.0015 at it and at twice it
-(``python -m tests.benchmarks.constants``).
+over 72 rendered pairs the median error of λ is 0.0017 at half that width, and 0.0015 at it and at twice it.
 """
 
 

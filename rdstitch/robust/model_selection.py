@@ -14,7 +14,7 @@ from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 from rdstitch.robust.refinement import Fits, PairProblems, refine_pairs
 
-# Halved or doubled, these change the median error of λ by a sixth at most (``python -m tests.benchmarks.constants``).
+# Halved or doubled, these change the median error of λ by a sixth at most.
 _MIN_NOISE = 0.02  # pixels; below, noise-free data would reject every model over rounding
 _MAX_RESIDUAL = 3.0  # errors, in thresholds, beyond which a match is left out of the choice
 _FREE_STEPS, _STEPS = 8, 15

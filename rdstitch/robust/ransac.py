@@ -16,7 +16,7 @@ from rdstitch.robust.sampling import Sampler
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
 from rdstitch.solvers.solutions import Solutions
 
-# Halved or doubled, none of these changes what is found, only the time (``python -m tests.benchmarks.constants``).
+# Halved or doubled, none of these changes what is found, only the time.
 _FIRST_BATCH, _SECOND_BATCH = 64, 160  # samples of five points; then of each solver: three of 60 % outliers need 140
 _MAX_BATCH = 512
 _SAMPLES_AT_ONCE = 4096

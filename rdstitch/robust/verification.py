@@ -13,7 +13,7 @@ MIN_PLACES = 8
 """Cells in which the inliers must lie.
 
 With half as many, 14 % of 72 pairs come out wrong instead of 3 %, mostly clusters of wrong matches; with twice as many,
-89 % of the solvable ones are found instead of 94 % (``python -m tests.benchmarks.constants --pairs 36``). The size of
+89 % of the solvable ones are found instead of 94 %. The size of
 the cells and the limit of chance, halved or doubled, change nothing there.
 """
 

@@ -1,6 +1,6 @@
 """The sidecar's fields with their types, as they are checked when it is read, and the JSON Schema that follows.
 
-docs/sidecar.md describes them. Fields may be added; a change that would mislead a reader raises the version. What
+docs/formats.md describes them. Fields may be added; a change that would mislead a reader raises the version. What
 earlier versions did not have has a default.
 """
 

@@ -31,7 +31,7 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
     coordinates of an image to the plane, or to directions where the camera turned on the spot,
     ``output.plane_to_output`` places of the plane, or of the projection, to pixels of the output;
     ``images[].to_output`` is the product, on a plane; ``pairs[].homography`` maps coordinates of the first image
-    to those of the second. All fields are described in docs/sidecar.md.
+    to those of the second. All fields are described in docs/formats.md.
     """
     registration, alignment = result.registration, result.registration.alignment
     camera = registration.camera

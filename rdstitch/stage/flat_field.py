@@ -28,6 +28,9 @@ _SIDE = 512
 _DEGREE = 4
 """Of the polynomial that the logarithm of the illumination is."""
 
+_TRUNCATED = 0.9113
+"""Variance of a standard normal number within 2.5 of its mean."""
+
 _BINS, _LEAST_BINS, _LEAST_IN_BIN = 24, 6, 16
 """Bins of brightness, and cells of a bin, by which noise is compared with light."""
 
@@ -80,8 +83,12 @@ def _noise(tile: NDArray[Any]) -> FloatArray:
     rows, columns = (max(1, side // _CELLS) for side in second.shape[:2])
     cut = second[: rows * _CELLS, : columns * _CELLS]
     cells = cut.reshape(_CELLS, rows, _CELLS, columns, -1).transpose(0, 2, 4, 1, 3)
-    deviation = np.median(cells.reshape(_CELLS, _CELLS, tile.shape[2], -1), axis=-1) / 0.6745
-    return np.asarray(deviation**2 / 6.0)
+    cells = cells.reshape(_CELLS, _CELLS, tile.shape[2], -1)
+    # Squares of what is within 2.5 standard deviations, which whole numbers do not make coarse as their median is.
+    limit = np.maximum(np.median(cells, axis=-1, keepdims=True), 1.0) * (2.5 / 0.6745)
+    inside = cells <= limit
+    variance = np.where(inside, cells**2, 0.0).sum(axis=-1) / np.maximum(inside.sum(axis=-1), 1) / _TRUNCATED
+    return np.asarray(variance / 6.0)
 
 
 def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Illumination:
@@ -170,8 +177,9 @@ def _dark_level(ground: FloatArray, variance: FloatArray) -> float:
     bins = [part for part in np.array_split(order, min(_BINS, len(order) // _LEAST_IN_BIN)) if len(part)]
     if len(bins) < _LEAST_BINS:
         return 0.0
-    x, y = (np.array([np.median(values[part]) for part in bins]) for values in (mean, noise))
-    # Median of the slopes between all bins: texture, which is taken for noise, makes some of them too steep.
+    x = np.array([np.median(mean[part]) for part in bins])
+    # Of each bin the lower part: texture, too, is taken for noise.
+    y = np.array([np.quantile(noise[part], 0.25) for part in bins])
     first, second = np.triu_indices(len(x), 1)
     apart = x[second] - x[first] > 0.0
     slopes = (y[second] - y[first])[apart] / (x[second] - x[first])[apart]

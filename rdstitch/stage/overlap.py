@@ -68,10 +68,11 @@ class Overlap:
         return np.asarray((self.blocks[:, :2] + self.blocks[:, 2:] - 1) / 2.0)
 
     def cells(self, size: tuple[int, int]) -> IntArray:
-        """The blocks cut across too where the overlap is wide, (L, 4): a lens bends none of these to speak of."""
+        """The blocks cut across too where the overlap is wide, (L, 4), and every other one then, as on a chessboard."""
         parts = []
-        for x0, y0, x1, y1 in self.blocks.tolist():
+        for row, (x0, y0, x1, y1) in enumerate(self.blocks.tolist()):
             across, down = (_count(b - a, n) for a, b, n in ((x0, x1, size[0]), (y0, y1, size[1])))
             x, y = np.rint(np.linspace(x0, x1, across + 1)), np.rint(np.linspace(y0, y1, down + 1))
-            parts += [(x[i], y[k], x[i + 1], y[k + 1]) for k in range(down) for i in range(across)]
+            cut = [(i, k) for k in range(down) for i in range(across) if across * down == 1 or (i + k + row) % 2]
+            parts += [(x[i], y[k], x[i + 1], y[k + 1]) for i, k in cut]
         return np.array(parts, dtype=np.intp)

@@ -8,18 +8,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import tifffile
 
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.file_access import canonical_name, canonical_text, open_regular, read_text
+from rdstitch.io.ome_xml import read_ome
 from rdstitch.io.opening import TIFF_MAGIC, decoding
 from rdstitch.stage.grid import TileGrid
 
 _NAMES = ("name", "file", "filename", "image")
-_MICROMETRES = {"nm": 1e-3, "µm": 1.0, "um": 1.0, "μm": 1.0, "micron": 1.0, "mm": 1e3, "cm": 1e4, "m": 1e6}
 _METADATA_FILE = "metadata.txt"
 _HOW = (
     "say where they are: --grid 'r{row}c{col}' --overlap PERCENT for names, or --positions FILE with name,x,y; "
@@ -146,37 +145,10 @@ def position_of(file: Path) -> StagePosition | None:
             stream.seek(0)
             with tifffile.TiffFile(stream, name=str(file)) as tiff:
                 ome, tag = tiff.ome_metadata, tiff.pages.first.tags.get("MicroManagerMetadata")
-        if ome:
-            found = ome_position(ome)
-            if found is not None:
-                return found
+        told = read_ome(ome)
+        if told is not None and told.position is not None:
+            return StagePosition(*told.position, told.unit, told.pixel_size)
         return None if tag is None else _micro_manager_position(tag.value)
-
-
-def ome_position(text: str) -> StagePosition | None:
-    """The place of the first image in OME-XML; None where it has none."""
-    try:
-        elements = list(ElementTree.fromstring(text).iter())
-    except ElementTree.ParseError:
-        return None
-    pixels = next((e for e in elements if _tag(e) == "Pixels"), None)
-    plane = next((e for e in elements if _tag(e) == "Plane" and {"PositionX", "PositionY"} <= e.attrib.keys()), None)
-    if pixels is None or plane is None:
-        return None
-    unit = plane.get("PositionXUnit", "µm")
-    size = pixels.get("PhysicalSizeX")
-    scale = _MICROMETRES.get(pixels.get("PhysicalSizeXUnit", "µm"))
-    return StagePosition(
-        float(plane.attrib["PositionX"]),
-        float(plane.attrib["PositionY"]),
-        # "reference frame" is what programs write that do not know the unit: pixels.
-        _MICROMETRES.get(unit),
-        float(size) * scale if size and scale else None,
-    )
-
-
-def _tag(element: ElementTree.Element) -> str:
-    return element.tag.rpartition("}")[2]
 
 
 def _micro_manager_file(file: Path) -> dict[str, StagePosition]:

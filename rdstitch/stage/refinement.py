@@ -1,6 +1,8 @@
 """Displacements of blocks to a fraction of a pixel, by Newton's method on their correlation, with their covariance."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -13,6 +15,9 @@ _SMOOTHING = 1.2
 """Standard deviation of the filter before derivatives are taken, pixels."""
 
 _MARGIN = 5
+_STEP = 8
+"""Pixels between which the lens is straight."""
+
 _ITERATIONS = 5
 _MIN_SIDE = 12
 _SIGNIFICANT = 5.0
@@ -20,6 +25,9 @@ _SIGNIFICANT = 5.0
 
 _CORRELATED = 4.0 * np.pi * _SMOOTHING**2
 """Pixels that share their noise after the filter."""
+
+
+Transfer = Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -44,25 +52,21 @@ class BlockMatches:
 
 
 def refine(
-    first: NDArray[Any], second: NDArray[Any], blocks: IntArray, displacements: FloatArray, tolerance: float
+    first: NDArray[Any], second: NDArray[Any], blocks: IntArray, transfer: Transfer, tolerance: float
 ) -> BlockMatches:
-    """Refine the displacements of blocks of the first tile in the second.
+    """Refine where blocks of the first tile are in the second.
 
     Parameters
     ----------
     first, second : ndarray of shape (h, w)
     blocks : ndarray of shape (K, 4)
         Boxes in the first tile.
-    displacements : ndarray of shape (K, 2)
-        What is at p in the first is at ``p - displacement`` in the second, about.
+    transfer : callable
+        Gives the places in the second tile, about, of points (N, 2) of the first; its lens is in it.
     tolerance : float
         By how much that may be wrong, pixels.
     """
-    found = []
-    for block, displacement in zip(blocks, displacements, strict=True):
-        match = _refined(first, second, block, displacement, tolerance)
-        if match is not None:
-            found.append(match)
+    found = [match for block in blocks if (match := _refined(first, second, block, transfer, tolerance)) is not None]
     if not found:
         return BlockMatches(np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2, 2)))
     points1, points2, information = (np.array(values) for values in zip(*found, strict=True))
@@ -70,18 +74,27 @@ def refine(
 
 
 def _refined(
-    first: NDArray[Any], second: NDArray[Any], block: IntArray, displacement: FloatArray, tolerance: float
+    first: NDArray[Any], second: NDArray[Any], block: IntArray, transfer: Transfer, tolerance: float
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Places of a block's content in both tiles and their information; None where it shows nothing."""
-    whole = np.rint(displacement).astype(np.intp)
     sides = np.array([first.shape[::-1], second.shape[::-1]])
-    low = np.maximum(np.maximum(block[:2], _MARGIN), whole + _MARGIN)
-    high = np.minimum(np.minimum(block[2:], sides[0] - _MARGIN), sides[1] + whole - _MARGIN)
+    corners = np.array([block[[0, 1]], block[[2, 1]], block[[0, 3]], block[[2, 3]]], dtype=np.float64)
+    off = corners - transfer(corners)
+    # What the search may need beside them is there of both.
+    low = np.maximum(block[:2], np.maximum(0, np.ceil(off.max(axis=0)).astype(np.intp)) + _MARGIN)
+    high = np.minimum(block[2:], np.minimum(sides[0], sides[1] + np.floor(off.min(axis=0)).astype(np.intp)) - _MARGIN)
     if (high - low < _MIN_SIDE).any():
         return None
-    one = _smooth(first, low, high)
-    wide = _smooth(second, low - whole - _MARGIN + 1, high - whole + _MARGIN - 1)
-    inner = slice(_MARGIN - 1, 1 - _MARGIN)
+    across, down = (_interpolation(side) for side in (high - low).tolist())
+    nodes = np.stack(
+        np.meshgrid(*(a + _STEP * np.arange(m.shape[1]) for a, m in zip(low, (across, down), strict=True))), axis=-1
+    )
+    lattice = transfer(nodes.reshape(-1, 2).astype(np.float64)).reshape(nodes.shape)
+    moved = np.stack([down @ lattice[..., k] @ across.T for k in (0, 1)], axis=-1)
+    corner = np.maximum(np.floor(moved.min(axis=(0, 1))).astype(np.intp) - _MARGIN, 0)
+    stop = np.minimum(np.ceil(moved.max(axis=(0, 1))).astype(np.intp) + _MARGIN + 1, sides[1])
+    maps = (moved - corner).astype(np.float32)
+    one, wide = _smooth(first, low, high), _smooth(second, corner, stop)
     weight = _window(*one.shape)
     total = float(weight.sum())
     one -= float((weight * one).sum()) / total
@@ -89,9 +102,9 @@ def _refined(
     gradient1 = _gradient(one)
     shift = np.zeros(2)
     for _ in range(_ITERATIONS):
-        matrix = np.array([[1.0, 0.0, shift[0]], [0.0, 1.0, shift[1]]])
-        moved = cv2.warpAffine(wide, matrix, wide.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-        two = moved[inner, inner]
+        x, y = (maps[..., k] - np.float32(shift[k]) for k in (0, 1))
+        # Smoothed, so that linear interpolation will do; OpenCV's cubic kernel moves content by up to 0.05 pixels.
+        two = cv2.remap(wide, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         two = two - float((weight * two).sum()) / total
         spread = np.sqrt(float((weight * two * two).sum()) / total)
         if not min(spread, deviation) > 0.0:
@@ -117,10 +130,19 @@ def _refined(
         return None
     noise = float((weight * difference**2).sum()) / total * _CORRELATED
     energy = np.array([[float((a * b / np.maximum(weight, 1e-6)).sum()) for b in mean] for a in mean])
-    covariance = noise * energy
-    information = hessian @ np.linalg.pinv(covariance) @ hessian
+    information = hessian @ np.linalg.pinv(noise * energy) @ hessian
     point = low + _centroid(mean)
-    return point, point - whole - shift, information
+    return point, transfer(point[None])[0] - shift, information
+
+
+@lru_cache(maxsize=256)
+def _interpolation(length: int) -> FloatArray:
+    """Weights by which values at every eighth pixel give those at all of a length, linearly."""
+    place, node = np.divmod(np.arange(length), _STEP)[::-1]
+    weights = np.zeros((length, -(-length // _STEP) + 1))
+    weights[np.arange(length), node] = 1.0 - place / _STEP
+    weights[np.arange(length), node + 1] = place / _STEP
+    return weights
 
 
 def _smooth(tile: NDArray[Any], low: IntArray, high: IntArray) -> NDArray[np.float32]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.camera import Camera
 from rdstitch.io.reduction import block_mean
 from rdstitch.progress import Progress, silent
 from rdstitch.scipy_parts import csgraph, sparse
@@ -16,7 +17,7 @@ from rdstitch.stage.adjustment import Adjustment, LinkedPoints, adjust
 from rdstitch.stage.correlation import Surfaces, correlate
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.overlap import Overlap
-from rdstitch.stage.refinement import BlockMatches, refine
+from rdstitch.stage.refinement import BlockMatches, Transfer, refine
 
 Reader = Callable[[int], NDArray[Any]]
 """Gives a tile as it is registered, (h, w)."""
@@ -136,8 +137,7 @@ def register_tiles(
         overlap = expected(pair, _moved(grid.places, pair, peak.offset * factor), 1)
         for cells in (overlap.cells(grid.size), overlap.whole):
             cut = replace(overlap, blocks=cells)
-            displacements = peak.offset * factor + exact.shifts(cut, known)
-            found = refine(one, two, cells, displacements, factor + 1.5)
+            found = refine(one, two, cells, exact.transfer(cut, peak.offset * factor, known), factor + 1.5)
             if len(found):
                 matches[shown[number]] = found
                 break
@@ -198,6 +198,7 @@ class _Lens:
     """What a lens displaces blocks by."""
 
     def __init__(self, grid: TileGrid, factor: int) -> None:
+        self.size = grid.size
         size = np.array(grid.size) / factor
         self.center, self.scale = (size - 1.0) / 2.0, math.hypot(*size) / 2.0
 
@@ -209,6 +210,15 @@ class _Lens:
         bent = [self._bend(points, distortion) for points in (first, first - overlap.offset)]
         shifts = bent[1] - bent[0]
         return np.asarray(shifts - shifts.mean(axis=0))
+
+    def transfer(self, overlap: Overlap, offset: FloatArray, distortion: float) -> Transfer:
+        """Where points of the first tile are in the second, whose blocks are off by an offset in the mean."""
+        if distortion == 0.0:
+            return lambda points: points - offset
+        camera = Camera(self.size, distortion)
+        middle = overlap.centers
+        between = (camera.undistort(middle) - camera.undistort(middle - offset)).mean(axis=0)
+        return lambda points: camera.distort(camera.undistort(points) - between)
 
     def _bend(self, points: FloatArray, distortion: float) -> FloatArray:
         away = (points - self.center) / self.scale

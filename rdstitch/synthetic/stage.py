@@ -138,7 +138,7 @@ class StageGrid:
         """One tile as the camera gives it, (tile, tile) or (tile, tile, 3), counts of 12 bits."""
         rng = np.random.default_rng([self.seed, 2, index])
         maps = (self._coordinates(index) - self._origin).astype(np.float32)
-        light = cv2.remap(self._ground["light"], maps[..., 0], maps[..., 1], cv2.INTER_CUBIC)
+        light = cv2.remap(self._ground["light"], maps[..., 0], maps[..., 1], cv2.INTER_LANCZOS4)
         light = np.maximum(light.reshape(self.tile, self.tile, self.channels), 0.0) * self.flat_field
         # Shot noise of the electrons, and 1.5 counts of the amplifier.
         counts = light + rng.normal(size=light.shape) * np.sqrt(light / self.electrons + 1.5**2) + self.offset

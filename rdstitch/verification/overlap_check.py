@@ -126,12 +126,8 @@ def check_overlaps(registration: Registration, executor: Executor, cache: Cache 
             checked += found
         return checked
 
-    def valid(checked: list[CheckedLink]) -> bool:
-        return [link.pair for link in checked] == [(fit.image1, fit.image2) for fit in chosen]
-
-    kinds = (CheckedLink, LinkFit, Agreement, Ambiguity)
     inputs = (placed, chosen, registration.stretch, list(parallax.values()))
-    return cache.recall("overlaps", kinds, inputs, compute, valid, hint=list[CheckedLink])
+    return cache.recall("overlaps", inputs, compute)
 
 
 def share_alike(checked: Sequence[CheckedLink]) -> float:

@@ -36,9 +36,9 @@ LIMITS = {
     "few matches": Limit(40, "matches", "pairs that share nothing have been seen to have up to 33 of one motion"),
     "error": Limit(1.0, "thresholds, rms of the whole", "the definition of an inlier"),
     "error of rough ground": Limit(3.0, "thresholds, where images look alike", "small_failures, classical"),
-    "error that relief explains": Limit(0.02, "of an image's diagonal", "python -m tests.benchmarks.relief"),
+    "error that relief explains": Limit(0.02, "of an image's diagonal", "python -m examples.benchmarks.relief"),
     "alike": Limit(0.25, "share of the overlaps", "0.26 to 1 in 22 sets that a person would keep: benchmarks.world"),
-    "clearly alike": Limit(0.5, "share of the overlaps", "python -m tests.benchmarks.relief"),
+    "clearly alike": Limit(0.5, "share of the overlaps", "python -m examples.benchmarks.relief"),
     "unlike": Limit(0.10, "share of the cells of an overlap", "chance reaches 0.07; low sun, parallax, blur 0.20"),
     "little alike": Limit(0.15, "share of the cells of an overlap", "between the two"),
     "unlike, undecided": Limit(
@@ -211,6 +211,7 @@ def _second_motion(found: Evidence) -> Iterator[Finding]:
         return
     alike = share_alike(found.checked)
     clear = alike >= FILLED_BY_A_PLANE or (share < FILLED_BY_A_PLANE and not alike < _limit("unlike, undecided"))
+    clear |= found.depth and alike >= _limit("alike")  # nearer and farther things move differently
     if compared is not None:
         clear = compared.won or (clear and not compared.lost)
     worst = max(motions, key=lambda own: own.area)

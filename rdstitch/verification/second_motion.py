@@ -44,7 +44,7 @@ less than the second; vehicles move by 0.25 to 0.5."""
 
 _MIN_SHARE = 0.1
 """Of the area that has either motion. Flights over trees and houses reach 0.08, vehicles over a tenth 0.09 to 0.5
-(``python -m tests.benchmarks.trust --kind vehicle``)."""
+(``python -m examples.benchmarks.trust --kind vehicle``)."""
 
 _MIN_HELD, _MIN_HELD_BY_PAIR = 0.3, 0.15
 """Share that looks alike of what the other motion does not explain, in all pairs together and in one. Planes reach 0.37

@@ -9,7 +9,7 @@ import pytest
 
 import rdstitch
 from rdstitch.errors import RdstitchError
-from tests.benchmarks.real_lenses import BOARDS, corners_of, files_of, off_lines, rational_undistort
+from tests.chessboards import BOARDS, corners_of, files_of, off_lines, rational_undistort
 
 Locate = Callable[[str], Path]
 

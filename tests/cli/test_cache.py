@@ -16,8 +16,8 @@ from rdstitch_cli.main import run
 from rdstitch.matching import two_view
 from rdstitch.pipeline import aligner
 from rdstitch.verification import overlap_check
-from tests.benchmarks.interruptions import repeated
 from tests.cli.running import FAST, Run, finished, start
+from tests.interrupted_runs import repeated
 from tests.sampled import sampled
 
 

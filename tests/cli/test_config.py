@@ -18,7 +18,7 @@ from rdstitch.errors import InputError
 from tests.cli.running import CACHED, Run
 from tests.damaged_texts import damaged_text
 
-_DOCUMENT = Path(__file__).parents[2] / "docs" / "configuration.md"
+_DOCUMENT = Path(__file__).parents[2] / "docs" / "guide.md"
 
 
 def _example() -> str:

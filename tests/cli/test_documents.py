@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from rdstitch_cli.main import cli
 
-from tests.documented_figures import FEATURES, README, ROOT, feature_row, readme, without_seconds
+from tests.documented_figures import MEASUREMENTS, README, ROOT, feature_row, readme, without_seconds
 
 _PAGES = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
 
@@ -22,7 +22,7 @@ def test_readme_shows_what_its_commands_print() -> None:
 
 @pytest.mark.parametrize("kind", ["rootsift", "orb"])
 def test_features_are_as_their_table_says(kind: str) -> None:
-    assert feature_row(kind) in FEATURES.read_text(encoding="utf-8")
+    assert feature_row(kind) in MEASUREMENTS.read_text(encoding="utf-8")
 
 
 def test_the_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions
 from rdstitch.pipeline import StitchOptions, pano
 from rdstitch.pipeline.compose import viewed_images
+from rdstitch.report.camera_path import view_directions
 from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, panorama_rotations, turning_sequence
 from rdstitch.synthetic.rendering import Photometry
 from rdstitch.viewer import viewer_page
@@ -67,6 +69,8 @@ def test_outlines_are_where_the_images_are_at_both_ends_of_a_full_turn(around: l
     result = pano(around, tmp_path / "x.png", StitchOptions(features=FeatureOptions(max_features=600)))
     canvas, alignment = result.canvas, result.registration.alignment
     assert canvas.period is not None
+    odd = tuple(replace(source, path=Path(f"<b>{source.path.name}")) for source in result.registration.sources)
+    assert "<title>&lt;b&gt;" in view_directions(replace(result.registration, sources=odd))
     page = viewer_page("x.dzi", canvas.size, viewed_images(result))
     data = re.search(r'<script type="application/json" id="data">(.*?)</script>', page)
     assert data is not None

@@ -25,6 +25,7 @@ from rdstitch.report import report_page, write_report
 from rdstitch.report.pairs import matched
 from rdstitch.report.summary import _motion
 from rdstitch.report.svg import counted
+from rdstitch.verification.findings import Finding
 from tests.cli.running import CACHED, Run
 
 _VOID = {"meta", "img"}
@@ -152,8 +153,9 @@ def test_calibrate_has_no_mosaic(rdstitch: Run, frames: list[Path], tmp_path: Pa
 def test_what_is_refused_is_shown(
     rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, output: str
 ) -> None:
-    found = (Message("the images <disagree>", severity="failure"), Message("look at that seam"))
-    monkeypatch.setattr(accept, "judge", lambda *arguments, **options: found)
+    said = [Message("the images <disagree>", severity="failure"), Message("look at that seam")]
+    monkeypatch.setattr(accept, "judge", lambda *arguments, **options: (Finding("errors"),))
+    monkeypatch.setattr(accept, "messages_of", lambda *arguments: said)
     report = tmp_path / "report.html"
     arguments = (command, *frames[:2], "-o", tmp_path / output, "--report", report, *CACHED)
     assert rdstitch(*arguments).status == 4

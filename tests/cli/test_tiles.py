@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from rdstitch.io.flat_field import FlatField
 from rdstitch.synthetic.stage import StageGrid
 from tests.cli.running import Run
 
@@ -42,6 +43,9 @@ def test_samples_of_the_mosaic_are_those_of_the_tiles(rdstitch: Run, slide: Path
         for dx in (-1, 0, 1)
     ]
     assert any(np.array_equal(part, middle) for part in near)
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "backlash of rows" in page
+    assert "9 of 9" in page
     assert json.loads(output.with_name("slide.tif.json").read_text(encoding="utf-8"))["model"] == "rigid"
 
 
@@ -65,3 +69,33 @@ def test_wrong_places_are_refused_in_one_line(rdstitch: Run, slide: Path, tmp_pa
     assert not output.exists()
     assert rdstitch("tiles", slide, "-o", output).status == 3
     assert rdstitch("tiles", slide, *NAMED).status == 2
+
+
+def test_ome_tiff_in_and_out(rdstitch: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "ome"
+    folder.mkdir()
+    for index, (x, y) in enumerate(STAGE.nominal.tolist()):
+        tile = STAGE.render(index)
+        metadata = {
+            "axes": "CYX",
+            "PhysicalSizeX": 0.5,
+            "PhysicalSizeXUnit": "µm",
+            "Plane": {"PositionX": [0.5 * x] * 2, "PositionY": [0.5 * y] * 2},
+        }
+        tifffile.imwrite(folder / f"{index}.ome.tif", np.stack([tile, tile // 2]), ome=True, metadata=metadata)
+    output = tmp_path / "slide.ome.tif"
+    done = rdstitch("tiles", folder, "--channel", "0", "--flat-field", "off", "-o", output, "-j", "1")
+    assert done.status == 0
+    with tifffile.TiffFile(output) as tiff:
+        series = tiff.series[0]
+        assert (series.axes, series.shape[0], len(series.levels)) == ("CYX", 2, 3)
+        assert 'PhysicalSizeX="0.5"' in (tiff.ome_metadata or "")
+        first, second = series.asarray()
+        assert np.array_equal(second, first // 2)
+        assert first.shape[0] > 600
+    flat = tmp_path / "flat.tif"
+    FlatField(np.full((256, 256, 1), 1.0, np.float32), np.zeros((1, 1, 1), np.float32)).write(flat)
+    same = ("--flat-field", flat, "--match", "name")
+    again = tmp_path / "again.ome.tif"
+    assert rdstitch("apply", f"{output}.json", "--images", folder, "-o", again, *same, "-j", "1").status == 0
+    assert again.read_bytes() == output.read_bytes()

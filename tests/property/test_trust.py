@@ -1,4 +1,4 @@
-"""No run says that all is well when it is not; ``python -m tests.benchmarks.trust`` asks 300 sets, this a few."""
+"""No run says that all is well when it is not; ``python -m examples.benchmarks.trust`` asks 300 sets, this a few."""
 
 from pathlib import Path
 

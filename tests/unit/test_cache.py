@@ -6,19 +6,13 @@ import sys
 import tempfile
 import tracemalloc
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from rdstitch import cache
 from rdstitch.cache import Cache
-from rdstitch.features import FeatureOptions
-from rdstitch.io.packing import pack
-from rdstitch.pipeline import StitchOptions, mosaic
-from tests.cli.running import flight
 
 
 @pytest.fixture(autouse=True)
@@ -41,7 +35,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def _recall(folder: Path, value: int) -> int:
     cache.software.cache_clear()
-    return Cache(folder).recall("stage", (), ("input",), lambda: value)
+    return Cache(folder).recall("stage", ("input",), lambda: value)
 
 
 def test_a_change_of_the_sources_makes_entries_void(tmp_path: Path, package: Path) -> None:
@@ -79,7 +73,7 @@ def test_of_several_results_only_those_that_are_missing_are_computed(tmp_path: P
             asked.append(places)
             return [names[place].upper() for place in places]
 
-        return cache.recall_many("stage", (), [(name,) for name in names], compute)
+        return cache.recall_many("stage", [(name,) for name in names], compute)
 
     assert recalled(Cache(tmp_path), "ac") == ["A", "C"]
     assert recalled(Cache(tmp_path), "abcd") == ["A", "B", "C", "D"]
@@ -98,39 +92,6 @@ def test_entries_can_be_read_by_whoever_may_read_the_folder(tmp_path: Path, fold
     assert {path.stat().st_mode & 0o7777 for path in file.parents[:2]} == {folder}
 
 
-def test_entries_that_are_no_result_are_computed_again(tmp_path: Path) -> None:
-    def recall(value: list[int]) -> list[int]:
-        return Cache(tmp_path / "cache").recall("stage", (), ("x",), lambda: value, valid=lambda kept: kept[0] > 0)
-
-    assert recall([]) == []
-    assert recall([-1]) == [-1]
-    assert recall([3]) == [3]
-    assert recall([4]) == [3]
-
-
-def test_an_entry_of_another_type_is_computed_again(tmp_path: Path) -> None:
-    def recall(value: Any, hint: Any) -> Any:
-        return Cache(tmp_path / "cache").recall("stage", (), ("x",), lambda: value, lambda kept: kept[0] > 0, hint=hint)
-
-    assert recall(["text"], list[int]) == ["text"]
-    assert recall([2], list[int]) == [2]
-    assert recall((5,), tuple[int]) == (5,)
-    assert recall([6], tuple[int]) == (5,)
-
-
-@pytest.mark.parametrize("error", [TypeError, AttributeError])
-def test_a_programming_error_in_the_validation_is_raised(tmp_path: Path, error: type[Exception]) -> None:
-    """It would make every run compute everything anew."""
-
-    def wrong(kept: int) -> bool:
-        raise error
-
-    recall = partial(Cache(tmp_path / "cache").recall, "stage", (), ("x",), lambda: 1)
-    assert recall() == 1
-    with pytest.raises(error):
-        recall(wrong)
-
-
 def test_an_entry_that_is_a_pipe_is_computed_again(tmp_path: Path, package: Path) -> None:
     assert _recall(tmp_path / "cache", 1) == 1
     (file,) = (path for path in (tmp_path / "cache").rglob("*") if path.is_file())
@@ -139,35 +100,17 @@ def test_an_entry_that_is_a_pipe_is_computed_again(tmp_path: Path, package: Path
     assert _recall(tmp_path / "cache", 2) == 2
 
 
-def test_an_emptied_check_is_made_again(tmp_path: Path) -> None:
-    """A list of no overlaps, well packed under the name of the right one, must not switch the check off."""
-    frames = flight(3, 2).write(tmp_path)
-    options = StitchOptions(cache=tmp_path / "cache", workers=1, features=FeatureOptions(max_features=600))
-    first = mosaic(frames, options=options)
-    broken: dict[str, Any] = {"overlaps": [], "pairs": "text", "alignment": None, "features": 3, "matches": ()}
-    for stage, value in broken.items():
-        entries = [path for path in (tmp_path / "cache" / stage).rglob("*") if path.is_file()]
-        assert entries
-        for path in entries:
-            path.write_bytes(pack((path.parent.name + path.name, value)))
-    again = mosaic(frames, options=options)
-    np.testing.assert_array_equal(again.image, first.image)
-    assert again.distortion == first.distortion
-    for path in (tmp_path / "cache" / "overlaps").rglob("*"):
-        assert path.is_dir() or path.stat().st_size > 300
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="nothing proves a process dead there")
 def test_abandoned_unfinished_files_are_removed(tmp_path: Path) -> None:
     cache = Cache(tmp_path)
-    cache.recall("stage", (), (1,), lambda: 1)
+    cache.recall("stage", (1,), lambda: 1)
     (entry,) = (file for file in tmp_path.rglob("*") if file.is_file())
     abandoned, fresh = (entry.with_name(f".{name}.part") for name in ("abandoned", "fresh"))
     for file in (abandoned, fresh):
         file.write_bytes(b"half")
     os.utime(abandoned, (0, 0))
     entry.unlink()
-    cache.recall("stage", (), (1,), lambda: 1)
+    cache.recall("stage", (1,), lambda: 1)
     assert (entry.exists(), abandoned.exists(), fresh.exists()) == (True, False, True)
 
 

@@ -21,14 +21,14 @@ def _nothing_recent(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _kept(folder: Path, name: str, value: float) -> Stored[tuple[float]]:
-    return Cache(folder).stored("stage", (), (name,), lambda: (value,))
+    return Cache(folder).stored("stage", (name,), lambda: (value,))
 
 
 def test_what_was_kept_is_read_again(tmp_path: Path) -> None:
     assert _kept(tmp_path, "a", 1.0).load() == (1.0,)
     # An entry is not computed twice.
     assert _kept(tmp_path, "a", 2.0).load() == (1.0,)
-    assert Cache().stored("stage", (), ("a",), lambda: (3.0,)).load() == (3.0,)
+    assert Cache().stored("stage", ("a",), lambda: (3.0,)).load() == (3.0,)
 
 
 @pytest.mark.parametrize("damage", ["removed", "cut", "replaced"])
@@ -46,7 +46,7 @@ def test_an_entry_that_is_gone_is_named(tmp_path: Path, damage: str) -> None:
 
 
 def test_what_was_used_recently_stays_in_memory_within_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    entries = [Cache(tmp_path).stored("stage", (), (k,), lambda k=k: np.full(1000, k)) for k in range(4)]  # type: ignore[misc]
+    entries = [Cache(tmp_path).stored("stage", (k,), lambda k=k: np.full(1000, k)) for k in range(4)]  # type: ignore[misc]
     monkeypatch.setattr(stored, "_recent", stored._RecentlyUsed(20_000))
     loaded = [entry.load() for entry in entries[:2]]
     assert all(entry.load() is value for entry, value in zip(entries[:2], loaded, strict=True))
@@ -59,7 +59,7 @@ def test_what_was_used_recently_stays_in_memory_within_limits(tmp_path: Path, mo
 
 def test_a_folder_of_a_run_lives_as_long_as_what_lies_in_it() -> None:
     cache = Cache.for_this_run()
-    found = cache.stored("stage", (), ("a",), lambda: 5)
+    found = cache.stored("stage", ("a",), lambda: 5)
     folder = cache.folder
     assert folder is not None
     del cache
@@ -86,6 +86,6 @@ def test_without_a_place_for_temporary_files_everything_stays_in_memory(monkeypa
         raise FileNotFoundError("No usable temporary directory found")
 
     monkeypatch.setattr("tempfile.gettempdir", nowhere)
-    found = Cache.for_this_run().stored("stage", (), ("a",), lambda: 5)
+    found = Cache.for_this_run().stored("stage", ("a",), lambda: 5)
     assert found.file is None
     assert found.load() == 5

@@ -43,6 +43,7 @@ Examples:
     help="How images find their places: by name (the suffix may differ), by order, or by order if no name fits.",
 )
 @options.mask
+@options.flat_field("off")
 @options.compositing
 @options.workers
 @options.strict
@@ -56,6 +57,7 @@ def apply(
     topic: str | None,
     match: Literal["auto", "name", "order"],
     mask: Path | None,
+    flat_field: str | Path,
     workers: int,
     strict: bool,
     dry_run: bool,
@@ -83,6 +85,7 @@ def apply(
         replace(read_sidecar(sidecar).composite, **given),
         match=match,
         mask=mask,
+        flat_field=flat_field,
         every=every,
         topic=topic,
         workers=workers,

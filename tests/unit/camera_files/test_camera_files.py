@@ -500,6 +500,16 @@ def test_pixels_that_are_no_squares_are_named_as_the_cause(tmp_path: Path) -> No
     assert usual.cause == ""
 
 
+def test_yaml_may_be_written_in_any_style(tmp_path: Path) -> None:
+    usual = load_camera(_opencv_file(tmp_path / "c.yml", (900.0, 900.0), [-0.2, 0.05, 0.0, 0.0, 0.0], (1280, 960)))
+    rows = "\n".join(f"    - {value}" for value in ("9e2", "0", "641.", "0", "9e+02", "478.", "0", "0", "1"))
+    (tmp_path / "block.yaml").write_text(
+        f"image_width: 1280  # pixels\nimage_height: 960\ncamera_matrix:\n    rows: 3\n    cols: 3\n    data:\n{rows}\n"
+        "distortion_coefficients: {rows: 1, cols: 5, data: [-2e-1, 5.0e-02, 0, 0, 0]}\n"
+    )
+    assert load_camera(tmp_path / "block.yaml") == usual
+
+
 def test_a_file_without_a_size_takes_that_of_the_images(tmp_path: Path) -> None:
     file = _opencv_file(tmp_path / "c.yml", (900.0, 900.0), [-0.2, 0.05, 0.0, 0.0, 0.0], None)
     with pytest.raises(InputError, match="image_width"):

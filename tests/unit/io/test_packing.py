@@ -1,8 +1,6 @@
 """Values as bytes and back."""
 
-import hashlib
-import struct
-from dataclasses import dataclass
+import os
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from rdstitch.cache import Cache
 from rdstitch.camera import Camera
-from rdstitch.errors import ArgumentError, InputError, RdstitchError
-from rdstitch.io import packing
+from rdstitch.errors import ArgumentError, InputError
 from rdstitch.io.packing import digest, pack, unpack
+from rdstitch.options import StitchOptions
 
 _ARRAYS = hnp.arrays(
     st.sampled_from([np.dtype(kind) for kind in ("f8", "f4", "u1", "u2", "i8", "bool")]),
@@ -54,20 +53,26 @@ def test_a_value_comes_back_in_every_bit(value: Any) -> None:
     assert digest(unpack(pack(value))) == digest(value)
 
 
-def test_dataclasses_come_back_where_they_are_expected() -> None:
+def test_dataclasses_come_back() -> None:
     value = (Camera((400, 300), -0.2, focal=350.0), Path("a/b"), np.arange(6.0).reshape(2, 3).T)
-    camera, path, turned = unpack(pack(value), [Camera])
+    camera, path, turned = unpack(pack(value))
     assert (camera, path) == value[:2]
     # The order in memory decides on the last bits of sums.
     assert turned.flags.f_contiguous
-    with pytest.raises(InputError):
-        unpack(pack(value))
+    assert turned.flags.writeable
 
 
-def test_what_cannot_be_packed_is_refused() -> None:
+def test_what_has_no_digest_is_refused() -> None:
     for value in (object(), {1: 2}, np.array(["text"]), {3}, b"bytes"):
         with pytest.raises(ArgumentError):
-            pack(value)
+            digest(value)
+
+
+def test_values_of_other_types_or_limits_have_other_digests() -> None:
+    values: list[Any] = [0, 0.0, False, "", "0", [], (), {}, ["a", "b"], ["ab"], [["a"], "b"], ["a", ["b"]], None]
+    values += [np.zeros(2), np.zeros((2, 1)), np.zeros(2, np.float32), np.zeros((2, 2)), np.asfortranarray(np.eye(2))]
+    values += ["None", np.eye(2), Path("a"), "a", Camera((4, 3)), Camera((3, 4)), (Camera((4, 3)),)]
+    assert len({digest(value) for value in values}) == len(values)
 
 
 def test_dictionaries_are_equal_in_any_order() -> None:
@@ -84,55 +89,22 @@ def test_damage_is_noticed(data: st.DataObject) -> None:
     damaged[where] ^= data.draw(st.integers(1, 255))
     for bad in (bytes(damaged), packed[:where], packed + b"x"):
         with pytest.raises(InputError):
-            unpack(bad, [Camera])
+            unpack(bad)
 
 
-@dataclass(frozen=True)
-class _Whole:
-    """Stands for any dataclass."""
+class _Runs:
+    """Would run code when it is read."""
 
-    number: int
-
-
-@given(st.binary(max_size=200))
-def test_what_has_the_right_digest_but_was_not_packed_is_refused_or_a_value(body: bytes) -> None:
-    """A description of a value, "null" for one, may come about by chance; it then stands for that value."""
-    for inner in (body, struct.pack("<Q", len(body)) + body, struct.pack("<Q", 2**63)):
-        forged = packing._MAGIC + hashlib.sha256(inner).digest() + inner
-        try:
-            value = unpack(forged, [_Whole, Camera])
-        except RdstitchError:
-            continue
-        assert _same(unpack(pack(value), [_Whole, Camera]), value)
+    def __reduce__(self) -> tuple[Any, tuple[str]]:
+        return os.system, ("true",)
 
 
-@pytest.mark.parametrize("inner", [b"", struct.pack("<Q", 2**63), struct.pack("<Q", 3) + b"{x}", b"12345678null"])
-def test_what_only_pretends_is_refused(inner: bytes) -> None:
-    with pytest.raises(RdstitchError):
-        unpack(packing._MAGIC + hashlib.sha256(inner).digest() + inner)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        '{"object": "os.system", "fields": {}}',
-        '{"object": "_Whole", "fields": {}}',
-        '{"array": "O", "shape": [1], "order": "C"}',
-        '{"array": "<f8", "shape": [1000000000000], "order": "C"}',
-        '{"array": "<f8", "shape": [-1], "order": "C"}',
-        '{"array": "<f8"}',
-        '{"array": ",8", "shape": [1], "order": "C"}',
-        '{"float": "much"}',
-        '{"float": 1}',
-        '{"path": 3}',
-        '{"tuple": 3}',
-        "[1]",
-        "{}",
-        '{"object": "Camera", "fields": {"image_size": "wide"}}',
-        '{"list": ' * 30000,
-    ],
-)
-def test_forged_descriptions_are_refused(text: str) -> None:
-    inner = struct.pack("<Q", len(text)) + text.encode()
-    with pytest.raises(RdstitchError):
-        unpack(packing._MAGIC + hashlib.sha256(inner).digest() + inner, [_Whole, Camera])
+@pytest.mark.parametrize("value", [_Runs(), open, Camera.distort, StitchOptions, np.load, [print], Cache])
+def test_what_could_run_code_is_refused(value: Any) -> None:
+    """A class alone is data; what builds it is a dataclass of this package."""
+    packed = pack(value)
+    if value in (StitchOptions, Cache):
+        assert unpack(packed) is value
+    else:
+        with pytest.raises(InputError, match="no result"):
+            unpack(packed)

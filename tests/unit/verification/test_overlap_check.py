@@ -1,7 +1,6 @@
 """Which overlaps are compared, and how many agree."""
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -89,27 +88,6 @@ def test_a_turn_is_compared_between_the_two_images(monkeypatch: pytest.MonkeyPat
     np.testing.assert_allclose(seen[0].homography, half.T @ focal, atol=1e-9)
     np.testing.assert_allclose(seen[1].homography, half @ focal, atol=1e-9)
     np.testing.assert_allclose(straight_on, [focal], atol=1e-9)
-
-
-def test_cached_overlaps_are_those_of_the_same_links(monkeypatch: pytest.MonkeyPatch) -> None:
-    links = (_fit(0, 1), _fit(1, 2), LinkFit(0, 2, 9, 0, 0.5, False))
-    checked = [CheckedLink(fit, Agreement(1, 1), Ambiguity(1.0, 0.0, 0.0)) for fit in links[:2]]
-    verdicts: list[bool] = []
-
-    class Recorded:
-        def file(self, mask: object) -> str:
-            return ""
-
-        def recall(self, kind: str, types: object, key: object, compute: object, valid: Any, *, hint: object) -> Any:
-            verdicts.extend([valid(checked), valid(checked[::-1]), valid(checked[:1])])
-            return checked
-
-    alignment = SimpleNamespace(links=links, cameras=[None] * 3, homographies=[None] * 3, on_sphere=True)
-    source = SimpleNamespace(content=lambda cache: "", mask_content=lambda cache: "")
-    registration: Any = SimpleNamespace(alignment=alignment, sources=[source] * 3, stretch=None)
-    cache: Any = Recorded()
-    assert overlap_check.check_overlaps(registration, ThreadPoolExecutor(1), cache) == checked
-    assert verdicts == [True, False, False]
 
 
 def test_over_rough_ground_images_look_alike_where_their_matches_are() -> None:

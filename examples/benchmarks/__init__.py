@@ -1,0 +1,1 @@
+"""Measurements of rdstitch where the truth is known, beside its peers."""

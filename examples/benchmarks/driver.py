@@ -1,0 +1,109 @@
+"""What all benchmarks share: their command line, and measurements of time and memory.
+
+``python -m examples.benchmarks.NAME --help`` lists the options of each.
+"""
+
+import inspect
+import resource
+import sys
+import time
+import types
+import typing
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import click
+
+
+def run(benchmark: Callable[..., None]) -> None:
+    """Call a function with what the command line gives: its positional parameters, and an option for each keyword."""
+    hints = typing.get_type_hints(benchmark)
+    parameters = [_parameter(parameter, hints[name]) for name, parameter in _signature(benchmark).items()]
+    positional = [name for name, p in _signature(benchmark).items() if p.kind is not p.KEYWORD_ONLY]
+
+    def call(**given: Any) -> None:
+        first = [given.pop(name) for name in positional]
+        benchmark(*first, **given)
+
+    description = sys.modules[benchmark.__module__].__doc__
+    click.Command(benchmark.__module__, params=parameters, callback=call, help=description)()
+
+
+def _signature(benchmark: Callable[..., None]) -> dict[str, inspect.Parameter]:
+    return dict(inspect.signature(benchmark).parameters)
+
+
+def _parameter(parameter: inspect.Parameter, hint: Any) -> click.Parameter:
+    """The option or argument of a parameter; a tuple of values may be given one by one."""
+    if typing.get_origin(hint) is types.UnionType:
+        hint = next(kind for kind in typing.get_args(hint) if kind is not types.NoneType)
+    several = typing.get_origin(hint) is tuple
+    hint = typing.get_args(hint)[0] if several else hint
+    kind: Any = click.Choice(typing.get_args(hint)) if typing.get_origin(hint) is Literal else hint
+    kind = click.Path(path_type=Path) if hint is Path else kind
+    required = parameter.default is parameter.empty
+    default = None if required else parameter.default
+    if parameter.kind is not parameter.KEYWORD_ONLY:
+        return click.Argument(
+            [parameter.name], type=kind, nargs=-1 if several else 1, required=required, default=default
+        )
+    flag = f"--{parameter.name.replace('_', '-')}"
+    return click.Option([flag], type=kind, is_flag=hint is bool, multiple=several, default=default, show_default=True)
+
+
+def images_of(folder: Path) -> list[Path]:
+    """The image files of a folder, in the order of their names."""
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
+
+
+SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
+
+
+def timed(work: Callable[[], Any]) -> tuple[float, Any]:
+    """Processor seconds, and the result."""
+    begun = time.process_time()
+    result = work()
+    return time.process_time() - begun, result
+
+
+def peak_memory() -> float:
+    """Most memory that this process has held, MB (10⁶ bytes).
+
+    On Linux since its program began: ``ru_maxrss`` is never less than what the parent held when it started this one.
+    """
+    with suppress(OSError):
+        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024 / 1e6
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+
+
+@dataclass
+class StagePeaks:
+    """Most memory that was held in each stage, MB; a progress of recipes. Linux only."""
+
+    held: dict[str, float] = field(default_factory=dict)
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """What was held since the last report belongs to the stage that now reports."""
+        self.held[stage] = max(self.held.get(stage, 0.0), peak_memory())
+        # The peak begins anew: see proc(5).
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+
+
+@dataclass
+class StageTimes:
+    """Processor seconds until each stage last reported; a progress of recipes."""
+
+    begun: float = field(default_factory=time.process_time)
+    spent: dict[str, float] = field(default_factory=dict)
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """What has passed since the last report belongs to the stage that now reports."""
+        now = time.process_time()
+        self.spent[stage] = self.spent.get(stage, 0.0) + now - self.begun
+        self.begun = now

@@ -1,0 +1,135 @@
+"""Cost and accuracy by the number of frames: ``python -m examples.benchmarks.scale [COUNT …]``.
+
+A drone's survey of 480 x 360 frames, one lane beside the other, is rendered frame by frame into a temporary folder (60
+kB a frame) and stitched by one worker in a process of its own. Printed are processor time and peak memory by stage, the
+error of λ, and the largest position error of any frame, also as a share of the path. Times depend on the machine: only
+those of one run compare.
+"""
+
+import json
+import resource
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+import rdstitch
+from examples.benchmarks.driver import StagePeaks, StageTimes, run
+from examples.judging import alignment_error
+from rdstitch.camera import Camera
+from rdstitch.io.write import write_image
+from rdstitch.radial_homography import to_plane
+from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over, survey_poses
+
+COUNTS = (100, 300, 1000, 3000)
+DISTORTION = -0.25
+SIZE = (480, 360)
+_SEED = 19
+_GRID = (5, 4)  # points of a frame at which its place is compared
+_STAGES_SHOWN = 6
+
+
+def survey(count: int) -> Sequence:
+    """A drone's survey of ``count`` frames that overlap by 70 % along a lane and by 50 % across."""
+    lens = Camera(SIZE, DISTORTION, focal=0.8 * SIZE[0])
+    poses = survey_poses(lens, count, attitude_jitter=0.01, tilt=(0.02, -0.03), seed=_SEED)
+    return sequence_over(partial(ground, seed=_SEED), lens, poses, photometry=Photometry(noise=0.01), seed=_SEED)
+
+
+def frame_order(count: int, shuffled: bool) -> list[int]:
+    """Which frame of the survey the i-th image of the folder is."""
+    return np.random.default_rng(_SEED).permutation(count).tolist() if shuffled else list(range(count))
+
+
+def write_frames(sequence: Sequence, order: list[int], folder: Path) -> None:
+    """Render the frames into a folder, one at a time."""
+    for place, index in enumerate(order):
+        write_image(folder / f"frame_{place:05d}.jpg", sequence.frame(index))
+
+
+def measure(folder: Path, count: int, shuffled: bool, register_only: bool) -> dict[str, Any]:
+    """Stitch a folder of rendered frames in this process; what that cost, and how near it came to the truth."""
+    stages, peaks, before = StageTimes(), StagePeaks(), resource.getrusage(resource.RUSAGE_SELF)
+
+    def note(stage: str, done: int, total: int) -> None:
+        stages(stage, done, total)
+        peaks(stage, done, total)
+
+    options = rdstitch.StitchOptions(workers=1, overwrite=True, force=True)
+    if register_only:
+        registration = rdstitch.calibrate([folder], options, progress=note)
+    else:
+        with TemporaryDirectory() as output:
+            registration = rdstitch.mosaic([folder], Path(output) / "out.tif", options, progress=note).registration
+    own, begun = resource.getrusage(resource.RUSAGE_SELF), before.ru_utime + before.ru_stime
+    seconds = own.ru_utime + own.ru_stime - begun
+    note("the rest", 0, 0)
+    alignment = registration.alignment
+    sequence, order = survey(count), frame_order(count, shuffled)
+    places = {
+        order[i]: partial(to_plane, alignment.cameras[i], alignment.homographies[i])
+        for i in np.flatnonzero(alignment.used).tolist()
+    }
+    error = alignment_error(sequence, places, model="similarity", points_per_side=_GRID)
+    positions = sequence.poses.position / sequence.poses.height[0] * sequence.lens.focal
+    path = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+    return {
+        "count": count,
+        "seconds": seconds,
+        "memory": max(peaks.held.values()),
+        "used": int(alignment.used.sum()),
+        "pairs": len(registration.pairs),
+        "distortion": alignment.distortion,
+        "largest": error.max,
+        "median": error.median,
+        "path": path,
+        "stages": stages.spent,
+        "peaks": peaks.held,
+    }
+
+
+def print_row(row: dict[str, Any], first: dict[str, Any]) -> None:
+    """One line a number of frames, and one of its costliest stages."""
+    count, each = row["count"], 1e3 * row["seconds"] / row["count"]
+    line = f"{count:8d}{row['seconds']:10.1f}{each:10.1f}"
+    line += f"{each / (1e3 * first['seconds'] / first['count']):8.2f}{row['memory']:10.0f}"
+    growth = (row["memory"] - first["memory"]) / max(count - first["count"], 1)
+    line += f"{growth:10.2f}" if row is not first else f"{'':10s}"
+    line += f"{row['used']:8d}{row['pairs'] / count:10.1f}{row['distortion'] - DISTORTION:11.6f}"
+    print(line + f"{row['median']:9.3f}{row['largest']:9.3f}{100 * row['largest'] / row['path']:10.4f}", flush=True)
+    for unit, values in (
+        ("ms/frame", {stage: 1e3 * taken / count for stage, taken in row["stages"].items()}),
+        ("MB", row["peaks"]),
+    ):
+        most = sorted(values.items(), key=lambda stage: -stage[1])[:_STAGES_SHOWN]
+        print(f"{'':8s}{unit}: " + ", ".join(f"{stage} {value:.1f}" for stage, value in most), flush=True)
+
+
+def main(
+    counts: tuple[int, ...] = COUNTS, *, shuffled: bool = False, register: bool = False, folder: Path | None = None
+) -> None:
+    """Print the table; or, in a process of its own, one row of it as JSON."""
+    if folder is not None:
+        print(json.dumps(measure(folder, counts[0], shuffled, register)))
+        return
+    columns = ("s", "ms/frame", "ratio", "MB", "MB/frame", "used", "pairs/fr.", "Δλ", "median", "largest", "% of path")
+    widths = (10, 10, 8, 10, 10, 8, 10, 11, 9, 9, 10)
+    print(f"{'frames':>8}" + "".join(f"{name:>{width}}" for name, width in zip(columns, widths, strict=True)))
+    first: dict[str, Any] | None = None
+    for count in counts:
+        with TemporaryDirectory() as rendered:
+            write_frames(survey(count), frame_order(count, shuffled), Path(rendered))
+            command = [sys.executable, "-m", "examples.benchmarks.scale", str(count), "--folder", rendered]
+            command += ["--shuffled"] * shuffled + ["--register"] * register
+            printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        row = json.loads(printed.splitlines()[-1])
+        first = first or row
+        print_row(row, first)
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,162 @@
+"""Sets of the world, as a user would stitch them: ``python -m examples.benchmarks.world FOLDER… [--output DIR]``.
+
+Every subfolder that holds images is one set; each is stitched by ``rdstitch mosaic`` with no option. A row a set: exit
+status, images used, model, λ, the ratio of the areas that a pixel gets within the output (98 % over 2 %), the focal
+length, lines of messages, and processor time; with ``--peer``, the ``stitch`` command of the package ``stitching``, its
+processor time beside it. A result is "good" where the status is 0, all images are used, |λ| ≤ 0.09, the ratio of areas
+at most 30, and no image folded: what a person sees at a glance. Look at the images in ``--output`` for the rest.
+"""
+
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from examples.benchmarks.driver import SUFFIXES, images_of, run
+from rdstitch.arrays import FloatArray
+
+_GRID = np.stack(np.meshgrid([0.1, 0.5, 0.9], [0.1, 0.5, 0.9]), axis=-1).reshape(-1, 2)
+_MAX_DISTORTION, _MAX_STRETCH = 0.09, 30.0
+_MAX_SECONDS = 900
+
+
+@dataclass(frozen=True)
+class Row:
+    """What became of one set."""
+
+    name: str
+    status: int
+    used: int
+    count: int
+    model: str
+    distortion: float
+    stretch: float
+    folded: bool
+    focal: float
+    seconds: float
+    messages: tuple[str, ...]
+    peer_seconds: float = math.nan
+
+    @property
+    def good(self) -> bool:
+        """Whether a person would keep it, as far as numbers tell."""
+        distorted = abs(self.distortion) > _MAX_DISTORTION
+        return (
+            self.status == 0
+            and self.used == self.count
+            and not (distorted or self.folded)
+            and self.stretch <= _MAX_STRETCH
+        )
+
+    def __str__(self) -> str:
+        """One line of the table."""
+        return (
+            f"{'good' if self.good else '-':4s} {self.name:24s} {self.status:3d} {self.used:3d}/{self.count:<3d} "
+            f"{self.model:10s} {self.distortion:+7.3f} {self.stretch:8.1f}{'F' if self.folded else ' '} "
+            f"{self.focal:6.2f} {len(self.messages):3d} {self.seconds:7.1f} {self.peer_seconds:7.1f}"
+        )
+
+
+def to_output(image: dict[str, Any], points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Map measured pixels (N, 2) of an image to a planar output, and the sign of their depth."""
+    half = math.hypot(*image["size"]) / 2.0
+    distorted = (points - np.array(image["center_px"])) / half
+    squared = (distorted**2).sum(axis=1)
+    divisor = 1.0 + sum(c * squared ** (k + 1) for k, c in enumerate(image["coefficients"]))
+    plane = np.column_stack([distorted, divisor]) @ np.array(image["to_output"]).T
+    return plane[:, :2] / plane[:, 2:], plane[:, 2]
+
+
+def shape_of(images: list[dict[str, Any]]) -> tuple[float, bool]:
+    """Ratio of the areas of pixels in a planar output, and whether an image is folded; (1, False) on a sphere."""
+    areas, folded = [], False
+    for image in images:
+        if image["to_output"] is None:
+            continue
+        points, step = _GRID * image["size"], 1e-3 * image["size"][1]
+        (origin, depth), (right, _), (down, _) = (to_output(image, points + d) for d in ((0, 0), (step, 0), (0, step)))
+        folded |= bool(depth.min() * depth.max() <= 0.0)
+        a, b = right - origin, down - origin
+        areas.append(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / step**2)
+    if not areas:
+        return 1.0, folded
+    low, high = np.quantile(np.concatenate(areas), [0.02, 0.98])
+    return float(high / max(low, 1e-12)), folded
+
+
+def execute(command: list[str]) -> tuple[int, str, float]:
+    """Run a command; its status, standard error, and processor time."""
+    with tempfile.TemporaryFile("w+") as errors:
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors)
+        _, status, usage = os.wait4(process.pid, 0)
+        errors.seek(0)
+        return os.waitstatus_to_exitcode(status), errors.read(), usage.ru_utime + usage.ru_stime
+
+
+def stitch(folder: Path, output: Path, options: list[str], peer: str | None) -> Row:
+    """Stitch one set."""
+    files = [str(file) for file in images_of(folder)]
+    written = output / f"{folder.name}.jpg"
+    program = ["timeout", str(_MAX_SECONDS), sys.executable, "-m", "rdstitch_cli"]
+    status, errors, seconds = execute([*program, "mosaic", *files, "-o", str(written), "--overwrite", *options])
+    messages = tuple(line for line in errors.splitlines() if line.startswith("rdstitch:"))
+    (output / f"{folder.name}.txt").write_text(errors)
+    peer_seconds = math.nan
+    if peer is not None:
+        peer_seconds = execute(
+            ["timeout", str(_MAX_SECONDS), peer, *files, "--output", str(output / f"{folder.name}.peer.jpg")]
+        )[2]
+    sidecar = Path(f"{written}.json")
+    if status or not sidecar.exists():
+        return Row(
+            folder.name, status, 0, len(files), "", math.nan, math.nan, False, math.nan, seconds, messages, peer_seconds
+        )
+    found = json.loads(sidecar.read_text())
+    used = [image for image in found["images"] if image["used"]]
+    focal = (found["focal_px"] or math.nan) / (math.hypot(*used[0]["size"]) / 2.0)
+    distortion = math.nan if found["lambda"] is None else found["lambda"]
+    return Row(
+        folder.name,
+        status,
+        len(used),
+        len(files),
+        found["model"],
+        distortion,
+        *shape_of(used),
+        focal,
+        seconds,
+        messages,
+        peer_seconds,
+    )
+
+
+def main(
+    folders: tuple[Path, ...], *, output: Path | None = None, peer: str | None = None, jobs: int = 1, options: str = ""
+) -> None:
+    """Print a row a set."""
+    sets = sorted({file.parent for folder in folders for file in folder.rglob("*") if file.suffix.lower() in SUFFIXES})
+    output = output or Path(tempfile.mkdtemp())
+    output.mkdir(parents=True, exist_ok=True)
+    print("     set                      status used  model           λ    areas   f/half lines  cpu s  peer s")
+    with ThreadPoolExecutor(jobs) as pool:
+        rows = []
+        for row in pool.map(lambda folder: stitch(folder, output, options.split(), peer), sets):
+            print(row, flush=True)
+            rows.append(row)
+    ratios = [row.seconds / row.peer_seconds for row in rows if math.isfinite(row.peer_seconds)]
+    print(
+        f"{sum(row.good for row in rows)} of {len(rows)} good; {sum(len(row.messages) for row in rows)} messages"
+        + (f"; time over the peer's, median {np.median(ratios):.2f}" if ratios else "")
+    )
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,38 @@
+"""Taking out of all images the illumination that they have in common."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from rdstitch.errors import InputError
+from rdstitch.inputs.source import Source
+from rdstitch.io.flat_field import read_flat_field
+from rdstitch.messages import Message
+from rdstitch.stage.flat_field import estimate_illumination
+
+
+def check_size(sources: Sequence[Source]) -> None:
+    """Refuse tiles of several sizes."""
+    (w1, h1), other = sources[0].camera.image_size, None
+    other = next((source for source in sources if source.camera.image_size != (w1, h1)), None)
+    if other is not None:
+        w2, h2 = other.camera.image_size
+        raise InputError(f"{other.path}: has {w2} x {h2} pixels, the tiles before it have {w1} x {h1}; leave it out")
+
+
+def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list[Source], list[Message]]:
+    """The tiles, which are read without the illumination that all have; and what there is to say of that."""
+    if wanted == "off":
+        return list(sources), []
+    if wanted != "auto":
+        pixels = sources[0].read().pixels
+        channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+        field = read_flat_field(wanted, sources[0].camera.image_size, channels)
+        return [replace(source, flat_field=field) for source in sources], []
+    shown = estimate_illumination(lambda index: sources[index].read().pixels, len(sources))
+    if shown.field is None:
+        text = f"{len(sources)} tiles show no illumination that they have in common, and samples stay as they are"
+        return list(sources), [Message(text, severity="note", code="flat-field")]
+    dark = ", ".join(f"{value:.0f}" for value in shown.dark)
+    text = f"flat field: {shown.shading:.0%} less light where it is darkest, ± {shown.error:.1%}; dark level {dark}"
+    return [replace(source, flat_field=shown.field) for source in sources], [Message(text, severity="note")]

@@ -1,0 +1,103 @@
+"""The public API: the examples of its docstrings run, and every name is typed and described."""
+
+import dataclasses
+import doctest
+import inspect
+import re
+import shutil
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rdstitch
+from rdstitch import solvers
+
+
+def _run(test: doctest.DocTest) -> None:
+    output: list[str] = []
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL)
+    results = runner.run(test, out=output.append)
+    assert results.failed == 0, "".join(output)
+
+
+@pytest.fixture
+def images(frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The images that the examples name, in the current folder."""
+    (tmp_path / "flight").mkdir()
+    for name, frame in zip(("left", "middle", "right"), frames, strict=True):
+        shutil.copy(frame, tmp_path / f"{name}.png")
+        shutil.copy(frame, tmp_path / "flight")
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.usefixtures("images")
+@pytest.mark.parametrize("name", ["pano", "mosaic", "estimate_radial_homography"])
+def test_the_examples_of_help_run(name: str) -> None:
+    function = getattr(rdstitch, name)
+    (test,) = doctest.DocTestFinder(recurse=False).find(function, name, globs={"np": np})
+    assert test.examples
+    assert "Returns\n" in (function.__doc__ or "").replace("    ", "")
+    _run(test)
+
+
+def test_the_package_shows_its_names_and_loads_them_when_they_are_used() -> None:
+    assert set(rdstitch.__all__) < set(dir(rdstitch))
+    assert "__version__" in dir(rdstitch)
+    program = (
+        "import sys, rdstitch; print(rdstitch.__version__); heavy = {'numpy', 'scipy', 'cv2'} & sys.modules.keys(); "
+        "rdstitch.errors.InputError, rdstitch.synthetic.pair_poses; print(sorted(heavy))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == f"{metadata.version('rdstitch')}\n[]\n"
+    with pytest.raises(AttributeError, match="no attribute 'stitch'"):
+        rdstitch.stitch  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    "kind", [getattr(rdstitch, name) for name in rdstitch.__all__ if dataclasses.is_dataclass(getattr(rdstitch, name))]
+)
+def test_help_describes_every_field(kind: type) -> None:
+    """Options with their units; of results some fields share a line."""
+    text = (inspect.getdoc(kind) or "").split("Raises\n")[0]
+    entries = re.split(r"\n(?=[\w, ]+ : )", text)
+    names = {name: entry for entry in entries for name in entry.split(" : ")[0].split(", ")}
+    fields = [field.name for field in dataclasses.fields(kind) if not field.name.startswith("_")]
+    assert [name for name in fields if name not in names] == []
+    if kind.__name__.endswith("Options"):
+        assert [name for name in fields if len(names[name].splitlines()) < 2] == []
+
+
+@pytest.mark.usefixtures("images")
+def test_results_show_themselves_in_one_line() -> None:
+    result = rdstitch.mosaic(["flight/"], options=rdstitch.StitchOptions(workers=1))
+    registration = result.registration
+    path = rdstitch.Trajectory.from_alignment(registration.alignment)
+    failed = rdstitch.RadialHomography.failed("too few matches", registration.camera, registration.camera, 3)
+    shown = [result, registration, registration.alignment, path, registration.pairs[0].relation, failed]
+    lines = [repr(each) for each in (*shown, result.composite)]
+    assert all(len(line) < 120 and "\n" not in line and line[0] == "<" for line in lines), lines
+    assert lines[5] == "<RadialHomography failed: too few matches>"
+
+
+@pytest.mark.parametrize("name", [name for name in solvers.__all__ if name[0].islower()])
+def test_solvers_say_what_they_take_and_give(name: str) -> None:
+    text = inspect.getdoc(getattr(solvers, name)) or ""
+    assert re.search(r"Parameters\n|:func:", text)
+    assert re.search(r"Returns\n|Solutions|:func:", text)
+
+
+@pytest.mark.parametrize(
+    "function", [getattr(rdstitch, name) for name in rdstitch.__all__ if inspect.isfunction(getattr(rdstitch, name))]
+)
+def test_public_functions_are_typed_and_described(function: object) -> None:
+    assert callable(function)
+    signature = inspect.signature(function)
+    assert all(parameter.annotation is not inspect.Parameter.empty for parameter in signature.parameters.values())
+    assert signature.return_annotation is not inspect.Signature.empty
+    text = inspect.getdoc(function) or ""
+    missing = [name for name in signature.parameters if not re.search(rf"\b{name}\b", text)]
+    assert missing == []
