@@ -6,7 +6,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.registration import Registration
-from rdstitch.report.svg import counted, section, table
+from rdstitch.report.svg import counted, element, section, table
 from rdstitch.stage.register import TileRegistration
 
 
@@ -32,11 +32,11 @@ def stage(registration: Registration) -> str:
     return section(
         "Stage",
         f"{counted(len(grid), 'tile')}; the error of links is what overlaps disagree by after all places are adjusted.",
-        table((), rows),
-        "<h3>Rows</h3>",
-        table(header, _lines(tiled, grid.rows, model.rows)),
-        "<h3>Columns</h3>",
-        table(header, _lines(tiled, grid.columns, model.columns)),
+        table(rows),
+        element("h3", "Rows"),
+        table([header, *_lines(tiled, grid.rows, model.rows)]),
+        element("h3", "Columns"),
+        table([header, *_lines(tiled, grid.columns, model.columns)]),
     )
 
 
