@@ -54,9 +54,9 @@ _MATCHES_OF_ALL, _MATCHES_OF_A_LINK = 500_000, 60
 _ROUNDS = 3
 """Rounds of rejecting wrong pairs and adjusting again."""
 
-_FEW_VIEWS, _LENS_OVER_DEPTH = 3, 4.0
+_FEW_VIEWS, _LENS_OVER_DEPTH = 3, 8.0
 """Images from more than which depth does not look like a lens; times by which a lens must make errors of depth smaller
-to be no depth itself, whose power grows with the square of the wavelength."""
+to be no depth itself: in published pairs through lenses with next to no distortion λ has done so by more than four."""
 
 _LITTLE_DEPTH = 0.0003
 """Diagonals of an image: errors that neighbours share beside a lens, up to which there is no depth to speak of."""

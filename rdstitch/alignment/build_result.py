@@ -287,8 +287,8 @@ def _overruled_focal(found: AdjustedImages, camera: Camera) -> str | None:
     ratio = camera.focal / camera.half_diagonal / math.exp(given.log_focal)
     if abs(math.log(ratio)) < math.log(_OVERRULED):
         return None
-    shown, said = camera.focal, camera.focal / ratio
-    return f"the images show a focal length of {shown:.0f} pixels, not of {said:.0f} as EXIF says; --focal gives it"
+    times = f"{ratio:.1f} times the one" if ratio > 1.0 else f"1/{1.0 / ratio:.1f} of the one"
+    return f"the images show a focal length that is {times} in EXIF, which was not used; --focal gives the right one"
 
 
 def _warnings(found: AdjustedImages, camera: Camera) -> tuple[Message, ...]:
