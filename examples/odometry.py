@@ -23,9 +23,12 @@ def odometry(pose: rdstitch.Pose, std: float) -> dict[str, Any]:
     """A pose as the fields of nav_msgs/Odometry, by REP 103: x to the right and y to the top of the first frame."""
     assert pose.position is not None
     assert pose.yaw is not None
+    assert pose.tracked is not None
+    # Where the track was lost a new map begins, which has neither place nor unit in common with the one before.
+    frame = f"odom_{pose.tracked.map_number}"
     covariance = np.diag([std**2] * 3 + [1e6, 1e6, std**2])  # roll and pitch are not tracked
     return {
-        "header": {"stamp": pose.timestamp, "frame_id": "odom"},
+        "header": {"stamp": pose.timestamp, "frame_id": frame},
         "child_frame_id": "camera",
         "pose": {
             "pose": {

@@ -70,3 +70,4 @@ def test_the_example_prints_odometry(drive: Sequence, tmp_path: Path, capsys: py
     assert lines
     assert lines[-1]["pose"]["pose"]["position"]["z"] == pytest.approx(0.8, rel=0.05)
     assert len(lines[-1]["pose"]["covariance"]) == 36
+    assert lines[-1]["header"]["frame_id"] == "odom_0"
