@@ -17,7 +17,7 @@ from rdstitch.pipeline.accept import _is_of_the_whole, _is_simpler, _may_be_anot
 from rdstitch.pipeline.aligner import Aligner
 from rdstitch.pipeline.register import register
 from rdstitch.verification.findings import Finding
-from tests.cli.running import flight
+from tests.cli.running import DISTORTION, flight
 
 OPTIONS = StitchOptions(workers=1, features=FeatureOptions(max_features=600))
 
@@ -100,12 +100,11 @@ def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path:
     frames = plane.write(tmp_path)
     for k, frame in enumerate(frames):
         write_image(frame, np.concatenate([plane.frame(k)[:192], ahead.frame(k)[192:]]))
-    sources = _read(frames)
+    sources, options = _read(frames), replace(OPTIONS, distortion=DISTORTION)
     with open_executor(1, len(sources)) as executor:
-        found = register(sources, OPTIONS, executor, skip_bad=False)
-        accepted = accept(found, OPTIONS, executor)
+        found = register(sources, options, executor, skip_bad=False)
+        accepted = accept(found, options, executor)
     steps = [np.diff(k.alignment.homographies[:, 0, 2]) for k in (found, accepted)]
     assert np.all(np.abs(steps[0]) < 0.2)  # heights above the ground: what drives ahead moves by a sixth
-    assert np.all(np.abs(steps[1]) > 0.7)
-    (message,) = accepted.messages
-    assert (message.code, message.severity) == ("rival-motion", "warning")
+    assert np.all(np.abs(steps[1]) > 0.6)
+    assert [message.code for message in accepted.messages if message.severity == "warning"] == ["rival-motion"]

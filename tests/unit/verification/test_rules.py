@@ -93,7 +93,7 @@ def _of_motions(motion: SecondMotion, alike: float, compared: MotionComparison |
     ]
     found = SimpleNamespace(
         motions=[motion], compared=compared, checked=[] if np.isnan(alike) else checked, parallax=[], static=False,
-        lens_only=False, ambiguous={}, alignment=SimpleNamespace(cameras=[CAMERA] * 2),
+        lens_only=False, ambiguous={}, depth=False, alignment=SimpleNamespace(cameras=[CAMERA] * 2),
     )  # fmt: skip
     registration: Any = SimpleNamespace(sources=[SimpleNamespace(path=f"folder/{name}.png") for name in "ab"])
     said = messages_of(rules._second_motion(_with(found, **changed)), registration)
