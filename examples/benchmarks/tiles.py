@@ -1,8 +1,9 @@
 """Tiles on a stage: ``python -m examples.benchmarks.tiles``.
 
 Rendered grids of fluorescence and brightfield tiles: how far tiles are off, λ, the flat field, and the time. With
-``--peer-python`` of an environment that has m2stitch and ashlar, the same tiles by these. Errors are within each group
-of tiles that overlaps hold together; tiles with content are those of which overlaps show it.
+``--peer-python`` of an environment that has m2stitch, ashlar and basicpy, the same tiles by these; basicpy also with
+the camera's true offset taken off, which rdstitch is not told. Errors are within each group of tiles that overlaps hold
+together; tiles with content are those of which overlaps show it.
 """
 
 import json
@@ -11,8 +12,10 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from examples.benchmarks.driver import run
 from rdstitch.arrays import FloatArray
@@ -30,13 +33,23 @@ folder, overlap, which = Path(sys.argv[1]), float(sys.argv[4]), sys.argv[5]
 rows, columns = int(sys.argv[2]), int(sys.argv[3])
 files = sorted(folder.glob("r*.tif"))
 cells = [divmod(k, columns) for k in range(rows * columns)]
-read = lambda file: (lambda a: a if a.ndim == 2 else a.mean(axis=2).astype(a.dtype))(tifffile.imread(file))
-tiles = np.stack([read(file) for file in files])
+colours = np.stack([np.atleast_3d(tifffile.imread(file)) for file in files])
+tiles = colours[..., 0] if colours.shape[-1] == 1 else colours.mean(axis=-1).astype(colours.dtype)
+places = np.zeros((0, 2))
 start = time.process_time()
 if which == "m2stitch":
     import m2stitch
     found, _ = m2stitch.stitch_images(tiles, [r for r, _ in cells], [c for _, c in cells], row_col_transpose=False)
     places = found[["x_pos", "y_pos"]].to_numpy(float)
+elif which.startswith("basicpy"):
+    from basicpy import BaSiC
+    start = time.process_time()
+    planes = []
+    for channel in np.moveaxis(colours, -1, 0):
+        basic = BaSiC()
+        basic.fit(channel.astype(np.float32) - (float(sys.argv[6]) if which.endswith("offset") else 0.0))
+        planes.append(np.asarray(basic.flatfield))
+    np.save(folder / "flat_field.npy", np.stack(planes, axis=-1))
 else:
     from ashlar import reg
     side = tiles.shape[1]
@@ -79,6 +92,11 @@ def errors(stage: StageGrid, places: FloatArray, groups: Sequence[Sequence[int]]
     )
 
 
+def gain_error(stage: StageGrid, gain: NDArray[Any]) -> float:
+    """How far a flat field is from the truth, root mean square, but for its mean in each channel."""
+    return float(np.sqrt(((gain / gain.mean(axis=(0, 1)) / stage.flat_field - 1.0) ** 2).mean()))
+
+
 def measure(name: str, stage: StageGrid, folder: Path, peer: str | None) -> None:
     """Print a line for rdstitch, and one for each peer."""
     files = stage.write(folder)
@@ -86,7 +104,7 @@ def measure(name: str, stage: StageGrid, folder: Path, peer: str | None) -> None
     sources, _ = with_flat_field(read_sources(files, skip_bad=False)[0], "auto")
     flat_seconds = time.process_time() - start
     field = sources[0].flat_field
-    off = float("nan") if field is None else float(np.sqrt(((field.gain / stage.flat_field - 1.0) ** 2).mean()))
+    off = float("nan") if field is None else gain_error(stage, field.gain)
     # Read once before: what is timed is registration.
     planes = [pixels if pixels.ndim == 2 else pixels.mean(axis=2) for pixels in (s.read().pixels for s in sources)]
     start = time.process_time()
@@ -100,7 +118,7 @@ def measure(name: str, stage: StageGrid, folder: Path, peer: str | None) -> None
         f"{1e3 * seconds / megapixels:.0f} ms a megapixel, flat field {1e3 * flat_seconds / megapixels:.0f}",
         flush=True,
     )
-    for which in ("m2stitch", "ashlar") if peer else ():
+    for which in ("m2stitch", "ashlar", "basicpy", "basicpy, true offset") if peer else ():
         command = [
             peer or "",
             "-c",
@@ -110,17 +128,23 @@ def measure(name: str, stage: StageGrid, folder: Path, peer: str | None) -> None
             str(stage.columns),
             str(stage.overlap),
             which,
+            str(stage.offset),
         ]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             print(f"  {which}: {(done.stderr.strip().splitlines() or ['failed'])[-1]}", flush=True)
             continue
         result = json.loads(done.stdout.splitlines()[-1])
+        milliseconds = 1e3 * result["seconds"] / megapixels
+        if which.startswith("basicpy"):
+            their_field = gain_error(stage, np.load(folder / "flat_field.npy"))
+            print(f"  {which}: flat field {their_field:.2%}; {milliseconds:.0f} ms a megapixel", flush=True)
+            continue
         theirs = errors(stage, np.array(result["places"]), found.groups)
         right = int((theirs < 2.0).sum())
         print(
             f"  {which}: {right} of the same tiles within 2 pixels, error {np.median(theirs):.2f} median, "
-            f"{theirs.max():.2f} largest; {1e3 * result['seconds'] / megapixels:.0f} ms a megapixel",
+            f"{theirs.max():.2f} largest; {milliseconds:.0f} ms a megapixel",
             flush=True,
         )
 
