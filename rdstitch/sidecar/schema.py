@@ -180,6 +180,29 @@ class OptionsRecord(Struct):
     composite: dict[str, Any]
 
 
+class TileRecord(Struct):
+    """Where a tile on a stage is in its row and column, and what placed it."""
+
+    name: str
+    row: Count
+    column: Count
+    placed_by: Literal["overlap", "stage"]
+
+
+class StageRecord(Struct):
+    """What a stage does: the matrix from its pixels to the camera's, and what its lines are off, px."""
+
+    source: str
+    pixel_um: _Positive | None
+    matrix: tuple[Pair, Pair]
+    rows_px: list[Pair]
+    columns_px: list[Pair]
+    row_std_px: NonNegative
+    column_std_px: NonNegative
+    tile_std_px: NonNegative
+    tiles: list[TileRecord]
+
+
 class Applied(Struct):
     """Only in the sidecar of ``apply``: what was applied, and how images found their places."""
 
@@ -211,6 +234,7 @@ class SidecarRecord(Struct, kw_only=True):
     reference: str
     output: OutputRecord
     local_alignment: LocalAlignmentRecord | None = None
+    stage: StageRecord | None = None
     images: Annotated[list[ImageRecord], Meta(min_length=1)]
     pairs: list[PairRecord]
     verdict: VerdictRecord

@@ -18,6 +18,7 @@ from rdstitch.compositing.projection import PLANE
 from rdstitch.export.georeference import Georeference
 from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.local_alignment import DisplacementField, LocalAlignment
+from rdstitch.registration import Registration
 from rdstitch.stitch_result import StitchResult
 
 VERSION = 2
@@ -59,6 +60,7 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
             "georeference": georeference_fields(result.georeference, result.not_georeferenced),
         },
         "local_alignment": _local_alignment(result.local_alignment),
+        "stage": _stage(registration),
         "images": _images(result),
         "pairs": _pairs(result),
         "verdict": {**dataclasses.asdict(result.verdict), "relief": alignment.relief},
@@ -154,6 +156,28 @@ def _local_alignment(local: LocalAlignment) -> dict[str, Any]:
         "reason": local.reason,
         "cells": local.cells,
         "held_out_px": {"before": local.before, "after": local.after},
+    }
+
+
+def _stage(registration: Registration) -> dict[str, Any] | None:
+    """What the stage does, and which tiles have their places from it alone; None where the images are no tiles."""
+    if registration.tiles is None:
+        return None
+    grid, model = registration.tiles.grid, registration.tiles.adjustment.stage
+    lines = zip(registration.sources, grid.rows, grid.columns, registration.tiles.linked, strict=True)
+    return {
+        "source": grid.source,
+        "pixel_um": grid.pixel_size,
+        "matrix": model.matrix,
+        "rows_px": model.rows,
+        "columns_px": model.columns,
+        "row_std_px": model.row_std,
+        "column_std_px": model.column_std,
+        "tile_std_px": model.std,
+        "tiles": [
+            {"name": source.name, "row": row, "column": column, "placed_by": "overlap" if linked else "stage"}
+            for source, row, column, linked in lines
+        ],
     }
 
 

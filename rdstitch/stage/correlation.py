@@ -1,8 +1,12 @@
 """Phase correlation of the blocks of an overlap, whitened as far as they are more than noise."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +21,12 @@ _TAPER = 0.15
 
 _NOISE_SHARE = 4.0
 """Products of spectra are whitened where they are so many times what noise would give."""
+
+_CORRELATED = 4.0 * math.pi
+"""Pixels that share their noise after a Gaussian filter of 1 pixel."""
+
+_BETTER = 3.0
+"""Standard deviations of chance by which a correlation must exceed another."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +84,43 @@ def correlate(first: Image, second: Image, overlap: Overlap, reach: int) -> Surf
     surface = fft.irfft2(product, s=shape) * (shape[0] * shape[1] / np.sqrt(power + 1e-12))
     rows, columns = (np.arange(-reach, reach + 1) % side for side in shape)
     return Surfaces(surface[:, rows[:, None], columns].astype(np.float16))
+
+
+def best_place(
+    first: Image, second: Image, overlap: Overlap, shifts: FloatArray, places: Sequence[FloatArray]
+) -> FloatArray:
+    """Choose the place with the best normalized cross-correlation of what two tiles (h, w) have in common there.
+
+    The first of the places stands unless another is better by more than chance.
+
+    Parameters
+    ----------
+    shifts : ndarray of shape (K, 2)
+        What each block of the overlap is displaced by besides, pixels.
+    places : sequence of ndarray of shape (2,)
+        Of the second tile in the first, pixels.
+    """
+    if len(places) == 1:
+        return places[0]
+    one, two = (cv2.GaussianBlur(tile, (0, 0), 1.0) for tile in (first, second))
+    scores, variances = np.full(len(places), -1.0), np.ones(len(places))
+    for number, place in enumerate(places):
+        common: tuple[list[NDArray[Any]], list[NDArray[Any]]] = [], []
+        for block, moved in zip(overlap.blocks, np.rint(place + shifts).astype(int), strict=True):
+            low = np.maximum(np.maximum(block[:2], moved), 0)
+            high = np.maximum(low, np.minimum(np.minimum(block[2:], moved + second.shape[::-1]), first.shape[::-1]))
+            for parts, tile, (x0, y0), (x1, y1) in (
+                (common[0], one, low, high),
+                (common[1], two, low - moved, high - moved),
+            ):
+                parts.append(tile[y0:y1, x0:x1].ravel())
+        a, b = (np.concatenate(parts) for parts in common)
+        if len(a):
+            a, b = a - a.mean(), b - b.mean()
+            scores[number] = float(a @ b) / max(math.sqrt(float(a @ a) * float(b @ b)), 1e-12)
+            variances[number] = _CORRELATED / len(a)
+    better = scores - _BETTER * np.sqrt(variances + variances[0]) > scores[0]
+    return places[int(np.argmax(np.where(better, scores, -1.0)))] if better.any() else places[0]
 
 
 def _fill(

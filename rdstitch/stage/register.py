@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +15,7 @@ from rdstitch.io.reduction import block_mean
 from rdstitch.progress import Progress, silent
 from rdstitch.scipy_parts import csgraph, sparse
 from rdstitch.stage.adjustment import Adjustment, LinkedPoints, adjust
-from rdstitch.stage.correlation import Surfaces, correlate
+from rdstitch.stage.correlation import Surfaces, best_place, correlate
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.overlap import Overlap
 from rdstitch.stage.refinement import BlockMatches, Transfer, refine
@@ -39,6 +40,9 @@ _FALSE_ALARMS = 1e-4
 
 _LARGEST_REACH = 4.0
 """Standard deviations of the stage within which a peak of little height is looked for."""
+
+_CANDIDATES = 12
+"""Highest peaks of a pair that are compared by normalized cross-correlation."""
 
 _AGREES = 0.25
 """Weight of a pair from which on it holds its tiles."""
@@ -114,30 +118,31 @@ def register_tiles(
         progress("correlating", number + 1, len(pairs))
     lens = _Lens(grid, factor)
     known = _best_lens(surfaces, overlaps, lens, radius) if distortion is None else distortion
-    peaks = [_peak(s, o, lens.shifts(o, known), radius) for s, o in zip(surfaces, overlaps, strict=True)]
+    peaks = [_peaks(s, o, lens.shifts(o, known), radius) for s, o in zip(surfaces, overlaps, strict=True)]
     rough = _adjusted(grid, pairs, peaks, factor, search, known)
     # Again, nearer to where the stage as it has shown itself puts them.
     near = rough.places
     std = max(rough.stage.std, factor / 2.0)
     window = max(2, min(radius, math.ceil(_LARGEST_REACH * math.sqrt(2.0) * std / factor)))
     peaks = [
-        _peak(s, o, lens.shifts(o, known), radius, ((near[p[1]] - near[p[0]]) / factor - o.offset, window))
-        for s, o, p in zip(surfaces, overlaps, pairs, strict=True)
+        _peaks(s, o, lens.shifts(o, known), radius, ((near[p[1]] - near[p[0]]) / factor - o.offset, window)) + others
+        for s, o, p, others in zip(surfaces, overlaps, pairs, peaks, strict=True)
     ]
-    shown = [k for k, peak in enumerate(peaks) if peak is not None]
+    peaks = [list({tuple(peak): peak for peak in own}.values()) for own in peaks]
+    shown = [k for k, own in enumerate(peaks) if own]
     if not shown:
         return _result(grid, pairs, [], rough)
-    rough = _adjusted(grid, pairs, peaks, factor, search, known)
     matches: dict[int, BlockMatches] = {}
     exact = _Lens(grid, 1)
     for number, (one, two) in enumerate(_in_pairs(read, pairs[shown])):
-        peak = peaks[shown[number]]
-        assert peak is not None
-        pair = pairs[shown[number]]
-        overlap = expected(pair, _moved(grid.places, pair, peak.offset * factor), 1)
+        pair, overlap = pairs[shown[number]], overlaps[shown[number]]
+        # Whitened spectra weigh all frequencies alike: of a repeated pattern a wrong period may be the highest peak.
+        small = _coarse(one, factor), _coarse(two, factor)
+        offset = factor * best_place(*small, overlap, lens.shifts(overlap, known), peaks[shown[number]])
+        overlap = expected(pair, _moved(grid.places, pair, offset), 1)
         for cells in (overlap.cells(grid.size), overlap.whole):
             cut = replace(overlap, blocks=cells)
-            found = refine(one, two, cells, exact.transfer(cut, peak.offset * factor, known), factor + 1.5)
+            found = refine(one, two, cells, exact.transfer(cut, offset, known), factor + 1.5)
             if len(found):
                 matches[shown[number]] = found
                 break
@@ -226,14 +231,6 @@ class _Lens:
         return np.asarray(self.scale * away * (1.0 / (1.0 + distortion * r2) - 1.0))
 
 
-@dataclass(frozen=True)
-class _Peak:
-    """Where a pair correlates: the place of the second tile in the first, coarse pixels, and how clearly."""
-
-    offset: FloatArray
-    height: float
-
-
 def _best_lens(surfaces: Sequence[Surfaces], overlaps: Sequence[Overlap], lens: _Lens, radius: int) -> float:
     """λ for which the blocks of all pairs agree best."""
     heights = np.zeros(len(_LENSES))
@@ -251,24 +248,27 @@ def _threshold(total: FloatArray, radius: int) -> float:
     return deviation * math.sqrt(2.0 * math.log((2 * radius + 1) ** 2 / _FALSE_ALARMS))
 
 
-def _peak(
+def _peaks(
     surface: Surfaces,
     overlap: Overlap,
     shifts: FloatArray,
     radius: int,
     near: tuple[FloatArray, int] | None = None,
-) -> _Peak | None:
-    """The highest peak of a pair, if it is no noise; near an expected displacement, if that is given with a window."""
+) -> list[FloatArray]:
+    """Places of the second tile in the first, coarse pixels, at peaks of which the first, the highest, is no noise.
+
+    Near an expected displacement, if that is given with a window.
+    """
     total = surface.total(shifts, radius)
     middle, window = (np.zeros(2), radius) if near is None else near
     low = np.clip(np.rint(middle).astype(int) - window + radius, 0, 2 * radius)
     high = np.clip(np.rint(middle).astype(int) + window + radius + 1, 1, 2 * radius + 1)
     part = total[low[1] : high[1], low[0] : high[0]]
-    y, x = np.unravel_index(int(part.argmax()), part.shape)
-    height = float(part[y, x])
-    if height < _threshold(total, window):
-        return None
-    return _Peak(overlap.offset + low + (x, y) - radius, height)
+    if part.max() < _threshold(total, window):
+        return []
+    y, x = np.nonzero(part == cv2.dilate(part, np.ones((3, 3), dtype=np.uint8)))
+    order = np.argsort(-part[y, x], kind="stable")[:_CANDIDATES]
+    return [overlap.offset + low + (x[k], y[k]) - radius for k in order]
 
 
 def _moved(places: FloatArray, pair: IntArray, offset: FloatArray) -> FloatArray:
@@ -279,15 +279,21 @@ def _moved(places: FloatArray, pair: IntArray, offset: FloatArray) -> FloatArray
 
 
 def _adjusted(
-    grid: TileGrid, pairs: IntArray, peaks: Sequence[_Peak | None], factor: int, search: float, distortion: float
+    grid: TileGrid,
+    pairs: IntArray,
+    peaks: Sequence[Sequence[FloatArray]],
+    factor: int,
+    search: float,
+    distortion: float,
 ) -> Adjustment:
-    """Places by the peaks alone."""
+    """Places by the highest peaks alone."""
     matches = {}
-    for number, peak in enumerate(peaks):
-        if peak is not None:
-            middle = (np.array(grid.size) - 1.0 + peak.offset * factor) / 2.0
+    for number, own in enumerate(peaks):
+        if own:
+            offset = own[0] * factor
+            middle = (np.array(grid.size) - 1.0 + offset) / 2.0
             information = np.eye(2)[None] / (factor / 2.0) ** 2
-            matches[number] = BlockMatches(middle[None], (middle - peak.offset * factor)[None], information)
+            matches[number] = BlockMatches(middle[None], (middle - offset)[None], information)
     return adjust(grid, _links(pairs, matches), search / 3.0, distortion)
 
 

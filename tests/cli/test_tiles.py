@@ -9,8 +9,9 @@ import pytest
 import tifffile
 
 from rdstitch.io.flat_field import FlatField
+from rdstitch.report.stage import backlash
 from rdstitch.synthetic.stage import StageGrid
-from tests.cli.running import Run
+from tests.cli.running import SIDECAR_SCHEMA, Run
 
 STAGE = StageGrid(rows=3, columns=3, tile=256, overlap=0.15, content=0.8, backlash=4.0, seed=5)
 NAMED = ("--grid", "r{row}c{col}", "--overlap", "15")
@@ -46,7 +47,16 @@ def test_samples_of_the_mosaic_are_those_of_the_tiles(rdstitch: Run, slide: Path
     page = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert "backlash of rows" in page
     assert "9 of 9" in page
-    assert json.loads(output.with_name("slide.tif.json").read_text(encoding="utf-8"))["model"] == "rigid"
+    content = json.loads(output.with_name("slide.tif.json").read_text(encoding="utf-8"))
+    SIDECAR_SCHEMA.validate(content)
+    assert content["model"] == "rigid"
+    stage = content["stage"]
+    assert [tile["placed_by"] for tile in stage["tiles"]] == [row["placed_by"] for row in rows] == ["overlap"] * 9
+    assert [[tile["row"], tile["column"]] for tile in stage["tiles"]] == STAGE.cells.tolist()
+    # Rows are taken to and fro: every other one is off by twice the backlash.
+    assert backlash(np.array(stage["rows_px"]))[0] == pytest.approx(2 * STAGE.backlash, abs=2.5)
+    assert np.shape(stage["columns_px"]) == (3, 2)
+    np.testing.assert_allclose(stage["matrix"], np.eye(2), atol=0.02)
 
 
 def test_places_from_a_mirrored_stage_are_found_too(rdstitch: Run, slide: Path, tmp_path: Path) -> None:

@@ -1,10 +1,13 @@
 """All places of tiles on a stage against the truth."""
 
+import cv2
 import numpy as np
 import pytest
 
 from rdstitch.arrays import FloatArray
 from rdstitch.stage import TileGrid, TileRegistration, register_tiles
+from rdstitch.stage.correlation import correlate
+from rdstitch.stage.overlap import Overlap
 from rdstitch.synthetic.stage import Specimen, StageGrid
 
 
@@ -49,3 +52,21 @@ def test_nothing_but_noise_leaves_all_places_as_they_were() -> None:
     assert not found.linked.any()
     np.testing.assert_allclose(found.adjustment.places, places, atol=1e-6)
     assert np.isinf(found.adjustment.distortion_std)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_wrong_period_of_a_pattern_does_not_win_by_the_height_of_its_peak(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:300, :600].astype(np.float32)
+    dots = 60.0 * np.exp(-((x % 14.0 - 7.0) ** 2 + (y % 14.0 - 7.0) ** 2) / 3.0)
+    clouds = cv2.GaussianBlur(rng.normal(size=x.shape).astype(np.float32), (0, 0), 10.0)
+    ground = dots + 30.0 * clouds / clouds.std()
+    tiles = [ground[20:276, 10:266], ground[23:279, 225:481]]
+    tiles = [(tile + rng.normal(0.0, 12.0, size=tile.shape)).astype(np.float32) for tile in tiles]
+    overlap = Overlap.expected(0, 1, np.array([212.0, 0.0]), (256, 256), 5)
+    surface = correlate(tiles[0], tiles[1], overlap, 30).total(np.zeros((len(overlap.blocks), 2)), 30)
+    highest = np.unravel_index(int(surface.argmax()), surface.shape)
+    assert np.abs(np.array(highest) - (33, 33)).max() > 5
+    grid = TileGrid(np.array([[0.0, 0.0], [212.0, 0.0]]), (256, 256))
+    places = register_tiles(grid, tiles.__getitem__, search=30.0, distortion=0.0).adjustment.places
+    np.testing.assert_allclose(places[1] - places[0], (215.0, 3.0), atol=0.3)
