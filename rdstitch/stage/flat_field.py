@@ -57,38 +57,49 @@ class Illumination:
 
 
 class _Statistics:
-    """Ground, and variance of noise, of all cells of all tiles."""
+    """Ground, and variance of noise and the light that it is of, of all cells of all tiles."""
 
     def __init__(self, tiles: Iterable[NDArray[Any]]) -> None:
-        ground, variance = [], []
+        ground, light, variance = [], [], []
         for tile in tiles:
             factor = max(1, round(max(tile.shape[:2]) / _SIDE))
             small = block_mean(tile, factor).reshape(-(-tile.shape[0] // factor), -(-tile.shape[1] // factor), -1)
             rows, columns = (max(1, side // _CELLS) for side in small.shape[:2])
             cut = small[: rows * _CELLS, : columns * _CELLS].astype(np.float32)
-            cells = cut.reshape(_CELLS, rows, _CELLS, columns, -1).transpose(0, 2, 4, 1, 3)
-            cells = cells.reshape(_CELLS, _CELLS, cut.shape[2], -1)
-            middle = np.median(cells, axis=-1)
-            ground.append(middle)
-            variance.append(_noise(tile.reshape(*tile.shape[:2], -1)))
+            ground.append(np.median(_cells(cut), axis=-1))
+            mean, noise = _noise(tile.reshape(*tile.shape[:2], -1))
+            light.append(mean)
+            variance.append(noise)
         self.size = small.shape[:2]
         self.used = rows * _CELLS, columns * _CELLS
-        self.ground, self.variance = np.array(ground, dtype=np.float64), np.array(variance, dtype=np.float64)
+        self.ground, self.light, self.variance = (np.array(v, dtype=np.float64) for v in (ground, light, variance))
 
 
-def _noise(tile: NDArray[Any]) -> FloatArray:
-    """Variance of the noise in each cell of a tile (h, w, C), by second differences in every other row."""
-    second = tile[::2].astype(np.float32)
-    second = np.abs(second[:, :-2] - 2.0 * second[:, 1:-1] + second[:, 2:])
-    rows, columns = (max(1, side // _CELLS) for side in second.shape[:2])
-    cut = second[: rows * _CELLS, : columns * _CELLS]
-    cells = cut.reshape(_CELLS, rows, _CELLS, columns, -1).transpose(0, 2, 4, 1, 3)
-    cells = cells.reshape(_CELLS, _CELLS, tile.shape[2], -1)
+def _cells(plane: NDArray[Any]) -> NDArray[Any]:
+    """The samples of each cell of a plane (h, w, C), (cells, cells, C, n)."""
+    rows, columns = (max(1, side // _CELLS) for side in plane.shape[:2])
+    cut = plane[: rows * _CELLS, : columns * _CELLS].reshape(_CELLS, rows, _CELLS, columns, -1)
+    return cut.transpose(0, 2, 4, 1, 3).reshape(_CELLS, _CELLS, plane.shape[2], -1)
+
+
+def _noise(tile: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
+    """Mean and variance of the noise of the ground in each cell of a tile (h, w, C), by second differences in rows.
+
+    The ground is the half of the samples next to which, in the rows between, the light is nearest to its median: noise
+    of bright spots is not held against the ground, and what is left out does not depend on the noise.
+    """
+    rows = tile[: tile.shape[0] // 2 * 2].astype(np.float32)
+    rows, between = rows[::2], rows[1::2]
+    beside = _cells(between[:, :-2] + between[:, 1:-1] + between[:, 2:])
+    away = np.abs(beside - np.median(beside, axis=-1, keepdims=True))
+    half = max(1, away.shape[-1] // 2)
+    ground = np.argpartition(away, half - 1, axis=-1)[..., :half]
+    second = _cells(np.abs(rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]))
+    second, light = (np.take_along_axis(values, ground, axis=-1) for values in (second, _cells(rows[:, 1:-1])))
     # Squares of what is within 2.5 standard deviations, which whole numbers do not make coarse as their median is.
-    limit = np.maximum(np.median(cells, axis=-1, keepdims=True), 1.0) * (2.5 / 0.6745)
-    inside = cells <= limit
-    variance = np.where(inside, cells**2, 0.0).sum(axis=-1) / np.maximum(inside.sum(axis=-1), 1) / _TRUNCATED
-    return np.asarray(variance / 6.0)
+    inside = second <= np.maximum(np.median(second, axis=-1, keepdims=True), 1.0) * (2.5 / 0.6745)
+    variance = np.where(inside, second**2, 0.0).sum(axis=-1) / np.maximum(inside.sum(axis=-1), 1) / _TRUNCATED
+    return np.asarray(light.mean(axis=-1)), np.asarray(variance / 6.0)
 
 
 def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Illumination:
@@ -114,7 +125,7 @@ def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Il
     dark, errors, noise = np.zeros(channels), [], []
     for channel in range(channels):
         ground = shown.ground[..., channel]
-        dark[channel] = _dark_level(ground, shown.variance[..., channel])
+        dark[channel] = _dark_level(shown.light[..., channel], shown.variance[..., channel])
         whole = _fitted(ground - dark[channel])
         halves = [_fitted(ground[k::2] - dark[channel]) for k in (0, 1)] if count > 1 else [whole, 2.0 * whole]
         gain[..., channel] = np.exp(_surface(whole, x, y))
