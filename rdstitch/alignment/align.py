@@ -56,11 +56,11 @@ _ROUNDS = 3
 
 _FEW_VIEWS, _LENS_OVER_DEPTH = 3, 6.0
 """Images from more than which depth does not look like a lens; times by which a lens must make errors of depth smaller
-to be no depth itself: of published pairs with depth λ has taken the blame by up to 5.3 times, and of a pair through a
-fisheye, whose μ it leaves, it explains 7.6 times as much."""
+to be no depth itself: in published pairs with depth λ has taken the blame for up to 5.3 times what is left."""
 
-_LITTLE_DEPTH = 0.0003
-"""Diagonals of an image: errors that neighbours share beside a lens, up to which there is no depth to speak of."""
+_LITTLE_DEPTH, _LITTLE_DEPTH_PX = 0.0003, 0.3
+"""Diagonals of an image, and pixels: errors that neighbours share beside a lens, up to which there is no depth to speak
+of. Less than the noise of keypoints says nothing: published pairs with depth leave 0.6 to 1 pixel."""
 
 _AS_GOOD = 1.5
 """Errors of an earlier alignment, in units of those of pairs on their own, up to which a later one starts there."""
@@ -266,7 +266,7 @@ def _may_be_depth(
     errors = [whitened_errors(observations, fit.homographies, fit.parameters.lens) for fit in (bent, flat)]
     evidence = Evidence.of(observations, errors[0])
     with_lens, without = (evidence.cost(each).field for each in errors)
-    largest = _LITTLE_DEPTH * 2.0 * float(np.median(observations.scale2))
+    largest = max(_LITTLE_DEPTH * 2.0 * float(np.median(observations.scale2)), _LITTLE_DEPTH_PX)
     return with_lens > largest and without < _LENS_OVER_DEPTH * with_lens
 
 

@@ -2,11 +2,14 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from rdstitch.cache import NO_CACHE
+from rdstitch.errors import RegistrationError
 from rdstitch.executors import open_executor
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.source import Source, read_sources
@@ -17,7 +20,7 @@ from rdstitch.pipeline.accept import _is_of_the_whole, _is_simpler, _may_be_anot
 from rdstitch.pipeline.aligner import Aligner
 from rdstitch.pipeline.register import register
 from rdstitch.verification.findings import Finding
-from tests.cli.running import DISTORTION, flight
+from tests.cli.running import flight
 
 OPTIONS = StitchOptions(workers=1, features=FeatureOptions(max_features=600))
 
@@ -71,6 +74,65 @@ def test_motions_in_the_plane_are_compared_by_their_freedom(former: str, model: 
     assert _is_simpler(model, former) is simpler
 
 
+class _Stub(SimpleNamespace):
+    """As much of a registration of four images, the third of which is damaged, as ``accept`` asks for."""
+
+    def with_messages(self, messages: object) -> Any:
+        return _Stub(**{**vars(self), "found": messages})
+
+    @property
+    def ok(self) -> bool:
+        return not self.found
+
+
+def _stub(model: str, used: int) -> Any:
+    guard = SimpleNamespace(messages=[Message("is damaged", ("2.jpg",), code="damaged")])
+    sources = [SimpleNamespace(path=f"{k}.jpg", guard=guard) for k in range(4)]
+    alignment = SimpleNamespace(model=model, used=np.arange(4) < used)
+    return _Stub(alignment=alignment, sources=sources, pairs=(), left_out=(), found=())
+
+
+@pytest.mark.parametrize(
+    ("rest", "remaining", "fails", "left_out"),
+    [
+        ("rigid", 3, (), True),  # the damaged one alone asked for tilts
+        ("tilting", 3, (), False),
+        ("tilting", 3, (4,), True),  # the whole fails, the rest does not
+        ("tilting", 3, (3, 4), None),
+        ("rigid", 2, (), False),  # most of the images would be missing
+    ],
+)
+def test_what_is_damaged_is_left_out_where_the_others_fit_better(
+    monkeypatch: pytest.MonkeyPatch, rest: str, remaining: int, fails: tuple[int, ...], left_out: bool | None
+) -> None:
+    whole, smaller = _stub("tilting", 4), _stub(rest, remaining)
+    asked: list[_Offenders] = []
+
+    def without(_: object, offenders: _Offenders, aligner: object) -> Any:
+        asked.append(offenders)
+        return smaller
+
+    def judge(registration: Any, **_: object) -> tuple[Finding, ...]:
+        return (Finding("pattern", values={"count": 2, "of": 3}),) if registration.alignment.used.sum() in fails else ()
+
+    stage = "rdstitch.pipeline.accept"
+    monkeypatch.setattr(f"{stage}._without", without)
+    monkeypatch.setattr(f"{stage}.judge", judge)
+    monkeypatch.setattr(f"{stage}._plane_of_most", lambda *_: None)
+    monkeypatch.setattr(f"{stage}.at_full_size", lambda registration: registration)
+    aligner = Aligner.of([], OPTIONS, NO_CACHE)
+    monkeypatch.setattr(f"{stage}.Aligner.of", lambda *_, **__: aligner)
+    monkeypatch.setattr(f"{stage}.RefusedError", RegistrationError)
+    nowhere: Any = None
+    if left_out is None:
+        with pytest.raises(RegistrationError):
+            accept(whole, OPTIONS, nowhere)
+    else:
+        accepted = accept(whole, OPTIONS, nowhere)
+        assert accepted.alignment is (smaller if left_out else whole).alignment
+    assert [list(offenders.reasons) for offenders in asked[:1]] == [[2]]
+
+
 def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Path) -> None:
     """The pair of the other two images had been dropped for contradicting the third one, and 0 with it."""
     frames = flight(3, 3).write(tmp_path)
@@ -91,6 +153,21 @@ def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Pat
     assert [str(message) for message in rest.left_out] == [f"left out {frames[2]}: shows something else [left-out]"]
 
 
+def test_what_remains_has_metric_poses_where_they_are_needed(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def aligned(aligner: Aligner, pairs: object, former: object) -> Any:
+        asked.append(aligner.options.model)
+        return SimpleNamespace(poses=None if aligner.options.model == "auto" else "poses", on_sphere=False)
+
+    monkeypatch.setattr(Aligner, "_aligned", aligned)
+    monkeypatch.setattr("rdstitch.pipeline.aligner.over_rough_ground", lambda pairs, threshold: pairs)
+    free = Aligner.of([], OPTIONS, NO_CACHE)
+    assert free.align(()).alignment.poses is None
+    assert replace(free, needs_poses=True).align(()).alignment.poses is not None
+    assert asked == ["auto", "auto", "pose"]
+
+
 def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path: Path) -> None:
     """What drives ahead fills a good third of every image, and has more matches where images overlap little."""
     plane, ahead = flight(3, 3, overlap=0.4), flight(5, 3, overlap=0.4)
@@ -100,11 +177,12 @@ def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path:
     frames = plane.write(tmp_path)
     for k, frame in enumerate(frames):
         write_image(frame, np.concatenate([plane.frame(k)[:192], ahead.frame(k)[192:]]))
-    sources, options = _read(frames), replace(OPTIONS, distortion=DISTORTION)
+    sources = _read(frames)
     with open_executor(1, len(sources)) as executor:
-        found = register(sources, options, executor, skip_bad=False)
-        accepted = accept(found, options, executor)
+        found = register(sources, OPTIONS, executor, skip_bad=False)
+        accepted = accept(found, OPTIONS, executor)
     steps = [np.diff(k.alignment.homographies[:, 0, 2]) for k in (found, accepted)]
     assert np.all(np.abs(steps[0]) < 0.2)  # heights above the ground: what drives ahead moves by a sixth
-    assert np.all(np.abs(steps[1]) > 0.6)
-    assert "rival-motion" in [message.code for message in accepted.messages if message.severity == "warning"]
+    assert np.all(np.abs(steps[1]) > 0.7)
+    (message,) = accepted.messages
+    assert (message.code, message.severity) == ("rival-motion", "warning")

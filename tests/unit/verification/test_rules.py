@@ -136,6 +136,13 @@ def test_what_fills_less_than_half_of_the_images_fails(
     assert how == severity
 
 
+@pytest.mark.parametrize(("alike", "severity"), [(0.24, "failure"), (0.26, "warning")])
+def test_what_is_nearer_or_farther_is_no_second_plane(alike: float, severity: str) -> None:
+    """Where the scene has depth and the overlaps look alike; without depth neither of the two is clear."""
+    assert [how for how, _ in _of_motions(MOTION, alike, depth=True)] == [severity]
+    assert [how for how, _ in _of_motions(MOTION, alike)] == ["failure"]
+
+
 def test_the_place_is_named_and_no_distance_is_larger_than_an_image() -> None:
     ((_, text),) = _of_motions(MOTION, 0.8)
     for part in ("46%", "(30, 40) of a.png", "b.png", "120 pixels", "a mask keeps it out"):
