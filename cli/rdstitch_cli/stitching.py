@@ -174,6 +174,10 @@ def staged_beside(
     """What stages the report, and the layers where they are wanted, together with the image."""
     if whole_layers and layers is None:
         raise click.UsageError("--whole-layers goes with --layers DIR")
+    if layers is not None:
+        from rdstitch.pipeline.layers import make_folder
+
+        make_folder(layers)
 
     def stage(outputs: "Outputs", result: "StitchResult") -> None:
         report.stage(outputs, result)

@@ -36,6 +36,20 @@ def layer_files(names: list[str], folder: str | Path) -> list[Path]:
     return [Path(folder) / f"{stem}{kind}.tif" for stem in stems for kind in ("", "_mask")]
 
 
+def make_folder(folder: str | Path) -> None:
+    """Make the folder of layers, which is better known before long work than after it.
+
+    Raises
+    ------
+    OutputError
+        When that is impossible.
+    """
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot make the folder: {error.strerror}") from error
+
+
 def write_layers(
     result: StitchResult | Recomposition,
     folder: str | Path,
@@ -74,10 +88,7 @@ def write_layers(
     if outputs is None:
         with Outputs(overwrite) as own:
             return write_layers(result, folder, whole=whole, overwrite=overwrite, outputs=own)
-    try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot make the folder: {error.strerror}") from error
+    make_folder(folder)
     check_outputs(files, overwrite, [source.path for source in placed.sources])
     images = placed.images(result.canvas.near)
     with prepare_composite(images, result.canvas, replace(options, crop="none")) as prepared:

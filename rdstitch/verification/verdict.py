@@ -9,6 +9,7 @@ from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.errors import RegistrationError
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.matching.two_view import Pair
+from rdstitch.messages import Message
 from rdstitch.registration import Registration
 from rdstitch.verification import rules
 from rdstitch.verification.evidence import Evidence
@@ -26,8 +27,10 @@ class RefusedError(RegistrationError):
     code = "not-reliable"
 
     def __init__(self, registration: Registration) -> None:
-        first = {message.kind or message.text: message for message in reversed(registration.failures)}
-        chosen = [message for message in registration.failures if message in first.values()][: rules.MAX_WARNINGS]
+        first: dict[str, Message] = {}
+        for message in registration.failures:
+            first.setdefault(message.kind or message.text, message)
+        chosen = list(first.values())[: rules.MAX_WARNINGS]
         reasons = "; ".join(message.clause for message in chosen)
         if rest := len(registration.failures) - len(chosen):
             reasons += f"; and {rest} more like {'these' if len(chosen) > 1 else 'this'}"

@@ -59,6 +59,16 @@ def test_what_is_there_is_kept(rdstitch: Run, frames: list[Path], tmp_path: Path
     assert rdstitch("mosaic", frames[0].parent, "-o", tmp_path / "b.png", "--whole-layers", *CACHED).status == 2
 
 
+def test_a_folder_that_cannot_be_made_is_refused_before_the_work(
+    rdstitch: Run, frames: list[Path], tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_bytes(b"mine")
+    done = rdstitch("mosaic", frames[0].parent, "-o", tmp_path / "a.png", "--layers", tmp_path / "file", *CACHED)
+    assert done.status == 6
+    assert "cannot make the folder" in done.line
+    assert not (tmp_path / "a.png").exists()
+
+
 def test_sixteen_bits_of_four_bands_keep_them(tmp_path: Path) -> None:
     pixels = np.random.default_rng(0).integers(0, 65535, (5, 7, 4), dtype=np.uint16)
     alpha = np.full((5, 7), 255, np.uint8)

@@ -89,7 +89,7 @@ def tiles(
     reporter: Reporter,
     **given: Any,
 ) -> None:
-    """Stitch tiles that a motorised stage, a scanner or a gantry took at places known about.
+    """Stitch tiles that a motorised stage, a scanner or a gantry took at roughly known places.
 
     Neighbours are registered by correlation, so that dark tiles with little in them will do; tiles that show nothing
     keep their places. Samples stay as they were measured: images are cut where they meet, neither blended nor
