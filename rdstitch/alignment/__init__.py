@@ -2,7 +2,7 @@
 
 from rdstitch.alignment.align import align, most_matches_read
 from rdstitch.alignment.lens_selection import LENSES
-from rdstitch.alignment.model_family import MODELS
+from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.options import AlignmentOptions
 from rdstitch.alignment.result import Alignment
 from rdstitch.matching.links import Link

@@ -16,12 +16,11 @@ from rdstitch.alignment.bundle_adjustment import (
 )
 from rdstitch.alignment.camera_priors import CameraPriors
 from rdstitch.alignment.cycle_consistency import link_medians
-from rdstitch.alignment.initialization import MAX_ITERATIONS, adjust_pairs_independently
+from rdstitch.alignment.initialization import independent_pairs
 from rdstitch.alignment.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.metric_upgrade import metric_upgrade
 from rdstitch.alignment.motion_models import (
     HOMOGRAPHY,
-    POSE,
     PSI,
     SIMILARITY,
     THETA,
@@ -30,7 +29,6 @@ from rdstitch.alignment.motion_models import (
 )
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.planarity import coherence
-from rdstitch.alignment.rotation_model import FOCAL_STARTS
 from rdstitch.alignment.warm_start import WarmStart
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.matching.match_graph import spanning_tree
@@ -42,8 +40,8 @@ _WIDEST_START = 0.05
 _LONG_CHAIN = 60
 """Images over which chained homographies drift so far that a planar model is the better start."""
 
-_TRIAL_LINKS, _TRIAL_MATCHES, _TRIAL_ITERATIONS = 30, 40, 8
-"""What the tilts to start from are tried on, and how long."""
+_TRIAL_LINKS, _TRIAL_MATCHES = 30, 40
+"""What the shared parameters to start from are tried on."""
 
 POSE_TILT_SPREAD = math.radians(35.0)
 """Of images of which nothing is known: half of the tilts lie below 40 degrees."""
@@ -121,15 +119,15 @@ class Problem:
 
         The links start from ``shared`` parameters where these are known, otherwise from the best of several.
         """
-        if not others and not model.shared_names and self.count > _LONG_CHAIN:
+        if not others and not model.one_camera and self.count > _LONG_CHAIN:
             others = [self.fit(SIMILARITY)]
         starts = [self.taken_over(model, other) for other in others]
         if self.warm is not None and isinstance(model, PlanarModel):
             spread = self.warm.tilt_spread if model is self.warm.model else None
             return self.refine(model, self._nearest(model, [self.warm.start_of(model), *starts]), spread)
-        if model is POSE:
-            starts.append(self._upgraded())
-        elif not (others and self._has_free_tilts(model)):
+        if model.any_tilt:
+            starts.append(self._upgraded(model))
+        elif not (others and model.free_tilts):
             starts.append(self._chained(model, others, shared))
         return self.refine(model, self._nearest(model, starts))
 
@@ -161,12 +159,12 @@ class Problem:
         return sigma_of(squared[self.observations.scale_inliers_mask])
 
     def _refined(self, model: MotionModel, start: Parameters, tilt_spread: float | None) -> Fit:
-        if model is POSE and self.camera_priors.attitudes_std is None:
+        if model.any_tilt and self.camera_priors.attitudes_std is None:
             return Fit(model, self._run(model, start, POSE_TILT_SPREAD), self.free_lens, POSE_TILT_SPREAD)
-        if not self._has_free_tilts(model) or self.camera_priors.attitudes_std is not None:
+        if not model.free_tilts or self.camera_priors.attitudes_std is not None:
             spread = self.camera_priors.attitudes_std or 0.0
             adjusted = self._run(model, start, spread)
-            if not self._has_free_tilts(model):
+            if not model.free_tilts:
                 return Fit(model, adjusted, self.free_lens)
             again = self._run(model, adjusted.parameters, spread)  # attitudes are divided by the focal length
             return Fit(model, again, self.free_lens, spread)
@@ -184,10 +182,6 @@ class Problem:
         """The same model with more of the lens free."""
         wider = replace(self, free_lens=self.free_lens | lens)
         return wider.refine(fit.model, fit.adjusted.parameters, fit.tilt_spread)
-
-    @staticmethod
-    def _has_free_tilts(model: MotionModel) -> bool:
-        return PSI in getattr(model, "free", ())
 
     def _run(self, model: MotionModel, start: Parameters, tilt_spread: float) -> BundleAdjustmentResult:
         adjuster = self.adjuster(model, tilt_spread, start.shared)
@@ -214,80 +208,69 @@ class Problem:
         """Every link on its own, chained along the tree of the links trusted most."""
         o, attitudes = self.observations, self.camera_priors.attitudes
         shared, lens, homographies = np.zeros(0), self.lens, self.homographies
-        if model.shared_names:
-            apart = self._links_apart(SIMILARITY if self._has_free_tilts(model) else model, others, start)
-            shared, lens, homographies = apart.parameters.shared, apart.parameters.lens, apart.homographies
+        if model.one_camera:
+            shared, lens, homographies = self._links_apart(SIMILARITY if model.free_tilts else model, others, start)
         tree = spanning_tree(self.count, o.image1, o.image2, self.trust, self.reference)
         origin = model.origins(shared, attitudes[[tree.root]])[0]
         chained = tree.chained(homographies, o.image1, origin)
         return Parameters(model.nearest_poses(chained, shared, attitudes), shared, lens)
 
-    def _upgraded(self) -> Parameters:
+    def _upgraded(self, model: MotionModel) -> Parameters:
         """Chained homographies with the metric of the plane that makes them images of one camera."""
         o, prior = self.observations, self.camera_priors
         tree = spanning_tree(self.count, o.image1, o.image2, self.trust, self.reference)
         chained = tree.chained(self.homographies, o.image1, np.eye(3))
         upgraded = metric_upgrade(chained, tree.root, prior.log_focal, prior.log_focal_std)
-        shared = POSE.shared_from_physical(np.array([*upgraded.tilt, upgraded.log_focal]))
+        shared = model.shared_from_physical(np.array([*upgraded.tilt, upgraded.log_focal]))
         return Parameters(upgraded.poses, shared, self.lens)
 
     def _links_apart(
         self, model: MotionModel, others: Sequence[Fit], start: FloatArray | None
-    ) -> BundleAdjustmentResult:
-        """Every link on its own, from given shared parameters, those of another planar model or the best of several."""
-        priors = self.camera_priors.priors(model, self.count, _TILT_SPREAD_START)
-        planar = [other for other in others if other.model.shared_names]
-        best = start
-        if best is None:
-            best = (planar[-1].adjusted if planar else self.trial(model)).parameters.shared
-        return adjust_pairs_independently(
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Shared parameters, lens and homographies (L, 3, 3) of every link on its own under one camera.
+
+        From given shared parameters, those of another planar model, or the best of several.
+        """
+        known = self.camera_priors
+        planar = [other for other in others if other.model.one_camera]
+        if start is None:
+            start = (planar[-1].adjusted if planar else self.trial(model)).parameters.shared
+        if len(self.observations) == 1:  # which on its own is the whole
+            return start, self.lens, self.homographies
+        adjuster, at = independent_pairs(
             model,
             self.observations,
             self.homographies,
-            best,
+            start,
             self.lens,
             self.free_lens,
-            priors,
-            self.camera_priors.attitudes,
+            known.priors(model, self.count, _TILT_SPREAD_START),
+            known.attitudes,
         )
+        apart = adjuster.run(at)
+        return apart.parameters.shared, apart.parameters.lens, apart.homographies
 
     def trial(self, model: MotionModel) -> BundleAdjustmentResult:
-        """A few links on their own, from the best of several shared parameters."""
-        priors = self.camera_priors.priors(model, self.count, _TILT_SPREAD_START)
-        links = len(self.observations)
+        """A few links on their own, from the shared parameters that come nearest to them without adjustment."""
+        known, links = self.camera_priors, len(self.observations)
+        priors = known.priors(model, self.count, _TILT_SPREAD_START)
         few = np.linspace(0, links - 1, min(links, _TRIAL_LINKS)).astype(np.intp)
         sample, own = self.observations.subset(few).thinned(_TRIAL_MATCHES), self.homographies[few]
-
-        def adjusted(shared: FloatArray, lens: FloatArray, iterations: int) -> BundleAdjustmentResult:
-            return adjust_pairs_independently(
-                model, sample, own, shared, lens, self.free_lens, priors, self.camera_priors.attitudes, iterations
-            )
-
-        starts = self._shared_to_try(model)
-        if len(starts) == 1:
-            return adjusted(starts[0], self.lens, MAX_ITERATIONS)
-        trials = [adjusted(shared, self.lens, _TRIAL_ITERATIONS) for shared in starts]
-        width = ALIGNMENT_WIDTH * min(trial.sigma for trial in trials)
-        cost = [float(robust_cost(trial.squared, width).sum()) for trial in trials]
-        best = trials[int(np.argmin(cost))].parameters
-        return adjusted(best.shared, best.lens, MAX_ITERATIONS)
-
-    def _shared_to_try(self, model: MotionModel) -> list[FloatArray]:
-        """Focal lengths; or shared parameters for the known or zero tilt, and for four around it, 0.2 radians away."""
-        known = self.camera_priors
-        if model.on_sphere:
-            return [np.array([log_focal]) for log_focal in (known.log_focal, *FOCAL_STARTS)]
-        steps = np.array([(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2)])
-        if known.tilt_known:
-            steps = steps[:1]
-        return [model.shared_from_physical(np.array([*(known.tilt + step), known.log_focal])) for step in steps]
+        trials = [
+            independent_pairs(model, sample, own, shared, self.lens, self.free_lens, priors, known.attitudes)
+            for shared in model.shared_starts(known.log_focal, known.tilt, tilt_known=known.tilt_known)
+        ]
+        squared = [adjuster.squared(start) for adjuster, start in trials]
+        width = ALIGNMENT_WIDTH * min(map(sigma_of, squared))
+        adjuster, start = trials[int(np.argmin([robust_cost(each, width).sum() for each in squared]))]
+        return adjuster.run(start)
 
     def taken_over(self, model: MotionModel, other: Fit) -> Parameters:
         """Another model's solution as this model's start."""
         parameters = other.adjusted.parameters
         if isinstance(model, PlanarModel) and isinstance(other.model, PlanarModel):
             return replace(parameters, poses=model.taken_over(other.model, parameters.poses, parameters.shared))
-        shared = parameters.shared if model.shared_names else np.empty(0)
+        shared = parameters.shared if model.one_camera else np.empty(0)
         poses = model.nearest_poses(other.adjusted.matrices.matrices, shared, self.camera_priors.attitudes)
         return Parameters(poses, shared, parameters.lens)
 
@@ -305,9 +288,10 @@ def homography_apart(
 ) -> BundleAdjustmentResult:
     """Every link on its own with a homography: what is wrong with a link shows nowhere else."""
     priors = known.priors(HOMOGRAPHY, 0, 0.0)
-    return adjust_pairs_independently(
+    adjuster, at = independent_pairs(
         HOMOGRAPHY, observations, homographies, np.empty(0), lens, free_lens, priors, known.attitudes
     )
+    return adjuster.run(at)
 
 
 def thin_for_selection(links: int) -> int:

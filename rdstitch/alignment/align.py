@@ -21,6 +21,7 @@ from rdstitch.alignment.finer_lens import with_third_coefficient
 from rdstitch.alignment.initialization import relations_at
 from rdstitch.alignment.lens_selection import choose_lens, left_coherence
 from rdstitch.alignment.link_equations import whitened_errors
+from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.noise_model import EXACTNESS, noise_of_links
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.options import AlignmentOptions
@@ -29,7 +30,6 @@ from rdstitch.alignment.position_priors import hold_positions
 from rdstitch.alignment.priors import LENS
 from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief
 from rdstitch.alignment.result import Alignment
-from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.alignment.select import ModelChoice, select_model
 from rdstitch.alignment.warm_start import WarmStart
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
@@ -142,7 +142,7 @@ def align(
     choice = choose_over_relief(graph.problem(~wrong, images)[0], choice, options.models)
 
     report("adjustment")
-    if choice.fit.model is ROTATION and most_matches_read(len(links), options) is None:
+    if choice.fit.model.on_sphere and most_matches_read(len(links), options) is None:
         # Few images of a turn hardly determine the focal length; all their matches are used.
         everything, _ = _observations(links, cameras, _MATCHES_OF_A_TURN // len(links))
     full = replace(graph, observations=everything, free_lens=choice.fit.free_lens)
@@ -240,7 +240,7 @@ def _choose_from(
     sigma = sigma_of(squared)
     if misfitting_links(squared, problem.observations).any() or sigma > _AS_GOOD * math.hypot(noise, EXACTNESS):
         return None
-    planar = [name for name in options.models if name != ROTATION.name]  # what came before was no turn
+    planar = [name for name in options.models if not MODELS[name].on_sphere]  # what came before was no turn
     choice = select_model(replace(problem, warm=warm), planar, refinements)
     costs = [robust_cost(errors, ALIGNMENT_WIDTH * sigma).sum() for errors in (choice.fit.adjusted.squared, squared)]
     return choice if choice.fit.model is warm.model and costs[0] <= costs[1] else None

@@ -12,9 +12,8 @@ from itertools import product
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.motion_models import POSE, PSI, THETA, PlanarModel
+from rdstitch.alignment.motion_models import MODELS, POSE, PSI, THETA, PlanarModel
 from rdstitch.alignment.options import AlignmentOptions
-from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.alignment.select import select_model
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.messages import Message
@@ -63,10 +62,10 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
         known, attitudes=np.zeros_like(known.attitudes), attitudes_std=None, tilt=(0.0, 0.0), tilt_known=False
     )
     bare = replace(problem, camera_priors=nothing)
-    fit = select_model(bare, [name for name in without.models if name != ROTATION.name]).fit
+    fit = select_model(bare, [name for name in without.models if not MODELS[name].on_sphere]).fit
     if not isinstance(fit.model, PlanarModel):
         return None
-    if PSI in fit.model.free and fit.model is not POSE:  # whose prior draws tilts together
+    if fit.model.free_tilts and not fit.model.any_tilt:  # whose prior draws tilts together
         fit = bare.refine(POSE, bare.taken_over(POSE, fit))
     shown = _ShownTilts.of(bare, fit, free_mount=options.tilt is None)
     stated = options.attitudes_std if options.attitudes is not None else 0.0

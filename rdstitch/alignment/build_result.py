@@ -18,7 +18,6 @@ from rdstitch.alignment.noise_model import EXACTNESS
 from rdstitch.alignment.planarity import coherence, judge_relief
 from rdstitch.alignment.result import CONTRADICTS, Alignment, LinkFit, PlanarPoses, ShapeTest
 from rdstitch.alignment.rotation_frame import levelled
-from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.alignment.sandwich import sandwich_covariance
 from rdstitch.alignment.select import ModelChoice
 from rdstitch.alignment.shape_test import judge_shape
@@ -94,7 +93,7 @@ def build_alignment(found: AdjustedImages) -> Alignment:
     covariance = _covariance(found)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     names = (*fit.model.shared_names, *_names_of(problem.free_lens))
-    focal = float(np.exp(shared[-1])) if fit.model.shared_names else None
+    focal = float(np.exp(shared[-1])) if fit.model.one_camera else None
     lens_covariance = _lens_covariance(names, covariance)
     # What is reported is how far points are off, whatever moved them.
     observations = replace(problem.observations, relief=None)
@@ -156,7 +155,7 @@ def build_alignment(found: AdjustedImages) -> Alignment:
 def _shape(found: AdjustedImages) -> ShapeTest | None:
     """Whether the whole may be bent, with the image's index among all."""
     fit = found.choice.fit
-    if fit.model is ROTATION or not found.observable:
+    if fit.model.on_sphere or not found.observable:
         return None
     images = found.images
     judged = judge_shape(found.problem, fit, [found.cameras[k] for k in images])
@@ -224,7 +223,7 @@ def _in_frame_of_reference(found: AdjustedImages) -> tuple[FloatArray, PlanarPos
     count, fit, reference = len(found.cameras), found.choice.fit, found.problem.reference
     matrices = fit.adjusted.matrices.matrices
     homographies = np.full((count, 3, 3), np.nan)
-    if fit.model is ROTATION:
+    if fit.model.on_sphere:
         gravity = None if found.gravity is None else found.gravity[found.images]
         homographies[found.images] = levelled(matrices, reference, gravity)
         return homographies, None
@@ -281,8 +280,8 @@ def _link_fits(found: AdjustedImages, squared: FloatArray, agreeing: BoolArray) 
 
 def _overruled_focal(found: AdjustedImages, camera: Camera) -> str | None:
     """That the images show another focal length than EXIF says, where they do."""
-    given, shared = found.problem.camera_priors, found.choice.fit.model.shared_names
-    if given.focal_source != "exif" or not shared or camera.focal is None:
+    given = found.problem.camera_priors
+    if given.focal_source != "exif" or not found.choice.fit.model.one_camera or camera.focal is None:
         return None
     ratio = camera.focal / camera.half_diagonal / math.exp(given.log_focal)
     if abs(math.log(ratio)) < math.log(_OVERRULED):

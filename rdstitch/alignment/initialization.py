@@ -11,7 +11,6 @@ import numpy as np
 
 from rdstitch.alignment.bundle_adjustment import (
     BundleAdjuster,
-    BundleAdjustmentResult,
     FreeParameters,
     Parameters,
     Priors,
@@ -49,7 +48,7 @@ def relations_at(observations: Observations, relations: Sequence[RadialHomograph
     return result
 
 
-def adjust_pairs_independently(
+def independent_pairs(
     model: MotionModel,
     observations: Observations,
     homographies: FloatArray,
@@ -59,8 +58,8 @@ def adjust_pairs_independently(
     priors: Priors,
     attitudes: FloatArray,
     iterations: int = MAX_ITERATIONS,
-) -> BundleAdjustmentResult:
-    """Adjust every link on its own, with the shared parameters in common.
+) -> tuple[BundleAdjuster, Parameters]:
+    """Return the adjustment of every link on its own, with the shared parameters in common, and where it starts.
 
     Parameters
     ----------
@@ -85,4 +84,4 @@ def adjust_pairs_independently(
     none = Priors.none(model, count)
     known = replace(none, shared=priors.shared, lens=priors.lens)
     freedom = FreeParameters.fixing(model, count, list(range(0, count, 2)), free_lens)
-    return BundleAdjuster(model, apart, freedom, known, max_iterations=iterations).run(start)
+    return BundleAdjuster(model, apart, freedom, known, max_iterations=iterations), start

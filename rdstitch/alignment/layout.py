@@ -32,7 +32,7 @@ def stretch(fit: Fit) -> float:
     rays = np.column_stack([undistorted, np.ones(len(_GRID))])
     matrices = fit.adjusted.matrices.matrices
     to_plane = inverses(matrices)
-    if fit.model.shared_names:
+    if fit.model.one_camera:
         return _ratio(rays, to_plane)
     return min(_ratio(rays, frame @ to_plane) for frame in matrices[:: -(-len(matrices) // _FRAMES)])
 

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from rdstitch.alignment.camera_priors import CameraPriors, known_focal
 from rdstitch.alignment.lens_selection import LENSES
-from rdstitch.alignment.model_family import MODELS
+from rdstitch.alignment.motion_models import MODELS
 from rdstitch.camera import Camera
 from rdstitch.errors import ArgumentError
 

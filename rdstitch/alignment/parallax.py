@@ -8,7 +8,6 @@ import numpy as np
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, BundleAdjustmentResult
 from rdstitch.alignment.link_equations import LinearizedErrors, split_lens
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PlanarModel, X, Y, inverses
-from rdstitch.alignment.rotation_model import ROTATION
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.division_model import distort, undistort
 from rdstitch.radial_homography import project
@@ -53,7 +52,7 @@ class Parallax:
     @property
     def is_turn(self) -> bool:
         """Whether places are directions."""
-        return self.adjuster.model is ROTATION
+        return self.adjuster.model.on_sphere
 
     @cached_property
     def size(self) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.lens_selection import left_coherence
 from rdstitch.alignment.link_equations import linearized_errors
-from rdstitch.alignment.motion_models import POSE, SIMILARITY, TILTING, PlanarModel
+from rdstitch.alignment.motion_models import SIMILARITY, TILTING, PlanarModel
 from rdstitch.alignment.noise_model import noise_of_links
 from rdstitch.alignment.parallax import Parallax
 from rdstitch.alignment.planarity import judge_relief
@@ -58,7 +58,7 @@ def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[st
     fits: list[Fit] = []
     # From the least free one: a camera that is free to tilt has already followed the hills.
     for model in (SIMILARITY, TILTING):
-        if model.name in names and choice.fit.model is not POSE:
+        if model.name in names and not choice.fit.model.any_tilt:
             start = problem.refine(model, problem.taken_over(model, fits[-1])) if fits else problem.fit(model)
             problem, fit = _settled(problem, start)
             fits.append(fit)

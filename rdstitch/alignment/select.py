@@ -22,8 +22,7 @@ from rdstitch.alignment.evidence import ErrorCost, Evidence
 from rdstitch.alignment.layout import MAX_STRETCH, stretch
 from rdstitch.alignment.lens_selection import shows_center
 from rdstitch.alignment.link_equations import whitened_errors
-from rdstitch.alignment.model_family import MODELS
-from rdstitch.alignment.motion_models import HOMOGRAPHY, LOG_HEIGHT, POSE, PSI, THETA, MotionModel, PlanarModel
+from rdstitch.alignment.motion_models import MODELS, MotionModel
 from rdstitch.arrays import BoolArray, FloatArray
 
 _MIN_RATIO = 3.0
@@ -132,7 +131,7 @@ class Posterior:
 
     def suffices(self, best: Hypothesis, model: MotionModel) -> bool:
         """Whether a freer model could not be taken, even if it left the errors that links leave on their own."""
-        if model is HOMOGRAPHY and not _is_beyond_one_camera(self, best, self.least.field):
+        if not model.one_camera and not _is_beyond_one_camera(self, best, self.least.field):
             return True
         return not best.absurd and best.score <= self.least.cost + self.price(
             model, self.problem.free_lens, self.least.count
@@ -165,7 +164,7 @@ def select_model(
         if len(names) == 1 or trial.sigma <= posterior.largest_trial:
             tried.append(posterior.of(problem.fit(turn, shared=trial.parameters.shared)))
     for model in [MODELS[name] for name in names if not MODELS[name].on_sphere]:
-        if problem.count == 2 and PSI in getattr(model, "free", ()) and HOMOGRAPHY.name in names:
+        if problem.count == 2 and model.free_tilts and not all(MODELS[name].one_camera for name in names):
             continue  # with two images, one camera that tilts is a homography
         if tried and posterior.suffices(min(tried, key=_score), model):
             break
@@ -201,8 +200,8 @@ def _with_wider_lenses(
 
 def _best(posterior: Posterior, tried: Sequence[Hypothesis]) -> Hypothesis:
     """The one with the best score; where a plane has an absurd layout, a turn that joins the images."""
-    cameras = [one for one in tried if one.fit.model is not HOMOGRAPHY]
-    free = [one for one in tried if one.fit.model is HOMOGRAPHY]
+    cameras = [one for one in tried if one.fit.model.one_camera]
+    free = [one for one in tried if not one.fit.model.one_camera]
     best = min(cameras or free, key=_score)
     largest = _TOLERABLE * posterior.evidence.farthest
     turns = [one for one in tried if one.fit.model.on_sphere and one.field < largest]
@@ -223,22 +222,21 @@ def _is_beyond_one_camera(posterior: Posterior, best: Hypothesis, free: float) -
 def parameter_count(problem: Problem, model: MotionModel, free_lens: BoolArray) -> int:
     """Number of free parameters; in the pose model the shared tilt is only the mean of those of the images."""
     poses = problem.count * model.pose_size - int(model.gauge.sum())
-    return poses + len(model.shared_names) + int(free_lens.sum()) - (2 if model is POSE else 0)
+    return poses + len(model.shared_names) + int(free_lens.sum()) - (2 if model.any_tilt else 0)
 
 
 def has_plausible_focal(fit: Fit) -> bool:
     """Whether a lens can have the focal length of a fit: over relief, small tilts may ask for any."""
-    if not fit.model.shared_names:
+    if not fit.model.one_camera:
         return True
     focal = math.exp(float(fit.model.physical_parameters(fit.adjusted.parameters.shared)[0][-1]))
     return _FOCAL_LIMITS[0] < focal < _FOCAL_LIMITS[1]
 
 
 def _choice(posterior: Posterior, tried: Sequence[Hypothesis], best: Hypothesis, *, requested: bool) -> ModelChoice:
-    overdispersion = best.fit.overdispersion
-    what = (
-        f"{best.fit.model.name}: {_description(best.fit)}; it leaves an error of {best.fit.adjusted.sigma:.2f} pixels"
-    )
+    overdispersion, adjusted = best.fit.overdispersion, best.fit.adjusted
+    described = best.fit.model.description(adjusted.parameters.poses, adjusted.parameters.shared)
+    what = f"{best.fit.model.name}: {described}; it leaves an error of {adjusted.sigma:.2f} pixels"
     if requested:
         return ModelChoice(best.fit, f"{what}; as requested", overdispersion)
     others = [one for one in tried if one is not best]
@@ -248,21 +246,3 @@ def _choice(posterior: Posterior, tried: Sequence[Hypothesis], best: Hypothesis,
         for one in others
     ]
     return ModelChoice(best.fit, f"{what} (others: {'; '.join(listed)})" if listed else what, overdispersion)
-
-
-def _description(fit: Fit) -> str:
-    """What a model says of the camera."""
-    if fit.model.on_sphere:
-        return "the camera turned on the spot"
-    if not isinstance(fit.model, PlanarModel):
-        several = len(fit.adjusted.parameters.poses) > 2
-        return "no camera with one focal length explains the images" if several else "two images need no more"
-    parts = ["height and tilt stay the same"]
-    if LOG_HEIGHT in fit.model.free:
-        heights = float(np.std(fit.adjusted.parameters.poses[:, LOG_HEIGHT]))
-        parts = [f"heights differ by {heights:.0%}", "the tilt stays the same"]
-    if PSI in fit.model.free:
-        tilts = fit.model.metric_poses(fit.adjusted.parameters.poses, fit.adjusted.parameters.shared)[:, [PSI, THETA]]
-        largest = math.degrees(float(np.arccos(np.cos(tilts).prod(axis=1)).max()))
-        parts[1] = f"tilted by up to {largest:.0f} degrees"
-    return ", ".join(parts)

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment.bundle_adjustment import Parameters
-from rdstitch.alignment.motion_models import LOG_HEIGHT, PLANAR_MODELS, PSI, THETA, PlanarModel, X, Y
+from rdstitch.alignment.motion_models import LOG_HEIGHT, MODELS, PSI, THETA, PlanarModel, X, Y
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.camera import Camera
@@ -43,7 +43,7 @@ class WarmStart:
 
         What is not free of the lens (5,) stays as given.
         """
-        model = PLANAR_MODELS.get(former.model)
+        model = MODELS[former.model]
         poses, tilt, focal = former.poses, former.tilt, former.focal
         same = np.array_equal(np.flatnonzero(former.used), images)
         if not isinstance(model, PlanarModel) or poses is None or tilt is None or focal is None or not same:

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from rdstitch.alignment.motion_models import PLANAR_MODELS
+from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.cache import Cache
@@ -140,8 +140,8 @@ def _without_damage(registration: Registration, aligner: Aligner) -> Registratio
 
 def _is_simpler(model: str, former: str) -> bool:
     """Whether a motion in the plane has less freedom than a former one."""
-    by_freedom = list(PLANAR_MODELS)
-    return {model, former} <= PLANAR_MODELS.keys() and by_freedom.index(model) < by_freedom.index(former)
+    by_freedom = [name for name, each in MODELS.items() if not each.on_sphere]
+    return {model, former} <= set(by_freedom) and by_freedom.index(model) < by_freedom.index(former)
 
 
 def _fails(found: Iterable[Finding]) -> bool:

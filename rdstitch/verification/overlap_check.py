@@ -8,8 +8,8 @@ from itertools import chain
 
 import numpy as np
 
+from rdstitch.alignment.motion_models.rotation import nearest_rotation
 from rdstitch.alignment.result import LinkFit
-from rdstitch.alignment.rotation_model import nearest_rotation
 from rdstitch.arrays import FloatArray
 from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.camera import Camera

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rdstitch.alignment.model_family import MODELS
+from rdstitch.alignment.motion_models import MODELS
 from rdstitch.camera import Camera
 from rdstitch.features import FeatureOptions
 from rdstitch.pipeline import StitchOptions, pano

@@ -5,7 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from rdstitch.alignment.motion_models import _TRACELESS, HOMOGRAPHY, SIMILARITY, TILTING, inverses
+from rdstitch.alignment.motion_models import HOMOGRAPHY, SIMILARITY, TILTING, inverses
+from rdstitch.alignment.motion_models.homography import _TRACELESS
 from rdstitch.matching.thinning import spread_choice
 
 

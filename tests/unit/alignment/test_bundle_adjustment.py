@@ -5,7 +5,7 @@ import pytest
 
 from rdstitch.alignment.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters, Priors, sigma_of
 from rdstitch.alignment.link_equations import link_equations
-from rdstitch.alignment.motion_models import HOMOGRAPHY, PLANAR_MODELS, RIGID, TILTING, MotionModel
+from rdstitch.alignment.motion_models import HOMOGRAPHY, MODELS, RIGID, TILTING, MotionModel
 from rdstitch.alignment.normal_equations import chain
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.pose_blocks import PoseBlocks
@@ -37,7 +37,7 @@ def test_the_weight_of_an_error_is_the_derivative_of_its_loss() -> None:
 
 
 @pytest.mark.parametrize("width", [2.0, 20.0])  # px; the errors at the start are of some twenty
-@pytest.mark.parametrize("model", PLANAR_MODELS.values(), ids=PLANAR_MODELS)
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 def test_gradient_and_curvature_of_the_whole_cost(model: MotionModel, width: float) -> None:
     """Against differences of the robust cost, with the whitening held as the adjustment holds it."""
     truth = _scene()

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rdstitch.alignment.bundle_adjustment import Priors
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links, triangles
-from rdstitch.alignment.initialization import adjust_pairs_independently, relations_at
+from rdstitch.alignment.initialization import independent_pairs, relations_at
 from rdstitch.alignment.motion_models import HOMOGRAPHY, Y
 from rdstitch.alignment.observations import Observations
 from rdstitch.arrays import BoolArray
@@ -93,7 +93,7 @@ def _judged(given: Scene, links: list[Link]) -> tuple[BoolArray, NDArray[np.intp
     observations = Observations.from_links(links, given.cameras)
     lens = np.zeros(len(LENS_PARAMETERS))
     lens[0] = given.distortion
-    apart = adjust_pairs_independently(
+    adjuster, start = independent_pairs(
         HOMOGRAPHY,
         observations,
         relations_at(observations, [link.relation for link in links], lens),
@@ -103,4 +103,4 @@ def _judged(given: Scene, links: list[Link]) -> tuple[BoolArray, NDArray[np.intp
         Priors.none(HOMOGRAPHY, 0),
         np.zeros((9, 2)),
     )
-    return cycle_consistency(apart, observations, len(given.cameras))
+    return cycle_consistency(adjuster.run(start), observations, len(given.cameras))

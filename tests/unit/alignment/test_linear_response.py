@@ -14,7 +14,7 @@ from rdstitch.alignment.bundle_adjustment import (
 )
 from rdstitch.alignment.linear_response import LinearResponse
 from rdstitch.alignment.link_equations import LinearizedErrors, whitened_errors
-from rdstitch.alignment.motion_models import PLANAR_MODELS, MotionModel, inverses
+from rdstitch.alignment.motion_models import MODELS, MotionModel, inverses
 from rdstitch.alignment.observations import Observations
 from rdstitch.alignment.priors import Prior
 from rdstitch.arrays import FloatArray
@@ -37,7 +37,7 @@ def _adjusted(model: MotionModel) -> tuple[BundleAdjuster, BundleAdjustmentResul
     return adjuster, adjuster.run(Parameters(poses, shared, np.array([-0.25, 0.0, 0.0, 0.0, 0.0])))
 
 
-@pytest.mark.parametrize("model", PLANAR_MODELS.values(), ids=PLANAR_MODELS)
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 def test_changes_are_the_derivatives_of_the_errors(model: MotionModel) -> None:
     adjuster, adjusted = _adjusted(model)
     response, rng = LinearResponse.of(adjuster, adjusted), np.random.default_rng(0)
@@ -62,7 +62,7 @@ def test_changes_are_the_derivatives_of_the_errors(model: MotionModel) -> None:
 @pytest.mark.parametrize("model", ["similarity", "tilting"])
 def test_steps_are_what_adjusting_anew_finds(model: str) -> None:
     """The points of image 2 are moved by waves as large as the noise."""
-    adjuster, adjusted = _adjusted(PLANAR_MODELS[model])
+    adjuster, adjusted = _adjusted(MODELS[model])
     response, observations = LinearResponse.of(adjuster, adjusted), adjuster.observations
     wave = 0.3 * np.stack([np.sin(9.0 * observations.points2[:, 1]), np.cos(7.0 * observations.points2[:, 0])], axis=1)
     moved = replace(observations, points2=observations.points2 + wave / observations.scale2[0])
@@ -86,7 +86,7 @@ def test_steps_are_what_adjusting_anew_finds(model: str) -> None:
 
 def test_the_curvature_of_normal_errors_is_that_of_their_distribution() -> None:
     """``∫ (w + r² w') / ∫ w`` over ``t = r²/2``, which has the density exp(-t)."""
-    adjuster, adjusted = _adjusted(PLANAR_MODELS["similarity"])
+    adjuster, adjusted = _adjusted(MODELS["similarity"])
     t = np.linspace(0.0, 40.0, 40_001)
     ratio = 1.0 / (1.0 + 2.0 * t / 3.5**2)
     expected = float((np.exp(-t) * ratio**2 * (2.0 * ratio - 1.0)).sum() / (np.exp(-t) * ratio**2).sum())

@@ -6,7 +6,7 @@ import pytest
 from rdstitch.alignment.motion_models import (
     HOMOGRAPHY,
     LOG_HEIGHT,
-    PLANAR_MODELS,
+    MODELS,
     RIGID,
     SIMILARITY,
     TILTING,
@@ -22,14 +22,12 @@ SIGNS = np.array([[1.0], [-1.0]])
 
 def _some(model: MotionModel, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Poses and shared parameters."""
-    if not model.shared_names:
-        return (np.eye(3) + 0.2 * rng.normal(size=(count, 3, 3))).reshape(-1, 9), np.zeros(0)
-    poses = np.zeros((count, 6))
     shared = model.shared_from_physical(np.array([0.05, -0.08, np.log(1.4)]))
+    poses = model.nearest_poses(np.tile(np.eye(3), (count, 1, 1)), shared, np.zeros((count, 2)))
     return model.retract(poses, 0.3 * rng.normal(size=(count, model.pose_size))), shared
 
 
-@pytest.mark.parametrize("model", PLANAR_MODELS.values(), ids=PLANAR_MODELS)
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 def test_derivatives_are_those_of_the_matrices(model: MotionModel) -> None:
     rng = np.random.default_rng(0)
     poses, shared = _some(model, 4, rng)

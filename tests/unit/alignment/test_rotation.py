@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from rdstitch.alignment import AlignmentOptions, align
+from rdstitch.alignment.motion_models.rotation import ROTATION, nearest_rotation, rotation_from_vector
 from rdstitch.alignment.rotation_frame import level_frame
-from rdstitch.alignment.rotation_model import ROTATION, nearest_rotation, rotation_from_vector
 from rdstitch.camera import Camera
 from rdstitch.matching.links import Link
 from rdstitch.radial_homography import RadialHomography

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rdstitch.alignment.motion_models.rotation import rotation_from_vector
 from rdstitch.alignment.result import LinkFit
-from rdstitch.alignment.rotation_model import rotation_from_vector
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.inputs.input_guard import InputGuard

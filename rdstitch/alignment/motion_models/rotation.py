@@ -5,14 +5,15 @@ no horizon, so that a full circle closes. A step turns the camera in its own fra
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.alignment.motion_models import ModelMatrices
+from rdstitch.alignment.motion_models.base import ModelMatrices
 from rdstitch.arrays import BoolArray, FloatArray
 
-FOCAL_STARTS = tuple(math.log(focal) for focal in (0.6, 0.9, 1.4, 2.2, 3.6, 6.0))
+_FOCAL_STARTS = tuple(math.log(focal) for focal in (0.6, 0.9, 1.4, 2.2, 3.6, 6.0))
 """Logarithms of focal lengths in half diagonals: from fisheyes to long lenses, near enough to each other that the
 adjustment of pairs converges from the nearest."""
 
@@ -36,6 +37,9 @@ class RotationModel:
     pose_size: int = 3
     shared_names: tuple[str, ...] = ("log_focal",)
     on_sphere: bool = True
+    one_camera: bool = True
+    free_tilts: bool = False
+    any_tilt: bool = False
 
     @property
     def gauge(self) -> BoolArray:
@@ -60,6 +64,10 @@ class RotationModel:
         """Log f."""
         return np.asarray(physical[-1:], dtype=np.float64)
 
+    def shared_starts(self, log_focal: float, tilt: Sequence[float], *, tilt_known: bool) -> list[FloatArray]:
+        """The focal length that is known, and a range of others."""
+        return [np.array([each]) for each in (log_focal, *_FOCAL_STARTS)]
+
     def retract(self, poses: FloatArray, step: FloatArray) -> FloatArray:
         """Poses after a step of shape (N, 3), radians."""
         turned: FloatArray = rotation_from_vector(step) @ poses.reshape(-1, 3, 3)
@@ -80,6 +88,10 @@ class RotationModel:
         matrices = homographies / np.array([[focal], [focal], [1.0]])
         matrices = matrices * np.sign(np.linalg.det(matrices))[:, None, None]
         return nearest_rotation(matrices).reshape(-1, 9)
+
+    def description(self, poses: FloatArray, shared: FloatArray) -> str:
+        """What a turn says of the camera."""
+        return "the camera turned on the spot"
 
 
 def _focal(shared: FloatArray) -> float:

@@ -1,0 +1,102 @@
+"""What the adjustment uses of a motion model."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from rdstitch.arrays import BoolArray, FloatArray
+
+
+@dataclass(frozen=True)
+class ModelMatrices:
+    """Plane-to-image homographies of N images with their derivatives.
+
+    Attributes
+    ----------
+    matrices : ndarray of shape (N, 3, 3)
+    by_pose : ndarray of shape (N, D, 3, 3)
+        By a step of the D pose parameters, as :meth:`MotionModel.retract` takes it.
+    by_shared : ndarray of shape (N, S, 3, 3)
+        By the S shared parameters.
+    """
+
+    matrices: FloatArray
+    by_pose: FloatArray
+    by_shared: FloatArray
+
+
+class MotionModel(Protocol):
+    """A motion model, as the adjustment uses it."""
+
+    @property
+    def name(self) -> str:
+        """One word for it."""
+
+    @property
+    def pose_size(self) -> int:
+        """Free parameters per image, D."""
+
+    @property
+    def on_sphere(self) -> bool:
+        """Whether images lie around one centre, not over a plane."""
+
+    @property
+    def one_camera(self) -> bool:
+        """Whether all images are of one camera with one focal length, the last of the shared parameters."""
+
+    @property
+    def free_tilts(self) -> bool:
+        """Whether each image has a tilt of its own."""
+
+    @property
+    def any_tilt(self) -> bool:
+        """Whether the tilts may be any, and not only differ a little from a shared one."""
+
+    @property
+    def shared_names(self) -> tuple[str, ...]:
+        """Parameters that all images share, S of them, without those of the lens."""
+
+    @property
+    def gauge(self) -> BoolArray:
+        """Gauge: which of the D parameters of the reference image the choice of the frame fixes, shape (D,)."""
+
+    def matrices(self, poses: FloatArray, shared: FloatArray) -> ModelMatrices:
+        """Homographies from the plane to the images, with derivatives."""
+
+    def physical_parameters(self, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What :attr:`shared_names` names (S,), and its derivatives by the shared parameters (S, S)."""
+
+    def shared_from_physical(self, physical: FloatArray) -> FloatArray:
+        """The inverse of :meth:`physical_parameters`."""
+
+    def shared_starts(self, log_focal: float, tilt: Sequence[float], *, tilt_known: bool) -> list[FloatArray]:
+        """Shared parameters (S,) near enough to any usual ones for an adjustment to converge from the nearest."""
+
+    def retract(self, poses: FloatArray, step: FloatArray) -> FloatArray:
+        """Poses after a step of shape (N, D)."""
+
+    def prior_coordinates(self, poses: FloatArray) -> FloatArray:
+        """The D parameters of each image (N, D) that priors are on; zeros where there can be none."""
+
+    def origins(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+        """Homographies (N, 3, 3) of images at the origin of the plane, with the tilts (N, 2) given."""
+
+    def nearest_poses(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
+        """The poses with these tilts (N, 2) that come nearest to plane-to-image homographies (N, 3, 3)."""
+
+    def description(self, poses: FloatArray, shared: FloatArray) -> str:
+        """What a fit says of the camera."""
+
+
+def inverses(matrices: FloatArray) -> FloatArray:
+    """Inverses of (N, 3, 3) by cofactors; not finite where a step made a matrix singular."""
+    (a, b, c), (d, e, f), (g, h, i) = matrices.transpose(1, 2, 0)
+    cofactors = np.empty((3, 3, len(matrices)))
+    with np.errstate(all="ignore"):
+        cofactors[:, 0] = e * i - f * h, f * g - d * i, d * h - e * g
+        cofactors[:, 1] = c * h - b * i, a * i - c * g, b * g - a * h
+        cofactors[:, 2] = b * f - c * e, c * d - a * f, a * e - b * d
+        cofactors /= a * cofactors[0, 0] + b * cofactors[1, 0] + c * cofactors[2, 0]
+    return np.ascontiguousarray(cofactors.transpose(2, 0, 1))
