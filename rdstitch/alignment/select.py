@@ -12,7 +12,7 @@ translation. Of the planar models the least free one is taken that the images al
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -35,11 +35,11 @@ _FOCAL_LIMITS = 0.2, 50.0
 _TYPICAL_TILT_SPREAD = math.radians(3.0)
 """Spread of tilts from which on a wider one costs: Occam's factor of the hierarchical prior on the tilts."""
 
+_TOLERABLE = 0.25
+"""Of what an error counts at most: shared errors, besides the noise, that local alignment and seams can hide."""
+
 _PREFERENCE = 6.0
 """What the user's command says: odds of twenty to one for a turn by ``pano``, and for a plane by ``mosaic``."""
-
-_TOLERABLE = 0.25
-"""Of what an error counts at most: shared errors that local alignment and seams can hide."""
 
 _POSSIBLE, _PARALLAX = 4.0, 0.005
 """Times the noise, and diagonals of an image, that pairs may be off from a turn for it to be tried on all of them."""
@@ -159,8 +159,9 @@ def select_model(
     posterior = Posterior(problem, prefer_turn, layout_matters)
     tried: list[Hypothesis] = []
     turns = [MODELS[name] for name in names if MODELS[name].on_sphere]
+    wide = replace(problem, free_lens=np.logical_or.reduce([problem.free_lens, *lenses]))
     for turn in turns:
-        trial = problem.trial(turn)
+        trial = wide.trial(turn)
         if len(names) == 1 or trial.sigma <= posterior.largest_trial:
             tried.append(posterior.of(problem.fit(turn, shared=trial.parameters.shared)))
     for model in [MODELS[name] for name in names if not MODELS[name].on_sphere]:
@@ -193,7 +194,9 @@ def _with_wider_lenses(
         for index in sorted({0, *order}):
             fit = tried[index].fit
             wider = posterior.of(posterior.problem.extend(fit, lens | fit.free_lens))
-            if wider.score < tried[index].score and shows_center(wider.fit.adjusted, posterior.problem.observations):
+            # A centre that is off bends a plane as rough ground bends the images; directions it does not bend.
+            shown = fit.model.on_sphere or shows_center(wider.fit.adjusted, posterior.problem.observations)
+            if wider.score < tried[index].score and shown:
                 tried[index] = wider
     return tried
 
@@ -203,7 +206,7 @@ def _best(posterior: Posterior, tried: Sequence[Hypothesis]) -> Hypothesis:
     cameras = [one for one in tried if one.fit.model.one_camera]
     free = [one for one in tried if not one.fit.model.one_camera]
     best = min(cameras or free, key=_score)
-    largest = _TOLERABLE * posterior.evidence.farthest
+    largest = math.hypot(_TOLERABLE * posterior.evidence.farthest, posterior.evidence.noise)
     turns = [one for one in tried if one.fit.model.on_sphere and one.field < largest]
     if best.absurd and turns:
         return turns[0]

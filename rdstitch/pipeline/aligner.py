@@ -29,6 +29,7 @@ from rdstitch.orientation import quarter_turn
 from rdstitch.pipeline.inlier_selection import reselect_inliers
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.process_memory import return_freed_memory
+from rdstitch.verification.rules import LIMITS
 
 _CLOSURE_ROUNDS = 2
 
@@ -154,7 +155,9 @@ class Aligner:
         alignment = self._aligned(pairs, former)
         ground = over_rough_ground(pairs, self.threshold)
         rough = ground is not pairs and not self._explains(alignment, pairs, ground)
-        aligned = AlignedPairs(tuple(pairs), self._aligned(ground, None) if rough else alignment, rough)
+        over = self._aligned(ground, None) if rough else alignment
+        rough &= over.rms <= LIMITS["error of rough ground"].value * self.threshold  # or it is not one ground
+        aligned = AlignedPairs(tuple(pairs), over if rough else alignment, rough)
         return self.metric(aligned) if self.needs_poses else aligned
 
     def used(self, aligned: AlignedPairs) -> Sequence[PairRegistration]:

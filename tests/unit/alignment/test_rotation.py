@@ -1,5 +1,7 @@
 """Turning on the spot: derivatives of the model, the level frame, the choice between a turn and a plane."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -111,6 +113,27 @@ def test_a_full_turn_closes_and_gives_lens_and_focal_length() -> None:
         ray = k @ rotations[j] @ rotations[i].T @ np.array([0.0, 0.0, 1.0])
         truth = LENS.distort(ray[:2] / ray[2] + LENS.center)
         assert np.linalg.norm(found.transfer(i, j, middle)[0] - truth) < 0.1
+
+
+def test_a_turn_of_cropped_images_with_parallax_is_a_turn() -> None:
+    """The lens's axis is off the middle of all images alike, and what neighbours share besides is no reason against."""
+    rng = np.random.default_rng(5)
+    rotations, cut = panorama_rotations(13, 2 * np.pi / 13, seed=5), np.array([80.0, 60.0])
+    links = []
+    for link in _links(rotations, rng, noise=0.2, count=400):
+        kept = ((link.points1 >= cut) & (link.points2 >= cut)).all(axis=1)
+        parallax = np.sin(link.points1[kept] / 40.0 + rng.uniform(0.0, 6.0, 2))
+        relation = replace(link.relation, inliers=np.ones(int(kept.sum()), dtype=np.bool_))
+        points = link.points1[kept] - cut, link.points2[kept] - cut + parallax
+        if kept.sum() >= 20:
+            links.append(Link(link.image1, link.image2, *points, relation))
+    found = align([Camera((560, 420)).with_focal()] * 13, links)
+    assert found.model == "rotation"
+    assert found.used.all()
+    axis = np.array(LENS.center) - cut
+    np.testing.assert_allclose(found.cameras[0].center, axis, atol=6.0)
+    assert found.focal is not None
+    assert found.focal * found.cameras[0].half_diagonal == pytest.approx(554.0, rel=0.02)
 
 
 def test_a_shift_over_a_plane_is_no_turn() -> None:
