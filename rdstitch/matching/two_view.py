@@ -12,6 +12,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from rdstitch.arrays import FloatArray
 from rdstitch.cache import Cache
 from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features, Matcher, match_overlap
@@ -25,6 +26,9 @@ from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estim
 Item = TypeVar("Item")
 
 Pair = tuple[int, int]
+
+Transfer = Callable[[int, int, FloatArray], FloatArray]
+"""Takes two images and points (N, 2) of the first, pixels, to points of the second; NaN where it does not see them."""
 
 _SELECT_MODEL_BELOW = 50
 """Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them."""
@@ -71,6 +75,12 @@ class PairRegistration:
     def correspondences(self) -> Correspondences:
         """The putative matches, pixels; read every time."""
         return self.matches.load()
+
+    def errors(self, transfer: Transfer) -> FloatArray:
+        """How far each match, (M,), is from where ``transfer`` expects it, pixels; inf where that is nowhere."""
+        matched = self.correspondences
+        expected = transfer(self.image1, self.image2, matched.points1)
+        return np.asarray(np.nan_to_num(np.linalg.norm(expected - matched.points2, axis=1), nan=np.inf))
 
     def link(self) -> Link:
         """The inliers, as global adjustment takes them."""

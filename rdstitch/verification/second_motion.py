@@ -117,7 +117,7 @@ def find_second_motions(
         One for every pair of aligned images that have matches in common.
     """
     errors = {
-        pair.images: _transfer_errors(alignment, pair)
+        pair.images: pair.errors(alignment.transfer)
         for pair in pairs
         if alignment.used[pair.image1] and alignment.used[pair.image2]
     }
@@ -128,13 +128,6 @@ def find_second_motions(
     return [
         _second_motion(alignment, pair, errors[pair.images], threshold, found.get(pair.images)) for pair in compared
     ]
-
-
-def _transfer_errors(alignment: Alignment, pair: PairRegistration) -> FloatArray:
-    """Of all matches, pixels; infinite where the alignment puts a point nowhere."""
-    matched = pair.correspondences
-    expected = alignment.transfer(*pair.images, matched.points1)
-    return np.asarray(np.nan_to_num(np.linalg.norm(expected - matched.points2, axis=1), nan=np.inf))
 
 
 def _second_motion(

@@ -6,7 +6,6 @@ from functools import partial
 
 import numpy as np
 
-from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features, match
@@ -107,28 +106,6 @@ def test_static_matches_of_features_that_were_matched_otherwise_are_dropped_too(
         kept = static_places.without_static(before.correspondences)
         assert static.sum() >= 35
         assert len(kept) == (~static).sum()
-
-
-def test_weakly_linked_images_find_what_repeats_where_it_must_be() -> None:
-    pairing = _pairing(0, 160, repeated=120)
-    alone = pairing.estimate(ALL)
-    assert all(pair.relation for pair in alone)
-    cameras = [camera.with_focal() for camera in pairing.cameras]
-    alignment = align(cameras, [pair.link() for pair in alone], AlignmentOptions(model="homography"))
-    stronger = pairing.guided_rematch(alone, alignment.support, alignment.transfer)
-    assert sorted(stronger) == list(range(len(alone)))
-    for position, after in stronger.items():
-        assert after.relation.inliers.sum() > 1.5 * alone[position].relation.inliers.sum()
-    errors = [abs(pair.relation.distortion - LENS.distortion) for pair in stronger.values()]
-    assert np.median(errors) < 0.02
-
-
-def test_images_with_many_matches_are_left_as_they_are() -> None:
-    pairing = _pairing(0, 400)
-    alone = pairing.estimate(ALL)
-    cameras = [camera.with_focal() for camera in pairing.cameras]
-    alignment = align(cameras, [pair.link() for pair in alone], AlignmentOptions(model="homography"))
-    assert pairing.guided_rematch(alone, alignment.support, alignment.transfer) == {}
 
 
 def test_images_that_share_nothing_are_rejected_by_the_prescreen() -> None:
