@@ -18,7 +18,6 @@ from rdstitch.file_access import canonical_name
 from rdstitch.inputs.measurements import positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import neighbours
-from rdstitch.matching.neighbours_around import neighbours_around
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
@@ -203,8 +202,7 @@ def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candi
     for _ in range(_CLOSURE_ROUNDS):
         pairs, alignment = aligned.pairs, aligned.alignment
         tried = {(pair.image1, pair.image2) for pair in pairs}
-        find = neighbours_around if alignment.on_sphere else neighbours
-        loop_closures = find(alignment.cameras, alignment.homographies, tried)
+        loop_closures = neighbours(alignment.cameras, alignment.homographies, tried, on_sphere=alignment.on_sphere)
         unaligned = {(i, j) for i, j in candidates if not (alignment.used[i] and alignment.used[j])} - tried
         found = pairing.estimate(sorted(unaligned.union(loop_closures)), distortion=alignment.distortion)
         pairs = tuple(sorted([*pairs, *found], key=lambda pair: (pair.image1, pair.image2)))

@@ -13,7 +13,6 @@ from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.matching.two_view import Pair
 from rdstitch.registration import Registration
 from rdstitch.verification.overlap_check import CheckedLink, check_overlaps
-from rdstitch.verification.parallax import Parallax, find_parallax
 from rdstitch.verification.second_motion import (
     MotionComparison,
     SecondMotion,
@@ -94,11 +93,6 @@ class Evidence:
         return {link.pair: link for link in self.seen if link.ambiguity.ambiguous and not link.unique}
 
     @cached_property
-    def parallax(self) -> list[Parallax]:
-        """How far pairs of a turn are from one about the lens, the worst first."""
-        return find_parallax(self.alignment, self.registration.pairs) if self.alignment.on_sphere else []
-
-    @cached_property
     def alike(self) -> float:
         """How much alike images look where most pairs put them, [0, 1]; 0 where there is nothing to see."""
         shares = [link.agreement.share for link in self.checked if link.agreement.cells >= MIN_CELLS]
@@ -113,5 +107,6 @@ class Evidence:
 
     @property
     def depth(self) -> bool:
-        """Whether the scene has depth, or the camera moved while it turned."""
-        return self.alignment.relief.found or bool(self.parallax)
+        """Whether the scene has depth; of a turn, whether the camera moved, or something before it."""
+        turn_with_parallax = self.alignment.on_sphere and any(own.area for own in self.motions)
+        return self.alignment.relief.found or turn_with_parallax

@@ -119,12 +119,8 @@ def _errors(found: Evidence) -> Iterator[Finding]:
 
 
 def _depth(found: Evidence) -> Iterator[Finding]:
-    """Parallax of a turn, or errors that neighbouring matches have in common, and where they are largest."""
-    if found.parallax:
-        worst = found.parallax[0]
-        values = {"size": worst.size, "share": worst.share}
-        yield Finding("parallax", (worst.image1, worst.image2), "warning", values)
-    elif found.alignment.relief.found:
+    """Errors that neighbouring matches have in common, and where they are largest."""
+    if found.alignment.relief.found:
         fit = max(found.used, key=lambda fit: fit.rms)
         what = found.alignment.relief.explanation
         kind = "depth of a turn" if found.alignment.on_sphere else "relief"
@@ -201,13 +197,13 @@ def _pattern(found: Evidence) -> Iterator[Finding]:
 
 def _second_motion(found: Evidence) -> Iterator[Finding]:
     """What moves differently: a failure of all images where it may be the plane, as without the one that shows it best
-    it would only be harder to see.
+    it would only be harder to see. Of a turn it is parallax, or what moved before the camera.
     """
     motions = found.motions
     if found.lens_only:  # the same a period of the pattern further on; what is static has a message of its own
         motions = [] if found.static else [own for own in motions if own.images not in found.ambiguous]
     share, compared = share_of(motions), found.compared
-    if found.parallax or not motions or (share < _limit("second motion") and compared is None):
+    if not motions or (share < _limit("second motion") and compared is None):
         return
     alike = share_alike(found.checked)
     clear = alike >= FILLED_BY_A_PLANE or (share < FILLED_BY_A_PLANE and not alike < _limit("unlike, undecided"))
@@ -217,7 +213,9 @@ def _second_motion(found: Evidence) -> Iterator[Finding]:
     worst = max(motions, key=lambda own: own.area)
     off = min(worst.disagreement, 2.0 * found.alignment.cameras[worst.images[0]].half_diagonal)
     values = {"share": share, "place": worst.center, "shown": worst.images, "off": off}
-    if found.lens_only or clear:
+    if found.alignment.on_sphere:
+        yield Finding("parallax", worst.images, "warning", {"size": off, "share": share})
+    elif found.lens_only or clear:
         yield Finding("second motion", worst.images, "warning", values)
     else:
         yield Finding("undecided motion", tuple(sorted({k for own in motions for k in own.images})), "failure", values)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.spatial.transform import Rotation
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
@@ -236,6 +237,21 @@ def test_ten_neighbours_of_each_image_are_candidates() -> None:
     far = np.concatenate([places, places])
     far[11:, 0, 2] += 50.0
     assert len(neighbours([lens] * 22, far, everything)) == 55
+
+
+@pytest.mark.parametrize("focal", [0.4, 1.0, 4.0])
+def test_of_a_turn_neighbours_are_those_that_see_a_part_of_each_other(focal: float) -> None:
+    """A full circle: the next images, as far as their angle of view reaches, also across where the circle closes."""
+    count, camera = 36, Camera((640, 480))
+    turned = Rotation.from_rotvec(np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)[:, None] * [0, 1, 0]).as_matrix()
+    found = neighbours([camera] * count, turned @ np.diag([1.0, 1.0, focal]), set(), on_sphere=True)
+    half = np.degrees(np.arctan2(320.0, focal * camera.half_diagonal))
+    reach = min(5, int(2.0 * half * 0.8 // 10.0))
+    assert reach >= 1
+    apart = {min((j - i) % count, (i - j) % count) for i, j in found}
+    assert apart == set(range(1, max(apart) + 1))
+    assert abs(max(apart) - reach) <= 1
+    assert (0, count - 1) in found
 
 
 def _alike(ordered: bool = False) -> Any:

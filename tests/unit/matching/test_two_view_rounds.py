@@ -133,7 +133,7 @@ def test_a_few_matches_beside_hundreds_do_not_pass_the_prescreen() -> None:
 
 
 def test_images_behind_the_horizon_have_no_neighbours() -> None:
-    beyond = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [3.0, 0.0, 1.0]])
+    beyond = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
     assert neighbours([LENS] * 3, np.stack([beyond] * 3), set()) == []
     assert neighbours([LENS] * 3, np.stack([np.eye(3), beyond, beyond]), set()) == []
     assert neighbours([LENS] * 3, np.stack([np.eye(3), np.eye(3), beyond]), set()) == [(0, 1)]

@@ -92,12 +92,19 @@ def _of_motions(motion: SecondMotion, alike: float, compared: MotionComparison |
         )
     ]
     found = SimpleNamespace(
-        motions=[motion], compared=compared, checked=[] if np.isnan(alike) else checked, parallax=[], static=False,
-        lens_only=False, ambiguous={}, depth=False, alignment=SimpleNamespace(cameras=[CAMERA] * 2),
+        motions=[motion], compared=compared, checked=[] if np.isnan(alike) else checked, static=False,
+        lens_only=False, ambiguous={}, depth=False, alignment=SimpleNamespace(cameras=[CAMERA] * 2, on_sphere=False),
     )  # fmt: skip
     registration: Any = SimpleNamespace(sources=[SimpleNamespace(path=f"folder/{name}.png") for name in "ab"])
     said = messages_of(rules._second_motion(_with(found, **changed)), registration)
     return [(message.severity, message.text) for message in said]
+
+
+def test_of_a_turn_a_second_motion_is_parallax() -> None:
+    turn = SimpleNamespace(cameras=[CAMERA] * 2, on_sphere=True)
+    ((severity, text),) = _of_motions(SecondMotion((0, 1), 51, 49, (8.0, 9.0), 40.0), 0.3, alignment=turn)
+    assert severity == "warning"
+    assert "(parallax)" in text
 
 
 @pytest.mark.parametrize(
