@@ -1,7 +1,6 @@
 """Stage: check a registration; what fails a check is left out by name, and the rest is aligned anew."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -17,6 +16,7 @@ from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner, impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.registration import Registration
+from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding
 from rdstitch.verification.messages import messages_of
 from rdstitch.verification.second_motion import planes_of_pairs
@@ -54,7 +54,6 @@ class _Offenders:
 def accept(
     registration: Registration,
     options: StitchOptions,
-    executor: Executor,
     *,
     metric: bool = False,
     lens_only: bool = False,
@@ -66,8 +65,6 @@ def accept(
     ----------
     registration : Registration
         In pixels of the working size; the result is in those of the images.
-    executor : concurrent.futures.Executor
-        Where images are compared.
     metric : bool
         Metric poses are needed, also of what remains.
     lens_only : bool
@@ -89,7 +86,7 @@ def accept(
     undamaged = None if options.force else _without_damage(registration, aligner)
     if undamaged is not None and _is_simpler(undamaged.alignment.model, registration.alignment.model):
         registration, undamaged = undamaged, None
-    checked = partial(judge, threshold=options.threshold, executor=executor, cache=cache, lens_only=lens_only)
+    checked = partial(_judged, options=options, cache=cache, lens_only=lens_only)
     current, found = registration, checked(registration)
     first, found_first = registration, found
     if _fails(found) and undamaged is not None and not _fails(judged := checked(undamaged)):
@@ -119,6 +116,12 @@ def accept(
     if options.strict and accepted.left_out:
         raise PartialResultError("; ".join(map(str, told_once(accepted.left_out))))
     return accepted
+
+
+def _judged(
+    registration: Registration, options: StitchOptions, cache: Cache, *, lens_only: bool
+) -> tuple[Finding, ...]:
+    return judge(Evidence(registration, options.threshold, options.threads, cache, lens_only))
 
 
 def _without_damage(registration: Registration, aligner: Aligner) -> Registration | None:

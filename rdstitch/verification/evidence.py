@@ -1,8 +1,6 @@
 """What speaks for and against a registration: its matches, its pixels, and motions that it does not explain."""
 
 from collections.abc import Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,7 +10,7 @@ from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.matching.two_view import Pair
 from rdstitch.registration import Registration
-from rdstitch.verification.overlap_check import CheckedLink, check_overlaps
+from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, check_overlaps
 from rdstitch.verification.second_motion import (
     MotionComparison,
     SecondMotion,
@@ -34,16 +32,18 @@ class Evidence:
     registration : Registration
     threshold : float
         Largest transfer error of an inlier of a pair, pixels.
-    executor : concurrent.futures.Executor, optional
-        Where images are compared; None: in one thread.
+    threads : int
+        Pairs of images that are compared at the same time.
     cache : Cache
+        Of results of earlier runs.
     lens_only : bool
-        Only the lens is wanted, so that the places of images do not matter.
+        Only the lens is wanted, so that doubts about the places of images do not make the result fail, and are not
+        reported where a repeated pattern explains them.
     """
 
     registration: Registration
     threshold: float
-    executor: Executor | None = None
+    threads: int = 1
     cache: Cache = NO_CACHE
     lens_only: bool = False
 
@@ -65,12 +65,15 @@ class Evidence:
         return [fit for fit in self.alignment.links if fit.used]
 
     @cached_property
+    def _images(self) -> ComparedImages:
+        return ComparedImages(self.registration.sources, self.registration.stretch, self.threads)
+
+    @cached_property
     def checked(self) -> list[CheckedLink]:
         """What the pixels say of each used link, or of the least confirmed of many."""
         if self.static:
             return []
-        with nullcontext(self.executor) if self.executor is not None else ThreadPoolExecutor(1) as where:
-            return check_overlaps(self.registration, where, self.cache)
+        return check_overlaps(self.registration, self._images, self.cache)
 
     @cached_property
     def motions(self) -> list[SecondMotion]:
@@ -80,7 +83,7 @@ class Evidence:
     @cached_property
     def compared(self) -> MotionComparison | None:
         """Which of the two motions is the plane, by the pixels."""
-        return compare_motions(self.registration, self.motions, self.checked)
+        return compare_motions(self.alignment, self._images, self.motions, self.checked)
 
     @cached_property
     def seen(self) -> Sequence[CheckedLink]:

@@ -20,7 +20,7 @@ from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.warp import Lattice
 from rdstitch.io.read import DecodedImage
-from rdstitch.io.reduction import fitting_reduction, mean_of_channels, reduced_size
+from rdstitch.io.reduction import mean_of_channels
 from rdstitch.radial_homography import from_plane, to_plane
 from rdstitch.scipy_parts import spatial
 
@@ -148,12 +148,6 @@ class ComparedImage:
             self.grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(float("nan"),)
         )
         return np.asarray(found, dtype=np.float32)
-
-
-def as_compared(camera: Camera) -> Camera:
-    """The camera of an image as it is compared, for one that is read no larger than that asks for."""
-    read = reduced_size(camera.image_size, fitting_reduction(max(camera.image_size) / COMPARED_SIDE))
-    return camera.resized(_compared_size(read))
 
 
 def _compared_size(size: tuple[int, int]) -> tuple[int, int]:

@@ -12,7 +12,6 @@ is not seen there.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Self
 
 import numpy as np
@@ -25,7 +24,7 @@ from rdstitch.radial_homography import RadialHomography, from_plane, to_plane
 from rdstitch.registration import Registration
 from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
 from rdstitch.scipy_parts import spatial
-from rdstitch.verification.overlap_check import CheckedLink, placed_image, share_alike
+from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, share_alike
 from rdstitch.verification.photometric_agreement import CELL, Agreement, ComparedCells, ComparedImage, compare_cells
 from rdstitch.verification.self_similarity import Ambiguity
 
@@ -62,9 +61,6 @@ _MIN_INLIERS = 12
 _SAME_SHIFT = 0.05
 """Share of the longer side of an image by which two shifts differ that are the same: matches show theirs where they
 are, pixels in the mean of all that they cover."""
-
-_IMAGES_AT_ONCE = 64
-"""Images that are kept while pairs are compared, 1 MB each."""
 
 
 @dataclass(frozen=True)
@@ -205,6 +201,12 @@ class Cells(ComparedCells):
         seen = np.isfinite(there).all(axis=1)
         return cls(cells.centers[seen], cells.confirming[seen], cells.in_all, there[seen])
 
+    @classmethod
+    def moved(cls, images: ComparedImages, pair: Pair, motion: RadialHomography) -> Self:
+        """Compare two images as a motion from one to the other puts them."""
+        first = images.placed(pair[0], motion.camera, motion.homography)
+        return cls.of(first, images.placed(pair[1], motion.camera2, np.eye(3)))
+
 
 def fills_at_most(compared: Iterable[Cells]) -> float:
     """Share of the images of some pairs that is not seen to contradict a motion, in [0, 1]."""
@@ -284,7 +286,7 @@ class MotionComparison:
 
 
 def compare_motions(
-    registration: Registration, motions: Sequence[SecondMotion], checked: Sequence[CheckedLink]
+    alignment: Alignment, images: ComparedImages, motions: Sequence[SecondMotion], checked: Sequence[CheckedLink]
 ) -> MotionComparison | None:
     """Compare what was aligned over a plane with what moves differently, by the pixels.
 
@@ -298,11 +300,12 @@ def compare_motions(
     """
     second = {own.images: own.relation for own in motions if own.relation is not None}
     separate, far = is_separate(motions), any(own.relation is not None and own.is_far for own in motions)
-    if registration.alignment.on_sphere or not (separate or (far and share_alike(checked) < FILLED_BY_A_PLANE)):
+    if alignment.on_sphere or not (separate or (far and share_alike(checked) < FILLED_BY_A_PLANE)):
         return None
-    images, pairs = _Images(registration), [link.pair for link in checked]
-    own = {pair: images.aligned(pair) for pair in pairs}
-    others = {pair: images.moved(pair, second[pair]) for pair in pairs if pair in second}
+    pairs = [link.pair for link in checked]
+    placed = images.aligned(alignment, (k for pair in pairs for k in pair))
+    own = {(i, j): Cells.of(placed[i], placed[j]) for i, j in pairs}
+    others = {pair: Cells.moved(images, pair, second[pair]) for pair in pairs if pair in second}
     held = _Held(others.items())
     outside = {pair: held.outside(pair, cells) for pair, cells in own.items()}
     doubtful = frozenset(pair for pair, cells in own.items() if not _may_be_the_plane(cells, outside[pair]))
@@ -353,16 +356,16 @@ def planes_of_pairs(registration: Registration, threshold: float) -> list[PairRe
         When an image can no longer be read.
     """
     alignment, pairs = registration.alignment, [pair for pair in registration.pairs if pair.relation]
-    images = _Images(registration)
+    images = ComparedImages(registration.sources, registration.stretch)
     first = {pair.images: pair.relation for pair in pairs}
-    cells = {pair: images.moved(pair, motion) for pair, motion in first.items()}
+    cells = {pair: Cells.moved(images, pair, motion) for pair, motion in first.items()}
     if all(fills_at_most([own]) >= FILLED_BY_A_PLANE for own in cells.values()):
         return None
     lens = float(np.median([motion.distortion for motion in first.values()]))
     rests = {pair: np.flatnonzero(~motion.inliers) for pair, motion in first.items()}
     second = _strongest_motions(alignment, pairs, rests, lens, threshold)
     candidates = [(pair, motion, cells[pair]) for pair, motion in first.items()]
-    candidates += [(pair, motion, images.moved(pair, motion)) for pair, motion in second.items()]
+    candidates += [(pair, motion, Cells.moved(images, pair, motion)) for pair, motion in second.items()]
     held = _Held((pair, own) for pair, _, own in candidates if fills_at_most([own]) < FILLED_BY_A_PLANE)
     best: dict[Pair, tuple[float, RadialHomography]] = {}
     for pair, motion, own in candidates:
@@ -380,30 +383,3 @@ def planes_of_pairs(registration: Registration, threshold: float) -> list[PairRe
 def _no_plane(pair: PairRegistration) -> RadialHomography:
     own, reason = pair.relation, "what the two share fills less than half of them (a vehicle?)"
     return RadialHomography.failed(reason, own.camera, own.camera2, len(own.inliers))
-
-
-class _Images:
-    """The images of a registration, small, as pairs of them are compared."""
-
-    def __init__(self, registration: Registration) -> None:
-        self._alignment = registration.alignment
-
-        @lru_cache(_IMAGES_AT_ONCE)
-        def read(k: int) -> ComparedImage:
-            camera = registration.alignment.cameras[k]
-            return placed_image(registration.sources[k], camera, np.eye(3), registration.stretch)
-
-        self._read = read
-
-    def _placed(self, k: int, camera: Camera, homography: FloatArray) -> ComparedImage:
-        image = self._read(k)
-        return replace(image, camera=camera.resized(image.camera.image_size), homography=homography)
-
-    def aligned(self, pair: Pair) -> Cells:
-        """As the alignment puts two of them."""
-        return Cells.of(*(self._placed(k, self._alignment.cameras[k], self._alignment.homographies[k]) for k in pair))
-
-    def moved(self, pair: Pair, motion: RadialHomography) -> Cells:
-        """As a motion from one to the other puts them."""
-        first = self._placed(pair[0], motion.camera, motion.homography)
-        return Cells.of(first, self._placed(pair[1], motion.camera2, np.eye(3)))

@@ -4,8 +4,6 @@ Both images are drawn on the plane, and correlated at every shift at once (maske
 Padfield 2012). Where the plane is metric a shift by a period of the pattern is as good as the right one.
 """
 
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -122,18 +120,10 @@ def placement_ambiguity(first: Drawing, second: Drawing) -> Ambiguity:
     return Ambiguity(here, float(other.flat[best]), float(distance.flat[best]) / MAX_SIDE)
 
 
-def ambiguous_pairs(
-    placed: Mapping[int, ComparedImage], pairs: Sequence[tuple[int, int]], workers: int = 1
-) -> list[tuple[int, int]]:
-    """The pairs of images that look as much alike elsewhere, drawn at one scale by ``workers`` threads."""
-    images = sorted({k for pair in pairs for k in pair})
-    if not images:
-        return []
-    scale = float(np.median([drawing_scale(placed[k].camera, placed[k].homography) for k in images]))
-    with ThreadPoolExecutor(workers) as pool:
-        drawings = dict(zip(images, pool.map(lambda k: draw(placed[k], scale), images), strict=True))
-        found = pool.map(lambda pair: placement_ambiguity(drawings[pair[0]], drawings[pair[1]]).ambiguous, pairs)
-        return [pair for pair, ambiguous in zip(pairs, found, strict=True) if ambiguous]
+def find_ambiguity(first: ComparedImage, second: ComparedImage) -> Ambiguity:
+    """Draw two images on the plane at the scale of the second one, and compare them at all shifts."""
+    scale = drawing_scale(second.camera, second.homography)
+    return placement_ambiguity(draw(first, scale), draw(second, scale))
 
 
 def _box_around(chosen: NDArray[np.bool_], margin: int) -> tuple[slice, slice]:

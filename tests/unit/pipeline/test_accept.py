@@ -112,8 +112,9 @@ def test_what_is_damaged_is_left_out_where_the_others_fit_better(
         asked.append(offenders)
         return smaller
 
-    def judge(registration: Any, **_: object) -> tuple[Finding, ...]:
-        return (Finding("pattern", values={"count": 2, "of": 3}),) if registration.alignment.used.sum() in fails else ()
+    def judge(found: Any) -> tuple[Finding, ...]:
+        fails_now = found.alignment.used.sum() in fails
+        return (Finding("pattern", values={"count": 2, "of": 3}),) if fails_now else ()
 
     stage = "rdstitch.pipeline.accept"
     monkeypatch.setattr(f"{stage}._without", without)
@@ -123,12 +124,11 @@ def test_what_is_damaged_is_left_out_where_the_others_fit_better(
     aligner = Aligner.of([], OPTIONS, NO_CACHE)
     monkeypatch.setattr(f"{stage}.Aligner.of", lambda *_, **__: aligner)
     monkeypatch.setattr(f"{stage}.RefusedError", RegistrationError)
-    nowhere: Any = None
     if left_out is None:
         with pytest.raises(RegistrationError):
-            accept(whole, OPTIONS, nowhere)
+            accept(whole, OPTIONS)
     else:
-        accepted = accept(whole, OPTIONS, nowhere)
+        accepted = accept(whole, OPTIONS)
         assert accepted.alignment is (smaller if left_out else whole).alignment
     assert [list(offenders.reasons) for offenders in asked[:1]] == [[2]]
 
@@ -180,7 +180,7 @@ def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path:
     sources = _read(frames)
     with open_executor(1, len(sources)) as executor:
         found = register(sources, OPTIONS, executor, skip_bad=False)
-        accepted = accept(found, OPTIONS, executor)
+        accepted = accept(found, OPTIONS)
     steps = [np.diff(k.alignment.homographies[:, 0, 2]) for k in (found, accepted)]
     assert np.all(np.abs(steps[0]) < 0.2)  # heights above the ground: what drives ahead moves by a sixth
     assert np.all(np.abs(steps[1]) > 0.7)

@@ -12,8 +12,7 @@ from rdstitch.camera import Camera
 from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.synthetic.textures import ground
-from rdstitch.verification import second_motion
-from rdstitch.verification.overlap_check import CheckedLink
+from rdstitch.verification.overlap_check import CheckedLink, ComparedImages
 from rdstitch.verification.photometric_agreement import Agreement, ComparedImage, Grey
 from rdstitch.verification.second_motion import (
     Cells,
@@ -67,10 +66,10 @@ def _moving(pixels: float, inliers: Any = ()) -> RadialHomography:
 def _registration(monkeypatch: pytest.MonkeyPatch, images: list[Grey], places: list[float], pairs: Any = ()) -> Any:
     """Images put at these places along the plane, pixels."""
 
-    def placed(source: int, camera: Camera, homography: FloatArray, stretch: object) -> ComparedImage:
-        return ComparedImage(np.ascontiguousarray(images[source], dtype=np.float32), camera, homography)
+    def placed(_: object, k: int, camera: Camera, homography: FloatArray) -> ComparedImage:
+        return ComparedImage(np.ascontiguousarray(images[k], dtype=np.float32), camera, homography)
 
-    monkeypatch.setattr(second_motion, "placed_image", placed)
+    monkeypatch.setattr(ComparedImages, "placed", placed)
     homographies = np.stack([_shift(-place) for place in places])
     alignment = SimpleNamespace(cameras=[LENS] * len(places), homographies=homographies, on_sphere=False)
     return SimpleNamespace(sources=range(len(images)), alignment=alignment, stretch=None, pairs=pairs)
@@ -79,7 +78,8 @@ def _registration(monkeypatch: pytest.MonkeyPatch, images: list[Grey], places: l
 def _contest(registration: Any, pairs: list[Pair], motions: dict[Pair, RadialHomography]) -> MotionComparison:
     """Where what moves differently covers a fifth of the matched area."""
     second = [SecondMotion(pair, 20, 80, disagreement=120.0, relation=motion) for pair, motion in motions.items()]
-    found = compare_motions(registration, second, [_link(*pair) for pair in pairs])
+    read = ComparedImages(registration.sources, None)
+    found = compare_motions(registration.alignment, read, second, [_link(*pair) for pair in pairs])
     assert found is not None
     return found
 

@@ -20,6 +20,7 @@ from rdstitch.pipeline.register import register
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.registration import Registration
 from rdstitch.verification import evidence, verdict
+from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding
 from rdstitch.verification.messages import messages_of
 from rdstitch.verification.overlap_check import CheckedLink
@@ -43,7 +44,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Registration:
 
 def judge(registration: Registration, threshold: float, *, lens_only: bool = False) -> tuple[Message, ...]:
     """What is found, in words."""
-    return tuple(messages_of(verdict.judge(registration, threshold, lens_only=lens_only), registration))
+    return tuple(messages_of(verdict.judge(Evidence(registration, threshold, lens_only=lens_only)), registration))
 
 
 def _texts(registration: Registration, *, lens_only: bool = False) -> list[str]:
