@@ -98,9 +98,10 @@ def register(
     )
     moving = pairing.remove_static_background(pairing.estimate_candidates(candidates), candidates)
     found = moving.pairing.match_repeated_patterns(moving.pairs) if lens_only else moving.pairs
-    lenses = separate_lenses(aligner.cameras, found, options.threshold, options.known_distortion)
-    aligned = aligner.align(lenses.pairs)
-    aligned = close_loops(aligner, moving.pairing, aligned, lenses.of_one_lens(candidates))
+    mixed, other_lens = separate_lenses(aligner.cameras, found, options.threshold, options.known_distortion)
+    aligned = aligner.align([pair for pair in found if not {*pair.images} & other_lens.keys()])
+    candidates = [pair for pair in candidates if not {*pair} & other_lens.keys()]
+    aligned = close_loops(aligner, moving.pairing, aligned, candidates)
     aligned = select_by_whole_lens(aligner, aligned)
     settle = match_crossings if lens_only else settle_repeated_pattern
     aligned, undecided = settle(aligner, moving.pairing, aligned, sources, rendered.stretch, options.threads)
@@ -115,11 +116,11 @@ def register(
             *aligned.alignment.messages,
             *([_STATIC_BACKGROUND] if moving.found else []),
             *_low_contrast(rendered.equalized, aligned.alignment, aligner.paths),
-            *_left_out(aligned.alignment, aligner.paths, counts, {**lenses.left_out, **detected.damaged, **undecided}),
+            *_left_out(aligned.alignment, aligner.paths, counts, {**other_lens, **detected.damaged, **undecided}),
         ),
         static_background=moving.found,
         stretch=rendered.stretch,
-        mixed=lenses.mixed,
+        mixed=mixed,
     )
 
 
