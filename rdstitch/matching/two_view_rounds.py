@@ -18,11 +18,8 @@ from rdstitch.matching.repeated_pattern import MIN_REPETITION, match_pattern, re
 from rdstitch.matching.static_background import (
     has_static_background,
     moving_features,
-    moving_images,
     show_motion,
-    static_places,
 )
-from rdstitch.matching.static_places import StaticPlaces
 from rdstitch.matching.two_view import (
     EstimationTask,
     MatchingTask,
@@ -64,8 +61,6 @@ class Pairing:
         Of what need not be in memory all the time.
     tilts : sequence of (float, float), optional
         (ψ, θ), radians, of each image, where they are known exactly.
-    static : StaticPlaces, optional
-        Where static matches are no evidence.
     """
 
     features: FeatureStore
@@ -77,7 +72,6 @@ class Pairing:
     cache: Cache = NO_CACHE
     store: Cache = NO_CACHE
     tilts: Sequence[tuple[float, float]] | None = None
-    static: StaticPlaces | None = None
 
     def prescreen_pairs(self, pairs: Sequence[Pair]) -> dict[Pair, StoredMatches]:
         """The pairs whose strongest features match and that matter for the place of an image, with those matches.
@@ -134,12 +128,8 @@ class Pairing:
         everything = [*pairs, *self.estimate(others)]
         chosen = sorted([*compared, *others])
         moving = replace(self, features=moving_features(self.features, everything, threshold))
-        strict = replace(moving, static=static_places(everything, threshold))
-        again, fewer = moving.estimate(chosen), strict.estimate(chosen)
-        count = len(self.features)
-        if moving_images(fewer, count, threshold) >= moving_images(again, count, threshold):
-            moving, again = strict, fewer
-        if not show_motion(again, count, threshold):
+        again = moving.estimate(chosen)
+        if not show_motion(again, len(self.features), threshold):
             return MovingPairs(self, pairs, found=False)
         return MovingPairs(moving, again, found=True)
 
@@ -224,16 +214,14 @@ class Pairing:
                 [(self._tilt(pairs[k][0]), self._tilt(pairs[k][1])) for k in batch],
                 options,
                 self.cache,
-                self.store,
-                self.static,
             )
             for batch in estimation_batches(range(len(pairs)))
         )
         done: list[PairRegistration] = []
         for found in in_order(self.executor, estimate_pairs, tasks):
+            start = len(done)
             done += [
-                PairRegistration(*pair, matches, relation)
-                for pair, (matches, relation) in zip(pairs[len(done) :], found, strict=False)
+                PairRegistration(*pairs[start + k], matched[start + k], relation) for k, relation in enumerate(found)
             ]
             if stage is not None:
                 self.progress(stage, len(done), len(pairs))
