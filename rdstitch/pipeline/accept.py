@@ -18,11 +18,11 @@ from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.registration import Registration
 from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding
+from rdstitch.verification.limits import limit
 from rdstitch.verification.messages import messages_of
 from rdstitch.verification.second_motion import planes_of_pairs
 from rdstitch.verification.verdict import RefusedError, judge
 
-_MAX_SCALE_UNCERTAINTY = 0.05  # share that lengths may be off by, as far as the focal length is, without a word
 _MAX_ROUNDS = 20  # times that something is left out; each takes one adjustment
 
 
@@ -262,7 +262,7 @@ def _aligned_anew(
 
 def scale_uncertainty(alignment: Alignment) -> list[Message]:
     """A warning where the focal length, and with it the length of every step, is hardly known."""
-    if not alignment.length_std > _MAX_SCALE_UNCERTAINTY:
+    if not alignment.length_std > limit("length"):
         return []
     off = f"all lengths may be off together by {alignment.length_std:.0%}"
     text = f"{off}: the images hardly show the focal length; give --focal"

@@ -10,17 +10,15 @@ from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.matching.two_view import Pair
 from rdstitch.registration import Registration
+from rdstitch.verification.limits import limit
 from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, check_overlaps
 from rdstitch.verification.second_motion import (
     MotionComparison,
     SecondMotion,
     compare_motions,
     find_second_motions,
-    outside_second_motions,
+    unexplained,
 )
-
-MIN_CELLS = 8
-"""Cells of an overlap that have texture; of fewer the pixels say nothing."""
 
 
 @dataclass(frozen=True)
@@ -83,12 +81,12 @@ class Evidence:
     @cached_property
     def compared(self) -> MotionComparison | None:
         """Which of the two motions is the plane, by the pixels."""
-        return compare_motions(self.alignment, self._images, self.motions, self.checked)
+        return compare_motions(self._images, self.motions, [] if self.alignment.on_sphere else self.checked)
 
     @cached_property
     def seen(self) -> Sequence[CheckedLink]:
-        """The checked links, where nothing moves differently if that is the smaller part."""
-        return outside_second_motions(self.checked, self.motions, self.compared)
+        """The checked links; where what moves differently is the smaller part, without what that may explain."""
+        return unexplained(self.checked, self.motions, self.compared)
 
     @cached_property
     def ambiguous(self) -> dict[Pair, CheckedLink]:
@@ -98,7 +96,7 @@ class Evidence:
     @cached_property
     def alike(self) -> float:
         """How much alike images look where most pairs put them, [0, 1]; 0 where there is nothing to see."""
-        shares = [link.agreement.share for link in self.checked if link.agreement.cells >= MIN_CELLS]
+        shares = [link.agreement.share for link in self.checked if link.agreement.cells >= limit("cells")]
         return float(np.median(shares)) if shares else 0.0
 
     @property

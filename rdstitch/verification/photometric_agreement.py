@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.warp import Lattice
@@ -23,16 +23,13 @@ from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import mean_of_channels
 from rdstitch.radial_homography import from_plane, to_plane
 from rdstitch.scipy_parts import spatial
+from rdstitch.verification.limits import limit
 
 Grey = NDArray[np.float32]
 
 COMPARED_SIDE = 512  # pixels of the longer side of the images that are compared
 CELL = 24  # pixels
 _SEARCH_RADIUS = 8  # pixels
-_MIN_TEXTURE = 0.012  # standard deviation in a cell, of full range
-_MIN_CORRELATION = 0.5  # correlation from which on two cells show the same
-_MAX_OFFSET = 2.5  # pixels
-_MAX_CELLS = 120
 _OPAQUE = 250
 _NEAREST = 3  # matches that show the parallax of a cell; one of them may be wrong
 _LATTICE = 8  # pixels between the places that are computed; those between are interpolated
@@ -48,39 +45,18 @@ class Agreement:
         Cells with texture in both images.
     confirming : int
         Cells that correlate best, and well, where the registration says.
+    in_all : int
+        Cells with texture in the whole of the second image.
     """
 
     cells: int
     confirming: int
+    in_all: int = 0
 
     @property
     def share(self) -> float:
         """Share of the cells that confirm the registration; 1 without cells."""
         return self.confirming / self.cells if self.cells else 1.0
-
-
-@dataclass(frozen=True)
-class ComparedCells:
-    """Cells with texture in both images of an overlap, and what each of them says.
-
-    Attributes
-    ----------
-    centers : ndarray of shape (N, 2)
-        Where the registration puts them, pixels of the second image as it is compared.
-    confirming : ndarray of shape (N,), bool
-        Which correlate best, and well, where the registration says.
-    in_all : int
-        Cells with texture in the whole of the second image.
-    """
-
-    centers: FloatArray
-    confirming: BoolArray
-    in_all: int
-
-    @property
-    def agreement(self) -> Agreement:
-        """How many there are, and how many confirm the registration."""
-        return Agreement(len(self.confirming), int(self.confirming.sum()))
 
 
 @dataclass(frozen=True)
@@ -172,13 +148,6 @@ def _reduced_grey(image: DecodedImage, stretch: tuple[float, float] | None) -> G
 
 def overlap_agreement(first: ComparedImage, second: ComparedImage, parallax: Parallax | None = None) -> Agreement:
     """Compare two registered images where they overlap, where the ground is rough by what moves its places."""
-    return compare_cells(first, second, parallax, _MAX_CELLS).agreement
-
-
-def compare_cells(
-    first: ComparedImage, second: ComparedImage, parallax: Parallax | None = None, most: int | None = None
-) -> ComparedCells:
-    """The cells of an overlap one by one, or about ``most`` of them; see :func:`overlap_agreement`."""
     height, width = second.grey.shape
     # The first image as the second one's lens would have seen it.
     seen = first.sampled(partial(to_plane, second.camera, second.homography), (0, 0, width, height))
@@ -186,8 +155,7 @@ def compare_cells(
     rows, columns = (np.arange(margin, n - margin + 1, CELL) for n in (height, width))
     corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2) - CELL // 2
     textured = corners[_have_texture(_cells(seen, corners))]
-    looked_at = textured if most is None else textured[:: max(1, -(-len(textured) // most))]
-    there = looked_at
+    looked_at = there = textured
     if parallax is not None and len(looked_at):
         there = looked_at + parallax.at(looked_at[:, ::-1] + (CELL - 1) / 2.0)[:, ::-1]
         inside = ((there >= _SEARCH_RADIUS) & (there + CELL + _SEARCH_RADIUS <= (height, width))).all(axis=1)
@@ -196,10 +164,8 @@ def compare_cells(
     inner = windows[:, _SEARCH_RADIUS:-_SEARCH_RADIUS, _SEARCH_RADIUS:-_SEARCH_RADIUS]
     known = np.isfinite(windows).all(axis=(1, 2)) & _have_texture(inner)
     cells = _cells(seen, looked_at[known])
-    confirming = [_confirms(*both) for both in zip(cells, windows[known], strict=True)]
-    centers = looked_at[known][:, ::-1] + (CELL - 1) / 2.0
-    in_all = int(_have_texture(_cells(second.grey, corners)).sum())
-    return ComparedCells(centers, np.array(confirming, dtype=np.bool_), in_all)
+    confirming = sum(_confirms(*both) for both in zip(cells, windows[known], strict=True))
+    return Agreement(len(cells), confirming, int(_have_texture(_cells(second.grey, corners)).sum()))
 
 
 def _cells(image: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:
@@ -214,7 +180,7 @@ def _cells(image: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:
 
 def _have_texture(cells: Grey) -> NDArray[np.bool_]:
     """Which cells (N, h, w) are distinctive; not those with transparent pixels, whose deviation is NaN."""
-    return np.asarray(cells.std(axis=(1, 2)) > _MIN_TEXTURE)
+    return np.asarray(cells.std(axis=(1, 2)) > limit("texture"))
 
 
 def _confirms(cell: Grey, window: Grey) -> bool:
@@ -222,6 +188,6 @@ def _confirms(cell: Grey, window: Grey) -> bool:
     scores = np.asarray(cv2.matchTemplate(window, cell, cv2.TM_CCOEFF_NORMED))
     row, column = np.unravel_index(int(scores.argmax()), scores.shape)
     return bool(
-        scores[row, column] >= _MIN_CORRELATION
-        and np.hypot(row - _SEARCH_RADIUS, column - _SEARCH_RADIUS) <= _MAX_OFFSET
+        scores[row, column] >= limit("correlation")
+        and np.hypot(row - _SEARCH_RADIUS, column - _SEARCH_RADIUS) <= limit("offset")
     )

@@ -142,7 +142,7 @@ def test_one_wrong_pair_does_not_condemn_its_images(good: Registration) -> None:
 
 def _checked(cells: int, confirming: int, *, pair: tuple[int, int] = (0, 1), elsewhere: float = 0.0) -> CheckedLink:
     fit = LinkFit(*pair, 100, 90, 0.5, True)
-    return CheckedLink(fit, Agreement(cells, confirming), Ambiguity(0.9, elsewhere, 0.25))
+    return CheckedLink(fit, Agreement(cells, confirming, 10 * cells), Ambiguity(0.9, elsewhere, 0.25))
 
 
 def _checked_by(monkeypatch: pytest.MonkeyPatch, good: Registration, *checked: CheckedLink) -> list[Message]:
@@ -179,8 +179,7 @@ def test_where_something_moves_differently_two_fifths_must_look_alike(
     monkeypatch.setattr(evidence, "find_second_motions", lambda *_: [second])
     found = _checked_by(monkeypatch, good, _checked(100, int(100 * share)), _checked(100, 90, pair=(1, 2)))
     assert [message.severity for message in found] == severities
-    outside = {(0, 1): Agreement(50, 39), (1, 2): Agreement(100, 90)}
-    monkeypatch.setattr(evidence, "compare_motions", lambda *_: MotionComparison(0.8, 0.3, outside, frozenset()))
+    monkeypatch.setattr(evidence, "compare_motions", lambda *_: MotionComparison(0.8, 0.3))
     compared = judge(good, THRESHOLD)  # what moves differently was seen to be smaller
     assert [message.severity for message in compared] == ["warning"]
 
@@ -200,7 +199,7 @@ def test_pairs_that_the_second_may_hold_together_do_not_count(
     ):
         second = SecondMotion((0, 1), area, 100 - area, (30.0, 40.0), 120.0, relation)
         monkeypatch.setattr(evidence, "find_second_motions", lambda *_, second=second: [second])
-        found = MotionComparison(fills, 0.3, {}, doubtful)
+        found = MotionComparison(fills, 0.3, doubtful)
         compared = found if area == 20 or found.lost else None
         monkeypatch.setattr(evidence, "compare_motions", lambda *_, compared=compared: compared)
         failures = [m.text for m in _checked_by(monkeypatch, good, *checked) if m.severity == "failure"]
