@@ -16,7 +16,7 @@ from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import write_image
 from rdstitch.messages import Message, Severity, left_out
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.accept import _is_of_the_whole, _is_simpler, _may_be_another_plane, _Offenders, _without, accept
+from rdstitch.pipeline.accept import Offenders, _is_of_the_whole, _is_simpler, _may_be_another_plane, _without, accept
 from rdstitch.pipeline.aligner import Aligner
 from rdstitch.pipeline.register import register
 from rdstitch.verification.findings import Finding
@@ -106,9 +106,9 @@ def test_what_is_damaged_is_left_out_where_the_others_fit_better(
     monkeypatch: pytest.MonkeyPatch, rest: str, remaining: int, fails: tuple[int, ...], left_out: bool | None
 ) -> None:
     whole, smaller = _stub("tilting", 4), _stub(rest, remaining)
-    asked: list[_Offenders] = []
+    asked: list[Offenders] = []
 
-    def without(_: object, offenders: _Offenders, aligner: object) -> Any:
+    def without(_: object, offenders: Offenders, aligner: object) -> Any:
         asked.append(offenders)
         return smaller
 
@@ -130,7 +130,7 @@ def test_what_is_damaged_is_left_out_where_the_others_fit_better(
     else:
         accepted = accept(whole, OPTIONS)
         assert accepted.alignment is (smaller if left_out else whole).alignment
-    assert [list(offenders.reasons) for offenders in asked[:1]] == [[2]]
+    assert [list(offenders) for offenders in asked[:1]] == [[(2,)]]
 
 
 def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Path) -> None:
@@ -145,9 +145,7 @@ def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Pat
         alignment=replace(found.alignment, links=links, used=found.alignment.used & [False, True, True]),
         messages=(left_out(frames[0], "contradicts"),),
     )
-    rest = _without(
-        spoiled, _Offenders({2: Message("shows something else")}, {}), Aligner.of(sources, OPTIONS, NO_CACHE)
-    )
+    rest = _without(spoiled, {(2,): Message("shows something else")}, Aligner.of(sources, OPTIONS, NO_CACHE))
     assert rest is not None
     assert rest.alignment.used.tolist() == [True, True, False]
     assert [str(message) for message in rest.left_out] == [f"left out {frames[2]}: shows something else [left-out]"]
