@@ -75,22 +75,10 @@ def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None 
     if alike is None or alike.ordered:
         chosen |= {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + _SEQUENCE_NEIGHBOURS, count))}
     if alike is not None:
-        chosen |= _alike_to_each(alike, set(np.flatnonzero(features.counts).tolist()))
+        best = ((i, j) for i, row in enumerate(alike.most_alike[:, :_RETRIEVED].tolist()) for j in row)
+        chosen |= {(min(pair), max(pair)) for pair in best if features.counts[[*pair]].all()}
         chosen |= _most_alike(alike, chosen, CANDIDATES * count // 2)
     return sorted(chosen)
-
-
-def _alike_to_each(alike: Similarity, known: set[int]) -> set[tuple[int, int]]:
-    """Pairs of each image with those most like it; in a sequence with those before and after which there are less.
-
-    Neighbours in the sequence would otherwise hide the places where it crosses itself.
-    """
-    chosen = set()
-    for i, (row, peak) in enumerate(zip(alike.most_alike.tolist(), alike.peak.tolist(), strict=True)):
-        if alike.ordered:
-            row = [j for j, own in zip(row, peak, strict=True) if own and abs(i - j) > _SEQUENCE_NEIGHBOURS]
-        chosen |= {(min(i, j), max(i, j)) for j in row[:_RETRIEVED] if i in known and j in known}
-    return chosen
 
 
 def _most_alike(alike: Similarity, chosen: set[tuple[int, int]], total: int) -> set[tuple[int, int]]:
