@@ -141,13 +141,6 @@ def _cells_of(link: CheckedLink) -> dict[str, object]:
     return {"confirming": link.agreement.confirming, "cells": link.agreement.cells}
 
 
-def _held_by_second_motion(found: Evidence) -> Iterator[Finding]:
-    """Images that what moves differently may hold together; none where that holds all of them."""
-    if found.compared is not None and not found.compared.lost:
-        doubtful = found.compared.doubtful
-        yield from (Finding("held by another", link.pair) for link in found.checked if link.pair in doubtful)
-
-
 def _ambiguous(found: Evidence) -> Iterator[Finding]:
     for pair, link in found.ambiguous.items():
         yield Finding("ambiguous", pair, values={"shift": link.ambiguity.shift})
@@ -225,7 +218,7 @@ Find = Callable[[Evidence], Iterable[Finding]]
 OF_MATCHES: tuple[Find, ...] = (_mixed_lenses, _matches_disagree, _misfitting_images)
 """Failures by which the pixels need not be asked: of images that may be left out."""
 
-OF_PAIRS: tuple[Find, ...] = (disagreeing_pairs, _unlike, _held_by_second_motion, _ambiguous)
+OF_PAIRS: tuple[Find, ...] = (disagreeing_pairs, _unlike, _ambiguous)
 """Suspicions of pairs, the last of each counts: a failure where images hang on it alone."""
 
 OF_THE_WHOLE: tuple[Find, ...] = (_errors, _depth, _shape, _pattern, _second_motion, _little_alike, _two_left, _inputs)

@@ -174,13 +174,10 @@ class MotionComparison:
     ----------
     fills_at_most, second_fills_at_most : float
         Share of the images that is not seen to contradict the alignment, and what moves differently, in [0, 1].
-    doubtful : frozenset of (int, int)
-        Pairs that what moves differently may hold together: what was aligned fills less than half of the images.
     """
 
     fills_at_most: float
     second_fills_at_most: float
-    doubtful: frozenset[Pair] = frozenset()
 
     @property
     def won(self) -> bool:
@@ -212,8 +209,7 @@ def compare_motions(
         return None
     fills = fills_at_most(link.agreement for link in checked)
     moved = (_moved(images, link.pair, second[link.pair]) for link in checked if link.pair in second)
-    doubtful = frozenset(link.pair for link in checked if not _may_be_a_plane(link.agreement))
-    found = MotionComparison(fills, fills_at_most(moved), doubtful)
+    found = MotionComparison(fills, fills_at_most(moved))
     return found if separate or found.lost else None
 
 
