@@ -20,7 +20,6 @@ from rdstitch.verification.photometric_agreement import (
     COMPARED_SIDE,
     Agreement,
     ComparedImage,
-    Parallax,
     overlap_agreement,
 )
 from rdstitch.verification.self_similarity import SLACK, Ambiguity, drawing_scale, find_ambiguity
@@ -114,25 +113,21 @@ def check_overlaps(registration: Registration, images: ComparedImages, cache: Ca
         (k, source.content(cache), source.mask_content(cache), alignment.cameras[k], alignment.homographies[k])
         for k, source in ((k, registration.sources[k]) for k in every)
     ]
-    parallax = _parallax(registration, chosen)
 
     def compute() -> list[CheckedLink]:
         placed = images.aligned(alignment, every)
 
         def compare(fit: LinkFit) -> CheckedLink:
-            first, second = placed[fit.image1], placed[fit.image2]
-            moved = parallax.get((fit.image1, fit.image2))
-            if moved is not None:
-                moved = moved.resized(alignment.cameras[fit.image2], second.camera)
-            both = _between(first, second) if alignment.on_sphere else (first, second)
-            return CheckedLink(fit, overlap_agreement(*both, moved), find_ambiguity(*both))
+            both = placed[fit.image1], placed[fit.image2]
+            both = _between(*both) if alignment.on_sphere else both
+            return CheckedLink(fit, overlap_agreement(*both), find_ambiguity(*both))
 
         with ThreadPoolExecutor(images.threads) as pool:
             checked = list(pool.map(compare, chosen))
         # On a plane that is not metric a period of a pattern is another shift at every place.
         return checked if alignment.poses is None or alignment.on_sphere else _by_what_is_unique(placed, checked)
 
-    inputs = (described, chosen, registration.stretch, list(parallax.values()))
+    inputs = (described, chosen, registration.stretch)
     return cache.recall("overlaps", inputs, compute)
 
 
@@ -140,22 +135,6 @@ def share_alike(checked: Sequence[CheckedLink]) -> float:
     """Share of all overlaps together that looks alike, in [0, 1]; NaN where nothing was compared."""
     cells = sum(link.agreement.cells for link in checked)
     return sum(link.agreement.confirming for link in checked) / cells if cells else float("nan")
-
-
-def _parallax(registration: Registration, chosen: Sequence[LinkFit]) -> dict[tuple[int, int], Parallax]:
-    """Of links over rough ground, as their inliers show it; nothing where the ground is flat."""
-    alignment = registration.alignment
-    if alignment.on_sphere or not alignment.relief.found:
-        return {}
-    pairs = {(pair.image1, pair.image2): pair for pair in registration.pairs}
-    result = {}
-    for images in ((fit.image1, fit.image2) for fit in chosen):
-        link = pairs[images].link()
-        expected = alignment.transfer(*images, link.points1)
-        seen = np.isfinite(expected).all(axis=1)
-        if seen.any():
-            result[images] = Parallax(expected[seen], (link.points2 - expected)[seen])
-    return result
 
 
 def _by_what_is_unique(placed: Mapping[int, ComparedImage], checked: Sequence[CheckedLink]) -> list[CheckedLink]:

@@ -2,12 +2,11 @@
 
 One image is resampled as the other's lens would have seen it. In each small cell of the overlap that has texture,
 the place where the two correlate best is searched around where the registration says it is. Where the registration is
-right nearly all cells find it there; elsewhere they find it anywhere. Over rough ground that place is moved by the
-parallax of the matches around it.
+right nearly all cells find it there; elsewhere they find it anywhere.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Self
 
@@ -22,7 +21,6 @@ from rdstitch.compositing.warp import Lattice
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import mean_of_channels
 from rdstitch.radial_homography import from_plane, to_plane
-from rdstitch.scipy_parts import spatial
 from rdstitch.verification.limits import limit
 
 Grey = NDArray[np.float32]
@@ -31,7 +29,6 @@ COMPARED_SIDE = 512  # pixels of the longer side of the images that are compared
 CELL = 24  # pixels
 _SEARCH_RADIUS = 8  # pixels
 _OPAQUE = 250
-_NEAREST = 3  # matches that show the parallax of a cell; one of them may be wrong
 _LATTICE = 8  # pixels between the places that are computed; those between are interpolated
 
 
@@ -57,33 +54,6 @@ class Agreement:
     def share(self) -> float:
         """Share of the cells that confirm the registration; 1 without cells."""
         return self.confirming / self.cells if self.cells else 1.0
-
-
-@dataclass(frozen=True)
-class Parallax:
-    """By how much matches are off the places where the registration expects them.
-
-    Attributes
-    ----------
-    places : ndarray of shape (M, 2)
-        Expected, pixels of the second image.
-    shifts : ndarray of shape (M, 2)
-        From there to where they were found, pixels.
-    """
-
-    places: FloatArray
-    shifts: FloatArray
-
-    def resized(self, camera: Camera, other: Camera) -> Self:
-        """The same in pixels of another size of the second image."""
-        scale = other.half_diagonal / camera.half_diagonal
-        return replace(self, places=other.denormalize(camera.normalize(self.places)), shifts=scale * self.shifts)
-
-    def at(self, points: FloatArray) -> NDArray[np.intp]:
-        """Of points (N, 2): the median of that of the nearest matches, whole pixels (N, 2)."""
-        nearest = spatial.cKDTree(self.places).query(points, k=min(_NEAREST, len(self.places)))[1]
-        around = self.shifts[np.asarray(nearest).reshape(len(points), -1)]
-        return np.rint(np.median(around, axis=1)).astype(np.intp)
 
 
 @dataclass(frozen=True)
@@ -146,26 +116,19 @@ def _reduced_grey(image: DecodedImage, stretch: tuple[float, float] | None) -> G
     return grey
 
 
-def overlap_agreement(first: ComparedImage, second: ComparedImage, parallax: Parallax | None = None) -> Agreement:
-    """Compare two registered images where they overlap, where the ground is rough by what moves its places."""
+def overlap_agreement(first: ComparedImage, second: ComparedImage) -> Agreement:
+    """Compare two registered images where they overlap."""
     height, width = second.grey.shape
     # The first image as the second one's lens would have seen it.
     seen = first.sampled(partial(to_plane, second.camera, second.homography), (0, 0, width, height))
     margin = CELL // 2 + _SEARCH_RADIUS
     rows, columns = (np.arange(margin, n - margin + 1, CELL) for n in (height, width))
     corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2) - CELL // 2
-    textured = corners[_have_texture(_cells(seen, corners))]
-    looked_at = there = textured
-    if parallax is not None and len(looked_at):
-        there = looked_at + parallax.at(looked_at[:, ::-1] + (CELL - 1) / 2.0)[:, ::-1]
-        inside = ((there >= _SEARCH_RADIUS) & (there + CELL + _SEARCH_RADIUS <= (height, width))).all(axis=1)
-        looked_at, there = looked_at[inside], there[inside]
-    windows = _cells(second.grey, there, _SEARCH_RADIUS)
-    inner = windows[:, _SEARCH_RADIUS:-_SEARCH_RADIUS, _SEARCH_RADIUS:-_SEARCH_RADIUS]
-    known = np.isfinite(windows).all(axis=(1, 2)) & _have_texture(inner)
-    cells = _cells(seen, looked_at[known])
-    confirming = sum(_confirms(*both) for both in zip(cells, windows[known], strict=True))
-    return Agreement(len(cells), confirming, int(_have_texture(_cells(second.grey, corners)).sum()))
+    cells, windows = _cells(seen, corners), _cells(second.grey, corners, _SEARCH_RADIUS)
+    textured = _have_texture(windows[:, _SEARCH_RADIUS:-_SEARCH_RADIUS, _SEARCH_RADIUS:-_SEARCH_RADIUS])
+    known = textured & _have_texture(cells) & np.isfinite(windows).all(axis=(1, 2))
+    confirming = sum(_confirms(*both) for both in zip(cells[known], windows[known], strict=True))
+    return Agreement(int(known.sum()), confirming, int(textured.sum()))
 
 
 def _cells(image: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:

@@ -1,15 +1,12 @@
 """Which overlaps are compared, and how many agree."""
 
 import math
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from rdstitch.alignment.motion_models.rotation import rotation_from_vector
 from rdstitch.alignment.result import LinkFit
-from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.verification import overlap_check
 from rdstitch.verification.overlap_check import CheckedLink, _least_confirmed, share_alike
@@ -56,22 +53,3 @@ def test_a_turn_is_compared_between_the_two_images() -> None:
     both = overlap_check._between(*(ComparedImage(grey, Camera((64, 48)), turn @ focal) for turn in (first, last)))
     np.testing.assert_allclose(both[0].homography, half.T @ focal, atol=1e-9)
     np.testing.assert_allclose(both[1].homography, half @ focal, atol=1e-9)
-
-
-def test_over_rough_ground_images_look_alike_where_their_matches_are() -> None:
-    """Two pixels to the right of where the alignment expects them; of a link that is not used nothing is asked."""
-    points = np.array([[10.0, 20.0], [30.0, 5.0]])
-    link = SimpleNamespace(points1=points, points2=points + np.array([2.0, 0.0]))
-    pairs = [SimpleNamespace(image1=i, image2=j, link=lambda: link) for i, j in ((0, 1), (1, 2))]
-
-    def transfer(i: int, j: int, points: FloatArray) -> FloatArray:
-        return np.where(points[:, :1] > 20.0, np.nan, points)
-
-    alignment = SimpleNamespace(on_sphere=False, relief=SimpleNamespace(found=True), transfer=transfer)
-    registration: Any = SimpleNamespace(alignment=alignment, pairs=pairs)
-    found = overlap_check._parallax(registration, [_fit(0, 1)])
-    assert list(found) == [(0, 1)]
-    np.testing.assert_allclose(found[0, 1].places, points[:1])
-    np.testing.assert_allclose(found[0, 1].shifts, [[2.0, 0.0]])
-    alignment.relief.found = False
-    assert overlap_check._parallax(registration, [_fit(0, 1)]) == {}

@@ -13,7 +13,6 @@ from rdstitch.verification.photometric_agreement import (
     COMPARED_SIDE,
     Agreement,
     ComparedImage,
-    Parallax,
     overlap_agreement,
 )
 
@@ -44,21 +43,6 @@ def test_two_and_a_half_pixels_are_forgiven(off: float, agree: bool) -> None:
     for put in ((off, 0.0), (0.0, -off), (-off * 0.6, off * 0.8)):
         found = overlap_agreement(_placed(100, 100), _placed(200, 150, put=put))
         assert (found.share > 0.8) if agree else (found.share < 0.2), put
-
-
-def test_what_relief_moves_agrees_where_the_matches_around_it_were_found() -> None:
-    put = (9.0, -5.0)
-    places = np.stack(np.meshgrid(np.arange(0.0, 400.0, 40.0), np.arange(0.0, 300.0, 40.0)), -1).reshape(-1, 2)
-    shifts = np.tile(put, (len(places), 1))
-    shifts[::17] = 100.0  # wrong matches
-    both = _placed(100, 100, put=put), _placed(200, 150)
-    moved = Parallax(places, -shifts)
-    assert overlap_agreement(*both).share < 0.2
-    assert overlap_agreement(*both, moved).share > 0.9
-    assert overlap_agreement(*both, Parallax(places, shifts)).share < 0.2
-    twice = Parallax(2.0 * places + 0.5, -2.0 * shifts).resized(LENS.resized((800, 600)), LENS)
-    np.testing.assert_allclose(twice.places, places, atol=1e-9)
-    np.testing.assert_allclose(twice.shifts, -shifts)
 
 
 def test_other_ground_does_not_agree() -> None:
