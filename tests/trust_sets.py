@@ -139,6 +139,8 @@ class Judged:
         What the user would have read.
     warned : bool
         Whether a warning names the place, or a decision that the user has to judge.
+    warnings : tuple of str
+        Codes of the warnings that are printed without ``-v``.
     """
 
     kind: str
@@ -148,6 +150,7 @@ class Judged:
     error: float
     text: str
     warned: bool = False
+    warnings: tuple[str, ...] = ()
 
 
 def trust_set(seed: int, kind: str | None = None) -> TrustSet:
@@ -286,8 +289,9 @@ def judge_set(item: TrustSet, folder: Path, options: StitchOptions | None = None
     complete = (
         missing <= dispensable if mixed is None else missing == mixed.taken or (mixed.usable and missing < mixed.taken)
     )
-    warned = any(message.images and message.severity == "warning" for message in registration.messages)
-    return Judged(item.kind, 0, right, complete, error, text, warned)
+    said = [message for message in registration.messages if message.severity == "warning"]
+    warned, codes = any(message.images for message in said), tuple(message.code for message in said)
+    return Judged(item.kind, 0, right, complete, error, text, warned, codes)
 
 
 def registration_error(sequence: Sequence, registration: Registration) -> tuple[float, float]:

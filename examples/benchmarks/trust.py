@@ -1,7 +1,8 @@
 """Is any result wrong that claims to be right? And how many of the solvable sets are solved?
 
 ``python -m examples.benchmarks.trust [--sets 300] [--kind pair]``; ``--kind adverse`` takes all adverse ones in turn,
-``--keep FILE`` continues an earlier run.
+``--keep FILE`` continues an earlier run. The last lines count the warnings that are printed, and those that are true: a
+result that is off, or a set in which there is what the warning says.
 """
 
 import json
@@ -16,6 +17,17 @@ from tests.adverse_sets import ADVERSE, SOLVABLE_ADVERSE
 from tests.trust_sets import HOPELESS, ODD, SOLVABLE, SPOILED, Judged, judge_set, trust_set
 
 _SOLVABLE = (*SOLVABLE, *ODD, *SPOILED, *SOLVABLE_ADVERSE)
+_TRUE_OF = {
+    "damaged": ("bit rot", "spoiled"),
+    "mixed-lenses": ("mixed lenses", "mixed by one", "spoiled"),
+    "relief": ("cylinder",),
+    "repeated-pattern": ("dirt", "repeated"),
+    "rival-motion": ("vehicle", "body"),
+    "shape": ("off centre", "crops", "rolling shutter", "cylinder", "odd lens"),
+    "static-background": ("body", "banner", "round border", "curved border"),
+}
+"""Kinds of sets in which there is what a warning of a code says."""
+
 _OTHERS = (*HOPELESS, *(kind for kind in ADVERSE if kind not in SOLVABLE_ADVERSE))
 
 
@@ -23,7 +35,7 @@ def main(
     *, sets: int = 30, first: int = 0, kind: str | None = None, keep: Path | None = None, verbose: bool = False
 ) -> None:
     """Print every set that was not solved right, and the totals."""
-    counts: Counter[tuple[str, str]] = Counter()
+    counts, warnings = Counter[tuple[str, str]](), Counter[tuple[str, bool]]()
     kept = _read(keep)
     start, done = time.process_time(), 0
     for seed in range(first, first + sets):
@@ -36,6 +48,7 @@ def main(
         what = _outcome(judged)
         silent, solved = what == "silently wrong", what == "solved"
         counts[judged.kind, what] += 1
+        warnings.update((code, not judged.right or judged.kind in _TRUE_OF.get(code, ())) for code in judged.warnings)
         if silent or verbose or (judged.kind in _SOLVABLE and not solved):
             print(
                 f"{seed} {judged.kind}: {what}, status {judged.status}, {judged.error:.2f} px: {judged.text[:230]}",
@@ -52,6 +65,9 @@ def main(
     print(f"\n{share:.1%} of {solvable} solvable sets solved, {refused:.1%} refused; ", end="")
     print(f"{wrong} of {sets} sets silently wrong; ", end="")
     print(f"{(time.process_time() - start) / max(done, 1):.1f} s of processor time a set")
+    codes = sorted({code for code, _ in warnings})
+    print("true warnings: ", end="")
+    print("; ".join(f"{warnings[c, True]} of {warnings[c, True] + warnings[c, False]} [{c}]" for c in codes) or "none")
 
 
 def _outcome(judged: Judged) -> str:

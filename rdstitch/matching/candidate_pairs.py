@@ -15,7 +15,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.matching.retrieval import Similarity, similarity
-from rdstitch.radial_homography import to_plane
+from rdstitch.radial_homography import from_plane, to_plane
 from rdstitch.scipy_parts import sparse, spatial
 
 EXHAUSTIVE_UP_TO = 30
@@ -27,8 +27,9 @@ CANDIDATES = 15
 _SEQUENCE_NEIGHBOURS = 3  # images after each one that are tried
 _RETRIEVED = 4  # images most like each one that are tried, whatever the others are like
 _NEAREST = 8  # images taken nearest to each one that are tried
-_NEIGHBOURS = 10  # nearest images in the plane that are considered for each one
-_MIN_OVERLAP = 0.15  # share of the smaller footprint
+_NEIGHBOURS = 10  # nearest images, by their middles, that are considered for each one
+_MIN_OVERLAP = 0.15  # share of the image of which more is seen in the other
+_PLACES_PER_SIDE = 10  # of an image, that are looked up in others
 _PARTNERS = 6  # pairs of an image that its place is found by; those that others choose come on top
 _CELLS_PER_SIDE = 4  # cells of an image, a side, that its partners are to cover
 
@@ -74,22 +75,10 @@ def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None 
     if alike is None or alike.ordered:
         chosen |= {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + _SEQUENCE_NEIGHBOURS, count))}
     if alike is not None:
-        chosen |= _alike_to_each(alike, set(np.flatnonzero(features.counts).tolist()))
+        best = ((i, j) for i, row in enumerate(alike.most_alike[:, :_RETRIEVED].tolist()) for j in row)
+        chosen |= {(min(pair), max(pair)) for pair in best if features.counts[[*pair]].all()}
         chosen |= _most_alike(alike, chosen, CANDIDATES * count // 2)
     return sorted(chosen)
-
-
-def _alike_to_each(alike: Similarity, known: set[int]) -> set[tuple[int, int]]:
-    """Pairs of each image with those most like it; in a sequence with those before and after which there are less.
-
-    Neighbours in the sequence would otherwise hide the places where it crosses itself.
-    """
-    chosen = set()
-    for i, (row, peak) in enumerate(zip(alike.most_alike.tolist(), alike.peak.tolist(), strict=True)):
-        if alike.ordered:
-            row = [j for j, own in zip(row, peak, strict=True) if own and abs(i - j) > _SEQUENCE_NEIGHBOURS]
-        chosen |= {(min(i, j), max(i, j)) for j in row[:_RETRIEVED] if i in known and j in known}
-    return chosen
 
 
 def _most_alike(alike: Similarity, chosen: set[tuple[int, int]], total: int) -> set[tuple[int, int]]:
@@ -144,7 +133,9 @@ def pairs_that_matter(
     return {pair: found for pair, found in shared.items() if pair in chosen}
 
 
-def neighbours(cameras: Sequence[Camera], homographies: FloatArray, tried: set[tuple[int, int]]) -> Pairs:
+def neighbours(
+    cameras: Sequence[Camera], homographies: FloatArray, tried: set[tuple[int, int]], *, on_sphere: bool = False
+) -> Pairs:
     """Pairs that the poses put over one another and that were not tried yet, where the match graph needs them.
 
     It does not need a pair of images that both have their partners, one of them in common: that closes no loop.
@@ -153,16 +144,21 @@ def neighbours(cameras: Sequence[Camera], homographies: FloatArray, tried: set[t
     ----------
     cameras : sequence of Camera
     homographies : ndarray of shape (N, 3, 3)
-        From undistorted normalized coordinates of each image to the plane; NaN for images without a pose.
+        From undistorted normalized coordinates of each image to the plane, or to directions; NaN for images without a
+        pose.
     tried : set of (int, int)
         Pairs (i, j), i < j.
+    on_sphere : bool
+        Whether they lead to directions.
     """
-    footprints = np.array([_footprint(*placed) for placed in zip(cameras, homographies, strict=True)])
-    known = np.flatnonzero(np.isfinite(footprints).all(axis=(1, 2))).tolist()
+    middles = homographies[:, :, 2]
+    with np.errstate(invalid="ignore"):
+        ahead = np.isfinite(homographies).all(axis=(1, 2)) & (on_sphere | (middles[:, 2] > 0.0))
+    known = np.flatnonzero(ahead)
     if len(known) < 2:
         return []
-    boxes = footprints[known]
-    centres = boxes.mean(axis=1)
+    size = np.linalg.norm(middles[known], axis=1) if on_sphere else middles[known, 2]
+    centres = middles[known] / size[:, None]
     nearest = spatial.KDTree(centres).query(centres, k=min(_NEIGHBOURS + 1, len(known)))[1].reshape(len(known), -1)
     partners: dict[int, set[int]] = {}
     for i, j in tried:
@@ -173,26 +169,20 @@ def neighbours(cameras: Sequence[Camera], homographies: FloatArray, tried: set[t
         first, second = partners.get(i, set()), partners.get(j, set())
         return min(len(first), len(second)) < _PARTNERS or not first & second
 
-    found = set()
-    for a, row in enumerate(nearest.tolist()):
-        for b in row:
-            pair = (known[min(a, b)], known[max(a, b)])
-            if a == b or pair in tried or not needed(*pair):
-                continue
-            if _overlap(boxes[a], boxes[b]) >= _MIN_OVERLAP:
-                found.add(pair)
-    return sorted(found)
+    near = np.sort(np.stack([np.repeat(known, nearest.shape[1]), known[nearest.ravel()]], axis=1), axis=1)
+    return [
+        pair
+        for pair in sorted({(i, j) for i, j in near.tolist() if i != j} - tried)
+        if needed(*pair)
+        and max(_share_seen(cameras, homographies, *both) for both in (pair, pair[::-1])) >= _MIN_OVERLAP
+    ]
 
 
-def _footprint(camera: Camera, homography: FloatArray) -> FloatArray:
-    """Lower and upper bounds (2, 2) of an image in the plane; NaN where the horizon crosses it."""
-    plane = to_plane(camera, homography, camera.outline(8))
-    return np.stack([plane.min(axis=0), plane.max(axis=0)])
-
-
-def _overlap(box1: FloatArray, box2: FloatArray) -> float:
-    """Area that two boxes share, relative to the smaller one."""
-    common = np.minimum(box1[1], box2[1]) - np.maximum(box1[0], box2[0])
-    if (common <= 0.0).any():
-        return 0.0
-    return float(common.prod() / min(np.ptp(box1, axis=0).prod(), np.ptp(box2, axis=0).prod()))
+def _share_seen(cameras: Sequence[Camera], homographies: FloatArray, i: int, j: int) -> float:
+    """Share of one image that another shows, by places on a grid over it."""
+    share = (np.arange(_PLACES_PER_SIDE) + 0.5) / _PLACES_PER_SIDE
+    places = np.stack(np.meshgrid(share, share), axis=-1).reshape(-1, 2) * cameras[i].image_size - 0.5
+    across = to_plane(cameras[i], np.linalg.inv(homographies[j]) @ homographies[i], places)
+    seen = from_plane(cameras[j], np.eye(3), across)
+    with np.errstate(invalid="ignore"):
+        return float(((seen > -0.5) & (seen < np.array(cameras[j].image_size) - 0.5)).all(axis=1).mean())

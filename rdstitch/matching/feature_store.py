@@ -30,8 +30,6 @@ class StoredFeatures:
         Width and height of the image in whose pixels they are wanted; None: as they are stored.
     chosen : ndarray of shape (N,), intp, optional
         Those that are wanted, in their order; None: all.
-    most : int, optional
-        Only so many of these, the first ones.
     shown : int
         Keypoints that the image shows at its working size, see :class:`rdstitch.features.Features`.
     faint : bool
@@ -42,7 +40,6 @@ class StoredFeatures:
     count: int
     image_size: Size | None = None
     chosen: NDArray[np.intp] | None = None
-    most: int | None = None
     shown: int = 0
     faint: bool = False
 
@@ -60,30 +57,22 @@ class StoredFeatures:
 
     def __len__(self) -> int:
         """Number of features."""
-        count = self.count if self.chosen is None else len(self.chosen)
-        return count if self.most is None else min(count, self.most)
+        return self.count if self.chosen is None else len(self.chosen)
 
     def load(self) -> Features:
         """Read the features; InputError when they have vanished."""
         features = self.stored.load().unpack()
         if self.image_size is not None and features.image_size not in (None, self.image_size):
             features = _at_size(features, self.image_size)
-        if self.chosen is None and self.most is None:
-            return features
-        chosen = np.arange(len(features)) if self.chosen is None else self.chosen
-        return features.take(chosen[: self.most])
+        return features if self.chosen is None else features.take(self.chosen)
 
     def take(self, index: NDArray[np.intp]) -> Self:
         """Those of the given indices."""
         return replace(self, chosen=index if self.chosen is None else self.chosen[index])
 
-    def strongest(self, most: int) -> Self:
-        """At most so many."""
-        return replace(self, most=most)
-
     def key(self, cache: Cache) -> str:
         """What stands for them in the inputs of later results; empty without a cache."""
-        return cache.digest((self.stored.name or self.stored.value, self.image_size, self.chosen, self.most))
+        return cache.digest((self.stored.name or self.stored.value, self.image_size, self.chosen))
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +117,7 @@ class FeatureStore(Sequence[Features]):
 
     def strongest(self, most: int) -> Self:
         """At most so many of each image."""
-        return replace(self, items=tuple(item.strongest(most) for item in self.items))
+        return replace(self, items=tuple(item.take(np.arange(min(most, len(item)))) for item in self.items))
 
 
 @dataclass(frozen=True, eq=False)

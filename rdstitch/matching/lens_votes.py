@@ -12,6 +12,7 @@ from rdstitch.matching.thinning import spread_choice
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.own_lenses import OwnLenses, own_lenses
+from rdstitch.scipy_parts import sparse, sparse_linalg
 
 _MAX_DISTANCE = 10.0  # thresholds from where one λ puts them, within which correspondences may fit with two
 _MAX_MATCHES = 250  # matches of a pair that are used
@@ -72,12 +73,6 @@ class Votes:
         """How far each vote is from what is expected, (L, 2), in its standard deviations."""
         return np.asarray(np.linalg.norm(self._whitened(self.distortion - expected), axis=1))
 
-    @property
-    def differences(self) -> tuple[FloatArray, FloatArray]:
-        """λ of the second image of each pair less that of the first, and its standard deviation, both (L,)."""
-        sign = np.array([-1.0, 1.0])
-        return self.distortion @ sign, np.sqrt(sign @ self.covariance @ sign + 2.0 * _MIN_STD**2)
-
     def which(self, second: BoolArray) -> IntArray:
         """From which lens, 0 or 1, the two images of each pair come, shape (L, 2)."""
         return np.stack([second[self.image1], second[self.image2]], axis=1).astype(np.intp)
@@ -92,13 +87,15 @@ class Votes:
         lenses : ndarray of shape (K,)
             λ to start from; that of a lens without votes stays.
         """
-        design = self._whitening @ np.eye(len(lenses))[which]
+        rows, count = 2 * len(self), len(lenses)
+        places = np.repeat(np.arange(rows), 2), np.repeat(which, 2, axis=0).ravel()
+        design = sparse.coo_array((self._whitening.ravel(), places), shape=(rows, count)).tocsc()
         seen = np.bincount(which.ravel(), minlength=len(lenses)) > 0
         for _ in range(_ROUNDS):
-            weight = 1.0 / np.maximum(self.mahalanobis_residuals(lenses[which]), 0.1)
-            normal = np.einsum("l,lij,lik->jk", weight, design, design)
-            right = np.einsum("l,lij,li->j", weight, design, self._whitened(self.distortion))
-            lenses = np.where(seen, np.linalg.lstsq(normal, right, rcond=None)[0], lenses)
+            weight = np.repeat(1.0 / np.maximum(self.mahalanobis_residuals(lenses[which]), 0.1), 2)
+            normal = (design.T * weight) @ design + sparse.diags_array(1.0 - seen)
+            right = design.T @ (weight * self._whitened(self.distortion).ravel())
+            lenses = np.where(seen, np.asarray(sparse_linalg.spsolve(normal.tocsc(), right)), lenses)
         return lenses
 
     @cached_property

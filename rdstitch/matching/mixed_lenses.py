@@ -4,7 +4,7 @@ A pair of images sees λ of both of them, each on its own: the same one where th
 the images into two lenses predicts what every pair sees.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,13 +12,10 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.camera import Camera
 from rdstitch.matching.lens_votes import Votes
-from rdstitch.matching.match_graph import connected_components, spanning_forest
 from rdstitch.matching.two_view import PairRegistration
 
-_DIFFERENT_SIGMA = 5.0  # standard deviations from which on a pair is taken to see two lenses, until all votes are heard
 _STARTS = 5  # divisions that are begun with
-_ROUNDS = 6
-_MOVES = 12
+_ROUNDS = 3
 _MIN_GAP = 0.01  # λ; what is nearer is one lens that one λ does not quite describe
 _MIN_GAP_PX = 4.0  # the same at a corner, pixels; with one λ, images are off by a tenth of that, rows of them by half
 _MAX_MEAN_RESIDUAL = 1.25  # standard deviations that a vote, two numbers, is off on average; less is luck
@@ -62,8 +59,7 @@ def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
     if not len(votes):
         return None
     count, gap = len(cameras), max(_MIN_GAP, _MIN_GAP_PX / min(camera.half_diagonal for camera in cameras))
-    divisions = [_divide(count, votes, *guess) for guess in _guesses(count, votes)]
-    divisions = [(second, lenses) for second, lenses in divisions if abs(lenses[1] - lenses[0]) >= gap]
+    divisions = [found for found in _divisions(count, votes) if abs(found[1][1] - found[1][0]) >= gap]
     if not divisions:
         return None
     second, lenses = min(
@@ -84,32 +80,12 @@ def two_lenses(cameras: Sequence[Camera], votes: Votes) -> TwoLenses | None:
     return TwoLenses(second, (float(lenses[0]), float(lenses[1])), bool(clear and not between.all()))
 
 
-@dataclass(frozen=True)
-class SeparatedLenses:
-    """Pairs of the images of one lens.
-
-    Attributes
-    ----------
-    pairs : list of PairRegistration
-    left_out : mapping of int to str
-        Why an image was left out, by its index.
-    mixed : TwoLenses or None
-        Both lenses, where there are two.
-    """
-
-    pairs: list[PairRegistration]
-    left_out: Mapping[int, str]
-    mixed: TwoLenses | None
-
-    def of_one_lens(self, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-        """The pairs of images that were not left out."""
-        return [pair for pair in pairs if not {*pair} & self.left_out.keys()]
-
-
 def separate_lenses(
-    cameras: Sequence[Camera], pairs: list[PairRegistration], threshold: float, known_distortion: float | None
-) -> SeparatedLenses:
-    """Leave out the images of the lens that took fewer; none where one lens will do, λ is known, or in doubt.
+    cameras: Sequence[Camera], pairs: Sequence[PairRegistration], threshold: float, known_distortion: float | None
+) -> tuple[TwoLenses | None, Mapping[int, str]]:
+    """Both lenses, where there are two, and the images of that which took fewer, with why they are left out.
+
+    None where one lens will do or λ is known; none are left out where it is not clear which belong together.
 
     Parameters
     ----------
@@ -122,9 +98,7 @@ def separate_lenses(
         λ in the half-diagonal frame, where the user gave it.
     """
     mixed = None if known_distortion is not None else two_lenses(cameras, Votes.of(pairs, threshold))
-    others = {} if mixed is None else _of_the_other_lens(mixed, pairs)
-    kept = [pair for pair in pairs if not {pair.image1, pair.image2} & others.keys()]
-    return SeparatedLenses(kept, others, mixed)
+    return mixed, {} if mixed is None else _of_the_other_lens(mixed, pairs)
 
 
 def _of_the_other_lens(mixed: TwoLenses, pairs: Sequence[PairRegistration]) -> dict[int, str]:
@@ -146,40 +120,17 @@ def _of_the_other_lens(mixed: TwoLenses, pairs: Sequence[PairRegistration]) -> d
     return {int(k): reason for k in np.flatnonzero(mixed.second != kept)}
 
 
-def _guesses(count: int, votes: Votes) -> list[tuple[BoolArray, FloatArray]]:
-    """Divisions to start from: of the groups that the most certain votes connect, those with the larger λ."""
-    difference, std = votes.differences
-    held = spanning_forest(count, votes.image1, votes.image2, -std)
-    alike = held[np.abs(difference[held]) < _DIFFERENT_SIGMA * std[held]]
-    group = np.empty(count, dtype=np.intp)
-    for number, images in enumerate(connected_components(count, votes.image1[alike], votes.image2[alike])):
-        group[images] = number
-    start = np.full(group.max() + 1, np.median(votes.distortion))
-    own = votes.fitted(group[np.stack([votes.image1, votes.image2], axis=1)], start)
-    levels = np.sort(own)
-    widest = np.argsort(levels[:-1] - levels[1:], kind="stable")[:_STARTS]
-    return [(own[group] > levels[cut], levels[[cut, cut + 1]]) for cut in widest]
-
-
-def _divide(count: int, votes: Votes, second: BoolArray, lenses: FloatArray) -> tuple[BoolArray, FloatArray]:
-    """Images and λ of two lenses, in turn, from a first guess of which images are of the second one."""
-    for _ in range(_ROUNDS):
-        lenses = votes.fitted(votes.which(second), lenses)
-        improved = _improved_division(count, votes, second, lenses)
-        if (improved == second).all():
-            break
-        second = improved
-    return second, lenses
-
-
-def _improved_division(count: int, votes: Votes, second: BoolArray, lenses: FloatArray) -> BoolArray:
-    """The division after moving those images to the other lens by which the votes gain most, some at a time."""
-    for _ in range(_MOVES):
-        margin = _margins(count, votes, second, lenses)
-        if margin.min() >= -1e-9:
-            break
-        second = second ^ (margin < min(0.5 * margin.min(), -1e-9))
-    return second
+def _divisions(count: int, votes: Votes) -> Iterator[tuple[BoolArray, FloatArray]]:
+    """Images of the second of two lenses, and λ of both, by the widest gaps between λ of each image on its own."""
+    every = np.stack([votes.image1, votes.image2], axis=1)
+    own = votes.fitted(every, np.full(count, np.median(votes.distortion)))
+    levels = np.unique(own[every])
+    for cut in np.argsort(levels[:-1] - levels[1:], kind="stable")[:_STARTS]:
+        second, lenses = own > levels[cut], levels[[cut, cut + 1]]
+        for _ in range(_ROUNDS):
+            lenses = votes.fitted(votes.which(second), lenses)
+            second ^= _margins(count, votes, second, lenses) < 0.0
+        yield second, lenses
 
 
 def _margins(count: int, votes: Votes, second: BoolArray, lenses: FloatArray) -> FloatArray:

@@ -4,7 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rdstitch.errors import ArgumentError
-from rdstitch.robust import SOLVERS
+from rdstitch.robust import SOLVERS, EstimationOptions, RansacOptions
+
+_SELECT_MODEL_BELOW = 50
+"""Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +25,12 @@ class PairOptions:
         """Check the solver's name before long work begins."""
         if self.solver not in SOLVERS:
             raise ArgumentError(f"unknown solver {self.solver!r}; choose one of {', '.join(SOLVERS)}")
+
+    @property
+    def estimation(self) -> EstimationOptions:
+        """The same as the estimation of many pairs takes it."""
+        limits = RansacOptions(self.threshold, self.confidence, self.max_iterations, self.seed)
+        return EstimationOptions(self.solver, self.distortion, limits, _SELECT_MODEL_BELOW)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.features import Features
 from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.scipy_parts import sparse
@@ -28,8 +28,6 @@ _SHORTLIST = 40  # most similar images of each that are considered further
 _SHARED_NEIGHBOURS = 10  # most similar images of each that two images may have in common
 _SHARED_NEIGHBOUR_WEIGHT = 1.0  # weight of having all neighbours in common, in units of the usual best similarity
 _SEQUENCE_RANK = 0.75  # share of the other images that are less alike than the next one where the order means something
-_ONE_SIGMA = 0.16  # quantile of a normal distribution one standard deviation below its median
-_SIGNIFICANT_SIGMA = 5.0  # standard deviations above the median of all images
 _MIN_SEQUENTIAL_SHARE = 0.5  # share of the images of which that is true of the next one; a quarter by chance
 _BLOCK = 8192  # descriptors assigned at a time
 _ROWS = 256  # images compared with all others at a time
@@ -50,16 +48,12 @@ class Similarity:
         Symmetric; larger is more alike, and what any two images have in common counts nothing.
     most_alike : ndarray of shape (N, K), intp
         The K other images that are most alike to each, the most alike first.
-    peak : ndarray of shape (N, K), bool
-        Whether such an image is more alike than chance makes it, and more than the one before it and the one after it
-        in the sequence.
     ordered : bool
         Whether images that follow one another are alike, so that their order means something.
     """
 
     scores: "sparse.csr_array"
     most_alike: IntArray
-    peak: BoolArray
     ordered: bool
 
 
@@ -171,27 +165,20 @@ def _compare(weights: "sparse.csr_array") -> Similarity:
     count = weights.shape[0]
     kept = min(_SHORTLIST, count - 1)
     best, values = np.empty((count, kept), dtype=np.intp), np.empty((count, kept))
-    peak = np.zeros((count, kept), dtype=np.bool_)
-    usual, spread, next_one = np.empty(count), np.empty(count), np.zeros(count, dtype=np.bool_)
+    usual, next_one = np.empty(count), np.zeros(count, dtype=np.bool_)
     across = weights.T.tocsr()
     for first in range(0, count, _ROWS):
         rows = np.arange(first, min(first + _ROWS, count))
         alike = np.asarray((weights[rows] @ across).todense(), dtype=np.float64)
-        low, usual[rows], high = np.quantile(alike, (_ONE_SIGMA, 0.5, _SEQUENCE_RANK), axis=1)
-        spread[rows] = usual[rows] - low  # the other half has the images that are truly alike
+        usual[rows], high = np.quantile(alike, (0.5, _SEQUENCE_RANK), axis=1)
         following = alike[np.arange(len(rows)), np.minimum(rows + 1, count - 1)]
         next_one[rows] = following > high
         alike[np.arange(len(rows)), rows] = -1.0
         best[rows] = np.argsort(-alike, axis=1, kind="stable")[:, :kept]
         values[rows] = np.take_along_axis(alike, best[rows], axis=1)
-        padded = np.pad(alike, ((0, 0), (1, 1)), constant_values=-1.0)
-        is_peak = (alike >= padded[:, :-2]) & (alike >= padded[:, 2:])
-        peak[rows] = np.take_along_axis(is_peak, best[rows], axis=1)
     excess = np.maximum(values - (usual[:, None] + usual[best]) / 2.0, 0.0)
-    peak &= excess > _SIGNIFICANT_SIGMA * spread[:, None]
-    return Similarity(
-        _with_shared_neighbours(best, excess), best, peak, bool(next_one[:-1].mean() > _MIN_SEQUENTIAL_SHARE)
-    )
+    ordered = bool(next_one[:-1].mean() > _MIN_SEQUENTIAL_SHARE)
+    return Similarity(_with_shared_neighbours(best, excess), best, ordered)
 
 
 def _with_shared_neighbours(best: IntArray, excess: FloatArray) -> "sparse.csr_array":

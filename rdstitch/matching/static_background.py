@@ -12,7 +12,6 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.matching.match_graph import connected_components
-from rdstitch.matching.static_places import StaticPlaces
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.scipy_parts import spatial
 
@@ -26,7 +25,7 @@ _MIN_STATIC_MATCHES = 8
 """Of a pair that moves. Wrong matches lie anywhere: of 1,000, less than one ends within a pixel of where it began."""
 
 _MIN_CONFIRMATIONS = 3
-"""Static matches at one place, from which on every static match there counts as one."""
+"""Static matches at one place, from which on every feature there counts as static."""
 
 _MIN_OVERLAID_PAIRS, _MIN_OVERLAID_SHARE = 2, 0.2
 """Pairs with such matches, in number and as a share of the pairs that move; by one pair alone nothing is decided."""
@@ -49,25 +48,25 @@ def has_static_background(pairs: Sequence[PairRegistration], threshold: float) -
 
 
 def moving_features(features: FeatureStore, pairs: Sequence[PairRegistration], threshold: float) -> FeatureStore:
-    """The features of each image without those that have a static match."""
+    """The features of each image without those that have a static match, or lie where several pairs have one.
+
+    The latter were matched otherwise at first; once the others are gone, they would find what is static, too.
+    """
     moving = [np.ones(len(found), dtype=np.bool_) for found in features.items]
+    begun = [np.empty((0, 2))]
     for pair in pairs:
-        static = pair.correspondences.indices[_static_matches(pair, threshold)]
-        moving[pair.image1][static[:, 0]] = False
-        moving[pair.image2][static[:, 1]] = False
+        matched = pair.correspondences.take(np.flatnonzero(_static_matches(pair, threshold)))
+        moving[pair.image1][matched.indices[:, 0]] = False
+        moving[pair.image2][matched.indices[:, 1]] = False
+        begun.append(matched.points1)
+    places, radius = np.concatenate(begun), threshold * _MAX_STATIC_MOTION
+    confirmations = spatial.cKDTree(places).query_ball_point(places, radius, return_length=True)
+    static = spatial.cKDTree(places[confirmations >= _MIN_CONFIRMATIONS])
+    for found, kept in zip(features, moving, strict=True):
+        kept &= ~np.isfinite(static.query(found.points, distance_upper_bound=radius)[0])
     return FeatureStore(
         tuple(found.take(np.flatnonzero(kept)) for found, kept in zip(features.items, moving, strict=True))
     )
-
-
-def static_places(pairs: Sequence[PairRegistration], threshold: float) -> StaticPlaces:
-    """Places where at least three static matches of any pairs begin."""
-    found = np.concatenate(
-        [np.empty((0, 2)), *(pair.correspondences.points1[_static_matches(pair, threshold)] for pair in pairs)]
-    )
-    radius = threshold * _MAX_STATIC_MOTION
-    matches = spatial.cKDTree(found).query_ball_point(found, radius, return_length=True)
-    return StaticPlaces(spatial.cKDTree(found[matches >= _MIN_CONFIRMATIONS]), radius)
 
 
 def _static_matches(pair: PairRegistration, threshold: float) -> BoolArray:

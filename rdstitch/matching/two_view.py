@@ -12,22 +12,22 @@ from typing import TypeVar
 
 import numpy as np
 
+from rdstitch.arrays import FloatArray
 from rdstitch.cache import Cache
 from rdstitch.camera import Camera
 from rdstitch.features import Correspondences, Features, Matcher, match_overlap
 from rdstitch.matching.feature_store import StoredFeatures, StoredMatches
 from rdstitch.matching.links import Link
 from rdstitch.matching.options import PairOptions
-from rdstitch.matching.static_places import StaticPlaces
 from rdstitch.radial_homography import RadialHomography
-from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
+from rdstitch.robust import PairMatches, estimate_radial_homographies
 
 Item = TypeVar("Item")
 
 Pair = tuple[int, int]
 
-_SELECT_MODEL_BELOW = 50
-"""Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them."""
+Transfer = Callable[[int, int, FloatArray], FloatArray]
+"""Takes two images and points (N, 2) of the first, pixels, to points of the second; NaN where it does not see them."""
 
 _MIN_BATCHES = 8
 """Batches that pairs are at least divided into for matching, so that a few pairs keep several workers busy."""
@@ -71,6 +71,12 @@ class PairRegistration:
     def correspondences(self) -> Correspondences:
         """The putative matches, pixels; read every time."""
         return self.matches.load()
+
+    def errors(self, transfer: Transfer) -> FloatArray:
+        """How far each match, (M,), is from where ``transfer`` expects it, pixels; inf where that is nowhere."""
+        matched = self.correspondences
+        expected = transfer(self.image1, self.image2, matched.points1)
+        return np.asarray(np.nan_to_num(np.linalg.norm(expected - matched.points2, axis=1), nan=np.inf))
 
     def link(self) -> Link:
         """The inliers, as global adjustment takes them."""
@@ -145,10 +151,6 @@ class EstimationTask:
         Known tilts (ψ, θ), radians, of the two images of each pair; None where unknown.
     options : PairOptions
     cache : Cache
-    static : StaticPlaces, optional
-        Where static matches are no evidence.
-    store : Cache, optional
-        Where matches that are left without those lie on disk; ``cache`` if not given.
     """
 
     cameras: Sequence[tuple[Camera, Camera]]
@@ -156,35 +158,21 @@ class EstimationTask:
     tilts: Sequence[tuple[tuple[float, float] | None, tuple[float, float] | None]]
     options: PairOptions
     cache: Cache
-    store: Cache
-    static: StaticPlaces | None = None
 
 
-def estimate_pairs(task: EstimationTask) -> list[tuple[StoredMatches, RadialHomography]]:
-    """Estimate the two-view geometry of every pair of a task, in lockstep, with the matches that it was found from."""
-    matches = [found if task.static is None else _moving(found, task.static, task.store) for found in task.matches]
+def estimate_pairs(task: EstimationTask) -> list[RadialHomography]:
+    """Estimate the two-view geometry of every pair of a task, in lockstep."""
     inputs = [
         (*cameras, found.key(task.cache), task.options, *tilts)
-        for cameras, found, tilts in zip(task.cameras, matches, task.tilts, strict=True)
+        for cameras, found, tilts in zip(task.cameras, task.matches, task.tilts, strict=True)
     ]
-    options = task.options
-    limits = RansacOptions(options.threshold, options.confidence, options.max_iterations, options.seed)
-    how = EstimationOptions(options.solver, options.distortion, limits, _SELECT_MODEL_BELOW)
 
     def estimate(places: list[int]) -> list[RadialHomography]:
-        pairs = [_pair_matches(task.cameras[k], matches[k].load(), task.tilts[k]) for k in places]
+        pairs = [_pair_matches(task.cameras[k], task.matches[k].load(), task.tilts[k]) for k in places]
         with _one_estimation:
-            return estimate_radial_homographies(pairs, how)
+            return estimate_radial_homographies(pairs, task.options.estimation)
 
-    relations = task.cache.recall_many("pairs", inputs, estimate)
-    return list(zip(matches, relations, strict=True))
-
-
-def _moving(found: StoredMatches, static: StaticPlaces, store: Cache) -> StoredMatches:
-    """The matches that are left without those that are static."""
-    inputs = (found.key(store), static.radius, static.places.data)
-    stored = store.stored("moving-matches", inputs, lambda: static.without_static(found.load()))
-    return StoredMatches(stored, len(stored.load()))
+    return task.cache.recall_many("pairs", inputs, estimate)
 
 
 def _pair_matches(

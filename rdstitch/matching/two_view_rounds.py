@@ -1,35 +1,31 @@
 """Pairs of images through all rounds: matched once, estimated alone, then with what the others know."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray
 from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.camera import Camera
 from rdstitch.executors import in_order
 from rdstitch.features import Correspondences, Matcher, match_near
 from rdstitch.matching.candidate_pairs import pairs_that_matter
-from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.options import MatchingOptions, PairOptions
 from rdstitch.matching.repeated_pattern import MIN_REPETITION, match_pattern, repetition
 from rdstitch.matching.static_background import (
     has_static_background,
     moving_features,
-    moving_images,
     show_motion,
-    static_places,
 )
-from rdstitch.matching.static_places import StaticPlaces
 from rdstitch.matching.two_view import (
     EstimationTask,
     MatchingTask,
     Pair,
     PairRegistration,
+    Transfer,
     estimate_pairs,
     estimation_batches,
     match_pairs,
@@ -37,12 +33,9 @@ from rdstitch.matching.two_view import (
 )
 from rdstitch.progress import Progress
 
-Transfer = Callable[[int, int, FloatArray], FloatArray]
-
 _PRESCREEN_FEATURES = 1000  # strongest features of an image, by which pairs are prescreened
 _MIN_PRESCREEN_MATCHES = 8  # matches among these; images that share nothing have three to six by chance
 _MIN_RELATIVE_MATCHES = 0.05  # share of the matches that an image has with the one most like it; less adds nothing
-_SUFFICIENT_MATCHES = 200  # of an image with all others, from which on it needs no more
 _FEW_INLIERS = 50  # of a pair of a repeated pattern, which shows hundreds of keypoints
 _MIN_INLIER_RATIO = 0.7  # of such matches that agree: right pairs have 0.8 to 1, lattices that hardly match half
 _SAMPLED = 5  # images that are looked at for a repeated pattern
@@ -68,8 +61,6 @@ class Pairing:
         Of what need not be in memory all the time.
     tilts : sequence of (float, float), optional
         (ψ, θ), radians, of each image, where they are known exactly.
-    static : StaticPlaces, optional
-        Where static matches are no evidence.
     """
 
     features: FeatureStore
@@ -81,7 +72,6 @@ class Pairing:
     cache: Cache = NO_CACHE
     store: Cache = NO_CACHE
     tilts: Sequence[tuple[float, float]] | None = None
-    static: StaticPlaces | None = None
 
     def prescreen_pairs(self, pairs: Sequence[Pair]) -> dict[Pair, StoredMatches]:
         """The pairs whose strongest features match and that matter for the place of an image, with those matches.
@@ -138,12 +128,8 @@ class Pairing:
         everything = [*pairs, *self.estimate(others)]
         chosen = sorted([*compared, *others])
         moving = replace(self, features=moving_features(self.features, everything, threshold))
-        strict = replace(moving, static=static_places(everything, threshold))
-        again, fewer = moving.estimate(chosen), strict.estimate(chosen)
-        count = len(self.features)
-        if moving_images(fewer, count, threshold) >= moving_images(again, count, threshold):
-            moving, again = strict, fewer
-        if not show_motion(again, count, threshold):
+        again = moving.estimate(chosen)
+        if not show_motion(again, len(self.features), threshold):
             return MovingPairs(self, pairs, found=False)
         return MovingPairs(moving, again, found=True)
 
@@ -174,64 +160,9 @@ class Pairing:
         return bool(np.median([repetition(self.features[k]) for k in sampled]) >= MIN_REPETITION)
 
     def rematch_elsewhere(self, pairs: Sequence[PairRegistration], transfer: Transfer) -> list[PairRegistration]:
-        """Match registered pairs again, only near where ``transfer`` puts them; see :meth:`guided_rematch`."""
+        """Match registered pairs again, only near where ``transfer`` puts them."""
         matched = [StoredMatches.of(self._near(pair, transfer)) for pair in pairs]
         return self._relate([(pair.image1, pair.image2) for pair in pairs], matched, self.options.pair.distortion)
-
-    def retry_with_consensus_distortion(self, pairs: list[PairRegistration]) -> list[PairRegistration]:
-        """Estimate the pairs that failed again, with the λ that the others agree on."""
-        relations = [pair.relation for pair in pairs if pair.relation]
-        failed = [index for index, pair in enumerate(pairs) if not pair.relation]
-        if self.options.pair.distortion is not None or not failed or not relations:
-            return pairs
-        consensus = vote([r.distortion for r in relations], [r.distortion_std for r in relations])
-        if not np.isfinite(consensus.distortion):
-            return pairs
-        again = self._relate(
-            [(pairs[index].image1, pairs[index].image2) for index in failed],
-            [pairs[index].matches for index in failed],
-            consensus.distortion,
-            "retrying pairs",
-        )
-        rescued = list(pairs)
-        for index, pair in zip(failed, again, strict=True):
-            if pair.relation:
-                rescued[index] = _without_vote(pair)
-        return rescued
-
-    def guided_rematch(
-        self, pairs: list[PairRegistration], support: Mapping[Pair, int], transfer: Transfer
-    ) -> dict[int, PairRegistration]:
-        """Match the pairs of weakly supported images again, only near where the alignment expects the matches.
-
-        Parameters
-        ----------
-        pairs : list of PairRegistration
-        support : mapping of (int, int) to int
-            Number of inliers of every pair that the alignment uses.
-        transfer : callable
-            Takes two images and points (N, 2) of the first, pixels, to points of the second, pixels.
-
-        Returns
-        -------
-        dict of int to PairRegistration
-            The pairs that have more inliers now, by their position in ``pairs``.
-        """
-        held = np.zeros(len(self.features), dtype=np.intp)
-        for images, inliers in support.items():
-            held[[*images]] += inliers
-        weak = {images for images in support if held[[*images]].min() < _SUFFICIENT_MATCHES}
-        chosen = [index for index, pair in enumerate(pairs) if pair.relation and (pair.image1, pair.image2) in weak]
-        again = self._relate(
-            [(pairs[index].image1, pairs[index].image2) for index in chosen],
-            [StoredMatches.of(self._near(pairs[index], transfer)) for index in chosen],
-            self.options.pair.distortion,
-        )
-        return {
-            index: pair
-            for index, pair in zip(chosen, again, strict=True)
-            if pair.relation and pair.relation.inliers.sum() > pairs[index].relation.inliers.sum()
-        }
 
     def _near(self, pair: PairRegistration, transfer: Transfer) -> Correspondences:
         """Matches of a pair near the places where the alignment expects them."""
@@ -283,16 +214,14 @@ class Pairing:
                 [(self._tilt(pairs[k][0]), self._tilt(pairs[k][1])) for k in batch],
                 options,
                 self.cache,
-                self.store,
-                self.static,
             )
             for batch in estimation_batches(range(len(pairs)))
         )
         done: list[PairRegistration] = []
         for found in in_order(self.executor, estimate_pairs, tasks):
+            start = len(done)
             done += [
-                PairRegistration(*pair, matches, relation)
-                for pair, (matches, relation) in zip(pairs[len(done) :], found, strict=False)
+                PairRegistration(*pairs[start + k], matched[start + k], relation) for k, relation in enumerate(found)
             ]
             if stage is not None:
                 self.progress(stage, len(done), len(pairs))

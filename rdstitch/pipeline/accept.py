@@ -1,8 +1,7 @@
 """Stage: check a registration; what fails a check is left out by name, and the rest is aligned anew."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -17,44 +16,24 @@ from rdstitch.options import StitchOptions
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner, impossible_estimates_fail
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.registration import Registration
+from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding
+from rdstitch.verification.limits import limit
 from rdstitch.verification.messages import messages_of
 from rdstitch.verification.second_motion import planes_of_pairs
 from rdstitch.verification.verdict import RefusedError, judge
 
-_MAX_SCALE_UNCERTAINTY = 0.05  # share that lengths may be off by, as far as the focal length is, without a word
 _MAX_ROUNDS = 20  # times that something is left out; each takes one adjustment
 
 
-@dataclass(frozen=True)
-class _Offenders:
-    """What one round leaves out: images, and links without which other images may fall off.
-
-    Attributes
-    ----------
-    reasons : mapping of int to Message
-        What is wrong with an image, by its index.
-    links : mapping of (int, int) to Message
-        What is wrong with a pair of images.
-    """
-
-    reasons: Mapping[int, Message]
-    links: Mapping[tuple[int, int], Message]
-
-    def __bool__(self) -> bool:
-        """Whether there are any."""
-        return bool(self.reasons or self.links)
-
-    def __or__(self, other: "_Offenders") -> "_Offenders":
-        """Those of both."""
-        return _Offenders({**self.reasons, **other.reasons}, {**self.links, **other.links})
+Offenders = Mapping[tuple[int, ...], Message]
+"""What is left out, with what is wrong: images (k,), and pairs (i, j) without which other images may fall off."""
 
 
 @impossible_estimates_fail()
 def accept(
     registration: Registration,
     options: StitchOptions,
-    executor: Executor,
     *,
     metric: bool = False,
     lens_only: bool = False,
@@ -66,8 +45,6 @@ def accept(
     ----------
     registration : Registration
         In pixels of the working size; the result is in those of the images.
-    executor : concurrent.futures.Executor
-        Where images are compared.
     metric : bool
         Metric poses are needed, also of what remains.
     lens_only : bool
@@ -89,7 +66,7 @@ def accept(
     undamaged = None if options.force else _without_damage(registration, aligner)
     if undamaged is not None and _is_simpler(undamaged.alignment.model, registration.alignment.model):
         registration, undamaged = undamaged, None
-    checked = partial(judge, threshold=options.threshold, executor=executor, cache=cache, lens_only=lens_only)
+    checked = partial(_judged, options=options, cache=cache, lens_only=lens_only)
     current, found = registration, checked(registration)
     first, found_first = registration, found
     if _fails(found) and undamaged is not None and not _fails(judged := checked(undamaged)):
@@ -100,7 +77,7 @@ def accept(
         judged = () if plane is None else checked(plane)
         if plane is not None and not any(map(_is_of_the_whole, judged)):
             current, found = plane, judged
-        start, left = current, _Offenders({}, {})
+        start, left = current, dict[tuple[int, ...], Message]()
         for _ in range(_MAX_ROUNDS):
             if not _fails(found):
                 break
@@ -110,7 +87,7 @@ def accept(
             left |= worst
             shrunk = _without(start, left, aligner) if worst else None
             # Where as many images fail as pass, nobody can say which of them are right.
-            if shrunk is None or shrunk.alignment.used.sum() <= len(left.reasons):
+            if shrunk is None or shrunk.alignment.used.sum() <= len(_images(left)):
                 raise RefusedError(_told(first, found_first))
             current, found = shrunk, checked(shrunk)
     if _fails(found) and not options.force:
@@ -119,6 +96,12 @@ def accept(
     if options.strict and accepted.left_out:
         raise PartialResultError("; ".join(map(str, told_once(accepted.left_out))))
     return accepted
+
+
+def _judged(
+    registration: Registration, options: StitchOptions, cache: Cache, *, lens_only: bool
+) -> tuple[Finding, ...]:
+    return judge(Evidence(registration, options.threshold, options.threads, cache, lens_only))
 
 
 def _without_damage(registration: Registration, aligner: Aligner) -> Registration | None:
@@ -134,7 +117,7 @@ def _without_damage(registration: Registration, aligner: Aligner) -> Registratio
     if not damaged:
         return None
     reason = Message("is damaged, and all others fit better without it; copy it again from its source")
-    rest = _without(registration, _Offenders(dict.fromkeys(damaged, reason), {}), aligner)
+    rest = _without(registration, {(k,): reason for k in damaged}, aligner)
     return rest if rest is not None and 2 * rest.alignment.used.sum() > used.sum() else None
 
 
@@ -178,22 +161,27 @@ def _is_of_the_whole(finding: Finding) -> bool:
     return finding.fails and len(finding.images) not in (1, 2)
 
 
-def _worst(registration: Registration, found: Iterable[Finding]) -> _Offenders:
+def _images(offenders: Offenders) -> dict[int, Message]:
+    """Those that are images."""
+    return {images[0]: message for images, message in offenders.items() if len(images) == 1}
+
+
+def _worst(registration: Registration, found: Iterable[Finding]) -> Offenders:
     """The worst images, no two of them linked, since a bad image spoils its neighbours; else the failing pairs."""
     failures = [finding for finding in found if finding.fails]
     single = {finding.images[0]: finding for finding in failures if len(finding.images) == 1}
     if not single:
         pairs = [finding for finding in failures if len(finding.images) == 2]
         said = zip(pairs, messages_of(pairs, registration), strict=True)
-        return _Offenders({}, {(finding.images[0], finding.images[1]): message for finding, message in said})
+        return {finding.images: message for finding, message in said}
     used = [fit for fit in registration.alignment.links if fit.used]
     fit_share = agreement(used, len(registration.sources))
-    chosen: dict[int, Message] = {}
+    chosen = dict[tuple[int, ...], Message]()
     for image in sorted(single, key=lambda k: (fit_share[k], k)):
         linked = {fit.image1 + fit.image2 - image for fit in used if image in (fit.image1, fit.image2)}
-        if not linked & chosen.keys():
-            (chosen[image],) = messages_of([single[image]], registration)
-    return _Offenders(chosen, {})
+        if not linked & _images(chosen).keys():
+            (chosen[image,],) = messages_of([single[image]], registration)
+    return chosen
 
 
 def agreement(links: Sequence[LinkFit], count: int) -> np.ndarray:
@@ -205,36 +193,32 @@ def agreement(links: Sequence[LinkFit], count: int) -> np.ndarray:
     return np.where(given > 0, kept / np.maximum(given, 1.0), 1.0)
 
 
-def _held_by(registration: Registration, offenders: _Offenders) -> dict[int, set[int]]:
+def _held_by(registration: Registration, offenders: Mapping[int, Message]) -> dict[int, set[int]]:
     """The images left out that each other image is linked with."""
     held: dict[int, set[int]] = {}
     for fit in registration.alignment.links:
         for own, other in ((fit.image1, fit.image2), (fit.image2, fit.image1)):
-            if fit.used and other in offenders.reasons and own not in offenders.reasons:
+            if fit.used and other in offenders and own not in offenders:
                 held.setdefault(own, set()).add(other)
     return held
 
 
-def _without(registration: Registration, offenders: _Offenders, aligner: Aligner) -> Registration | None:
+def _without(registration: Registration, offenders: Offenders, aligner: Aligner) -> Registration | None:
     """The rest, aligned anew; None where nothing that fits together would be left.
 
     Pairs that contradicted the offenders are judged again: it may have been the offenders that were wrong.
     """
-    pairs = [
-        pair
-        for pair in registration.pairs
-        if not {pair.image1, pair.image2} & offenders.reasons.keys()
-        and (pair.image1, pair.image2) not in offenders.links
-    ]
+    reasons = _images(offenders)
+    pairs = [p for p in registration.pairs if not {*p.images} & reasons.keys() and p.images not in offenders]
     try:
         aligned = aligner.align(pairs)
     except RegistrationError:
         return None
     used = aligned.alignment.used
-    reasons = dict(offenders.reasons)
-    for pair, message in offenders.links.items():
-        reasons.update({k: message for k in pair if not used[k]})
-    for image, others in _held_by(registration, offenders).items():
+    held = _held_by(registration, reasons)
+    for images, message in offenders.items():
+        reasons |= {k: message for k in images if not used[k]}
+    for image, others in held.items():
         named_others = ", ".join(names_of(aligner.paths[k] for k in sorted(others)))
         reasons.setdefault(image, Message(f"hangs on {named_others}, which was left out; add images around it"))
     return _aligned_anew(registration, aligned, aligner.paths, reasons)
@@ -259,7 +243,7 @@ def _aligned_anew(
 
 def scale_uncertainty(alignment: Alignment) -> list[Message]:
     """A warning where the focal length, and with it the length of every step, is hardly known."""
-    if not alignment.length_std > _MAX_SCALE_UNCERTAINTY:
+    if not alignment.length_std > limit("length"):
         return []
     off = f"all lengths may be off together by {alignment.length_std:.0%}"
     text = f"{off}: the images hardly show the focal length; give --focal"

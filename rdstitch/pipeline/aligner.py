@@ -18,8 +18,6 @@ from rdstitch.file_access import canonical_name
 from rdstitch.inputs.measurements import positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import neighbours
-from rdstitch.matching.eccentricity import blob_radii
-from rdstitch.matching.neighbours_around import neighbours_around
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
@@ -175,9 +173,7 @@ class Aligner:
         for pair, more in zip(pairs, ground, strict=True):
             new = more.relation.inliers & ~pair.relation.inliers
             if (pair.image1, pair.image2) in alignment.support and new.any():
-                matched = pair.correspondences.take(np.flatnonzero(new))
-                expected = alignment.transfer(pair.image1, pair.image2, matched.points1)
-                errors.append(np.linalg.norm(expected - matched.points2, axis=1))
+                errors.append(pair.errors(alignment.transfer)[new])
         every = np.concatenate(errors)
         return alignment.on_sphere or not len(every) or bool(np.mean(every < self.threshold) > _EXPLAINED)
 
@@ -209,8 +205,7 @@ def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candi
     for _ in range(_CLOSURE_ROUNDS):
         pairs, alignment = aligned.pairs, aligned.alignment
         tried = {(pair.image1, pair.image2) for pair in pairs}
-        find = neighbours_around if alignment.on_sphere else neighbours
-        loop_closures = find(alignment.cameras, alignment.homographies, tried)
+        loop_closures = neighbours(alignment.cameras, alignment.homographies, tried, on_sphere=alignment.on_sphere)
         unaligned = {(i, j) for i, j in candidates if not (alignment.used[i] and alignment.used[j])} - tried
         found = pairing.estimate(sorted(unaligned.union(loop_closures)), distortion=alignment.distortion)
         pairs = tuple(sorted([*pairs, *found], key=lambda pair: (pair.image1, pair.image2)))
@@ -220,22 +215,17 @@ def close_loops(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs, candi
     return aligned
 
 
-def rematch_weak_pairs(aligner: Aligner, pairing: Pairing, aligned: AlignedPairs) -> AlignedPairs:
-    """Match pairs of weakly supported images again, only near where the alignment expects the matches.
+def select_by_whole_lens(aligner: Aligner, aligned: AlignedPairs) -> AlignedPairs:
+    """Where the lens has more than λ, select the inliers of all pairs again with it.
 
-    Where the lens has more than λ, the inliers of all pairs, these among them, are selected again with it: pairs on
-    their own have one λ, with which matches at the corners of such a lens are outliers, and relief is not. They are
-    taken for the middles of blobs then, see :mod:`rdstitch.matching.eccentricity`.
+    Pairs on their own have one λ, with which matches at the corners of such a lens are outliers.
     """
-    alignment = aligned.alignment
-    changed = pairing.guided_rematch(list(aligned.pairs), alignment.support, alignment.transfer)
-    pairs = [changed.get(k, pair) for k, pair in enumerate(aligned.pairs)]
-    if alignment.lens == "division" and not alignment.cameras[alignment.reference].higher:
-        return aligner.align(pairs, alignment) if changed else aligned
-    radii = [blob_radii(pairing.features[k]) for k in range(len(aligner.cameras))]
+    pairs = aligned.pairs
     for _ in range(_SELECTION_ROUNDS):
         former = aligned.alignment
-        selected = reselect_inliers(pairs, former, pairing.options.pair.threshold, radii, pairing.store)
+        if former.lens == "division" and not former.cameras[former.reference].higher:
+            break
+        selected = reselect_inliers(pairs, former, aligner.threshold)
         aligned = aligner.align([selected.get(k, pair) for k, pair in enumerate(pairs)], former)
         if _same_lens(*(found.cameras[found.reference] for found in (former, aligned.alignment))):
             break

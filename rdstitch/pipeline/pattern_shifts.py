@@ -1,6 +1,7 @@
 """Stage: images of a repeated pattern that were put together some periods away go where what is unique agrees."""
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +13,9 @@ from rdstitch.matching.two_view import PairRegistration
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.radial_homography import RadialHomography, from_plane, to_plane
-from rdstitch.verification.overlap_check import placed_image
+from rdstitch.verification.overlap_check import ComparedImages
 from rdstitch.verification.photometric_agreement import COMPARED_SIDE
-from rdstitch.verification.self_similarity import ambiguous_pairs
+from rdstitch.verification.self_similarity import find_ambiguity
 from rdstitch.verification.unique_places import unique_shifts
 
 _MAX_IMAGES = 2**27 // (2 * COMPARED_SIDE**2 * np.dtype(np.float32).itemsize)
@@ -63,11 +64,10 @@ def settle_repeated_pattern(
         return aligned, {}
     used = [pair for pair in aligned.pairs if pair.relation and alignment.used[[pair.image1, pair.image2]].all()]
     compared = sorted(used, key=lambda pair: pair.image2 - pair.image1)[: _PAIRS_OF_AN_IMAGE * len(sources)]
-    shown = {
-        k: placed_image(sources[k], alignment.cameras[k], alignment.homographies[k], stretch)
-        for k in np.flatnonzero(alignment.used).tolist()
-    }
-    doubtful = ambiguous_pairs(shown, [(pair.image1, pair.image2) for pair in compared], workers)
+    shown = ComparedImages(sources, stretch, workers).aligned(alignment, np.flatnonzero(alignment.used).tolist())
+    with ThreadPoolExecutor(workers) as pool:
+        found = pool.map(lambda pair: find_ambiguity(shown[pair.image1], shown[pair.image2]).ambiguous, compared)
+        doubtful = [pair.images for pair, ambiguous in zip(compared, found, strict=True) if ambiguous]
     if not doubtful:
         return aligned, {}
     shifts = unique_shifts(shown, doubtful, workers)

@@ -360,7 +360,7 @@ def _accepted(
     purpose = {"metric": metric, "lens_only": lens_only, "prefer_turn": prefer_turn}
     try:
         registration = register(sources, options, executor, skip_bad=skip_bad, progress=progress, **purpose)
-        return accept(registration.with_messages(known), options, executor, **purpose)
+        return accept(registration.with_messages(known), options, **purpose)
     except RegistrationError as error:
         unread = [str(replace(message, code="")) for message in told_once(known) if message.severity == "left out"]
         error.args = ("; ".join([str(error), *unread]),)

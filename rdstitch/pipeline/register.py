@@ -20,7 +20,7 @@ from rdstitch.matching.mixed_lenses import separate_lenses
 from rdstitch.matching.two_view_rounds import Pairing
 from rdstitch.messages import Message, left_out, names_of, shortened
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.aligner import Aligner, close_loops, impossible_estimates_fail, rematch_weak_pairs
+from rdstitch.pipeline.aligner import Aligner, close_loops, impossible_estimates_fail, select_by_whole_lens
 from rdstitch.pipeline.detect_features import detect_by_contrast
 from rdstitch.pipeline.pattern_crossings import match_crossings
 from rdstitch.pipeline.pattern_shifts import settle_repeated_pattern
@@ -50,7 +50,6 @@ def register(
 ) -> Registration:
     """Detect features, register pairs, and align all images as one.
 
-    Pairs that fail alone are tried again with the λ that the others agree on, which then takes only two or four points.
     Once there are poses, images that these put beside each other are tried too (loop closures), and every pair of an
     image that found no place. Where the images come from two lenses, those of one are aligned. All pixels in the
     result are those of the size that features are detected at, see :mod:`rdstitch.pipeline.working_size`.
@@ -99,11 +98,11 @@ def register(
     )
     moving = pairing.remove_static_background(pairing.estimate_candidates(candidates), candidates)
     found = moving.pairing.match_repeated_patterns(moving.pairs) if lens_only else moving.pairs
-    lenses = separate_lenses(aligner.cameras, found, options.threshold, options.known_distortion)
-    pairs = moving.pairing.retry_with_consensus_distortion(lenses.pairs)
-    aligned = aligner.align(pairs)
-    aligned = close_loops(aligner, moving.pairing, aligned, lenses.of_one_lens(candidates))
-    aligned = rematch_weak_pairs(aligner, moving.pairing, aligned)
+    mixed, other_lens = separate_lenses(aligner.cameras, found, options.threshold, options.known_distortion)
+    aligned = aligner.align([pair for pair in found if not {*pair.images} & other_lens.keys()])
+    candidates = [pair for pair in candidates if not {*pair} & other_lens.keys()]
+    aligned = close_loops(aligner, moving.pairing, aligned, candidates)
+    aligned = select_by_whole_lens(aligner, aligned)
     settle = match_crossings if lens_only else settle_repeated_pattern
     aligned, undecided = settle(aligner, moving.pairing, aligned, sources, rendered.stretch, options.threads)
     if metric:
@@ -117,11 +116,11 @@ def register(
             *aligned.alignment.messages,
             *([_STATIC_BACKGROUND] if moving.found else []),
             *_low_contrast(rendered.equalized, aligned.alignment, aligner.paths),
-            *_left_out(aligned.alignment, aligner.paths, counts, {**lenses.left_out, **detected.damaged, **undecided}),
+            *_left_out(aligned.alignment, aligner.paths, counts, {**other_lens, **detected.damaged, **undecided}),
         ),
         static_background=moving.found,
         stretch=rendered.stretch,
-        mixed=lenses.mixed,
+        mixed=mixed,
     )
 
 

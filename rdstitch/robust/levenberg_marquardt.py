@@ -19,9 +19,6 @@ FIRST_DAMPING, MAX_DAMPING = 1e-4, 1e4
 
 _MIN_DAMPING = 1e-9
 
-_SETTLED, _OPTIMISM = 3, 20.0
-"""Steps after which a descent is given up that would have to gain so many times what its next step promises."""
-
 
 @dataclass
 class BatchedNormalEquations:
@@ -87,25 +84,22 @@ def descend(
     retract: Retract,
     start: FloatArray,
     iterations: int,
-    useful: FloatArray | None = None,
     *,
     rough: bool = False,
 ) -> tuple[FloatArray, BatchedNormalEquations]:
     """Where at most so many steps lead to, parameters of shape (B, K), and the equations there.
 
-    A problem that has converged takes no further part, so that each is solved as if it were alone; nor does one whose
-    loss will not fall to what is ``useful`` (B,), if given. ``rough``: another descent goes on from there.
+    A problem that has converged takes no further part, so that each is solved as if it were alone. ``rough``: another
+    descent goes on from there.
     """
     least_gain = ROUGH_GAIN if rough else PAIR_GAIN
     result, parameters = start.copy(), start
     current = found = problems.normal_equations(start)
     damping, rows = np.full(len(start), FIRST_DAMPING), np.arange(len(start))
-    for taken in range(iterations):
+    for _ in range(iterations):
         step = _damped_step(current, damping)
         gain = -np.einsum("bp,bp->b", step, current.gradient)
         going = (gain > least_gain * current.cost) & (damping <= MAX_DAMPING)
-        if useful is not None and taken >= _SETTLED:
-            going &= current.cost - _OPTIMISM * gain < useful[rows]
         if not going.any():
             break
         if not going.all():

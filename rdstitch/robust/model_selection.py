@@ -108,40 +108,6 @@ class PairSelection:
         fits, found = refine_pairs(problems, start, steps, rough=rough)
         return _Fitted(model, fits, found.errors, found.cost, found.information)
 
-    def fit_nested(
-        self, models: Sequence[PlanarPairModel], width: FloatArray, steps: int, useful: FloatArray
-    ) -> list[_Fitted]:
-        """The same of several models in lockstep: each is the last one with some of its parameters held at 0.
-
-        A fit is given up whose loss will not fall to what is ``useful`` (B,).
-        """
-        if not models:
-            return []
-        most, count = models[-1], len(self.data)
-        held = np.array([most.held_by(model) for model in models])
-        states = most.initialize(self.homography, self.tilts)
-        start = Fits(
-            np.concatenate([model.restricted(states) for model in models]),
-            *(np.concatenate([known] * len(models)) for known in (self.homography, self.distortion)),
-        )
-        every = self.take(np.tile(np.arange(count), len(models)))
-        problems = PairProblems(
-            most,
-            every.data,
-            np.tile(width, len(models)),
-            every.noise,
-            self.fixed_distortion,
-            np.repeat(held, count, axis=0),
-        )
-        fits, found = refine_pairs(problems, start, steps, np.tile(useful, len(models)))
-        errors, result = found.errors, []
-        for index, (model, own) in enumerate(zip(models, held, strict=True)):
-            rows = np.arange(index * count, (index + 1) * count)
-            free = np.flatnonzero(~np.concatenate([np.zeros(found.information.shape[1] - len(own), np.bool_), own]))
-            information = found.information[rows[:, None, None], free[:, None], free]
-            result.append(_Fitted(model, fits.take(rows), errors[rows], found.cost[rows], information))
-        return result
-
     def at(self, fits: Fits) -> Self:
         """Standing at fits."""
         return replace(self, homography=fits.homography, distortion=fits.distortion)
@@ -167,9 +133,7 @@ def select_models(planar: Sequence[PlanarPairModel], pairs: PairSelection) -> li
     inliers = np.maximum((free.errors < threshold).sum(axis=1), 1)
     width, price = loss_width(noise, threshold), noise**2 * np.log(2 * inliers)
     freest = near.fit(homography, width, _STEPS)
-    # Any model must fit that well to be chosen, even one without parameters.
-    useful = freest.cost + freest.information.shape[1] * price
-    fitted = [*near.fit_nested(planar, width, _STEPS, useful), freest]
+    fitted = [*(near.fit(model, width, _STEPS) for model in planar), freest]
     chosen = np.argmin([found.cost + found.information.shape[1] * price for found in fitted], axis=0)
     rms = np.stack([rms_of(found.errors, threshold) for found in fitted], axis=1)
     result: dict[int, PairFit] = {}

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.planar_motion import (
     ABOUT_X,
     ABOUT_Y,
@@ -163,14 +163,6 @@ class PlanarPairModel:
             tilt = np.tile(motion[:, :2], 2)
         height = np.log(np.maximum(motion[:, 5:], 1e-3)) if self.height_free else np.zeros((len(h), 1))
         return np.concatenate([tilt, motion[:, 2:5], height, np.zeros((len(h), 1))], axis=1)
-
-    def restricted(self, state: FloatArray) -> FloatArray:
-        """States of a freer model with the change of height that this one allows."""
-        return state if self.height_free else np.where(np.arange(state.shape[1]) == _HEIGHT, 0.0, state)
-
-    def held_by(self, other: "PlanarPairModel") -> BoolArray:
-        """Which of the parameters another model holds, (P,)."""
-        return np.asarray((self._directions[:, _HEIGHT] != 0.0) & (not other.height_free))
 
     def motion(self, state: FloatArray) -> PlanarMotion:
         """The motion that one state (9,) describes, with the tilt of image 1 where the two differ."""

@@ -1,6 +1,6 @@
 """Refinement of homography and λ over all matches of many pairs at once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -71,8 +71,6 @@ class PairProblems:
         Standard deviation of the errors per axis, pixels.
     fixed_distortion : bool
         Whether λ is known.
-    held : ndarray of shape (B, P), bool, optional
-        Which parameters of the model keep their values.
     """
 
     model: PairModel
@@ -80,14 +78,10 @@ class PairProblems:
     scale: FloatArray
     noise: FloatArray
     fixed_distortion: bool
-    held: BoolArray | None = None
 
     def take(self, rows: BoolArray | IntArray) -> Self:
         """Some of them."""
-        held = None if self.held is None else self.held[rows]
-        return type(self)(
-            self.model, self.data.take(rows), self.scale[rows], self.noise[rows], self.fixed_distortion, held
-        )
+        return replace(self, data=self.data.take(rows), scale=self.scale[rows], noise=self.noise[rows])
 
     def normal_equations(self, parameters: FloatArray) -> BatchedNormalEquations:
         """Loss, normal matrix and gradient."""
@@ -107,11 +101,6 @@ class PairProblems:
             information[:, free:, free:] += weight[:, None, None] * (by_state.T @ by_state)
             gradient[:, free:] += weight[:, None] * (residual @ by_state)
             cost = cost + weight * (residual**2).sum(axis=1)
-        if self.held is not None:
-            row, column = np.nonzero(self.held)
-            column += 0 if self.fixed_distortion else 1
-            information[row, column], information[row, :, column] = 0.0, 0.0
-            information[row, column, column], gradient[row, column] = 1.0, 0.0
         return BatchedNormalEquations(cost, information, gradient, entries.squared)
 
     def chain(self, state: FloatArray) -> FloatArray:
@@ -147,7 +136,6 @@ def refine_pairs(
     problems: PairProblems,
     start: Fits,
     iterations: int,
-    useful: FloatArray | None = None,
     *,
     rough: bool = False,
 ) -> tuple[Fits, BatchedNormalEquations]:
@@ -160,12 +148,10 @@ def refine_pairs(
     start : Fits
         Their ``distortion`` is kept where it is fixed.
     iterations : int
-    useful : ndarray of shape (B,), optional
-        Value of the loss above which a fit is of no use, so that it need not be found.
     rough : bool
         Another refinement goes on from there.
     """
     parameters = np.column_stack([start.distortion, start.state])
-    found, equations = descend(problems, problems.retract, parameters, iterations, useful, rough=rough)
+    found, equations = descend(problems, problems.retract, parameters, iterations, rough=rough)
     state = found[:, 1:]
     return Fits(state, problems.model.homography(state), found[:, 0]), equations

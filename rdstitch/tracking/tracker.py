@@ -16,7 +16,7 @@ from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
 from rdstitch.matching.options import PairOptions
 from rdstitch.radial_homography import from_plane
-from rdstitch.robust import EstimationOptions, PairMatches, RansacOptions, estimate_radial_homographies
+from rdstitch.robust import PairMatches, estimate_radial_homographies
 from rdstitch.tracking.flow import CornerFlow, fitted_affine
 from rdstitch.tracking.placement import CameraPose, Placement, PlaneSimilarity
 
@@ -32,7 +32,6 @@ _KEYFRAME_OVERLAP = 0.8  # share of a frame that its last keyframe shows, below 
 _GRID = 8  # points a side by which that is measured
 _MAX_LOST_FRAMES = 10  # frames in a row without a place, after which a new map begins
 _MIN_INLIERS = 15
-_SELECT_MODEL_BELOW = 50  # inliers below which motions of the plane compete with a free homography
 _MATCHES = 80  # of a link, that the alignment uses
 _SAME_TILT = ("rigid", "similarity")
 _FLOW_ERROR = 1.5  # pixels by which a corner that was followed may be off the motion of the plane
@@ -233,9 +232,6 @@ class Tracker:
         """Links of other frames with the frame, by the numbers of all."""
         if not others:
             return []
-        options = self._options.pair
-        limits = RansacOptions(options.threshold, options.confidence, options.max_iterations, options.seed)
-        how = EstimationOptions(options.solver, options.distortion, limits, _SELECT_MODEL_BELOW)
         matched = [self._match(other.features, frame.features) for other in others]
         pairs = [
             PairMatches(
@@ -243,7 +239,7 @@ class Tracker:
             )
             for other, found in zip(others, matched, strict=True)
         ]
-        relations = estimate_radial_homographies(pairs, how)
+        relations = estimate_radial_homographies(pairs, self._options.pair.estimation)
         return [
             Link(other.number, frame.number, found.points1[fit.inliers], found.points2[fit.inliers], fit)
             for other, found, fit in zip(others, matched, relations, strict=True)

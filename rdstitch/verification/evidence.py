@@ -1,8 +1,6 @@
 """What speaks for and against a registration: its matches, its pixels, and motions that it does not explain."""
 
 from collections.abc import Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,18 +10,15 @@ from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.matching.two_view import Pair
 from rdstitch.registration import Registration
-from rdstitch.verification.overlap_check import CheckedLink, check_overlaps
-from rdstitch.verification.parallax import Parallax, find_parallax
+from rdstitch.verification.limits import limit
+from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, check_overlaps
 from rdstitch.verification.second_motion import (
     MotionComparison,
     SecondMotion,
     compare_motions,
     find_second_motions,
-    outside_second_motions,
+    unexplained,
 )
-
-MIN_CELLS = 8
-"""Cells of an overlap that have texture; of fewer the pixels say nothing."""
 
 
 @dataclass(frozen=True)
@@ -35,16 +30,18 @@ class Evidence:
     registration : Registration
     threshold : float
         Largest transfer error of an inlier of a pair, pixels.
-    executor : concurrent.futures.Executor, optional
-        Where images are compared; None: in one thread.
+    threads : int
+        Pairs of images that are compared at the same time.
     cache : Cache
+        Of results of earlier runs.
     lens_only : bool
-        Only the lens is wanted, so that the places of images do not matter.
+        Only the lens is wanted, so that doubts about the places of images do not make the result fail, and are not
+        reported where a repeated pattern explains them.
     """
 
     registration: Registration
     threshold: float
-    executor: Executor | None = None
+    threads: int = 1
     cache: Cache = NO_CACHE
     lens_only: bool = False
 
@@ -66,12 +63,15 @@ class Evidence:
         return [fit for fit in self.alignment.links if fit.used]
 
     @cached_property
+    def _images(self) -> ComparedImages:
+        return ComparedImages(self.registration.sources, self.registration.stretch, self.threads)
+
+    @cached_property
     def checked(self) -> list[CheckedLink]:
         """What the pixels say of each used link, or of the least confirmed of many."""
         if self.static:
             return []
-        with nullcontext(self.executor) if self.executor is not None else ThreadPoolExecutor(1) as where:
-            return check_overlaps(self.registration, where, self.cache)
+        return check_overlaps(self.registration, self._images, self.cache)
 
     @cached_property
     def motions(self) -> list[SecondMotion]:
@@ -81,12 +81,12 @@ class Evidence:
     @cached_property
     def compared(self) -> MotionComparison | None:
         """Which of the two motions is the plane, by the pixels."""
-        return compare_motions(self.registration, self.motions, self.checked)
+        return compare_motions(self._images, self.motions, [] if self.alignment.on_sphere else self.checked)
 
     @cached_property
     def seen(self) -> Sequence[CheckedLink]:
-        """The checked links, where nothing moves differently if that is the smaller part."""
-        return outside_second_motions(self.checked, self.motions, self.compared)
+        """The checked links; where what moves differently is the smaller part, without what that may explain."""
+        return unexplained(self.checked, self.motions, self.compared)
 
     @cached_property
     def ambiguous(self) -> dict[Pair, CheckedLink]:
@@ -94,14 +94,9 @@ class Evidence:
         return {link.pair: link for link in self.seen if link.ambiguity.ambiguous and not link.unique}
 
     @cached_property
-    def parallax(self) -> list[Parallax]:
-        """How far pairs of a turn are from one about the lens, the worst first."""
-        return find_parallax(self.alignment, self.registration.pairs) if self.alignment.on_sphere else []
-
-    @cached_property
     def alike(self) -> float:
         """How much alike images look where most pairs put them, [0, 1]; 0 where there is nothing to see."""
-        shares = [link.agreement.share for link in self.checked if link.agreement.cells >= MIN_CELLS]
+        shares = [link.agreement.share for link in self.checked if link.agreement.cells >= limit("cells")]
         return float(np.median(shares)) if shares else 0.0
 
     @property
@@ -113,5 +108,6 @@ class Evidence:
 
     @property
     def depth(self) -> bool:
-        """Whether the scene has depth, or the camera moved while it turned."""
-        return self.alignment.relief.found or bool(self.parallax)
+        """Whether the scene has depth; of a turn, whether the camera moved, or something before it."""
+        turn_with_parallax = self.alignment.on_sphere and any(own.area for own in self.motions)
+        return self.alignment.relief.found or turn_with_parallax

@@ -47,10 +47,6 @@ TEXTS = {
         "",
         "{both} do not look alike where they are put together ({confirming} of {cells} places agree)",
     ),
-    "held by another": (
-        "",
-        "{both} may be held together by what moves differently from the plane (a vehicle?)",
-    ),
     "ambiguous": (
         "",
         "{both} fit as well elsewhere, {shift:.0%} of an image away (a repeated pattern?); take images that share "

@@ -2,12 +2,11 @@
 
 One image is resampled as the other's lens would have seen it. In each small cell of the overlap that has texture,
 the place where the two correlate best is searched around where the registration says it is. Where the registration is
-right nearly all cells find it there; elsewhere they find it anywhere. Over rough ground that place is moved by the
-parallax of the matches around it.
+right nearly all cells find it there; elsewhere they find it anywhere.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Self
 
@@ -15,26 +14,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.warp import Lattice
 from rdstitch.io.read import DecodedImage
-from rdstitch.io.reduction import fitting_reduction, mean_of_channels, reduced_size
+from rdstitch.io.reduction import mean_of_channels
 from rdstitch.radial_homography import from_plane, to_plane
-from rdstitch.scipy_parts import spatial
+from rdstitch.verification.limits import limit
 
 Grey = NDArray[np.float32]
 
 COMPARED_SIDE = 512  # pixels of the longer side of the images that are compared
 CELL = 24  # pixels
 _SEARCH_RADIUS = 8  # pixels
-_MIN_TEXTURE = 0.012  # standard deviation in a cell, of full range
-_MIN_CORRELATION = 0.5  # correlation from which on two cells show the same
-_MAX_OFFSET = 2.5  # pixels
-_MAX_CELLS = 120
 _OPAQUE = 250
-_NEAREST = 3  # matches that show the parallax of a cell; one of them may be wrong
 _LATTICE = 8  # pixels between the places that are computed; those between are interpolated
 
 
@@ -48,66 +42,18 @@ class Agreement:
         Cells with texture in both images.
     confirming : int
         Cells that correlate best, and well, where the registration says.
+    in_all : int
+        Cells with texture in the whole of the second image.
     """
 
     cells: int
     confirming: int
+    in_all: int = 0
 
     @property
     def share(self) -> float:
         """Share of the cells that confirm the registration; 1 without cells."""
         return self.confirming / self.cells if self.cells else 1.0
-
-
-@dataclass(frozen=True)
-class ComparedCells:
-    """Cells with texture in both images of an overlap, and what each of them says.
-
-    Attributes
-    ----------
-    centers : ndarray of shape (N, 2)
-        Where the registration puts them, pixels of the second image as it is compared.
-    confirming : ndarray of shape (N,), bool
-        Which correlate best, and well, where the registration says.
-    in_all : int
-        Cells with texture in the whole of the second image.
-    """
-
-    centers: FloatArray
-    confirming: BoolArray
-    in_all: int
-
-    @property
-    def agreement(self) -> Agreement:
-        """How many there are, and how many confirm the registration."""
-        return Agreement(len(self.confirming), int(self.confirming.sum()))
-
-
-@dataclass(frozen=True)
-class Parallax:
-    """By how much matches are off the places where the registration expects them.
-
-    Attributes
-    ----------
-    places : ndarray of shape (M, 2)
-        Expected, pixels of the second image.
-    shifts : ndarray of shape (M, 2)
-        From there to where they were found, pixels.
-    """
-
-    places: FloatArray
-    shifts: FloatArray
-
-    def resized(self, camera: Camera, other: Camera) -> Self:
-        """The same in pixels of another size of the second image."""
-        scale = other.half_diagonal / camera.half_diagonal
-        return replace(self, places=other.denormalize(camera.normalize(self.places)), shifts=scale * self.shifts)
-
-    def at(self, points: FloatArray) -> NDArray[np.intp]:
-        """Of points (N, 2): the median of that of the nearest matches, whole pixels (N, 2)."""
-        nearest = spatial.cKDTree(self.places).query(points, k=min(_NEAREST, len(self.places)))[1]
-        around = self.shifts[np.asarray(nearest).reshape(len(points), -1)]
-        return np.rint(np.median(around, axis=1)).astype(np.intp)
 
 
 @dataclass(frozen=True)
@@ -150,12 +96,6 @@ class ComparedImage:
         return np.asarray(found, dtype=np.float32)
 
 
-def as_compared(camera: Camera) -> Camera:
-    """The camera of an image as it is compared, for one that is read no larger than that asks for."""
-    read = reduced_size(camera.image_size, fitting_reduction(max(camera.image_size) / COMPARED_SIDE))
-    return camera.resized(_compared_size(read))
-
-
 def _compared_size(size: tuple[int, int]) -> tuple[int, int]:
     """Width and height that an image is made smaller to."""
     factor = min(1.0, COMPARED_SIDE / max(size))
@@ -176,36 +116,19 @@ def _reduced_grey(image: DecodedImage, stretch: tuple[float, float] | None) -> G
     return grey
 
 
-def overlap_agreement(first: ComparedImage, second: ComparedImage, parallax: Parallax | None = None) -> Agreement:
-    """Compare two registered images where they overlap, where the ground is rough by what moves its places."""
-    return compare_cells(first, second, parallax, _MAX_CELLS).agreement
-
-
-def compare_cells(
-    first: ComparedImage, second: ComparedImage, parallax: Parallax | None = None, most: int | None = None
-) -> ComparedCells:
-    """The cells of an overlap one by one, or about ``most`` of them; see :func:`overlap_agreement`."""
+def overlap_agreement(first: ComparedImage, second: ComparedImage) -> Agreement:
+    """Compare two registered images where they overlap."""
     height, width = second.grey.shape
     # The first image as the second one's lens would have seen it.
     seen = first.sampled(partial(to_plane, second.camera, second.homography), (0, 0, width, height))
     margin = CELL // 2 + _SEARCH_RADIUS
     rows, columns = (np.arange(margin, n - margin + 1, CELL) for n in (height, width))
     corners = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2) - CELL // 2
-    textured = corners[_have_texture(_cells(seen, corners))]
-    looked_at = textured if most is None else textured[:: max(1, -(-len(textured) // most))]
-    there = looked_at
-    if parallax is not None and len(looked_at):
-        there = looked_at + parallax.at(looked_at[:, ::-1] + (CELL - 1) / 2.0)[:, ::-1]
-        inside = ((there >= _SEARCH_RADIUS) & (there + CELL + _SEARCH_RADIUS <= (height, width))).all(axis=1)
-        looked_at, there = looked_at[inside], there[inside]
-    windows = _cells(second.grey, there, _SEARCH_RADIUS)
-    inner = windows[:, _SEARCH_RADIUS:-_SEARCH_RADIUS, _SEARCH_RADIUS:-_SEARCH_RADIUS]
-    known = np.isfinite(windows).all(axis=(1, 2)) & _have_texture(inner)
-    cells = _cells(seen, looked_at[known])
-    confirming = [_confirms(*both) for both in zip(cells, windows[known], strict=True)]
-    centers = looked_at[known][:, ::-1] + (CELL - 1) / 2.0
-    in_all = int(_have_texture(_cells(second.grey, corners)).sum())
-    return ComparedCells(centers, np.array(confirming, dtype=np.bool_), in_all)
+    cells, windows = _cells(seen, corners), _cells(second.grey, corners, _SEARCH_RADIUS)
+    textured = _have_texture(windows[:, _SEARCH_RADIUS:-_SEARCH_RADIUS, _SEARCH_RADIUS:-_SEARCH_RADIUS])
+    known = textured & _have_texture(cells) & np.isfinite(windows).all(axis=(1, 2))
+    confirming = sum(_confirms(*both) for both in zip(cells[known], windows[known], strict=True))
+    return Agreement(int(known.sum()), confirming, int(textured.sum()))
 
 
 def _cells(image: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:
@@ -220,7 +143,7 @@ def _cells(image: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:
 
 def _have_texture(cells: Grey) -> NDArray[np.bool_]:
     """Which cells (N, h, w) are distinctive; not those with transparent pixels, whose deviation is NaN."""
-    return np.asarray(cells.std(axis=(1, 2)) > _MIN_TEXTURE)
+    return np.asarray(cells.std(axis=(1, 2)) > limit("texture"))
 
 
 def _confirms(cell: Grey, window: Grey) -> bool:
@@ -228,6 +151,6 @@ def _confirms(cell: Grey, window: Grey) -> bool:
     scores = np.asarray(cv2.matchTemplate(window, cell, cv2.TM_CCOEFF_NORMED))
     row, column = np.unravel_index(int(scores.argmax()), scores.shape)
     return bool(
-        scores[row, column] >= _MIN_CORRELATION
-        and np.hypot(row - _SEARCH_RADIUS, column - _SEARCH_RADIUS) <= _MAX_OFFSET
+        scores[row, column] >= limit("correlation")
+        and np.hypot(row - _SEARCH_RADIUS, column - _SEARCH_RADIUS) <= limit("offset")
     )

@@ -1,4 +1,4 @@
-"""The rules that a result is judged by: every threshold with its unit and what set it, and what is found with them.
+"""The rules that a result is judged by, and what is found with them.
 
 A warning is for what puts this result at risk. Where images look alike in the pixels, what their matches say of depth
 or of errors has been hidden by local alignment and seams, and is a detail.
@@ -11,68 +11,35 @@ from typing import NamedTuple
 from rdstitch.alignment.result import LinkFit
 from rdstitch.alignment.unaligned import few_features
 from rdstitch.inputs.source import Source
-from rdstitch.verification.evidence import MIN_CELLS, Evidence
+from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding
+from rdstitch.verification.limits import limit
 from rdstitch.verification.overlap_check import CheckedLink, share_alike
-from rdstitch.verification.second_motion import FILLED_BY_A_PLANE, is_separate, share_of
+from rdstitch.verification.second_motion import is_separate, share_of
 
 MAX_WARNINGS = 3
 """Lines of one run."""
 
 
-class Limit(NamedTuple):
-    """A threshold."""
-
-    value: float
-    unit: str
-    source: str
-
-
-LIMITS = {
-    "inliers of a pair": Limit(0.5, "share of its matches", "less is another motion than that of the whole"),
-    "inliers of an image": Limit(
-        0.6, "share of its matches", "right images have been seen to have 0.83 even with relief, others 0.52"
-    ),
-    "few matches": Limit(40, "matches", "pairs that share nothing have been seen to have up to 33 of one motion"),
-    "error": Limit(1.0, "thresholds, rms of the whole", "the definition of an inlier"),
-    "error of rough ground": Limit(3.0, "thresholds, where images look alike", "small_failures, classical"),
-    "error that relief explains": Limit(0.02, "of an image's diagonal", "python -m examples.benchmarks.relief"),
-    "alike": Limit(0.25, "share of the overlaps", "0.26 to 1 in 22 sets that a person would keep: benchmarks.world"),
-    "clearly alike": Limit(0.5, "share of the overlaps", "python -m examples.benchmarks.relief"),
-    "unlike": Limit(0.10, "share of the cells of an overlap", "chance reaches 0.07; low sun, parallax, blur 0.20"),
-    "little alike": Limit(0.15, "share of the cells of an overlap", "between the two"),
-    "unlike, undecided": Limit(
-        0.4, "share of the cells of an overlap", "vehicles 0.15 to 0.36, planes beside one 0.2 to 0.9: benchmarks.trust"
-    ),
-    "pattern": Limit(0.4, "share of the checked pairs", "more is a pattern all over: leaving some out proves nothing"),
-    "second motion": Limit(0.1, "share of the area of either motion", "trees and houses reach 0.08: benchmarks.trust"),
-    "zoom": Limit(1.03, "ratio of focal lengths in EXIF", "they are rounded to about one per cent"),
-}
-
-
-def _limit(name: str) -> float:
-    return LIMITS[name].value
-
-
 def disagreeing_pairs(found: Evidence) -> Iterator[Finding]:
     """Pairs of whose matches most do not fit into the whole."""
     for fit in found.used:
-        if fit.inliers < _limit("inliers of a pair") * fit.count:
+        if fit.inliers < limit("inliers of a pair") * fit.count:
             reason = _reason(found, (fit.image1, fit.image2), [fit], "stitch them on their own")
             yield _of_matches("pair misfits", (fit.image1, fit.image2), [fit], reason)
 
 
 def _misfitting_images(found: Evidence) -> Iterator[Finding]:
     """Images of whose matches too many do not fit into the whole, over all pairs that do."""
-    agreeing = [fit for fit in found.used if fit.inliers >= _limit("inliers of a pair") * fit.count]
+    agreeing = [fit for fit in found.used if fit.inliers >= limit("inliers of a pair") * fit.count]
     for k in range(len(found.registration.sources)):
         own = [fit for fit in agreeing if k in (fit.image1, fit.image2)]
-        if sum(fit.inliers for fit in own) < _limit("inliers of an image") * sum(fit.count for fit in own):
+        if sum(fit.inliers for fit in own) < limit("inliers of an image") * sum(fit.count for fit in own):
             yield _of_matches("image misfits", (k,), own, _reason(found, (k,), own))
 
 
 def _matches_disagree(found: Evidence) -> Iterator[Finding]:
-    if sum(fit.inliers for fit in found.used) < _limit("inliers of a pair") * sum(fit.count for fit in found.used):
+    if sum(fit.inliers for fit in found.used) < limit("inliers of a pair") * sum(fit.count for fit in found.used):
         yield _of_matches("matches disagree", (), found.used)
 
 
@@ -87,7 +54,7 @@ def _reason(found: Evidence, images: Sequence[int], fits: Sequence[LinkFit], rem
     if any(why for _, why in few):
         return ", ".join(f"{name} has {why}" for name, why in few if why)
     why = "they agree with each other: another plane, camera or zoom, or none (trees, walls)?"
-    if sum(fit.count for fit in fits) < _limit("few matches"):
+    if sum(fit.count for fit in fits) < limit("few matches"):
         why = "too few to place it: little overlap, or none?"
     return f"{why} {remedy}".strip()
 
@@ -105,26 +72,22 @@ def _errors(found: Evidence) -> Iterator[Finding]:
     """Errors of all pairs together; those of rough ground are a warning where the pixels agree."""
     alignment, threshold = found.alignment, found.threshold
     rms, relief = alignment.rms, alignment.relief
-    if rms <= _limit("error") * threshold:
+    if rms <= limit("error") * threshold:
         return
-    largest = _limit("error that relief explains") * 2.0 * max(camera.half_diagonal for camera in alignment.cameras)
+    largest = limit("error that relief explains") * 2.0 * max(camera.half_diagonal for camera in alignment.cameras)
     # Without what neighbours have in common, errors are those of a plane.
-    explained = rms <= largest and rms**2 - relief.size**2 <= (_limit("error") * threshold) ** 2
+    explained = rms <= largest and rms**2 - relief.size**2 <= (limit("error") * threshold) ** 2
     # Where the pixels agree, depth that one surface does not explain has been found a place all the same.
-    rough = (rms <= _limit("error of rough ground") * threshold and found.alike >= _limit("alike")) or (
-        relief.found and explained and found.alike >= _limit("clearly alike")
+    rough = (rms <= limit("error of rough ground") * threshold and found.alike >= limit("alike")) or (
+        relief.found and explained and found.alike >= limit("clearly alike")
     )
     values = {"rms": rms, "threshold": threshold}
     yield Finding("rough", (), "warning", values) if rough else Finding("errors", values=values)
 
 
 def _depth(found: Evidence) -> Iterator[Finding]:
-    """Parallax of a turn, or errors that neighbouring matches have in common, and where they are largest."""
-    if found.parallax:
-        worst = found.parallax[0]
-        values = {"size": worst.size, "share": worst.share}
-        yield Finding("parallax", (worst.image1, worst.image2), "warning", values)
-    elif found.alignment.relief.found:
+    """Errors that neighbouring matches have in common, and where they are largest."""
+    if found.alignment.relief.found:
         fit = max(found.used, key=lambda fit: fit.rms)
         what = found.alignment.relief.explanation
         kind = "depth of a turn" if found.alignment.on_sphere else "relief"
@@ -155,9 +118,9 @@ def _unlike(found: Evidence) -> Iterator[Finding]:
 
     What two images share of a plane looks alike; where something else moves, it may be that which holds them.
     """
-    least = _limit("unlike, undecided" if _undecided(found) else "unlike")
+    least = limit("unlike, undecided" if _undecided(found) else "unlike")
     for link in found.seen:
-        if link.agreement.cells >= MIN_CELLS and link.agreement.share < least:
+        if link.agreement.cells >= limit("cells") and link.agreement.share < least:
             yield Finding("unlike", link.pair, values=_cells_of(link))
 
 
@@ -170,19 +133,12 @@ def _undecided(found: Evidence) -> bool:
 def _little_alike(found: Evidence) -> Iterator[Finding]:
     """Images that look less alike than most where they are put together."""
     for link in found.seen:
-        if link.agreement.cells >= MIN_CELLS and link.agreement.share < _limit("little alike"):
+        if link.agreement.cells >= limit("cells") and link.agreement.share < limit("little alike"):
             yield Finding("little alike", link.pair, "warning", _cells_of(link))
 
 
 def _cells_of(link: CheckedLink) -> dict[str, object]:
     return {"confirming": link.agreement.confirming, "cells": link.agreement.cells}
-
-
-def _held_by_second_motion(found: Evidence) -> Iterator[Finding]:
-    """Images that what moves differently may hold together; none where that holds all of them."""
-    if found.compared is not None and not found.compared.lost:
-        doubtful = found.compared.doubtful
-        yield from (Finding("held by another", link.pair) for link in found.checked if link.pair in doubtful)
 
 
 def _ambiguous(found: Evidence) -> Iterator[Finding]:
@@ -192,7 +148,7 @@ def _ambiguous(found: Evidence) -> Iterator[Finding]:
 
 def _pattern(found: Evidence) -> Iterator[Finding]:
     """A pattern over so many pairs that leaving some of them out proves nothing; or one in which the unique decided."""
-    if len(found.ambiguous) > _limit("pattern") * len(found.checked):
+    if len(found.ambiguous) > limit("pattern") * len(found.checked):
         yield Finding("pattern", values={"count": len(found.ambiguous), "of": len(found.checked)})
     settled = [link for link in found.seen if link.unique]
     if settled:
@@ -201,23 +157,27 @@ def _pattern(found: Evidence) -> Iterator[Finding]:
 
 def _second_motion(found: Evidence) -> Iterator[Finding]:
     """What moves differently: a failure of all images where it may be the plane, as without the one that shows it best
-    it would only be harder to see.
+    it would only be harder to see. Of a turn it is parallax, or what moved before the camera.
     """
     motions = found.motions
     if found.lens_only:  # the same a period of the pattern further on; what is static has a message of its own
         motions = [] if found.static else [own for own in motions if own.images not in found.ambiguous]
     share, compared = share_of(motions), found.compared
-    if found.parallax or not motions or (share < _limit("second motion") and compared is None):
+    if not motions or (share < limit("second motion") and compared is None):
         return
     alike = share_alike(found.checked)
-    clear = alike >= FILLED_BY_A_PLANE or (share < FILLED_BY_A_PLANE and not alike < _limit("unlike, undecided"))
-    clear |= found.depth and alike >= _limit("alike")  # nearer and farther things move differently
+    clear = alike >= limit("filled by a plane") or (
+        share < limit("filled by a plane") and not alike < limit("unlike, undecided")
+    )
+    clear |= found.depth and alike >= limit("alike")  # nearer and farther things move differently
     if compared is not None:
         clear = compared.won or (clear and not compared.lost)
     worst = max(motions, key=lambda own: own.area)
     off = min(worst.disagreement, 2.0 * found.alignment.cameras[worst.images[0]].half_diagonal)
     values = {"share": share, "place": worst.center, "shown": worst.images, "off": off}
-    if found.lens_only or clear:
+    if found.alignment.on_sphere:
+        yield Finding("parallax", worst.images, "warning", {"size": off, "share": share})
+    elif found.lens_only or clear:
         yield Finding("second motion", worst.images, "warning", values)
     else:
         yield Finding("undecided motion", tuple(sorted({k for own in motions for k in own.images})), "failure", values)
@@ -241,7 +201,7 @@ def _inputs(found: Evidence) -> Iterator[Finding]:
     focal = {k: _focal_share(source) for k, source in enumerate(sources) if source.metadata.focal_px is not None}
     if len(bodies) > 1:
         yield Finding("several cameras", (), "warning", {"bodies": bodies})
-    elif focal and max(focal.values()) > _limit("zoom") * min(focal.values()):
+    elif focal and max(focal.values()) > limit("zoom") * min(focal.values()):
         near, far = min(focal, key=lambda k: focal[k]), max(focal, key=lambda k: focal[k])
         yield Finding("zoomed", (), "warning", {"ratio": focal[far] / focal[near], "near": near, "far": far})
     without = [k for k, source in enumerate(sources) if source.mask is None]
@@ -258,7 +218,7 @@ Find = Callable[[Evidence], Iterable[Finding]]
 OF_MATCHES: tuple[Find, ...] = (_mixed_lenses, _matches_disagree, _misfitting_images)
 """Failures by which the pixels need not be asked: of images that may be left out."""
 
-OF_PAIRS: tuple[Find, ...] = (disagreeing_pairs, _unlike, _held_by_second_motion, _ambiguous)
+OF_PAIRS: tuple[Find, ...] = (disagreeing_pairs, _unlike, _ambiguous)
 """Suspicions of pairs, the last of each counts: a failure where images hang on it alone."""
 
 OF_THE_WHOLE: tuple[Find, ...] = (_errors, _depth, _shape, _pattern, _second_motion, _little_alike, _two_left, _inputs)
@@ -277,7 +237,7 @@ def _bent(found: Evidence) -> bool:
 
 def _seen(found: Evidence) -> bool:
     """Whether depth leaves breaks that are seen."""
-    return found.alike < _limit("alike")
+    return found.alike < limit("alike")
 
 
 class Aloud(NamedTuple):

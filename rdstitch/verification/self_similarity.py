@@ -4,8 +4,6 @@ Both images are drawn on the plane, and correlated at every shift at once (maske
 Padfield 2012). Where the plane is metric a shift by a period of the pattern is as good as the right one.
 """
 
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import cv2
@@ -15,6 +13,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
 from rdstitch.radial_homography import to_plane
+from rdstitch.verification.limits import limit
 from rdstitch.verification.photometric_agreement import ComparedImage, Grey
 
 MAX_SIDE = 256  # pixels of the images that are compared
@@ -23,9 +22,6 @@ _COARSEST = 8.0  # pixels, standard deviation of the blur that brightness is mea
 _MIN_SHIFT = 14  # pixels: shifts that are none
 SLACK = 3  # pixels by which the registration may be off
 _MIN_NORM = 1e-4  # of the largest: where fewer pixels overlap, rounding decides
-_MIN_SHARE = 0.5  # of the overlap that a shift must keep
-_MIN_CORRELATION = 0.5  # correlation from which on two images look alike
-_COMPARABLE_CORRELATION = 0.9  # of the correlation here; a repeated pattern reaches 0.97, other images seldom 0.5
 
 
 @dataclass(frozen=True)
@@ -48,7 +44,7 @@ class Ambiguity:
     @property
     def ambiguous(self) -> bool:
         """Whether the images fit elsewhere as well as here."""
-        return self.elsewhere > max(_MIN_CORRELATION, _COMPARABLE_CORRELATION * self.here)
+        return self.elsewhere > max(limit("correlation"), limit("as well elsewhere") * self.here)
 
 
 @dataclass(frozen=True)
@@ -110,7 +106,7 @@ def placement_ambiguity(first: Drawing, second: Drawing) -> Ambiguity:
     most = float(overlaps.area[close][within].max(initial=0.0))
     if not most > 0:
         return Ambiguity(0.0, 0.0, 0.0)
-    enough = overlaps.area >= _MIN_SHARE * most
+    enough = overlaps.area >= limit("kept overlap") * most
     box = _box_around(enough, SLACK)
     score, distance = overlaps.correlation(box), np.hypot(down[box[0], None], right[None, box[1]])
     near = distance <= SLACK
@@ -122,18 +118,10 @@ def placement_ambiguity(first: Drawing, second: Drawing) -> Ambiguity:
     return Ambiguity(here, float(other.flat[best]), float(distance.flat[best]) / MAX_SIDE)
 
 
-def ambiguous_pairs(
-    placed: Mapping[int, ComparedImage], pairs: Sequence[tuple[int, int]], workers: int = 1
-) -> list[tuple[int, int]]:
-    """The pairs of images that look as much alike elsewhere, drawn at one scale by ``workers`` threads."""
-    images = sorted({k for pair in pairs for k in pair})
-    if not images:
-        return []
-    scale = float(np.median([drawing_scale(placed[k].camera, placed[k].homography) for k in images]))
-    with ThreadPoolExecutor(workers) as pool:
-        drawings = dict(zip(images, pool.map(lambda k: draw(placed[k], scale), images), strict=True))
-        found = pool.map(lambda pair: placement_ambiguity(drawings[pair[0]], drawings[pair[1]]).ambiguous, pairs)
-        return [pair for pair, ambiguous in zip(pairs, found, strict=True) if ambiguous]
+def find_ambiguity(first: ComparedImage, second: ComparedImage) -> Ambiguity:
+    """Draw two images on the plane at the scale of the second one, and compare them at all shifts."""
+    scale = drawing_scale(second.camera, second.homography)
+    return placement_ambiguity(draw(first, scale), draw(second, scale))
 
 
 def _box_around(chosen: NDArray[np.bool_], margin: int) -> tuple[slice, slice]:

@@ -14,19 +14,16 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.radial_homography import from_plane, to_plane
+from rdstitch.verification.limits import limit
 from rdstitch.verification.photometric_agreement import COMPARED_SIDE, ComparedImage, Grey
 from rdstitch.verification.self_similarity import Drawing, Overlaps, draw, drawing_scale
 
 _MIN_SHIFT = 10  # pixels: a shorter shift is no period that could be told from the peak itself
-_PERIODIC = 0.4  # correlation from which on a shift is a period
 _OWN_OVERLAP, _OVERLAP = 0.15, 0.05  # of an image, that a shift must keep; of two, of the most that one keeps
-_MIN_PERIODS, _MAX_PERIODS = 4, 16  # shifts that an image is compared with itself at
+_MAX_PERIODS = 16  # shifts that an image is compared with itself at
 _MIN_COPIES = 3  # other copies of a place, of which the median is clean though one of them has dirt
 _MARGIN = 6  # pixels at the border of an image, where brightness cannot be removed well
-_DEPARTS, _MOST = 5.0, 25.0  # spreads of the copies: less is no departure, more counts as this
-_MIN_MATCHED = 400.0  # squared spreads times pixels: a stain of sixteen pixels, five spreads beyond what is none
-_MIN_SHARE = 0.8  # of the departures in the overlap that must be the same; right ones have 0.87 to 0.99
-_MIN_LEAD = 3.0  # of what is matched here, over what is matched at any other shift
+_MOST = 25.0  # spreads of the copies: a larger departure counts as this
 
 
 @dataclass(frozen=True)
@@ -53,8 +50,8 @@ class UniqueShift:
     @property
     def decides(self) -> bool:
         """Whether the images lie here and nowhere else."""
-        clear = self.matched >= max(_MIN_MATCHED, _MIN_LEAD * self.rival)
-        return clear and self.share >= _MIN_SHARE
+        clear = self.matched >= max(limit("matched departures"), limit("lead") * self.rival)
+        return clear and self.share >= limit("same departures")
 
 
 def unique_shifts(
@@ -111,7 +108,7 @@ def departures(pixels: Grey) -> Grey | None:
     found = _peaks(Overlaps.of(pixels, pixels), pixels, np.zeros(2), _OWN_OVERLAP)
     periods = found.shift[np.hypot(*found.shift.T) > _MIN_SHIFT]
     periods = periods[np.argsort(np.hypot(*periods.T), kind="stable")][:_MAX_PERIODS]
-    if len(periods) < _MIN_PERIODS:
+    if len(periods) < limit("periods"):
         return None
     copies = np.stack([_shifted(pixels, shift) for shift in periods])
     count = np.isfinite(copies).sum(axis=0)
@@ -126,7 +123,7 @@ def departures(pixels: Grey) -> Grey | None:
         for values in (pixels - middle, spread)
     )
     relative = departure / np.maximum(usual, max(float(np.median(usual[known])), 1e-6))
-    size = np.clip(np.abs(relative) - _DEPARTS, 0.0, _MOST)
+    size = np.clip(np.abs(relative) - limit("departure"), 0.0, _MOST)
     return np.where(known & (inside > 0), np.copysign(size, relative), np.float32(np.nan)).astype(np.float32)
 
 
@@ -164,7 +161,7 @@ def _peaks(overlaps: Overlaps, first: Grey, offset: FloatArray, least_overlap: f
     score = overlaps.correlation()
     kernel = np.ones((2 * _MIN_SHIFT + 1, 2 * _MIN_SHIFT + 1), dtype=np.uint8)
     enough = overlaps.area >= least_overlap * overlaps.area.max()
-    peak = (score >= cv2.dilate(score, kernel)) & enough & (score > _PERIODIC)
+    peak = (score >= cv2.dilate(score, kernel)) & enough & (score > limit("period"))
     peak[[0, -1]] = peak[:, [0, -1]] = False
     row, column = np.nonzero(peak)
     x, y = (

@@ -1,11 +1,9 @@
 """Every run judges itself: can the result be relied on? Evidence, rules, findings."""
 
 from collections.abc import Collection, Iterable, Sequence
-from concurrent.futures import Executor
 from dataclasses import replace
 
 from rdstitch.alignment.result import LinkFit
-from rdstitch.cache import NO_CACHE, Cache
 from rdstitch.errors import RegistrationError
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.matching.two_view import Pair
@@ -38,35 +36,16 @@ class RefusedError(RegistrationError):
         self.registration = registration
 
 
-def judge(
-    registration: Registration,
-    threshold: float,
-    executor: Executor | None = None,
-    cache: Cache = NO_CACHE,
-    *,
-    lens_only: bool = False,
-) -> tuple[Finding, ...]:
+def judge(found: Evidence) -> tuple[Finding, ...]:
     """Check an alignment against the pairs that it was made from, and against the pixels.
-
-    Parameters
-    ----------
-    registration : Registration
-    threshold : float
-        Largest transfer error of an inlier of a pair, pixels.
-    executor : concurrent.futures.Executor, optional
-        Where images are compared; None: in one thread.
-    cache : Cache
-    lens_only : bool
-        Only the lens is wanted, so that doubts about the places of images do not make the result fail, and are
-        not reported where a repeated pattern explains them.
 
     Returns
     -------
     tuple of Finding
         Failures, with the images that they concern where that is clear, and warnings; none for a good result.
     """
-    found = Evidence(registration, threshold, executor, cache, lens_only)
-    count = len(registration.sources)
+    lens_only = found.lens_only
+    count = len(found.registration.sources)
     of_matches = [finding for find in rules.OF_MATCHES for finding in find(found)]
     if found.static:
         of_matches = [finding for finding in of_matches if not finding.images]

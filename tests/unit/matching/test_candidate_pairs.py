@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.spatial.transform import Rotation
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
@@ -16,7 +17,6 @@ from rdstitch.features.keypoints import Descriptors
 from rdstitch.matching.candidate_pairs import (
     CANDIDATES,
     EXHAUSTIVE_UP_TO,
-    _alike_to_each,
     _most_alike,
     neighbours,
     pairs_that_matter,
@@ -238,17 +238,31 @@ def test_ten_neighbours_of_each_image_are_candidates() -> None:
     assert len(neighbours([lens] * 22, far, everything)) == 55
 
 
+@pytest.mark.parametrize("focal", [0.4, 1.0, 4.0])
+def test_of_a_turn_neighbours_are_those_that_see_a_part_of_each_other(focal: float) -> None:
+    """A full circle: the next images, as far as their angle of view reaches, also across where the circle closes."""
+    count, camera = 36, Camera((640, 480))
+    turned = Rotation.from_rotvec(np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)[:, None] * [0, 1, 0]).as_matrix()
+    found = neighbours([camera] * count, turned @ np.diag([1.0, 1.0, focal]), set(), on_sphere=True)
+    half = np.degrees(np.arctan2(320.0, focal * camera.half_diagonal))
+    reach = min(5, int(2.0 * half * 0.8 // 10.0))
+    assert reach >= 1
+    apart = {min((j - i) % count, (i - j) % count) for i, j in found}
+    assert apart == set(range(1, max(apart) + 1))
+    assert abs(max(apart) - reach) <= 1
+    assert (0, count - 1) in found
+
+
 def _alike(ordered: bool = False) -> Any:
     rows = [[0.0, 0.9, 0.5, 0.0], [0.9, 0.0, 0.7, 0.2], [0.5, 0.7, 0.0, 0.0], [0.0, 0.2, 0.0, 0.0]]
     scores = sparse.csr_array(np.array(rows))
     most = np.array([[1, 2], [0, 2], [1, 0], [1, 2]])
-    return SimpleNamespace(most_alike=most, peak=np.ones((4, 2), dtype=np.bool_), ordered=ordered, scores=scores)
+    return SimpleNamespace(most_alike=most, ordered=ordered, scores=scores)
 
 
 def test_images_without_features_are_like_none() -> None:
-    assert _alike_to_each(_alike(), {0, 1, 2, 3}) == {(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)}
-    assert _alike_to_each(_alike(), {0, 1, 2}) == {(0, 1), (0, 2), (1, 2)}
-    assert _alike_to_each(_alike(ordered=True), {0, 1, 2, 3}) == set()
+    images = [*_drive(40), _features(np.zeros((0, 64), np.float32))]
+    assert not any(40 - i > 3 for i, j in first_pairs(images, seed=0) if j == 40)
 
 
 def test_the_pairs_most_alike_fill_up_what_is_wanted() -> None:

@@ -50,12 +50,6 @@ def test_what_both_images_have_in_common_counts_little() -> None:
     assert 2.0 * alike.mahalanobis_residuals(-0.2)[0] < unlike.mahalanobis_residuals(-0.2)[0]
 
 
-def test_differences_have_the_deviation_of_a_difference() -> None:
-    difference, std = _votes([[-0.20, -0.16], [-0.1, -0.3]], OWN).differences
-    np.testing.assert_allclose(difference, [0.04, -0.2])
-    np.testing.assert_allclose(std, np.sqrt(4e-4 + 9e-4 - 2e-4 + 2 * 2e-4**2))
-
-
 def test_images_come_from_their_lenses() -> None:
     votes = _votes([[0.0, 0.0]] * 3, OWN)
     assert votes.which(np.array([False, True, True, False])).tolist() == [[0, 1], [1, 1], [1, 0]]

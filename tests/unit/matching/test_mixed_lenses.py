@@ -7,7 +7,7 @@ import pytest
 
 from rdstitch.camera import Camera
 from rdstitch.matching.lens_votes import Votes
-from rdstitch.matching.mixed_lenses import SeparatedLenses, TwoLenses, _guesses, two_lenses
+from rdstitch.matching.mixed_lenses import TwoLenses, two_lenses
 
 _CHAIN = [(0, 1), (1, 2), (2, 3), (3, 4)]
 _ALL = list(itertools.combinations(range(6), 2))
@@ -99,22 +99,3 @@ def test_lenses_that_differ_by_less_than_a_result_shows_are_one() -> None:
 def test_pairs_that_see_nothing_say_nothing() -> None:
     assert two_lenses([Camera((640, 480))] * 3, Votes.of([], 3.0)) is None
     assert _divided(_CHAIN[:1], [-0.2, -0.1], std=0.05) is None
-
-
-def test_pairs_of_one_lens_are_those_of_no_image_that_was_left_out() -> None:
-    found = SeparatedLenses([], {2: "another lens"}, None)
-    assert found.of_one_lens([(0, 1), (1, 2), (2, 3), (0, 3)]) == [(0, 1), (0, 3)]
-    assert SeparatedLenses([], {}, None).of_one_lens([(0, 1), (1, 2)]) == [(0, 1), (1, 2)]
-
-
-def test_divisions_begin_at_the_widest_gaps() -> None:
-    """Seven lenses, each of two images that a certain vote connects: the five widest gaps between them."""
-    levels = np.array([-0.50, -0.41, -0.33, -0.26, -0.20, -0.15, -0.11])
-    pairs = np.array([(2 * k, 2 * k + 1) for k in range(7)] + [(2 * k + 1, 2 * k + 2) for k in range(6)])
-    own = np.repeat(levels, 2)
-    votes = Votes(pairs[:, 0], pairs[:, 1], own[pairs], np.tile(1e-6 * np.eye(2), (13, 1, 1)))
-    cuts = [int((~second).sum()) for second, _ in _guesses(14, votes)]
-    assert cuts == [2, 4, 6, 8, 10]
-    for second, lenses in _guesses(14, votes):
-        below, above = own[~second].max(), own[second].min()
-        np.testing.assert_allclose(lenses, [below, above], atol=0.01)

@@ -12,7 +12,6 @@ from rdstitch.matching.static_background import (
     is_static_pair,
     moving_features,
     show_motion,
-    static_places,
 )
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.radial_homography import RadialHomography
@@ -122,15 +121,9 @@ def test_of_a_pair_that_moves_only_static_outliers_are_taken_out() -> None:
 
 @pytest.mark.parametrize(("pairs", "left"), [(3, 40), (2, 48)])
 def test_a_place_is_static_from_three_static_matches_on(pairs: int, left: int) -> None:
+    """Of an image of which no pair was estimated."""
     seen = [_with_overlay(8, 0, 1 + k, seed=k) for k in range(pairs)]
-    places = static_places(seen, THRESHOLD)
-    assert len(places.without_static(seen[0].correspondences)) == left
-    # What moves from such a place is kept.
-    moving = _pair(np.full(48, 30.0)).correspondences
-    assert len(places.without_static(moving)) == 48
-
-
-def test_a_static_place_reaches_as_far_as_a_static_match_moves() -> None:
-    places = static_places([_with_overlay(8, 0, 1 + k, seed=k) for k in range(3)], THRESHOLD)
-    assert places.radius == pytest.approx(THRESHOLD / 3.0)
-    assert places.places.n >= 8
+    one, points = np.ones(48), seen[0].correspondences.points1.copy()
+    points[40:] += (0.6, 0.7)  # nearer than a static match moves
+    features = [Features(points, np.zeros((48, 8), np.float32), one, one, one, None, "made up")] * 6
+    assert len(moving_features(FeatureStore.of(features), seen, THRESHOLD)[5]) == left

@@ -16,7 +16,7 @@ from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import write_image
 from rdstitch.messages import Message, Severity, left_out
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.accept import _is_of_the_whole, _is_simpler, _may_be_another_plane, _Offenders, _without, accept
+from rdstitch.pipeline.accept import Offenders, _is_of_the_whole, _is_simpler, _may_be_another_plane, _without, accept
 from rdstitch.pipeline.aligner import Aligner
 from rdstitch.pipeline.register import register
 from rdstitch.verification.findings import Finding
@@ -106,14 +106,15 @@ def test_what_is_damaged_is_left_out_where_the_others_fit_better(
     monkeypatch: pytest.MonkeyPatch, rest: str, remaining: int, fails: tuple[int, ...], left_out: bool | None
 ) -> None:
     whole, smaller = _stub("tilting", 4), _stub(rest, remaining)
-    asked: list[_Offenders] = []
+    asked: list[Offenders] = []
 
-    def without(_: object, offenders: _Offenders, aligner: object) -> Any:
+    def without(_: object, offenders: Offenders, aligner: object) -> Any:
         asked.append(offenders)
         return smaller
 
-    def judge(registration: Any, **_: object) -> tuple[Finding, ...]:
-        return (Finding("pattern", values={"count": 2, "of": 3}),) if registration.alignment.used.sum() in fails else ()
+    def judge(found: Any) -> tuple[Finding, ...]:
+        fails_now = found.alignment.used.sum() in fails
+        return (Finding("pattern", values={"count": 2, "of": 3}),) if fails_now else ()
 
     stage = "rdstitch.pipeline.accept"
     monkeypatch.setattr(f"{stage}._without", without)
@@ -123,14 +124,13 @@ def test_what_is_damaged_is_left_out_where_the_others_fit_better(
     aligner = Aligner.of([], OPTIONS, NO_CACHE)
     monkeypatch.setattr(f"{stage}.Aligner.of", lambda *_, **__: aligner)
     monkeypatch.setattr(f"{stage}.RefusedError", RegistrationError)
-    nowhere: Any = None
     if left_out is None:
         with pytest.raises(RegistrationError):
-            accept(whole, OPTIONS, nowhere)
+            accept(whole, OPTIONS)
     else:
-        accepted = accept(whole, OPTIONS, nowhere)
+        accepted = accept(whole, OPTIONS)
         assert accepted.alignment is (smaller if left_out else whole).alignment
-    assert [list(offenders.reasons) for offenders in asked[:1]] == [[2]]
+    assert [list(offenders) for offenders in asked[:1]] == [[(2,)]]
 
 
 def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Path) -> None:
@@ -145,9 +145,7 @@ def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Pat
         alignment=replace(found.alignment, links=links, used=found.alignment.used & [False, True, True]),
         messages=(left_out(frames[0], "contradicts"),),
     )
-    rest = _without(
-        spoiled, _Offenders({2: Message("shows something else")}, {}), Aligner.of(sources, OPTIONS, NO_CACHE)
-    )
+    rest = _without(spoiled, {(2,): Message("shows something else")}, Aligner.of(sources, OPTIONS, NO_CACHE))
     assert rest is not None
     assert rest.alignment.used.tolist() == [True, True, False]
     assert [str(message) for message in rest.left_out] == [f"left out {frames[2]}: shows something else [left-out]"]
@@ -180,7 +178,7 @@ def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path:
     sources = _read(frames)
     with open_executor(1, len(sources)) as executor:
         found = register(sources, OPTIONS, executor, skip_bad=False)
-        accepted = accept(found, OPTIONS, executor)
+        accepted = accept(found, OPTIONS)
     steps = [np.diff(k.alignment.homographies[:, 0, 2]) for k in (found, accepted)]
     assert np.all(np.abs(steps[0]) < 0.2)  # heights above the ground: what drives ahead moves by a sixth
     assert np.all(np.abs(steps[1]) > 0.7)

@@ -83,20 +83,3 @@ def test_it_comes_to_the_truth(model: PairModel, fixed: bool) -> None:
     assert np.isinf(seen.errors[0, 80:]).all()
     assert seen.influence.shape == (1, problems.data.present.shape[1], seen.information.shape[1])
     assert seen.cost == pytest.approx(problems.normal_equations(np.column_stack([found.distortion, found.state])).cost)
-
-
-def test_parameters_that_are_held_stay_and_the_rest_is_fitted_as_without_them() -> None:
-    """In lockstep with the freer model, a change of height that is held is no change of height."""
-    similar, rigid = (PlanarPairModel(FOCAL, 0.2, height_free=free) for free in (True, False))
-    state, near = similar.initialize(H[None]), np.array([-0.15])
-    own = refine_pairs(_problems(rigid), Fits(rigid.initialize(H[None]), H[None], near), 30)[0]
-    held = np.stack([similar.held_by(rigid), similar.held_by(similar)])
-    assert held.sum(axis=1).tolist() == [1, 0]
-    data = _data().take(np.array([0, 0]))
-    both = PairProblems(similar, data, np.full(2, 3.0), np.full(2, 0.5), False, held)
-    start = Fits(np.concatenate([rigid.restricted(state), state]), np.stack([H, H]), np.tile(near, 2))
-    found, equations = refine_pairs(both, start, 30)
-    np.testing.assert_allclose(found.state[0], own.state[0], atol=1e-6)
-    assert found.state[0, 7] == 0.0
-    assert found.distortion[0] == pytest.approx(own.distortion[0], abs=1e-7)
-    assert equations.gradient[0, 1 + np.flatnonzero(held[0])[0]] == 0.0

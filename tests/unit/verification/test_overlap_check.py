@@ -1,20 +1,15 @@
 """Which overlaps are compared, and how many agree."""
 
 import math
-from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from rdstitch.alignment.motion_models.rotation import rotation_from_vector
 from rdstitch.alignment.result import LinkFit
-from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.verification import overlap_check
-from rdstitch.verification.overlap_check import CheckedLink, _least_confirmed, _scales, share_alike
+from rdstitch.verification.overlap_check import CheckedLink, _least_confirmed, share_alike
 from rdstitch.verification.photometric_agreement import Agreement, ComparedImage
 from rdstitch.verification.self_similarity import Ambiguity
 
@@ -50,60 +45,11 @@ def test_the_share_alike_is_that_of_all_cells() -> None:
     assert math.isnan(share_alike([]))
 
 
-def test_images_are_drawn_at_powers_of_two_of_the_median_scale() -> None:
-    assert _scales([1.0, 1.2, 1.3, 2.6, 0.6]) == pytest.approx([1.2, 1.2, 1.2, 2.4, 0.6])
-
-
-def test_a_turn_is_compared_between_the_two_images(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Halfway between two directions, each image is tilted by half the angle; the scale is that of neither."""
-    seen: list[ComparedImage] = []
-    straight_on: list[FloatArray] = []
-
-    def agreement(*both: ComparedImage) -> Agreement:
-        seen.extend(both)
-        return Agreement(1, 1)
-
-    def scale(camera: Camera, homography: FloatArray) -> float:
-        straight_on.append(homography)
-        return 1.0
-
-    def of(image: None, camera: Camera, matrix: FloatArray, stretch: None) -> ComparedImage:
-        return ComparedImage(np.zeros((2, 2), np.float32), camera, matrix)
-
-    monkeypatch.setattr(overlap_check, "placement_ambiguity", lambda first, second: Ambiguity(1.0, 0.0, 0.0))
-    monkeypatch.setattr(overlap_check, "draw", lambda image, scale: image)
-    monkeypatch.setattr(overlap_check, "drawing_scale", scale)
-    monkeypatch.setattr(overlap_check, "overlap_agreement", agreement)
-    monkeypatch.setattr(ComparedImage, "of", of)
+def test_a_turn_is_compared_between_the_two_images() -> None:
+    """Halfway between two directions, each image is tilted by half the angle."""
     first, last, half = (rotation_from_vector(np.array([[0.0, angle, 0.0]]))[0] for angle in (0.1, 0.4, 0.15))
-    lens = Camera((64, 48))
     focal = np.diag([0.7, 0.7, 1.0])  # half diagonals to directions
-    alignment = SimpleNamespace(
-        homographies=np.stack([first, last]) @ focal, cameras=[lens] * 2, on_sphere=True, poses=None
-    )
-    source = SimpleNamespace(read=lambda *_, **__: None, camera=lens, guard=InputGuard(), path=Path("a.png"))
-    registration: Any = SimpleNamespace(alignment=alignment, sources=[source] * 2, stretch=None)
-    (task,) = overlap_check._tasks(registration, [_fit(0, 1)], {})
-    overlap_check.compare_overlaps(task)
-    np.testing.assert_allclose(seen[0].homography, half.T @ focal, atol=1e-9)
-    np.testing.assert_allclose(seen[1].homography, half @ focal, atol=1e-9)
-    np.testing.assert_allclose(straight_on, [focal], atol=1e-9)
-
-
-def test_over_rough_ground_images_look_alike_where_their_matches_are() -> None:
-    """Two pixels to the right of where the alignment expects them; of a link that is not used nothing is asked."""
-    points = np.array([[10.0, 20.0], [30.0, 5.0]])
-    link = SimpleNamespace(points1=points, points2=points + np.array([2.0, 0.0]))
-    pairs = [SimpleNamespace(image1=i, image2=j, link=lambda: link) for i, j in ((0, 1), (1, 2))]
-
-    def transfer(i: int, j: int, points: FloatArray) -> FloatArray:
-        return np.where(points[:, :1] > 20.0, np.nan, points)
-
-    alignment = SimpleNamespace(on_sphere=False, relief=SimpleNamespace(found=True), transfer=transfer)
-    registration: Any = SimpleNamespace(alignment=alignment, pairs=pairs)
-    found = overlap_check._parallax(registration, [_fit(0, 1)])
-    assert list(found) == [(0, 1)]
-    np.testing.assert_allclose(found[0, 1].places, points[:1])
-    np.testing.assert_allclose(found[0, 1].shifts, [[2.0, 0.0]])
-    alignment.relief.found = False
-    assert overlap_check._parallax(registration, [_fit(0, 1)]) == {}
+    grey = np.zeros((2, 2), np.float32)
+    both = overlap_check._between(*(ComparedImage(grey, Camera((64, 48)), turn @ focal) for turn in (first, last)))
+    np.testing.assert_allclose(both[0].homography, half.T @ focal, atol=1e-9)
+    np.testing.assert_allclose(both[1].homography, half @ focal, atol=1e-9)

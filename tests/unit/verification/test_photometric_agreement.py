@@ -13,7 +13,6 @@ from rdstitch.verification.photometric_agreement import (
     COMPARED_SIDE,
     Agreement,
     ComparedImage,
-    Parallax,
     overlap_agreement,
 )
 
@@ -46,21 +45,6 @@ def test_two_and_a_half_pixels_are_forgiven(off: float, agree: bool) -> None:
         assert (found.share > 0.8) if agree else (found.share < 0.2), put
 
 
-def test_what_relief_moves_agrees_where_the_matches_around_it_were_found() -> None:
-    put = (9.0, -5.0)
-    places = np.stack(np.meshgrid(np.arange(0.0, 400.0, 40.0), np.arange(0.0, 300.0, 40.0)), -1).reshape(-1, 2)
-    shifts = np.tile(put, (len(places), 1))
-    shifts[::17] = 100.0  # wrong matches
-    both = _placed(100, 100, put=put), _placed(200, 150)
-    moved = Parallax(places, -shifts)
-    assert overlap_agreement(*both).share < 0.2
-    assert overlap_agreement(*both, moved).share > 0.9
-    assert overlap_agreement(*both, Parallax(places, shifts)).share < 0.2
-    twice = Parallax(2.0 * places + 0.5, -2.0 * shifts).resized(LENS.resized((800, 600)), LENS)
-    np.testing.assert_allclose(twice.places, places, atol=1e-9)
-    np.testing.assert_allclose(twice.shifts, -shifts)
-
-
 def test_other_ground_does_not_agree() -> None:
     assert overlap_agreement(_placed(0, 0), _placed(0, 0, pixels=PLANE[390:690, 400:800])).share < 0.15
 
@@ -82,10 +66,10 @@ def test_what_has_no_texture_says_nothing() -> None:
         assert (overlap_agreement(_placed(0, 0, pixels=made), _placed(0, 0, pixels=made)).cells > 0) is textured
 
 
-def test_cells_lie_inside_the_overlap_and_there_are_not_too_many() -> None:
+def test_cells_lie_inside_the_overlap() -> None:
     whole = overlap_agreement(_placed(100, 100), _placed(100, 100))
     # Cells of 24 pixels, with eight around them: 15 by 11.
-    assert 60 < whole.cells <= 120
+    assert 120 < whole.cells <= whole.in_all <= 16 * 12
     none = overlap_agreement(_placed(0, 0), _placed(500, 400))
     assert none.cells == 0
     half = overlap_agreement(_placed(100, 100), _placed(300, 100))

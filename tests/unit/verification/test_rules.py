@@ -13,6 +13,7 @@ from rdstitch.messages import Message
 from rdstitch.verification import rules
 from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding
+from rdstitch.verification.limits import LIMITS
 from rdstitch.verification.messages import TEXTS, messages_of
 from rdstitch.verification.overlap_check import CheckedLink
 from rdstitch.verification.photometric_agreement import Agreement
@@ -78,7 +79,7 @@ def test_there_are_a_few_lines_of_a_run_the_gravest_first_and_one_of_a_kind() ->
 
 def test_every_kind_has_a_sentence_and_every_threshold_its_unit_and_source() -> None:
     assert set(rules.ALOUD) | rules.OF_PLACES <= {*TEXTS, "outvoted"}
-    assert all(limit.unit and limit.source for limit in rules.LIMITS.values())
+    assert all(limit.unit and limit.source for limit in LIMITS.values())
 
 
 MOTION = SecondMotion((0, 1), 46, 54, (30.0, 40.0), 120.0)
@@ -92,12 +93,19 @@ def _of_motions(motion: SecondMotion, alike: float, compared: MotionComparison |
         )
     ]
     found = SimpleNamespace(
-        motions=[motion], compared=compared, checked=[] if np.isnan(alike) else checked, parallax=[], static=False,
-        lens_only=False, ambiguous={}, depth=False, alignment=SimpleNamespace(cameras=[CAMERA] * 2),
+        motions=[motion], compared=compared, checked=[] if np.isnan(alike) else checked, static=False,
+        lens_only=False, ambiguous={}, depth=False, alignment=SimpleNamespace(cameras=[CAMERA] * 2, on_sphere=False),
     )  # fmt: skip
     registration: Any = SimpleNamespace(sources=[SimpleNamespace(path=f"folder/{name}.png") for name in "ab"])
     said = messages_of(rules._second_motion(_with(found, **changed)), registration)
     return [(message.severity, message.text) for message in said]
+
+
+def test_of_a_turn_a_second_motion_is_parallax() -> None:
+    turn = SimpleNamespace(cameras=[CAMERA] * 2, on_sphere=True)
+    ((severity, text),) = _of_motions(SecondMotion((0, 1), 51, 49, (8.0, 9.0), 40.0), 0.3, alignment=turn)
+    assert severity == "warning"
+    assert "(parallax)" in text
 
 
 @pytest.mark.parametrize(
@@ -131,7 +139,7 @@ def test_area_and_agreement_decide(area: int, alike: float, severity: str | None
 def test_what_fills_less_than_half_of_the_images_fails(
     area: int, alike: float, fills: float, second: float, severity: str
 ) -> None:
-    compared = MotionComparison(fills, second, {(0, 1): Agreement(100, 90)}, frozenset())
+    compared = MotionComparison(fills, second)
     ((how, _),) = _of_motions(replace(MOTION, area=area, plane_area=100 - area), alike, compared)
     assert how == severity
 

@@ -1,5 +1,6 @@
 """Which of two motions in the same images is the plane's, by what contradicts each."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,24 +10,21 @@ import pytest
 from rdstitch.alignment.result import LinkFit
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.matching.two_view import Pair, PairRegistration
+from rdstitch.matching.two_view import PairRegistration
 from rdstitch.radial_homography import RadialHomography
 from rdstitch.synthetic.textures import ground
-from rdstitch.verification import second_motion
-from rdstitch.verification.overlap_check import CheckedLink
-from rdstitch.verification.photometric_agreement import Agreement, ComparedImage, Grey
+from rdstitch.verification.overlap_check import CheckedLink, ComparedImages
+from rdstitch.verification.photometric_agreement import Agreement, ComparedImage, Grey, overlap_agreement
 from rdstitch.verification.second_motion import (
-    Cells,
     MotionComparison,
     SecondMotion,
-    _Held,
     compare_motions,
     fills_at_most,
     find_second_motions,
     is_separate,
-    outside_second_motions,
     planes_of_pairs,
     share_of,
+    unexplained,
 )
 from rdstitch.verification.self_similarity import Ambiguity
 
@@ -67,19 +65,21 @@ def _moving(pixels: float, inliers: Any = ()) -> RadialHomography:
 def _registration(monkeypatch: pytest.MonkeyPatch, images: list[Grey], places: list[float], pairs: Any = ()) -> Any:
     """Images put at these places along the plane, pixels."""
 
-    def placed(source: int, camera: Camera, homography: FloatArray, stretch: object) -> ComparedImage:
-        return ComparedImage(np.ascontiguousarray(images[source], dtype=np.float32), camera, homography)
+    def placed(_: object, k: int, camera: Camera, homography: FloatArray) -> ComparedImage:
+        return ComparedImage(np.ascontiguousarray(images[k], dtype=np.float32), camera, homography)
 
-    monkeypatch.setattr(second_motion, "placed_image", placed)
+    monkeypatch.setattr(ComparedImages, "placed", placed)
     homographies = np.stack([_shift(-place) for place in places])
     alignment = SimpleNamespace(cameras=[LENS] * len(places), homographies=homographies, on_sphere=False)
     return SimpleNamespace(sources=range(len(images)), alignment=alignment, stretch=None, pairs=pairs)
 
 
-def _contest(registration: Any, pairs: list[Pair], motions: dict[Pair, RadialHomography]) -> MotionComparison:
-    """Where what moves differently covers a fifth of the matched area."""
-    second = [SecondMotion(pair, 20, 80, disagreement=120.0, relation=motion) for pair, motion in motions.items()]
-    found = compare_motions(registration, second, [_link(*pair) for pair in pairs])
+def _contest(registration: Any, motion: RadialHomography) -> MotionComparison:
+    """Where what moves differently covers a fifth of the matched area of two images."""
+    second = [SecondMotion((0, 1), 20, 80, disagreement=120.0, relation=motion)]
+    read, alignment = ComparedImages(registration.sources, None), registration.alignment
+    first, last = (read.placed(k, alignment.cameras[k], alignment.homographies[k]) for k in (0, 1))
+    found = compare_motions(read, second, [replace(_link(0, 1), agreement=overlap_agreement(first, last))])
     assert found is not None
     return found
 
@@ -88,32 +88,18 @@ def _contest(registration: Any, pairs: list[Pair], motions: dict[Pair, RadialHom
 def test_what_fills_less_than_half_is_not_the_plane(monkeypatch: pytest.MonkeyPatch, covered: float) -> None:
     images = _images(covered)
     right = _registration(monkeypatch, images, [0, STEP])
-    found = _contest(right, [(0, 1)], {(0, 1): _moving(SWAY)})
-    assert (found.won, found.lost, found.doubtful) == (True, False, frozenset())
+    found = _contest(right, _moving(SWAY))
+    assert (found.won, found.lost) == (True, False)
     assert found.second_fills_at_most == pytest.approx(covered, abs=0.08)
-    wrong = _contest(_registration(monkeypatch, images, [0, SWAY]), [(0, 1)], {(0, 1): _moving(STEP)})
-    assert (wrong.won, wrong.lost, wrong.doubtful) == (False, True, frozenset({(0, 1)}))
+    wrong = _contest(_registration(monkeypatch, images, [0, SWAY]), _moving(STEP))
+    assert (wrong.won, wrong.lost) == (False, True)
 
 
 def test_what_covers_most_of_the_images_is_the_plane(monkeypatch: pytest.MonkeyPatch) -> None:
     """However little it moves; what it leaves free is an arm of the robot, say."""
     images = _images(0.6)
-    assert not _contest(_registration(monkeypatch, images, [0, STEP]), [(0, 1)], {(0, 1): _moving(SWAY)}).won
-    assert _contest(_registration(monkeypatch, images, [0, SWAY]), [(0, 1)], {(0, 1): _moving(STEP)}).won
-
-
-def test_a_pair_held_by_what_drives_ahead_is_found_by_its_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Put beside each other so that they overlap little, the two are not seen to contradict each other much."""
-    images = _images(0.4, 3)
-    images[2] = images[2].copy()
-    edge = round(0.6 * SIZE[0])
-    images[2][:, edge:] = AHEAD[: SIZE[1], 100 : 100 + SIZE[0]][:, edge:]
-    registration = _registration(monkeypatch, images, [0, STEP, STEP + 80])
-    second = {(0, 1): _moving(SWAY)}
-    assert (1, 2) in _contest(registration, [(0, 1), (1, 2)], second).doubtful
-    # The same at its right place.
-    registration = _registration(monkeypatch, images, [0, STEP, 2 * STEP])
-    assert _contest(registration, [(0, 1), (1, 2)], second).doubtful == frozenset()
+    assert not _contest(_registration(monkeypatch, images, [0, STEP]), _moving(SWAY)).won
+    assert _contest(_registration(monkeypatch, images, [0, SWAY]), _moving(STEP)).won
 
 
 class _Matched:
@@ -168,38 +154,17 @@ def test_where_all_pairs_show_a_plane_there_is_nothing_to_choose(monkeypatch: py
 
 
 def test_what_is_not_seen_speaks_against_nothing() -> None:
-    cells = Cells(np.zeros((10, 2)), np.arange(10) < 4, 40, np.zeros((10, 2)))
+    cells = Agreement(10, 4, 40)
     assert fills_at_most([cells]) == pytest.approx(1.0 - 6 / 40)
     assert fills_at_most([cells, cells]) == fills_at_most([cells])
     assert fills_at_most([]) == 1.0
 
 
-def test_two_of_the_five_cells_around_a_place_hold_it() -> None:
-    places = np.array([[0.0, 0.0], [20.0, 0.0], [0.0, 20.0], [20.0, 20.0], [40.0, 0.0], [400.0, 0.0]])
-    away = places + 1000.0
-    tried = np.array([[10.0, 10.0]])
-    for holding, outside in ((2, 0), (1, 1)):
-        held = _Held([((0, 1), Cells(away, np.arange(6) < holding, 6, places))])
-        cells = Cells(tried, np.array([True]), 1, tried)
-        assert held.outside((0, 2), cells) == Agreement(outside, outside)
-        assert held.outside((3, 2), cells) == Agreement(1, 1)  # images that nothing is known of
-    far = Cells(tried + 300.0, np.array([True]), 1, tried + 300.0)
-    assert held.outside((0, 1), far) == Agreement(1, 1)
-
-
 @pytest.mark.parametrize(
-    ("fills", "second", "agreement", "won", "lost"),
-    [
-        (0.6, 0.4, Agreement(100, 40), True, False),
-        (0.6, 0.4, Agreement(100, 25), False, False),
-        (0.6, 0.55, Agreement(100, 90), False, False),
-        (0.45, 0.4, Agreement(100, 90), False, True),
-    ],
+    ("fills", "second", "won", "lost"), [(0.6, 0.4, True, False), (0.6, 0.55, False, False), (0.45, 0.4, False, True)]
 )
-def test_the_plane_holds_and_the_other_fills_little(
-    fills: float, second: float, agreement: Agreement, won: bool, lost: bool
-) -> None:
-    found = MotionComparison(fills, second, {(0, 1): agreement}, frozenset())
+def test_the_plane_fills_half_and_the_other_less(fills: float, second: float, won: bool, lost: bool) -> None:
+    found = MotionComparison(fills, second)
     assert (found.won, found.lost) == (won, lost)
 
 
@@ -207,18 +172,18 @@ def test_the_plane_holds_and_the_other_fills_little(
 def test_what_fits_where_the_second_motion_puts_it_is_no_pattern(moves: float, ambiguous: bool) -> None:
     """Within a twentieth of an image."""
     second_motion = SecondMotion((0, 1), 40, 60, (30.0, 40.0), moves, _moving(0.0))
-    won = MotionComparison(0.8, 0.3, {(0, 1): Agreement(50, 45)}, frozenset())
-    first, second = outside_second_motions([_link(0, 1, 0.45), _link(1, 2, 0.45)], [second_motion], won)
+    won = MotionComparison(0.8, 0.3)
+    first, second = unexplained([_link(0, 1, 0.45), _link(1, 2, 0.45)], [second_motion], won)
     assert first.ambiguity.ambiguous is ambiguous
     assert second.ambiguity.ambiguous
-    assert (first.agreement, second.agreement) == (Agreement(50, 45), Agreement(100, 20))
+    assert first.agreement.cells == second.agreement.cells == 0
 
 
-@pytest.mark.parametrize("compared", [None, MotionComparison(0.8, 0.6, {(0, 1): Agreement(50, 45)}, frozenset())])
+@pytest.mark.parametrize("compared", [None, MotionComparison(0.8, 0.6)])
 def test_where_no_motion_is_seen_to_be_smaller_links_stay(compared: Any) -> None:
     links = [_link(0, 1, 0.45)]
     second_motion = SecondMotion((0, 1), 40, 60, (30.0, 40.0), 180.0, _moving(0.0))
-    assert outside_second_motions(links, [second_motion], compared) is links
+    assert unexplained(links, [second_motion], compared) is links
 
 
 WIDE = Camera((800, 600))

@@ -17,9 +17,9 @@ from rdstitch.matching.mixed_lenses import TwoLenses
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
 from rdstitch.pipeline.register import register
-from rdstitch.radial_homography import RadialHomography
 from rdstitch.registration import Registration
 from rdstitch.verification import evidence, verdict
+from rdstitch.verification.evidence import Evidence
 from rdstitch.verification.findings import Finding
 from rdstitch.verification.messages import messages_of
 from rdstitch.verification.overlap_check import CheckedLink
@@ -43,7 +43,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Registration:
 
 def judge(registration: Registration, threshold: float, *, lens_only: bool = False) -> tuple[Message, ...]:
     """What is found, in words."""
-    return tuple(messages_of(verdict.judge(registration, threshold, lens_only=lens_only), registration))
+    return tuple(messages_of(verdict.judge(Evidence(registration, threshold, lens_only=lens_only)), registration))
 
 
 def _texts(registration: Registration, *, lens_only: bool = False) -> list[str]:
@@ -141,7 +141,7 @@ def test_one_wrong_pair_does_not_condemn_its_images(good: Registration) -> None:
 
 def _checked(cells: int, confirming: int, *, pair: tuple[int, int] = (0, 1), elsewhere: float = 0.0) -> CheckedLink:
     fit = LinkFit(*pair, 100, 90, 0.5, True)
-    return CheckedLink(fit, Agreement(cells, confirming), Ambiguity(0.9, elsewhere, 0.25))
+    return CheckedLink(fit, Agreement(cells, confirming, 10 * cells), Ambiguity(0.9, elsewhere, 0.25))
 
 
 def _checked_by(monkeypatch: pytest.MonkeyPatch, good: Registration, *checked: CheckedLink) -> list[Message]:
@@ -178,33 +178,22 @@ def test_where_something_moves_differently_two_fifths_must_look_alike(
     monkeypatch.setattr(evidence, "find_second_motions", lambda *_: [second])
     found = _checked_by(monkeypatch, good, _checked(100, int(100 * share)), _checked(100, 90, pair=(1, 2)))
     assert [message.severity for message in found] == severities
-    outside = {(0, 1): Agreement(50, 39), (1, 2): Agreement(100, 90)}
-    monkeypatch.setattr(evidence, "compare_motions", lambda *_: MotionComparison(0.8, 0.3, outside, frozenset()))
+    monkeypatch.setattr(evidence, "compare_motions", lambda *_: MotionComparison(0.8, 0.3))
     compared = judge(good, THRESHOLD)  # what moves differently was seen to be smaller
     assert [message.severity for message in compared] == ["warning"]
 
 
-def test_pairs_that_the_second_may_hold_together_do_not_count(
-    good: Registration, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("area", "fills", "fails"), [(5, 0.8, False), (5, 0.45, True), (20, 0.8, False)])
+def test_what_fills_less_than_half_of_the_images_fails(
+    good: Registration, monkeypatch: pytest.MonkeyPatch, area: int, fills: float, fails: bool
 ) -> None:
     """However much alike they look: what drives ahead does."""
-    camera, other = good.alignment.cameras[:2]
-    relation = RadialHomography(np.eye(3), camera, other, np.ones(20, dtype=np.bool_))
-    checked = [_checked(100, 48), _checked(100, 45, pair=(1, 2))]
-    for area, fills, doubtful, texts in (
-        (5, 0.8, frozenset({(0, 1)}), []),  # a motion of a twentieth, and a plane that may be one
-        (5, 0.45, frozenset({(0, 1)}), ["not clear which"]),  # of all images together
-        (20, 0.8, frozenset({(0, 1)}), ["held together by what moves differently"]),
-        (20, 0.8, frozenset(), []),
-    ):
-        second = SecondMotion((0, 1), area, 100 - area, (30.0, 40.0), 120.0, relation)
-        monkeypatch.setattr(evidence, "find_second_motions", lambda *_, second=second: [second])
-        found = MotionComparison(fills, 0.3, {}, doubtful)
-        compared = found if area == 20 or found.lost else None
-        monkeypatch.setattr(evidence, "compare_motions", lambda *_, compared=compared: compared)
-        failures = [m.text for m in _checked_by(monkeypatch, good, *checked) if m.severity == "failure"]
-        assert len(failures) == len(texts)
-        assert all(part in text for part, text in zip(texts, failures, strict=True))
+    second = SecondMotion((0, 1), area, 100 - area, (30.0, 40.0), 120.0)
+    monkeypatch.setattr(evidence, "find_second_motions", lambda *_: [second])
+    found = MotionComparison(fills, 0.3)
+    monkeypatch.setattr(evidence, "compare_motions", lambda *_: found if area == 20 or found.lost else None)
+    messages = _checked_by(monkeypatch, good, _checked(100, 48), _checked(100, 45, pair=(1, 2)))
+    assert any("not clear which" in m.text and m.severity == "failure" for m in messages) is fails
 
 
 @pytest.mark.parametrize(("ambiguous", "of_all"), [(1, False), (2, True)])

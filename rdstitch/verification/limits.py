@@ -1,0 +1,64 @@
+"""The thresholds that results are judged by, each with its unit and what set it."""
+
+from typing import NamedTuple
+
+
+class Limit(NamedTuple):
+    """A threshold."""
+
+    value: float
+    unit: str
+    source: str
+
+
+LIMITS = {
+    # Matches.
+    "inliers of a pair": Limit(0.5, "share of its matches", "less is another motion than that of the whole"),
+    "inliers of an image": Limit(
+        0.6, "share of its matches", "right images have been seen to have 0.83 even with relief, others 0.52"
+    ),
+    "few matches": Limit(40, "matches", "pairs that share nothing have been seen to have up to 33 of one motion"),
+    "error": Limit(1.0, "thresholds, rms of the whole", "the definition of an inlier"),
+    "error of rough ground": Limit(3.0, "thresholds, where images look alike", "small_failures, classical"),
+    "error that relief explains": Limit(0.02, "of an image's diagonal", "python -m examples.benchmarks.relief"),
+    "length": Limit(0.05, "standard deviation of the focal length's logarithm", "5 cm in a metre are seen"),
+    # Cells of an overlap.
+    "texture": Limit(0.012, "standard deviation in a cell, of full range", "the noise of cameras stays below"),
+    "correlation": Limit(0.5, "of two places that look alike", "other places seldom reach it"),
+    "offset": Limit(2.5, "pixels of the compared images", "half a cell's search would be chance"),
+    "cells": Limit(8, "cells of an overlap", "of fewer the pixels say nothing"),
+    "unlike": Limit(0.10, "share of the cells of an overlap", "chance reaches 0.07; low sun, parallax, blur 0.20"),
+    "little alike": Limit(0.15, "share of the cells of an overlap", "between the two"),
+    "unlike, undecided": Limit(
+        0.4, "share of the cells of an overlap", "vehicles 0.15 to 0.36, planes beside one 0.2 to 0.9: benchmarks.trust"
+    ),
+    "alike": Limit(0.25, "share of the overlaps", "0.26 to 1 in 22 sets that a person would keep: benchmarks.world"),
+    "clearly alike": Limit(0.5, "share of the overlaps", "python -m examples.benchmarks.relief"),
+    # Repeated patterns.
+    "as well elsewhere": Limit(0.9, "of the correlation here", "repeated patterns reach 0.97, other images seldom 0.5"),
+    "kept overlap": Limit(0.5, "of the overlap, that a shift keeps", "of less chance decides"),
+    "pattern": Limit(0.4, "share of the checked pairs", "more is a pattern all over: leaving some out proves nothing"),
+    "period": Limit(0.4, "correlation at a shift that is a period", "neighbours of the peak stay below"),
+    "periods": Limit(4, "periods that an image shows", "a median of their copies must stand one that is dirty"),
+    "departure": Limit(5.0, "spreads of the copies of a place", "noise of the camera"),
+    "same departures": Limit(0.8, "correlation of departures", "right ones have 0.87 to 0.99"),
+    "matched departures": Limit(400.0, "squared spreads times pixels", "a stain of 16 pixels, 5 spreads beyond noise"),
+    "lead": Limit(3.0, "times what any other shift matches", "benchmarks.trust --kind dirt"),
+    # Second motions.
+    "off the plane": Limit(3.0, "thresholds", "nearer, relief and the lens may be to blame"),
+    "motion": Limit(0.02, "of an image's diagonal", "relief moves what stands on the plane by less"),
+    "far motion": Limit(0.05, "of an image's diagonal", "tops of trees and houses less; vehicles 0.25 to 0.5"),
+    "inliers of a motion": Limit(12, "matches", "four define it; eight more by chance have not been seen"),
+    "second motion": Limit(
+        0.1, "share of the area of either motion", "flights over trees and houses reach 0.08: benchmarks.trust"
+    ),
+    "filled by a plane": Limit(0.5, "share of the images", "what fills less is in front of it"),
+    "same shift": Limit(0.05, "of the longer side of an image", "matches show a shift where they are, pixels a mean"),
+    # Inputs.
+    "zoom": Limit(1.03, "ratio of focal lengths in EXIF", "they are rounded to about one per cent"),
+}  # fmt: skip
+
+
+def limit(name: str) -> float:
+    """The value of a threshold."""
+    return LIMITS[name].value
