@@ -27,7 +27,7 @@ from rdstitch.orientation import quarter_turn
 from rdstitch.pipeline.inlier_selection import reselect_inliers
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.process_memory import return_freed_memory
-from rdstitch.verification.rules import LIMITS
+from rdstitch.verification.limits import limit
 
 _CLOSURE_ROUNDS = 2
 
@@ -150,12 +150,12 @@ class Aligner:
             When no pair was registered.
         """
         return_freed_memory()
-        alignment = self._aligned(pairs, former)
+        aligned = AlignedPairs(tuple(pairs), self._aligned(pairs, former))
         ground = over_rough_ground(pairs, self.threshold)
-        rough = ground is not pairs and not self._explains(alignment, pairs, ground)
-        over = self._aligned(ground, None) if rough else alignment
-        rough &= over.rms <= LIMITS["error of rough ground"].value * self.threshold  # or it is not one ground
-        aligned = AlignedPairs(tuple(pairs), over if rough else alignment, rough)
+        if ground is not pairs and not self._explains(aligned.alignment, pairs, ground):
+            over = self._aligned(ground, None)
+            if over.rms <= limit("error of rough ground") * self.threshold:  # else it is not one ground
+                aligned = replace(aligned, alignment=over, rough=True)
         return self.metric(aligned) if self.needs_poses else aligned
 
     def used(self, aligned: AlignedPairs) -> Sequence[PairRegistration]:
