@@ -19,7 +19,7 @@ from rdstitch_cli.terminal import Reporter
 if TYPE_CHECKING:
     from rdstitch.camera import Camera
     from rdstitch.compositing import CompositePlan
-    from rdstitch.io.outputs import Outputs
+    from rdstitch.outputs import Outputs
     from rdstitch.pipeline import Registration, StitchOptions, StitchResult
     from rdstitch.robust import SolverName
 
@@ -95,7 +95,7 @@ def stitch_options(
 
 def _check_written(read: Iterable[Path | None]) -> None:
     """Refuse to write over a file that an option names to be read, or over the configuration."""
-    from rdstitch.io.atomic import check_not_read
+    from rdstitch.outputs import check_not_read
 
     context = click.get_current_context()
     files = [file for file in (*read, context.meta.get(CONFIG_FILE)) if file is not None]
@@ -133,7 +133,7 @@ class Report:
 
         self._file, self._reporter, self.progress = file, reporter, StageTimer(reporter)
         if file is not None:
-            from rdstitch.io.atomic import check_distinct, check_output
+            from rdstitch.outputs import check_distinct, check_output
             from rdstitch.viewer import viewer_path
 
             check_output(file, overwrite, inputs, suffixes=(".html", ".htm"))
@@ -148,7 +148,7 @@ class Report:
         try:
             yield
         except RefusedError as refused:
-            from rdstitch.io.outputs import Outputs
+            from rdstitch.outputs import Outputs
 
             with Outputs(overwrite=True) as outputs:
                 self.stage(outputs, refused.registration)
@@ -250,7 +250,7 @@ def warn_of(registration: "Registration", reporter: Reporter) -> None:
 
 
 def _echo_json(content: Any) -> None:
-    from rdstitch.io.atomic import json_bytes
+    from rdstitch.outputs import json_bytes
 
     click.echo(json_bytes(content), nl=False)
 

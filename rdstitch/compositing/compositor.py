@@ -18,13 +18,12 @@ from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.compositing.tiles import OutputStrip, ShareProgress
-from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.io.layout import Layout
 from rdstitch.io.metadata import Metadata
-from rdstitch.io.outputs import Outputs
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_format, check_memory, write_strips
 from rdstitch.messages import Message
+from rdstitch.outputs import Fingerprint, Outputs
 
 
 @dataclass(frozen=True, repr=False)

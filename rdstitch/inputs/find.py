@@ -16,9 +16,9 @@ from rdstitch.inputs.frame import Frame, Named, files_of
 from rdstitch.inputs.keyframes import wanted_frames
 from rdstitch.inputs.rosbag import extract_images, is_bag
 from rdstitch.io.optional_readers import HEIF_SUFFIXES, RAW_SUFFIXES
-from rdstitch.io.staging import temporary_folder
 from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames, grey_frames
 from rdstitch.messages import Message, names_of, shortened
+from rdstitch.outputs import temporary_folder
 
 _MAX_PATTERN = 4096  # characters: longer names no file has, and compiling a pattern takes the square of its length
 IMAGE_SUFFIXES = frozenset(

@@ -19,13 +19,12 @@ from rdstitch.inputs.frame import ChannelOrder, Frame, Images, as_inputs, files_
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
-from rdstitch.io.atomic import check_output, json_bytes
 from rdstitch.io.opening import check_readable
-from rdstitch.io.outputs import Outputs
 from rdstitch.local_alignment import DisplacementField
 from rdstitch.messages import Message, told_once
 from rdstitch.messages import left_out as left_out_message
 from rdstitch.options import StitchOptions
+from rdstitch.outputs import Outputs, check_output, json_bytes
 from rdstitch.pipeline.compose import Composed, compose_images, plainly_viewed, write_page
 from rdstitch.pipeline.flat_field import check_size, with_flat_field
 from rdstitch.pipeline.placed_images import PlacedImages

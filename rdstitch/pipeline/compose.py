@@ -27,14 +27,12 @@ from rdstitch.executors import in_order
 from rdstitch.export.georeference import Georeference, has_place, world_file_paths
 from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
-from rdstitch.io.atomic import check_output, text_bytes
 from rdstitch.io.colour import colour_space
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
-from rdstitch.io.fingerprint import Fingerprint
-from rdstitch.io.outputs import Outputs
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
 from rdstitch.messages import Message, names_of, shortened
+from rdstitch.outputs import Fingerprint, Outputs, check_output, text_bytes
 from rdstitch.pipeline.map_canvas import moved, place_messages, plan_on_map
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.process_memory import return_freed_memory

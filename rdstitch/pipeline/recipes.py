@@ -16,13 +16,11 @@ from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.source import Source
-from rdstitch.io.atomic import check_distinct, check_output, json_bytes, text_bytes
-from rdstitch.io.outputs import Outputs
-from rdstitch.io.staging import temporary_folder
 from rdstitch.local_alignment import LocalAlignment
 from rdstitch.messages import Message, told_once
 from rdstitch.options import StitchOptions
 from rdstitch.orientation import quarter_turn
+from rdstitch.outputs import Outputs, check_distinct, check_output, json_bytes, temporary_folder, text_bytes
 from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.compose import blocks_on, compose_images, viewed_images, write_page
 from rdstitch.pipeline.map_canvas import check_map
