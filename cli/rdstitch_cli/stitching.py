@@ -238,12 +238,12 @@ def report_registration(registration: "Registration", reporter: Reporter, *, as_
 
 def warn_of(registration: "Registration", reporter: Reporter) -> None:
     """What the user must know of a registration."""
-    from rdstitch.messages import told_once
+    from rdstitch.messages import of_severity, told_once
 
     alignment = registration.alignment
     for message in told_once((*registration.failures, *registration.warnings, *registration.left_out)):
         reporter.warn(str(message))
-    for message in (*registration.notes, *registration.details):
+    for message in (*of_severity(registration.messages, "note"), *of_severity(registration.messages, "detail")):
         reporter.tell(message)
     used = int(alignment.used.sum())
     reporter.log(f"{used} of {len(alignment.used)} images, rms {alignment.rms:.2f} pixels; {alignment.model_reason}")
