@@ -75,7 +75,10 @@ def stitch_options(
 
     _check_written([camera])
     if preview:
-        max_features, work_megapixels = _preview(max_features, work_megapixels, given)
+        quick = {"max_size": 1200, "seam": "voronoi"}
+        given |= {name: value for name, value in quick.items() if not is_given(name)}
+        max_features = max_features if is_given("max_features") else 1500
+        work_megapixels = work_megapixels if is_given("work_megapixels") else 0.5
     composite = {
         name: given.pop(name) for name in CompositeOptions.__dataclass_fields__ if name in given and name != "workers"
     }
@@ -102,15 +105,6 @@ def _check_written(read: Iterable[Path | None]) -> None:
     for name in ("output", "save_camera", "plot", "report"):
         if context.params.get(name) is not None:
             check_not_read([context.params[name]], files)
-
-
-def _preview(
-    max_features: int | None, work_megapixels: float | None, given: dict[str, Any]
-) -> tuple[int | None, float | None]:
-    """Features and megapixels of a quick result; changes the other options that the user did not set."""
-    quick = {"max_size": 1200, "seam": "voronoi"}
-    given |= {name: value for name, value in quick.items() if not is_given(name)}
-    return (max_features if is_given("max_features") else 1500, work_megapixels if is_given("work_megapixels") else 0.5)
 
 
 class Report:
@@ -162,7 +156,7 @@ class Report:
         def write() -> None:
             from rdstitch.report import write_report
 
-            write_report(file, result, self.progress.stages, _command_line(), outputs=outputs)
+            write_report(file, result, self.progress.stages, shlex.join(["rdstitch", *sys.argv[1:]]), outputs=outputs)
 
         for message in outputs.attempt(file, write):
             self._reporter.warn(str(message))
@@ -191,11 +185,6 @@ def staged_beside(
             reporter.warn(str(message))
 
     return stage
-
-
-def _command_line() -> str:
-    """As it may be typed again."""
-    return shlex.join(["rdstitch", *sys.argv[1:]])
 
 
 def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = False) -> None:
