@@ -11,9 +11,11 @@ The lens is the division model of :mod:`rdstitch.division_model`, with λ alone 
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
+from msgspec import Meta, Struct
+from msgspec import field as record_field
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
@@ -27,8 +29,11 @@ from rdstitch.division_model import (
     undistort,
 )
 from rdstitch.errors import ArgumentError, ImpossibleCameraError
+from rdstitch.file_access import read_text
 from rdstitch.orientation import SIDEWAYS, turned_size, turning_matrix
+from rdstitch.outputs import check_output, json_bytes, write_bytes_atomic
 from rdstitch.planar_motion import turned_tilt
+from rdstitch.records import NonNegative, Pair, Size, Triple, convert, parse_json
 
 FILE_VERSION = 2
 """Of camera files; version 1 had λ and μ only, as ``lambda`` and ``lambda2``."""
@@ -359,26 +364,99 @@ class Camera:
         }
 
     def save(self, path: str | Path) -> None:
-        """Write a camera file: :func:`rdstitch.save_camera`, with its formats and its errors.
+        """Write a camera file of rdstitch, ``.json``; :func:`rdstitch.save_camera` writes the formats of others too.
 
         Raises
         ------
         OutputError
-            When the name says no format, or the file cannot be written.
+            When the name ends otherwise, or the file cannot be written.
         """
-        from rdstitch.camera_files import save_camera
-
-        save_camera(self, path)
+        check_output(path, overwrite=True, suffixes=(".json",))
+        write_bytes_atomic(path, json_bytes(self.as_dict()))
 
     @staticmethod
     def load(path: str | Path) -> "Camera":
-        """Read a camera file of any known format: :func:`rdstitch.load_camera`.
+        """Read a camera file of rdstitch; :func:`rdstitch.load_camera` reads the formats of others too.
 
         Raises
         ------
         InputError
-            When the file cannot be read or is no camera file.
+            When the file cannot be read or is no camera file of rdstitch.
         """
-        from rdstitch.camera_files import load_camera
+        return convert(parse_json(read_text(path), str(path)), CameraRecord, str(path)).camera()
 
-        return load_camera(path)
+
+FocalSource = Literal["option", "file", "exif", "estimate", "guess"]
+_Row = tuple[float, float, float, float, float]
+
+
+class LensRecord(Struct, kw_only=True):
+    """What of a camera depends on the size of the image, and λ with it."""
+
+    center_px: Pair | None = None
+    image_circle_px: float | None = None
+    lambda_: float | None = record_field(name="lambda", default=None)
+    # Version 1 had λ and μ only.
+    lambda2: float = 0.0
+    coefficients: Triple | None = None
+    focal_px: float | None = None
+    focal_source: FocalSource | None = None
+
+    def lens(self, size: tuple[int, int]) -> Camera:
+        """Give the lens on an image of a size; not how far it is determined.
+
+        Raises
+        ------
+        ValueError
+            When there is none, or it is impossible.
+        """
+        if self.center_px is None or (self.coefficients is None and self.lambda_ is None):
+            raise ValueError(f"{'center_px' if self.center_px is None else 'lambda'} is missing")
+        distortion, second, third = self.coefficients or (self.lambda_ or 0.0, self.lambda2, 0.0)
+        return Camera(
+            image_size=size,
+            distortion=distortion,
+            distortion2=second,
+            distortion3=third,
+            center=self.center_px,
+            focal=self.focal_px,
+            focal_source=self.focal_source,
+            image_circle=self.image_circle_px,
+        )
+
+
+class CameraRecord(LensRecord, kw_only=True):
+    """A camera file of rdstitch."""
+
+    format: Literal["rdstitch camera"]
+    version: Annotated[int, Meta(ge=1, le=FILE_VERSION)]
+    image_size: Size
+    lambda_std: NonNegative | None = None
+    lambda_fit_rms_px: NonNegative = 0.0
+    lambda_fit_largest_px: NonNegative = 0.0
+    lens_covariance: tuple[_Row, _Row, _Row, _Row, _Row] | None = None
+    lambda_px: float | None = None
+    lambda_focal: float | None = None
+    focal_std_px: NonNegative | None = None
+    tilt_deg: Pair | None = None
+    tilt_std_deg: Pair | None = None
+
+    def __post_init__(self) -> None:
+        self.camera()
+
+    def camera(self) -> Camera:
+        """Give the camera that it describes."""
+        lens = self.lens(self.image_size)
+        return replace(
+            lens,
+            focal_source=None if lens.focal is None else "file",
+            distortion_std=self.lambda_std,
+            lens_covariance=self.lens_covariance,
+            focal_std=self.focal_std_px,
+            tilt=_radians(self.tilt_deg),
+            tilt_std=_radians(self.tilt_std_deg),
+        )
+
+
+def _radians(angles: Pair | None) -> Pair | None:
+    return None if angles is None else (math.radians(angles[0]), math.radians(angles[1]))

@@ -143,7 +143,9 @@ def examine(
         looks: dict[int, tuple[float, float, float]] = {}
         for index, source in enumerate(sources):
             try:
-                looks[index] = _look(source.read(max(1, round(np.sqrt(_pixels(source) / (_MEGAPIXELS * 1e6))))))
+                looks[index] = _look(
+                    source.read(max(1, round(np.sqrt(np.prod(source.camera.image_size) / (_MEGAPIXELS * 1e6)))))
+                )
             except InputError as error:
                 unreadable.append(str(error))
             progress("examining", index + 1, len(sources))
@@ -151,11 +153,6 @@ def examine(
             raise InputError(unreadable[0] if unreadable else "there is nothing to examine")
         plan, registration, problems = _dry_run(found.frames, progress) if len(looks) > 1 else (None, None, ())
     return _conclude([sources[k] for k in looks], np.array([*looks.values()]), unreadable, plan, registration, problems)
-
-
-def _pixels(source: Source) -> int:
-    width, height = source.camera.image_size
-    return width * height
 
 
 def _dry_run(
@@ -206,29 +203,26 @@ def _conclude(
     def named(chosen: Iterable[Any]) -> tuple[str, ...]:
         return tuple(source.name for source, is_one in zip(sources, chosen, strict=True) if is_one)
 
+    alone = tuple(source.name for source in sources)
+    if registration is not None:
+        placed = zip(registration.sources, registration.alignment.used, strict=True)
+        alone = tuple(source.name for source, is_used in placed if not is_used)
     focal, zoomed = _focal(sources)
     found = Examination(
         len(sources),
         tuple(unreadable),
-        _common("{} x {}".format(*source.metadata.size) for source in sources),
-        _common(map(_camera, sources)),
+        tuple(Counter("{} x {}".format(*source.metadata.size) for source in sources).most_common()),
+        tuple(Counter(map(_camera, sources)).most_common()),
         focal,
         named(sharpness < _BLURRED * np.median(sharpness)),
         named(brightness < _DARK),
         named(burnt > _BURNT),
-        _alone(sources, registration),
+        alone,
         None if registration is None else _overlap(registration),
         plan,
         (),
     )
     return replace(found, advice=tuple(_advice(found, zoomed, problems)))
-
-
-def _alone(sources: Sequence[Source], registration: Registration | None) -> tuple[str, ...]:
-    if registration is None:
-        return tuple(source.name for source in sources)
-    used = registration.alignment.used
-    return tuple(source.name for source, is_used in zip(registration.sources, used, strict=True) if not is_used)
 
 
 def _overlap(registration: Registration) -> float | None:
@@ -244,10 +238,6 @@ def _overlap(registration: Registration) -> float | None:
                 inside = ((moved >= 0) & (moved < other)).all(axis=1)
             best[first] = max(best[first], inside.mean())
     return float(np.median(best[best > 0])) if (best > 0).any() else None
-
-
-def _common(items: Iterable[str]) -> tuple[tuple[str, int], ...]:
-    return tuple(Counter(items).most_common())
 
 
 def _camera(source: Source) -> str:

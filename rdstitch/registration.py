@@ -92,16 +92,6 @@ class Registration:
         return of_severity(self.messages, "failure")
 
     @property
-    def notes(self) -> tuple[Message, ...]:
-        """How the result was made, where the user would not expect it."""
-        return of_severity(self.messages, "note")
-
-    @property
-    def details(self) -> tuple[Message, ...]:
-        """What only who asks need know."""
-        return of_severity(self.messages, "detail")
-
-    @property
     def warnings(self) -> tuple[Message, ...]:
         """What the user should look at although there is a result."""
         return of_severity(self.messages, "warning")

@@ -12,12 +12,12 @@ from rdstitch.compositing import Canvas, Composite, CompositePlan
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference
 from rdstitch.inputs.frame import ChannelOrder, in_order
-from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.io.preview import encode_preview, read_preview
 from rdstitch.io.read import read_image
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
 from rdstitch.messages import Message
 from rdstitch.options import StitchOptions
+from rdstitch.outputs import Fingerprint
 from rdstitch.registration import Registration, Verdict
 
 _PREVIEW = 800  # pixels of the longer side

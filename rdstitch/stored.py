@@ -13,7 +13,7 @@ from typing import Any, Generic, TypeVar, cast
 from rdstitch.errors import InputError
 from rdstitch.file_access import read_limited
 from rdstitch.io.packing import unpack
-from rdstitch.io.staging import StagingFolder
+from rdstitch.outputs import StagingFolder
 
 Value = TypeVar("Value")
 

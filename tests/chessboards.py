@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera_files.lens_models import Brown
+from rdstitch.camera_files.lens_models import LensModel
 
 BOARDS = {
     "fisheye_chess": (15, 9),
@@ -52,9 +52,8 @@ def rational_undistort(grids: FloatArray, size: tuple[int, int]) -> Undistort:
     _, matrix, lens, *_ = cv2.calibrateCamera(
         [flat] * len(seen), seen, size, start, np.zeros(8), flags=cv2.CALIB_RATIONAL_MODEL
     )
-    k1, k2, p1, p2, k3, k4, k5, k6 = lens.ravel()[:8].tolist()
     focal, center = (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2])
-    return Brown(focal, center, (k1, k2, k3), (p1, p2), (k4, k5, k6)).undistort
+    return LensModel(focal, center, tuple(lens.ravel()[:8].tolist())).undistort
 
 
 def off_lines(grids: FloatArray, undistort: Undistort) -> float:

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from rdstitch.errors import InputError
-from rdstitch_cli.parameter_types import Angle, Bytes, Epsg
+from rdstitch_cli.parameter_types import ANGLE, BYTES, EPSG
 
 COMMON = "common"
 """The table that holds for every command."""
@@ -106,11 +106,7 @@ def _converted(option: click.Option, value: Any, where: str) -> Any:
             raise InputError(f"{where}: expected a number, not {value!r}")
         if isinstance(option.type, click.types.IntParamType) and not isinstance(value, int):
             raise InputError(f"{where}: expected a whole number, not {value!r}")
-    elif (
-        isinstance(value, (int, float))
-        and not isinstance(value, bool)
-        and isinstance(option.type, (Angle, Bytes, Epsg))
-    ):
+    elif isinstance(value, (int, float)) and not isinstance(value, bool) and option.type in (ANGLE, BYTES, EPSG):
         value = str(value)  # no unit is needed: degrees, or bytes
     elif not isinstance(value, str):
         raise InputError(f"{where}: expected a text, not {value!r}")

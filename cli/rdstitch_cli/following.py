@@ -66,8 +66,7 @@ def followed(
     """
     from rdstitch.camera_files import CAMERA_SUFFIXES
     from rdstitch.inputs.arrivals import Arrivals
-    from rdstitch.io.atomic import check_output
-    from rdstitch.io.staging import temporary_folder
+    from rdstitch.outputs import check_output, temporary_folder
     from rdstitch.pipeline.follow import follow as follow_frames
 
     if len(inputs) != 1:

@@ -152,7 +152,9 @@ def run(arguments: list[str]) -> int:
     except _AskedToEndError as asked:
         return _complain(_interrupted(arguments), 128 + asked.number, debug)
     except click.ClickException as error:
-        return _complain(_usage(error), error.exit_code, debug)
+        context = getattr(error, "ctx", None)
+        hint = "" if context is None else f"; see '{context.command_path} --help'"
+        return _complain(error.format_message().rstrip(".") + hint, error.exit_code, debug)
     except RdstitchError as error:
         hint = f"; see 'rdstitch help {error.code}'" if error.code else ""
         return _complain(f"{error}{hint}", error.exit_status, debug)
@@ -228,13 +230,6 @@ def _end(number: int, frame: object) -> Never:
 def _interrupted(arguments: list[str]) -> str:
     cached = any(argument.partition("=")[0] == "--cache" for argument in arguments)
     return "interrupted" + "; the same command goes on from the cache" * cached
-
-
-def _usage(error: click.ClickException) -> str:
-    """A wrong usage in one line, with where to look."""
-    context = getattr(error, "ctx", None)
-    hint = "" if context is None else f"; see '{context.command_path} --help'"
-    return error.format_message().rstrip(".") + hint
 
 
 def _complain(text: str, status: int, debug: bool) -> int:

@@ -11,15 +11,15 @@ import click
 from click.core import ParameterSource
 
 from rdstitch_cli.parameter_types import (
-    Angle,
-    Angles,
-    Bytes,
-    Epsg,
+    ANGLE,
+    ANGLES,
+    BYTES,
+    EPSG,
     FileOr,
     RealNumber,
     UserPath,
     WholeNumber,
-    WordOrNumber,
+    word_or_number,
 )
 from rdstitch_cli.terminal import Reporter
 
@@ -84,7 +84,7 @@ def _every(otherwise: int | None) -> Decorator[Any]:
     usual = "auto" if otherwise is None else otherwise
     return click.option(
         "--every",
-        type=WordOrNumber(("auto",), 1, 1_000_000),
+        type=word_or_number(("auto",), 1, 1_000_000),
         callback=lambda _context, _option, value: {None: otherwise, "auto": None}.get(value, value),
         metavar="auto|N",
         help=f"Of a video or ROS bag, every N-th frame; auto: those that show new ground.  [default: {usual}]",
@@ -120,19 +120,11 @@ def verbosity(command: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
-class FlatFieldFile(UserPath):
-    """A file, or auto, or off."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Keep the words; of anything else, make a path."""
-        return value if value in ("auto", "off") else super().convert(value, param, ctx)
-
-
 def flat_field(usual: str) -> Decorator[Any]:
     """The option, and what a command does without it."""
     return click.option(
         "--flat-field",
-        type=FlatFieldFile(),
+        type=FileOr("auto", "off"),
         default=usual,
         show_default=True,
         metavar="auto|off|FILE",
@@ -163,7 +155,7 @@ known = together(
     click.option(
         "--focal", type=RealNumber(), metavar="PX", help="Focal length, pixels; otherwise from EXIF, else guessed."
     ),
-    click.option("--tilt", type=Angles(), help="Known tilt of the camera to the plane, degrees."),
+    click.option("--tilt", type=ANGLES, help="Known tilt of the camera to the plane, degrees."),
     click.option(
         "--attitude",
         type=FileOr("xmp"),
@@ -172,7 +164,7 @@ known = together(
     ),
     click.option(
         "--attitude-std",
-        type=Angle(),
+        type=ANGLE,
         default="1",
         show_default=True,
         help="Standard deviation of the attitudes, degrees; 0 for exact ones.",
@@ -284,7 +276,7 @@ output_form = together(
     ),
     click.option(
         "--max-memory",
-        type=Bytes(),
+        type=BYTES,
         help="Memory that compositing may take, as 800M; otherwise a quarter of what is available, at least 400M.",
     ),
     _number("--scale", RealNumber(), 1.0, "Factor to the size of the output; 1 keeps resolution."),
@@ -344,7 +336,7 @@ compositing = together(
     click.option(
         "--crs",
         "epsg",
-        type=Epsg(),
+        type=EPSG,
         help="Coordinate system of the map; otherwise UTM on WGS 84. Others than UTM need rasterio.",
     ),
 )
@@ -374,7 +366,7 @@ stitching = together(
     ),
     click.option(
         "--local-alignment",
-        type=WordOrNumber(("auto", "off"), 2, 100),
+        type=word_or_number(("auto", "off"), 2, 100),
         metavar="auto|off|N",
         default="auto",
         show_default=True,

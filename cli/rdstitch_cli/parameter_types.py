@@ -2,9 +2,9 @@
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import click
 
@@ -32,138 +32,125 @@ class UserPath(click.Path):
             return path
 
 
-def _one_number(number: click.IntRange | click.FloatRange, kind: str) -> str:
-    """What was expected, in words."""
-    if number.min is None:
-        return f"expected one {kind}"
-    if number.max is None:
-        return f"expected one {kind} {'above' if number.min_open else 'of at least'} {number.min:g}"
-    return f"expected one {kind} from {number.min:g} to {number.max:g}"
+class _WithinLimits:
+    """A number within limits, or any, called N in help pages; what was expected is said in words."""
 
+    name, kind = "N", ""
 
-class WholeNumber(click.IntRange):
-    """A whole number within limits, called N in help pages."""
-
-    name = "N"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+    def convert(self: Any, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         try:
-            return super().convert(value, param, ctx)
+            return super().convert(value, param, ctx)  # type: ignore[misc]
         except click.BadParameter:
-            self.fail(f"{_one_number(self, 'whole number')}, not {value!r}", param, ctx)
+            limits = ""
+            if self.min is not None and self.max is not None:
+                limits = f" from {self.min:g} to {self.max:g}"
+            elif self.min is not None:
+                limits = f" {'above' if self.min_open else 'of at least'} {self.min:g}"
+            self.fail(f"expected one {self.kind}{limits}, not {value!r}", param, ctx)
 
     def _describe_range(self) -> str:
         """Nothing, in help pages: their texts say what matters."""
         return ""
 
 
-class RealNumber(click.FloatRange):
-    """A number within limits, or any, called N in help pages."""
+class WholeNumber(_WithinLimits, click.IntRange):
+    """A whole number."""
 
-    name = "N"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        try:
-            return super().convert(value, param, ctx)
-        except click.BadParameter:
-            self.fail(f"{_one_number(self, 'number')}, not {value!r}", param, ctx)
-
-    def _describe_range(self) -> str:
-        """Nothing, in help pages: their texts say what matters."""
-        return ""
+    name, kind = "N", "whole number"
 
 
-class Angles(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
-    """Two angles in degrees, ``PSI,THETA``; the value is in radians."""
+class RealNumber(_WithinLimits, click.FloatRange):
+    """A number."""
 
-    name = "PSI,THETA"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        if isinstance(value, tuple):
-            return value[0], value[1]
-        try:
-            psi, theta = (math.radians(float(part)) for part in str(value).split(","))
-        except ValueError:
-            self.fail(f"{value!r} is not two angles in degrees like 2.5,-1", param, ctx)
-        if not (abs(psi) < math.pi / 2 and abs(theta) < math.pi / 2):
-            self.fail(f"{value!r}: a tilt lies between -90 and 90 degrees", param, ctx)
-        return psi, theta
+    name, kind = "N", "number"
 
 
 class FileOr(UserPath):
     """A file, or a word that stands for something else; a file of that name is written ``./word``."""
 
-    def __init__(self, word: str) -> None:
+    def __init__(self, *words: str) -> None:
         super().__init__()
-        self.word = word
+        self.words = words
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Keep the word; of anything else, make a path."""
-        return value if value == self.word else super().convert(value, param, ctx)
+        return value if value in self.words else super().convert(value, param, ctx)
 
 
-class WordOrNumber(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
+class Parsed(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
+    """What a function makes of the text; it raises ValueError with what is wrong.
+
+    Parameters
+    ----------
+    name : str
+        How it is called in help pages.
+    """
+
+    def __init__(self, name: str, parse: Callable[[str], Any]) -> None:
+        self.name, self.parse = name, parse
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if not isinstance(value, str):
+            return value
+        try:
+            return self.parse(value)
+        except ValueError as error:
+            self.fail(f"{value!r} {error}", param, ctx)
+
+
+def _angles(text: str) -> tuple[float, float]:
+    """Two angles, degrees, in radians."""
+    try:
+        psi, theta = (math.radians(float(part)) for part in text.split(","))
+    except ValueError:
+        raise ValueError("is not two angles in degrees like 2.5,-1") from None
+    if not (abs(psi) < math.pi / 2 and abs(theta) < math.pi / 2):
+        raise ValueError("is no tilt, which lies between -90 and 90 degrees")
+    return psi, theta
+
+
+def _angle(text: str) -> float:
+    """An angle that is not negative, degrees, in radians."""
+    try:
+        angle = math.radians(float(text))
+    except ValueError:
+        angle = math.nan
+    if not 0.0 <= angle < math.inf:
+        raise ValueError("is no angle in degrees like 0.5")
+    return angle
+
+
+def _bytes(text: str) -> int:
+    """An amount of memory, bytes."""
+    parts = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([KMGT]?)(?:i?B)?\s*", text, re.IGNORECASE)
+    amount = int(float(parts[1]) * 2 ** (10 * " KMGT".index(parts[2].upper() or " "))) if parts else 0
+    if amount < 1:
+        raise ValueError("is no amount of memory like 800M or 2G")
+    return amount
+
+
+def _epsg(text: str) -> int:
+    """The number of a coordinate system."""
+    number = text.upper().removeprefix("EPSG:")
+    if not (number.isdecimal() and 0 < int(number) < 2**16):
+        raise ValueError("is not a code like EPSG:25832")
+    return int(number)
+
+
+ANGLES, ANGLE, BYTES, EPSG = (
+    Parsed(name, parse)
+    for name, parse in (("PSI,THETA", _angles), ("DEG", _angle), ("SIZE", _bytes), ("EPSG:N", _epsg))
+)
+
+
+def word_or_number(words: Sequence[str], least: int, most: int) -> Parsed:
     """One of some words, or a whole number within limits."""
 
-    name = "integer"
+    def parse(text: str) -> str | int:
+        if text in words:
+            return text
+        if not (text.isdecimal() and least <= int(text) <= most):
+            raise ValueError(f"is neither {' nor '.join(words)} nor a number from {least} to {most}")
+        return int(text)
 
-    def __init__(self, words: Sequence[str], least: int, most: int) -> None:
-        self.words, self.least, self.most = words, least, most
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str | int:
-        if value in self.words:
-            return str(value)
-        try:
-            number = int(str(value))
-        except ValueError:
-            number = self.least - 1
-        if not self.least <= number <= self.most:
-            self.fail(
-                f"{value!r} is neither {' nor '.join(self.words)} nor a number from {self.least} to {self.most}",
-                param,
-                ctx,
-            )
-        return number
-
-
-class Bytes(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
-    """An amount of memory like ``800M`` or ``1.5G``; the value is in bytes."""
-
-    name = "SIZE"
-    units: ClassVar[dict[str, int]] = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40}
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        if isinstance(value, int):
-            return value
-        parts = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([KMGT]?)(?:i?B)?\s*", str(value), re.IGNORECASE)
-        amount = int(float(parts[1]) * self.units[parts[2].upper()]) if parts else 0
-        if amount < 1:
-            self.fail(f"{value!r} is no amount of memory like 800M or 2G", param, ctx)
-        return amount
-
-
-class Angle(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
-    """An angle in degrees that is not negative; the value is in radians."""
-
-    name = "DEG"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        try:
-            angle = math.radians(float(value))
-        except ValueError:
-            angle = math.nan
-        if not 0.0 <= angle < math.inf:
-            self.fail(f"{value!r} is no angle in degrees like 0.5", param, ctx)
-        return angle
-
-
-class Epsg(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
-    """The code of a coordinate system like ``EPSG:25832``; the value is the number."""
-
-    name = "EPSG:N"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        number = str(value).upper().removeprefix("EPSG:")
-        if not (number.isdecimal() and 0 < int(number) < 2**16):
-            self.fail(f"{value!r} is not a code like EPSG:25832", param, ctx)
-        return int(number)
+    return Parsed("integer", parse)

@@ -19,7 +19,7 @@ from rdstitch_cli.terminal import Reporter
 if TYPE_CHECKING:
     from rdstitch.camera import Camera
     from rdstitch.compositing import CompositePlan
-    from rdstitch.io.outputs import Outputs
+    from rdstitch.outputs import Outputs
     from rdstitch.pipeline import Registration, StitchOptions, StitchResult
     from rdstitch.robust import SolverName
 
@@ -75,7 +75,10 @@ def stitch_options(
 
     _check_written([camera])
     if preview:
-        max_features, work_megapixels = _preview(max_features, work_megapixels, given)
+        quick = {"max_size": 1200, "seam": "voronoi"}
+        given |= {name: value for name, value in quick.items() if not is_given(name)}
+        max_features = max_features if is_given("max_features") else 1500
+        work_megapixels = work_megapixels if is_given("work_megapixels") else 0.5
     composite = {
         name: given.pop(name) for name in CompositeOptions.__dataclass_fields__ if name in given and name != "workers"
     }
@@ -95,22 +98,13 @@ def stitch_options(
 
 def _check_written(read: Iterable[Path | None]) -> None:
     """Refuse to write over a file that an option names to be read, or over the configuration."""
-    from rdstitch.io.atomic import check_not_read
+    from rdstitch.outputs import check_not_read
 
     context = click.get_current_context()
     files = [file for file in (*read, context.meta.get(CONFIG_FILE)) if file is not None]
     for name in ("output", "save_camera", "plot", "report"):
         if context.params.get(name) is not None:
             check_not_read([context.params[name]], files)
-
-
-def _preview(
-    max_features: int | None, work_megapixels: float | None, given: dict[str, Any]
-) -> tuple[int | None, float | None]:
-    """Features and megapixels of a quick result; changes the other options that the user did not set."""
-    quick = {"max_size": 1200, "seam": "voronoi"}
-    given |= {name: value for name, value in quick.items() if not is_given(name)}
-    return (max_features if is_given("max_features") else 1500, work_megapixels if is_given("work_megapixels") else 0.5)
 
 
 class Report:
@@ -133,7 +127,7 @@ class Report:
 
         self._file, self._reporter, self.progress = file, reporter, StageTimer(reporter)
         if file is not None:
-            from rdstitch.io.atomic import check_distinct, check_output
+            from rdstitch.outputs import check_distinct, check_output
             from rdstitch.viewer import viewer_path
 
             check_output(file, overwrite, inputs, suffixes=(".html", ".htm"))
@@ -148,7 +142,7 @@ class Report:
         try:
             yield
         except RefusedError as refused:
-            from rdstitch.io.outputs import Outputs
+            from rdstitch.outputs import Outputs
 
             with Outputs(overwrite=True) as outputs:
                 self.stage(outputs, refused.registration)
@@ -162,7 +156,7 @@ class Report:
         def write() -> None:
             from rdstitch.report import write_report
 
-            write_report(file, result, self.progress.stages, _command_line(), outputs=outputs)
+            write_report(file, result, self.progress.stages, shlex.join(["rdstitch", *sys.argv[1:]]), outputs=outputs)
 
         for message in outputs.attempt(file, write):
             self._reporter.warn(str(message))
@@ -191,11 +185,6 @@ def staged_beside(
             reporter.warn(str(message))
 
     return stage
-
-
-def _command_line() -> str:
-    """As it may be typed again."""
-    return shlex.join(["rdstitch", *sys.argv[1:]])
 
 
 def summarize(result: "StitchResult", reporter: Reporter, *, as_json: bool = False) -> None:
@@ -238,19 +227,19 @@ def report_registration(registration: "Registration", reporter: Reporter, *, as_
 
 def warn_of(registration: "Registration", reporter: Reporter) -> None:
     """What the user must know of a registration."""
-    from rdstitch.messages import told_once
+    from rdstitch.messages import of_severity, told_once
 
     alignment = registration.alignment
     for message in told_once((*registration.failures, *registration.warnings, *registration.left_out)):
         reporter.warn(str(message))
-    for message in (*registration.notes, *registration.details):
+    for message in (*of_severity(registration.messages, "note"), *of_severity(registration.messages, "detail")):
         reporter.tell(message)
     used = int(alignment.used.sum())
     reporter.log(f"{used} of {len(alignment.used)} images, rms {alignment.rms:.2f} pixels; {alignment.model_reason}")
 
 
 def _echo_json(content: Any) -> None:
-    from rdstitch.io.atomic import json_bytes
+    from rdstitch.outputs import json_bytes
 
     click.echo(json_bytes(content), nl=False)
 

@@ -21,11 +21,11 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, TypeVar
 
-from rdstitch.camera import Camera
+from rdstitch.camera import Camera, CameraRecord
 from rdstitch.camera_files import writing
-from rdstitch.camera_files.fitting import CameraFile
 from rdstitch.camera_files.hugin import hugin_project, is_hugin, read_hugin
-from rdstitch.camera_files.lens_fit import LensFit
+from rdstitch.camera_files.lens_fit import CameraFile
+from rdstitch.camera_files.lens_models import LensFit
 from rdstitch.camera_files.reading import (
     ImageSize,
     colmap_cameras,
@@ -35,10 +35,9 @@ from rdstitch.camera_files.reading import (
     read_opencv,
     read_opendronemap,
 )
-from rdstitch.camera_record import CameraRecord
 from rdstitch.errors import ArgumentError, InputError, OutputError
 from rdstitch.file_access import read_text
-from rdstitch.io.atomic import text_bytes, write_bytes_atomic
+from rdstitch.outputs import json_bytes, text_bytes, write_bytes_atomic
 from rdstitch.records import convert, parse_json, parse_yaml
 
 __all__ = ["CAMERA_SUFFIXES", "CameraFile", "LensFit", "export_note", "load_camera", "read_camera_file", "save_camera"]
@@ -150,50 +149,45 @@ def save_camera(camera: Camera, path: str | Path) -> None:
 
 
 def camera_file_text(camera: Camera, path: str | Path) -> str:
-    """What :func:`save_camera` writes into a file of this name.
+    """Give what :func:`save_camera` writes into a file of this name.
 
     Raises
     ------
     OutputError
         When the name says no format.
     """
-    return _writer(Path(path))(camera)
+    file = Path(path)
+    name = file.name.lower().removesuffix(".yml")
+    name += ".yaml" if name != file.name.lower() else ""
+    for pattern, writer in _WRITERS.items():
+        if fnmatchcase(name, pattern):
+            return writer(camera)
+    raise OutputError(f"{file}: not the name of a camera file; use one of {' '.join(CAMERA_SUFFIXES)}")
 
 
 def export_note(camera: Camera, path: str | Path) -> tuple[str, ...]:
-    """What the model of a camera file of others costs, one sentence; nothing for rdstitch's own.
+    """Say what the model of a camera file of others costs, in one sentence; nothing for rdstitch's own.
 
     Parameters
     ----------
     path : path
         As :func:`save_camera` takes it.
     """
-    largest = _STATED.findall(_writer(Path(path))(camera))
+    largest = _STATED.findall(camera_file_text(camera, path))
     return tuple(f"{path}: its lens model is at most {float(value):.3f} pixels from the lens" for value in largest[-1:])
-
-
-def _writer(path: Path) -> Callable[[Camera], str]:
-    for pattern, writer in _WRITERS.items():
-        if fnmatchcase(path.name.lower(), pattern):
-            return writer
-    raise OutputError(f"{path}: not the name of a camera file; use one of {' '.join(CAMERA_SUFFIXES)}")
 
 
 _WRITERS: dict[str, Callable[[Camera], str]] = {
     "cameras.json": writing.opendronemap_json,
     "opencv.json": writing.opencv_json,
     "*.opencv.json": writing.opencv_json,
-    "?*.json": writing.own_json,
-    "camera_info.yml": writing.camera_info_yaml,
+    "?*.json": lambda camera: json_bytes(camera.as_dict()).decode(),
     "camera_info.yaml": writing.camera_info_yaml,
     "camchain.yaml": writing.camera_chain_yaml,
-    "fisheye.yml": writing.opencv_fisheye_yaml,
     "fisheye.yaml": writing.opencv_fisheye_yaml,
-    "*.fisheye.yml": writing.opencv_fisheye_yaml,
     "*.fisheye.yaml": writing.opencv_fisheye_yaml,
-    "?*.yml": writing.opencv_yaml,
     "?*.yaml": writing.opencv_yaml,
     "cameras.txt": writing.colmap_text,
     "?*.pto": hugin_project,
 }
-"""By the name of the file, the first that fits."""
+"""By the name of the file, the first that fits; ``.yml`` is ``.yaml``."""

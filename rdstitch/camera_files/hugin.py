@@ -14,9 +14,8 @@ from msgspec import Meta, Struct
 
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera
-from rdstitch.camera_files.fitting import CameraFile, fitted_camera
-from rdstitch.camera_files.lens_fit import LensFit, LensSamples
-from rdstitch.camera_files.lens_models import CLOSE
+from rdstitch.camera_files.lens_fit import CameraFile, fitted_camera
+from rdstitch.camera_files.lens_models import CLOSE, LensFit, LensSamples
 from rdstitch.camera_files.writing import comments
 from rdstitch.errors import ArgumentError
 from rdstitch.records import Side, convert

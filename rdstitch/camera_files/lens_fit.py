@@ -1,106 +1,84 @@
-"""From one lens model to another, by least squares over the image, with what that costs in pixels.
-
-Every model is a *forward* map: pixels of a lens without distortion to measured pixels. The division model is fitted to
-others so that the measured pixels agree; others are fitted to the division model in the same way.
-"""
+"""The division model that is nearest to a lens model of others: λ alone where that is enough, else with μ, and ν."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera, points_over
+from rdstitch.camera import Camera
+from rdstitch.camera_files.lens_models import LensFit, LensModel, least_squares
 from rdstitch.errors import ArgumentError
 
 Forward = Callable[[FloatArray], FloatArray]
 
-_GRID = 65  # points along each side of the image that polynomials are fitted at
-_RATIONAL_STEPS, _DIVISION_STEPS = 12, 8
+_STEPS = 8
 _EXACT_ERROR = 0.1  # pixels: as exactly as a lens can be described at all
 _MAX_ERROR = 0.1  # half diagonals: then the file is no lens of these images
-_RAYS, _STEPS, _REACH = 64, 1200, 8.0  # where other models are looked at: directions, steps, half diagonals
+_RAYS, _SAMPLES, _REACH = 64, 1200, 8.0  # where other models are looked at: directions, steps, half diagonals
+_SQUARE = 0.005  # calibrations give focal lengths along x and y that differ by less
 
 
 @dataclass(frozen=True)
-class LensFit:
-    """How well a fitted lens model agrees with the one it was fitted to.
+class CameraFile:
+    """A camera as a file tells it.
 
     Attributes
     ----------
-    rms, largest : float
-        Of the distances between the pixels that both models give, over the whole image, pixels.
+    camera : Camera
+    kind : str
+        Whose format it is: "rdstitch", "OpenCV", "COLMAP", "Kalibr", "OpenDroneMap" or "Hugin".
+    fit : LensFit or None
+        How well λ agrees with the file's own lens model; None where the file gives λ itself.
+    cause : str
+        What of the file's model λ cannot describe; empty where it is only the curve of the lens.
     """
 
-    rms: float
-    largest: float
+    camera: Camera
+    kind: str
+    fit: LensFit | None = None
+    cause: str = ""
 
 
-@dataclass(frozen=True)
-class LensSamples:
-    """Radii of points all over what is drawn of an image, N of them.
+def fitted_camera(
+    forward: Forward,
+    kind: str,
+    size: tuple[int, int],
+    center: tuple[float, float],
+    focal: float,
+    field: str = "",
+    cause: str = "",
+) -> CameraFile:
+    """Fit λ to the lens model of a file.
 
-    Attributes
-    ----------
-    straight, bent : ndarray of shape (N,)
-        From the distortion centre, undistorted and measured, focal lengths.
-    focal : float
-        Pixels; guessed where the camera has none.
+    Raises
+    ------
+    ArgumentError
+        When that is impossible; ``field`` begins and ``cause`` ends the text.
     """
-
-    straight: FloatArray
-    bent: FloatArray
-    focal: float
-
-    @classmethod
-    def of(cls, camera: Camera) -> Self:
-        """Of a camera."""
-        focal = camera.with_focal().focal
-        assert focal is not None
-        measured = points_over(camera.image_size, _GRID)
-        measured = measured[np.linalg.norm(measured - camera.center, axis=1) <= camera.drawn_radius]
-        straight = np.linalg.norm(camera.undistort(measured) - camera.center, axis=1) / focal
-        return cls(straight, np.linalg.norm(measured - camera.center, axis=1) / focal, focal)
-
-    def fit(self, start: FloatArray, terms: FloatArray) -> tuple[FloatArray, LensFit]:
-        """Coefficients (K,) for which ``start + terms k`` are the measured radii; ``terms`` of shape (N, K)."""
-        coefficients = _least_squares(terms, self.bent - start)
-        return coefficients, self.compare(start + terms @ coefficients)
-
-    def fit_rational(self) -> tuple[FloatArray, LensFit]:
-        """Coefficients (6,) for which ``u (1 + k1 u² + k2 u⁴ + k3 u⁶) / (1 + k4 u² + k5 u⁴ + k6 u⁶)`` are the radii.
-
-        Linear least squares, weighted by the denominator of the step before; of all steps the one with the smallest
-        error is kept.
-        """
-        # Radii up to 1, whatever the unit: high powers of large ones are otherwise all that counts.
-        size = float(self.straight.max())
-        powers = (self.straight[:, None] / size) ** np.array([2, 4, 6])
-        terms = np.hstack([self.straight[:, None] * powers, -self.bent[:, None] * powers])
-        denominator, fits = np.ones_like(self.bent), []
-        for _ in range(_RATIONAL_STEPS):
-            k = _least_squares(terms / denominator[:, None], (self.bent - self.straight) / denominator)
-            denominator = 1.0 + powers @ k[3:]
-            if not (denominator > 1e-3).all():
-                break
-            fits.append((k, self.compare(self.straight * (1.0 + powers @ k[:3]) / denominator)))
-        if not fits:
-            return np.zeros(6), self.compare(self.straight)
-        coefficients, fit = min(fits, key=lambda found: found[1].largest)
-        return coefficients / np.tile(size ** np.array([2.0, 4.0, 6.0]), 2), fit
-
-    def compare(self, bent: FloatArray) -> LensFit:
-        """How far a model's measured radii (N,) are from these."""
-        error = np.abs(bent - self.bent) * self.focal
-        return LensFit(float(np.sqrt(np.mean(error**2))), float(error.max()))
+    camera = Camera(size, center=center, focal=focal, focal_source="file")
+    try:
+        lens, fit = fit_lens(forward, camera)
+    except ArgumentError as error:
+        raise ArgumentError(f"{field}{error}{cause and f'; {cause}'}") from error
+    return CameraFile(lens, kind, fit, cause)
 
 
-def _least_squares(terms: FloatArray, values: FloatArray) -> FloatArray:
-    """Least squares with columns of one size."""
-    size = np.maximum(np.abs(terms).max(axis=0), 1e-300)
-    solution: FloatArray = np.linalg.lstsq(terms / size, values, rcond=None)[0] / size
-    return solution
+def fitted_lens(lens: LensModel, kind: str, size: tuple[int, int], field: str = "") -> CameraFile:
+    """Fit λ to a lens model that several formats share, and say what of it λ cannot describe.
+
+    Raises
+    ------
+    ArgumentError
+        As :func:`fitted_camera`, and for focal lengths that are none.
+    """
+    if not min(lens.focal) > 0.0:
+        raise ArgumentError(f"expected positive focal lengths, not {lens.focal[0]:g} and {lens.focal[1]:g}")
+    stretch = lens.focal[0] / lens.focal[1] - 1.0
+    cause = ""
+    if abs(stretch) > _SQUARE:
+        cause = f"its focal lengths along x and y differ by {abs(stretch):.1%}, but only square pixels are known here"
+    return fitted_camera(lens.distort, kind, size, lens.center, lens.mean_focal, field, cause)
 
 
 def fit_lens(forward: Forward, camera: Camera) -> tuple[Camera, LensFit]:
@@ -152,18 +130,18 @@ def _fit_divisor(radius2: FloatArray, divisor: FloatArray, weights: FloatArray, 
     """``count`` coefficients of ``g`` for which undistorted radii give the measured ones, by weighted least squares."""
     terms = radius2[:, None] ** np.arange(1, count + 1)
     found = np.zeros(count)
-    for _ in range(_DIVISION_STEPS):
+    for _ in range(_STEPS):
         # An error of g moves the measured radius by r / (g - 2 q g').
         slope = divisor - 2.0 * terms @ (np.arange(1, count + 1) * found)
         weight = np.sqrt(weights * radius2) / np.maximum(slope, 1e-2)
-        found = _least_squares(weight[:, None] * terms, weight * (divisor - 1.0))
+        found = least_squares(weight[:, None] * terms, weight * (divisor - 1.0))
     return found.tolist()
 
 
 def _rays(forward: Forward, camera: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Points along rays from the centre to the border of the measured image: straight, measured, and their areas."""
     angles = np.arange(_RAYS) * (2.0 * np.pi / _RAYS)
-    radii = np.linspace(0.0, _REACH * camera.half_diagonal, _STEPS + 1)[1:]
+    radii = np.linspace(0.0, _REACH * camera.half_diagonal, _SAMPLES + 1)[1:]
     rays = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None] * radii[None, :, None] + camera.center
     with np.errstate(all="ignore"):
         measured = forward(rays.reshape(-1, 2)).reshape(rays.shape)
@@ -173,8 +151,8 @@ def _rays(forward: Forward, camera: Camera) -> tuple[FloatArray, FloatArray, Flo
     inside = within[..., 0] & within[..., 1]
     # Along each ray, what comes before it leaves the image for the first time; with a fisheye of 180 degrees and
     # more it never does, and of what is near the horizon there is no need to know.
-    leaves = np.where(inside.all(axis=1), _STEPS, np.argmin(inside, axis=1))
-    seen = np.arange(_STEPS) < leaves[:, None]
+    leaves = np.where(inside.all(axis=1), _SAMPLES, np.argmin(inside, axis=1))
+    seen = np.arange(_SAMPLES) < leaves[:, None]
     if not inside[:, 0].all() or not (steps[seen] > 0.0).all():
         raise ArgumentError("the lens model folds the image; it does not belong to images of this size")
     return rays[seen], measured[seen], (distance * steps)[seen]

@@ -5,13 +5,13 @@ OpenCV's own reader is not used: it says on standard error what it does not like
 
 import re
 from collections.abc import Callable, Sequence
-from functools import partial
+from contextlib import suppress
 from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
-from rdstitch.camera_files.fitting import CameraFile, fitted_lens
-from rdstitch.camera_files.lens_models import Brown, Fisheye
+from rdstitch.camera_files.lens_fit import CameraFile, fitted_lens
+from rdstitch.camera_files.lens_models import LensModel
 from rdstitch.errors import ArgumentError
 from rdstitch.records import Count, Side, Size, convert
 
@@ -125,41 +125,42 @@ def read_opencv(content: dict[str, Any], file: str, image_size: ImageSize | None
     """
     named = {_ALIASES.get(name, name): value for name, value in content.items()}
     record = convert(named, _OpenCV, file, strict=False)
-    matrix, k = record.camera_matrix, record.distortion_coefficients.data
+    matrix, k = record.camera_matrix, tuple(record.distortion_coefficients.data)
     if (matrix.rows, matrix.cols) != (3, 3):
         raise ArgumentError("camera_matrix: expected 3 rows of 3")
     fx, skew, cx, _, fy, cy = matrix.data[:6]
     if not (fx > 0.0 and fy > 0.0 and abs(skew) < 1e-6 * fx):
         raise ArgumentError("camera_matrix: expected positive focal lengths and no skew")
-    read = partial(
-        fitted_lens, kind="OpenCV", size=_size(record, (cx, cy), image_size), field="distortion_coefficients: "
-    )
-    if (marked := record.is_fisheye) and len(k) != 4:
-        raise ArgumentError("distortion_coefficients: expected the 4 coefficients of a fisheye")
-    fisheye = Fisheye((fx, fy), (cx, cy), tuple(k))
-    if marked:
-        return read(fisheye)
+    size = _size(record, (cx, cy), image_size)
+
+    def read(*, fisheye: bool) -> CameraFile:
+        lens = LensModel((fx, fy), (cx, cy), k if fisheye else k[:8], fisheye)
+        return fitted_lens(lens, "OpenCV", size, "distortion_coefficients: ")
+
+    if record.is_fisheye:
+        if len(k) != 4:
+            raise ArgumentError("distortion_coefficients: expected the 4 coefficients of a fisheye")
+        return read(fisheye=True)
     if len(k) not in (0, 4, 5, 8, 12, 14) or any(k[8:]):
         raise ArgumentError(
             "distortion_coefficients: expected 4, 5 or 8; thin prisms and tilted sensors are not known here"
         )
-    lens = Brown.of_opencv((fx, fy), (cx, cy), k[:8])
-    if marked is not None or len(k) != 4 or not any(k):
-        return read(lens)
+    if record.is_fisheye is not None or len(k) != 4 or not any(k):
+        return read(fisheye=False)
+    brown = other = None
+    with suppress(ArgumentError):
+        other = read(fisheye=True)
     try:
-        other = read(fisheye)
+        brown = read(fisheye=False)
     except ArgumentError:
-        return read(lens)
-    try:
-        found = read(lens)
-    except ArgumentError:
-        found = None
-    if found is None or _is_rather(other, found):
+        if other is None:
+            raise
+    if brown is None or (other is not None and _is_rather(other, brown)):
         raise ArgumentError(
             "distortion_coefficients: these 4 make no lens of OpenCV's usual model, but one of cv2.fisheye; if they "
             'are that, add "fisheye_model: 1", else "distortion_model: plumb_bob"'
         )
-    return found
+    return brown
 
 
 def _is_rather(fisheye: CameraFile, brown: CameraFile) -> bool:
@@ -194,18 +195,19 @@ def read_opendronemap(entry: Any, file: str, name: str) -> CameraFile:
     fx, fy = (record.focal or value or 0.0 for value in (record.focal_x, record.focal_y))
     focal = (fx * longer, fy * longer)
     center = ((size[0] - 1) / 2 + record.c_x * longer, (size[1] - 1) / 2 + record.c_y * longer)
-    _check_focal(focal)
-    lens: Brown | Fisheye = Brown(focal, center, (record.k1, record.k2, record.k3), (record.p1, record.p2))
-    if record.projection_type == "fisheye_opencv":
-        lens = Fisheye(focal, center, (record.k1, record.k2, record.k3, record.k4))
-    return fitted_lens(lens, "OpenDroneMap", size)
+    fisheye = record.projection_type == "fisheye_opencv"
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    k = tuple(getattr(record, name) for name in names)
+    return fitted_lens(LensModel(focal, center, k, fisheye), "OpenDroneMap", size)
 
 
 def read_kalibr(entry: Any, file: str, name: str) -> CameraFile:
     """The one camera of a chain, to which λ is fitted."""
     record = convert(entry, _Kalibr, file, name, strict=False)
-    k = [] if record.distortion_model == "none" else record.distortion_coeffs
-    return _fitted("Kalibr", record.resolution, record.intrinsics, k, fisheye=record.distortion_model == "equi")
+    k = () if record.distortion_model == "none" else tuple(record.distortion_coeffs)
+    fx, fy, cx, cy = record.intrinsics
+    lens = LensModel((fx, fy), (cx, cy), k, record.distortion_model == "equi")
+    return fitted_lens(lens, "Kalibr", record.resolution)
 
 
 def colmap_cameras(text: str) -> list[tuple[str, ...]]:
@@ -224,29 +226,8 @@ def read_colmap(camera: Sequence[str], file: str) -> CameraFile:
     values = convert(given.split(), list[float], file, "PARAMS", strict=False)
     if len(values) != focals + 2 + coefficients:
         raise ArgumentError(f"PARAMS: expected {focals + 2 + coefficients} numbers, not {len(values)}")
-    # COLMAP's pixels have their centres at halves.
-    intrinsics = (values[0], values[focals - 1], values[focals] - 0.5, values[focals + 1] - 0.5)
     size = convert((width, height), tuple[int, int], file, "SIZE", strict=False)
-    return _fitted("COLMAP", size, intrinsics, values[focals + 2 :], fisheye="FISHEYE" in model)
-
-
-def _fitted(
-    kind: str,
-    size: tuple[int, int],
-    intrinsics: tuple[float, float, float, float],
-    coefficients: Sequence[float],
-    *,
-    fisheye: bool,
-) -> CameraFile:
-    """The camera of a focal length and centre along x and y, and OpenCV's coefficients."""
-    fx, fy, cx, cy = intrinsics
-    _check_focal((fx, fy))
-    lens: Brown | Fisheye = Brown.of_opencv((fx, fy), (cx, cy), coefficients)
-    if fisheye:
-        lens = Fisheye((fx, fy), (cx, cy), tuple(coefficients))
-    return fitted_lens(lens, kind, size)
-
-
-def _check_focal(focal: tuple[float, float]) -> None:
-    if not min(focal) > 0.0:
-        raise ArgumentError(f"expected positive focal lengths, not {focal[0]:g} and {focal[1]:g}")
+    # COLMAP's pixels have their centres at halves.
+    focal, center = (values[0], values[focals - 1]), (values[focals] - 0.5, values[focals + 1] - 0.5)
+    lens = LensModel(focal, center, tuple(values[focals + 2 :]), "FISHEYE" in model)
+    return fitted_lens(lens, "COLMAP", size)

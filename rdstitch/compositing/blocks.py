@@ -7,11 +7,8 @@ store that both see, so that neither they nor the images travel with tasks and r
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rdstitch.cache import Cache
 from rdstitch.compositing.tiles import OutputStrip, ShareProgress, TiledOutput
@@ -19,20 +16,6 @@ from rdstitch.opencv_state import one_opencv_thread
 from rdstitch.stored import Stored
 
 _MIN_TILES = 4  # tiles of a block, a side, at the least: images across the edges of blocks are read for each of them
-
-
-@dataclass(frozen=True, eq=False)
-class BlockStrip:
-    """Some rows of a block.
-
-    Attributes
-    ----------
-    samples : ndarray of shape (h, w, C)
-    alpha : ndarray of shape (h, w), uint8
-    """
-
-    samples: NDArray[Any]
-    alpha: NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,17 +33,16 @@ class Block:
     tiles: TiledOutput
     images: tuple[int, ...]
 
-    def compute(self, store: Cache) -> list[Stored[BlockStrip]]:
+    def compute(self, store: Cache) -> list[Stored[OutputStrip]]:
         """Its strips from top to bottom, in the store, which must be this run's own."""
-        box = self.tiles.box
         with one_opencv_thread():
-            return [
-                store.stored("blocks", (box, number), partial(BlockStrip, *strip))
-                for number, strip in enumerate(self.tiles.strips())
-            ]
+            return [self._kept(store, number, strip) for number, strip in enumerate(self.tiles.strips())]
+
+    def _kept(self, store: Cache, number: int, strip: OutputStrip) -> Stored[OutputStrip]:
+        return store.stored("blocks", (self.tiles.box, number), lambda: strip)
 
 
-BlockRunner = Callable[[Iterable[Block]], Generator[list[Stored[BlockStrip]]]]
+BlockRunner = Callable[[Iterable[Block]], Generator[list[Stored[OutputStrip]]]]
 """Computes blocks elsewhere: their strips, in the order of the blocks, which are taken as they are needed."""
 
 
@@ -89,8 +71,8 @@ def strips_of_blocks(
                 for part in parts:
                     part.remove()
                 yield (
-                    np.concatenate([strip.samples for strip in strips], axis=1),
-                    np.concatenate([strip.alpha for strip in strips], axis=1),
+                    np.concatenate([samples for samples, _ in strips], axis=1),
+                    np.concatenate([alpha for _, alpha in strips], axis=1),
                 )
 
 

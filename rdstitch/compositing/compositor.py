@@ -1,6 +1,6 @@
 """The compositor: images, cameras and homographies in, one image out, in memory or in a file."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,14 +17,13 @@ from rdstitch.compositing.photometric import Exposure
 from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.compositing.seam_finder import SeamMap
-from rdstitch.compositing.tiles import OutputStrip, ShareProgress
-from rdstitch.io.fingerprint import Fingerprint
+from rdstitch.compositing.tiles import ShareProgress
 from rdstitch.io.layout import Layout
 from rdstitch.io.metadata import Metadata
-from rdstitch.io.outputs import Outputs
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_format, check_memory, write_strips
 from rdstitch.messages import Message
+from rdstitch.outputs import Fingerprint, Outputs
 
 
 @dataclass(frozen=True, repr=False)
@@ -62,8 +61,6 @@ class FileComposite:
     Attributes
     ----------
     path : Path
-    coverage : float
-        Share of the output that images cover.
     fingerprint : Fingerprint
         Size and digest of the file.
     seams : SeamMap or None
@@ -75,7 +72,6 @@ class FileComposite:
     path: Path
     canvas: Canvas
     exposure: Exposure
-    coverage: float
     fingerprint: Fingerprint
     messages: tuple[Message, ...] = ()
     seams: SeamMap | None = None
@@ -170,14 +166,6 @@ def compose_to_file(
     OutputError
         When the file cannot be written; nothing is left behind.
     """
-    covered = 0
-
-    def counted(strips: Iterable[OutputStrip]) -> Iterator[OutputStrip]:
-        nonlocal covered
-        for samples, alpha in strips:
-            covered += int(np.count_nonzero(alpha))
-            yield samples, alpha
-
     with prepare_composite(images, canvas, options, progress) as prepared:
         renderer, size = prepared.renderer, prepared.canvas.size
         layout = Layout(
@@ -194,13 +182,11 @@ def compose_to_file(
         tags = () if file.extra_tags is None else file.extra_tags(prepared.canvas)
         # Nothing goes on behind a writer that fails.
         with closing(prepared.strips(progress, elsewhere)) as strips:
-            written = write_strips(file.path, layout, counted(strips), tags, outputs=file.outputs)
-    share = covered / (size[0] * size[1])
+            written = write_strips(file.path, layout, strips, tags, outputs=file.outputs)
     return FileComposite(
         Path(file.path),
         prepared.canvas,
         renderer.exposure,
-        share,
         written,
         prepared.messages,
         renderer.seams,

@@ -14,9 +14,8 @@ from rdstitch.compositing.boxes import Box, Float32Array, aligned, bounds, cut, 
 from rdstitch.compositing.image_cache import ImageCache
 from rdstitch.compositing.options import CompositeOptions
 from rdstitch.compositing.photometric import Exposure, full_scale
-from rdstitch.compositing.sampling import border_weight, reachable_part, read_part, sample, sample_opacity
+from rdstitch.compositing.sampling import border_weight, sample, sample_opacity
 from rdstitch.compositing.seam_finder import NO_OWNER, SeamMap
-from rdstitch.compositing.source_images import NOTHING
 from rdstitch.compositing.warp import Geometry, Warp, locate
 
 
@@ -101,17 +100,16 @@ class Renderer:
             cv2.copyTo(self._multiband(layers, zone), _as_mask(cut(covered, box, zone)), cut(pixels, box, zone))
         return pixels, covered
 
-    def requests(self, box: Box) -> Iterator[tuple[int, Box]]:
-        """Images that a tile takes samples from, and the part of each, but where the seam map misses a pixel."""
-        blended = self.options.blend == "multiband"
-        around = self._blend_support(box) if blended else box
-        owned = {} if self.seams is None else self.seams.bounds(around)
-        for index, warp in enumerate(self.warps):
-            # Where nobody owns anything, masks decide who covers it.
-            anywhere = self.seams is None or (NO_OWNER in owned and self.images.masked(index))
-            shown = intersection(warp.box, around if anywhere else owned.get(index, NOTHING))
-            if shown is not None and (part := intersection(shown, around)) is not None:
-                yield index, reachable_part(warp, self._support_within(part, around))
+    def shown(self, box: Box) -> set[int]:
+        """Find the images that a tile takes samples from, but for those where the seam map misses a pixel."""
+        around = self._blend_support(box) if self.options.blend == "multiband" else box
+        reaching = {index for index, warp in enumerate(self.warps) if intersection(warp.box, around) is not None}
+        if self.seams is None:
+            return reaching
+        owners = set(self.seams.owners(around))
+        # Where nobody owns anything, masks decide who covers it.
+        masked = {index for index in reaching if NO_OWNER in owners and self.images.masked(index)}
+        return reaching & (owners | masked)
 
     def part(self, box: Box, shares: int) -> tuple["Renderer", tuple[int, ...]]:
         """What the tiles of a box need, which it gives the same samples; and the images that are left in it.
@@ -205,7 +203,7 @@ class Renderer:
     def _samples(self, layer: Layer, box: Box) -> NDArray[Any]:
         """Resampled and exposure-corrected samples (h, w, C) of one image; mirrored content outside of it."""
         geometry = layer.geometry.on(box)
-        image = self.images.get(layer.index, read_part(geometry))
+        image = self.images.get(layer.index)
         pixels = sample(image, geometry, self.options.interpolation)
         return self.exposure.correct(layer.index, geometry, pixels.reshape(*geometry.shape, self.channels))
 
@@ -243,7 +241,7 @@ class Renderer:
         """Opacity of an image that has a mask."""
         if not self.images.masked(index):
             return None
-        return sample_opacity(self.images.get(index, read_part(geometry)), geometry)
+        return sample_opacity(self.images.get(index), geometry)
 
     def _owned(self, box: Box) -> list[Layer]:
         """Layers where each pixel has one owner, or, for feathering along a seam, shares of its owners.

@@ -6,32 +6,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.compositing.boxes import Box, Float32Array
+from rdstitch.compositing.boxes import Float32Array
 from rdstitch.compositing.masked_pixels import OPAQUE
-from rdstitch.compositing.source_images import KERNEL_MARGIN, LoadedImage
-from rdstitch.compositing.warp import Geometry, Warp, points_around
+from rdstitch.compositing.source_images import LoadedImage
+from rdstitch.compositing.warp import Geometry
 
 INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos": cv2.INTER_LANCZOS4}
 
 # OpenCV resamples from no side as long as this, pixels.
 _TOO_LONG = 32767
+_KERNEL_MARGIN = 8  # room around a piece of an image for the kernel of the resampling, pixels
 _MIN_WEIGHT = np.float32(1e-6)
-
-
-def read_part(geometry: Geometry) -> Box:
-    """The part of the image that :func:`sample` takes pixels from."""
-    return _part_of(geometry.warp, *geometry.maps)
-
-
-def reachable_part(warp: Warp, box: Box) -> Box:
-    """The part of the image that holds what :func:`read_part` gives for a box of the canvas and all boxes within."""
-    return _part_of(warp, *np.moveaxis(points_around(warp, box), -1, 0))
-
-
-def _part_of(warp: Warp, map_x: Float32Array, map_y: Float32Array) -> Box:
-    width, height = warp.camera.image_size
-    (left, right), (top, bottom) = _mirrored_extent(map_x, width), _mirrored_extent(map_y, height)
-    return left, top, right, bottom
 
 
 def border_weight(geometry: Geometry) -> Float32Array:
@@ -54,7 +39,7 @@ def sample(image: LoadedImage, geometry: Geometry, interpolation: str = "cubic")
     Parameters
     ----------
     image : LoadedImage
-        Prepared for ``geometry.warp.shrink``; it holds what :func:`read_part` gives.
+        Prepared for ``geometry.warp.shrink``.
     geometry : Geometry
         From :func:`locate`.
     interpolation : str
@@ -66,7 +51,7 @@ def sample(image: LoadedImage, geometry: Geometry, interpolation: str = "cubic")
         In the image's sample type.
     """
     map_x, map_y = _mirrored(image, geometry)
-    return _remap_from(image.pixels, image.origin, map_x, map_y, INTERPOLATION[interpolation])
+    return _remap_whole(image.pixels, map_x, map_y, INTERPOLATION[interpolation])
 
 
 def sample_places(image: LoadedImage, geometry: Geometry) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
@@ -80,7 +65,7 @@ def sample_opacity(image: LoadedImage, geometry: Geometry) -> Float32Array | Non
     if image.opacity is None:
         return None
     map_x, map_y = _mirrored(image, geometry)
-    opacity = _remap_from(image.opacity, image.origin, map_x, map_y, cv2.INTER_LINEAR) * np.float32(1.0 / OPAQUE)
+    opacity = _remap_whole(image.opacity, map_x, map_y, cv2.INTER_LINEAR) * np.float32(1.0 / OPAQUE)
     # The outer half of the last opaque pixel is outside.
     return np.where(opacity >= np.float32(0.5 * image.opacity_step), opacity, np.float32(0.0))
 
@@ -100,28 +85,15 @@ def _mirrored(image: LoadedImage, geometry: Geometry) -> tuple[Float32Array, Flo
     return map_x, map_y
 
 
-def _mirrored_extent(values: Float32Array, length: int) -> tuple[int, int]:
-    """First and last but one pixel that coordinates come to lie on when they are mirrored at both borders."""
-    low, high = float(values.min()), float(values.max())
-    start, stop = min(low, 2.0 * length - high), max(high, -low) + 2.0
-    return (0 if low < 0.0 else max(0, int(start))), (length if high > length else min(length, int(stop)))
-
-
-def _remap_from(
-    pixels: NDArray[Any], origin: tuple[int, int], map_x: Float32Array, map_y: Float32Array, interpolation: int
-) -> NDArray[Any]:
-    """``cv2.remap`` from an image whose first pixel is at ``origin``; of a very long one, from a piece of it."""
-    left, top = origin
-    if max(pixels.shape[:2]) >= _TOO_LONG:
-        x, y = (max(0, int(m.min()) - o - KERNEL_MARGIN) for m, o in zip((map_x, map_y), origin, strict=True))
-        right, bottom = (int(m.max()) - o + 2 + KERNEL_MARGIN for m, o in zip((map_x, map_y), origin, strict=True))
-        pixels, left, top = pixels[y:bottom, x:right], left + x, top + y
+def _remap_whole(pixels: NDArray[Any], map_x: Float32Array, map_y: Float32Array, interpolation: int) -> NDArray[Any]:
+    """``cv2.remap`` from an image; of a very long one, from the piece of it that is needed."""
+    if max(pixels.shape[:2]) < _TOO_LONG:
+        return remap(pixels, map_x, map_y, interpolation)
+    left, top = (max(0, int(m.min()) - _KERNEL_MARGIN) for m in (map_x, map_y))
+    right, bottom = (int(m.max()) + 2 + _KERNEL_MARGIN for m in (map_x, map_y))
     # Whole pixels are subtracted exactly, so the piece does not change the result.
-    if left:
-        map_x = map_x - np.float32(left)
-    if top:
-        map_y = map_y - np.float32(top)
-    return remap(pixels, map_x, map_y, interpolation)
+    piece = pixels[top:bottom, left:right]
+    return remap(piece, map_x - np.float32(left), map_y - np.float32(top), interpolation)
 
 
 def remap(piece: NDArray[Any], map_x: NDArray[Any], map_y: NDArray[Any], interpolation: int) -> NDArray[Any]:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.compositing.boxes import Box, Float32Array, bounds
+from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.compositing.photometric import Exposure, full_scale
 from rdstitch.compositing.survey import Survey
 from rdstitch.compositing.warp import locate
@@ -57,17 +57,6 @@ class SeamMap:
     def owners(self, box: Box) -> list[int]:
         """Images that own anything on a box (canvas pixels), ascending; -1 first where a part has no owner."""
         return [int(owner) for owner in np.unique(self._window(box))]
-
-    def bounds(self, box: Box) -> dict[int, Box]:
-        """As :meth:`owners`, with the smallest box (canvas pixels) that holds all where the share is not 0."""
-        labels, unit, around = self._window(box), self.factor, 1 + self.softness
-        left, top = ((start // unit - around) * unit for start in box[:2])
-        found = {}
-        for owner in np.unique(labels).tolist():
-            x0, y0, x1, y1 = bounds(labels == owner, (0, 0, *labels.shape[::-1])) or (0, 0, 0, 0)
-            reach = (x0 - around) * unit + left, (y0 - around) * unit + top
-            found[int(owner)] = (*reach, (x1 + around) * unit + left, (y1 + around) * unit + top)
-        return found
 
     def share(self, owner: int, box: Box) -> Float32Array:
         """How much of each pixel of a box (canvas pixels) an image owns: labels interpolated linearly, (h, w).

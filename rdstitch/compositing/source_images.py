@@ -1,4 +1,4 @@
-"""Images as the tiles need them: of one kind, smoothed for the output's resolution, whole or a part."""
+"""Images as the tiles need them: of one kind, smoothed for the output's resolution."""
 
 import math
 from collections.abc import Sequence
@@ -11,26 +11,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.compositing.boxes import Box, encloses, intersection
 from rdstitch.compositing.masked_pixels import OPACITY_BYTES, filled, opacity
 from rdstitch.compositing.placed_image import PlacedImage
 from rdstitch.errors import InputError
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import block_mean, fitting_reduction, reduced_size
 
-NOTHING: Box = (0, 0, 0, 0)
-
 _OPAQUE_FROM = 128
 # An image that gets smaller by less than this keeps its pixels as they are.
 _NEGLIGIBLE_SHRINK = 1.05
-# Room around a part of an image for the kernel of the resampling, pixels.
-KERNEL_MARGIN = 8
 # Pixels read for one of the output, at least: a Gaussian needs nearly two to smooth them.
 _PIXELS_PER_OUTPUT_PIXEL = 1.9
 # Largest reduction at which previews are read, a power of two.
 _MAX_PREVIEW = 8
-# Share of the pixels below which a part is cut out.
-_WORTH_CUTTING = 0.8
 
 
 @dataclass(frozen=True)
@@ -47,45 +40,17 @@ class LoadedImage:
         Opacity of the last opaque pixel beside a transparent one, as a share of OPAQUE.
     reduction : int
         The image is smaller than the original by this factor.
-    part : (int, int, int, int) or None
-        What can be resampled from it, pixels of the original; None for all of it. It holds more, for the kernel.
-    origin : (int, int)
-        Where its first pixel lies in the whole reduced image.
     """
 
     pixels: NDArray[Any]
     opacity: NDArray[np.uint16] | None = None
     opacity_step: float = 1.0
     reduction: int = 1
-    part: Box | None = None
-    origin: tuple[int, int] = (0, 0)
 
     @property
     def nbytes(self) -> int:
         """Memory that it takes, bytes."""
         return self.pixels.nbytes + (0 if self.opacity is None else self.opacity.nbytes)
-
-    def holds(self, part: Box) -> bool:
-        """Whether a part of the original can be resampled from it."""
-        return self.part is None or encloses(self.part, part)
-
-    def cut(self, part: Box, *, copy: bool = False) -> "LoadedImage":
-        """A part of the original, with what the kernel of the resampling needs around it, in memory of its own.
-
-        The whole where the part is not much less, unless a copy is wanted: it would not be worth its time.
-        """
-        unit, room = self.reduction, KERNEL_MARGIN
-        height, width = self.pixels.shape[:2]
-        x, y = self.origin
-        left, right = (max(0, part[0] // unit - room - x), min(width, -(-part[2] // unit) + room - x))
-        top, bottom = (max(0, part[1] // unit - room - y), min(height, -(-part[3] // unit) + room - y))
-        if not copy and (right - left) * (bottom - top) > _WORTH_CUTTING * width * height:
-            return self
-        rows, columns = slice(top, bottom), slice(left, right)
-        opacity = None if self.opacity is None else np.array(self.opacity[rows, columns])
-        left_part = part if self.part is None else intersection(part, self.part) or NOTHING
-        pixels, origin = np.array(self.pixels[rows, columns]), (left + x, top + y)
-        return replace(self, pixels=pixels, opacity=opacity, part=left_part, origin=origin)
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ def static_pixels(images: Sequence[NDArray[np.generic]]) -> BoolArray | None:
     ndarray of shape (h, w), bool, or None
         None where nothing stays, or so much that the camera hardly moved.
     """
-    grey = np.stack([_grey(image) for image in images])
+    grey = np.stack([mean_of_channels(image.astype(np.float32)) for image in images])
     window = max(3, round(_WINDOW * max(grey.shape[1:])))
     dark = grey.max(axis=0) <= _BLACK * max(float(grey.max()), 1e-12)
     black = _regions(dark, at_border=True)
@@ -49,10 +49,6 @@ def static_pixels(images: Sequence[NDArray[np.generic]]) -> BoolArray | None:
     static = _with_captions(static, np.ptp(grey, axis=0) <= _BLACK * float(grey.max()), window)
     share = float(static.mean())
     return static if _MIN_AREA < share < _MAX_AREA else None
-
-
-def _grey(image: NDArray[np.generic]) -> NDArray[np.float32]:
-    return mean_of_channels(image.astype(np.float32))
 
 
 def _agreement(grey: NDArray[np.float32], window: int) -> FloatArray:

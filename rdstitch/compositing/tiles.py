@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import Box
-from rdstitch.compositing.image_parts import RequestedParts
 from rdstitch.compositing.render import Renderer
 from rdstitch.io.layout import STRIP_ROWS
 from rdstitch.opencv_state import one_opencv_thread
@@ -50,13 +49,10 @@ class TiledOutput:
         return self.box[2] - self.box[0], self.box[3] - self.box[1]
 
     @cached_property
-    def _requested(self) -> RequestedParts:
-        """Which part of each image the tiles take."""
-        rows = (
-            [request for box in self._boxes(top) for request in self.renderer.requests(box)]
-            for top in range(0, self.size[1], self.tile_size)
-        )
-        return RequestedParts.of(len(self.renderer.warps), rows)
+    def _shown(self) -> list[set[int]]:
+        """Which images each row of tiles shows."""
+        tops = range(0, self.size[1], self.tile_size)
+        return [set().union(*map(self.renderer.shown, self._boxes(top))) for top in tops]
 
     def _boxes(self, top: int) -> list[Box]:
         """The tiles of a row that begins so many pixels below the top."""
@@ -105,8 +101,8 @@ class TiledOutput:
         backwards = row % 2 == 1
         images, warps = self.renderer.images, self.renderer.warps
         # The row above is not done yet.
-        images.expect(self._requested.from_row(row - 1))
-        images.prefetch(sorted(self._requested.on_row(row), key=lambda k: warps[k].box, reverse=backwards))
+        images.expect(set().union(*self._shown[max(row - 1, 0) :]))
+        images.prefetch(sorted(self._shown[row], key=lambda k: warps[k].box, reverse=backwards))
         shape = boxes[0][3] - boxes[0][1], self.size[0]
         samples = np.zeros((*shape, self.renderer.channels), dtype=self.renderer.dtype)
         alpha = np.zeros(shape, dtype=np.uint8)

@@ -266,16 +266,6 @@ def locate(warp: Warp, box: Box) -> Geometry:
     return Geometry(warp, box, Lattice.over(box, warp.step, warp.source_points))
 
 
-def points_around(warp: Warp, box: Box) -> Float32Array:
-    """Pixels (K, 2) of the image at the outermost nodes of the lattice over a box: no other node lies beyond."""
-    (x0, x1), (y0, y1) = _enclosing(box, LATTICE_STEPS[0])
-    x, y = (np.arange(start, stop + 1, warp.step, dtype=np.float64) for start, stop in ((x0, x1), (y0, y1)))
-    left, top = np.full_like(y, x0), np.full_like(x, y0)
-    return _somewhere(
-        warp.source_points(np.concatenate([x, x, left, left + (x1 - x0)]), np.concatenate([top, top + (y1 - y0), y, y]))
-    )
-
-
 def _somewhere(points: FloatArray) -> Float32Array:
     """Places in an image, far outside where there are none."""
     there = points.astype(np.float32)

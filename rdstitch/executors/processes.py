@@ -9,17 +9,22 @@ import pickle
 import subprocess
 import sys
 import threading
+import traceback
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
+from contextlib import suppress
+from queue import SimpleQueue
 from types import TracebackType
-from typing import Any, ParamSpec, TypeVar
+from typing import IO, Any, ParamSpec, TypeVar
 
 from rdstitch.errors import LimitError
+from rdstitch.opencv_state import one_opencv_thread
+from rdstitch.process_memory import return_freed_memory
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
 
-_PROGRAM = "from rdstitch.executors.worker import main; main()"
+_PROGRAM = "from rdstitch.executors.processes import work; work()"
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 _ATTEMPTS = 2  # at a task whose worker died
 
@@ -32,11 +37,9 @@ class ProcessExecutor(Executor):
     """
 
     def __init__(self, workers: int) -> None:
-        self._threads = ThreadPoolExecutor(workers)
-        self._own = threading.local()
-        self._workers: list[_Worker] = []
-        self._lock = threading.Lock()
-        self._stopped = False
+        self._threads, self._own = ThreadPoolExecutor(workers), threading.local()
+        self._workers: list[subprocess.Popen[bytes]] = []
+        self._lock, self._stopped = threading.Lock(), False
 
     def submit(self, fn: Callable[Given, Result], /, *args: Given.args, **kwargs: Given.kwargs) -> Future[Result]:
         """See :meth:`concurrent.futures.Executor.submit`; function and arguments are pickled."""
@@ -57,10 +60,14 @@ class ProcessExecutor(Executor):
     def _run(self, task: bytes) -> Any:
         for _ in range(_ATTEMPTS):
             worker = self._worker()
+            assert worker.stdin is not None
+            assert worker.stdout is not None
             try:
-                succeeded, result = worker.run(task)
+                worker.stdin.write(task)
+                worker.stdin.flush()
+                succeeded, result = pickle.load(worker.stdout)
             except (EOFError, OSError, pickle.UnpicklingError):
-                worker.stop()
+                _end(worker)
                 continue
             if not succeeded:
                 raise result
@@ -70,14 +77,22 @@ class ProcessExecutor(Executor):
             "need less memory"
         )
 
-    def _worker(self) -> "_Worker":
+    def _worker(self) -> "subprocess.Popen[bytes]":
         """The process of this thread, started when it is needed."""
-        worker: _Worker | None = getattr(self._own, "worker", None)
-        if worker is None or not worker.alive:
+        worker: subprocess.Popen[bytes] | None = getattr(self._own, "worker", None)
+        if worker is None or worker.poll() is not None:
+            paths = os.pathsep.join(path for path in sys.path if path)
             with self._lock:
                 if self._stopped:
                     raise CancelledError
-                worker = self._own.worker = _Worker()
+                worker = self._own.worker = subprocess.Popen(
+                    [sys.executable, "-P", "-W", "ignore", "-c", _PROGRAM],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    env={**os.environ, **dict.fromkeys(_ONE_THREAD, "1"), "PYTHONPATH": paths},
+                    # A session of its own: Ctrl-C on the terminal is for the parent alone.
+                    start_new_session=True,
+                )
                 self._workers.append(worker)
         return worker
 
@@ -85,45 +100,60 @@ class ProcessExecutor(Executor):
         with self._lock:
             self._stopped = True
             for worker in self._workers:
-                worker.stop()
+                _end(worker)
 
 
-class _Worker:
-    """A process that runs one task after the other."""
-
-    def __init__(self) -> None:
-        environment = {**os.environ, **dict.fromkeys(_ONE_THREAD, "1")}
-        environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
-        # A session of its own: Ctrl-C on the terminal is for the parent alone.
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-W", "ignore", "-c", _PROGRAM],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env=environment,
-            start_new_session=True,
-        )
-
-    @property
-    def alive(self) -> bool:
-        """Whether it can take a task."""
-        return self._process.poll() is None
-
-    def run(self, task: bytes) -> tuple[bool, Any]:
-        """Whether a task succeeded, and what it gave or raised; EOFError or OSError when the process ends meanwhile."""
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._process.stdin.write(task)
-        self._process.stdin.flush()
-        answer: tuple[bool, Any] = pickle.load(self._process.stdout)
-        return answer
-
-    def stop(self) -> None:
-        """End the process now."""
-        self._process.kill()
-        self._process.wait()
-        for pipe in (self._process.stdin, self._process.stdout):
+def _end(worker: "subprocess.Popen[bytes]") -> None:
+    """End a process now."""
+    worker.kill()
+    worker.wait()
+    for pipe in (worker.stdin, worker.stdout):
+        # What was not written yet cannot be any more.
+        with suppress(OSError):
             if pipe is not None:
-                try:
-                    pipe.close()
-                except OSError:  # what was not written yet cannot be any more
-                    continue
+                pipe.close()
+
+
+def work() -> None:
+    """Run tasks, in a worker: they come in by standard input and results go out by standard output, pickled.
+
+    Until the parent closes the pipe, or is gone; then it ends at once, in the middle of a task if need be.
+    """
+    results = os.fdopen(os.dup(1), "wb")
+    # What a library prints must not come among the results.
+    os.dup2(2, 1)
+    return_freed_memory()
+    tasks: SimpleQueue[Any] = SimpleQueue()
+    threading.Thread(target=_receive, args=(os.fdopen(os.dup(0), "rb"), tasks), daemon=True).start()
+    with one_opencv_thread():
+        while True:
+            results.write(_answer(tasks.get()))
+            results.flush()
+
+
+def _receive(stream: IO[bytes], tasks: "SimpleQueue[Any]") -> None:
+    while True:
+        try:
+            tasks.put(pickle.load(stream))
+        except EOFError:
+            os._exit(0)
+        except Exception as error:  # noqa: BLE001 - it is the task's failure, and goes where the task came from
+            tasks.put(error)
+
+
+def _answer(task: Any) -> bytes:
+    """Whether a task succeeded, and what it gave or raised."""
+    try:
+        if isinstance(task, Exception):
+            raise task
+        function, positional, named = task
+        return pickle.dumps((True, function(*positional, **named)), pickle.HIGHEST_PROTOCOL)
+    except BaseException as error:  # noqa: BLE001 - as above
+        text = "".join(traceback.format_exception(error))
+        error.add_note(f"in a worker process:\n{text}")
+        try:
+            answer = pickle.dumps((False, error))
+            pickle.loads(answer)
+        except Exception:  # noqa: BLE001 - an exception may hold anything
+            return pickle.dumps((False, RuntimeError(text)))
+        return answer

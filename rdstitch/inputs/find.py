@@ -16,9 +16,9 @@ from rdstitch.inputs.frame import Frame, Named, files_of
 from rdstitch.inputs.keyframes import wanted_frames
 from rdstitch.inputs.rosbag import extract_images, is_bag
 from rdstitch.io.optional_readers import HEIF_SUFFIXES, RAW_SUFFIXES
-from rdstitch.io.staging import temporary_folder
 from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames, grey_frames
 from rdstitch.messages import Message, names_of, shortened
+from rdstitch.outputs import temporary_folder
 
 _MAX_PATTERN = 4096  # characters: longer names no file has, and compiling a pattern takes the square of its length
 IMAGE_SUFFIXES = frozenset(
@@ -121,12 +121,16 @@ def find_images(
     outputs: list[Path] = []
     notes: list[Message] = []
     containers: list[Path] = []
-    found = list(_expand(arguments, frames_folder, every, notes, containers, topic))
+    found = list(_expand(arguments, frames_folder, notes, containers))
     stills = [(item, named) for item, named in found if not isinstance(item, _Clip)]
     if every is None and stills:
         notes += [item.among(len(stills)) for item, _ in found if isinstance(item, _Clip)]
         found = list(stills)
-    for frame, named in ((frame, named) for item, named in found for frame in _frames_of(item)):
+    for frame, named in (
+        (frame, named)
+        for item, named in found
+        for frame in ([item] if isinstance(item, Frame) else item.extract(every, topic, notes))
+    ):
         is_output = frame.image is None and not is_url(frame.path) and is_rdstitch_output(frame.path)
         if _entry(frame.path) in unwanted and is_output:
             continue
@@ -153,10 +157,8 @@ def natural_key(path: Path) -> list[tuple[int, str | int]]:
 def _expand(
     arguments: Iterable[Named],
     frames_folder: Callable[[], Path] | None,
-    every: int | None,
     notes: list[Message],
     containers: list[Path],
-    topic: str | None,
     lists: tuple[Path, ...] = (),
 ) -> "Iterator[tuple[Frame | _Clip, bool]]":
     """Every frame or video, and whether it was named one by one; ``notes`` and ``containers`` are added.
@@ -178,7 +180,7 @@ def _expand(
                 containers.append(file)
                 # Another program may write the list while we read it: @<(find ...) in a shell.
                 names = names_in(read_text(file, regular=False))
-                yield from _expand(names, frames_folder, every, notes, containers, topic, (*lists, file))
+                yield from _expand(names, frames_folder, notes, containers, (*lists, file))
             elif glob.has_magic(text):
                 yield from ((Frame(found), False) for found in _matching(text))
             else:
@@ -187,14 +189,14 @@ def _expand(
             if frames_folder is None:
                 raise InputError(f"{path}: a ROS bag is no image here; use 'rdstitch mosaic'")
             containers += path.iterdir() if path.is_dir() else [path]
-            yield _Clip(path, partial(_frames_of_bag, path, frames_folder, every, topic, notes)), True
+            yield _Clip(path, frames_folder), True
         elif path.is_dir():
             yield from ((Frame(found), False) for found in _in_folder(path, notes))
         elif path.suffix.lower() in VIDEO_SUFFIXES:
             if frames_folder is None:
                 raise InputError(f"{path}: a video is no image here; use 'rdstitch mosaic' or extract its frames")
             containers.append(path)
-            yield _Clip(path, partial(_frames_of_video, path, frames_folder, every, notes)), True
+            yield _Clip(path, frames_folder), True
         else:
             yield Frame(path), True
 
@@ -204,7 +206,17 @@ class _Clip:
     """A video or bag among the arguments, whose frames are not extracted yet."""
 
     path: Path
-    extract: Callable[[], list[Frame]]
+    folder: Callable[[], Path]
+
+    def extract(self, every: int | None, topic: str | None, notes: list[Message]) -> list[Frame]:
+        """Write the frames that are wanted; what was passed over is added to the notes."""
+        if is_bag(self.path):
+            images, wanted = extract_images(self.path, self.folder(), every, topic)
+            notes += wanted.messages(self.path)
+            return images
+        wanted = wanted_frames(every, partial(grey_frames, self.path))
+        notes += wanted.messages(self.path)
+        return [Frame(*frame) for frame in extract_frames(self.path, self.folder(), wanted.__contains__)]
 
     def among(self, images: int) -> Message:
         """Why it is not used beside images.
@@ -218,24 +230,6 @@ class _Clip:
         if images < 2:
             raise InputError(f"{self.path}: is a video beside one image; {remedy}")
         return Message(f"is a video among images, and was not used; {remedy}", (str(self.path),))
-
-
-def _frames_of(item: Frame | _Clip) -> list[Frame]:
-    return item.extract() if isinstance(item, _Clip) else [item]
-
-
-def _frames_of_bag(
-    path: Path, folder: Callable[[], Path], every: int | None, topic: str | None, notes: list[Message]
-) -> list[Frame]:
-    images, wanted = extract_images(path, folder(), every, topic)
-    notes += wanted.messages(path)
-    return images
-
-
-def _frames_of_video(path: Path, folder: Callable[[], Path], every: int | None, notes: list[Message]) -> list[Frame]:
-    wanted = wanted_frames(every, partial(grey_frames, path))
-    notes += wanted.messages(path)
-    return [Frame(*frame) for frame in extract_frames(path, folder(), wanted.__contains__)]
 
 
 def _at_url(url: str) -> Iterator[tuple[Frame, bool]]:

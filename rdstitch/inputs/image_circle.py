@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
+from rdstitch.cache import Cache
 from rdstitch.errors import InputError
 from rdstitch.executors import in_order
 from rdstitch.inputs.input_guard import GuardNotes
@@ -40,11 +41,15 @@ class Circle:
     radius: float
 
 
-def with_image_circle(sources: Sequence[Source], executor: Executor, megapixels: float | None) -> list[Source]:
+def with_image_circle(
+    sources: Sequence[Source], executor: Executor, store: Cache, megapixels: float | None
+) -> list[Source]:
     """Give the cameras their image circle where the images show one; given lenses stay.
 
     Parameters
     ----------
+    store : Cache
+        Where the circle lies.
     megapixels : float or None
         Of detection, which reads the same images next.
     """
@@ -54,20 +59,26 @@ def with_image_circle(sources: Sequence[Source], executor: Executor, megapixels:
     chosen = alike[:: -(-len(alike) // _IMAGES)]
     if given or any(source.mask is not None for source in chosen):
         return list(sources)
-    seen = []
-    for grey, notes in in_order(executor, _grey_of, [(source, megapixels) for source in chosen]):
-        sources[0].guard.learn(notes)
-        seen += [] if grey is None else [grey]
-    circle = find_circle(np.mean(seen, axis=0)) if seen else None
-    if circle is None:
+
+    def compute() -> Circle | None:
+        seen = []
+        for grey, notes in in_order(executor, _grey_of, [(source, megapixels) for source in chosen]):
+            sources[0].guard.learn(notes)
+            seen += [] if grey is None else [grey]
+        circle = find_circle(np.mean(seen, axis=0)) if seen else None
+        if circle is None:
+            return None
+        factor = size[0] / seen[0].shape[1]
+        x, y = ((value + 0.5) * factor - 0.5 for value in circle.center)
+        return Circle((x, y), _RIM * circle.radius * factor)
+
+    found = store.recall("circles", ([source.content(store) for source in chosen], size, megapixels), compute)
+    if found is None:
         return list(sources)
-    factor = size[0] / seen[0].shape[1]
-    x, y = ((value + 0.5) * factor - 0.5 for value in circle.center)
-    radius = _RIM * circle.radius * factor
     return [
         source
         if source.camera.image_size != size
-        else replace(source, camera=replace(source.camera, center=(x, y), image_circle=radius))
+        else replace(source, camera=replace(source.camera, center=found.center, image_circle=found.radius))
         for source in sources
     ]
 

@@ -73,39 +73,29 @@ def _of_images(sources: Sequence[Source]) -> list[tuple[float, float]]:
 
 def _of_table(sources: Sequence[Source], file: str | Path) -> list[tuple[float, float]]:
     """(ψ, θ), radians, of each source by its line."""
-    table = _read_table(file)
+    table: dict[str, tuple[float, float]] = {}
+    try:
+        rows = csv.DictReader(read_text(file).splitlines(), skipinitialspace=True)
+        missing = [name for name in _TILT_COLUMNS if name not in (rows.fieldnames or ())]
+        if missing:
+            raise InputError(f"{file}: has no column {missing[0]!r}; its first line must be {','.join(_TILT_COLUMNS)}")
+        for row in rows:
+            name, where = canonical_text(row["name"] or ""), f"{file}: line {rows.line_num}"
+            try:
+                psi, theta = (math.radians(float(row[column])) for column in _TILT_COLUMNS[1:])
+            except (TypeError, ValueError):
+                raise InputError(f"{where}: psi and theta must be numbers, in degrees") from None
+            if not (abs(psi) < math.pi / 2 and abs(theta) < math.pi / 2):
+                raise InputError(f"{where}: psi and theta must lie between -90 and 90 degrees")
+            if name in table:
+                raise InputError(f"{where}: {name} is here twice; remove one")
+            table[name] = psi, theta
+    except csv.Error as error:
+        raise InputError(f"{file}: is not a CSV file: {error}") from error
     for source in sources:
         if source.name not in table:
             raise InputError(f"{file}: has no line for {source.name}; add one with its psi and theta")
     return [turned_tilt(table[source.name], turning_matrix(source.metadata.orientation)) for source in sources]
-
-
-def _read_table(file: str | Path) -> dict[str, tuple[float, float]]:
-    """(ψ, θ), radians, of each name."""
-    try:
-        return _read_rows(file)
-    except csv.Error as error:
-        raise InputError(f"{file}: is not a CSV file: {error}") from error
-
-
-def _read_rows(file: str | Path) -> dict[str, tuple[float, float]]:
-    rows = csv.DictReader(read_text(file).splitlines(), skipinitialspace=True)
-    missing = [name for name in _TILT_COLUMNS if name not in (rows.fieldnames or ())]
-    if missing:
-        raise InputError(f"{file}: has no column {missing[0]!r}; its first line must be {','.join(_TILT_COLUMNS)}")
-    attitudes: dict[str, tuple[float, float]] = {}
-    for row in rows:
-        name = canonical_text(row["name"] or "")
-        try:
-            psi, theta = (math.radians(float(row[column])) for column in _TILT_COLUMNS[1:])
-        except (TypeError, ValueError):
-            raise InputError(f"{file}: line {rows.line_num}: psi and theta must be numbers, in degrees") from None
-        if not (abs(psi) < math.pi / 2 and abs(theta) < math.pi / 2):
-            raise InputError(f"{file}: line {rows.line_num}: psi and theta must lie between -90 and 90 degrees")
-        if name in attitudes:
-            raise InputError(f"{file}: line {rows.line_num}: {name} is here twice; remove one")
-        attitudes[name] = psi, theta
-    return attitudes
 
 
 def positions_of(sources: Sequence[Source]) -> FloatArray:
@@ -143,50 +133,33 @@ def timestamps_of(sources: Sequence[Source], file: str | Path | None = None) -> 
         When the file cannot be read, or has no time for an image.
     """
     if file is None:
-        return np.array([_own_time(source) for source in sources])
-    named = _read_times(file, _state_of(file))
+        own = [(None if source.frame is None else source.frame.timestamp) for source in sources]
+        times = [s.metadata.timestamp if known is None else known for s, known in zip(sources, own, strict=True)]
+        return np.array([math.nan if time is None else time for time in times])
+    try:
+        status = Path(file).stat()
+        state = status.st_size, status.st_mtime_ns
+    except OSError:  # reading it says so
+        state = 0, 0
+    named = _read_times(file, state)
     if isinstance(named, list):
-        return _by_number(sources, named, file)
+        numbers = [source.number(position) for position, source in enumerate(sources)]
+        if max(numbers) >= len(named):
+            raise InputError(f"{file}: has {len(named)} times, but image or frame {max(numbers)} (from 0) needs one")
+        return np.array([named[number] for number in numbers])
     for source in sources:
         if source.name not in named:
             raise InputError(f"{file}: has no time for {source.name}; add a line with its name and time")
     return np.array([named[source.name] for source in sources])
 
 
-def _state_of(file: str | Path) -> tuple[int, int]:
-    """What changes when a file does; zeros where it is not there, so that reading it says so."""
-    try:
-        status = Path(file).stat()
-    except OSError:
-        return 0, 0
-    return status.st_size, status.st_mtime_ns
-
-
 @lru_cache(maxsize=1)  # frames that are followed ask one after the other
 def _read_times(file: str | Path, state: tuple[int, int]) -> list[float] | dict[str, float]:
-    """The times in order, or by the names of the images."""
+    """The times in order, or by the names of the images, of a file in a state."""
     lines = [line.strip() for line in read_text(file).splitlines()]
     lines = [line for line in lines if line and not line.startswith("#")]
     if lines and all(_is_number(line) for line in lines):
         return [float(line) for line in lines]
-    return _by_name(lines, file)
-
-
-def _own_time(source: Source) -> float:
-    if source.frame is not None and source.frame.timestamp is not None:
-        return source.frame.timestamp
-    return math.nan if source.metadata.timestamp is None else source.metadata.timestamp
-
-
-def _by_number(sources: Sequence[Source], times: Sequence[float], file: str | Path) -> FloatArray:
-    """One time for each image in order, or for each frame of the video that images were taken from."""
-    numbers = [source.number(position) for position, source in enumerate(sources)]
-    if max(numbers) >= len(times):
-        raise InputError(f"{file}: has {len(times)} times, but image or frame {max(numbers)} (from 0) needs one")
-    return np.array([times[number] for number in numbers])
-
-
-def _by_name(lines: Sequence[str], file: str | Path) -> dict[str, float]:
     if lines and all(name in lines[0] for name in _TIME_COLUMNS):
         rows = [(row["timestamp"], row["name"]) for row in csv.DictReader(lines, skipinitialspace=True)]
     else:

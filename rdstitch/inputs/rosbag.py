@@ -129,17 +129,14 @@ class _Messages:
             stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
             name = f"{self.path.stem}_{number:06d}"
             if connection.msgtype == _COMPRESSED:
-                file = folder / f"{name}{_suffix(message.data)}"
+                # By its first bytes: the format field is free text.
+                suffix = ".png" if bytes(message.data[:4]) == b"\x89PNG" else ".jpg"
+                file = folder / f"{name}{suffix}"
                 file.write_bytes(message.data.tobytes())
             else:
                 file = write_frame(folder / f"{name}.png", _pixels(self.path, message))
             # Drivers that do not set the stamp leave it 0; the recorder's time is then the best that is known.
             yield Frame(file, number, stamp or time_ns * 1e-9)
-
-
-def _suffix(data: NDArray[np.uint8]) -> str:
-    """Of a compressed image, by its first bytes: the format field is free text."""
-    return ".png" if bytes(data[:4]) == b"\x89PNG" else ".jpg"
 
 
 def _grey_of_compressed(data: NDArray[np.uint8]) -> NDArray[np.uint8]:

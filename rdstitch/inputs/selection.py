@@ -29,19 +29,12 @@ def selected(frames: Sequence[Frame], exclude: Sequence[str], include_only: Sequ
     for option, patterns in (("exclude", exclude), ("include-only", include_only)):
         for pattern in patterns:
             if not any(_fits(frame, pattern) for frame in frames):
+                called = frames[0].path if frames else Path("frame_0001.png")
                 raise ArgumentError(
-                    f"--{option} {pattern}: none of the {len(frames)} images has this name; {_names(frames)}"
+                    f"--{option} {pattern}: none of the {len(frames)} images has this name; they are called like "
+                    f"{called.name}, and patterns like {called.stem}* fit too"
                 )
     return [frame for frame in frames if is_selected(frame, exclude, include_only)]
-
-
-def _names(frames: Sequence[Frame]) -> str:
-    """How names look."""
-    return (
-        f"they are called like {frames[0].path.name}, and patterns like {frames[0].path.stem}* fit too"
-        if frames
-        else ""
-    )
 
 
 def is_selected(frame: Frame, exclude: Sequence[str], include_only: Sequence[str]) -> bool:

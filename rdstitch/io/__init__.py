@@ -1,6 +1,5 @@
 """Files in and out: images with their metadata, sidecars, and nothing half-written."""
 
-from rdstitch.io.atomic import check_output
 from rdstitch.io.attitude import Attitude
 from rdstitch.io.layout import Layout
 from rdstitch.io.metadata import GpsPosition, Metadata, read_metadata
@@ -14,7 +13,6 @@ __all__ = [
     "Layout",
     "Metadata",
     "check_format",
-    "check_output",
     "check_size",
     "read_image",
     "read_metadata",

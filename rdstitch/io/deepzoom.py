@@ -4,8 +4,6 @@ An image's levels, each half as large as the next, are cut into tiles while the 
 strips. Beside ``name.dzi``, which tells the size, the folder ``name_files`` holds ``LEVEL/COLUMN_ROW.jpg``.
 """
 
-import os
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.errors import OutputError
 from rdstitch.io.encoding import jpeg_pieces
 from rdstitch.io.layout import Layout, Strip, as_eight_bit, with_alpha
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import read_image
 from rdstitch.io.reduction import halved, reduced_size
+from rdstitch.outputs import tiles_folder
 
 MAX_TILE_PROFILE = 2**16
 """Bytes of a colour profile that is written into every tile; the larger ones of RGB images have 60 kB."""
@@ -27,45 +25,11 @@ MAX_TILE_PROFILE = 2**16
 TILE, OVERLAP = 254, 1
 """Side of the tiles and how far they reach into their neighbours, pixels."""
 
-_LEVEL_NAME, _TILE_NAME = re.compile(r"[0-9]{1,2}"), re.compile(r"[0-9]+_[0-9]+\.jpg")
 _DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
 <Image xmlns="http://schemas.microsoft.com/deepzoom/2008" Format="jpg" Overlap="{overlap}" TileSize="{tile}">
   <Size Width="{width}" Height="{height}"/>
 </Image>
 """
-
-
-def tiles_folder(path: Path) -> Path:
-    """The folder of the tiles that belong to a ``.dzi`` file."""
-    return path.with_name(f"{path.stem}_files")
-
-
-def check_tiles_folder(folder: Path, overwrite: bool) -> None:
-    """Refuse to replace a folder that is to be kept, or in which anything is no tile.
-
-    Raises
-    ------
-    OutputError
-        With what to do about it.
-    """
-    if not folder.exists():
-        return
-    if not overwrite:
-        raise OutputError(f"{folder}: exists already; choose another name or use --overwrite")
-    if folder.is_symlink() or not folder.is_dir() or not holds_only_tiles(folder):
-        raise OutputError(f"{folder}: is a link, or holds other files than Deep Zoom tiles; choose another name")
-
-
-def holds_only_tiles(folder: Path) -> bool:
-    """Whether everything in a folder, however deep, is what :func:`write_deep_zoom` writes there."""
-    with os.scandir(folder) as levels:
-        for level in levels:
-            if not _LEVEL_NAME.fullmatch(level.name) or not level.is_dir(follow_symlinks=False):
-                return False
-            with os.scandir(level) as tiles:
-                if not all(_TILE_NAME.fullmatch(tile.name) and tile.is_file(follow_symlinks=False) for tile in tiles):
-                    return False
-    return True
 
 
 def write_deep_zoom(description: Path, folder: Path, layout: Layout, strips: Iterable[Strip]) -> None:

@@ -16,14 +16,12 @@ from PIL import Image
 
 from rdstitch.errors import ArgumentError, LimitError, OutputError
 from rdstitch.io import ome
-from rdstitch.io.atomic import IMAGE_SUFFIXES
-from rdstitch.io.deepzoom import check_tiles_folder, tiles_folder, write_deep_zoom
+from rdstitch.io.deepzoom import write_deep_zoom
 from rdstitch.io.encoding import jpeg_pieces, png_pieces
-from rdstitch.io.fingerprint import Fingerprint, fingerprint
 from rdstitch.io.layout import STRIP_ROWS, Layout, Strip, as_eight_bit, check_strips
 from rdstitch.io.metadata import Metadata
-from rdstitch.io.outputs import Outputs, naming
 from rdstitch.io.tiff import ExtraTag, write_tiff
+from rdstitch.outputs import IMAGE_SUFFIXES, Fingerprint, Outputs, check_tiles_folder, fingerprint, naming, tiles_folder
 
 # Width and height that the formats (or their one encoder) can hold.
 SIDE_LIMITS = {".jpg": 65500, ".jpeg": 65500, ".webp": 16383, ".png": 1_000_000}

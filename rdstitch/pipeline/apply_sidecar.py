@@ -19,14 +19,12 @@ from rdstitch.inputs.frame import ChannelOrder, Frame, Images, as_inputs, files_
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import with_masks
 from rdstitch.inputs.source import Source, read_sources
-from rdstitch.io.atomic import check_output, json_bytes
 from rdstitch.io.opening import check_readable
-from rdstitch.io.outputs import Outputs
-from rdstitch.local_alignment import DisplacementField
 from rdstitch.messages import Message, told_once
 from rdstitch.messages import left_out as left_out_message
 from rdstitch.options import StitchOptions
-from rdstitch.pipeline.compose import Composed, compose_images, plainly_viewed, write_page
+from rdstitch.outputs import Outputs, check_output, json_bytes
+from rdstitch.pipeline.compose import compose_images, plainly_viewed, write_page
 from rdstitch.pipeline.flat_field import check_size, with_flat_field
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.recomposition import Recomposition, applied_sidecar
@@ -151,17 +149,12 @@ def apply(
             composed.place,
             composed.place_reason,
         )
-        return result if dry_run else _written(result, composed, list(used.values()), outputs)
-
-
-def _written(result: Recomposition, composed: Composed, used: Sequence[Source], outputs: Outputs) -> Recomposition:
-    """The result, with the page and the sidecar written, if the image went to a file."""
-    if (output := result.output) is None:
+        if dry_run or output is None:
+            return result
+        page = partial(plainly_viewed, composed.canvas, [source.name for source in used.values()])
+        result = replace(result, messages=(*result.messages, *write_page(outputs, output, composed, page)))
+        outputs.write(f"{output}.json", json_bytes(applied_sidecar(result)))
         return result
-    page = partial(plainly_viewed, composed.canvas, [source.name for source in used])
-    result = replace(result, messages=(*result.messages, *write_page(outputs, output, composed, page)))
-    outputs.write(f"{output}.json", json_bytes(applied_sidecar(result)))
-    return result
 
 
 def _placed(saved: SavedRegistration, used: Mapping[int, Source]) -> PlacedImages:
@@ -171,7 +164,10 @@ def _placed(saved: SavedRegistration, used: Mapping[int, Source]) -> PlacedImage
         [source.camera for source in used.values()],
         np.array([saved.images[index].to_plane for index in used], dtype=np.float64),
         list(used).index(saved.reference) if saved.reference in used else None,
-        [_displacement(saved, index, source) for index, source in used.items()],
+        [
+            None if field is None else field.resized(source.camera.image_size)
+            for field, source in ((saved.images[index].displacement, source) for index, source in used.items())
+        ],
         saved.turned,
         saved.place,
     )
@@ -193,12 +189,6 @@ def _used(
         first = next(iter(left_out.values()))
         raise InputError(f"{saved.path}: none of its images can be used; {first.images[0]}: {first.text}")
     return dict(zip(used, with_masks(list(used.values()), mask), strict=True))
-
-
-def _displacement(saved: SavedRegistration, index: int, source: Source) -> DisplacementField | None:
-    """The displacement of an image of the registration for the one that takes its place."""
-    field = saved.images[index].displacement
-    return None if field is None else field.resized(source.camera.image_size)
 
 
 def _check_outputs(output: Path, overwrite: bool, inputs: Sequence[Path], sidecar: Path) -> None:

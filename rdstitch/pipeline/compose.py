@@ -21,20 +21,19 @@ from rdstitch.compositing import (
     compose_to_file,
     plan_composite,
 )
-from rdstitch.compositing.blocks import Block, BlockRunner, BlockStrip
+from rdstitch.compositing.blocks import Block, BlockRunner
+from rdstitch.compositing.tiles import OutputStrip
 from rdstitch.errors import OutputError
 from rdstitch.executors import in_order
 from rdstitch.export.georeference import Georeference, has_place, world_file_paths
 from rdstitch.inputs.input_guard import GuardNotes
 from rdstitch.inputs.source import Source
-from rdstitch.io.atomic import check_output, text_bytes
 from rdstitch.io.colour import colour_space
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
-from rdstitch.io.fingerprint import Fingerprint
-from rdstitch.io.outputs import Outputs
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import check_memory, check_size
 from rdstitch.messages import Message, names_of, shortened
+from rdstitch.outputs import Fingerprint, Outputs, check_output, text_bytes
 from rdstitch.pipeline.map_canvas import moved, place_messages, plan_on_map
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.process_memory import return_freed_memory
@@ -263,7 +262,7 @@ def blocks_on(executor: Executor, sources: Sequence[Source], folder: Path | None
     if isinstance(executor, ThreadPoolExecutor):
         return None
 
-    def run(blocks: Iterable[Block]) -> Generator[list[Stored[BlockStrip]]]:
+    def run(blocks: Iterable[Block]) -> Generator[list[Stored[OutputStrip]]]:
         store = Cache.for_this_run(folder)
         tasks = (BlockTask(block, tuple(sources[k] for k in block.images), store) for block in blocks)
         with closing(in_order(executor, compose_block, tasks)) as done:
@@ -274,7 +273,7 @@ def blocks_on(executor: Executor, sources: Sequence[Source], folder: Path | None
     return run
 
 
-def compose_block(task: BlockTask) -> tuple[list[Stored[BlockStrip]], GuardNotes]:
+def compose_block(task: BlockTask) -> tuple[list[Stored[OutputStrip]], GuardNotes]:
     """Compute a block; and what was noticed of its files."""
     strips = task.block.compute(task.store)
     if not task.sources:

@@ -13,9 +13,8 @@ import numpy as np
 from rdstitch.compositing.boxes import intersection
 from rdstitch.compositing.preparation import prepare_composite
 from rdstitch.errors import OutputError
-from rdstitch.io.atomic import check_outputs
 from rdstitch.io.cropped_tiff import write_cropped_tiff
-from rdstitch.io.outputs import Outputs
+from rdstitch.outputs import Outputs, check_outputs
 from rdstitch.pipeline.composer import placed_by
 from rdstitch.pipeline.recomposition import Recomposition
 from rdstitch.stitch_result import StitchResult

@@ -16,13 +16,11 @@ from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.measurements import timestamps_of
 from rdstitch.inputs.source import Source
-from rdstitch.io.atomic import check_distinct, check_output, json_bytes, text_bytes
-from rdstitch.io.outputs import Outputs
-from rdstitch.io.staging import temporary_folder
 from rdstitch.local_alignment import LocalAlignment
 from rdstitch.messages import Message, told_once
 from rdstitch.options import StitchOptions
 from rdstitch.orientation import quarter_turn
+from rdstitch.outputs import Outputs, check_distinct, check_output, json_bytes, temporary_folder, text_bytes
 from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.compose import blocks_on, compose_images, viewed_images, write_page
 from rdstitch.pipeline.map_canvas import check_map
@@ -100,26 +98,13 @@ def mosaic(
 ) -> StitchResult:
     """Stitch a whole sequence on the rectified plane: seen straight from above, metric up to scale.
 
+    Parameters and errors are those of :func:`pano`, but that images that cannot be read are left out by name.
+
     Parameters
     ----------
     inputs : path, ndarray, or iterable of them
         Folders, images, patterns, ``@list`` files, videos, and arrays of shape (H, W) or (H, W, C), whose channels
-        are in the order of ``options.channel_order``; see :func:`rdstitch.inputs.frame.as_inputs`. Images that cannot
-        be read are left out by name.
-    output : path, optional
-        As for :func:`pano`.
-    options, every, progress, beside
-        As for :func:`pano`.
-
-    Returns
-    -------
-    StitchResult
-        The image or its file, with everything that was estimated.
-
-    Raises
-    ------
-    RdstitchError
-        See the tree in :mod:`rdstitch.errors`.
+        are in the order of ``options.channel_order``; see :func:`rdstitch.inputs.frame.as_inputs`.
 
     Examples
     --------
@@ -186,13 +171,10 @@ def mosaic_blocks(
                 results.append(result)
                 options, beside = replace(options, save_camera=None, reference=None), None
             pairs = zip(registration.sources, registration.alignment.used, strict=True)
-            done = {_frame_key(source.frame or Frame(source.path)) for source, used in pairs if used}
-            frames = [frame for frame in frames if _frame_key(frame) not in done]
+            used = [source.frame or Frame(source.path) for source, used in pairs if used]
+            done = {(frame.path, frame.number) for frame in used}
+            frames = [frame for frame in frames if (frame.path, frame.number) not in done]
     return (_without_blocks(results[0], results[1:], [*found.messages, *refused]), *map(_without_blocks, results[1:]))
-
-
-def _frame_key(frame: Frame) -> tuple[Path, int | None]:
-    return frame.path, frame.number
 
 
 def _without_blocks(
@@ -232,7 +214,10 @@ def _stitch(
         with options.executor(len(sources)) as executor:
             known = [*unread, *found.messages]
             accepted = _accepted(sources, known, options, executor, progress, skip_bad=not pano, prefer_turn=pano)
-            return _composite(accepted, executor, output, options, progress, beside, frontal=pano)
+            registration = on_whole_pixels(with_frontal_reference(accepted, options, always=pano))
+            local = align_registration_locally(registration, options.local_alignment)
+            with Outputs(options.overwrite) as outputs:
+                return compose_registration(registration, local, executor, output, options, progress, beside, outputs)
 
 
 def calibrate(
@@ -378,26 +363,6 @@ def _check_outputs(output: str | Path | None, options: StitchOptions, inputs: Se
 
         check_output(options.save_camera, options.overwrite, inputs, suffixes=CAMERA_SUFFIXES)
         check_distinct([options.save_camera, *([] if output is None else [f"{output}.json"])])
-
-
-def _composite(
-    registration: Registration,
-    executor: Executor,
-    output: str | Path | None,
-    options: StitchOptions,
-    progress: Progress,
-    beside: Callable[[Outputs, StitchResult], None] | None,
-    *,
-    frontal: bool,
-) -> StitchResult:
-    """Compose into memory, or into a file that is published with all that belongs to it.
-
-    ``frontal`` takes the undistorted reference image for the plane.
-    """
-    registration = on_whole_pixels(with_frontal_reference(registration, options, always=frontal))
-    local = align_registration_locally(registration, options.local_alignment)
-    with Outputs(options.overwrite) as outputs:
-        return compose_registration(registration, local, executor, output, options, progress, beside, outputs)
 
 
 def compose_registration(

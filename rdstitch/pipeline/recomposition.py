@@ -9,9 +9,9 @@ from rdstitch.compositing import Canvas, Composite, CompositeOptions, CompositeP
 from rdstitch.export.georeference import Georeference
 from rdstitch.inputs.frame import ChannelOrder
 from rdstitch.inputs.source import Source
-from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.messages import Message
 from rdstitch.orientation import inverse
+from rdstitch.outputs import Fingerprint
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.write import (

@@ -76,7 +76,7 @@ def register(
     cache = Cache.at(options.cache)
     layout_matters = not (lens_only or metric)
     if options.known_distortion is None:
-        sources = with_image_circle(sources, executor, options.features.limits[1])
+        sources = with_image_circle(sources, executor, cache, options.features.limits[1])
     aligner = Aligner.of(sources, options, cache, prefer_turn=prefer_turn, layout_matters=layout_matters)
     store = cache if options.cache is not None else Cache.for_this_run()
     rendered = detect_by_contrast(sources, options.features, executor, store, skip_bad=skip_bad, progress=progress)

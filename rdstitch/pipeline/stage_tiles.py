@@ -18,14 +18,13 @@ from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Images, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
-from rdstitch.io.atomic import check_distinct, check_output, text_bytes
-from rdstitch.io.outputs import Outputs
 from rdstitch.io.reduction import mean_of_channels
 from rdstitch.local_alignment import no_local_alignment
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.messages import MAX_NAMED, Message, names_of
 from rdstitch.options import StitchOptions
+from rdstitch.outputs import Outputs, check_distinct, check_output, text_bytes
 from rdstitch.pipeline.flat_field import check_size, with_flat_field
 from rdstitch.pipeline.recipes import compose_registration
 from rdstitch.progress import Progress, silent

@@ -17,10 +17,10 @@ from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import ChannelOrder, Images, as_inputs, in_order
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
-from rdstitch.io.atomic import IMAGE_SUFFIXES, check_outputs
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.write import write_image
 from rdstitch.messages import Message, ignored
+from rdstitch.outputs import IMAGE_SUFFIXES, check_outputs
 from rdstitch.progress import Progress, silent
 
 Framing = Literal["same", "all", "valid"]

@@ -79,13 +79,14 @@ def lens_curve(registration: Registration) -> str:
     places = _places(registration)
     farthest = float(np.linalg.norm(camera.normalize(camera.outline(1)), axis=1).max())
     radii = np.linspace(0.0, farthest, _SAMPLES + 1)[1:]
+    counts = np.histogram(np.linalg.norm(camera.normalize(places), axis=1), bins=_BINS, range=(0.0, farthest))[0]
     return section(
         "Lens curve",
         "How many pixels farther from the distortion centre the lens measures a ray than the one-parameter lens with "
         f"λ = {alignment.distortion:.4f} (red) does, with twice the standard deviation on either side; below it, how "
         f"many matches there are at each radius. {_support(camera, places, farthest)}",
         element("ul", (element("li", line) for line in describe_lens(alignment, camera))),
-        _curve(camera, radii, _counts(camera, places, farthest)),
+        _curve(camera, radii, np.asarray(counts / max(int(counts.max()), 1), dtype=np.float64)),
     )
 
 
@@ -99,13 +100,6 @@ def _places(registration: Registration) -> FloatArray:
             own = other.normalize(residuals(registration, fit)[0])
             found.append(camera.denormalize(own))
     return np.concatenate(found)
-
-
-def _counts(camera: Camera, places: FloatArray, farthest: float) -> FloatArray:
-    """Share of the matches at each of the radii of the bars, relative to the fullest bar."""
-    radius = np.linalg.norm(camera.normalize(places), axis=1)
-    counts = np.histogram(radius, bins=_BINS, range=(0.0, farthest))[0]
-    return np.asarray(counts / max(int(counts.max()), 1), dtype=np.float64)
 
 
 def _support(camera: Camera, places: FloatArray, farthest: float) -> str:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from rdstitch.io.outputs import Outputs
+from rdstitch.outputs import Outputs
 from rdstitch.registration import Registration
 from rdstitch.report.camera_path import path_over_plane
 from rdstitch.report.lens import grid, lens_curve, votes

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from rdstitch.messages import of_severity
 from rdstitch.options import StitchOptions
 from rdstitch.registration import Registration
 from rdstitch.report.geometry import of_source
@@ -21,14 +22,20 @@ _WIDTH, _ROW, _LEFT = 640.0, 22.0, 190.0
 
 def summary(registration: Registration, result: StitchResult | None) -> str:
     """λ and everything else of which there is one number, with the verdict."""
-    alignment, camera = registration.alignment, registration.camera
+    alignment, camera, reason = registration.alignment, registration.camera, registration.alignment.model_reason
+    known = {str(source.path) for source in registration.sources}
+    unread = sum(message.images[0] not in known for message in registration.left_out)
+    verdict = element("p", "The result passed its own checks.", class_="good")
+    if not registration.ok:
+        failures = "; ".join(message.clause for message in registration.failures)
+        verdict = element("p", f"Not to be relied on: {failures}", class_="bad")
     rows = [
         ("λ (half diagonal)", _lambda(registration)),
         ("λ per px²", f"{camera.distortion_px:.4e}"),
-        ("images", f"{int(alignment.used.sum())} of {len(alignment.used) + _unread(registration)}"),
+        ("images", f"{int(alignment.used.sum())} of {len(alignment.used) + unread}"),
         ("pairs", f"{sum(fit.used for fit in alignment.links)} used of {len(registration.pairs)} compared"),
         ("error", f"{alignment.rms:.3f} pixels rms of all inliers"),
-        ("motion", _motion(alignment.model, alignment.model_reason)),
+        ("motion", reason if reason.startswith(f"{alignment.model}:") else f"{alignment.model}: {reason}"),
         ("scene", alignment.relief.explanation),
         ("reference", registration.sources[alignment.reference].name),
     ]
@@ -39,18 +46,18 @@ def summary(registration: Registration, result: StitchResult | None) -> str:
         rows.append(("focal length", f"{camera.focal:.1f}{std} pixels ({camera.focal_source})"))
     if result is not None:
         rows.append(("output", "{} x {} pixels".format(*result.canvas.size)))
-    return section("Summary", "", _verdict(registration), table(rows))
+    return section("Summary", "", verdict, table(rows))
 
 
 def notices(registration: Registration) -> str:
     """Warnings, and images that were left out, each with the reason."""
-    warnings = [message.clause for message in (*registration.warnings, *registration.notes)]
-    return section(
-        "Warnings and left-out images",
-        "",
-        _bullets("What to look at", warnings, "No warnings."),
-        _left_out(registration),
-    )
+    told = [
+        message.clause for severity in ("warning", "note") for message in of_severity(registration.messages, severity)
+    ]
+    listed = element("p", "No warnings.")
+    if told:
+        listed = joined(element("h3", "What to look at"), element("ul", (element("li", item) for item in told)))
+    return section("Warnings and left-out images", "", listed, _left_out(registration))
 
 
 def _left_out(registration: Registration) -> str:
@@ -67,18 +74,6 @@ def _left_out(registration: Registration) -> str:
     return joined(element("h3", "Left out"), element("div", shown, class_="thumbnails"))
 
 
-def _motion(model: str, reason: str) -> str:
-    """The model with the reason for it, which may begin with its name."""
-    return reason if reason.startswith(f"{model}:") else f"{model}: {reason}"
-
-
-def _verdict(registration: Registration) -> str:
-    if registration.ok:
-        return element("p", "The result passed its own checks.", class_="good")
-    failures = "; ".join(message.clause for message in registration.failures)
-    return element("p", f"Not to be relied on: {failures}", class_="bad")
-
-
 def _lambda(registration: Registration) -> str:
     alignment = registration.alignment
     if not math.isfinite(alignment.distortion_std):
@@ -86,17 +81,6 @@ def _lambda(registration: Registration) -> str:
     if alignment.distortion_std == 0.0:
         return f"{alignment.distortion:.6f} (given)"
     return f"{alignment.distortion:.6f} ± {alignment.distortion_std:.6f}"
-
-
-def _unread(registration: Registration) -> int:
-    known = {str(source.path) for source in registration.sources}
-    return sum(message.images[0] not in known for message in registration.left_out)
-
-
-def _bullets(title: str, items: Sequence[str], none: str) -> str:
-    if not items:
-        return element("p", none)
-    return joined(element("h3", title), element("ul", (element("li", item) for item in items)))
 
 
 def run(options: StitchOptions | None, command: str) -> str:

@@ -14,9 +14,8 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.crs import Crs
 from rdstitch.export.georeference import Georeference
 from rdstitch.file_access import read_text
-from rdstitch.io.deepzoom import tiles_folder
-from rdstitch.io.fingerprint import Fingerprint, fingerprint
 from rdstitch.local_alignment import DisplacementField
+from rdstitch.outputs import Fingerprint, fingerprint, tiles_folder
 from rdstitch.sidecar.write import VERSION
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct, field
 
-from rdstitch.camera_record import CameraRecord, FocalSource, LensRecord
+from rdstitch.camera import CameraRecord, FocalSource, LensRecord
 from rdstitch.compositing.options import ProjectionName
 from rdstitch.records import Count, Matrix, NonNegative, Pair, Size, Triple, check_invertible
 from rdstitch.sidecar.write import VERSION

@@ -16,8 +16,8 @@ from rdstitch.compositing import Canvas
 from rdstitch.compositing.panorama_canvas import center_of_view, field_of_view
 from rdstitch.compositing.projection import PLANE
 from rdstitch.export.georeference import Georeference
-from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.local_alignment import DisplacementField, LocalAlignment
+from rdstitch.outputs import Fingerprint
 from rdstitch.registration import Registration
 from rdstitch.stitch_result import StitchResult
 

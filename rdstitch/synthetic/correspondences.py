@@ -1,6 +1,7 @@
 """Matches of one pair of images, with noise and outliers and their truth: for tests of robust estimation."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +88,22 @@ def correspondences(
     camera = Camera(image_size, distortion, focal=f, focal_source="option")
     half = (np.array(image_size) - 1.0) / 2.0
     right = count - round(count * outliers)
-    drawn = _instance(camera, half / f, motion, right, seed, max_tilt, max_height_change, overlap)
+    # The longest motion is that which still leaves images of this field of view something in common.
+    shared: dict[str, Any] = {
+        "seed": seed,
+        "distortion": (camera.distortion_px * f**2,) * 2,
+        "translation": (0.1 * half_diagonal / f, 1.5 * half_diagonal / f),
+        "half_size": tuple((half / f).tolist()),
+        "overlap": overlap,
+    }
+    drawn: Instances
+    if motion == "homography":
+        drawn = general_instances(1, right, max_angle=max_tilt, **shared)
+    elif motion in ("rigid", "similarity"):
+        change = max_height_change if motion == "similarity" else 0.0
+        drawn = planar_instances(1, right, max_tilt=max_tilt, height=(1.0 - change, 1.0 + change), **shared)
+    else:
+        raise ArgumentError(f"motion must be rigid, similarity or homography, not {motion!r}")
 
     rng = np.random.default_rng((seed, 1))
     points1, points2 = (half * rng.uniform(-1.0, 1.0, (count, 2)) for _ in range(2))
@@ -111,46 +127,3 @@ def correspondences(
         solver="truth",
     )
     return SyntheticMatches(points1 + camera.center, points2 + camera.center, quality, truth)
-
-
-def _instance(
-    camera: Camera,
-    half_size: FloatArray,
-    motion: str,
-    count: int,
-    seed: int,
-    max_tilt: float,
-    max_height_change: float,
-    overlap: float,
-) -> Instances:
-    """One instance of ``count`` noise-free correspondences, in focal-normalized coordinates."""
-    assert camera.focal is not None
-    lam = camera.distortion_px * camera.focal**2
-    field = (float(half_size[0]), float(half_size[1]))
-    # The longest motion is that which still leaves images of this field of view something in common.
-    length = (0.1 * camera.half_diagonal / camera.focal, 1.5 * camera.half_diagonal / camera.focal)
-    if motion == "homography":
-        return general_instances(
-            1,
-            count,
-            seed=seed,
-            distortion=(lam, lam),
-            max_angle=max_tilt,
-            translation=length,
-            half_size=field,
-            overlap=overlap,
-        )
-    if motion not in ("rigid", "similarity"):
-        raise ArgumentError(f"motion must be rigid, similarity or homography, not {motion!r}")
-    change = max_height_change if motion == "similarity" else 0.0
-    return planar_instances(
-        1,
-        count,
-        seed=seed,
-        distortion=(lam, lam),
-        max_tilt=max_tilt,
-        translation=length,
-        height=(1.0 - change, 1.0 + change),
-        half_size=field,
-        overlap=overlap,
-    )

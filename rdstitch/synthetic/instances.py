@@ -64,7 +64,12 @@ class Instances:
         order = np.lexsort((error, sample))
         first = order[np.r_[True, np.diff(sample[order]) > 0]] if len(order) else order
         distortion_error[sample[first]] = error[first]
-        homography_error[sample[first]] = _distance(solutions.homography[first], self.homography[sample[first]])
+        found, true = (
+            h / np.linalg.norm(h, axis=(1, 2), keepdims=True)
+            for h in (solutions.homography[first], self.homography[sample[first]])
+        )
+        both = [np.linalg.norm(found + sign * true, axis=(1, 2)) for sign in (-1.0, 1.0)]
+        homography_error[sample[first]] = np.minimum(*both)
         return distortion_error, homography_error
 
 
@@ -158,18 +163,8 @@ def planar_instances(
         middle = rigid_in_plane(motion[which, 0], motion[which, 1:3], motion[which, 3])
         return rotation2[which] @ middle @ np.swapaxes(rotation[which], 1, 2)
 
-    x1, x2, h = visible_points(rng, lam, rotation[:, :, 2], points, half_size, overlap, draw)
-    return PlanarInstances(
-        x1=x1 + noise * rng.standard_normal(x1.shape),
-        x2=x2 + noise * rng.standard_normal(x2.shape),
-        homography=h,
-        distortion=lam,
-        tilt=tilt,
-        tilt2=tilt2,
-        yaw=motion[:, 0],
-        translation=motion[:, 1:3],
-        height=motion[:, 3],
-    )
+    x1, x2, h = _visible_points(rng, lam, rotation[:, :, 2], points, half_size, overlap, noise, draw)
+    return PlanarInstances(x1, x2, h, lam, tilt, tilt2, motion[:, 0], motion[:, 1:3], motion[:, 3])
 
 
 def general_instances(
@@ -202,25 +197,21 @@ def general_instances(
         t *= (rng.uniform(*translation, len(which)) / np.linalg.norm(t, axis=1))[:, None]
         return attitude @ turn @ (np.eye(3) - t[:, :, None] * normal[which][:, None, :])
 
-    x1, x2, h = visible_points(rng, lam, normal, points, half_size, overlap, draw)
-    return Instances(
-        x1=x1 + noise * rng.standard_normal(x1.shape),
-        x2=x2 + noise * rng.standard_normal(x2.shape),
-        homography=h,
-        distortion=lam,
-    )
+    x1, x2, h = _visible_points(rng, lam, normal, points, half_size, overlap, noise, draw)
+    return Instances(x1, x2, h, lam)
 
 
-def visible_points(
+def _visible_points(
     rng: np.random.Generator,
     distortion: FloatArray,
     normal: FloatArray,
     points: int,
     half_size: Range,
     overlap: float,
+    noise: float,
     draw: Callable[[IndexArray], FloatArray],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Points of image 1 and where image 2 sees them; motions without enough of them are drawn again."""
+    """Draw points of image 1 and where image 2 sees them, both noisy, and H; motions without enough are drawn again."""
     count, drawn = len(distortion), int(np.ceil(points / overlap))
     half = np.asarray(half_size)
     if np.min(1.0 + distortion * np.sum(half**2), initial=1.0) <= 0.0:
@@ -230,14 +221,16 @@ def visible_points(
     missing = np.arange(count)
     for _ in range(_MAX_ROUNDS):
         if not len(missing):
+            x1 += noise * rng.standard_normal(x1.shape)
+            x2 += noise * rng.standard_normal(x2.shape)
             return x1, x2, h
         motion = draw(missing)
         candidates = half * rng.uniform(-1.0, 1.0, (len(missing), drawn, 2))
-        seen = _batch_transfer(motion, distortion[missing], candidates)
+        rays = lift(candidates, distortion[missing, None])
+        seen = distort(project(rays @ np.swapaxes(motion, 1, 2)), distortion[missing, None])
+        steepness = np.einsum("bki,bi->bk", rays, normal[missing]) / np.linalg.norm(rays, axis=-1)
         # NaN, a point that cannot be seen, compares as False.
-        visible = (np.abs(seen) <= half).all(axis=-1) & (
-            _steepness(candidates, distortion[missing], normal[missing]) > _MIN_STEEPNESS
-        )
+        visible = (np.abs(seen) <= half).all(axis=-1) & (steepness > _MIN_STEEPNESS)
         first = np.argsort(~visible, axis=1, kind="stable")[:, :points, None]
         enough = visible.sum(axis=1) >= points
         x1[missing] = np.take_along_axis(candidates, first, axis=1)
@@ -245,27 +238,6 @@ def visible_points(
         h[missing] = motion
         missing = missing[~enough]
     raise ArgumentError("these ranges give images that have too few points in common")
-
-
-def _steepness(points: FloatArray, distortion: FloatArray, normal: FloatArray) -> FloatArray:
-    """Cosine between the ray of each measured point (B, k, 2) and its plane's normal (B, 3)."""
-    rays = lift(points, distortion[:, None])
-    cosine: FloatArray = np.einsum("bki,bi->bk", rays, normal) / np.linalg.norm(rays, axis=-1)
-    return cosine
-
-
-def _batch_transfer(homography: FloatArray, distortion: FloatArray, points: FloatArray) -> FloatArray:
-    """Each instance's own points (B, k, 2) through its own H and λ."""
-    lifted = lift(points, distortion[:, None])
-    return distort(project(lifted @ np.swapaxes(homography, 1, 2)), distortion[:, None])
-
-
-def _distance(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Frobenius distance of batches of homographies, scaled to unit norm, for the better sign."""
-    a = a / np.linalg.norm(a, axis=(1, 2), keepdims=True)
-    b = b / np.linalg.norm(b, axis=(1, 2), keepdims=True)
-    distance: FloatArray = np.minimum(np.linalg.norm(a - b, axis=(1, 2)), np.linalg.norm(a + b, axis=(1, 2)))
-    return distance
 
 
 @dataclass(frozen=True)
@@ -325,15 +297,8 @@ def rotation_instances(
 
     # In front of image 1 every ray counts, however oblique: there is no plane that it should meet.
     ahead = np.tile([0.0, 0.0, 1.0], (count, 1))
-    x1, x2, h = visible_points(rng, lam, ahead, points, half_size, overlap, draw)
-    return RotationInstances(
-        x1=x1 + noise * rng.standard_normal(x1.shape),
-        x2=x2 + noise * rng.standard_normal(x2.shape),
-        homography=h,
-        distortion=lam,
-        rotation=h * (k[:, None, :] / k[:, :, None]),
-        focal=length,
-    )
+    x1, x2, h = _visible_points(rng, lam, ahead, points, half_size, overlap, noise, draw)
+    return RotationInstances(x1, x2, h, lam, h * (k[:, None, :] / k[:, :, None]), length)
 
 
 def _about(axes: FloatArray, angles: FloatArray) -> FloatArray:

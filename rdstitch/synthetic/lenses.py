@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from rdstitch.arrays import FloatArray
 from rdstitch.camera import Camera, border_of
 from rdstitch.camera_files.lens_fit import fit_lens
-from rdstitch.camera_files.lens_models import Brown
+from rdstitch.camera_files.lens_models import LensModel
 from rdstitch.errors import ArgumentError
 
 _FISHEYES: dict[str, tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], FloatArray]]] = {
@@ -145,9 +145,8 @@ class BrownLens(_FixedFocalLens):
     p2: float = 0.0
 
     @property
-    def _model(self) -> Brown:
-        radial = (self.k1, self.k2, self.k3)
-        return Brown((self.focal, self.focal), self.center, radial, (self.p1, self.p2))
+    def _model(self) -> LensModel:
+        return LensModel((self.focal,) * 2, self.center, (self.k1, self.k2, self.p1, self.p2, self.k3))
 
     def distort(self, points: ArrayLike) -> FloatArray:
         """Pinhole pixels to measured pixels; where the polynomial has folded, the result has no meaning."""

@@ -1,9 +1,9 @@
 """Tiles that a microscope's motorised stage brings before the camera, with their true places, lens and illumination."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -73,7 +73,6 @@ class StageGrid:
     distortion: float = 0.0
     electrons: float = 2.0
     seed: int = 0
-    _grounds: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1 or not 0.0 < self.overlap < 1.0:
@@ -129,16 +128,11 @@ class StageGrid:
         """Pattern of the file names, as ``--grid`` takes it."""
         return "r{row}c{col}"
 
-    def tissue(self, index: int) -> float:
-        """Share of a tile that shows content."""
-        x, y = (self._coordinates(index, 32) - self._origin).transpose(2, 0, 1).astype(np.int64)
-        return float((self._ground["tissue"][y, x] > 0.5).mean())
-
     def render(self, index: int) -> NDArray[np.uint16]:
         """One tile as the camera gives it, (tile, tile) or (tile, tile, 3), counts of 12 bits."""
         rng = np.random.default_rng([self.seed, 2, index])
         maps = (self._coordinates(index) - self._origin).astype(np.float32)
-        light = cv2.remap(self._ground["light"], maps[..., 0], maps[..., 1], cv2.INTER_LANCZOS4)
+        light = cv2.remap(self._ground, maps[..., 0], maps[..., 1], cv2.INTER_LANCZOS4)
         light = np.maximum(light.reshape(self.tile, self.tile, self.channels), 0.0) * self.flat_field
         # Shot noise of the electrons, and 1.5 counts of the amplifier.
         counts = light + rng.normal(size=light.shape) * np.sqrt(light / self.electrons + 1.5**2) + self.offset
@@ -154,9 +148,9 @@ class StageGrid:
         (folder / "positions.csv").write_text("\n".join(["name,x,y", *rows, ""]), encoding="utf-8")
         return files
 
-    def _coordinates(self, index: int, step: int = 1) -> FloatArray:
-        """Where every ``step``-th pixel of a tile lies on the ground, (h, w, 2)."""
-        side = np.arange(0, self.tile, step, dtype=np.float64)
+    def _coordinates(self, index: int) -> FloatArray:
+        """Where every pixel of a tile lies on the ground, (h, w, 2)."""
+        side = np.arange(self.tile, dtype=np.float64)
         points = np.stack(np.meshgrid(side, side), axis=-1)
         return np.asarray(self.camera.undistort(points.reshape(-1, 2)).reshape(points.shape) + self.places[index])
 
@@ -170,30 +164,24 @@ class StageGrid:
         corner = self.camera.undistort(np.zeros((1, 2)))[0]
         return float(_APRON + max(0.0, -corner.min()))
 
-    @property
-    def _ground(self) -> dict[str, Any]:
-        if not self._grounds:
-            extent = np.ptp(self.places, axis=0) + self.tile + 2 * self._beyond
-            width, height = np.ceil(extent).astype(int).tolist()
-            self._grounds.update(_ground((height, width), self))
-        return self._grounds
-
-
-def _ground(size: tuple[int, int], grid: StageGrid) -> dict[str, Any]:
-    """Light that the specimen sends, (h, w, C) float32, and where there is tissue, (h, w)."""
-    rng = np.random.default_rng([grid.seed, 3])
-    coarse = _clouds(rng, size, grid.tile * 0.8)
-    level = np.quantile(coarse[::16, ::16], 1.0 - grid.content)
-    tissue = np.clip((coarse - level) / 0.05 + 0.5, 0.0, 1.0).astype(np.float32)
-    nuclei = _nuclei(rng, size, tissue)
-    grain = _clouds(rng, size, 24.0)
-    if grid.specimen == "fluorescence":
-        light = 60.0 + 40.0 * tissue * (1.0 + 0.5 * grain) + 900.0 * nuclei * (1.0 + 0.2 * grain)
-        return {"light": light.astype(np.float32), "tissue": tissue}
-    fibres = _clouds(rng, size, 9.0)
-    stain = tissue * (0.25 + 0.08 * grain + 0.08 * fibres) + 0.8 * nuclei
-    colours = np.array([0.7, 1.0, 0.5], dtype=np.float32)
-    return {"light": 2600.0 * np.exp(-np.maximum(stain, 0.0)[..., None] * colours), "tissue": tissue}
+    @cached_property
+    def _ground(self) -> NDArray[np.float32]:
+        """Light that the specimen sends, (h, w) or (h, w, 3)."""
+        extent = np.ptp(self.places, axis=0) + self.tile + 2 * self._beyond
+        width, height = np.ceil(extent).astype(int).tolist()
+        size, rng = (height, width), np.random.default_rng([self.seed, 3])
+        coarse = _clouds(rng, size, self.tile * 0.8)
+        level = np.quantile(coarse[::16, ::16], 1.0 - self.content)
+        tissue = np.clip((coarse - level) / 0.05 + 0.5, 0.0, 1.0).astype(np.float32)
+        nuclei = _nuclei(rng, size, tissue)
+        grain = _clouds(rng, size, 24.0)
+        if self.specimen == "fluorescence":
+            light = 60.0 + 40.0 * tissue * (1.0 + 0.5 * grain) + 900.0 * nuclei * (1.0 + 0.2 * grain)
+            return np.asarray(light, dtype=np.float32)
+        fibres = _clouds(rng, size, 9.0)
+        stain = tissue * (0.25 + 0.08 * grain + 0.08 * fibres) + 0.8 * nuclei
+        colours = np.array([0.7, 1.0, 0.5], dtype=np.float32)
+        return np.asarray(2600.0 * np.exp(-np.maximum(stain, 0.0)[..., None] * colours), dtype=np.float32)
 
 
 def _clouds(rng: np.random.Generator, size: tuple[int, int], grain: float) -> NDArray[np.float32]:

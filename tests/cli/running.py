@@ -16,8 +16,7 @@ import numpy as np
 from jsonschema import Draft202012Validator
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera import Camera
-from rdstitch.camera_record import CameraRecord
+from rdstitch.camera import Camera, CameraRecord
 from rdstitch.radial_homography import project
 from rdstitch.records import convert
 from rdstitch.sidecar.schema import json_schema

@@ -8,7 +8,7 @@ import pytest
 
 import rdstitch as library
 from rdstitch.camera_files import load_camera
-from rdstitch.camera_files.lens_models import Fisheye, fisheye_of
+from rdstitch.camera_files.lens_models import nearest_model
 from rdstitch.synthetic import FisheyeLens, ground
 from tests.cli.running import CACHED, Run
 
@@ -66,8 +66,7 @@ def test_the_camera_file_is_read_to_the_horizon(folder: Path) -> None:
     near = angle < 80.0
     assert np.linalg.norm(LENS.distort(straight[near]) - points[near], axis=1).max() < 0.1
     assert np.isnan(straight[angle > 91.0]).all()
-    model, fit = fisheye_of(camera)
-    assert isinstance(model, Fisheye)
+    _, fit = nearest_model(camera, "fisheye")
     assert fit.largest < 0.1
 
 

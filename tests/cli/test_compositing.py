@@ -97,10 +97,10 @@ def test_no_amount_of_memory(rdstitch: Run, sidecar: Path, tmp_path: Path, text:
 
 
 def test_amounts_of_memory() -> None:
-    from rdstitch_cli.parameter_types import Bytes
+    from rdstitch_cli.parameter_types import BYTES
 
     amounts = {"800M": 800 * 2**20, "2G": 2**31, "1.5 GiB": 3 * 2**29, "64k": 65536, "12345": 12345}
-    assert {text: Bytes().convert(text, None, None) for text in amounts} == amounts
+    assert {text: BYTES.convert(text, None, None) for text in amounts} == amounts
 
 
 def test_dry_run_reports_and_writes_nothing(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from rdstitch_cli.options import FEATURES
 
 from rdstitch.arrays import FloatArray
-from rdstitch.camera_record import CameraRecord
+from rdstitch.camera import CameraRecord
 from rdstitch.features import KINDS
 from rdstitch.records import convert
 from tests.cli.running import Run, transfers

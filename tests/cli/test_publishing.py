@@ -138,7 +138,7 @@ def test_the_report_is_published_with_the_image(
 
 _KILLED_WHILE_PUBLISHING = """
 import os, signal
-from rdstitch.io.outputs import Outputs
+from rdstitch.outputs import Outputs
 from rdstitch_cli.main import main
 place, left = Outputs._place, [{published}]
 def publish(outputs, item):

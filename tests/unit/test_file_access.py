@@ -11,10 +11,10 @@ from rdstitch.errors import InputError, OutputError
 from rdstitch.file_access import is_url, url_of
 from rdstitch.inputs.find import find_images
 from rdstitch.inputs.source import Source, read_sources
-from rdstitch.io.atomic import check_output
 from rdstitch.io.metadata import read_metadata
 from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
+from rdstitch.outputs import check_output
 
 fsspec = pytest.importorskip("fsspec")
 

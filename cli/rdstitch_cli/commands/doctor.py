@@ -31,7 +31,7 @@ def doctor(inputs: tuple[Path, ...], every: int | None, topic: str | None, as_js
     written.
     """
     from rdstitch.doctor import examine
-    from rdstitch.io.atomic import json_bytes
+    from rdstitch.outputs import json_bytes
 
     found = examine(options.resolve(inputs), every=every, topic=topic, progress=reporter)
     reporter.finish()

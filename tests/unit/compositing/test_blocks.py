@@ -10,8 +10,9 @@ import pytest
 
 from rdstitch.cache import Cache
 from rdstitch.compositing import CompositeOptions
-from rdstitch.compositing.blocks import Block, BlockStrip
+from rdstitch.compositing.blocks import Block
 from rdstitch.compositing.compositor import compose
+from rdstitch.compositing.tiles import OutputStrip
 from rdstitch.stored import Stored
 from rdstitch.synthetic.rendering import Photometry
 from tests.compositing_scenes import Scene, render
@@ -32,7 +33,7 @@ def test_blocks_give_the_same_bytes(scene: Scene, tmp_path: Path, blend: Any, se
     options = CompositeOptions(blend=blend, seam=seam, crop=crop, tile_size=256)
     store, computed, images = Cache.at(tmp_path), [], []
 
-    def elsewhere(blocks: Iterable[Block]) -> Generator[list[Stored[BlockStrip]]]:
+    def elsewhere(blocks: Iterable[Block]) -> Generator[list[Stored[OutputStrip]]]:
         for block in blocks:
             # As a worker in another process has it.
             copy = pickle.loads(pickle.dumps(block))

@@ -16,13 +16,11 @@ import pytest
 from rdstitch.camera import Camera
 from rdstitch.compositing.image_cache import ImageCache
 from rdstitch.compositing.placed_image import PlacedImage, place_images
-from rdstitch.compositing.source_images import NOTHING, ImageOnDisk, ImageReader, prepare_image
+from rdstitch.compositing.source_images import ImageOnDisk, ImageReader, prepare_image
 from rdstitch.errors import InputError
 from rdstitch.io import DecodedImage
 from rdstitch.io.read import reduced
 from tests.compositing_scenes import as_image
-
-WHOLE = (0, 0, 200, 100)
 
 
 class DecodedImageCache:
@@ -56,10 +54,10 @@ def test_those_used_last_are_held_and_the_others_wait_on_disk(
     decoded_images = DecodedImageCache()
     cache = decoded_images.cache(limit=2 * 20_000)
     for index in (0, 1, 0, 1, 2, 1, 0):
-        np.testing.assert_array_equal(cache.get(index, WHOLE).pixels, decoded_images.frames[index])
+        np.testing.assert_array_equal(cache.get(index).pixels, decoded_images.frames[index])
     assert decoded_images.reads == {0: 1 if writable else 2, 1: 1, 2: 1}
     assert sum(file.stat().st_size for file in tmp_path.rglob("*")) >= 20_000 * writable
-    cache.expect([WHOLE, WHOLE, NOTHING, NOTHING])
+    cache.expect({0, 1})
     cache.close()
     assert not list(tmp_path.iterdir())
 
@@ -76,12 +74,11 @@ def test_what_waits_on_disk_comes_back_as_it_was(kind: str) -> None:
     cache, whole = ImageCache(reader, [1.0] * 3, 1), [prepare_image(p, 1.0) for p in images]
     for _ in range(2):
         for index in range(3):
-            kept, expected = cache.get(index, (50, 20, 90, 77)), whole[index].cut((50, 20, 90, 77))
-            x, y = (a - b for a, b in zip(expected.origin, kept.origin, strict=True))
-            for got, true in ((kept.pixels, expected.pixels), (kept.opacity, expected.opacity)):
+            kept = cache.get(index)
+            for got, true in ((kept.pixels, whole[index].pixels), (kept.opacity, whole[index].opacity)):
                 assert got is not None
                 assert true is not None
-                np.testing.assert_array_equal(got[y : y + len(true), x : x + true.shape[1]], true)
+                np.testing.assert_array_equal(got, true)
 
 
 def test_a_full_disk_costs_time_only(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,44 +89,22 @@ def test_a_full_disk_costs_time_only(monkeypatch: pytest.MonkeyPatch) -> None:
     decoded_images = DecodedImageCache()
     cache = decoded_images.cache(limit=20_000)
     for index in (0, 1, 0):
-        np.testing.assert_array_equal(cache.get(index, WHOLE).pixels, decoded_images.frames[index])
+        np.testing.assert_array_equal(cache.get(index).pixels, decoded_images.frames[index])
     assert decoded_images.reads == {0: 2, 1: 1}
 
 
-def test_parts_take_less_room() -> None:
+def test_what_is_not_expected_makes_room_and_is_read_once_more_if_need_be() -> None:
     decoded_images = DecodedImageCache()
-    cache = decoded_images.cache(limit=20_000)
-    cache.expect([(50, 10, 100, 30)] * 4)
-    for index in (0, 1, 2, 3, 0, 1, 2, 3):
-        held = cache.get(index, (60, 10, 90, 30))
-        x, y = held.origin
-        np.testing.assert_array_equal(held.pixels[12 - y, 61 - x], decoded_images.frames[index][12, 61])
-    assert max(decoded_images.reads.values()) == 1
-
-
-def test_more_than_expected_is_read_once_more_and_kept() -> None:
-    decoded_images = DecodedImageCache()
-    cache = decoded_images.cache(limit=80_000)
-    cache.expect([(50, 10, 100, 30), NOTHING, WHOLE, WHOLE])
-    for part in ((60, 10, 90, 30), (0, 0, 90, 30), (90, 10, 200, 100)):
-        assert cache.get(0, part).holds(part)
-        assert cache.get(1, part).holds(part)
-    cache.expect([NOTHING] * 4)
-    assert cache.get(0, WHOLE).holds(WHOLE)
-    assert decoded_images.reads == {0: 2, 1: 1}
-
-
-def test_parts_that_are_done_with_go_before_images_do() -> None:
-    decoded_images = DecodedImageCache()
-    cache = decoded_images.cache(limit=50_000)
-    for index in (0, 1):
-        cache.get(index, WHOLE)
-    cache.expect([(0, 0, 100, 40), (0, 50, 200, 100), WHOLE, WHOLE])
-    assert cache.get(0, (0, 0, 10, 10)).holds(WHOLE), "there is room for all of it"
-    cache.get(2, WHOLE)
-    assert not cache.get(0, (0, 0, 100, 40)).holds(WHOLE)
-    np.testing.assert_array_equal(cache.get(1, (0, 50, 200, 100)).pixels[-1], decoded_images.frames[1][-1])
+    cache = decoded_images.cache(limit=40_000)
+    cache.get(0)
+    cache.get(1)
+    cache.expect({1, 2})
+    cache.get(2)
+    cache.get(1)
     assert decoded_images.reads == {0: 1, 1: 1, 2: 1}
+    np.testing.assert_array_equal(cache.get(0).pixels, decoded_images.frames[0])
+    np.testing.assert_array_equal(cache.get(0).pixels, decoded_images.frames[0])
+    assert decoded_images.reads == {0: 2, 1: 1, 2: 1}
 
 
 def _until(told: Callable[[], bool]) -> None:
@@ -143,16 +118,16 @@ def _until(told: Callable[[], bool]) -> None:
 def test_images_are_read_ahead_where_there_is_room() -> None:
     decoded_images = DecodedImageCache()
     cache = decoded_images.cache(limit=45_000, ahead=True)
-    cache.expect([WHOLE, WHOLE, WHOLE, NOTHING])
+    cache.expect({0, 1, 2})
     cache.prefetch([3, 1, 0, 2, 1])
     _until(lambda: decoded_images.reads.total() == 2)
-    np.testing.assert_array_equal(cache.get(0, WHOLE).pixels, decoded_images.frames[0])
-    np.testing.assert_array_equal(cache.get(1, WHOLE).pixels, decoded_images.frames[1])
+    np.testing.assert_array_equal(cache.get(0).pixels, decoded_images.frames[0])
+    np.testing.assert_array_equal(cache.get(1).pixels, decoded_images.frames[1])
     assert decoded_images.reads == {0: 1, 1: 1}
-    cache.expect([NOTHING, WHOLE, WHOLE, NOTHING])
+    cache.expect({1, 2})
     cache.prefetch([2])
     _until(lambda: decoded_images.reads[2] == 1)
-    np.testing.assert_array_equal(cache.get(2, WHOLE).pixels, decoded_images.frames[2])
+    np.testing.assert_array_equal(cache.get(2).pixels, decoded_images.frames[2])
     assert decoded_images.reads == {0: 1, 1: 1, 2: 1}
 
 
@@ -173,7 +148,7 @@ def test_nothing_is_read_ahead_once_it_is_closed() -> None:
     cache.close()
     cache.prefetch(range(4))
     assert decoded_images.reads == {0: 1}
-    np.testing.assert_array_equal(cache.get(3, WHOLE).pixels, decoded_images.frames[3])
+    np.testing.assert_array_equal(cache.get(3).pixels, decoded_images.frames[3])
 
 
 @pytest.mark.parametrize("shrink", [1.0, 3.9, 5.0])
@@ -195,20 +170,4 @@ def test_a_failed_prefetch_raises_where_the_image_is_read() -> None:
     cache.prefetch([1, 2])
     _until(lambda: decoded_images.reads[2] == 1)
     with pytest.raises(InputError, match="image 2 has 200 x 50 pixels"):
-        cache.get(1, WHOLE)
-
-
-@pytest.mark.parametrize("shrink", [1.0, 5.0])
-def test_a_cut_holds_what_was_requested(shrink: float) -> None:
-    frame = np.random.default_rng(1).integers(0, 256, (300, 400, 3), dtype=np.uint8)
-    whole = prepare_image(as_image(frame), shrink)
-    part = whole.cut((101, 53, 222, 177))
-    again = part.cut((150, 100, 160, 110))
-    for smaller, box in ((part, (101, 53, 222, 177)), (again, (150, 100, 160, 110))):
-        assert smaller.holds(box)
-        assert not smaller.holds((0, 0, 400, 300))
-        assert not smaller.holds((box[0] - 1, box[1], box[2], box[3])), "the kernel needs what is around"
-        assert smaller.nbytes < 0.5 * whole.nbytes
-        x, y = smaller.origin
-        rows, columns = smaller.pixels.shape[:2]
-        np.testing.assert_array_equal(smaller.pixels, whole.pixels[y : y + rows, x : x + columns])
+        cache.get(1)

@@ -35,8 +35,8 @@ def test_a_tenth_of_the_contrast_with_noise_is_seen_and_said(frames: list[NDArra
     hazy = _hazy(frames)
     clear, found = (rdstitch.calibrate(images, _OPTIONS) for images in (frames, hazy))
     assert found.alignment.used.all()
-    assert any(message.code == "low-contrast" for message in found.details)
-    assert not any(message.code == "low-contrast" for message in clear.details)
+    assert any(message.code == "low-contrast" for message in found.messages)
+    assert not any(message.code == "low-contrast" for message in clear.messages)
     assert clear.stretch is None
     deviation = np.hypot(clear.alignment.distortion_std, found.alignment.distortion_std)
     assert abs(clear.alignment.distortion - found.alignment.distortion) < 3 * deviation
@@ -54,7 +54,7 @@ def test_a_single_image_of_little_contrast_is_seen_and_named(frames: list[NDArra
     assert found.alignment.used.all()
     assert found.keypoints[::2] == clear.keypoints[::2]
     assert found.keypoints[1] > clear.keypoints[1] / 2
-    (message,) = [message for message in found.details if message.code == "low-contrast"]
+    (message,) = [message for message in found.messages if message.code == "low-contrast"]
     assert message.images == (str(found.sources[1].path),)
     assert message.text.startswith("shows little contrast")
 
@@ -88,7 +88,7 @@ def test_a_board_shows_few_features_but_no_little_contrast() -> None:
     plane = ImageTexture((60 + 130 * squares).astype(np.uint8))
     frames = sequence_over(plane, lens, poses, photometry=Photometry(noise=0.012, blur=0.7)).frames() * 3
     found = rdstitch.calibrate(frames, rdstitch.StitchOptions(workers=1))
-    assert not any(message.code == "low-contrast" for message in found.details)
+    assert not any(message.code == "low-contrast" for message in found.messages)
     assert found.alignment.used.all()
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from rdstitch.errors import InputError
 from rdstitch.inputs.find import find_images
-from rdstitch.inputs.measurements import _read_table
+from rdstitch.inputs.measurements import with_attitudes
 
 
 def test_a_pattern_longer_than_any_name_is_refused_at_once(tmp_path: Path) -> None:
@@ -22,4 +22,4 @@ def test_a_table_with_an_endless_field_is_named(tmp_path: Path, text: str) -> No
     table = tmp_path / "attitudes.csv"
     table.write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=r"attitudes.csv: is not a CSV file"):
-        _read_table(table)
+        with_attitudes([], table)

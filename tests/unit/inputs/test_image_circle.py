@@ -1,13 +1,18 @@
 """A fisheye whose circle is smaller than its images: the circle is found, and what is black around it is no content."""
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 import rdstitch
-from rdstitch.inputs.image_circle import find_circle
+from rdstitch.cache import Cache
+from rdstitch.inputs.image_circle import find_circle, with_image_circle
+from rdstitch.inputs.source import read_sources
+from rdstitch.io import DecodedImage, read_image
 from rdstitch.synthetic import FisheyeLens, grid_poses, ground, sequence_over
 from tests.acceptance.rendered import geometry
 
@@ -66,3 +71,24 @@ def test_a_circular_fisheye_is_stitched_and_calibrated(tmp_path: Path) -> None:
     given = rdstitch.mosaic(files, options=rdstitch.StitchOptions(camera=again)).registration.alignment
     assert given.used.all()
     assert given.cameras[0].coefficients == camera.coefficients
+
+
+def test_a_second_run_decodes_nothing_to_find_the_circle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lens = FisheyeLens((240, 180), 83.0 / np.radians(75.0), image_circle=83.0)
+    poses = grid_poses(lens, 2, 2, overlap=0.9, seed=3)
+    files = sequence_over(lambda size: ground(size, 3, channels=1), lens, poses).write(tmp_path)
+    decoded: list[Path] = []
+
+    def counted(path: Path, *given: Any) -> DecodedImage:
+        decoded.append(path)
+        return read_image(path, *given)
+
+    monkeypatch.setattr("rdstitch.inputs.source.read_image", counted)
+    found = []
+    for _ in range(2):
+        sources, _ = read_sources(files, skip_bad=False)
+        with ThreadPoolExecutor(1) as executor:
+            found.append(with_image_circle(sources, executor, Cache.at(tmp_path / "cache"), 0.6))
+    assert decoded == files
+    assert found[0] == found[1]
+    assert found[0][0].camera.image_circle is not None

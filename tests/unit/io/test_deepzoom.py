@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.errors import OutputError
-from rdstitch.io import Layout, Metadata, check_output, write_image, write_strips
-from rdstitch.io.deepzoom import read_deep_zoom, tiles_folder
+from rdstitch.io import Layout, Metadata, write_image, write_strips
+from rdstitch.io.deepzoom import read_deep_zoom
+from rdstitch.outputs import check_output, tiles_folder
 
 NAMESPACE = "{http://schemas.microsoft.com/deepzoom/2008}"
 

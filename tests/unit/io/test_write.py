@@ -21,13 +21,11 @@ from rdstitch.errors import ArgumentError, LimitError, OutputError
 from rdstitch.io import (
     Layout,
     Metadata,
-    check_output,
     read_image,
     write_image,
     write_strips,
 )
-from rdstitch.io.atomic import write_bytes_atomic
-from rdstitch.io.outputs import Outputs
+from rdstitch.outputs import Outputs, check_output, write_bytes_atomic
 
 Pixels = NDArray[Any]
 

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from rdstitch import outputs as atomic
 from rdstitch.errors import OutputError
-from rdstitch.io import atomic
-from rdstitch.io.atomic import check_outputs
+from rdstitch.outputs import check_outputs
 
 
 def test_each_file_is_looked_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

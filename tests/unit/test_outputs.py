@@ -11,9 +11,7 @@ from pathlib import Path
 import pytest
 
 from rdstitch.errors import OutputError
-from rdstitch.io.atomic import check_output, write_bytes_atomic
-from rdstitch.io.outputs import Outputs
-from rdstitch.io.staging import StagingFolder, temporary_folder
+from rdstitch.outputs import Outputs, StagingFolder, check_output, temporary_folder, write_bytes_atomic
 from tests.faults import OPERATIONS, Operation, failing_disk
 
 _NAMES = ("a.dzi", "a.dzw", "a.dzi.json")
@@ -158,8 +156,8 @@ def test_whatever_is_no_tile_keeps_a_folder(tmp_path: Path, name: str) -> None:
 _KILLED = """
 import os, signal, sys
 from pathlib import Path
-from rdstitch.io.outputs import Outputs
-from rdstitch.io.staging import temporary_folder
+from rdstitch.outputs import Outputs
+from rdstitch.outputs import temporary_folder
 with temporary_folder() as folder, Outputs(False) as outputs:
     (folder / "frame.png").write_bytes(b"half")
     with outputs.writing(sys.argv[1]) as staged:

@@ -1,0 +1,453 @@
+"""The files of one result: checked early, written aside, then put in their places.
+
+An image, its tiles, its world file, its pages and its sidecar belong together. Each is written into a hidden folder
+beside its place; when all are complete, each replaces what was there, in the order in which they were staged. The
+sidecar is staged last and names size and digest of its image: where a run is cut off within these milliseconds, a
+reader sees that the older sidecar is of another image.
+"""
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from rdstitch.errors import OutputError, RdstitchError
+from rdstitch.file_access import local_file
+from rdstitch.messages import Message
+
+# On Windows nothing proves a process dead, and its leftovers stay.
+if sys.platform != "win32":
+    import fcntl
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".dzi")
+_LEVEL_NAME, _TILE_NAME = re.compile(r"[0-9]{1,2}"), re.compile(r"[0-9]+_[0-9]+\.jpg")
+_LOCK = "lock"
+
+
+def check_output(
+    path: str | Path,
+    overwrite: bool = False,
+    inputs: Iterable[str | Path] = (),
+    suffixes: Iterable[str] = IMAGE_SUFFIXES,
+) -> Path:
+    """Find out before long work whether a file can be written; nothing is created.
+
+    Parameters
+    ----------
+    path
+        File to be written later.
+    overwrite
+        Whether an existing file may be replaced.
+    inputs
+        Files that must never be written over, whatever ``overwrite`` says.
+    suffixes
+        Known file name endings, lower case; empty for any.
+
+    Raises
+    ------
+    OutputError
+        With what to do about it.
+    """
+    file, known = Path(path), tuple(suffixes)
+    if known and file.suffix.lower() not in known:
+        what = f"unknown file type '{file.suffix}'" if file.suffix else "no file type in the name"
+        raise OutputError(f"{file}: {what}; use one of {' '.join(known)}")
+    try:
+        with naming(file):
+            _check_place(file, overwrite, inputs)
+    except ValueError as error:
+        raise OutputError(f"{file}: cannot be written: {error}") from error
+    return file
+
+
+def check_outputs(paths: Sequence[Path], overwrite: bool, inputs: Iterable[str | Path]) -> None:
+    """Find out of many files what :func:`check_output` does of one, in a time linear in their number."""
+    check_not_read(paths, inputs)
+    for path in paths:
+        check_output(path, overwrite)
+
+
+def _check_place(file: Path, overwrite: bool, inputs: Iterable[str | Path]) -> None:
+    """The part of :func:`check_output` that needs the file system."""
+    folder = file.parent
+    if file.is_dir():
+        raise OutputError(f"{file}: is a folder; name a file in it")
+    if not folder.is_dir():
+        raise OutputError(f"{file}: the folder {folder} does not exist; create it first")
+    if file.suffix.lower() == ".dzi":
+        check_tiles_folder(tiles_folder(Path(os.path.realpath(file))), overwrite)
+    if file.is_symlink() and not file.exists():
+        raise OutputError(f"{file}: is a link to nothing; remove it, or choose another name")
+    if file.exists():
+        check_not_read([file], inputs)
+        if not overwrite:
+            raise OutputError(f"{file}: exists already; choose another name or use --overwrite")
+        # A link stays, and what it leads to is replaced.
+        folder = Path(os.path.realpath(file)).parent
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise OutputError(f"{file}: no permission to write into the folder {folder}")
+
+
+def check_not_read(files: Iterable[Path], inputs: Iterable[str | Path]) -> None:
+    """Refuse to write over what is read, by whatever name.
+
+    Raises
+    ------
+    OutputError
+        When one of the files is one of the inputs.
+    """
+    read = {_identity(local_file(Path(path))) for path in inputs} - {None}
+    for file in files:
+        if _identity(file) in read:
+            raise OutputError(f"{file}: is read as input; choose another name")
+
+
+def check_distinct(paths: Iterable[str | Path]) -> None:
+    """Find out before long work whether two outputs would be written into one file.
+
+    Raises
+    ------
+    OutputError
+        When two of the names lead to the same place.
+    """
+    seen: set[tuple[str, str]] = set()
+    for file in map(Path, paths):
+        place = os.path.realpath(file.parent), file.name
+        if place in seen:
+            raise OutputError(f"{file}: is the name of two outputs; choose another one for each")
+        seen.add(place)
+
+
+def _identity(file: Path) -> tuple[int, int] | None:
+    """The same for all names that lead to one file; None for a missing one."""
+    try:
+        status = file.stat()
+    except (OSError, ValueError):
+        return None
+    return status.st_dev, status.st_ino
+
+
+def write_bytes_atomic(path: str | Path, data: bytes, overwrite: bool = True) -> None:
+    """Write a file, whole or not at all.
+
+    Raises
+    ------
+    OutputError
+        When the file system refuses.
+    """
+    with Outputs(overwrite) as outputs:
+        outputs.write(path, data)
+
+
+def text_bytes(text: str) -> bytes:
+    """Text in UTF-8; names of files that are none come out as they are."""
+    return text.encode("utf-8", "surrogateescape")
+
+
+def json_bytes(data: Any) -> bytes:
+    """JSON in UTF-8 (two spaces, final newline, no NaN).
+
+    The bytes of a file name that are no UTF-8 become JSON's own escapes: the file stays valid, and the name can be
+    got back from it.
+    """
+    text = json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    return text.encode("utf-8", "backslashreplace")
+
+
+def tiles_folder(path: Path) -> Path:
+    """The folder of the tiles that belong to a ``.dzi`` file."""
+    return path.with_name(f"{path.stem}_files")
+
+
+def check_tiles_folder(folder: Path, overwrite: bool) -> None:
+    """Refuse to replace a folder that is to be kept, or in which anything is no tile.
+
+    Raises
+    ------
+    OutputError
+        With what to do about it.
+    """
+    if not folder.exists():
+        return
+    if not overwrite:
+        raise OutputError(f"{folder}: exists already; choose another name or use --overwrite")
+    if folder.is_symlink() or not folder.is_dir() or not holds_only_tiles(folder):
+        raise OutputError(f"{folder}: is a link, or holds other files than Deep Zoom tiles; choose another name")
+
+
+def holds_only_tiles(folder: Path) -> bool:
+    """Whether everything in a folder, however deep, is what :func:`write_deep_zoom` writes there."""
+    with os.scandir(folder) as levels:
+        for level in levels:
+            if not _LEVEL_NAME.fullmatch(level.name) or not level.is_dir(follow_symlinks=False):
+                return False
+            with os.scandir(level) as tiles:
+                if not all(_TILE_NAME.fullmatch(tile.name) and tile.is_file(follow_symlinks=False) for tile in tiles):
+                    return False
+    return True
+
+
+@dataclass(frozen=True)
+class Fingerprint:
+    """What an image's files come to.
+
+    Attributes
+    ----------
+    size : int
+        Bytes of all files.
+    sha256 : str
+        Of the file; of a Deep Zoom image that of the list of its files, as ``sha256sum`` prints it (digest, two
+        spaces, name), in order of names, the description first as ``.dzi``.
+    """
+
+    size: int
+    sha256: str
+
+
+def fingerprint(image: Path, tiles: Path | None = None) -> Fingerprint:
+    """The fingerprint of an image, and of the tiles that belong to it.
+
+    Raises
+    ------
+    OSError
+        When a file cannot be read.
+    """
+    if tiles is None:
+        return Fingerprint(image.stat().st_size, _sha256(image))
+    found = sorted(path for path in tiles.rglob("*") if path.is_file())
+    files = [(".dzi", image), *((file.relative_to(tiles).as_posix(), file) for file in found)]
+    listing = "".join(f"{_sha256(file)}  {name}\n" for name, file in files)
+    return Fingerprint(sum(file.stat().st_size for _, file in files), hashlib.sha256(listing.encode()).hexdigest())
+
+
+def _sha256(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+class StagingFolder:
+    """A hidden folder that exists until it is closed, or until a later one in its place finds its process dead.
+
+    Parameters
+    ----------
+    parent : Path
+        Where it is made. Renaming from it into ``parent`` stays within one file system.
+    prefix : str
+        Of its name.
+
+    Raises
+    ------
+    OSError
+        When it cannot be made.
+    """
+
+    def __init__(self, parent: Path, prefix: str = ".rdstitch-") -> None:
+        _remove_dead(parent, prefix)
+        self.path = Path(tempfile.mkdtemp(prefix=prefix, dir=parent))
+        self._lock = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT, 0o600)
+        _lock(self._lock)
+        try:
+            # Only a folder of this ending is looked at by others, and it has its lock by then.
+            self.path = self.path.rename(f"{self.path}.part")
+        except OSError:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Remove the folder with everything in it."""
+        os.close(self._lock)
+        shutil.rmtree(self.path, ignore_errors=True)
+
+
+@contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """A folder among the system's temporary files that goes with the block, or with the next run after a crash."""
+    staging = StagingFolder(Path(tempfile.gettempdir()), prefix="rdstitch-")
+    try:
+        yield staging.path
+    finally:
+        staging.close()
+
+
+def _lock(descriptor: int) -> bool:
+    """Lock an open file for this process; False where another has locked it, or there are no locks."""
+    with suppress(OSError):
+        if sys.platform != "win32":
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+    return False
+
+
+def _remove_dead(parent: Path, prefix: str) -> None:
+    """Remove the folders of processes that hold their locks no more; they were killed."""
+    for folder in parent.glob(f"{prefix}*.part"):
+        with suppress(OSError):
+            descriptor = os.open(folder / _LOCK, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
+            dead = _lock(descriptor)
+            os.close(descriptor)
+            if dead:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+@dataclass(frozen=True)
+class _Item:
+    """One output: its name as given, its place, and where it is staged."""
+
+    name: Path
+    place: Path
+    staged: Path
+    is_folder: bool
+
+
+class Outputs:
+    """Outputs that are put in their places when the block ends without an error; after an error none is.
+
+    A symbolic link as an output stays; what it leads to is replaced.
+
+    Parameters
+    ----------
+    overwrite : bool
+        Replace what exists. Without it, also a file that appears during the run is kept.
+
+    Raises
+    ------
+    OutputError
+        For any failure of the file system; every file is whole, the old one or the new one.
+    """
+
+    def __init__(self, overwrite: bool) -> None:
+        self._overwrite = overwrite
+        self._folders: dict[Path, StagingFolder] = {}
+        self._items: list[_Item] = []
+
+    def __enter__(self) -> Self:
+        """Begin; nothing is made before it is needed."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Put everything in its place, or throw it away."""
+        try:
+            for act in (self._check, self._place) if kind is None else ():
+                for item in self._items:
+                    with naming(item.name):
+                        act(item)
+        finally:
+            for folder in self._folders.values():
+                folder.close()
+
+    @contextmanager
+    def writing(self, path: str | Path) -> Iterator[Path]:
+        """Stage a file: yields where to write it; a failure of the file system is one of ``path``."""
+        name = Path(path)
+        with naming(name):
+            staged = self._stage(name, is_folder=False)
+            yield staged
+            # A full disk must be noticed before anything is replaced.
+            descriptor = os.open(staged, os.O_RDWR)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+
+    @contextmanager
+    def writing_folder(self, path: str | Path) -> Iterator[Path]:
+        """Stage a folder of Deep Zoom tiles: yields an empty folder."""
+        name = Path(path)
+        with naming(name):
+            staged = self._stage(name, is_folder=True)
+            staged.mkdir()
+            yield staged
+
+    def write(self, path: str | Path, data: bytes) -> None:
+        """Stage a file with this content."""
+        with self.writing(path) as staged:
+            staged.write_bytes(data)
+
+    def attempt(self, path: str | Path, stage: Callable[[], object]) -> list[Message]:
+        """Stage what belongs beside an image, whose failure must not cost the image: a warning, where it fails."""
+        count = len(self._items)
+        try:
+            stage()
+        except Exception as error:  # noqa: BLE001 the work of hours is not thrown away for a page, whatever is wrong
+            del self._items[count:]
+            text = str(error) if isinstance(error, RdstitchError) else f"{type(error).__name__}: {error}"
+            older = "; the file of this name is older" if Path(path).exists() else ""
+            return [Message(f"{path}: not written, all else is: {text.removeprefix(f'{path}: ')}{older}")]
+        return []
+
+    def staged(self, path: str | Path) -> Path | None:
+        """Where an output lies until it is in its place; None where none of this name is staged."""
+        return next((item.staged for item in self._items if item.name == Path(path)), None)
+
+    def _stage(self, name: Path, *, is_folder: bool) -> Path:
+        place = Path(os.path.realpath(name.parent)) / name.name
+        if place.is_symlink():
+            place = Path(os.path.realpath(place))
+        if place.parent not in self._folders:
+            self._folders[place.parent] = StagingFolder(place.parent)
+        # Tiles are staged just before their description, and are found beside it by its name.
+        number = sum(not item.is_folder for item in self._items)
+        staged = self._folders[place.parent].path / f"new{number}{'_files' if is_folder else name.suffix}"
+        self._items.append(_Item(name, place, staged, is_folder))
+        return staged
+
+    def _check(self, item: _Item) -> None:
+        """Before anything is replaced: what is there may be, and keeps its permissions."""
+        if not item.place.exists():
+            return
+        if not self._overwrite:
+            raise _appeared(item.name)
+        if not item.is_folder:
+            item.staged.chmod(item.place.stat().st_mode & 0o777)
+        elif not holds_only_tiles(item.place):
+            raise OutputError(f"{item.name}: holds other files than Deep Zoom tiles; choose another name")
+
+    def _place(self, item: _Item) -> None:
+        if item.is_folder:
+            self._place_folder(item)
+            return
+        if not self._overwrite:
+            # A link replaces nothing; where a file system has none, the check a moment ago must do.
+            with suppress(OSError):
+                os.link(item.staged, item.place)
+                return
+            self._check(item)
+        item.staged.replace(item.place)
+
+    def _place_folder(self, item: _Item) -> None:
+        """No system call replaces a folder that is not empty: the old one goes aside, and back if this fails."""
+        old = item.staged.with_name(f"old{item.staged.name}")
+        if self._overwrite and item.place.exists():
+            item.place.rename(old)
+        try:
+            item.staged.rename(item.place)
+        except OSError:
+            if old.exists():
+                old.rename(item.place)
+            elif item.place.exists():
+                raise _appeared(item.name) from None
+            raise
+
+
+def _appeared(name: Path) -> OutputError:
+    return OutputError(f"{name}: exists already; it has appeared during the run, and is kept")
+
+
+@contextmanager
+def naming(name: Path) -> Iterator[None]:
+    """A failure of the file system is one of writing this output."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{name}: cannot be written: {error.strerror or error}") from error
