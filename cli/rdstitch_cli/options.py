@@ -311,9 +311,13 @@ compositing = together(
     crop,
     _choice(
         "--projection",
-        ["auto", "plane", "cylinder", "sphere", "mercator"],
+        ["auto", "plane", "cylinder", "sphere", "mercator", "panini", "stereographic"],
         "auto",
         "How images taken by turning on the spot are laid out.",
+    ),
+    *(
+        _number(f"--{name}", RealNumber(), 0.0, f"Turn the view of a panorama {where}, before it is projected.", "DEG")
+        for name, where in (("yaw", "to the right"), ("pitch", "up"), ("roll", "clockwise"))
     ),
     interpolation,
     output_form,

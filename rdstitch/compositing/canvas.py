@@ -45,6 +45,8 @@ class Canvas:
         Width of a full turn, pixels, where the images go all the way round; None where they do not.
     near : tuple of NearPart or None
         What of each image is drawn; None for all of it, empty for all of all images.
+    orientation : ndarray of shape (3, 3), or None
+        What the registered images were turned by before, as it is recorded; None where they were not.
     """
 
     size: tuple[int, int]
@@ -53,6 +55,7 @@ class Canvas:
     projection: Projection = PLANE
     period: float | None = None
     near: tuple[NearPart | None, ...] = ()
+    orientation: FloatArray | None = None
 
     def box(self, index: int) -> Box:
         """Bounds (x0, y0, x1, y1) of an image, whole pixels inside the canvas, end exclusive.

@@ -4,19 +4,20 @@ import math
 from dataclasses import dataclass, fields
 from typing import Literal, get_args, get_type_hints
 
+from rdstitch.compositing.projection import ProjectionName
+from rdstitch.compositing.upright import UprightOptions
 from rdstitch.errors import ArgumentError
 
 ExposureMethod = Literal["none", "gain", "blocks", "balanced"]
 Seam = Literal["none", "voronoi", "graphcut"]
 Blend = Literal["none", "feather", "multiband"]
 Crop = Literal["none", "auto"]
-ProjectionName = Literal["auto", "plane", "cylinder", "sphere", "mercator"]
 Interpolation = Literal["linear", "cubic", "lanczos"]
 
 
 @dataclass(frozen=True)
-class CompositeOptions:
-    """Options of the compositor; the command line has the same names and defaults.
+class CompositeOptions(UprightOptions):
+    """Options of the compositor, and of how the output is turned; the command line has the same names and defaults.
 
     Attributes
     ----------
@@ -35,8 +36,8 @@ class CompositeOptions:
         image.
     projection : str
         How images taken by turning on the spot are laid out: "plane", "cylinder", "sphere" (equirectangular),
-        "mercator", or "auto": the plane up to a view of 90 degrees, the cylinder for what is wide and low, the sphere
-        for the rest. Images of a plane stay on it.
+        "mercator", "panini", "stereographic", or "auto": the plane up to a view of 90 degrees, the cylinder for what
+        is wide and low, the sphere for the rest. Images of a plane stay on it.
     scale : float
         Factor to the size of the output; 1 keeps the resolution of the reference image, or the median one, at its
         centre.
@@ -96,6 +97,7 @@ class CompositeOptions:
     workers: int | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         hints = get_type_hints(type(self))
         for option in fields(self):
             allowed = get_args(hints[option.name])

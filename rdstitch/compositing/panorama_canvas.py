@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.camera import Camera
+from rdstitch.camera import Camera, points_over
 from rdstitch.compositing.canvas import Canvas, canvas_between, plan_canvas, refuse_scale, turned_and_scaled
-from rdstitch.compositing.projection import PLANE, TURN, Projection
+from rdstitch.compositing.projection import PLANE, PROJECTIONS, TURN, Projection
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.radial_homography import project, to_directions
 
 _POINTS_PER_SIDE = 64
+_GRID = 33  # points along each side of an image, over all of it
 _PROBES = 2048  # of a turn: a sixth of a degree
 # Radians: the view up to which a plane shows it without much stretching, and the height up to which a cylinder does.
 _PLANE_VIEW = math.radians(90.0)
@@ -96,7 +97,7 @@ def choose_projection(seen: SeenDirections) -> Projection:
     steepest = float(max(-low[1], high[1]))
     if max(seen.extent) <= _PLANE_VIEW and steepest <= _PLANE_VIEW / 2:
         return PLANE
-    return Projection("cylinder" if not seen.around and 2.0 * steepest <= _CYLINDER_HEIGHT else "sphere")
+    return PROJECTIONS["cylinder" if not seen.around and 2.0 * steepest <= _CYLINDER_HEIGHT else "sphere"]
 
 
 def plan_panorama(
@@ -117,12 +118,12 @@ def plan_panorama(
     directions : ndarray of shape (N, 3, 3)
         From undistorted normalized coordinates of each image to directions.
     projection : str
-        "plane", "cylinder", "sphere", "mercator", or "auto": what suits the field of view.
+        One of :data:`rdstitch.compositing.projection.PROJECTIONS`, or "auto": what suits the field of view.
     scale, rotate, reference, names
         As for :func:`rdstitch.compositing.plan_canvas`.
     max_stretch : float
         What the projection would stretch more than so many times has no place on the canvas: the ends of a plane, the
-        top and the bottom of a cylinder. Without a limit, images that look too far up or down are refused.
+        top and the bottom of a cylinder.
 
     Raises
     ------
@@ -132,7 +133,7 @@ def plan_panorama(
         When an image looks farther than the projection shows, or the canvas would be absurd.
     """
     seen = seen_directions(cameras, directions)
-    chosen = choose_projection(seen) if projection == "auto" else Projection(projection)
+    chosen = choose_projection(seen) if projection == "auto" else PROJECTIONS[projection]
     if chosen == PLANE:
         how: dict[str, Any] = {"scale": scale, "rotate": rotate, "reference": reference, "names": names}
         return plan_canvas(cameras, directions, max_stretch=max_stretch, **how)
@@ -140,62 +141,66 @@ def plan_panorama(
     lengths = np.linalg.norm(directions, axis=1)
     focal = lengths[:, 2] / lengths[:, 0] * [camera.half_diagonal for camera in cameras]
     resolution = scale * float(np.median(focal) if reference is None else focal[reference])
-    if max_stretch < math.inf:
-        seen = _within(seen, chosen.latitude_limit(max_stretch), called)
-    canvas = _lay_out(seen, chosen, resolution, rotate, called)
-    refuse_scale(cameras, np.array(canvas.size, dtype=np.float64))
-    return canvas
-
-
-def _within(seen: SeenDirections, limit: float, names: Sequence[str]) -> SeenDirections:
-    """The part of a field of view up to a latitude, radians, above and below the horizon."""
-    for outline, name in zip(seen.outlines, names, strict=True):
-        if not (outline[:, 1].min() < limit and outline[:, 1].max() > -limit):
+    extent = np.array(chosen.extent(max_stretch))
+    if chosen.periodic:
+        outlines = [_places(outline, chosen) for outline in seen.outlines]
+    else:
+        outlines = [_flat_outline(*image, chosen, extent) for image in zip(cameras, directions, strict=True)]
+    for outline, name in zip(outlines, called, strict=True):
+        if not (outline.min(axis=0) < extent).all() or not (outline.max(axis=0) > -extent).all():
             raise LimitError(
-                f"{name}: looks so far up or down that all of it would be stretched beyond the limit; "
+                f"{name}: looks so far to the side that all of it would be stretched beyond the limit; "
                 "use --projection sphere, or raise --max-stretch"
             )
-    outlines = (np.column_stack([outline[:, 0], np.clip(outline[:, 1], -limit, limit)]) for outline in seen.outlines)
-    return replace(seen, outlines=tuple(outlines))
+    start = seen.start if seen.around and chosen.periodic else None
+    canvas = _lay_out([np.clip(outline, -extent, extent) for outline in outlines], start, resolution, rotate)
+    refuse_scale(cameras, np.array(canvas.size, dtype=np.float64))
+    return replace(canvas, projection=chosen)
 
 
-def _lay_out(
-    seen: SeenDirections, projection: Projection, resolution: float, rotate: float, names: Sequence[str]
-) -> Canvas:
-    """The canvas that holds a field of view.
+def _lay_out(outlines: Sequence[FloatArray], start: float | None, resolution: float, rotate: float) -> Canvas:
+    """The canvas that holds the places (K, 2) of images.
 
     Parameters
     ----------
-    projection : Projection
-        Not the plane.
+    start : float or None
+        Longitude at the left border of a full turn; None where there is none.
     resolution : float
-        pixels per radian at the horizon.
+        pixels per radian straight ahead.
     rotate : float
         Degrees that the output is turned clockwise.
-    names : sequence of str
-        What to call the images in messages.
     """
-    for outline, name in zip(seen.outlines, names, strict=True):
-        if projection.name != "sphere" and np.abs(outline[:, 1]).max() > projection.largest_latitude:
-            raise LimitError(
-                f"{name}: looks too far up or down for the {projection.name} projection; use --projection sphere"
-            )
-    if seen.around and rotate:
+    if start is not None and rotate:
         raise ArgumentError("a panorama that goes all the way round cannot be turned; leave out --rotate")
-    places = [_places(outline, projection) for outline in seen.outlines]
     period = None
-    if seen.around:
+    if start is not None:
         width = TURN * resolution
         unit = max(_UNIT, 1 << int(math.log2(max(width / _UNITS_PER_TURN, 1.0))))
         period = float(math.ceil(width / unit) * unit)
         resolution = period / TURN
     linear = turned_and_scaled(rotate, resolution)
-    placed = [outline @ linear.T for outline in places]
+    placed = [outline @ linear.T for outline in outlines]
     everything = np.concatenate(placed)
     low, high = everything.min(axis=0), everything.max(axis=0)
-    if period is not None:
-        low[0], high[0] = seen.start * resolution, seen.start * resolution + period
-    return replace(canvas_between(low, high, linear, placed), projection=projection, period=period)
+    if start is not None and period is not None:
+        low[0], high[0] = start * resolution, start * resolution + period
+    return replace(canvas_between(low, high, linear, placed), period=period)
+
+
+def _flat_outline(camera: Camera, matrix: FloatArray, projection: Projection, extent: FloatArray) -> FloatArray:
+    """Places (K, 2) of an image's border, or of a box around it where that does not enclose what the image shows."""
+    border, inside = (
+        places[np.isfinite(places).all(axis=1)]
+        for points in (camera.outline(_POINTS_PER_SIDE), points_over(camera.image_size, _GRID))
+        for places in [projection.project(to_directions(camera, matrix, points))]
+    )
+    if not (np.abs(inside) < extent).all(axis=1).any():
+        return np.full((1, 2), np.inf)  # nowhere
+    border, inside = np.clip(border, -extent, extent), np.clip(inside, -extent, extent)
+    low, high = inside.min(axis=0), inside.max(axis=0)
+    if (low >= border.min(axis=0)).all() and (high <= border.max(axis=0)).all():
+        return border
+    return np.array([low, (high[0], low[1]), high, (low[0], high[1])])
 
 
 def _outline(camera: Camera, matrix: FloatArray) -> FloatArray:
@@ -271,15 +276,18 @@ def field_of_view(canvas: Canvas) -> tuple[float, float]:
     """Angles that the middle row and the middle column of a canvas span, radians."""
     width, height = canvas.size
     x, y = (width - 1) / 2, (height - 1) / 2
-    if canvas.projection.periodic:
-        resolution = math.hypot(canvas.matrix[0, 0], canvas.matrix[1, 0])
-        across = width / resolution
-    else:
-        left, right = directions_on(canvas, np.array([(-0.5, y), (width - 0.5, y)]))
-        across = math.acos(float(np.clip(left @ right, -1.0, 1.0)))
     # At a pole, rounding must not lead beyond it.
-    top, bottom = directions_on(canvas, np.array([(x, -0.5 + 1e-6), (x, height - 0.5 - 1e-6)]))
-    return across, math.acos(float(np.clip(top @ bottom, -1.0, 1.0)))
+    down = _angle_along(canvas, [(x, -0.5 + 1e-6), (x, y), (x, height - 0.5 - 1e-6)])
+    if canvas.projection.periodic:
+        return width / math.hypot(canvas.matrix[0, 0], canvas.matrix[1, 0]), down
+    return _angle_along(canvas, [(-0.5, y), (x, y), (width - 0.5, y)]), down
+
+
+def _angle_along(canvas: Canvas, points: Sequence[tuple[float, float]]) -> float:
+    """Sum of the angles from each canvas pixel to the next, radians."""
+    directions = directions_on(canvas, np.array(points))
+    cosines = (directions[1:] * directions[:-1]).sum(axis=1)
+    return float(np.arccos(np.clip(cosines, -1.0, 1.0)).sum())
 
 
 def center_of_view(canvas: Canvas) -> tuple[float, float]:

@@ -28,6 +28,7 @@ from rdstitch.pipeline.compose import compose_images, plainly_viewed, write_page
 from rdstitch.pipeline.flat_field import check_size, with_flat_field
 from rdstitch.pipeline.placed_images import PlacedImages
 from rdstitch.pipeline.recomposition import Recomposition, applied_sidecar
+from rdstitch.pipeline.upright import turned_anew
 from rdstitch.progress import Progress, silent
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
 
@@ -121,7 +122,7 @@ def apply(
             corrected, said = with_flat_field(list(used.values()), flat_field)
             used = dict(zip(used, corrected, strict=True))
             doubts += said
-        placed = _placed(saved, used)
+        placed = turned_anew(_placed(saved, used), options, saved.composite)
         composed = compose_images(
             placed,
             output,
@@ -170,6 +171,7 @@ def _placed(saved: SavedRegistration, used: Mapping[int, Source]) -> PlacedImage
         ],
         saved.turned,
         saved.place,
+        saved.orientation,
     )
 
 

@@ -74,6 +74,8 @@ class PlacedImages:
         Whether the camera turned on the spot, so that the homographies lead to directions, not to a plane.
     place : Georeference or None
         Of the plane, where it is known from an earlier run.
+    orientation : ndarray of shape (3, 3), or None
+        What the homographies were turned by; see :mod:`rdstitch.pipeline.upright`.
     """
 
     sources: Sequence[Source]
@@ -83,6 +85,7 @@ class PlacedImages:
     displacements: Sequence[Displacement | None] | None = None
     turned: bool = False
     place: Georeference | None = None
+    orientation: FloatArray | None = None
 
     @classmethod
     def of(cls, registration: Registration, displacements: Sequence[Displacement | None] | None) -> Self:
@@ -174,10 +177,11 @@ def _plan(placed: PlacedImages, options: CompositeOptions, scale: float) -> Canv
         "max_stretch": options.max_stretch,
     }
     if placed.turned:
-        return plan_panorama(placed.cameras, placed.homographies, projection=options.projection, **how)
+        canvas = plan_panorama(placed.cameras, placed.homographies, projection=options.projection, **how)
+        return replace(canvas, orientation=placed.orientation)
     if options.projection not in ("auto", "plane"):
         raise ArgumentError(
             f"the {options.projection} projection is for images taken by turning on the spot; these were not, "
             "leave out --projection"
         )
-    return plan_canvas(placed.cameras, placed.homographies, **how)
+    return replace(plan_canvas(placed.cameras, placed.homographies, **how), orientation=placed.orientation)

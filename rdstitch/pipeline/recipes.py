@@ -27,6 +27,7 @@ from rdstitch.pipeline.map_canvas import check_map
 from rdstitch.pipeline.placed_images import PlacedImages, align_registration_locally
 from rdstitch.pipeline.read_inputs import in_lasting_order, read_inputs
 from rdstitch.pipeline.register import register, with_frontal_reference
+from rdstitch.pipeline.upright import turned
 from rdstitch.pipeline.whole_pixels import on_whole_pixels
 from rdstitch.progress import Progress, silent
 from rdstitch.registration import Registration
@@ -376,7 +377,10 @@ def compose_registration(
     outputs: Outputs,
 ) -> StitchResult:
     """Compose images at the places of a registration, into memory or among the outputs, with all that belongs to it."""
-    placed = PlacedImages.of(registration, local.fields or None)
+    placed = turned(PlacedImages.of(registration, local.fields or None), options.composite)
+    if placed.orientation is not None:
+        homographies = placed.orientation @ registration.alignment.homographies
+        registration = replace(registration, alignment=replace(registration.alignment, homographies=homographies))
     composed = compose_images(
         placed,
         output,

@@ -138,13 +138,15 @@ def _image(result: Recomposition, index: int, entry: dict[str, Any]) -> dict[str
         reason = result.left_out[index].text if index in result.left_out else image.reason
         lens = {} if image.camera is None else lens_fields(image.camera)
         return {**entry, **lens, "used": False, "reason": reason, "to_plane": None, "to_output": None, "pose": None}
+    to_plane = result.placed.homographies[sum(earlier is not None for earlier in result.sources[:index])]
     return {
         **entry,
         "name": source.name,
         "path": str(source.path),
         "size": source.camera.image_size,
         **lens_fields(source.camera),
-        "to_output": to_output(result.canvas, image.to_plane),
+        "to_plane": to_plane,
+        "to_output": to_output(result.canvas, to_plane),
     }
 
 

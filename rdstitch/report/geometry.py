@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rdstitch.alignment.result import LinkFit
 from rdstitch.arrays import FloatArray
-from rdstitch.compositing.projection import Projection
+from rdstitch.compositing.projection import PROJECTIONS
 from rdstitch.errors import InputError
 from rdstitch.inputs.source import Source
 from rdstitch.io.preview import encode_preview, read_preview
@@ -57,7 +57,7 @@ def _on_plane(registration: Registration, index: int, points: FloatArray) -> Flo
     camera, matrix = registration.alignment.cameras[index], registration.alignment.homographies[index]
     if not registration.alignment.on_sphere:
         return to_plane(camera, matrix, points)
-    places = Projection("sphere").project(to_directions(camera, matrix, points))
+    places = PROJECTIONS["sphere"].project(to_directions(camera, matrix, points))
     # Longitudes of one image have no jump.
     own = np.arctan2(matrix[0, 2], matrix[2, 2])
     places[:, 0] = own + np.mod(places[:, 0] - own + np.pi, 2.0 * np.pi) - np.pi

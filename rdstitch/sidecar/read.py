@@ -66,6 +66,8 @@ class SavedRegistration:
         Whether the camera turned on the spot, so that ``to_plane`` leads to directions.
     composite : CompositeOptions
         What the image was composited with.
+    orientation : ndarray of shape (3, 3), or None
+        What the registered images were turned by to be at ``to_plane``.
     place : Georeference or None
         Of the plane, where the output was georeferenced.
     content : dict
@@ -78,6 +80,7 @@ class SavedRegistration:
     distortion: float
     turned: bool
     composite: CompositeOptions
+    orientation: FloatArray | None
     place: Georeference | None
     content: dict[str, Any]
 
@@ -111,7 +114,11 @@ def read_sidecar(path: str | Path) -> SavedRegistration:
         place = _place(record.output)
     except ArgumentError as error:
         raise InputError(f"{path}: output.georeference.crs: {error}") from error
-    return SavedRegistration(Path(path), images, reference, record.lambda_, turned, composite, place, content)
+    matrix = record.output.orientation
+    orientation = None if matrix is None else np.array(matrix, dtype=np.float64)
+    return SavedRegistration(
+        Path(path), images, reference, record.lambda_, turned, composite, orientation, place, content
+    )
 
 
 def mismatch_with_image(saved: SavedRegistration) -> str:

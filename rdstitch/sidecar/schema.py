@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Meta, Struct, field
 
 from rdstitch.camera import CameraRecord, FocalSource, LensRecord
-from rdstitch.compositing.options import ProjectionName
+from rdstitch.compositing.projection import ProjectionName
 from rdstitch.records import Count, Matrix, NonNegative, Pair, Size, Triple, check_invertible
 from rdstitch.sidecar.write import VERSION
 
@@ -58,6 +58,7 @@ class OutputRecord(Struct, kw_only=True):
     size: Size | None = None
     plane_to_output: Matrix | None = None
     projection: ProjectionName | None = None
+    orientation: Matrix | None = None
     wraps_around: bool = False
     field_of_view_deg: Pair | None = None
     center_deg: Pair | None = None
@@ -66,6 +67,8 @@ class OutputRecord(Struct, kw_only=True):
     def __post_init__(self) -> None:
         if self.plane_to_output is not None:
             check_invertible(self.plane_to_output, "plane_to_output")
+        if self.orientation is not None:
+            check_invertible(self.orientation, "orientation")
 
 
 class HeldOut(Struct):

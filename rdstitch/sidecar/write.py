@@ -113,6 +113,7 @@ def output_geometry(canvas: Canvas, *, turned: bool) -> dict[str, Any]:
         "size": canvas.size,
         "plane_to_output": canvas.matrix,
         "projection": canvas.projection.name,
+        "orientation": canvas.orientation,
         "wraps_around": canvas.period is not None,
         "field_of_view_deg": np.degrees(field_of_view(canvas)) if turned else None,
         "center_deg": np.degrees(center_of_view(canvas)) if turned else None,

@@ -108,10 +108,30 @@ def test_the_projection_is_the_users(rdstitch: Run, around: list[Path], tmp_path
     assert not record["output"]["wraps_around"]
 
 
+def test_the_view_is_turned_and_turned_again(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:
+    """What is 40 degrees to the right comes to the middle; apply gives the same bytes, and turns from there."""
+    first, second, third = (tmp_path / f"{k}.png" for k in range(3))
+    how = ("--projection", "sphere", "--seam", "voronoi", "--exposure", "none")
+    assert rdstitch("pano", *around, "-o", first, *how, "--yaw", "40", "--pitch", "-10", *CACHE).status == 0
+    images = ("--images", around[0].parent)
+    assert rdstitch("apply", f"{first}.json", *images, "-o", second).status == 0
+    assert first.read_bytes() == second.read_bytes()
+    assert rdstitch("apply", f"{first}.json", *images, "-o", third, "--pitch", "0", "--yaw", "0").status == 0
+    turned, plain = (json.loads(Path(f"{file}.json").read_text("utf-8")) for file in (first, third))
+    assert plain["output"]["orientation"] is None
+    ahead, base = (np.array(record["images"][0]["to_plane"])[:, 2] for record in (turned, plain))
+    expected = camera_rotations(np.radians(40), np.radians(-10))[0] @ base
+    np.testing.assert_allclose(ahead, expected, atol=1e-12)
+    np.testing.assert_allclose(np.array(turned["output"]["orientation"]) @ base, ahead, atol=1e-12)
+
+
 def test_images_of_a_plane_have_no_other_projection(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     done = rdstitch("pano", *frames, "-o", tmp_path / "out.png", "--projection", "sphere", *CACHE)
     assert done.status == 2
     assert "--projection" in done.err
+    done = rdstitch("pano", *frames, "-o", tmp_path / "out.png", "--yaw", "10", *CACHE)
+    assert done.status == 2
+    assert "turning on the spot" in done.err
 
 
 def test_a_lens_is_calibrated_by_turning(rdstitch: Run, around: list[Path], tmp_path: Path) -> None:

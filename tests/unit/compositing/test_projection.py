@@ -15,14 +15,13 @@ from rdstitch.compositing.panorama_canvas import (
     seen_directions,
 )
 from rdstitch.compositing.placed_image import place_images
-from rdstitch.compositing.projection import PLANE, Projection
+from rdstitch.compositing.projection import PLANE, PROJECTIONS
 from rdstitch.compositing.warp import plan_warp
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.synthetic.panorama import TurningSequence, camera_rotations, turning_sequence
 from rdstitch.synthetic.rendering import Photometry
 from tests.compositing_scenes import as_image, gradient, grey
 
-NAMES = ("plane", "cylinder", "sphere", "mercator")
 LENS = Camera((160, 120), -0.2, focal=110.0, focal_source="option")
 
 
@@ -48,13 +47,13 @@ def _composed(
     )
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", PROJECTIONS)
 def test_directions_come_back(name: str) -> None:
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(200, 3))
     directions[:, 2] = np.abs(directions[:, 2]) if name == "plane" else directions[:, 2]
-    places = Projection(name).project(directions)
-    back = np.stack(np.broadcast_arrays(*Projection(name).directions(*places.T)), axis=-1)
+    places = PROJECTIONS[name].project(directions)
+    back = np.stack(np.broadcast_arrays(*PROJECTIONS[name].directions(*places.T)), axis=-1)
     np.testing.assert_allclose(
         back / np.linalg.norm(back, axis=1, keepdims=True),
         directions / np.linalg.norm(directions, axis=1, keepdims=True),
@@ -62,10 +61,10 @@ def test_directions_come_back(name: str) -> None:
     )
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", PROJECTIONS)
 def test_near_the_horizon_all_agree(name: str) -> None:
     direction = np.array([[1e-4, 2e-4, 1.0]])
-    np.testing.assert_allclose(Projection(name).project(direction), [[1e-4, 2e-4]], atol=1e-11)
+    np.testing.assert_allclose(PROJECTIONS[name].project(direction), [[1e-4, 2e-4]], atol=1e-11)
 
 
 def test_the_projection_follows_the_view() -> None:
@@ -112,7 +111,7 @@ def test_a_gap_that_is_open_between_closed_corners_lies_at_the_border(heading: f
     assert not middle[-1]
 
 
-@pytest.mark.parametrize("name", ["cylinder", "sphere", "mercator"])
+@pytest.mark.parametrize("name", [name for name in PROJECTIONS if name != "plane"])
 @pytest.mark.parametrize("rotate", [0.0, 15.0])
 def test_points_of_an_image_come_back_through_the_warp(name: str, rotate: float) -> None:
     rotations = camera_rotations([0.4, -0.5], [0.2, -0.1], [0.1, 0.2])
@@ -128,9 +127,10 @@ def test_points_of_an_image_come_back_through_the_warp(name: str, rotate: float)
 
 
 def test_what_a_projection_cannot_show_is_refused_by_name() -> None:
-    up = _directions(camera_rotations([0.0, 0.5], [0.0, 1.4]))
-    with pytest.raises(LimitError, match=r"b.png.*--projection sphere"):
-        plan_panorama([LENS] * 2, up, projection="cylinder", names=["a.png", "b.png"])
+    behind = _directions(camera_rotations([0.0, 3.0]))
+    for name in ("panini", "stereographic"):
+        with pytest.raises(LimitError, match=r"b.png.*--projection sphere"):
+            plan_panorama([LENS] * 2, behind, projection=name, names=["a.png", "b.png"], max_stretch=3.0)
     around = _directions(camera_rotations(np.arange(9) * 2 * np.pi / 9))
     with pytest.raises(ArgumentError, match="rotate"):
         plan_panorama([LENS] * 9, around, rotate=10.0)
@@ -203,6 +203,21 @@ def test_poles_are_shown_whole() -> None:
     assert canvas.box(8)[2] == canvas.size[0]
     found = _composed(sequence, directions, canvas, CompositeOptions())
     assert (found.alpha[: canvas.size[1] // 3] > 0).all()
+
+
+def test_a_small_planet_is_shown_whole() -> None:
+    """The sphere looked at from above: what is straight down in the middle, the zenith beyond the edge."""
+    pitches = [*[0.5] * 8, *[-0.5] * 8, -np.pi / 2, np.pi / 2]
+    rotations = camera_rotations([*(np.arange(16) * np.pi / 4), 0.0, 0.0], pitches)
+    sequence, directions = _panorama(rotations)
+    down = camera_rotations(0.0, -np.pi / 2)[0]
+    canvas = plan_panorama([LENS] * 18, down @ directions, projection="stereographic", max_stretch=16.0)
+    assert canvas.box(17) == (0, 0, *canvas.size)
+    found = _composed(sequence, down @ directions, canvas, CompositeOptions(seam="voronoi", exposure="none"))
+    assert canvas.size == pytest.approx((4 * np.sqrt(15) * 110,) * 2, abs=1)
+    assert (found.alpha > 0).mean() > 0.995
+    assert field_of_view(canvas)[0] == pytest.approx(4 * np.arctan(np.sqrt(15)), abs=0.01)
+    assert center_of_view(canvas) == pytest.approx((0.0, 0.0), abs=0.01)
 
 
 def test_cropping_a_full_turn_keeps_its_width() -> None:
