@@ -171,6 +171,8 @@ class StitchOptions:
             raise ArgumentError(f"local_alignment is auto, off or a number of cells, not {self.local_alignment!r}")
         if self.scheduler not in (None, LOCAL) and self.cache is None:
             raise ArgumentError("a cluster needs a folder for features that all its machines see: give --cache too")
+        if self.composite.measured and self.reference is None:
+            raise ArgumentError("rectangle and lines are pixels of the reference image: say which, give reference too")
         if self.workers < 0 or self.seed < 0:
             raise ArgumentError("workers and seed must not be negative")
         if self.workers > _MAX_WORKERS:

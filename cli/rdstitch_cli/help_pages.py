@@ -21,8 +21,9 @@ _GROUPS = {
         "features aliked_model lightglue_model max_features work_megapixels solver model threshold"
     ),
     "Output": (
-        "gsd epsg north_up rotate yaw pitch roll crop projection max_stretch max_size local_alignment exposure seam "
-        "blend interpolation background quality layers whole_layers all_blocks plot as_json"
+        "gsd epsg north_up rotate straighten rectangle level yaw pitch roll crop projection max_stretch max_size "
+        "local_alignment exposure seam blend interpolation background quality layers whole_layers all_blocks plot "
+        "as_json"
     ),
     "Control": "strict force dry_run cache max_memory workers scheduler seed verbose config help help_all",
 }

@@ -14,7 +14,9 @@ from rdstitch_cli.parameter_types import (
     ANGLE,
     ANGLES,
     BYTES,
+    CORNERS,
     EPSG,
+    LINES,
     FileOr,
     RealNumber,
     UserPath,
@@ -314,6 +316,25 @@ compositing = together(
         ["auto", "plane", "cylinder", "sphere", "mercator", "panini", "stereographic"],
         "auto",
         "How images taken by turning on the spot are laid out.",
+    ),
+    click.option(
+        "--rectangle",
+        type=CORNERS,
+        help="Four corners, pixels of the image of --reference as it is read, clockwise: they become an upright "
+        "rectangle of its true aspect ratio, the first one its top left corner.",
+    ),
+    click.option(
+        "--straighten",
+        type=LINES,
+        default="off",
+        show_default=True,
+        help="Make horizontal and vertical what is so in the scene. auto: edges found in the images; LINES: "
+        "'x1,y1,x2,y2;…', ends in pixels of the image of --reference as it is read.",
+    ),
+    click.option(
+        "--level",
+        is_flag=True,
+        help="Make vertical on the plane what the cameras measured (XMP, --attitude), else what most images do.",
     ),
     *(
         _number(f"--{name}", RealNumber(), 0.0, f"Turn the view of a panorama {where}, before it is projected.", "DEG")

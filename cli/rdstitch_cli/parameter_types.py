@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -137,9 +138,32 @@ def _epsg(text: str) -> int:
     return int(number)
 
 
-ANGLES, ANGLE, BYTES, EPSG = (
+def _pixels(text: str, count: int) -> tuple[float, ...]:
+    """So many coordinates of places in an image."""
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"is not {count} numbers with commas between them")
+    return numbers
+
+
+def _lines(text: str) -> str | tuple[tuple[float, ...], ...]:
+    """A word, or lines by both ends."""
+    return text if text in ("off", "auto") else tuple(_pixels(line, 4) for line in text.split(";"))
+
+
+ANGLES, ANGLE, BYTES, EPSG, CORNERS, LINES = (
     Parsed(name, parse)
-    for name, parse in (("PSI,THETA", _angles), ("DEG", _angle), ("SIZE", _bytes), ("EPSG:N", _epsg))
+    for name, parse in (
+        ("PSI,THETA", _angles),
+        ("DEG", _angle),
+        ("SIZE", _bytes),
+        ("EPSG:N", _epsg),
+        ("X1,Y1,…,X4,Y4", partial(_pixels, count=8)),
+        ("off|auto|LINES", _lines),
+    )
 )
 
 

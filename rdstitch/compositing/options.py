@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, fields
-from typing import Literal, get_args, get_type_hints
+from typing import Literal, get_args, get_origin, get_type_hints
 
 from rdstitch.compositing.projection import ProjectionName
 from rdstitch.compositing.upright import UprightOptions
@@ -102,7 +102,7 @@ class CompositeOptions(UprightOptions):
         for option in fields(self):
             allowed = get_args(hints[option.name])
             value = getattr(self, option.name)
-            if isinstance(value, str) and value not in allowed:
+            if get_origin(hints[option.name]) is Literal and value not in allowed:
                 raise ArgumentError(f"{option.name} must be one of {', '.join(allowed)}, not '{value}'")
         if not 1e-6 <= self.scale <= 1e6:
             raise ArgumentError(f"scale must lie between 1e-6 and 1e6, not {self.scale}")

@@ -122,7 +122,8 @@ def apply(
             corrected, said = with_flat_field(list(used.values()), flat_field)
             used = dict(zip(used, corrected, strict=True))
             doubts += said
-        placed = turned_anew(_placed(saved, used), options, saved.composite)
+        placed, said = turned_anew(_placed(saved, used), options, saved.composite)
+        doubts += said
         composed = compose_images(
             placed,
             output,

@@ -51,7 +51,7 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
             raise ArgumentError(f"gsd needs a georeferenced output: {reason}; leave it out")
         return canvas, None, reason
     rotate, scale = options.rotate, options.scale
-    if options.north_up and not rotate:
+    if options.north_up and not rotate and not options.upright:
         rotate = place.clockwise_deg
     if options.gsd is not None:
         scale *= place.gsd / options.gsd

@@ -377,7 +377,7 @@ def compose_registration(
     outputs: Outputs,
 ) -> StitchResult:
     """Compose images at the places of a registration, into memory or among the outputs, with all that belongs to it."""
-    placed = turned(PlacedImages.of(registration, local.fields or None), options.composite)
+    placed, said = turned(PlacedImages.of(registration, local.fields or None), options.composite)
     if placed.orientation is not None:
         homographies = placed.orientation @ registration.alignment.homographies
         registration = replace(registration, alignment=replace(registration.alignment, homographies=homographies))
@@ -393,7 +393,7 @@ def compose_registration(
         dry_run=options.dry_run,
     )
     result = StitchResult(
-        _finished(registration).with_messages(composed.messages),
+        _finished(registration).with_messages((*said, *composed.messages)),
         composed.canvas,
         options.for_images(len(registration.sources)),
         None if output is None else Path(output),

@@ -1,37 +1,175 @@
 """Registered images, turned as the user wants to see them: between registration and canvas."""
 
-from dataclasses import fields, replace
+import math
+from dataclasses import replace
+from typing import Any
 
+import cv2
 import numpy as np
 
-from rdstitch.compositing.upright import UprightOptions
+from rdstitch.arrays import FloatArray
+from rdstitch.compositing.upright import (
+    Edges,
+    Focal,
+    Upright,
+    UprightOptions,
+    nearest_axis,
+    nearest_rotation,
+    of_edges,
+    of_rectangle,
+    of_scene,
+    to_axes,
+)
 from rdstitch.errors import ArgumentError
+from rdstitch.features.prepared_image import prepare
+from rdstitch.messages import Message
 from rdstitch.pipeline.placed_images import PlacedImages
 
+_MEGAPIXELS = 0.6  # of the images that edges are found in
+_MAX_IMAGES = 40
+_MIN_LENGTH = 0.03  # of an edge, half diagonals
+_POINTING = 2.0  # pixels: how well people point at places
+_DETECTION = 0.3  # pixels: how well the detector does
+_CLEARANCE = 3.0  # pixels that an edge keeps from what is masked
+_SURE = 0.01  # relative standard deviation of an aspect ratio that needs no warning
+_STEEP = math.cos(math.radians(30.0))  # a camera that looks nearer to straight up or down shows nothing upright
 
-def turned(placed: PlacedImages, options: UprightOptions) -> PlacedImages:
-    """The images as the options turn them; :attr:`PlacedImages.orientation` says by what.
+
+def turned(placed: PlacedImages, options: UprightOptions) -> tuple[PlacedImages, list[Message]]:
+    """The images as the options turn them, and what the user should know of it.
+
+    :attr:`PlacedImages.orientation` says by what.
 
     Raises
     ------
     ArgumentError
-        When a plane should be turned as only a panorama can be.
+        When a plane should be turned as only a panorama can be, or places are given where there is no reference
+        image, or that it cannot show.
     """
-    view = options.view
-    if view is None:
-        return placed
-    if not placed.turned:
-        raise ArgumentError(
-            "yaw, pitch and roll are for images taken by turning on the spot; these were not, use --rotate"
-        )
-    return replace(placed, homographies=view @ placed.homographies, orientation=view)
+    matrix, said = _upright(placed, options) if options.upright else (None, [])
+    if (view := options.view) is not None:
+        if not placed.turned:
+            raise ArgumentError(
+                "yaw, pitch and roll are for images taken by turning on the spot; these were not, use --rotate"
+            )
+        matrix = view if matrix is None else view @ matrix
+    if matrix is None:
+        return placed, said
+    return replace(placed, homographies=matrix @ placed.homographies, orientation=matrix), said
 
 
-def turned_anew(placed: PlacedImages, options: UprightOptions, former: UprightOptions) -> PlacedImages:
+def turned_anew(
+    placed: PlacedImages, options: UprightOptions, former: UprightOptions
+) -> tuple[PlacedImages, list[Message]]:
     """The same of images that other options have turned before."""
-    if all(getattr(options, name) == getattr(former, name) for name in (f.name for f in fields(UprightOptions))):
-        return placed
+    if options.same_turn(former):
+        return placed, []
     if placed.orientation is not None:
         homographies = np.linalg.inv(placed.orientation) @ placed.homographies
         placed = replace(placed, homographies=homographies, orientation=None, place=None)
     return turned(placed, options)
+
+
+def _upright(placed: PlacedImages, options: UprightOptions) -> tuple[FloatArray | None, list[Message]]:
+    """What takes the images to where the scene is upright; None where nothing shows how."""
+    if placed.reference is None:
+        raise ArgumentError("the reference image is not among the images: nothing can be turned upright")
+    frame = placed.homographies[placed.reference]
+    focal = _focal(placed)
+    start = nearest_rotation(np.asarray(np.linalg.inv(to_axes(frame, focal.value))))
+    camera = placed.cameras[placed.reference]
+    pixel = 1.0 / camera.half_diagonal
+    said: list[Message] = []
+    upright: Upright | None
+    if options.rectangle is not None:
+        corners = _in_reference(placed, np.reshape(options.rectangle, (4, 2)))
+        upright, aspect, error = of_rectangle(corners, focal, pixel)
+        text = f"rectangle: {aspect:.4g} times as wide as high ± {error:.1%}"
+        text += f", with a focal length of {upright.focal.value / pixel:.0f} pixels ({camera.focal_source or 'guess'})"
+        said = [Message(text, severity="warning" if error > _SURE else "note")]
+    elif options.straighten == "auto":
+        upright = of_scene(_edges(placed), start, focal, depth=placed.turned)
+        if upright is None:
+            said = [Message("no straight edges were found: the output is not turned", code="not-straightened")]
+    elif not isinstance(options.straighten, str):
+        ends = _in_reference(placed, np.reshape(options.straighten, (-1, 2))).reshape(-1, 2, 2)
+        edges = _between(placed, np.concatenate([ends, np.ones((len(ends), 2, 1))], axis=2), _POINTING * pixel)
+        axis = nearest_axis(edges, start[:2], focal.value)
+        upright = of_edges(edges, axis, start, focal, focal.value)
+    else:
+        upright, said = _level(placed, start, focal)
+    return (None if upright is None else upright.matrix(frame, turned=placed.turned)), said
+
+
+def _focal(placed: PlacedImages) -> Focal:
+    """The focal length of the reference image, as the alignment has it."""
+    assert placed.reference is not None
+    if placed.turned:
+        lengths = np.linalg.norm(placed.homographies[placed.reference], axis=0)
+        return Focal(float(lengths[2] / lengths[0]))
+    camera = placed.cameras[placed.reference].with_focal()
+    assert camera.focal is not None
+    return Focal(camera.focal / camera.half_diagonal, camera.focal_log_std)
+
+
+def _in_reference(placed: PlacedImages, points: FloatArray) -> FloatArray:
+    """Undistorted places (N, 2) of pixels of the reference image, half diagonals from its centre."""
+    assert placed.reference is not None
+    camera = placed.cameras[placed.reference]
+    flat = camera.normalize(camera.undistort(points))
+    if not np.isfinite(flat).all():
+        raise ArgumentError("rectangle, straighten: a place lies where the lens of the reference image shows nothing")
+    return flat
+
+
+def _edges(placed: PlacedImages) -> Edges:
+    """Straight edges in the images, by the line segment detector of Grompone von Gioi et al. (2010)."""
+    assert placed.reference is not None
+    to_reference = np.linalg.inv(placed.homographies[placed.reference]) @ placed.homographies
+    detector = cv2.createLineSegmentDetector()
+    found, error = [], 0.0
+    count = len(placed.sources)
+    for k in np.unique(np.linspace(0, count - 1, min(count, _MAX_IMAGES)).astype(np.intp)).tolist():
+        camera, image = placed.cameras[k], prepare(placed.sources[k].view(_MEGAPIXELS), _MEGAPIXELS)
+        lines: Any = detector.detect(image.grey)[0]
+        ends = np.reshape(np.empty(0) if lines is None else lines, (-1, 2)).astype(np.float64)
+        clear = image.covers(ends, np.full(len(ends), _CLEARANCE)).reshape(-1, 2).all(axis=1)
+        flat = camera.normalize(camera.undistort(image.to_full_size(ends))).reshape(-1, 2, 2)[clear]
+        flat = flat[np.linalg.norm(flat[:, 1] - flat[:, 0], axis=1) > _MIN_LENGTH]
+        found.append(np.concatenate([flat, np.ones((len(flat), 2, 1))], axis=2) @ to_reference[k].T)
+        error = max(error, _DETECTION * float(image.factor.max()) / camera.half_diagonal)
+    return _between(placed, np.concatenate(found), error)
+
+
+def _between(placed: PlacedImages, ends: FloatArray, error: float) -> Edges:
+    """Edges by their ends (N, 2, 3) in the reference image, undistorted."""
+    if not placed.turned:
+        return Edges.between(ends[(ends[:, :, 2] > 0.0).all(axis=1)], error)
+    focal = _focal(placed).value
+    return Edges.between(ends * (1.0, 1.0, focal), error / focal, on_sphere=True)
+
+
+def _level(placed: PlacedImages, start: FloatArray, focal: Focal) -> tuple[Upright | None, list[Message]]:
+    """With what is down in the scene, or else in most images, down in the output."""
+    if placed.turned:
+        return None, [Message("the horizon of a panorama is level already", severity="note")]
+    assert placed.reference is not None
+    to_reference = np.linalg.inv(placed.homographies[placed.reference]) @ placed.homographies
+    calibration = np.diag([1.0, 1.0, focal.value])
+    measured = [source.down for source in placed.sources]
+    known = any(down is not None for down in measured)
+    directions = [
+        np.sign(matrix[2, 2]) * calibration @ matrix @ np.linalg.inv(calibration) @ (down or (0.0, 1.0, 0.0))
+        for matrix, down in zip(to_reference, measured, strict=True)
+        if down is not None or not known
+    ]
+    down = np.mean([direction / np.linalg.norm(direction) for direction in directions], axis=0)
+    down /= np.linalg.norm(down)
+    ahead = start[2]
+    if abs(down @ ahead) > _STEEP:
+        return None, [Message("the camera looks straight down: there is nothing to level")]
+    if not known:
+        down -= (down @ ahead) * ahead
+        down /= np.linalg.norm(down)
+    right = np.cross(down, ahead)
+    return Upright(np.stack([right / np.linalg.norm(right), down]), focal), []

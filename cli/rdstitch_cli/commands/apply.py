@@ -78,6 +78,8 @@ def apply(
     # What is given takes the place of what the sidecar has for the same purpose.
     if "scale" in given or "gsd" in given:
         given = {"scale": 1.0, "gsd": None, **given}
+    if given.keys() & {"rectangle", "straighten", "level"}:
+        given = {"rectangle": None, "straighten": "off", "level": False, **given}
     result = recipe(
         sidecar,
         options.resolve(images),
